@@ -1,0 +1,171 @@
+//! What can be chosen about the array.
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use crate::units::MAX_SATELLITES;
+use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
+
+/// Which way the ascending node moves.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum NodeMotion {
+    /// Westward, as lunar J2 makes it for a prograde orbit.
+    #[default]
+    Regress,
+    /// Eastward.
+    Advance,
+}
+
+/// Orbit and formation; the defaults are the paper's fiducial array.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ArrayConfig {
+    /// Number of daughters on the circle.
+    pub satellites: usize,
+    /// Altitude of the circular orbit, m.
+    pub altitude_m: f64,
+    /// Radius of the Moon, m.
+    pub moon_radius_m: f64,
+    /// Inclination to the ecliptic, degrees.
+    pub inclination_deg: f64,
+    /// Orbital period, s.
+    pub orbital_period_s: f64,
+    /// Time in which the node goes round once, s.
+    pub precession_period_s: f64,
+    /// Sense of the node's motion.
+    pub node_motion: NodeMotion,
+    /// Orbital phase of daughter 1 at the epoch, degrees.
+    pub orbital_phase_deg: f64,
+    /// Longitude of the ascending node at the epoch, degrees.
+    pub node_longitude_deg: f64,
+    /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch, degrees.
+    pub earth_longitude_deg: f64,
+    /// The formation's breathing.
+    pub breathing: BreathingConfig,
+}
+
+impl Default for ArrayConfig {
+    fn default() -> Self {
+        Self {
+            satellites: 8,
+            altitude_m: 300e3,
+            moon_radius_m: MOON_RADIUS_M,
+            inclination_deg: 30.0,
+            orbital_period_s: 8_248.68,
+            precession_period_s: 1.3 * YEAR_S,
+            node_motion: NodeMotion::Regress,
+            orbital_phase_deg: 0.0,
+            node_longitude_deg: 0.0,
+            earth_longitude_deg: 0.0,
+            breathing: BreathingConfig::default(),
+        }
+    }
+}
+
+/// How the formation contracts and expands along the track (the paper, Sect. 2).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BreathingConfig {
+    /// Contraction and expansion together, s.
+    pub period_s: f64,
+    /// Least distance of daughters 1 and 2, m; R_2 times this is the greatest.
+    pub first_spacing_m_min: f64,
+    /// Ratio R_2 of greatest to least distance of daughters 1 and 2.
+    pub first_ratio: f64,
+    /// Least distance of daughters 2 and 3, m; R times this is the greatest.
+    pub second_spacing_m_min: f64,
+    /// Ratio R of greatest to least arc of daughters 3 and later.
+    pub ratio: f64,
+    /// Greatest arc from the first to the last daughter, m.
+    pub span_m_max: f64,
+}
+
+impl Default for BreathingConfig {
+    fn default() -> Self {
+        Self {
+            period_s: 14.0 * DAY_S,
+            first_spacing_m_min: 100.0,
+            first_ratio: 6.0,
+            second_spacing_m_min: 500.0,
+            ratio: 3.0,
+            span_m_max: 100e3,
+        }
+    }
+}
+
+/// Why an array cannot be.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[non_exhaustive]
+pub enum ArrayError {
+    /// A parameter outside its range.
+    #[error("array.{key} = {value}: expected {expected}")]
+    Parameter {
+        /// Key in the `[array]` section.
+        key: &'static str,
+        /// Value found.
+        value: f64,
+        /// Range that is accepted.
+        expected: &'static str,
+    },
+    /// No geometric progression of spacings fits.
+    #[error(
+        "array.breathing: no progression of spacings fits {satellites} daughters between {first_m} m \
+         and {span_m} m with a second step of {second_m} m; lower second_spacing_m_min or raise span_m_max"
+    )]
+    Progression {
+        /// Number of daughters.
+        satellites: usize,
+        /// Arc of daughter 2, m.
+        first_m: f64,
+        /// Arc from daughter 2 to daughter 3, m.
+        second_m: f64,
+        /// Arc of the last daughter, m.
+        span_m: f64,
+    },
+}
+
+impl ArrayConfig {
+    /// Everything that is wrong with the configuration; empty if it is good.
+    #[must_use]
+    pub fn problems(&self) -> Vec<ArrayError> {
+        const POSITIVE: &str = "a positive number";
+        const FINITE: &str = "a finite number";
+        let breathing = &self.breathing;
+        let mut found = Vec::new();
+        let mut require = |key, value: f64, good: bool, expected| {
+            if !(good && value.is_finite()) {
+                found.push(ArrayError::Parameter { key, value, expected });
+            }
+        };
+        let count = self.satellites as f64;
+        require("satellites", count, (3..=MAX_SATELLITES).contains(&self.satellites), "3 to 64");
+        for (key, value) in [
+            ("moon_radius_m", self.moon_radius_m),
+            ("altitude_m", self.altitude_m),
+            ("orbital_period_s", self.orbital_period_s),
+            ("precession_period_s", self.precession_period_s),
+            ("breathing.period_s", breathing.period_s),
+            ("breathing.first_spacing_m_min", breathing.first_spacing_m_min),
+            ("breathing.second_spacing_m_min", breathing.second_spacing_m_min),
+            ("breathing.span_m_max", breathing.span_m_max),
+        ] {
+            require(key, value, value > 0.0, POSITIVE);
+        }
+        for (key, value) in
+            [("breathing.first_ratio", breathing.first_ratio), ("breathing.ratio", breathing.ratio)]
+        {
+            require(key, value, value >= 1.0, "a number of at least 1");
+        }
+        let inclination = self.inclination_deg;
+        require("inclination_deg", inclination, (0.0..=180.0).contains(&inclination), "0 to 180");
+        for (key, value) in [
+            ("orbital_phase_deg", self.orbital_phase_deg),
+            ("node_longitude_deg", self.node_longitude_deg),
+            ("earth_longitude_deg", self.earth_longitude_deg),
+        ] {
+            require(key, value, true, FINITE);
+        }
+        found
+    }
+}

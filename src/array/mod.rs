@@ -1,0 +1,19 @@
+//! Where the daughters are, what the Moon hides from them, and how a pair answers to the sky.
+//!
+//! Pure functions of time and position; uses [`crate::units`] and [`crate::sky`].
+//!
+//! Frame: centred on the Moon, ecliptic axes (x to ecliptic longitude 0, z to the north ecliptic pole).
+
+mod config;
+mod formation;
+mod integration;
+mod orbit;
+mod windows;
+
+pub mod response;
+
+pub use config::{ArrayConfig, ArrayError, BreathingConfig, NodeMotion};
+pub use formation::Formation;
+pub use integration::{IntegrationRule, integration_time_s};
+pub use orbit::{Array, SatelliteState, hidden_by_moon};
+pub use windows::ObservingWindows;

@@ -1,0 +1,152 @@
+//! Orbital motion of the daughters, the Earth's direction, and occultation by the Moon.
+
+use std::f64::consts::TAU;
+
+use super::config::{ArrayConfig, ArrayError, NodeMotion};
+use super::formation::Formation;
+use crate::units::constants::SIDEREAL_MONTH_S;
+use crate::units::vector::{Vec3, dot};
+
+/// Position and velocity of one daughter.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SatelliteState {
+    /// Position, m.
+    pub position_m: Vec3,
+    /// Velocity, m/s, with orbital motion, precession and breathing.
+    pub velocity_m_s: Vec3,
+}
+
+/// The array in motion: positions of everything at any time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Array {
+    formation: Formation,
+    orbit_radius_m: f64,
+    moon_radius_m: f64,
+    inclination_rad: f64,
+    orbital_period_s: f64,
+    phase_rad: f64,
+    node_rad: f64,
+    node_rate_rad_s: f64,
+    earth_rad: f64,
+}
+
+impl Array {
+    /// The array of a configuration.
+    ///
+    /// # Errors
+    /// The first of [`ArrayConfig::problems`], or a formation that does not exist.
+    pub fn new(config: &ArrayConfig) -> Result<Self, ArrayError> {
+        if let Some(problem) = config.problems().into_iter().next() {
+            return Err(problem);
+        }
+        let rate = TAU / config.precession_period_s;
+        Ok(Self {
+            formation: Formation::new(config)?,
+            orbit_radius_m: config.moon_radius_m + config.altitude_m,
+            moon_radius_m: config.moon_radius_m,
+            inclination_rad: config.inclination_deg.to_radians(),
+            orbital_period_s: config.orbital_period_s,
+            phase_rad: config.orbital_phase_deg.to_radians(),
+            node_rad: config.node_longitude_deg.to_radians(),
+            node_rate_rad_s: match config.node_motion {
+                NodeMotion::Regress => -rate,
+                NodeMotion::Advance => rate,
+            },
+            earth_rad: config.earth_longitude_deg.to_radians(),
+        })
+    }
+
+    /// Number of daughters.
+    #[must_use]
+    pub fn satellites(&self) -> usize {
+        self.formation.satellites()
+    }
+
+    /// Radius of the Moon, m.
+    #[must_use]
+    pub fn moon_radius_m(&self) -> f64 {
+        self.moon_radius_m
+    }
+
+    /// Radius of the orbit, m.
+    #[must_use]
+    pub fn orbit_radius_m(&self) -> f64 {
+        self.orbit_radius_m
+    }
+
+    /// Orbital period, s.
+    #[must_use]
+    pub fn orbital_period_s(&self) -> f64 {
+        self.orbital_period_s
+    }
+
+    /// The daughters' arcs.
+    #[must_use]
+    pub fn formation(&self) -> &Formation {
+        &self.formation
+    }
+
+    /// State of daughter `n` (from 0) at `t_s`.
+    ///
+    /// `r = R [cos O cos f - sin O sin f cos i, sin O cos f + cos O sin f cos i, sin f sin i]`
+    /// with `f = phi - s_n / R` (the paper, Sect. 2).
+    #[must_use]
+    pub fn state(&self, n: usize, t_s: f64) -> SatelliteState {
+        let radius = self.orbit_radius_m;
+        let (arc_m, arc_rate_m_s) = self.formation.arc_m(n, t_s);
+        let turns = (t_s / self.orbital_period_s).fract();
+        let phase = self.phase_rad + TAU * turns - arc_m / radius;
+        let phase_rate = TAU / self.orbital_period_s - arc_rate_m_s / radius;
+        let (sin_f, cos_f) = phase.sin_cos();
+        let (sin_o, cos_o) = (self.node_rad + self.node_rate_rad_s * t_s).sin_cos();
+        let (sin_i, cos_i) = self.inclination_rad.sin_cos();
+        let radial =
+            [cos_o * cos_f - sin_o * sin_f * cos_i, sin_o * cos_f + cos_o * sin_f * cos_i, sin_f * sin_i];
+        let along =
+            [-cos_o * sin_f - sin_o * cos_f * cos_i, -sin_o * sin_f + cos_o * cos_f * cos_i, cos_f * sin_i];
+        let around = [-radial[1], radial[0], 0.0];
+        SatelliteState {
+            position_m: radial.map(|x| radius * x),
+            velocity_m_s: std::array::from_fn(|k| {
+                radius * (phase_rate * along[k] + self.node_rate_rad_s * around[k])
+            }),
+        }
+    }
+
+    /// Position of daughter `n` (from 0), m.
+    #[must_use]
+    pub fn position_m(&self, n: usize, t_s: f64) -> Vec3 {
+        self.state(n, t_s).position_m
+    }
+
+    /// Direction of the Earth from the Moon.
+    #[must_use]
+    pub fn earth_hat(&self, t_s: f64) -> Vec3 {
+        let turns = (t_s / SIDEREAL_MONTH_S).fract();
+        let (sin, cos) = (self.earth_rad + TAU * turns).sin_cos();
+        [cos, sin, 0.0]
+    }
+
+    /// Whether the Earth is hidden from daughter 1, so that the array observes.
+    #[must_use]
+    pub fn observing(&self, t_s: f64) -> bool {
+        self.earth_depth_m(t_s) > 0.0
+    }
+
+    /// How deep the Earth stands behind the limb for daughter 1, m: positive when hidden.
+    pub(super) fn earth_depth_m(&self, t_s: f64) -> f64 {
+        let position = self.position_m(0, t_s);
+        hiding_depth_m(position, self.earth_hat(t_s), self.moon_radius_m)
+    }
+}
+
+/// Whether the Moon hides direction `n_hat` from a satellite at `r_m` (the paper, Eq. 8).
+#[must_use]
+pub fn hidden_by_moon(r_m: Vec3, n_hat: Vec3, moon_radius_m: f64) -> bool {
+    hiding_depth_m(r_m, n_hat, moon_radius_m) > 0.0
+}
+
+fn hiding_depth_m(r_m: Vec3, n_hat: Vec3, moon_radius_m: f64) -> f64 {
+    let to_limb_m = (dot(r_m, r_m) - moon_radius_m * moon_radius_m).max(0.0).sqrt();
+    -dot(n_hat, r_m) - to_limb_m
+}

@@ -1,0 +1,1 @@
+//! How a pair answers to the sky: rows of the beam matrix B. (to come)

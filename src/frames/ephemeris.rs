@@ -1,0 +1,40 @@
+//! Tabulated satellite positions.
+
+use crate::units::MissionTime;
+use crate::units::vector::Vec3;
+
+/// Positions of all satellites at equal steps over a stretch of time without manoeuvres.
+///
+/// The stretch is smooth: interpolation never crosses a segment's ends.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EphemerisSegment {
+    /// Time of the first node.
+    pub start: MissionTime,
+    /// Distance of the nodes, us; positive.
+    pub step_ticks: u32,
+    /// Number of satellites.
+    pub satellites: u8,
+    /// Positions, m, Moon-centred ecliptic axes: node after node, `satellites` each.
+    pub positions_m: Vec<Vec3>,
+}
+
+impl EphemerisSegment {
+    /// Number of nodes.
+    #[must_use]
+    pub fn nodes(&self) -> usize {
+        self.positions_m.len() / usize::from(self.satellites).max(1)
+    }
+
+    /// Time of the last node.
+    #[must_use]
+    pub fn end(&self) -> MissionTime {
+        let last = self.nodes().saturating_sub(1) as i64;
+        self.start.plus_ticks(last * i64::from(self.step_ticks))
+    }
+
+    /// Whether `time` lies between the first and the last node.
+    #[must_use]
+    pub fn covers(&self, time: MissionTime) -> bool {
+        self.start <= time && time <= self.end()
+    }
+}

@@ -1,0 +1,111 @@
+//! Integrated visibilities, before and after the ground has placed them.
+
+use num_complex::{Complex32, Complex64};
+
+use crate::units::vector::Vec3;
+use crate::units::{ChannelId, MissionTime, Pair};
+
+/// Why a visibility should not be used; a set of bits, 0 for a good one.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Flags(pub u8);
+
+impl Flags {
+    /// Nothing wrong.
+    pub const GOOD: Self = Self(0);
+    /// Radio interference.
+    pub const INTERFERENCE: Self = Self(1);
+    /// Samples were missing for part of the integration.
+    pub const INCOMPLETE: Self = Self(2);
+    /// A receiver saturated.
+    pub const SATURATED: Self = Self(4);
+    /// Calibration refused it.
+    pub const UNCALIBRATED: Self = Self(8);
+
+    /// Whether no bit is set.
+    #[must_use]
+    pub fn is_good(self) -> bool {
+        self.0 == 0
+    }
+}
+
+/// Consecutive integrations of one pair in one channel, as the mother makes them.
+///
+/// Structure of arrays; all arrays have the same length.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct VisibilityBlock {
+    /// Channel.
+    pub channel: ChannelId,
+    /// Pair.
+    pub pair: Pair,
+    /// Time that `offset_ticks` counts from.
+    pub start: MissionTime,
+    /// Start of each integration after `start`, us.
+    pub offset_ticks: Vec<u32>,
+    /// Length of each integration, us.
+    pub duration_ticks: Vec<u32>,
+    /// Visibility, K sr.
+    pub value_k_sr: Vec<Complex32>,
+    /// Inverse variance of the real part (equal to that of the imaginary part), (K sr)^-2.
+    pub weight: Vec<f32>,
+    /// Flags.
+    pub flags: Vec<Flags>,
+}
+
+impl VisibilityBlock {
+    /// Number of visibilities.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.value_k_sr.len()
+    }
+
+    /// Whether the block is empty.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.value_k_sr.is_empty()
+    }
+
+    /// Middle of integration `k`, s since the mission epoch.
+    #[must_use]
+    pub fn middle_s(&self, k: usize) -> f64 {
+        let half_ticks = 0.5 * f64::from(self.duration_ticks[k]);
+        let from_start_s = (f64::from(self.offset_ticks[k]) + half_ticks) * 1e-6;
+        self.start.seconds() + from_start_s
+    }
+}
+
+/// Calibrated visibilities with the positions of their two satellites, ready for accumulation.
+///
+/// Structure of arrays; all arrays have the same length. Times increase.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PlacedVisibilities {
+    /// Channel.
+    pub channel: ChannelId,
+    /// Centre frequency of the channel, Hz.
+    pub frequency_hz: f64,
+    /// Pair.
+    pub pair: Pair,
+    /// Middle of each integration, s since the mission epoch.
+    pub time_s: Vec<f64>,
+    /// Position of satellite i, m.
+    pub r_i_m: Vec<Vec3>,
+    /// Position of satellite j, m.
+    pub r_j_m: Vec<Vec3>,
+    /// Visibility, K sr.
+    pub value_k_sr: Vec<Complex64>,
+    /// Inverse variance of the real part, (K sr)^-2; positive.
+    pub weight: Vec<f64>,
+}
+
+impl PlacedVisibilities {
+    /// Number of visibilities.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.time_s.len()
+    }
+
+    /// Whether the block is empty.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.time_s.is_empty()
+    }
+}

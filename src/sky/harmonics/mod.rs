@@ -1,0 +1,5 @@
+//! Spherical harmonics: orthonormal, Condon-Shortley phase.
+
+mod coefficients;
+
+pub use coefficients::Alm;

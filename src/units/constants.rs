@@ -1,0 +1,22 @@
+//! Physical constants, each with its source.
+
+/// Speed of light in vacuum, m/s (SI, exact).
+pub const SPEED_OF_LIGHT_M_S: f64 = 299_792_458.0;
+
+/// Boltzmann constant, J/K (SI, exact).
+pub const BOLTZMANN_J_K: f64 = 1.380_649e-23;
+
+/// Mean radius of the Moon, m (IAU 2015; the paper, Sect. 2).
+pub const MOON_RADIUS_M: f64 = 1_737_100.0;
+
+/// One Julian day, s.
+pub const DAY_S: f64 = 86_400.0;
+
+/// One Julian year, s.
+pub const YEAR_S: f64 = 365.25 * DAY_S;
+
+/// Sidereal month: the period of the Earth's direction as seen from the Moon, s.
+pub const SIDEREAL_MONTH_S: f64 = 27.321_661 * DAY_S;
+
+/// HEALPix value of a pixel that was never seen, K.
+pub const HEALPIX_UNSEEN: f64 = -1.637_5e30;

@@ -1,0 +1,13 @@
+//! Identifiers, mission time, constants, three-vectors and keyed random streams.
+//!
+//! Uses nothing else of the crate.
+
+pub mod constants;
+mod ids;
+mod random;
+mod time;
+pub mod vector;
+
+pub use ids::{ChannelId, MAX_SATELLITES, Pair, PairError, all_pairs};
+pub use random::{StreamKind, random_stream};
+pub use time::{MissionTime, TICKS_PER_SECOND};

@@ -1,0 +1,35 @@
+//! Random streams keyed by what they are for, so that nothing depends on scheduling.
+
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+
+/// What a random stream is for; streams of different kinds are independent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum StreamKind {
+    /// Thermal noise of integrated visibilities.
+    VisibilityNoise = 1,
+    /// Noise drawn on the ground for the noise-only companion map.
+    CompanionNoise = 2,
+    /// Small-scale structure of a generated sky.
+    SkyFluctuations = 3,
+    /// Point sources of a generated sky.
+    SkySources = 4,
+    /// Starting vectors of eigenvalue iterations and probing vectors.
+    Probe = 5,
+}
+
+/// The random stream of `seed`, `kind` and two words of identity (for a block of visibilities:
+/// channel and pair, and start tick).
+///
+/// ChaCha8 with the identity as key: equal arguments give equal streams, wherever and whenever they
+/// are drawn.
+#[must_use]
+pub fn random_stream(seed: u64, kind: StreamKind, identity: [u64; 2]) -> ChaCha8Rng {
+    let words = [seed, kind as u64, identity[0], identity[1]];
+    let mut key = [0_u8; 32];
+    for (bytes, word) in key.chunks_exact_mut(8).zip(words) {
+        bytes.copy_from_slice(&word.to_le_bytes());
+    }
+    ChaCha8Rng::from_seed(key)
+}

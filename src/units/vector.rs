@@ -1,0 +1,53 @@
+//! Three-vectors as plain arrays.
+
+/// A vector in the frame its context names; metres or dimensionless.
+pub type Vec3 = [f64; 3];
+
+/// Scalar product.
+#[inline]
+#[must_use]
+pub fn dot(a: Vec3, b: Vec3) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// `a - b`.
+#[inline]
+#[must_use]
+pub fn sub(a: Vec3, b: Vec3) -> Vec3 {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+/// `a + b`.
+#[inline]
+#[must_use]
+pub fn add(a: Vec3, b: Vec3) -> Vec3 {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+
+/// `s a`.
+#[inline]
+#[must_use]
+pub fn scale(s: f64, a: Vec3) -> Vec3 {
+    [s * a[0], s * a[1], s * a[2]]
+}
+
+/// Vector product.
+#[inline]
+#[must_use]
+pub fn cross(a: Vec3, b: Vec3) -> Vec3 {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+/// Euclidean length.
+#[inline]
+#[must_use]
+pub fn norm(a: Vec3) -> f64 {
+    dot(a, a).sqrt()
+}
+
+/// `a` scaled to length one.
+#[inline]
+#[must_use]
+pub fn unit(a: Vec3) -> Vec3 {
+    scale(1.0 / norm(a), a)
+}
