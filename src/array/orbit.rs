@@ -94,8 +94,8 @@ impl Array {
     pub fn state(&self, n: usize, t_s: f64) -> SatelliteState {
         let radius = self.orbit_radius_m;
         let (arc_m, arc_rate_m_s) = self.formation.arc_m(n, t_s);
-        let turns = (t_s / self.orbital_period_s).fract();
-        let phase = self.phase_rad + TAU * turns - arc_m / radius;
+        // As the paper writes it; after 1.3 years the phase's last bit is worth 7 um along the track.
+        let phase = self.phase_rad + TAU * t_s / self.orbital_period_s - arc_m / radius;
         let phase_rate = TAU / self.orbital_period_s - arc_rate_m_s / radius;
         let (sin_f, cos_f) = phase.sin_cos();
         let (sin_o, cos_o) = (self.node_rad + self.node_rate_rad_s * t_s).sin_cos();
@@ -122,8 +122,7 @@ impl Array {
     /// Direction of the Earth from the Moon.
     #[must_use]
     pub fn earth_hat(&self, t_s: f64) -> Vec3 {
-        let turns = (t_s / SIDEREAL_MONTH_S).fract();
-        let (sin, cos) = (self.earth_rad + TAU * turns).sin_cos();
+        let (sin, cos) = (self.earth_rad + TAU * t_s / SIDEREAL_MONTH_S).sin_cos();
         [cos, sin, 0.0]
     }
 
