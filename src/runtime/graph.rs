@@ -1,0 +1,156 @@
+//! Building a graph of typed links.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use crossbeam_channel::{Receiver, bounded};
+
+use super::cancel::{Cancel, Halt};
+use super::error::RuntimeError;
+use super::metrics::{Counters, Metrics};
+use super::outlet::{Outlet, Queue, Stamped};
+use super::report::Report;
+use super::stage::{Sink, Source, Stage};
+use super::supervisor;
+use super::worker::{Inlet, SinkWorker, SourceWorker, StageWorker, Worker};
+
+/// The output of a source or stage that nothing takes yet.
+#[must_use = "nothing takes this output yet: end the chain with a sink"]
+pub struct Link<T> {
+    receiver: Receiver<Stamped<T>>,
+    capacity: usize,
+    from: usize,
+    /// Which graph it belongs to.
+    halt: Arc<Halt>,
+}
+
+/// A worker that waits for its thread.
+pub(super) struct Node {
+    pub(super) counters: Arc<Counters>,
+    pub(super) worker: Box<dyn Worker>,
+    /// Whether something takes its output; true of a sink.
+    taken: bool,
+}
+
+/// Sources, stages and sinks, each to run on a thread of its own.
+pub struct Graph {
+    nodes: Vec<Node>,
+    metrics: Arc<Metrics>,
+    halt: Arc<Halt>,
+    /// First mistake made while building.
+    mistake: Option<RuntimeError>,
+}
+
+impl Default for Graph {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Graph {
+    /// A graph without stages.
+    #[must_use]
+    pub fn new() -> Self {
+        Self { nodes: Vec::new(), metrics: Arc::default(), halt: Arc::new(Halt::new()), mistake: None }
+    }
+
+    /// Adds a source whose output queue holds `capacity` items.
+    ///
+    /// A mistake (a name that is taken, capacity 0) is reported by [`Graph::run`].
+    pub fn source<S>(&mut self, name: &str, capacity: usize, source: S) -> Link<S::Out>
+    where
+        S: Source<Out: 'static> + 'static,
+    {
+        let counters = self.counters(name, None, source.units().name);
+        let (out, link) = self.link(capacity, &counters);
+        self.add(counters, Box::new(SourceWorker { source, out }), false);
+        link
+    }
+
+    /// Adds a stage that takes what comes over `input`; its output queue holds `capacity` items.
+    ///
+    /// A mistake (a name that is taken, capacity 0, a link of another graph) is reported by
+    /// [`Graph::run`].
+    pub fn stage<S>(&mut self, name: &str, capacity: usize, input: Link<S::In>, stage: S) -> Link<S::Out>
+    where
+        S: Stage<In: 'static, Out: 'static> + 'static,
+    {
+        let counters = self.counters(name, Some(input.capacity), stage.units().name);
+        let inlet = self.inlet(name, input);
+        let (out, link) = self.link(capacity, &counters);
+        self.add(counters, Box::new(StageWorker { stage, inlet, out }), false);
+        link
+    }
+
+    /// Adds a sink that takes what comes over `input`.
+    ///
+    /// A mistake (a name that is taken, a link of another graph) is reported by [`Graph::run`].
+    pub fn sink<S>(&mut self, name: &str, input: Link<S::In>, sink: S)
+    where
+        S: Sink<In: 'static> + 'static,
+    {
+        let counters = self.counters(name, Some(input.capacity), sink.units().name);
+        let inlet = self.inlet(name, input);
+        self.add(counters, Box::new(SinkWorker { sink, inlet }), true);
+    }
+
+    /// Counters that may be polled while the graph runs.
+    #[must_use]
+    pub fn metrics(&self) -> Arc<Metrics> {
+        Arc::clone(&self.metrics)
+    }
+
+    /// Runs every stage on its own thread until all have ended.
+    ///
+    /// After `cancel` the sources stop and the rest drains for as long as it takes. After a failure
+    /// the stages have until `deadline` has passed to end; those that do not are left to themselves
+    /// and named in the error. A thread cannot be ended from outside, so the process should be.
+    ///
+    /// # Errors
+    /// [`RuntimeError`]: a mistake in the graph, or the first failure of a stage.
+    pub fn run(mut self, cancel: &Cancel, deadline: Duration) -> Result<Report, RuntimeError> {
+        if let Some(mistake) = self.mistake.take() {
+            return Err(mistake);
+        }
+        if let Some(open) = self.nodes.iter().find(|node| !node.taken) {
+            return Err(RuntimeError::OpenEnd { stage: open.counters.name.clone() });
+        }
+        supervisor::run(self.nodes, &self.halt, cancel, deadline)
+    }
+
+    fn counters(&mut self, name: &str, queue: Option<usize>, unit: &'static str) -> Arc<Counters> {
+        if name.is_empty() || name.contains('\0') || self.metrics.knows(name) {
+            self.note(RuntimeError::Name { stage: name.to_owned() });
+        }
+        let counters = Arc::new(Counters::new(name, queue, unit));
+        self.metrics.add(Arc::clone(&counters));
+        counters
+    }
+
+    fn link<T>(&mut self, capacity: usize, counters: &Arc<Counters>) -> (Outlet<T>, Link<T>) {
+        if capacity == 0 {
+            self.note(RuntimeError::Capacity { stage: counters.name.clone() });
+        }
+        let (sender, receiver) = bounded(capacity);
+        let queue = Queue::new(sender, Arc::clone(&self.halt), Arc::clone(counters));
+        let link = Link { receiver, capacity, from: self.nodes.len(), halt: Arc::clone(&self.halt) };
+        (Outlet::queue(queue), link)
+    }
+
+    fn inlet<T>(&mut self, name: &str, link: Link<T>) -> Inlet<T> {
+        if !Arc::ptr_eq(&link.halt, &self.halt) {
+            self.note(RuntimeError::ForeignLink { stage: name.to_owned() });
+        } else if let Some(from) = self.nodes.get_mut(link.from) {
+            from.taken = true;
+        }
+        Inlet::new(link.receiver)
+    }
+
+    fn add(&mut self, counters: Arc<Counters>, worker: Box<dyn Worker>, taken: bool) {
+        self.nodes.push(Node { counters, worker, taken });
+    }
+
+    fn note(&mut self, mistake: RuntimeError) {
+        self.mistake.get_or_insert(mistake);
+    }
+}

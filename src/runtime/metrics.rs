@@ -1,0 +1,124 @@
+//! Counters that may be read while a run goes on.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::stage::Units;
+
+/// Counters of one stage; written by its thread alone, so stores suffice.
+#[derive(Debug)]
+pub(super) struct Counters {
+    pub(super) name: String,
+    /// Capacity of the queue before the stage; `None` for a source.
+    pub(super) queue_capacity: Option<usize>,
+    pub(super) unit: &'static str,
+    items_in: AtomicU64,
+    items_out: AtomicU64,
+    units: AtomicU64,
+    queue_depth_max: AtomicUsize,
+    ended: AtomicBool,
+}
+
+impl Counters {
+    pub(super) fn new(name: &str, queue_capacity: Option<usize>, unit: &'static str) -> Self {
+        Self {
+            name: name.to_owned(),
+            queue_capacity,
+            unit,
+            items_in: AtomicU64::new(0),
+            items_out: AtomicU64::new(0),
+            units: AtomicU64::new(0),
+            queue_depth_max: AtomicUsize::new(0),
+            ended: AtomicBool::new(false),
+        }
+    }
+
+    pub(super) fn count_in(&self) {
+        self.items_in.store(self.items_in() + 1, Ordering::Relaxed);
+    }
+
+    pub(super) fn count_out(&self) {
+        self.items_out.store(self.items_out() + 1, Ordering::Relaxed);
+    }
+
+    pub(super) fn set_units(&self, units: Units) {
+        self.units.store(units.count, Ordering::Relaxed);
+    }
+
+    pub(super) fn note_depth(&self, depth: usize) {
+        if depth > self.queue_depth_max() {
+            self.queue_depth_max.store(depth, Ordering::Relaxed);
+        }
+    }
+
+    pub(super) fn end(&self) {
+        self.ended.store(true, Ordering::Relaxed);
+    }
+
+    pub(super) fn items_in(&self) -> u64 {
+        self.items_in.load(Ordering::Relaxed)
+    }
+
+    pub(super) fn items_out(&self) -> u64 {
+        self.items_out.load(Ordering::Relaxed)
+    }
+
+    pub(super) fn units(&self) -> Units {
+        Units::of(self.units.load(Ordering::Relaxed), self.unit)
+    }
+
+    pub(super) fn queue_depth_max(&self) -> usize {
+        self.queue_depth_max.load(Ordering::Relaxed)
+    }
+
+    fn progress(&self) -> StageProgress {
+        StageProgress {
+            name: self.name.clone(),
+            items_in: self.items_in(),
+            items_out: self.items_out(),
+            units: self.units(),
+            queue_depth_max: self.queue_depth_max(),
+            queue_capacity: self.queue_capacity,
+            ended: self.ended.load(Ordering::Relaxed),
+        }
+    }
+}
+
+/// What one stage has done so far.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct StageProgress {
+    /// Name of the stage.
+    pub name: String,
+    /// Items taken, the one in work included.
+    pub items_in: u64,
+    /// Items given.
+    pub items_out: u64,
+    /// Units dealt with, as of the last completed step.
+    pub units: Units,
+    /// Most items found waiting before the stage.
+    pub queue_depth_max: usize,
+    /// Room before the stage; `None` for a source.
+    pub queue_capacity: Option<usize>,
+    /// Whether the stage has ended.
+    pub ended: bool,
+}
+
+/// Live counters of a graph's stages; reading them costs the stages nothing.
+#[derive(Debug, Default)]
+pub struct Metrics(Mutex<Vec<Arc<Counters>>>);
+
+impl Metrics {
+    /// Every stage's progress, in the order in which they were added.
+    #[must_use]
+    pub fn snapshot(&self) -> Vec<StageProgress> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).iter().map(|c| c.progress()).collect()
+    }
+
+    pub(super) fn add(&self, counters: Arc<Counters>) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(counters);
+    }
+
+    pub(super) fn knows(&self, name: &str) -> bool {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).iter().any(|c| c.name == name)
+    }
+}

@@ -1,0 +1,161 @@
+//! Where a stage puts what it makes.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use crossbeam_channel::{Sender, TrySendError, select};
+
+use super::cancel::Halt;
+use super::metrics::Counters;
+
+/// An item and the instant at which its source emitted what it descends from.
+pub(super) struct Stamped<T> {
+    pub(super) item: T,
+    pub(super) born: Instant,
+}
+
+/// Takes what a stage makes, in order: a queue to the next stage, or a list for tests.
+///
+/// On a queue, [`Outlet::push`] waits while it is full. Once the run has failed elsewhere, pushing
+/// does nothing and the runner ends the stage after its step; a stage that makes very much in one
+/// step may ask [`Outlet::is_closed`] and leave early.
+pub struct Outlet<T>(Target<T>);
+
+enum Target<T> {
+    Queue(Queue<T>),
+    List(Vec<T>),
+}
+
+impl<T> Outlet<T> {
+    /// An outlet that keeps everything, to test a stage alone.
+    #[must_use]
+    pub fn collect() -> Self {
+        Self(Target::List(Vec::new()))
+    }
+
+    pub(super) fn queue(queue: Queue<T>) -> Self {
+        Self(Target::Queue(queue))
+    }
+
+    /// Hands `item` on.
+    pub fn push(&mut self, item: T) {
+        match &mut self.0 {
+            Target::Queue(queue) => queue.push(item),
+            Target::List(list) => list.push(item),
+        }
+    }
+
+    /// Whether nobody will take anything any more.
+    #[must_use]
+    pub fn is_closed(&self) -> bool {
+        match &self.0 {
+            Target::Queue(queue) => queue.closed,
+            Target::List(_) => false,
+        }
+    }
+
+    /// What a collecting outlet holds; empty for a queue.
+    #[must_use]
+    pub fn items(&self) -> &[T] {
+        match &self.0 {
+            Target::Queue(_) => &[],
+            Target::List(list) => list,
+        }
+    }
+
+    /// Takes out what a collecting outlet holds; empty for a queue.
+    pub fn take(&mut self) -> Vec<T> {
+        match &mut self.0 {
+            Target::Queue(_) => Vec::new(),
+            Target::List(list) => std::mem::take(list),
+        }
+    }
+
+    /// What a collecting outlet held; empty for a queue.
+    #[must_use]
+    pub fn into_vec(mut self) -> Vec<T> {
+        self.take()
+    }
+
+    /// Gives all that is pushed from now on the birth of `born`.
+    pub(super) fn descend_from(&mut self, born: Instant) {
+        if let Target::Queue(queue) = &mut self.0 {
+            queue.born = Some(born);
+        }
+    }
+
+    /// Time spent waiting for room since the last call.
+    pub(super) fn lap(&mut self) -> Duration {
+        match &mut self.0 {
+            Target::Queue(queue) => std::mem::take(&mut queue.waited),
+            Target::List(_) => Duration::ZERO,
+        }
+    }
+}
+
+/// The sending end of a link.
+pub(super) struct Queue<T> {
+    sender: Sender<Stamped<T>>,
+    halt: Arc<Halt>,
+    counters: Arc<Counters>,
+    /// Birth of what is pushed; `None` in a source, where items are born as they are pushed.
+    born: Option<Instant>,
+    waited: Duration,
+    closed: bool,
+}
+
+impl<T> Queue<T> {
+    pub(super) fn new(sender: Sender<Stamped<T>>, halt: Arc<Halt>, counters: Arc<Counters>) -> Self {
+        Self { sender, halt, counters, born: None, waited: Duration::ZERO, closed: false }
+    }
+
+    fn push(&mut self, item: T) {
+        if self.closed {
+            return;
+        }
+        let born = self.born.unwrap_or_else(Instant::now);
+        match self.sender.try_send(Stamped { item, born }) {
+            Ok(()) => {}
+            Err(TrySendError::Full(stamped)) => self.wait_and_push(stamped),
+            Err(TrySendError::Disconnected(_)) => self.closed = true,
+        }
+        if !self.closed {
+            self.counters.count_out();
+        }
+    }
+
+    fn wait_and_push(&mut self, stamped: Stamped<T>) {
+        let since = Instant::now();
+        select! {
+            send(self.sender, stamped) -> sent => self.closed = sent.is_err(),
+            recv(self.halt.stop()) -> _ => self.closed = true,
+        }
+        self.waited += since.elapsed();
+    }
+}
+
+impl<T> Drop for Queue<T> {
+    /// A panic on the way out must not look like a clean end to the next stage.
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            self.halt.set();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_collecting_outlet_keeps_order() {
+        let mut out = Outlet::collect();
+        out.push(1);
+        out.push(2);
+        assert_eq!(out.items(), [1, 2]);
+        assert!(!out.is_closed());
+        assert_eq!(out.take(), [1, 2]);
+        out.push(3);
+        assert_eq!(out.into_vec(), [3]);
+    }
+}

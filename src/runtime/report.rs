@@ -1,0 +1,183 @@
+//! What a run was like.
+
+use std::fmt;
+
+use serde::Serialize;
+
+use super::metrics::Counters;
+use super::timing::Summary;
+use super::worker::Timings;
+
+/// Use of the queue before a stage.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct QueueReport {
+    /// Items it has room for.
+    pub capacity: usize,
+    /// Most items found in it.
+    pub depth_max: usize,
+}
+
+/// What one stage did. The three kinds of time add up to the thread's life.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct StageReport {
+    /// Name of the stage.
+    pub name: String,
+    /// Items taken.
+    pub items_in: u64,
+    /// Items given.
+    pub items_out: u64,
+    /// Units dealt with.
+    pub units: u64,
+    /// Name of the unit; empty if none is counted.
+    pub unit: &'static str,
+    /// Waiting for input: an entry an input, and one for its end.
+    pub waiting_in: Summary,
+    /// Working: an entry a step, and one for `finish`.
+    pub working: Summary,
+    /// Waiting for room in the output queue: an entry a step, and one for `finish`.
+    pub waiting_out: Summary,
+    /// From a source's pushing an item to the end of the step on what came of it; an entry an input.
+    pub since_source: Summary,
+    /// The queue before the stage; `None` for a source.
+    pub queue: Option<QueueReport>,
+}
+
+impl StageReport {
+    pub(super) fn new(counters: &Counters, timings: &Timings) -> Self {
+        let units = counters.units();
+        Self {
+            name: counters.name.clone(),
+            items_in: counters.items_in(),
+            items_out: counters.items_out(),
+            units: units.count,
+            unit: units.name,
+            waiting_in: timings.waiting_in.summary(),
+            working: timings.working.summary(),
+            waiting_out: timings.waiting_out.summary(),
+            since_source: timings.since_source.summary(),
+            queue: counters
+                .queue_capacity
+                .map(|capacity| QueueReport { capacity, depth_max: counters.queue_depth_max() }),
+        }
+    }
+}
+
+/// What a run was like, stage by stage; shown as a table.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Report {
+    /// The stages in the order in which they were added.
+    pub stages: Vec<StageReport>,
+    /// Wall time, s.
+    pub elapsed_s: f64,
+    /// Whether a source was stopped before its end.
+    pub cancelled: bool,
+}
+
+impl Report {
+    /// The stage called `name`.
+    #[must_use]
+    pub fn stage(&self, name: &str) -> Option<&StageReport> {
+        self.stages.iter().find(|stage| stage.name == name)
+    }
+}
+
+const HEADINGS: [&str; 10] = [
+    "stage",
+    "in",
+    "out",
+    "units/s",
+    "busy",
+    "wait in",
+    "wait out",
+    "queue",
+    "step p50 / p99 / p99.9",
+    "since source p50 / p99 / p99.9",
+];
+
+impl fmt::Display for Report {
+    /// A table in plain text: shares of each thread's time, most items queued of the room there was,
+    /// time of a step, latency.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut rows = vec![HEADINGS.map(str::to_owned)];
+        rows.extend(self.stages.iter().map(|stage| self.row(stage)));
+        let widths: Vec<usize> = (0..HEADINGS.len())
+            .map(|column| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0))
+            .collect();
+        for row in &rows {
+            let mut line = String::new();
+            for (column, (cell, &width)) in row.iter().zip(&widths).enumerate() {
+                let cell = if column == 0 { format!("{cell:<width$}") } else { format!("  {cell:>width$}") };
+                line.push_str(&cell);
+            }
+            writeln!(f, "{}", line.trim_end())?;
+        }
+        let cut = if self.cancelled { ", cancelled" } else { "" };
+        write!(f, "elapsed {}{cut}", duration(self.elapsed_s))
+    }
+}
+
+impl Report {
+    fn row(&self, stage: &StageReport) -> [String; HEADINGS.len()] {
+        let life_s = stage.waiting_in.total_s + stage.working.total_s + stage.waiting_out.total_s;
+        let share = |summary: &Summary| match life_s {
+            0.0 => "-".to_owned(),
+            _ => format!("{:.0} %", 100.0 * summary.total_s / life_s),
+        };
+        let has_queue = stage.queue.is_some();
+        let rate = match stage.unit {
+            "" => "-".to_owned(),
+            unit => format!("{} {unit}", rate(stage.units as f64 / self.elapsed_s)),
+        };
+        [
+            stage.name.clone(),
+            if has_queue { stage.items_in.to_string() } else { "-".to_owned() },
+            stage.items_out.to_string(),
+            rate,
+            share(&stage.working),
+            if has_queue { share(&stage.waiting_in) } else { "-".to_owned() },
+            if stage.waiting_out.count > 0 { share(&stage.waiting_out) } else { "-".to_owned() },
+            stage.queue.map_or("-".to_owned(), |queue| format!("{}/{}", queue.depth_max, queue.capacity)),
+            percentiles(&stage.working),
+            percentiles(&stage.since_source),
+        ]
+    }
+}
+
+fn percentiles(summary: &Summary) -> String {
+    if summary.count == 0 {
+        return "-".to_owned();
+    }
+    let [p50, p99, p999] = [summary.p50_s, summary.p99_s, summary.p999_s].map(duration);
+    format!("{p50} / {p99} / {p999}")
+}
+
+/// `seconds` to three digits with a fitting unit.
+fn duration(seconds: f64) -> String {
+    let (value, unit) = match seconds {
+        s if s >= 1.0 => (s, "s"),
+        s if s >= 1e-3 => (s * 1e3, "ms"),
+        s if s >= 1e-6 => (s * 1e6, "us"),
+        s => (s * 1e9, "ns"),
+    };
+    format!("{} {unit}", three_digits(value))
+}
+
+/// `per_second` to three digits with a fitting prefix.
+fn rate(per_second: f64) -> String {
+    let (value, prefix) = match per_second {
+        r if r >= 1e9 => (r * 1e-9, " G"),
+        r if r >= 1e6 => (r * 1e-6, " M"),
+        r if r >= 1e3 => (r * 1e-3, " k"),
+        r => (r, ""),
+    };
+    format!("{}{prefix}", three_digits(value))
+}
+
+fn three_digits(value: f64) -> String {
+    let decimals = match value {
+        v if v >= 100.0 => 0,
+        v if v >= 10.0 => 1,
+        _ => 2,
+    };
+    format!("{value:.decimals$}")
+}

@@ -1,0 +1,173 @@
+//! Starts the threads, keeps the first failure, wakes everybody and joins with a deadline.
+
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use crossbeam_channel::{Receiver, Sender, bounded, never, select};
+
+use super::cancel::{Cancel, Halt};
+use super::error::{Laggards, RuntimeError};
+use super::graph::Node;
+use super::metrics::Counters;
+use super::report::{Report, StageReport};
+use super::worker::{Ending, Timings, Watch, Worker};
+
+/// Keeps the first failure of a run.
+struct Verdict {
+    halt: Arc<Halt>,
+    first: Mutex<Option<RuntimeError>>,
+}
+
+impl Verdict {
+    fn fail(&self, error: RuntimeError) {
+        self.first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+        self.halt.set();
+    }
+
+    fn take(&self) -> Option<RuntimeError> {
+        self.first.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
+}
+
+/// A thread's last word.
+struct Ended {
+    index: usize,
+    ending: Ending,
+    timings: Timings,
+}
+
+/// A thread that was started, and what it left.
+struct Member {
+    counters: Arc<Counters>,
+    handle: Option<JoinHandle<()>>,
+    timings: Option<Timings>,
+}
+
+pub(super) fn run(
+    nodes: Vec<Node>,
+    halt: &Arc<Halt>,
+    cancel: &Cancel,
+    deadline: Duration,
+) -> Result<Report, RuntimeError> {
+    let since = Instant::now();
+    let verdict = Arc::new(Verdict { halt: Arc::clone(halt), first: Mutex::new(None) });
+    let (say, heard) = bounded(nodes.len().max(1));
+    let mut members = start(nodes, &verdict, cancel, &say);
+    drop(say);
+    let cancelled = join(&mut members, &heard, halt, deadline);
+    let laggards =
+        Laggards { stages: names(members.iter().filter(|member| member.handle.is_some())), waited: deadline };
+    if let Some(error) = verdict.take() {
+        return Err(with_laggards(error, laggards));
+    }
+    let stages = members
+        .iter()
+        .filter_map(|member| Some(StageReport::new(&member.counters, member.timings.as_ref()?)))
+        .collect();
+    Ok(Report { stages, elapsed_s: since.elapsed().as_secs_f64(), cancelled })
+}
+
+fn names<'a>(members: impl Iterator<Item = &'a Member>) -> Vec<String> {
+    members.map(|member| member.counters.name.clone()).collect()
+}
+
+/// Starts a thread for every node, or as many as the system gives.
+fn start(nodes: Vec<Node>, verdict: &Arc<Verdict>, cancel: &Cancel, say: &Sender<Ended>) -> Vec<Member> {
+    let mut members = Vec::with_capacity(nodes.len());
+    for (index, Node { counters, worker, .. }) in nodes.into_iter().enumerate() {
+        let watch = Watch::new(Arc::clone(&counters), cancel.clone(), Arc::clone(&verdict.halt));
+        let (verdict_there, say) = (Arc::clone(verdict), say.clone());
+        let body = move || {
+            let (ending, timings) = live(worker, watch, &verdict_there);
+            // Fails only if the supervisor has stopped waiting.
+            let _ = say.send(Ended { index, ending, timings });
+        };
+        match thread::Builder::new().name(counters.name.clone()).spawn(body) {
+            Ok(handle) => members.push(Member { counters, handle: Some(handle), timings: None }),
+            Err(source) => {
+                let stage = counters.name.clone();
+                verdict.fail(RuntimeError::Thread { stage, laggards: Laggards::default(), source });
+                break;
+            }
+        }
+    }
+    members
+}
+
+/// A thread's whole life: works, reports a failure before it lets go of its links, cleans up.
+fn live(mut worker: Box<dyn Worker>, mut watch: Watch, verdict: &Verdict) -> (Ending, Timings) {
+    let worked = catch_unwind(AssertUnwindSafe(|| worker.work(&mut watch)));
+    let (stage, at) = (watch.counters.name.clone(), watch.moment());
+    let panicked = |payload: Box<dyn Any + Send>| RuntimeError::Panicked {
+        stage: stage.clone(),
+        at,
+        message: panic_message(payload.as_ref()),
+        laggards: Laggards::default(),
+    };
+    let ending = match worked {
+        Ok(Ok(ending)) => ending,
+        Ok(Err(source)) => {
+            let stage = stage.clone();
+            verdict.fail(RuntimeError::Failed { stage, at, laggards: Laggards::default(), source });
+            Ending::Halted
+        }
+        Err(payload) => {
+            verdict.fail(panicked(payload));
+            Ending::Halted
+        }
+    };
+    if let Err(payload) = catch_unwind(AssertUnwindSafe(|| drop(worker))) {
+        verdict.fail(panicked(payload));
+    }
+    watch.counters.end();
+    (ending, watch.timings)
+}
+
+fn panic_message(payload: &(dyn Any + Send)) -> String {
+    let text = payload.downcast_ref::<&str>().copied();
+    let text = text.or_else(|| payload.downcast_ref::<String>().map(String::as_str));
+    text.unwrap_or("a payload that is not text").to_owned()
+}
+
+/// Waits for all members, but after a failure no longer than `deadline`; members that ended have no
+/// handle any more. Returns whether a source was cut short by cancellation.
+fn join(members: &mut [Member], heard: &Receiver<Ended>, halt: &Halt, deadline: Duration) -> bool {
+    let mut cancelled = false;
+    let mut remaining = members.len();
+    let mut stop = halt.stop().clone();
+    let mut give_up = never();
+    while remaining > 0 {
+        select! {
+            recv(heard) -> ended => {
+                let Ok(Ended { index, ending, timings }) = ended else { break };
+                cancelled |= ending == Ending::Cancelled;
+                remaining -= 1;
+                let Some(member) = members.get_mut(index) else { continue };
+                member.timings = Some(timings);
+                if let Some(handle) = member.handle.take() {
+                    // The thread has nothing left to do but to return, and it catches its panics.
+                    let _ = handle.join();
+                }
+            }
+            recv(stop) -> _ => {
+                stop = never();
+                give_up = crossbeam_channel::after(deadline);
+            }
+            recv(give_up) -> _ => break,
+        }
+    }
+    cancelled
+}
+
+fn with_laggards(mut error: RuntimeError, found: Laggards) -> RuntimeError {
+    if let RuntimeError::Failed { laggards, .. }
+    | RuntimeError::Panicked { laggards, .. }
+    | RuntimeError::Thread { laggards, .. } = &mut error
+    {
+        *laggards = found;
+    }
+    error
+}

@@ -1,0 +1,259 @@
+//! How runs end: errors, panics, cancellation, stuck stages.
+
+use std::error::Error;
+use std::sync::mpsc;
+use std::time::Duration;
+
+use super::parts::{Count, Each, Into, Keep, PATIENCE, Refused};
+use crate::runtime::{Cancel, Flow, Graph, Moment, Outlet, RuntimeError, Sink, Source, Stage};
+
+/// Runs numbers through `stage` into a sink that keeps them; without end unless something stops it.
+/// Returns the error, and whether the sink ran its `finish`.
+fn fail_with<S>(stage: S) -> (RuntimeError, bool)
+where
+    S: Stage<In = u64, Out = u64, Error = Refused> + 'static,
+{
+    let mut graph = Graph::new();
+    let numbers = graph.source("count", 2, Count::to(100));
+    let passed = graph.stage("middle", 2, numbers, stage);
+    let (sink, kept) = Keep::new();
+    graph.sink("keep", passed, sink);
+    let error = graph.run(&Cancel::new(), PATIENCE).unwrap_err();
+    let finished = kept.lock().unwrap().finished;
+    (error, finished)
+}
+
+fn pass(n: u64, out: &mut Outlet<u64>) {
+    out.push(n);
+}
+
+#[test]
+fn an_error_in_the_middle_carries_stage_place_and_cause() {
+    let (error, finished) = fail_with(Each::new(|n, out: &mut Outlet<u64>| {
+        pass(n, out);
+        if n == 41 { Err(Refused(n)) } else { Ok(()) }
+    }));
+    assert!(!finished, "a failed run must not look complete to its sink");
+    assert_eq!(error.to_string(), "stage `middle` failed at item 41");
+    let cause = error.source().and_then(|cause| cause.downcast_ref::<Refused>());
+    assert_eq!(cause, Some(&Refused(41)));
+}
+
+#[test]
+fn an_error_in_finish_is_told_apart() {
+    let step = |n, out: &mut Outlet<u64>| {
+        pass(n, out);
+        Ok(())
+    };
+    let (error, finished) = fail_with(Each::with_finish(step, |_: &mut Outlet<u64>| Err(Refused(7))));
+    assert!(!finished);
+    assert!(matches!(error, RuntimeError::Failed { at: Moment::Finish(100), .. }), "{error:?}");
+    assert_eq!(error.to_string(), "stage `middle` failed in finish, after 100 items");
+}
+
+#[test]
+fn a_panic_in_a_stage_is_an_error() {
+    let (error, finished) = fail_with(Each::new(|n, out: &mut Outlet<u64>| {
+        assert!(n != 5, "five is right out");
+        pass(n, out);
+        Ok(())
+    }));
+    assert!(!finished);
+    assert_eq!(error.to_string(), "stage `middle` panicked at item 5: five is right out");
+}
+
+#[test]
+fn a_panic_while_a_stage_is_dropped_is_an_error() {
+    struct Bomb;
+    impl Drop for Bomb {
+        fn drop(&mut self) {
+            panic!("dropped");
+        }
+    }
+    let bomb = Bomb;
+    let (error, finished) = fail_with(Each::new(move |n, out: &mut Outlet<u64>| {
+        let _ = &bomb;
+        pass(n, out);
+        Ok(())
+    }));
+    assert!(!finished);
+    assert_eq!(error.to_string(), "stage `middle` panicked in finish, after 100 items: dropped");
+}
+
+#[test]
+fn a_panic_in_a_sink_is_an_error() {
+    let mut graph = Graph::new();
+    let numbers = graph.source("count", 2, Count::to(u64::MAX));
+    let number: u64 = 3;
+    graph.sink(
+        "end",
+        numbers,
+        Into::new(move |n: u64| if n == number { panic!("sink {n}") } else { Ok(()) }),
+    );
+    let error = graph.run(&Cancel::new(), PATIENCE).unwrap_err();
+    assert_eq!(error.to_string(), "stage `end` panicked at item 3: sink 3");
+}
+
+/// A source that gives three numbers and fails.
+struct Failing(u64);
+
+impl Source for Failing {
+    type Out = u64;
+    type Error = Refused;
+
+    fn next(&mut self, out: &mut Outlet<u64>) -> Result<Flow, Refused> {
+        if self.0 == 3 {
+            return Err(Refused(self.0));
+        }
+        out.push(self.0);
+        self.0 += 1;
+        Ok(Flow::Continue)
+    }
+}
+
+/// A sink that refuses to finish.
+struct Unfinished;
+
+impl Sink for Unfinished {
+    type In = u64;
+    type Error = Refused;
+
+    fn take(&mut self, _: u64) -> Result<(), Refused> {
+        Ok(())
+    }
+
+    fn finish(&mut self) -> Result<(), Refused> {
+        Err(Refused(0))
+    }
+}
+
+#[test]
+fn errors_at_both_ends_say_where() {
+    let mut graph = Graph::new();
+    let numbers = graph.source("start", 2, Failing(0));
+    let (sink, kept) = Keep::new();
+    graph.sink("keep", numbers, sink);
+    let error = graph.run(&Cancel::new(), PATIENCE).unwrap_err();
+    assert_eq!(error.to_string(), "stage `start` failed at item 3");
+    assert!(!kept.lock().unwrap().finished);
+
+    let mut graph = Graph::new();
+    let numbers = graph.source("count", 2, Count::to(4));
+    graph.sink("end", numbers, Unfinished);
+    let error = graph.run(&Cancel::new(), PATIENCE).unwrap_err();
+    assert_eq!(error.to_string(), "stage `end` failed in finish, after 4 items");
+}
+
+#[test]
+fn cancellation_drains_and_finishes() {
+    let cancel = Cancel::new();
+    let trigger = cancel.clone();
+    let mut graph = Graph::new();
+    let numbers = graph.source("count", 7, Count::to(u64::MAX));
+    let step = move |n, out: &mut Outlet<u64>| {
+        if n == 50 {
+            trigger.cancel();
+        }
+        pass(n, out);
+        Ok(())
+    };
+    let flush = |out: &mut Outlet<u64>| {
+        out.push(u64::MAX);
+        Ok(())
+    };
+    let passed = graph.stage("middle", 3, numbers, Each::with_finish(step, flush));
+    let (sink, kept) = Keep::new();
+    graph.sink("keep", passed, sink);
+    let report = graph.run(&cancel, PATIENCE).unwrap();
+
+    assert!(report.cancelled);
+    let kept = kept.lock().unwrap();
+    assert!(kept.finished);
+    let given = report.stage("count").unwrap().items_out;
+    let expected: Vec<u64> = (0..given).chain([u64::MAX]).collect();
+    assert_eq!(kept.items, expected);
+}
+
+#[test]
+fn cancelling_a_run_that_is_complete_changes_nothing() {
+    let cancel = Cancel::new();
+    let trigger = cancel.clone();
+    let mut graph = Graph::new();
+    // The source ends in the call that makes its last number, before the sink sees it.
+    let numbers = graph.source("count", 16, Count::to(8));
+    let (told, ended) = mpsc::channel();
+    let wait = Each::with_finish(
+        |n, out: &mut Outlet<u64>| {
+            pass(n, out);
+            Ok(())
+        },
+        move |_: &mut Outlet<u64>| {
+            // Runs after the source has ended.
+            trigger.cancel();
+            told.send(()).map_err(|_| Refused(0))
+        },
+    );
+    let passed = graph.stage("middle", 16, numbers, wait);
+    let (sink, kept) = Keep::new();
+    graph.sink("keep", passed, sink);
+    let report = graph.run(&cancel, PATIENCE).unwrap();
+    assert!(ended.recv().is_ok());
+    assert!(!report.cancelled);
+    assert_eq!(kept.lock().unwrap().items.len(), 8);
+}
+
+#[test]
+fn a_stuck_stage_is_named() {
+    let (release, stuck) = mpsc::channel::<()>();
+    let mut graph = Graph::new();
+    let numbers = graph.source("count", 1, Count::to(u64::MAX));
+    let hang = Each::new(move |n: u64, out: &mut Outlet<u64>| {
+        pass(n, out);
+        if n == 2 {
+            // Waits until the test lets go of the other end.
+            let _ = stuck.recv();
+        }
+        Ok(())
+    });
+    let held = graph.stage("hang", 1, numbers, hang);
+    let fail = Into::new(|n: u64| if n == 2 { Err(Refused(n)) } else { Ok(()) });
+    graph.sink("fail", held, fail);
+    let metrics = graph.metrics();
+    let error = graph.run(&Cancel::new(), Duration::from_millis(300)).unwrap_err();
+
+    let RuntimeError::Failed { stage, at, laggards, .. } = &error else { panic!("{error:?}") };
+    assert_eq!((stage.as_str(), *at), ("fail", Moment::Item(2)));
+    assert_eq!(laggards.stages, ["hang"]);
+    assert!(error.to_string().contains("`hang`"), "{error}");
+    drop(release);
+    // The stage ends by itself once it is free.
+    while !metrics.snapshot().iter().all(|stage| stage.ended) {
+        std::thread::yield_now();
+    }
+}
+
+#[test]
+fn a_failure_wakes_a_chain_that_waits_for_its_source() {
+    let (release, stuck) = mpsc::channel::<()>();
+    /// Gives nothing, for long.
+    struct Silent(mpsc::Receiver<()>);
+    impl Source for Silent {
+        type Out = u64;
+        type Error = Refused;
+        fn next(&mut self, _: &mut Outlet<u64>) -> Result<Flow, Refused> {
+            let _ = self.0.recv();
+            Ok(Flow::Done)
+        }
+    }
+    let mut graph = Graph::new();
+    let nothing = graph.source("silent", 1, Silent(stuck));
+    graph.sink("waiting", nothing, Into::new(|_: u64| Ok(())));
+    let numbers = graph.source("count", 1, Count::to(u64::MAX));
+    graph.sink("fail", numbers, Into::new(|n: u64| if n == 9 { Err(Refused(n)) } else { Ok(()) }));
+    let error = graph.run(&Cancel::new(), Duration::from_millis(300)).unwrap_err();
+    let RuntimeError::Failed { stage, laggards, .. } = &error else { panic!("{error:?}") };
+    assert_eq!(stage, "fail");
+    // Not `waiting`: it was woken although its source said nothing.
+    assert_eq!(laggards.stages, ["silent"]);
+    drop(release);
+}

@@ -1,0 +1,185 @@
+//! Order, back pressure, counting, and graphs that cannot run.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use super::parts::{Count, Each, Into, Keep, PATIENCE, Refused};
+use crate::runtime::{Cancel, Graph, Outlet, RuntimeError, Stage};
+
+/// Gives each number twice, and -1 at the end.
+fn twice() -> impl Stage<In = u64, Out = i64, Error = Refused> {
+    Each::with_finish(
+        |n: u64, out: &mut Outlet<i64>| {
+            out.push(n as i64);
+            out.push(n as i64);
+            Ok(())
+        },
+        |out: &mut Outlet<i64>| {
+            out.push(-1);
+            Ok(())
+        },
+    )
+}
+
+#[test]
+fn a_stage_runs_alone() {
+    let mut out = Outlet::collect();
+    let mut stage = twice();
+    stage.step(3, &mut out).unwrap();
+    stage.finish(&mut out).unwrap();
+    assert_eq!(out.into_vec(), [3, 3, -1]);
+}
+
+#[test]
+fn order_is_kept_whatever_the_capacities() {
+    let expected: Vec<i64> = (0..500).flat_map(|n| [n, n]).chain([-1]).collect();
+    for capacity in 1..=64 {
+        let mut graph = Graph::new();
+        let numbers = graph.source("count", capacity, Count::to(500));
+        let doubled = graph.stage("twice", 65 - capacity, numbers, twice());
+        let (sink, kept) = Keep::new();
+        graph.sink("keep", doubled, sink);
+        let report = graph.run(&Cancel::new(), PATIENCE).unwrap();
+        assert!(!report.cancelled);
+        let kept = kept.lock().unwrap();
+        assert!(kept.finished);
+        assert_eq!(kept.items, expected, "capacity {capacity}");
+    }
+}
+
+#[test]
+fn the_report_counts_what_passed() {
+    let mut graph = Graph::new();
+    let metrics = graph.metrics();
+    let numbers = graph.source("count", 4, Count::to(100));
+    let doubled = graph.stage("twice", 8, numbers, twice());
+    graph.sink("drop", doubled, Into::new(|_| Ok(())));
+    let report = graph.run(&Cancel::new(), PATIENCE).unwrap();
+
+    let names: Vec<&str> = report.stages.iter().map(|stage| stage.name.as_str()).collect();
+    assert_eq!(names, ["count", "twice", "drop"]);
+    let flows: Vec<(u64, u64)> = report.stages.iter().map(|s| (s.items_in, s.items_out)).collect();
+    assert_eq!(flows, [(0, 100), (100, 201), (201, 0)]);
+    assert_eq!((report.stages[0].units, report.stages[0].unit), (100, "numbers"));
+    assert_eq!(report.stages[0].queue, None);
+    for (stage, capacity) in report.stages[1..].iter().zip([4, 8]) {
+        let queue = stage.queue.unwrap();
+        assert_eq!(queue.capacity, capacity);
+        assert!((1..=capacity).contains(&queue.depth_max), "{queue:?}");
+        assert_eq!(stage.since_source.count, stage.items_in);
+        // An entry an input and one for the end.
+        assert_eq!(stage.waiting_in.count, stage.items_in + 1);
+        assert_eq!(stage.working.count, stage.items_in + 1);
+    }
+    for (live, stage) in metrics.snapshot().iter().zip(&report.stages) {
+        assert!(live.ended);
+        assert_eq!((live.items_in, live.items_out), (stage.items_in, stage.items_out));
+    }
+    let table = report.to_string();
+    assert_eq!(table.lines().count(), 5, "{table}");
+    assert!(names.iter().all(|name| table.contains(name)), "{table}");
+    let json = serde_json::to_value(&report).unwrap();
+    assert_eq!(json["stages"][2]["items_in"], 201);
+}
+
+/// An item that knows how many of its kind there are.
+struct Tracked(Arc<AtomicUsize>);
+
+impl Drop for Tracked {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::SeqCst);
+    }
+}
+
+#[test]
+fn a_slow_sink_bounds_what_is_in_flight() {
+    const CAPACITIES: [usize; 2] = [3, 5];
+    const STAGES: usize = 3;
+    let alive = Arc::new(AtomicUsize::new(0));
+    let most = Arc::new(AtomicUsize::new(0));
+    let (alive_there, most_there) = (Arc::clone(&alive), Arc::clone(&most));
+
+    let mut graph = Graph::new();
+    let numbers = graph.source("count", 1, Count::to(200));
+    let make = Each::new(move |_: u64, out: &mut Outlet<Tracked>| {
+        let now = alive_there.fetch_add(1, Ordering::SeqCst) + 1;
+        most_there.fetch_max(now, Ordering::SeqCst);
+        out.push(Tracked(Arc::clone(&alive_there)));
+        Ok(())
+    });
+    let made = graph.stage("make", CAPACITIES[0], numbers, make);
+    let pass = Each::new(|item: Tracked, out: &mut Outlet<Tracked>| {
+        out.push(item);
+        Ok(())
+    });
+    let passed = graph.stage("pass", CAPACITIES[1], made, pass);
+    let slow = Into::new(|_: Tracked| {
+        std::thread::sleep(Duration::from_micros(200));
+        Ok(())
+    });
+    graph.sink("slow", passed, slow);
+    graph.run(&Cancel::new(), PATIENCE).unwrap();
+
+    assert_eq!(alive.load(Ordering::SeqCst), 0);
+    let most = most.load(Ordering::SeqCst);
+    let bound = CAPACITIES.iter().sum::<usize>() + STAGES;
+    assert!(most <= bound, "{most} in flight, expected at most {bound}");
+    // The source is faster: the queues did fill.
+    assert!(most > CAPACITIES[1], "{most}");
+}
+
+#[test]
+fn several_chains_run_side_by_side() {
+    let mut graph = Graph::new();
+    let (first, kept_first) = Keep::new();
+    let (second, kept_second) = Keep::new();
+    let one = graph.source("one", 1, Count::to(10));
+    let other = graph.source("other", 1, Count::to(20));
+    graph.sink("first", one, first);
+    graph.sink("second", other, second);
+    graph.run(&Cancel::new(), PATIENCE).unwrap();
+    assert_eq!(kept_first.lock().unwrap().items.len(), 10);
+    assert_eq!(kept_second.lock().unwrap().items.len(), 20);
+}
+
+#[test]
+fn an_empty_graph_ends_at_once() {
+    let report = Graph::new().run(&Cancel::new(), PATIENCE).unwrap();
+    assert!(report.stages.is_empty());
+    assert_eq!(report.to_string().lines().count(), 2);
+}
+
+#[test]
+fn graphs_that_cannot_run_are_refused() {
+    let run = |graph: Graph| graph.run(&Cancel::new(), PATIENCE).unwrap_err();
+    let ignore = || Into::new(|_: u64| Ok(()));
+
+    let mut graph = Graph::new();
+    let link = graph.source("count", 0, Count::to(1));
+    graph.sink("end", link, ignore());
+    assert!(matches!(run(graph), RuntimeError::Capacity { stage } if stage == "count"));
+
+    let mut graph = Graph::new();
+    let link = graph.source("same", 1, Count::to(1));
+    graph.sink("same", link, ignore());
+    assert!(matches!(run(graph), RuntimeError::Name { stage } if stage == "same"));
+
+    for name in ["", "nul\0"] {
+        let mut graph = Graph::new();
+        let link = graph.source(name, 1, Count::to(1));
+        graph.sink("end", link, ignore());
+        assert!(matches!(run(graph), RuntimeError::Name { .. }));
+    }
+
+    let mut graph = Graph::new();
+    let link = graph.source("count", 1, Count::to(1));
+    drop(link);
+    assert!(matches!(run(graph), RuntimeError::OpenEnd { stage } if stage == "count"));
+
+    let mut graph = Graph::new();
+    let mut other = Graph::new();
+    let link = other.source("count", 1, Count::to(1));
+    graph.sink("end", link, ignore());
+    assert!(matches!(run(graph), RuntimeError::ForeignLink { stage } if stage == "end"));
+}

@@ -1,0 +1,93 @@
+//! Many short runs of random shape and fate; a deadlock would show as a run that does not end.
+
+use std::sync::mpsc;
+use std::thread;
+
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+
+use super::parts::{Count, Each, Into, PATIENCE, Refused};
+use crate::runtime::{Cancel, Graph, Outlet, Report, RuntimeError};
+
+/// What befalls a run, at which stage and which item.
+#[derive(Clone, Copy, Debug)]
+enum Fate {
+    Nothing,
+    Error { stage: u64, item: u64 },
+    Panic { stage: u64, item: u64 },
+    Cancel { stage: u64, item: u64 },
+}
+
+const ITEMS: u64 = 40;
+
+fn run(stages: u64, fate: Fate, random: &mut ChaCha8Rng) -> Result<Report, RuntimeError> {
+    let cancel = Cancel::new();
+    let mut graph = Graph::new();
+    let mut link = graph.source("source", random.random_range(1..4), Count::to(ITEMS));
+    for index in 0..stages {
+        let trigger = cancel.clone();
+        let step = move |n: u64, out: &mut Outlet<u64>| {
+            match fate {
+                Fate::Error { stage, item } if (stage, item) == (index, n) => return Err(Refused(n)),
+                // Unwinds without the hook that would print every one of these.
+                Fate::Panic { stage, item } if (stage, item) == (index, n) => {
+                    std::panic::resume_unwind(Box::new("wanted"))
+                }
+                Fate::Cancel { stage, item } if (stage, item) == (index, n) => trigger.cancel(),
+                _ => {}
+            }
+            out.push(n);
+            Ok(())
+        };
+        link = graph.stage(&format!("stage {index}"), random.random_range(1..4), link, Each::new(step));
+    }
+    graph.sink("sink", link, Into::new(|_: u64| Ok(())));
+    graph.run(&cancel, PATIENCE)
+}
+
+fn check(stages: u64, fate: Fate, result: Result<Report, RuntimeError>) {
+    match (fate, result) {
+        (Fate::Nothing, Ok(report)) => {
+            assert_eq!(report.stage("sink").map(|sink| sink.items_in), Some(ITEMS));
+        }
+        (Fate::Error { stage, .. }, Err(RuntimeError::Failed { stage: name, laggards, .. }))
+        | (Fate::Panic { stage, .. }, Err(RuntimeError::Panicked { stage: name, laggards, .. })) => {
+            assert_eq!(name, format!("stage {stage}"));
+            assert!(laggards.stages.is_empty(), "{laggards}");
+        }
+        (Fate::Cancel { .. }, Ok(report)) => {
+            let given = report.stage("source").map(|source| source.items_out);
+            assert_eq!(report.stage("sink").map(|sink| sink.items_in), given);
+            assert!(report.cancelled || given == Some(ITEMS));
+        }
+        (fate, result) => panic!("{stages} stages, {fate:?}: {result:?}"),
+    }
+}
+
+#[test]
+fn no_run_hangs() {
+    let (done, ended) = mpsc::channel();
+    let runs = thread::spawn(move || {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        for _ in 0..600 {
+            let stages = random.random_range(1..5);
+            let (stage, item) = (random.random_range(0..stages), random.random_range(0..ITEMS));
+            let fate = match random.random_range(0..4) {
+                0 => Fate::Nothing,
+                1 => Fate::Error { stage, item },
+                2 => Fate::Panic { stage, item },
+                _ => Fate::Cancel { stage, item },
+            };
+            check(stages, fate, run(stages, fate, &mut random));
+        }
+        let _ = done.send(());
+    });
+    // A failed check drops `done` and shows as the panic that `join` returns.
+    if let Err(mpsc::RecvTimeoutError::Timeout) = ended.recv_timeout(4 * PATIENCE) {
+        panic!("a run did not end");
+    }
+    if let Err(payload) = runs.join() {
+        std::panic::resume_unwind(payload);
+    }
+}

@@ -1,0 +1,225 @@
+//! What each thread does: the loops around a source, a stage and a sink.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use crossbeam_channel::{Receiver, TryRecvError, select};
+
+use super::cancel::{Cancel, Halt};
+use super::error::{BoxError, Moment};
+use super::metrics::Counters;
+use super::outlet::{Outlet, Stamped};
+use super::stage::{Flow, Sink, Source, Stage, Units};
+use super::timing::Timing;
+
+/// How a worker ended without an error of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Ending {
+    /// All was worked off and `finish` ran.
+    Finished,
+    /// As `Finished`, but a source was cut short by [`Cancel`].
+    Cancelled,
+    /// Something failed elsewhere.
+    Halted,
+}
+
+/// A source, stage or sink with its ends of the links.
+pub(super) trait Worker: Send {
+    /// Works until the input ends, the run halts, or an error.
+    fn work(&mut self, watch: &mut Watch) -> Result<Ending, BoxError>;
+}
+
+/// The four timings of a stage.
+pub(super) struct Timings {
+    pub(super) waiting_in: Timing,
+    pub(super) working: Timing,
+    pub(super) waiting_out: Timing,
+    pub(super) since_source: Timing,
+}
+
+/// Counts and times one worker.
+pub(super) struct Watch {
+    pub(super) counters: Arc<Counters>,
+    pub(super) timings: Timings,
+    cancel: Cancel,
+    halt: Arc<Halt>,
+    finishing: bool,
+    /// End of what was timed last.
+    mark: Instant,
+}
+
+impl Watch {
+    pub(super) fn new(counters: Arc<Counters>, cancel: Cancel, halt: Arc<Halt>) -> Self {
+        let timings = Timings {
+            waiting_in: Timing::new(),
+            working: Timing::new(),
+            waiting_out: Timing::new(),
+            since_source: Timing::new(),
+        };
+        Self { counters, timings, cancel, halt, finishing: false, mark: Instant::now() }
+    }
+
+    /// Where the worker stands, for an error.
+    pub(super) fn moment(&self) -> Moment {
+        let is_source = self.counters.queue_capacity.is_none();
+        match (self.finishing, is_source) {
+            (false, true) => Moment::Item(self.counters.items_out()),
+            (true, true) => Moment::Finish(self.counters.items_out()),
+            (false, false) => Moment::Item(self.counters.items_in().saturating_sub(1)),
+            (true, false) => Moment::Finish(self.counters.items_in()),
+        }
+    }
+
+    /// The wait for input is over.
+    fn received(&mut self) {
+        let now = Instant::now();
+        self.timings.waiting_in.record(now - self.mark);
+        self.mark = now;
+    }
+
+    /// A step is over; `waited` of it went by waiting for room.
+    fn worked(&mut self, waited: Duration, born: Option<Instant>, units: Units) {
+        let now = Instant::now();
+        self.timings.working.record((now - self.mark).saturating_sub(waited));
+        if let Some(born) = born {
+            self.timings.since_source.record(now.saturating_duration_since(born));
+        }
+        self.counters.set_units(units);
+        self.mark = now;
+    }
+
+    /// As [`Watch::worked`], for a worker with an outlet.
+    fn worked_into<T>(&mut self, out: &mut Outlet<T>, born: Option<Instant>, units: Units) {
+        let waited = out.lap();
+        self.worked(waited, born, units);
+        self.timings.waiting_out.record(waited);
+    }
+}
+
+/// The receiving end of a link.
+pub(super) struct Inlet<T> {
+    receiver: Receiver<Stamped<T>>,
+}
+
+enum Received<T> {
+    Item(Stamped<T>),
+    End,
+    Halt,
+}
+
+impl<T> Inlet<T> {
+    pub(super) fn new(receiver: Receiver<Stamped<T>>) -> Self {
+        Self { receiver }
+    }
+
+    /// Waits for the next item; timed and counted.
+    fn receive(&mut self, watch: &mut Watch) -> Received<T> {
+        let depth = self.receiver.len();
+        let received = match self.receiver.try_recv() {
+            Ok(stamped) => Some(stamped),
+            Err(TryRecvError::Empty) => self.wait(&watch.halt),
+            Err(TryRecvError::Disconnected) => None,
+        };
+        watch.received();
+        // After the wait: a closed channel means an end only if nothing failed.
+        if watch.halt.is_set() {
+            return Received::Halt;
+        }
+        let Some(stamped) = received else {
+            return Received::End;
+        };
+        watch.counters.note_depth(depth.max(1));
+        watch.counters.count_in();
+        Received::Item(stamped)
+    }
+
+    fn wait(&self, halt: &Halt) -> Option<Stamped<T>> {
+        select! {
+            recv(self.receiver) -> stamped => stamped.ok(),
+            recv(halt.stop()) -> _ => None,
+        }
+    }
+}
+
+/// A source and its outlet. Fields drop in this order: the source first, then the link.
+pub(super) struct SourceWorker<S: Source> {
+    pub(super) source: S,
+    pub(super) out: Outlet<S::Out>,
+}
+
+impl<S: Source> Worker for SourceWorker<S> {
+    fn work(&mut self, watch: &mut Watch) -> Result<Ending, BoxError> {
+        let Self { source, out } = self;
+        let ending = loop {
+            if watch.halt.is_set() {
+                return Ok(Ending::Halted);
+            }
+            if watch.cancel.is_cancelled() {
+                break Ending::Cancelled;
+            }
+            let flow = source.next(out)?;
+            watch.worked_into(out, None, source.units());
+            if flow == Flow::Done {
+                break Ending::Finished;
+            }
+        };
+        watch.finishing = true;
+        source.finish(out)?;
+        watch.worked_into(out, None, source.units());
+        Ok(if out.is_closed() { Ending::Halted } else { ending })
+    }
+}
+
+/// A stage and its links. Fields drop in this order: the stage first, then the links.
+pub(super) struct StageWorker<S: Stage> {
+    pub(super) stage: S,
+    pub(super) inlet: Inlet<S::In>,
+    pub(super) out: Outlet<S::Out>,
+}
+
+impl<S: Stage> Worker for StageWorker<S> {
+    fn work(&mut self, watch: &mut Watch) -> Result<Ending, BoxError> {
+        let Self { stage, inlet, out } = self;
+        loop {
+            match inlet.receive(watch) {
+                Received::Item(Stamped { item, born }) => {
+                    out.descend_from(born);
+                    stage.step(item, out)?;
+                    watch.worked_into(out, Some(born), stage.units());
+                }
+                Received::End => break,
+                Received::Halt => return Ok(Ending::Halted),
+            }
+        }
+        watch.finishing = true;
+        stage.finish(out)?;
+        watch.worked_into(out, None, stage.units());
+        Ok(if out.is_closed() { Ending::Halted } else { Ending::Finished })
+    }
+}
+
+/// A sink and its link.
+pub(super) struct SinkWorker<S: Sink> {
+    pub(super) sink: S,
+    pub(super) inlet: Inlet<S::In>,
+}
+
+impl<S: Sink> Worker for SinkWorker<S> {
+    fn work(&mut self, watch: &mut Watch) -> Result<Ending, BoxError> {
+        let Self { sink, inlet } = self;
+        loop {
+            match inlet.receive(watch) {
+                Received::Item(Stamped { item, born }) => {
+                    sink.take(item)?;
+                    watch.worked(Duration::ZERO, Some(born), sink.units());
+                }
+                Received::End => break,
+                Received::Halt => return Ok(Ending::Halted),
+            }
+        }
+        watch.finishing = true;
+        sink.finish()?;
+        watch.worked(Duration::ZERO, None, sink.units());
+        Ok(Ending::Finished)
+    }
+}
