@@ -157,7 +157,12 @@ impl fmt::Display for LedgerReport {
 
 /// The accounts of a run do not balance: a bug of the program.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
-#[error("the ledger does not close: {} samples unaccounted for ({}); expected sampled = accumulated + flagged + lost", report.unaccounted(), accounts(report))]
+#[error(
+    "the ledger does not close: {} samples unaccounted for ({}); expected sampled = accumulated + flagged + \
+     lost",
+    report.unaccounted(),
+    accounts(report)
+)]
 pub struct LedgerImbalance {
     /// All accounts.
     pub report: LedgerReport,
@@ -237,7 +242,9 @@ mod tests {
             std::thread::scope(|scope| {
                 for part in fates.chunks(7) {
                     let shared = together.clone();
-                    scope.spawn(move || part.iter().rev().for_each(|&(fate, count)| post(&shared, fate, count)));
+                    scope.spawn(move || {
+                        part.iter().rev().for_each(|&(fate, count)| post(&shared, fate, count));
+                    });
                 }
             });
             prop_assert_eq!(forward.report(), together.report());

@@ -1,0 +1,97 @@
+//! What can be chosen about calibration.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::{AntennaGains, Calibration, CalibrationError, Identity};
+
+/// Which calibration is applied.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CalibrationHook {
+    /// None.
+    #[default]
+    Identity,
+    /// Complex gains of every antenna, from a file.
+    AntennaGains,
+}
+
+/// The `[calibration]` section.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CalibrationConfig {
+    /// Which calibration is applied.
+    pub hook: CalibrationHook,
+    /// File of gains, for `antenna-gains`; relative to the folder of the configuration.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gains_file: Option<PathBuf>,
+}
+
+impl CalibrationConfig {
+    /// Everything that is wrong with the configuration; empty if it is good. Does not open the file.
+    #[must_use]
+    pub fn problems(&self) -> Vec<CalibrationError> {
+        let expected = match (self.hook, &self.gains_file) {
+            (CalibrationHook::AntennaGains, None) => "the path of a file, for hook = \"antenna-gains\"",
+            (CalibrationHook::Identity, Some(_)) => "no such key, or hook = \"antenna-gains\"",
+            _ => return Vec::new(),
+        };
+        let value = self.gains_file.as_ref().map_or("(missing)".to_owned(), |path| format!("{path:?}"));
+        vec![CalibrationError::Parameter { key: "calibration.gains_file".to_owned(), value, expected }]
+    }
+
+    /// The calibration; `folder` is where the configuration lies.
+    ///
+    /// # Errors
+    /// The first of [`CalibrationConfig::problems`], or what is wrong with the gains file.
+    pub fn build(&self, folder: &Path) -> Result<Box<dyn Calibration>, CalibrationError> {
+        if let Some(problem) = self.problems().into_iter().next() {
+            return Err(problem);
+        }
+        Ok(match &self.gains_file {
+            Some(file) => Box::new(AntennaGains::read(&folder.join(file))?),
+            None => Box::new(Identity),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_default_is_the_identity() {
+        let config: CalibrationConfig = toml::from_str("").unwrap();
+        assert!(config.problems().is_empty());
+        assert_eq!(config.build(Path::new("")).unwrap().name(), "identity");
+        assert_eq!(toml::from_str::<CalibrationConfig>(&toml::to_string(&config).unwrap()), Ok(config));
+    }
+
+    #[test]
+    fn hook_and_file_must_agree() {
+        for text in ["hook = 'antenna-gains'", "gains_file = 'gains.toml'"] {
+            let config: CalibrationConfig = toml::from_str(text).unwrap();
+            let problems = config.problems();
+            assert_eq!(problems.len(), 1);
+            assert!(problems[0].to_string().starts_with("calibration.gains_file = "), "{}", problems[0]);
+            assert!(config.build(Path::new("")).is_err());
+        }
+        assert!(toml::from_str::<CalibrationConfig>("hook = 'magic'").is_err());
+        assert!(toml::from_str::<CalibrationConfig>("gain_file = 'gains.toml'").is_err());
+    }
+
+    #[test]
+    fn the_file_is_sought_beside_the_configuration() {
+        let folder = tempfile::tempdir().unwrap();
+        let config: CalibrationConfig =
+            toml::from_str("hook = 'antenna-gains'\ngains_file = 'gains.toml'").unwrap();
+        assert!(config.problems().is_empty());
+        let missing = config.build(folder.path()).err().unwrap();
+        assert!(matches!(missing, CalibrationError::Read { .. }), "{missing}");
+        let gains =
+            "[[channels]]\nfrequency_hz = 1e7\nsolutions = [{ time_s = 0, gains = [[1, 0], [0, 1]] }]";
+        std::fs::write(folder.path().join("gains.toml"), gains).unwrap();
+        assert_eq!(config.build(folder.path()).unwrap().name(), "antenna-gains");
+    }
+}

@@ -1,0 +1,79 @@
+//! What can be wrong with a calibration.
+
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+use crate::units::Pair;
+
+/// Why a calibration cannot be made or applied.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum CalibrationError {
+    /// A parameter outside its range.
+    #[error("{key} = {value}: expected {expected}")]
+    Parameter {
+        /// Key, with its place in lists counted from 0.
+        key: String,
+        /// Value found.
+        value: String,
+        /// What is accepted.
+        expected: &'static str,
+    },
+    /// The gains file cannot be read.
+    #[error("gains file {}: cannot be read", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The gains file is not TOML or JSON of the expected shape.
+    #[error("gains file {}: {message}", path.display())]
+    Syntax {
+        /// The file.
+        path: PathBuf,
+        /// Where and what, from the parser.
+        message: String,
+    },
+    /// The gains file holds impossible values.
+    #[error("gains file {}: {}", path.display(), list(problems))]
+    Values {
+        /// The file.
+        path: PathBuf,
+        /// Everything that is wrong with it.
+        problems: Vec<CalibrationError>,
+    },
+    /// Values that cannot be gains, not from a file.
+    #[error("gains: {}", list(problems))]
+    Gains {
+        /// Everything that is wrong with them.
+        problems: Vec<CalibrationError>,
+    },
+    /// A channel without gains.
+    #[error(
+        "no gains within {tolerance_hz} Hz of the channel at {frequency_hz} Hz, the nearest are for \
+         {nearest_hz} Hz; add them to the gains file or leave the channel out"
+    )]
+    Channel {
+        /// Centre frequency of the channel, Hz.
+        frequency_hz: f64,
+        /// Nearest frequency that has gains, Hz.
+        nearest_hz: f64,
+        /// Largest distance that is accepted, Hz.
+        tolerance_hz: f64,
+    },
+    /// A satellite without gains.
+    #[error("no gains for pair {pair}: the gains file has {satellites} satellites; is it for this array?")]
+    Satellite {
+        /// The pair.
+        pair: Pair,
+        /// Number of satellites that have gains.
+        satellites: usize,
+    },
+}
+
+fn list(problems: &[CalibrationError]) -> String {
+    let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
+    lines.join("; ")
+}

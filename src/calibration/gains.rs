@@ -1,0 +1,185 @@
+//! Division by complex gains of the antennas.
+
+use std::path::Path;
+
+use num_complex::Complex64;
+
+use super::{Calibration, CalibrationError, CalibrationReport, GainsFile, Interpolation};
+use crate::frames::PlacedVisibilities;
+use crate::units::Pair;
+
+/// Complex voltage gains of every antenna, by channel and time.
+///
+/// With E'_i = g_i E_i and V_ij = <E_i conj(E_j)>, the scalar case of the measurement equation
+/// (Hamaker, Bregman & Sault 1996, A&AS 117, 137; Smirnov 2011, A&A 527, A106, Sect. 1.6):
+///
+/// - V'_ij = g_i conj(g_j) V_ij, so V_ij = V'_ij / c with c = g_i conj(g_j);
+/// - noise of variance s^2 in each part becomes s^2 / |c|^2 in each, for division by c turns and scales
+///   a circular distribution; so the weight, its inverse, is multiplied by |c|^2.
+///
+/// Between solutions at t_0 and t_1, with u = (t - t_0) / (t_1 - t_0), a gain is
+/// g_0 exp(u ln(g_1 / g_0)), ln the principal value: log amplitude and phase are linear. That holds
+/// while the phase turns by less than pi from one solution to the next.
+#[derive(Clone, Debug)]
+pub struct AntennaGains {
+    interpolation: Interpolation,
+    frequency_tolerance_hz: f64,
+    satellites: usize,
+    channels: Vec<ChannelTable>,
+}
+
+/// Gains of one channel, ready for interpolation.
+#[derive(Clone, Debug)]
+struct ChannelTable {
+    frequency_hz: f64,
+    /// Times of the solutions, s; increasing, at least one.
+    time_s: Vec<f64>,
+    /// Gains: solution after solution, one a satellite.
+    gain: Vec<Complex64>,
+    /// ln(g_1 / g_0) to the next solution; one solution less.
+    log_step: Vec<Complex64>,
+}
+
+impl AntennaGains {
+    /// Reads a file of gains.
+    ///
+    /// # Errors
+    /// [`CalibrationError`]: the file cannot be read or parsed, or everything wrong with its values.
+    pub fn read(path: &Path) -> Result<Self, CalibrationError> {
+        Self::new(&GainsFile::read(path)?).map_err(|error| match error {
+            CalibrationError::Gains { problems } => {
+                CalibrationError::Values { path: path.to_owned(), problems }
+            }
+            other => other,
+        })
+    }
+
+    /// Gains that are already in memory.
+    ///
+    /// # Errors
+    /// [`CalibrationError::Gains`] with everything that is wrong with them.
+    pub fn new(file: &GainsFile) -> Result<Self, CalibrationError> {
+        let problems = file.problems();
+        if !problems.is_empty() {
+            return Err(CalibrationError::Gains { problems });
+        }
+        let channels = file
+            .channels
+            .iter()
+            .map(|channel| {
+                let time_s = channel.solutions.iter().map(|solution| solution.time_s).collect();
+                let gains = channel.solutions.iter().flat_map(|solution| &solution.gains);
+                let gain = gains.map(|&[re, im]| Complex64::new(re, im)).collect();
+                ChannelTable::new(channel.frequency_hz, time_s, gain)
+            })
+            .collect();
+        Ok(Self {
+            interpolation: file.interpolation,
+            frequency_tolerance_hz: file.frequency_tolerance_hz,
+            satellites: file.satellites(),
+            channels,
+        })
+    }
+
+    /// The factor g_i conj(g_j) by which visibilities of `pair` at `frequency_hz` were multiplied at
+    /// `time_s` (s since the mission epoch); not finite or zero where a gain is unusable.
+    ///
+    /// # Errors
+    /// [`CalibrationError`] if there are no gains for the pair or frequency.
+    pub fn factor(&self, frequency_hz: f64, pair: Pair, time_s: f64) -> Result<Complex64, CalibrationError> {
+        let table = self.table(frequency_hz, pair)?;
+        Ok(table.factor(self.interpolation, self.satellites, pair, time_s))
+    }
+
+    /// The table for a channel, after checking that it has both satellites.
+    fn table(&self, frequency_hz: f64, pair: Pair) -> Result<&ChannelTable, CalibrationError> {
+        if usize::from(pair.i.max(pair.j)) >= self.satellites {
+            return Err(CalibrationError::Satellite { pair, satellites: self.satellites });
+        }
+        let distance_hz = |table: &ChannelTable| (table.frequency_hz - frequency_hz).abs();
+        let nearest = self.channels.iter().min_by(|a, b| distance_hz(a).total_cmp(&distance_hz(b)));
+        match nearest {
+            Some(table) if distance_hz(table) <= self.frequency_tolerance_hz => Ok(table),
+            _ => Err(CalibrationError::Channel {
+                frequency_hz,
+                nearest_hz: nearest.map_or(f64::NAN, |table| table.frequency_hz),
+                tolerance_hz: self.frequency_tolerance_hz,
+            }),
+        }
+    }
+}
+
+impl ChannelTable {
+    fn new(frequency_hz: f64, time_s: Vec<f64>, gain: Vec<Complex64>) -> Self {
+        let satellites = gain.len() / time_s.len().max(1);
+        let log_step = gain.iter().zip(gain.iter().skip(satellites)).map(|(g_0, g_1)| (g_1 / g_0).ln());
+        Self { frequency_hz, time_s, log_step: log_step.collect(), gain }
+    }
+
+    fn factor(&self, interpolation: Interpolation, satellites: usize, pair: Pair, time_s: f64) -> Complex64 {
+        let (i, j) = (usize::from(pair.i), usize::from(pair.j));
+        let at = |table: &[Complex64], row: usize| {
+            // A product of two gains, or of two ratios of gains, is a sum of their logarithms.
+            (table[row * satellites + i], table[row * satellites + j].conj())
+        };
+        let later = self.time_s.partition_point(|&t| t <= time_s);
+        let row = later.saturating_sub(1);
+        let (g_i, g_j) = at(&self.gain, row);
+        if later == 0 || later == self.time_s.len() || time_s == self.time_s[row] {
+            return g_i * g_j;
+        }
+        let u = (time_s - self.time_s[row]) / (self.time_s[later] - self.time_s[row]);
+        match interpolation {
+            Interpolation::LogLinear => {
+                let (log_i, log_j) = at(&self.log_step, row);
+                g_i * g_j * (u * (log_i + log_j)).exp()
+            }
+            Interpolation::Nearest => {
+                let (g_i, g_j) = at(&self.gain, if u > 0.5 { later } else { row });
+                g_i * g_j
+            }
+        }
+    }
+}
+
+impl Calibration for AntennaGains {
+    fn name(&self) -> &'static str {
+        "antenna-gains"
+    }
+
+    fn apply(&mut self, block: &mut PlacedVisibilities) -> Result<CalibrationReport, CalibrationError> {
+        let pair = block.pair;
+        let table = self.table(block.frequency_hz, pair)?;
+        let count = block.len();
+        let mut kept = 0;
+        for k in 0..count {
+            let factor = table.factor(self.interpolation, self.satellites, pair, block.time_s[k]);
+            let power = factor.norm_sqr();
+            let weight = block.weight[k] * power;
+            // Normal: neither zero nor infinite nor so small that digits are gone.
+            if !(power.is_normal() && weight.is_normal()) {
+                continue;
+            }
+            block.value_k_sr[kept] = block.value_k_sr[k] / factor;
+            block.weight[kept] = weight;
+            block.time_s[kept] = block.time_s[k];
+            block.r_i_m[kept] = block.r_i_m[k];
+            block.r_j_m[kept] = block.r_j_m[k];
+            kept += 1;
+        }
+        truncate(block, kept);
+        Ok(CalibrationReport { kept, unusable_gain: count - kept })
+    }
+}
+
+fn truncate(block: &mut PlacedVisibilities, len: usize) {
+    let PlacedVisibilities { time_s, r_i_m, r_j_m, value_k_sr, weight, .. } = block;
+    time_s.truncate(len);
+    r_i_m.truncate(len);
+    r_j_m.truncate(len);
+    value_k_sr.truncate(len);
+    weight.truncate(len);
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,229 @@
+//! The file of antenna gains.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::CalibrationError;
+use crate::units::MAX_SATELLITES;
+
+/// How gains go from one solution to the next.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Interpolation {
+    /// Log amplitude and phase change linearly, the phase by the shorter way round.
+    #[default]
+    LogLinear,
+    /// The solution that is nearer in time holds; the earlier one half-way.
+    Nearest,
+}
+
+/// Gains of all satellites in some channels at some times, as TOML or JSON:
+///
+/// ```toml
+#[doc = include_str!("gains_example.toml")]
+/// ```
+///
+/// Before the first and after the last solution that one holds. A gain of zero or (in TOML) `nan`
+/// says that a satellite is of no use at that time.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GainsFile {
+    /// How gains go from one solution to the next.
+    #[serde(default)]
+    pub interpolation: Interpolation,
+    /// Largest distance of a channel from the frequency whose gains it takes, Hz.
+    #[serde(default = "half_a_channel_hz")]
+    pub frequency_tolerance_hz: f64,
+    /// Gains by channel, in any order.
+    pub channels: Vec<ChannelGains>,
+}
+
+/// Half the width of the paper's channels, Hz.
+fn half_a_channel_hz() -> f64 {
+    4e3
+}
+
+/// Gains in one channel.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ChannelGains {
+    /// Centre frequency, Hz.
+    pub frequency_hz: f64,
+    /// Gains at increasing times.
+    pub solutions: Vec<GainSolution>,
+}
+
+/// Gains at one time.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GainSolution {
+    /// Time since the mission epoch, s.
+    pub time_s: f64,
+    /// Real and imaginary part of every satellite's voltage gain.
+    pub gains: Vec<[f64; 2]>,
+}
+
+impl GainsFile {
+    /// Reads a file: JSON if its name ends so, TOML otherwise. Its values are not looked at.
+    ///
+    /// # Errors
+    /// [`CalibrationError::Read`] and [`CalibrationError::Syntax`].
+    pub fn read(path: &Path) -> Result<Self, CalibrationError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| CalibrationError::Read { path: path.to_owned(), source })?;
+        let parsed = if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json")) {
+            serde_json::from_str(&text).map_err(|error| error.to_string())
+        } else {
+            toml::from_str(&text).map_err(|error| error.to_string())
+        };
+        parsed.map_err(|message| CalibrationError::Syntax { path: path.to_owned(), message })
+    }
+
+    /// Everything that is wrong with the values; empty if they are good.
+    #[must_use]
+    pub fn problems(&self) -> Vec<CalibrationError> {
+        let mut found = Problems(Vec::new());
+        let tolerance_hz = self.frequency_tolerance_hz;
+        if !(tolerance_hz.is_finite() && tolerance_hz >= 0.0) {
+            found.add("frequency_tolerance_hz", tolerance_hz, "a finite number of at least 0");
+        }
+        if self.channels.is_empty() {
+            found.add("channels", "[]", "at least one channel");
+        }
+        let satellites = self.satellites();
+        for (index, channel) in self.channels.iter().enumerate() {
+            let key = format!("channels[{index}]");
+            let frequency_hz = channel.frequency_hz;
+            if !(frequency_hz.is_finite() && frequency_hz > 0.0) {
+                found.add(&format!("{key}.frequency_hz"), frequency_hz, "a positive number");
+            }
+            if self.channels[..index].iter().any(|earlier| earlier.frequency_hz == frequency_hz) {
+                found.add(&format!("{key}.frequency_hz"), frequency_hz, "every frequency once");
+            }
+            channel.add_problems(&key, satellites, &mut found);
+        }
+        found.0
+    }
+
+    /// Number of satellites in the first solution; 0 if there is none.
+    #[must_use]
+    pub fn satellites(&self) -> usize {
+        let first = self.channels.iter().find_map(|channel| channel.solutions.first());
+        first.map_or(0, |solution| solution.gains.len())
+    }
+}
+
+impl ChannelGains {
+    fn add_problems(&self, key: &str, satellites: usize, found: &mut Problems) {
+        if self.solutions.is_empty() {
+            found.add(&format!("{key}.solutions"), "[]", "at least one solution");
+        }
+        let mut before_s = f64::NEG_INFINITY;
+        for (index, solution) in self.solutions.iter().enumerate() {
+            let key = format!("{key}.solutions[{index}]");
+            let time_s = solution.time_s;
+            if !(time_s.is_finite() && time_s > before_s) {
+                found.add(&format!("{key}.time_s"), time_s, "a finite time after the one before");
+            }
+            before_s = before_s.max(time_s);
+            let count = solution.gains.len();
+            if !(2..=MAX_SATELLITES).contains(&count) {
+                found.add(&format!("{key}.gains"), format!("({count} satellites)"), "2 to 64 satellites");
+            } else if count != satellites {
+                let expected = "as many satellites as in the first solution";
+                found.add(&format!("{key}.gains"), format!("({count} satellites)"), expected);
+            }
+        }
+    }
+}
+
+struct Problems(Vec<CalibrationError>);
+
+impl Problems {
+    fn add(&mut self, key: &str, value: impl ToString, expected: &'static str) {
+        self.0.push(CalibrationError::Parameter { key: key.to_owned(), value: value.to_string(), expected });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn read(name: &str, text: &str) -> Result<GainsFile, CalibrationError> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        GainsFile::read(&path)
+    }
+
+    const TOML: &str =
+        "[[channels]]\nfrequency_hz = 1e7\nsolutions = [{ time_s = 5, gains = [[1, 0], [0.5, -2]] }]";
+
+    #[test]
+    fn toml_and_json_say_the_same() {
+        let json = r#"{"channels": [{"frequency_hz": 1e7,
+                       "solutions": [{"time_s": 5, "gains": [[1, 0], [0.5, -2]]}]}]}"#;
+        let (from_toml, from_json) = (read("a.toml", TOML).unwrap(), read("a.JSON", json).unwrap());
+        assert_eq!(from_toml, from_json);
+        assert!(from_toml.problems().is_empty());
+        assert_eq!(from_toml.channels[0].solutions[0].gains, [[1.0, 0.0], [0.5, -2.0]]);
+    }
+
+    #[test]
+    fn the_example_in_the_documentation_is_good() {
+        let file: GainsFile = toml::from_str(include_str!("gains_example.toml")).unwrap();
+        assert!(file.problems().is_empty());
+        assert_eq!(file.channels[0].solutions.len(), 2);
+    }
+
+    #[test]
+    fn unknown_keys_and_foreign_files_are_refused() {
+        for text in [&format!("gain = 1\n{TOML}"), "", "SIMPLE  =  T", "channels = 3"] {
+            let error = read("a.toml", text).unwrap_err();
+            assert!(matches!(error, CalibrationError::Syntax { .. }), "{error}");
+            assert!(error.to_string().contains("a.toml"), "{error}");
+        }
+    }
+
+    #[test]
+    fn everything_wrong_is_said_at_once() {
+        let text = "frequency_tolerance_hz = -1\n\
+            [[channels]]\nfrequency_hz = 1e7\n\
+            solutions = [{ time_s = 5, gains = [[1, 0], [1, 0]] }, { time_s = 5, gains = [[1, 0]] }]\n\
+            [[channels]]\nfrequency_hz = 1e7\nsolutions = []\n\
+            [[channels]]\nfrequency_hz = nan\n\
+            solutions = [{ time_s = inf, gains = [[1, 0], [1, 0], [1, 0]] }]";
+        let keys: Vec<String> = read("a.toml", text)
+            .unwrap()
+            .problems()
+            .into_iter()
+            .map(|problem| match problem {
+                CalibrationError::Parameter { key, .. } => key,
+                other => panic!("{other}"),
+            })
+            .collect();
+        let expected = [
+            "frequency_tolerance_hz",
+            "channels[0].solutions[1].time_s",
+            "channels[0].solutions[1].gains",
+            "channels[1].frequency_hz",
+            "channels[1].solutions",
+            "channels[2].frequency_hz",
+            "channels[2].solutions[0].time_s",
+            "channels[2].solutions[0].gains",
+        ];
+        assert_eq!(keys, expected);
+    }
+
+    proptest! {
+        #[test]
+        fn any_text_is_read_or_refused(text in any::<String>(), cut in 0..TOML.len()) {
+            let _ = toml::from_str::<GainsFile>(&text).map(|file| file.problems());
+            let _ = toml::from_str::<GainsFile>(&TOML[..cut]).map(|file| file.problems());
+            let _ = serde_json::from_str::<GainsFile>(&text).map(|file| file.problems());
+        }
+    }
+}
