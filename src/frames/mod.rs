@@ -4,10 +4,12 @@
 //! checked where the data enters (the configuration on the spacecraft, the decoder on the ground).
 
 mod ephemeris;
+mod housekeeping;
 mod instrument;
 mod visibility;
 
 pub use ephemeris::EphemerisSegment;
+pub use housekeeping::Housekeeping;
 pub use instrument::{AntennaResponse, Channel, Instrument};
 pub use visibility::{Flags, PlacedVisibilities, VisibilityBlock};
 
@@ -20,6 +22,8 @@ pub enum GroundFrame {
     Ephemeris(EphemerisSegment),
     /// Integrated visibilities of one pair and channel.
     Visibilities(VisibilityBlock),
+    /// What the spacecraft has counted so far.
+    Housekeeping(Housekeeping),
 }
 
 /// A stretch of time in which the Earth is hidden from the first daughter.

@@ -1,0 +1,140 @@
+//! What the ground has received, lost and refused.
+
+use serde::Serialize;
+
+use super::kind::Kind;
+use super::payload::PayloadFault;
+
+/// Packets of one kind.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct KindCounts {
+    /// Good packets, duplicates left out.
+    pub packets: u64,
+    /// Octets of those.
+    pub octets: u64,
+    /// Packets whose headers hold but whose body does not.
+    pub damaged: u64,
+    /// Packets that had been here before.
+    pub duplicates: u64,
+    /// Gaps in the packet count.
+    pub gaps: u64,
+    /// Packets in those gaps.
+    pub missing: u64,
+    /// Packets that have filled a gap, or the place of a damaged one, afterwards.
+    pub late: u64,
+    /// Times that the spacecraft has begun to count anew.
+    pub restarts: u64,
+    /// Packets of payloads that could not be put together, for want of a segment.
+    pub orphans: u64,
+}
+
+/// Payloads that were refused although their packets' checks held, by reason.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct FaultCounts {
+    /// Unknown format version.
+    pub version: u64,
+    /// Malformed record.
+    pub record: u64,
+    /// Length other than the record asks for.
+    pub length: u64,
+    /// Value out of range.
+    pub value: u64,
+    /// Times that do not increase.
+    pub order: u64,
+}
+
+impl FaultCounts {
+    pub(super) fn add(&mut self, fault: &PayloadFault) {
+        *match fault {
+            PayloadFault::Version { .. } => &mut self.version,
+            PayloadFault::Record { .. } => &mut self.record,
+            PayloadFault::Length { .. } => &mut self.length,
+            PayloadFault::Value { .. } => &mut self.value,
+            PayloadFault::Order => &mut self.order,
+        } += 1;
+    }
+
+    /// All of them.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        self.version + self.record + self.length + self.value + self.order
+    }
+}
+
+/// The account of a reception.
+///
+/// `octets = octets_garbage + octets_truncated + octets_damaged + octets_duplicate +` those of the kinds'
+/// packets. Visibilities in good packets are `decoded + bad_value + refused + before_instrument + foreign`.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct ReceptionCounters {
+    /// Octets received.
+    pub octets: u64,
+    /// Octets that belong to no packet.
+    pub octets_garbage: u64,
+    /// Stretches of those.
+    pub garbage_stretches: u64,
+    /// Octets of unfinished packets at the end of a stream.
+    pub octets_truncated: u64,
+    /// Octets of damaged packets.
+    pub octets_damaged: u64,
+    /// Octets of packets that had been here before.
+    pub octets_duplicate: u64,
+    /// Instrument descriptions.
+    pub instrument: KindCounts,
+    /// Satellite positions.
+    pub ephemeris: KindCounts,
+    /// Visibilities.
+    pub visibilities: KindCounts,
+    /// Calibration: reserved, counted and skipped.
+    pub calibration: KindCounts,
+    /// The spacecraft's own counts.
+    pub housekeeping: KindCounts,
+    /// Payloads refused.
+    pub faults: FaultCounts,
+    /// Instrument descriptions that contradict the first.
+    pub instruments_contradictory: u64,
+    /// Payloads other than instrument descriptions that followed a contradictory one, and were refused.
+    pub payloads_foreign: u64,
+    /// Payloads that came before any instrument description and could not be understood.
+    pub payloads_before_instrument: u64,
+    /// Visibilities handed on.
+    pub visibilities_decoded: u64,
+    /// Visibilities dropped because they are not finite, or of weight or duration zero.
+    pub visibilities_bad_value: u64,
+    /// Visibilities in refused payloads.
+    pub visibilities_refused: u64,
+    /// Visibilities that came before any instrument description.
+    pub visibilities_before_instrument: u64,
+    /// Visibilities that followed a contradictory instrument description.
+    pub visibilities_foreign: u64,
+}
+
+impl ReceptionCounters {
+    /// Counts of one kind.
+    #[must_use]
+    pub fn kind(&self, kind: Kind) -> &KindCounts {
+        match kind {
+            Kind::Instrument => &self.instrument,
+            Kind::Ephemeris => &self.ephemeris,
+            Kind::Visibilities => &self.visibilities,
+            Kind::Calibration => &self.calibration,
+            Kind::Housekeeping => &self.housekeeping,
+        }
+    }
+
+    pub(super) fn kind_mut(&mut self, kind: Kind) -> &mut KindCounts {
+        match kind {
+            Kind::Instrument => &mut self.instrument,
+            Kind::Ephemeris => &mut self.ephemeris,
+            Kind::Visibilities => &mut self.visibilities,
+            Kind::Calibration => &mut self.calibration,
+            Kind::Housekeeping => &mut self.housekeeping,
+        }
+    }
+
+    /// Good packets of all kinds.
+    #[must_use]
+    pub fn packets(&self) -> u64 {
+        Kind::ALL.iter().map(|kind| self.kind(*kind).packets).sum()
+    }
+}

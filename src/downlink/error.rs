@@ -1,0 +1,69 @@
+//! What can go wrong with a downlink as a whole; bad data in it is counted instead.
+
+use std::io;
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+use super::payload::PayloadFault;
+
+/// Why a downlink cannot be written or read.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum DownlinkError {
+    /// A configuration value outside its range.
+    #[error("downlink.{key} = {value}: expected {expected}")]
+    Parameter {
+        /// Key in the `[downlink]` section.
+        key: &'static str,
+        /// Value found.
+        value: u64,
+        /// Range that is accepted.
+        expected: &'static str,
+    },
+    /// A frame was to be sent before the instrument description, which gives the time codes their epoch.
+    #[error("a frame was to be sent before the instrument description; send that one first")]
+    NoInstrument,
+    /// A frame that the ground would refuse.
+    #[error("a frame cannot be sent: {0}")]
+    Frame(#[from] PayloadFault),
+    /// A time that the packets' time code cannot express.
+    #[error(
+        "{time_s} s after the mission epoch lies outside 1958-2094, which the packets' time code covers; \
+             mend the epoch (epoch_tai_s = {epoch_tai_s})"
+    )]
+    Time {
+        /// Mission epoch, TAI seconds since 1958.
+        epoch_tai_s: f64,
+        /// Mission time, s.
+        time_s: f64,
+    },
+    /// The operating system refused.
+    #[error("{}: cannot {action}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What was tried.
+        action: &'static str,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A file without a single octet.
+    #[error("{}: the file is empty; expected CCSDS space packets as `lunarray simulate` writes them", path.display())]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A file in which nothing of ours was found.
+    #[error(
+        "{}: not one downlink packet in {octets} octets; expected CCSDS space packets with APIDs 0x101 to \
+         0x105 and CUC times (P-field 0x1F), as `lunarray simulate` writes them",
+        path.display()
+    )]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+        /// Its length.
+        octets: u64,
+    },
+}

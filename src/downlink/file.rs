@@ -1,0 +1,178 @@
+//! Downlink files.
+
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+
+use super::config::DownlinkConfig;
+use super::counters::ReceptionCounters;
+use super::decoder::Decoder;
+use super::error::DownlinkError;
+use super::packetizer::Packetizer;
+use super::receiver::{Event, Receiver};
+use crate::frames::GroundFrame;
+
+/// Octets that are gathered before they are written.
+const WRITE_OCTETS: usize = 1 << 20;
+
+/// Writes frames to a file of packets.
+///
+/// The file is called `NAME.partial` until [`DownlinkWriter::finish`] has put all of it on the disk; then it takes its
+/// name, replacing an older one. Cut short by whatever it is, what is there can be read.
+#[derive(Debug)]
+pub struct DownlinkWriter {
+    path: PathBuf,
+    partial_path: PathBuf,
+    file: File,
+    packetizer: Packetizer,
+    pending: Vec<u8>,
+    octets: u64,
+}
+
+impl DownlinkWriter {
+    /// Begins a file.
+    ///
+    /// # Errors
+    /// A bad configuration, or a file that cannot be written.
+    pub fn create(path: &Path, config: &DownlinkConfig) -> Result<Self, DownlinkError> {
+        let packetizer = Packetizer::new(config)?;
+        let mut name = path.as_os_str().to_owned();
+        name.push(".partial");
+        let partial_path = PathBuf::from(name);
+        let file = File::create(&partial_path).map_err(io_error(&partial_path, "create the file"))?;
+        Ok(Self { path: path.to_owned(), partial_path, file, packetizer, pending: Vec::new(), octets: 0 })
+    }
+
+    /// Appends the packets of a frame.
+    ///
+    /// # Errors
+    /// Those of [`Packetizer::encode`], and a file that cannot be written.
+    pub fn write(&mut self, frame: &GroundFrame) -> Result<(), DownlinkError> {
+        self.packetizer.encode(frame, &mut self.pending)?;
+        if self.pending.len() >= WRITE_OCTETS { self.flush() } else { Ok(()) }
+    }
+
+    /// Octets of all packets so far.
+    #[must_use]
+    pub fn octets(&self) -> u64 {
+        self.octets + self.pending.len() as u64
+    }
+
+    /// Puts everything on the disk and gives the file its name; returns its length in octets.
+    ///
+    /// # Errors
+    /// A file that cannot be written or renamed.
+    pub fn finish(mut self) -> Result<u64, DownlinkError> {
+        self.flush()?;
+        self.file.sync_all().map_err(io_error(&self.partial_path, "put the file on the disk"))?;
+        fs::rename(&self.partial_path, &self.path).map_err(io_error(&self.path, "rename the file"))?;
+        let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        let folder = folder.unwrap_or(Path::new("."));
+        File::open(folder)
+            .and_then(|folder| folder.sync_all())
+            .map_err(io_error(folder, "put the folder on the disk"))?;
+        Ok(self.octets)
+    }
+
+    fn flush(&mut self) -> Result<(), DownlinkError> {
+        self.file.write_all(&self.pending).map_err(io_error(&self.partial_path, "write"))?;
+        self.octets += self.pending.len() as u64;
+        self.pending.clear();
+        Ok(())
+    }
+}
+
+/// Reads frames from a file of packets, in bounded memory.
+#[derive(Debug)]
+pub struct DownlinkReader<R = File> {
+    path: PathBuf,
+    source: R,
+    receiver: Receiver,
+    decoder: Decoder,
+    packets: u64,
+    finished: bool,
+}
+
+impl DownlinkReader<File> {
+    /// Opens a file.
+    ///
+    /// # Errors
+    /// A file that cannot be opened.
+    pub fn open(path: &Path) -> Result<Self, DownlinkError> {
+        Ok(Self::new(File::open(path).map_err(io_error(path, "open the file"))?, path))
+    }
+}
+
+impl<R: Read> DownlinkReader<R> {
+    /// Reads from any source; `path` names it in errors.
+    #[must_use]
+    pub fn new(source: R, path: &Path) -> Self {
+        Self {
+            path: path.to_owned(),
+            source,
+            receiver: Receiver::new(),
+            decoder: Decoder::new(),
+            packets: 0,
+            finished: false,
+        }
+    }
+
+    /// Goes on with what the decoder of an earlier file has learnt and counted.
+    #[must_use]
+    pub fn with_decoder(self, decoder: Decoder) -> Self {
+        Self { decoder, ..self }
+    }
+
+    /// The decoder, for the next file.
+    #[must_use]
+    pub fn into_decoder(self) -> Decoder {
+        self.decoder
+    }
+
+    /// The next frame; `None` at the end of the file.
+    ///
+    /// # Errors
+    /// A file that cannot be read, is empty, or holds no packet at all; damage is counted instead.
+    pub fn next_frame(&mut self) -> Result<Option<GroundFrame>, DownlinkError> {
+        loop {
+            while let Some(event) = self.receiver.next_event() {
+                self.packets += u64::from(matches!(event, Event::Packet(_)));
+                if let Some(frame) = self.decoder.accept(&event) {
+                    return Ok(Some(frame));
+                }
+            }
+            if self.finished {
+                return self.end().map(|()| None);
+            }
+            if self.receiver.fill_from(&mut self.source).map_err(io_error(&self.path, "read"))? == 0 {
+                self.receiver.finish();
+                self.finished = true;
+            }
+        }
+    }
+
+    /// The account so far.
+    #[must_use]
+    pub fn counters(&self) -> &ReceptionCounters {
+        self.decoder.counters()
+    }
+
+    fn end(&mut self) -> Result<(), DownlinkError> {
+        self.decoder.finish();
+        require_packets(&self.path, self.receiver.octets(), self.packets)
+    }
+}
+
+/// An error for a file of so many octets if there was no packet in it.
+pub(super) fn require_packets(path: &Path, octets: u64, packets: u64) -> Result<(), DownlinkError> {
+    match (octets, packets) {
+        (0, _) => Err(DownlinkError::Empty { path: path.to_owned() }),
+        (_, 0) => Err(DownlinkError::Foreign { path: path.to_owned(), octets }),
+        _ => Ok(()),
+    }
+}
+
+pub(super) fn io_error(path: &Path, action: &'static str) -> impl FnOnce(io::Error) -> DownlinkError {
+    let path = path.to_owned();
+    move |source| DownlinkError::Io { path, action, source }
+}
