@@ -5,15 +5,19 @@
 //! Frame: centred on the Moon, ecliptic axes (x to ecliptic longitude 0, z to the north ecliptic pole).
 
 mod config;
+mod ephemeris;
 mod formation;
 mod integration;
 mod orbit;
+mod placing;
 mod windows;
 
 pub mod response;
 
 pub use config::{ArrayConfig, ArrayError, BreathingConfig, NodeMotion};
+pub use ephemeris::{Ephemeris, Insertion, segments_for};
 pub use formation::Formation;
 pub use integration::{IntegrationRule, integration_time_s};
 pub use orbit::{Array, SatelliteState, hidden_by_moon};
+pub use placing::{FlaggedCounts, PlacingCounts};
 pub use windows::ObservingWindows;

@@ -69,8 +69,8 @@ pub enum PayloadFault {
         /// Range that is accepted.
         expected: &'static str,
     },
-    /// Times that should increase do not.
-    #[error("the times of the visibilities do not increase")]
+    /// The middles of the integrations should increase and do not.
+    #[error("the middles of the integrations do not increase")]
     Order,
 }
 

@@ -103,8 +103,8 @@ pub(in crate::downlink) fn check(
     {
         require_length("visibility arrays", block.len(), length)?;
     }
-    let later = block.offset_ticks.get(1..).unwrap_or_default();
-    let disorder = block.offset_ticks.iter().zip(later).fold(false, |bad, (a, b)| bad | (a >= b));
+    let twice_middle = |k: usize| 2 * u64::from(block.offset_ticks[k]) + u64::from(block.duration_ticks[k]);
+    let disorder = (1..block.len()).fold(false, |bad, k| bad | (twice_middle(k - 1) >= twice_middle(k)));
     if disorder { Err(PayloadFault::Order) } else { Ok(()) }
 }
 
