@@ -1,6 +1,6 @@
 //! The open data chain of a lunar-orbit radio interferometer.
 //!
-//! Modules stand in the order in which data passes them: a [`sky`] is seen by an [`array`] of
+//! Modules stand in the order in which data passes them: a [`sky`] is seen by an [`mod@array`] of
 //! daughter satellites, integrated by the [`mother`], sent down ([`downlink`]), calibrated
 //! ([`calibration`]), summed into normal equations ([`accumulation`]), solved ([`solve`]) and written
 //! out ([`products`]). The [`runtime`] moves data between stages and knows no physics; the

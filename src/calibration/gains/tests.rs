@@ -96,7 +96,8 @@ proptest! {
         // g_3 = exp((decay + i rate) t), known every 3 s: the phase turns by less than pi between.
         let drift = Complex64::new(decay, rate);
         let unity = Complex64::new(1.0, 0.0);
-        let solutions = (0..15).map(|k| 3.0 * f64::from(k)).map(|t| (t, vec![unity, unity, (drift * t).exp()]));
+        let times = (0..15).map(|k| 3.0 * f64::from(k));
+        let solutions = times.map(|t| (t, vec![unity, unity, (drift * t).exp()]));
         let gains = AntennaGains::new(&file(Interpolation::LogLinear, solutions.collect())).unwrap();
         let found = gains.factor(FREQUENCY_HZ, Pair { i: 0, j: 2 }, time_s).unwrap();
         let expected = (drift * time_s).exp().conj();
