@@ -2,5 +2,6 @@
 //!
 //! Uses [`crate::units`] only.
 
+pub mod generated;
 pub mod harmonics;
 pub mod healpix;
