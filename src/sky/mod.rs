@@ -5,6 +5,7 @@
 mod error;
 pub mod fits;
 mod frame;
+pub mod generated;
 pub mod harmonics;
 pub mod healpix;
 mod map;
