@@ -1,0 +1,164 @@
+//! Averages over blocks that the limb of the Moon cuts: child by child, but without a sine for each.
+//!
+//! Lanes hold columns of children (several pieces of a column when the block is small); all lanes step
+//! through their children together. The phase along a column is quadratic, so the fringe goes from child
+//! to child by one rotation and the rotation by another.
+
+use std::f32::consts::TAU;
+
+use multiversion::multiversion;
+
+use super::blocks::{GX, GY, Group, HXX, HXY, HYY};
+use super::kernel::{Prepared, cos_sin_turns, dot64, fraction, fused};
+
+const LANES: usize = 16;
+
+/// A scalar field over a block: constant, x, y, x^2 - v, x y, y^2 - v.
+type Field = [f32; 6];
+
+/// Mean of A S_i S_j exp(-2 pi i u . n) over block `lane` of `group`, of `children`^2 children.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+pub(super) fn cut_mean(pair: &Prepared, children: usize, group: &Group, lane: usize) -> (f32, f32) {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
+    let field = |v: [f64; 3]| -> Field {
+        let term = |term: usize| {
+            (0..3).map(|axis| v[axis] * f64::from(group.slopes[term + axis][lane])).sum::<f64>() as f32
+        };
+        [0.0, term(GX), term(GY), term(HXX), term(HXY), term(HYY)]
+    };
+    let at_centre =
+        |v: [f64; 3]| dot64::<FMA>(v, group.centre[0][lane], group.centre[1][lane], group.centre[2][lane]);
+    let with = |constant: f32, mut field: Field| {
+        field[0] = constant;
+        field
+    };
+    let fields = Fields {
+        turns: with(fraction(at_centre(pair.u)), field(pair.u)),
+        depth_i: with((at_centre(pair.i_hat) + pair.limb_i) as f32, field(pair.i_hat)),
+        depth_j: with((at_centre(pair.j_hat) + pair.limb_j) as f32, field(pair.j_hat)),
+        along: match pair.dipole {
+            Some(dipole) => with(at_centre(dipole) as f32, field(dipole)),
+            None => [0.0; 6],
+        },
+    };
+    let columns = children.min(LANES);
+    // Power-of-two children: pieces of columns fill the lanes, or several passes cover the columns.
+    let pieces = (LANES / columns).min(children);
+    let mut sum = [0.0_f32; 2];
+    for first_column in (0..children).step_by(columns) {
+        let pass = Pass { children, columns, pieces, first_column };
+        let part = fields.sum::<FMA>(pass);
+        sum = [sum[0] + part[0], sum[1] + part[1]];
+    }
+    let per_child = 1.0 / (children * children) as f32;
+    (sum[0] * per_child, sum[1] * per_child)
+}
+
+/// What is needed of a pair over one block.
+struct Fields {
+    turns: Field,
+    depth_i: Field,
+    depth_j: Field,
+    along: Field,
+}
+
+/// Some columns of a block, cut into pieces so that columns times pieces fit the lanes.
+#[derive(Clone, Copy)]
+struct Pass {
+    children: usize,
+    columns: usize,
+    pieces: usize,
+    first_column: usize,
+}
+
+impl Fields {
+    /// Sum over the children of a pass.
+    #[inline(always)]
+    fn sum<const FMA: bool>(&self, pass: Pass) -> [f32; 2] {
+        let per_side = 1.0 / pass.children as f32;
+        let variance = (1.0 - per_side * per_side) / 12.0;
+        let steps = pass.children / pass.pieces;
+        let (mut x, mut y, mut active) = ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
+        for lane in 0..LANES {
+            let column = pass.first_column + lane % pass.columns;
+            let piece = lane / pass.columns;
+            x[lane] = (column as f32 + 0.5) * per_side - 0.5;
+            y[lane] = ((piece * steps) as f32 + 0.5) * per_side - 0.5;
+            active[lane] = if piece < pass.pieces { 1.0 } else { 0.0 };
+        }
+        let on = |field: &Field| Columns::new::<FMA>(field, &x, variance);
+        let (turns, depth_i, depth_j, along) =
+            (on(&self.turns), on(&self.depth_i), on(&self.depth_j), on(&self.along));
+        let (mut re, mut im) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+        let (mut step_re, mut step_im) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+        for lane in 0..LANES {
+            (re[lane], im[lane]) = turn_back::<FMA>(turns.at::<FMA>(lane, y[lane]));
+            let step = turns.at::<FMA>(lane, y[lane] + per_side) - turns.at::<FMA>(lane, y[lane]);
+            (step_re[lane], step_im[lane]) = turn_back::<FMA>(step);
+        }
+        // Second difference of the phase: small, the same in all lanes.
+        let bend = TAU * 2.0 * turns.square * per_side * per_side;
+        let (bend_re, bend_im) = (fused::<FMA>(-0.5 * bend, bend, 1.0), -bend);
+        let (mut sum_re, mut sum_im) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+        for _ in 0..steps {
+            for lane in 0..LANES {
+                let depth = depth_i.at::<FMA>(lane, y[lane]).min(depth_j.at::<FMA>(lane, y[lane]));
+                let along = along.at::<FMA>(lane, y[lane]);
+                let seen = if depth >= 0.0 { fused::<FMA>(-along, along, 1.0) } else { 0.0 };
+                sum_re[lane] = fused::<FMA>(seen, re[lane], sum_re[lane]);
+                sum_im[lane] = fused::<FMA>(seen, im[lane], sum_im[lane]);
+                (re[lane], im[lane]) = product::<FMA>((re[lane], im[lane]), (step_re[lane], step_im[lane]));
+                (step_re[lane], step_im[lane]) =
+                    product::<FMA>((step_re[lane], step_im[lane]), (bend_re, bend_im));
+                y[lane] += per_side;
+            }
+        }
+        let mut sum = [0.0_f32; 2];
+        for lane in 0..LANES {
+            sum[0] = fused::<FMA>(active[lane], sum_re[lane], sum[0]);
+            sum[1] = fused::<FMA>(active[lane], sum_im[lane], sum[1]);
+        }
+        sum
+    }
+}
+
+/// A field along the lanes' columns: a quadratic in y for each.
+struct Columns {
+    constant: [f32; LANES],
+    linear: [f32; LANES],
+    square: f32,
+}
+
+impl Columns {
+    #[inline(always)]
+    fn new<const FMA: bool>(field: &Field, x: &[f32; LANES], variance: f32) -> Self {
+        let [constant, fx, fy, fxx, fxy, fyy] = *field;
+        let mut columns = Self { constant: [0.0; LANES], linear: [0.0; LANES], square: fyy };
+        for lane in 0..LANES {
+            let curved = fused::<FMA>(fxx, x[lane] * x[lane] - variance, constant - fyy * variance);
+            columns.constant[lane] = fused::<FMA>(fx, x[lane], curved);
+            columns.linear[lane] = fused::<FMA>(fxy, x[lane], fy);
+        }
+        columns
+    }
+
+    #[inline(always)]
+    fn at<const FMA: bool>(&self, lane: usize, y: f32) -> f32 {
+        fused::<FMA>(fused::<FMA>(self.square, y, self.linear[lane]), y, self.constant[lane])
+    }
+}
+
+/// exp(-2 pi i turns) for a few turns.
+#[inline(always)]
+fn turn_back<const FMA: bool>(turns: f32) -> (f32, f32) {
+    // As in `fraction`: good for |turns| < 2^21, and a block spans a few.
+    const MAGIC: f32 = 12_582_912.0;
+    let (cos, sin) = cos_sin_turns::<FMA>(turns - ((turns + MAGIC) - MAGIC));
+    (cos, -sin)
+}
+
+#[inline(always)]
+fn product<const FMA: bool>(a: (f32, f32), b: (f32, f32)) -> (f32, f32) {
+    (fused::<FMA>(a.0, b.0, -a.1 * b.1), fused::<FMA>(a.0, b.1, a.1 * b.0))
+}

@@ -1,0 +1,94 @@
+//! The response in `f64`, one direction after another: what the fast path is checked against.
+
+use std::f64::consts::TAU;
+
+use num_complex::Complex64;
+
+use super::{PairGeometry, SkySum};
+use crate::array::hidden_by_moon;
+use crate::frames::AntennaResponse;
+use crate::sky::healpix;
+use crate::units::vector::{Vec3, dot};
+
+/// A S_i S_j of a pair: 0 where the Moon hides the direction from either satellite.
+#[must_use]
+pub fn envelope(pair: &PairGeometry, n_hat: Vec3) -> f64 {
+    let hidden = |r_m| hidden_by_moon(r_m, n_hat, pair.moon_radius_m);
+    if hidden(pair.r_i_m) || hidden(pair.r_j_m) {
+        return 0.0;
+    }
+    match pair.response {
+        AntennaResponse::Isotropic => 1.0,
+        AntennaResponse::DipoleNormal => pair.antenna(n_hat),
+    }
+}
+
+/// exp(-2 pi i u . n), the phase reduced to a fraction of a turn first.
+fn fringe(baseline_wavelengths: Vec3, n_hat: Vec3) -> Complex64 {
+    let turns = dot(baseline_wavelengths, n_hat);
+    Complex64::cis(-TAU * (turns - turns.round()))
+}
+
+/// The row of B at the given directions, without the pixel area.
+#[must_use]
+pub fn centre_row(pair: &PairGeometry, directions: &[Vec3]) -> Vec<Complex64> {
+    let u = pair.baseline_wavelengths();
+    let at = |&n_hat: &Vec3| match envelope(pair, n_hat) {
+        0.0 => Complex64::ZERO,
+        shade => shade * fringe(u, n_hat),
+    };
+    directions.iter().map(at).collect()
+}
+
+/// The row of B averaged over the centres of `children`^2 children of each pixel of `nside`, each with
+/// its own shading; RING order, without the pixel area. `children` need not be a power of two.
+#[must_use]
+pub fn average_row(pair: &PairGeometry, nside: usize, children: usize) -> Vec<Complex64> {
+    let u = pair.baseline_wavelengths();
+    let of_pixel = |pixel| {
+        let mut sum = Complex64::ZERO;
+        for n_hat in child_directions(nside, children, pixel) {
+            let shade = envelope(pair, n_hat);
+            if shade != 0.0 {
+                sum += shade * fringe(u, n_hat);
+            }
+        }
+        sum / (children * children) as f64
+    };
+    (0..healpix::pixel_count(nside)).map(of_pixel).collect()
+}
+
+/// Centres of the `children`^2 children of a RING pixel, y running fastest.
+pub(super) fn child_directions(nside: usize, children: usize, pixel: usize) -> impl Iterator<Item = Vec3> {
+    let (face, ix, iy) = healpix::nested_to_face(nside, healpix::ring_to_nested(nside, pixel));
+    let place =
+        move |whole: usize, k: usize| (whole as f64 + (k as f64 + 0.5) / children as f64) / nside as f64;
+    (0..children * children)
+        .map(move |k| healpix::face_direction(face, place(ix, k / children), place(iy, k % children)))
+}
+
+/// Visibility and zero-spacing sum of a sky (K) at the given directions, each of `area_sr`.
+///
+/// Sums are carried in `f64` over blocks of 1024 directions and then over blocks.
+#[must_use]
+pub fn visibility(pair: &PairGeometry, directions: &[Vec3], sky_k: &[f64], area_sr: f64) -> SkySum {
+    const BLOCK: usize = 1024;
+    let u = pair.baseline_wavelengths();
+    let mut total = SkySum::default();
+    for (directions, sky_k) in directions.chunks(BLOCK).zip(sky_k.chunks(BLOCK)) {
+        let mut part = SkySum::default();
+        for (&n_hat, &value) in directions.iter().zip(sky_k) {
+            let shade = envelope(pair, n_hat);
+            if shade != 0.0 {
+                part.visibility_k_sr += value * shade * fringe(u, n_hat);
+                part.zero_spacing_k_sr += value * shade;
+            }
+        }
+        total.visibility_k_sr += part.visibility_k_sr;
+        total.zero_spacing_k_sr += part.zero_spacing_k_sr;
+    }
+    SkySum {
+        visibility_k_sr: total.visibility_k_sr * area_sr,
+        zero_spacing_k_sr: total.zero_spacing_k_sr * area_sr,
+    }
+}

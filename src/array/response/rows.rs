@@ -1,0 +1,247 @@
+//! Rows of B by the fast path.
+
+use std::sync::OnceLock;
+
+use multiversion::multiversion;
+
+use super::average::{Means, block_means};
+use super::blocks::{BlockClass, BlockSet, GROUP};
+use super::edge::cut_mean;
+use super::exact::{self, child_directions};
+use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused};
+use super::{CHILDREN, Directions, PairGeometry, PixelMethod, ResponseError};
+use crate::sky::healpix;
+use crate::units::vector::{Vec3, norm};
+
+/// Greatest nside of rows: blocks of nside 512 take some GB.
+const NSIDE_MAX: usize = 512;
+
+/// Longest baselines of the classes of blocks, times the pixel's width, in wavelengths, and blocks along
+/// a pixel's side at which a class begins. Maps use baselines of up to 2.
+const CLASSES: [(f64, usize); 5] = [(0.5, 1), (1.0, 1), (2.01, 1), (4.02, 2), (8.04, 4)];
+
+/// A number that rows can be made of.
+pub trait RowValue: Copy + Send + Sync + 'static {
+    /// From a kernel's number.
+    fn of_f32(value: f32) -> Self;
+    /// From an exact number.
+    fn of_f64(value: f64) -> Self;
+}
+
+impl RowValue for f32 {
+    #[inline(always)]
+    fn of_f32(value: f32) -> Self {
+        value
+    }
+
+    #[inline(always)]
+    fn of_f64(value: f64) -> Self {
+        value as f32
+    }
+}
+
+impl RowValue for f64 {
+    #[inline(always)]
+    fn of_f32(value: f32) -> Self {
+        f64::from(value)
+    }
+
+    #[inline(always)]
+    fn of_f64(value: f64) -> Self {
+        value
+    }
+}
+
+/// Makes rows of B for one pixelisation and method.
+///
+/// [`PixelMethod::Average`] agrees with the mean over all children to 1e-3 rms. Its blocks are made when
+/// a class of baselines is first asked for (0.1 s at nside 64). A baseline of more than 8 wavelengths a
+/// pixel has no use in a map of that pixelisation; it is averaged child by child, slowly.
+#[derive(Debug)]
+pub struct RowMaker {
+    nside: usize,
+    method: PixelMethod,
+    pixel_width_rad: f64,
+    centres: Vec<Vec3>,
+    directions: Directions,
+    classes: [OnceLock<BlockClass>; CLASSES.len()],
+}
+
+impl RowMaker {
+    /// For maps of `nside` in RING order.
+    ///
+    /// # Errors
+    /// [`ResponseError::Nside`] unless `nside` is a power of two up to 512.
+    pub fn new(nside: usize, method: PixelMethod) -> Result<Self, ResponseError> {
+        if !healpix::is_valid_nside(nside) || nside > NSIDE_MAX {
+            return Err(ResponseError::Nside(nside));
+        }
+        let centres = healpix::pixel_directions(nside);
+        Ok(Self {
+            nside,
+            method,
+            pixel_width_rad: healpix::pixel_area_sr(nside).sqrt(),
+            directions: Directions::from(centres.as_slice()),
+            centres,
+            classes: Default::default(),
+        })
+    }
+
+    /// Resolution.
+    #[must_use]
+    pub fn nside(&self) -> usize {
+        self.nside
+    }
+
+    /// Method.
+    #[must_use]
+    pub fn method(&self) -> PixelMethod {
+        self.method
+    }
+
+    /// Number of pixels: the length of a row.
+    #[must_use]
+    pub fn pixels(&self) -> usize {
+        self.centres.len()
+    }
+
+    /// Pixel width theta_p = sqrt(4 pi / N_pix), rad.
+    #[must_use]
+    pub fn pixel_width_rad(&self) -> f64 {
+        self.pixel_width_rad
+    }
+
+    /// Writes the pair's row, real and imaginary parts, times `factor` (pixel area and root of weight).
+    ///
+    /// Both slices have [`Self::pixels`] elements; what is beyond the shorter one is left alone.
+    pub fn fill<R: RowValue>(&self, pair: &PairGeometry, factor: f64, re: &mut [R], im: &mut [R]) {
+        let pixels = self.pixels().min(re.len()).min(im.len());
+        let (re, im) = (&mut re[..pixels], &mut im[..pixels]);
+        match self.method {
+            PixelMethod::Centre => self.fill_centre(&Prepared::new(pair), factor, re, im),
+            PixelMethod::AverageExact => {
+                let row = exact::average_row(pair, self.nside, CHILDREN);
+                for ((re, im), value) in re.iter_mut().zip(im).zip(row) {
+                    (*re, *im) = (R::of_f64(value.re * factor), R::of_f64(value.im * factor));
+                }
+            }
+            PixelMethod::Average => self.fill_average(pair, factor, re, im),
+        }
+    }
+
+    fn fill_centre<R: RowValue>(&self, pair: &Prepared, factor: f64, re: &mut [R], im: &mut [R]) {
+        let mut values = [[0.0_f32; CHUNK]; 2];
+        let mut n = [[0.0_f64; CHUNK]; 3];
+        let chunks = re.chunks_mut(CHUNK).zip(im.chunks_mut(CHUNK));
+        for (k, (re, im)) in chunks.enumerate() {
+            let range = k * CHUNK..k * CHUNK + re.len();
+            for (to, from) in n.iter_mut().zip([&self.directions.x, &self.directions.y, &self.directions.z]) {
+                to[..re.len()].copy_from_slice(&from[range.clone()]);
+            }
+            fringes(pair, &n, &mut values);
+            store(&values[0], factor, re);
+            store(&values[1], factor, im);
+        }
+    }
+
+    fn fill_average<R: RowValue>(&self, pair: &PairGeometry, factor: f64, re: &mut [R], im: &mut [R]) {
+        let prepared = Prepared::new(pair);
+        let pixels_long = norm(prepared.u) * self.pixel_width_rad;
+        let class = CLASSES.iter().position(|&(longest, _)| pixels_long <= longest);
+        let Some(class) = class else {
+            return self.fill_children(&prepared, factor, re, im);
+        };
+        let blocks = self.classes[class].get_or_init(|| {
+            let (longest, per_side) = CLASSES[class];
+            BlockClass::new(self.nside, per_side, longest / self.pixel_width_rad)
+        });
+        for set in &blocks.sets {
+            fill_set(&prepared, set, factor, re, im);
+        }
+    }
+
+    /// Averages child by child in the fast path's precision.
+    fn fill_children<R: RowValue>(&self, pair: &Prepared, factor: f64, re: &mut [R], im: &mut [R]) {
+        const { assert!(CHUNK == CHILDREN * CHILDREN, "a chunk is one pixel's children") };
+        let mut values = [[0.0_f32; CHUNK]; 2];
+        let mut n = [[0.0_f64; CHUNK]; 3];
+        for (pixel, (re, im)) in re.iter_mut().zip(im).enumerate() {
+            for (k, child) in child_directions(self.nside, CHILDREN, pixel).enumerate() {
+                for axis in 0..3 {
+                    n[axis][k] = child[axis];
+                }
+            }
+            fringes(pair, &n, &mut values);
+            let mean = |values: &[f32; CHUNK]| {
+                values.iter().map(|&value| f64::from(value)).sum::<f64>() / CHUNK as f64
+            };
+            *re = R::of_f64(mean(&values[0]) * factor);
+            *im = R::of_f64(mean(&values[1]) * factor);
+        }
+    }
+}
+
+/// Writes the pixels of one set of blocks.
+fn fill_set<R: RowValue>(pair: &Prepared, set: &BlockSet, factor: f64, re: &mut [R], im: &mut [R]) {
+    let per_pixel = set.per_pixel();
+    let factor = (factor / per_pixel as f64) as f32;
+    let mut means = Means::default();
+    let mut sum = [0.0_f32; 2];
+    let mut filled = 0;
+    let mut pixels = set.pixels.iter();
+    for group in &set.groups {
+        if block_means(pair, set.children, group, &mut means) {
+            for lane in 0..GROUP {
+                if means.cut[lane] != 0.0 {
+                    (means.re[lane], means.im[lane]) = cut_mean(pair, set.children, group, lane);
+                }
+            }
+        }
+        for (block_re, block_im) in means.re.iter().zip(&means.im) {
+            sum = [sum[0] + block_re, sum[1] + block_im];
+            filled += 1;
+            if filled == per_pixel {
+                // The last group's empty blocks belong to no pixel.
+                let Some(&pixel) = pixels.next() else { return };
+                re[pixel as usize] = R::of_f32(sum[0] * factor);
+                im[pixel as usize] = R::of_f32(sum[1] * factor);
+                (filled, sum) = (0, [0.0; 2]);
+            }
+        }
+    }
+}
+
+fn store<R: RowValue>(values: &[f32; CHUNK], factor: f64, out: &mut [R]) {
+    let factor = factor as f32;
+    for (out, &value) in out.iter_mut().zip(values) {
+        *out = R::of_f32(value * factor);
+    }
+}
+
+/// A S_i S_j exp(-2 pi i u . n), real and imaginary parts, to 1e-6.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn fringes(pair: &Prepared, n: &[[f64; CHUNK]; 3], out: &mut [[f32; CHUNK]; 2]) {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
+    let [x, y, z] = n;
+    let mut turns = [0.0_f32; CHUNK];
+    let mut seen = [0.0_f32; CHUNK];
+    for k in 0..CHUNK {
+        turns[k] = fraction(dot64::<FMA>(pair.u, x[k], y[k], z[k]));
+        let depth_i = dot64::<FMA>(pair.i_hat, x[k], y[k], z[k]) + pair.limb_i;
+        let depth_j = dot64::<FMA>(pair.j_hat, x[k], y[k], z[k]) + pair.limb_j;
+        seen[k] = if depth_i.min(depth_j) >= 0.0 { 1.0 } else { 0.0 };
+    }
+    if let Some(dipole) = pair.dipole {
+        for k in 0..CHUNK {
+            let along = dot64::<FMA>(dipole, x[k], y[k], z[k]) as f32;
+            seen[k] *= fused::<FMA>(-along, along, 1.0);
+        }
+    }
+    let [re, im] = out;
+    for k in 0..CHUNK {
+        let (cos, sin) = cos_sin_turns::<FMA>(turns[k]);
+        re[k] = seen[k] * cos;
+        im[k] = -seen[k] * sin;
+    }
+}
