@@ -100,15 +100,21 @@ impl Array {
         let (sin_f, cos_f) = phase.sin_cos();
         let (sin_o, cos_o) = (self.node_rad + self.node_rate_rad_s * t_s).sin_cos();
         let (sin_i, cos_i) = self.inclination_rad.sin_cos();
-        let radial =
-            [cos_o * cos_f - sin_o * sin_f * cos_i, sin_o * cos_f + cos_o * sin_f * cos_i, sin_f * sin_i];
+        // The point of the orbital plane first, then turned into place, fused: fewer roundings than with the
+        // radius outside. Half a nanometre is 1e-10 of a turn at 30 MHz, as much as rows may be off.
+        let (along_node, across) = (radius * cos_f, radius * sin_f);
+        let position_m = [
+            (-sin_o * cos_i).mul_add(across, cos_o * along_node),
+            (cos_o * cos_i).mul_add(across, sin_o * along_node),
+            sin_i * across,
+        ];
         let along =
             [-cos_o * sin_f - sin_o * cos_f * cos_i, -sin_o * sin_f + cos_o * cos_f * cos_i, cos_f * sin_i];
-        let around = [-radial[1], radial[0], 0.0];
+        let around = [-position_m[1], position_m[0], 0.0];
         SatelliteState {
-            position_m: radial.map(|x| radius * x),
+            position_m,
             velocity_m_s: std::array::from_fn(|k| {
-                radius * (phase_rate * along[k] + self.node_rate_rad_s * around[k])
+                radius * phase_rate * along[k] + self.node_rate_rad_s * around[k]
             }),
         }
     }
