@@ -134,13 +134,12 @@ impl Columns {
     #[inline(always)]
     fn new<const FMA: bool>(field: &Field, x: &[f32; LANES], variance: f32) -> Self {
         let [constant, fx, fy, fxx, fxy, fyy] = *field;
-        let mut columns = Self { constant: [0.0; LANES], linear: [0.0; LANES], square: fyy };
-        for lane in 0..LANES {
-            let curved = fused::<FMA>(fxx, x[lane] * x[lane] - variance, constant - fyy * variance);
-            columns.constant[lane] = fused::<FMA>(fx, x[lane], curved);
-            columns.linear[lane] = fused::<FMA>(fxy, x[lane], fy);
+        let curved = |x: f32| fused::<FMA>(fxx, x * x - variance, constant - fyy * variance);
+        Self {
+            constant: x.map(|x| fused::<FMA>(fx, x, curved(x))),
+            linear: x.map(|x| fused::<FMA>(fxy, x, fy)),
+            square: fyy,
         }
-        columns
     }
 
     #[inline(always)]

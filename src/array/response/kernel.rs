@@ -93,8 +93,8 @@ pub(super) fn polynomial<const FMA: bool, const N: usize>(coefficients: &[f32; N
 /// points of 0 <= t^2 <= 1/4; then the formulas for the double angle.
 #[inline(always)]
 pub(super) fn cos_sin_turns<const FMA: bool>(turns: f32) -> (f32, f32) {
-    const SIN: [f32; 5] = [3.141_592_7, -5.167_710_3, 2.550_077_4, -0.598_291_3, 0.077_657_66];
-    const COS: [f32; 6] = [1.0, -4.934_802, 4.058_709, -1.335_212, 0.234_937_21, -0.024_396_325];
+    const SIN: [f32; 5] = [std::f32::consts::PI, -5.167_710_3, 2.550_077_4, -0.598_291_3, 0.077_657_66];
+    const COS: [f32; 6] = [1.0, -4.934_802, 4.058_709, -1.335_212, 0.234_937_2, -0.024_396_325];
     let square = turns * turns;
     let sin = turns * polynomial::<FMA, 5>(&SIN, square);
     let cos = polynomial::<FMA, 6>(&COS, square);
@@ -122,7 +122,7 @@ mod tests {
     #[test]
     fn fractions_of_many_turns_keep_their_bits() {
         // 100 km at 30 MHz is 1e4 turns.
-        for turns in [0.0, 0.25, -0.25, 10_006.922_9, -10_006.4999, 1e9 + 0.125] {
+        for turns in [0.0, 0.25, -0.25, 10_006.922_9, -10_006.499_9, 1e9 + 0.125] {
             let expected = turns - f64::round(turns);
             assert!((f64::from(fraction(turns)) - expected).abs() < 1e-7, "{turns}");
         }
