@@ -65,19 +65,19 @@ fn frames() -> Vec<GroundFrame> {
 
 fn encode(frames: &[GroundFrame]) -> Vec<u8> {
     let mut packetizer = Packetizer::new(&DownlinkConfig::default()).unwrap();
-    let mut octets = Vec::new();
+    let mut bytes = Vec::new();
     for frame in frames {
-        packetizer.encode(frame, &mut octets).unwrap();
+        packetizer.encode(frame, &mut bytes).unwrap();
     }
-    octets
+    bytes
 }
 
-/// The octets of each packet, by their own length fields.
-fn packets(octets: &[u8]) -> Vec<Vec<u8>> {
-    let mut rest = octets;
+/// The bytes of each packet, by their own length fields.
+fn packets(bytes: &[u8]) -> Vec<Vec<u8>> {
+    let mut rest = bytes;
     let mut packets = Vec::new();
     while let Some(header) = PacketHeader::parse(rest) {
-        let (packet, after) = rest.split_at(header.octets);
+        let (packet, after) = rest.split_at(header.bytes);
         packets.push(packet.to_vec());
         rest = after;
     }
@@ -85,8 +85,8 @@ fn packets(octets: &[u8]) -> Vec<Vec<u8>> {
     packets
 }
 
-/// Frames and account of octets that come in chunks; the account of octets must close.
-fn receive(octets: &[u8], chunk: usize) -> (Vec<GroundFrame>, ReceptionCounters) {
+/// Frames and account of bytes that come in chunks; the account of bytes must close.
+fn receive(bytes: &[u8], chunk: usize) -> (Vec<GroundFrame>, ReceptionCounters) {
     let mut receiver = Receiver::new();
     let mut decoder = Decoder::new();
     let mut frames = Vec::new();
@@ -95,7 +95,7 @@ fn receive(octets: &[u8], chunk: usize) -> (Vec<GroundFrame>, ReceptionCounters)
             frames.extend(decoder.accept(&event));
         }
     };
-    for part in octets.chunks(chunk) {
+    for part in bytes.chunks(chunk) {
         receiver.push(part);
         drain(&mut receiver);
     }
@@ -103,13 +103,11 @@ fn receive(octets: &[u8], chunk: usize) -> (Vec<GroundFrame>, ReceptionCounters)
     drain(&mut receiver);
     decoder.finish();
     let counters = decoder.counters().clone();
-    let in_packets: u64 = Kind::ALL.iter().map(|kind| counters.kind(*kind).octets).sum();
-    let others = counters.octets_garbage
-        + counters.octets_truncated
-        + counters.octets_damaged
-        + counters.octets_duplicate;
-    assert_eq!(counters.octets, octets.len() as u64);
-    assert_eq!(in_packets + others, counters.octets);
+    let in_packets: u64 = Kind::ALL.iter().map(|kind| counters.kind(*kind).bytes).sum();
+    let others =
+        counters.bytes_garbage + counters.bytes_truncated + counters.bytes_damaged + counters.bytes_duplicate;
+    assert_eq!(counters.bytes, bytes.len() as u64);
+    assert_eq!(in_packets + others, counters.bytes);
     (frames, counters)
 }
 
@@ -136,12 +134,12 @@ fn joined(frames: Vec<GroundFrame>) -> Vec<GroundFrame> {
 #[test]
 fn a_sound_stream_returns_what_was_sent_in_any_chunks() {
     let sent = frames();
-    let octets = encode(&sent);
+    let bytes = encode(&sent);
     for chunk in [1, 7, 1000, 8192, usize::MAX] {
-        let (received, counters) = receive(&octets, chunk);
+        let (received, counters) = receive(&bytes, chunk);
         assert_eq!(joined(received), sent, "chunk {chunk}");
         assert_eq!(counters.visibilities_decoded, 3 * 2 * 1007);
-        assert_eq!((counters.faults.total(), counters.octets_garbage), (0, 0));
+        assert_eq!((counters.faults.total(), counters.bytes_garbage), (0, 0));
     }
 }
 
