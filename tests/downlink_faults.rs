@@ -1,4 +1,5 @@
 //! What the ground makes of a downlink, sound or damaged.
+#![allow(clippy::unwrap_used)] // Also in the helpers.
 
 use lunarray::downlink::{
     Decoder, DownlinkConfig, Kind, PacketHeader, Packetizer, Receiver, ReceptionCounters,

@@ -7,7 +7,7 @@
 //! | payload: records and arrays | own, versioned | `payload` |
 //! | space packet, time code | CCSDS 133.0-B, 301.0-B | [`Packetizer`], [`Receiver`] |
 //! | transfer frame, Reed-Solomon, randomizer, sync marker | CCSDS 732.0-B, 131.0-B | not yet |
-//! | file | | [`DownlinkWriter`], [`DownlinkReader`] |
+//! | file | | [`DownlinkWriter`], [`DownlinkReader`], [`Contents`] |
 //!
 //! A frame layer slots in between packets and files: it takes the bytes that [`Packetizer::encode`] appends
 //! and hands what it recovers to [`Receiver::push`], whatever the chunks are. Idle packets are its own
@@ -32,6 +32,7 @@
 //! given a kind, a time and a count.
 
 mod config;
+pub mod contents;
 mod counters;
 mod cuc;
 mod decoder;
@@ -45,6 +46,7 @@ mod receiver;
 mod sequence;
 
 pub use config::DownlinkConfig;
+pub use contents::Contents;
 pub use counters::{FaultCounts, KindCounts, ReceptionCounters};
 pub use cuc::CucTime;
 pub use decoder::Decoder;
