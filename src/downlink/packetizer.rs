@@ -80,10 +80,8 @@ impl Packetizer {
             return Ok(());
         }
         self.bytes_since_repeat = 0;
-        if let Some(instrument) = self.instrument.take() {
-            let sent = self.send_instrument(&instrument, out);
-            self.instrument = Some(instrument);
-            sent?;
+        if let Some(instrument) = self.instrument.clone() {
+            self.send_instrument(&instrument, out)?;
         }
         let ephemeris = std::mem::take(&mut self.ephemeris);
         let sent = ephemeris.iter().try_for_each(|segment| self.send_ephemeris(segment, out));
