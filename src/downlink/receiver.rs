@@ -208,10 +208,12 @@ impl Receiver {
     /// Room for so many bytes behind those in the buffer.
     fn room(&mut self, bytes: usize) -> &mut [u8] {
         if self.end + bytes > self.buffer.len() {
-            self.buffer.copy_within(self.begin..self.end, 0);
-            self.offset += self.begin as u64;
-            self.end -= self.begin;
-            self.begin = 0;
+            if self.begin > 0 {
+                self.buffer.copy_within(self.begin..self.end, 0);
+                self.offset += self.begin as u64;
+                self.end -= self.begin;
+                self.begin = 0;
+            }
             if self.end + bytes > self.buffer.len() {
                 self.buffer.resize(self.end + bytes, 0);
             }
@@ -305,7 +307,7 @@ impl Receiver {
         match arrival {
             Arrival::AfterGap { expected } => self.steps.push_back(Step::Gap { header, expected }),
             Arrival::Restart { expected } => self.steps.push_back(Step::Restart { header, expected }),
-            Arrival::InOrder | Arrival::Late | Arrival::Duplicate => {}
+            Arrival::InOrder | Arrival::Late | Arrival::Early | Arrival::Duplicate => {}
         }
     }
 
@@ -319,5 +321,81 @@ impl Receiver {
             self.begin = self.end - bytes;
             self.steps.push_back(Step::Truncated { bytes });
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::Rng;
+
+    use super::*;
+    use crate::downlink::cuc::CucTime;
+    use crate::downlink::header::{FORMAT_VERSION, PACKET_BYTES_MAX, Segment};
+    use crate::units::{StreamKind, random_stream};
+
+    /// Bytes that a stream's events cover, and what the receiver ever held; it must have read all of it.
+    fn cover(stream: &mut impl Read) -> (u64, usize) {
+        let mut receiver = Receiver::new();
+        let (mut covered, mut held) = (0, 0);
+        loop {
+            if receiver.fill_from(stream).unwrap() == 0 {
+                receiver.finish();
+            }
+            while let Some(event) = receiver.next_event() {
+                covered += match event {
+                    Event::Packet(packet) => packet.header.bytes as u64,
+                    Event::Duplicate { header, .. } => header.bytes as u64,
+                    Event::Damaged { bytes, .. }
+                    | Event::Garbage { bytes, .. }
+                    | Event::Truncated { bytes, .. } => bytes,
+                    Event::Gap { .. } | Event::Restart { .. } => 0,
+                };
+            }
+            held = held.max(receiver.buffer.len());
+            if receiver.finished {
+                assert_eq!(covered, receiver.bytes());
+                return (covered, held);
+            }
+        }
+    }
+
+    const HELD_MAX: usize = PACKET_BYTES_MAX + HEADER_BYTES + CHUNK_BYTES;
+
+    #[test]
+    fn a_hundred_megabytes_of_noise_take_bounded_memory() {
+        struct Noise(rand_chacha::ChaCha8Rng, u64);
+        impl Read for Noise {
+            fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+                let bytes = out.len().min(self.1 as usize);
+                self.0.fill_bytes(&mut out[..bytes]);
+                self.1 -= bytes as u64;
+                Ok(bytes)
+            }
+        }
+        let mut noise = Noise(random_stream(2, StreamKind::Probe, [0, 0]), 100_000_000);
+        let (covered, held) = cover(&mut noise);
+        assert_eq!(covered, 100_000_000);
+        assert!(held <= HELD_MAX, "{held}");
+    }
+
+    #[test]
+    fn forged_headers_without_bodies_end_in_time() {
+        // Each names the greatest packet, so that each makes the receiver check 64 KiB.
+        let forged: Vec<u8> = (0..20_000)
+            .flat_map(|count| {
+                PacketHeader {
+                    kind: Kind::Visibilities,
+                    segment: Segment::Whole,
+                    count: 2 * count,
+                    time: CucTime(1),
+                    version: FORMAT_VERSION,
+                    bytes: PACKET_BYTES_MAX,
+                }
+                .to_bytes()
+            })
+            .collect();
+        let (covered, held) = cover(&mut forged.as_slice());
+        assert_eq!(covered, forged.len() as u64);
+        assert!(held <= HELD_MAX);
     }
 }
