@@ -31,7 +31,8 @@ pub struct Packetizer {
     ephemeris: Vec<EphemerisSegment>,
     ephemeris_is_open: bool,
     bytes_since_repeat: u64,
-    now: MissionTime,
+    /// Latest time of anything sampled so far.
+    now: Option<MissionTime>,
     counts: [u64; Kind::ALL.len()],
     payload: Vec<u8>,
 }
@@ -52,7 +53,7 @@ impl Packetizer {
             ephemeris: Vec::new(),
             ephemeris_is_open: false,
             bytes_since_repeat: 0,
-            now: MissionTime(0),
+            now: None,
             counts: [0; Kind::ALL.len()],
             payload: Vec::new(),
         })
@@ -108,7 +109,8 @@ impl Packetizer {
                 self.ephemeris_is_open = false;
                 self.payload.clear();
                 encode_housekeeping(counts, &mut self.payload)?;
-                self.send_payload(Kind::Housekeeping, counts.time, out)
+                let now = self.advance(counts.time);
+                self.send_payload(Kind::Housekeeping, now, out)
             }
         }
     }
@@ -116,14 +118,16 @@ impl Packetizer {
     fn send_instrument(&mut self, instrument: &Instrument, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         self.payload.clear();
         encode_instrument(instrument, &mut self.payload)?;
-        self.send_payload(Kind::Instrument, self.now, out)
+        self.send_payload(Kind::Instrument, self.now.unwrap_or_default(), out)
     }
 
     fn send_ephemeris(&mut self, segment: &EphemerisSegment, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         let instrument = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?;
         self.payload.clear();
         encode_ephemeris(segment, instrument, &mut self.payload)?;
-        self.send_payload(Kind::Ephemeris, segment.start, out)
+        // Positions are known ahead: they do not move the clock on.
+        let now = *self.now.get_or_insert(segment.start);
+        self.send_payload(Kind::Ephemeris, now, out)
     }
 
     fn remember(&mut self, segment: &EphemerisSegment) {
@@ -143,7 +147,8 @@ impl Packetizer {
             let range = first..block.len().min(first + each);
             let last = range.end - 1;
             let end = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);
-            let time = self.time(block.start.plus_ticks(end))?;
+            let now = self.advance(block.start.plus_ticks(end));
+            let time = self.code(now)?;
             let start = out.len();
             out.resize(start + HEADER_BYTES, 0);
             encode_visibilities(block, range, out)?;
@@ -159,7 +164,7 @@ impl Packetizer {
         time: MissionTime,
         out: &mut Vec<u8>,
     ) -> Result<(), DownlinkError> {
-        let time = self.time(time)?;
+        let time = self.code(time)?;
         let payload = std::mem::take(&mut self.payload);
         let each = self.packet_bytes_max - HEADER_BYTES - TRAILER_BYTES;
         let segments = payload.len().div_ceil(each);
@@ -190,13 +195,14 @@ impl Packetizer {
         out.extend_from_slice(&check);
     }
 
-    /// The time code of a packet made now: the latest time of anything sent so far.
-    fn time(&mut self, time: MissionTime) -> Result<CucTime, DownlinkError> {
+    /// Moves the clock on to `time`, never back; packets are made at what it shows.
+    fn advance(&mut self, time: MissionTime) -> MissionTime {
+        *self.now.insert(self.now.map_or(time, |now| now.max(time)))
+    }
+
+    fn code(&self, time: MissionTime) -> Result<CucTime, DownlinkError> {
         let epoch_tai_s = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?.epoch_tai_s;
-        let now = self.now.max(time);
-        let error = || DownlinkError::Time { epoch_tai_s, time_s: now.seconds() };
-        let code = CucTime::new(epoch_tai_s, now).ok_or_else(error)?;
-        self.now = now;
-        Ok(code)
+        let error = || DownlinkError::Time { epoch_tai_s, time_s: time.seconds() };
+        CucTime::new(epoch_tai_s, time).ok_or_else(error)
     }
 }
