@@ -284,7 +284,8 @@ impl Coverage {
         EphemerisSummary {
             segments,
             nodes,
-            covered_s: each().map(|[start_s, end_s]| end_s - start_s).sum(),
+            // An empty sum of f64 is -0.
+            covered_s: each().fold(0.0, |sum, [start_s, end_s]| sum + (end_s - start_s)),
             covered: Listing {
                 count: self.stretches.len() as u64,
                 listed: each().take(LISTED_MAX).collect(),
