@@ -10,8 +10,8 @@ use super::payload::PayloadFault;
 pub struct KindCounts {
     /// Good packets, duplicates left out.
     pub packets: u64,
-    /// Octets of those.
-    pub octets: u64,
+    /// Bytes of those.
+    pub bytes: u64,
     /// Packets whose headers hold but whose body does not.
     pub damaged: u64,
     /// Packets that had been here before.
@@ -63,22 +63,22 @@ impl FaultCounts {
 
 /// The account of a reception.
 ///
-/// `octets = octets_garbage + octets_truncated + octets_damaged + octets_duplicate +` those of the kinds'
+/// `bytes = bytes_garbage + bytes_truncated + bytes_damaged + bytes_duplicate +` those of the kinds'
 /// packets. Visibilities in good packets are `decoded + bad_value + refused + before_instrument + foreign`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ReceptionCounters {
-    /// Octets received.
-    pub octets: u64,
-    /// Octets that belong to no packet.
-    pub octets_garbage: u64,
+    /// Bytes received.
+    pub bytes: u64,
+    /// Bytes that belong to no packet.
+    pub bytes_garbage: u64,
     /// Stretches of those.
     pub garbage_stretches: u64,
-    /// Octets of unfinished packets at the end of a stream.
-    pub octets_truncated: u64,
-    /// Octets of damaged packets.
-    pub octets_damaged: u64,
-    /// Octets of packets that had been here before.
-    pub octets_duplicate: u64,
+    /// Bytes of unfinished packets at the end of a stream.
+    pub bytes_truncated: u64,
+    /// Bytes of damaged packets.
+    pub bytes_damaged: u64,
+    /// Bytes of packets that had been here before.
+    pub bytes_duplicate: u64,
     /// Instrument descriptions.
     pub instrument: KindCounts,
     /// Satellite positions.

@@ -4,10 +4,10 @@ use serde::Serialize;
 
 use crate::units::{MissionTime, TICKS_PER_SECOND};
 
-/// P-field: no extension, time code 001 (TAI since 1958-01-01), 4 octets of seconds, 3 of fraction.
+/// P-field: no extension, time code 001 (TAI since 1958-01-01), 4 bytes of seconds, 3 of fraction.
 pub(super) const P_FIELD: u8 = 0x1F;
 
-/// Seconds of the epoch that 4 octets can count.
+/// Seconds of the epoch that 4 bytes can count.
 const SECONDS_MAX: f64 = u32::MAX as f64;
 
 /// TAI since 1958-01-01 in units of 2^-24 s (60 ns).
@@ -38,17 +38,17 @@ impl CucTime {
 
     /// P-field and T-field.
     #[must_use]
-    pub fn to_octets(self) -> [u8; 8] {
-        let mut octets = self.0.to_be_bytes();
-        octets[0] = P_FIELD;
-        octets
+    pub fn to_bytes(self) -> [u8; 8] {
+        let mut bytes = self.0.to_be_bytes();
+        bytes[0] = P_FIELD;
+        bytes
     }
 
-    /// The time that eight octets express; `None` if their P-field is another than ours.
+    /// The time that eight bytes express; `None` if their P-field is another than ours.
     #[must_use]
-    pub fn from_octets(mut octets: [u8; 8]) -> Option<Self> {
-        let p_field = std::mem::take(&mut octets[0]);
-        (p_field == P_FIELD).then(|| Self(u64::from_be_bytes(octets)))
+    pub fn from_bytes(mut bytes: [u8; 8]) -> Option<Self> {
+        let p_field = std::mem::take(&mut bytes[0]);
+        (p_field == P_FIELD).then(|| Self(u64::from_be_bytes(bytes)))
     }
 }
 
@@ -57,11 +57,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn octets_are_those_of_the_standard() {
+    fn bytes_are_those_of_the_standard() {
         // 2020-01-01T00:00:00 TAI is 22645 days after 1958-01-01: 1 956 528 000 s = 0x749E_3F80.
         let time = CucTime::new(1_956_528_000.0, MissionTime(500_000)).unwrap();
-        assert_eq!(time.to_octets(), [0x1F, 0x74, 0x9E, 0x3F, 0x80, 0x80, 0, 0]);
-        assert_eq!(CucTime::from_octets(time.to_octets()), Some(time));
+        assert_eq!(time.to_bytes(), [0x1F, 0x74, 0x9E, 0x3F, 0x80, 0x80, 0, 0]);
+        assert_eq!(CucTime::from_bytes(time.to_bytes()), Some(time));
         assert_eq!(time.tai_s(), 1_956_528_000.5);
     }
 

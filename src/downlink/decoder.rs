@@ -12,14 +12,14 @@ use super::receiver::{Event, Packet};
 use crate::frames::{GroundFrame, Instrument};
 
 /// Greatest payload that is put together from segments; a window's ephemeris is a thousandth of it.
-const PAYLOAD_OCTETS_MAX: usize = 1 << 24;
+const PAYLOAD_BYTES_MAX: usize = 1 << 24;
 
 /// A payload of which not all segments have come.
 #[derive(Debug)]
 struct Partial {
     next: u64,
     time: CucTime,
-    octets: Vec<u8>,
+    bytes: Vec<u8>,
 }
 
 /// What an instrument description says, compared with what is known.
@@ -58,29 +58,29 @@ impl Decoder {
         match *event {
             Event::Packet(packet) => return self.take_packet(packet),
             Event::Duplicate { header, .. } => {
-                counters.octets += header.octets as u64;
-                counters.octets_duplicate += header.octets as u64;
+                counters.bytes += header.bytes as u64;
+                counters.bytes_duplicate += header.bytes as u64;
                 counters.kind_mut(header.kind).duplicates += 1;
             }
-            Event::Damaged { header, octets, .. } => {
-                counters.octets += octets;
-                counters.octets_damaged += octets;
+            Event::Damaged { header, bytes, .. } => {
+                counters.bytes += bytes;
+                counters.bytes_damaged += bytes;
                 counters.kind_mut(header.kind).damaged += 1;
             }
-            Event::Gap { kind, expected, found, .. } => {
-                let counts = counters.kind_mut(kind);
+            Event::Gap { header, expected, .. } => {
+                let counts = counters.kind_mut(header.kind);
                 counts.gaps += 1;
-                counts.missing += found - expected;
+                counts.missing += header.count - expected;
             }
-            Event::Restart { kind, .. } => counters.kind_mut(kind).restarts += 1,
-            Event::Garbage { octets, .. } => {
-                counters.octets += octets;
-                counters.octets_garbage += octets;
+            Event::Restart { header, .. } => counters.kind_mut(header.kind).restarts += 1,
+            Event::Garbage { bytes, .. } => {
+                counters.bytes += bytes;
+                counters.bytes_garbage += bytes;
                 counters.garbage_stretches += 1;
             }
-            Event::Truncated { octets, .. } => {
-                counters.octets += octets;
-                counters.octets_truncated += octets;
+            Event::Truncated { bytes, .. } => {
+                counters.bytes += bytes;
+                counters.bytes_truncated += bytes;
             }
         }
         None
@@ -111,11 +111,11 @@ impl Decoder {
     }
 
     fn take_packet(&mut self, packet: Packet<'_>) -> Option<GroundFrame> {
-        let PacketHeader { kind, segment, version, octets, .. } = packet.header;
-        self.counters.octets += octets as u64;
+        let PacketHeader { kind, segment, version, bytes, .. } = packet.header;
+        self.counters.bytes += bytes as u64;
         let counts = self.counters.kind_mut(kind);
         counts.packets += 1;
-        counts.octets += octets as u64;
+        counts.bytes += bytes as u64;
         counts.late += u64::from(packet.late);
         if version != FORMAT_VERSION {
             return self.refuse(packet, PayloadFault::Version { found: version, expected: FORMAT_VERSION });
@@ -133,24 +133,24 @@ impl Decoder {
         let PacketHeader { kind, segment, count, time, .. } = packet.header;
         if segment == Segment::First {
             self.give_up(kind);
-            let octets = packet.payload.to_vec();
-            self.partial[kind.index()] = Some(Partial { next: count + 1, time, octets });
+            let bytes = packet.payload.to_vec();
+            self.partial[kind.index()] = Some(Partial { next: count + 1, time, bytes });
             return None;
         }
         let fits = |partial: &Partial| {
             partial.next == count
                 && partial.time == time
-                && partial.octets.len() + packet.payload.len() <= PAYLOAD_OCTETS_MAX
+                && partial.bytes.len() + packet.payload.len() <= PAYLOAD_BYTES_MAX
         };
         let Some(mut partial) = self.partial[kind.index()].take_if(|partial| fits(partial)) else {
             self.give_up(kind);
             self.counters.kind_mut(kind).orphans += 1;
             return None;
         };
-        partial.octets.extend_from_slice(packet.payload);
+        partial.bytes.extend_from_slice(packet.payload);
         partial.next += 1;
         if segment == Segment::Last {
-            return Some(partial.octets);
+            return Some(partial.bytes);
         }
         self.partial[kind.index()] = Some(partial);
         None

@@ -48,7 +48,7 @@ pub enum DownlinkError {
         /// What the system said.
         source: io::Error,
     },
-    /// A file without a single octet.
+    /// A file without a single byte.
     #[error("{}: the file is empty; expected CCSDS space packets as `lunarray simulate` writes them", path.display())]
     Empty {
         /// The file.
@@ -56,7 +56,7 @@ pub enum DownlinkError {
     },
     /// A file in which nothing of ours was found.
     #[error(
-        "{}: not one downlink packet in {octets} octets; expected CCSDS space packets with APIDs 0x101 to \
+        "{}: not one downlink packet in {bytes} bytes; expected CCSDS space packets with APIDs 0x101 to \
          0x105 and CUC times (P-field 0x1F), as `lunarray simulate` writes them",
         path.display()
     )]
@@ -64,6 +64,6 @@ pub enum DownlinkError {
         /// The file.
         path: PathBuf,
         /// Its length.
-        octets: u64,
+        bytes: u64,
     },
 }

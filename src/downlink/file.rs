@@ -12,8 +12,8 @@ use super::packetizer::Packetizer;
 use super::receiver::{Event, Receiver};
 use crate::frames::GroundFrame;
 
-/// Octets that are gathered before they are written.
-const WRITE_OCTETS: usize = 1 << 20;
+/// Bytes that are gathered before they are written.
+const WRITE_BYTES: usize = 1 << 20;
 
 /// Writes frames to a file of packets.
 ///
@@ -26,7 +26,7 @@ pub struct DownlinkWriter {
     file: File,
     packetizer: Packetizer,
     pending: Vec<u8>,
-    octets: u64,
+    bytes: u64,
 }
 
 impl DownlinkWriter {
@@ -40,7 +40,7 @@ impl DownlinkWriter {
         name.push(".partial");
         let partial_path = PathBuf::from(name);
         let file = File::create(&partial_path).map_err(io_error(&partial_path, "create the file"))?;
-        Ok(Self { path: path.to_owned(), partial_path, file, packetizer, pending: Vec::new(), octets: 0 })
+        Ok(Self { path: path.to_owned(), partial_path, file, packetizer, pending: Vec::new(), bytes: 0 })
     }
 
     /// Appends the packets of a frame.
@@ -49,16 +49,16 @@ impl DownlinkWriter {
     /// Those of [`Packetizer::encode`], and a file that cannot be written.
     pub fn write(&mut self, frame: &GroundFrame) -> Result<(), DownlinkError> {
         self.packetizer.encode(frame, &mut self.pending)?;
-        if self.pending.len() >= WRITE_OCTETS { self.flush() } else { Ok(()) }
+        if self.pending.len() >= WRITE_BYTES { self.flush() } else { Ok(()) }
     }
 
-    /// Octets of all packets so far.
+    /// Bytes of all packets so far.
     #[must_use]
-    pub fn octets(&self) -> u64 {
-        self.octets + self.pending.len() as u64
+    pub fn bytes(&self) -> u64 {
+        self.bytes + self.pending.len() as u64
     }
 
-    /// Puts everything on the disk and gives the file its name; returns its length in octets.
+    /// Puts everything on the disk and gives the file its name; returns its length in bytes.
     ///
     /// # Errors
     /// A file that cannot be written or renamed.
@@ -71,12 +71,12 @@ impl DownlinkWriter {
         File::open(folder)
             .and_then(|folder| folder.sync_all())
             .map_err(io_error(folder, "put the folder on the disk"))?;
-        Ok(self.octets)
+        Ok(self.bytes)
     }
 
     fn flush(&mut self) -> Result<(), DownlinkError> {
         self.file.write_all(&self.pending).map_err(io_error(&self.partial_path, "write"))?;
-        self.octets += self.pending.len() as u64;
+        self.bytes += self.pending.len() as u64;
         self.pending.clear();
         Ok(())
     }
@@ -159,15 +159,15 @@ impl<R: Read> DownlinkReader<R> {
 
     fn end(&mut self) -> Result<(), DownlinkError> {
         self.decoder.finish();
-        require_packets(&self.path, self.receiver.octets(), self.packets)
+        require_packets(&self.path, self.receiver.bytes(), self.packets)
     }
 }
 
-/// An error for a file of so many octets if there was no packet in it.
-pub(super) fn require_packets(path: &Path, octets: u64, packets: u64) -> Result<(), DownlinkError> {
-    match (octets, packets) {
+/// An error for a file of so many bytes if there was no packet in it.
+pub(super) fn require_packets(path: &Path, bytes: u64, packets: u64) -> Result<(), DownlinkError> {
+    match (bytes, packets) {
         (0, _) => Err(DownlinkError::Empty { path: path.to_owned() }),
-        (_, 0) => Err(DownlinkError::Foreign { path: path.to_owned(), octets }),
+        (_, 0) => Err(DownlinkError::Foreign { path: path.to_owned(), bytes }),
         _ => Ok(()),
     }
 }

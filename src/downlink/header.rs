@@ -8,16 +8,16 @@ use super::kind::Kind;
 /// Version of headers and payloads; a receiver skips packets of another one and counts them.
 pub const FORMAT_VERSION: u8 = 1;
 
-/// Octets before the payload.
-pub const HEADER_OCTETS: usize = 22;
+/// Bytes before the payload.
+pub const HEADER_BYTES: usize = 22;
 
-/// Octets after the payload: CRC-32C.
-pub const TRAILER_OCTETS: usize = 4;
+/// Bytes after the payload: CRC-32C.
+pub const TRAILER_BYTES: usize = 4;
 
 /// Greatest packet that the 16-bit length field allows.
-pub const PACKET_OCTETS_MAX: usize = 65_542;
+pub const PACKET_BYTES_MAX: usize = 65_542;
 
-const PRIMARY_OCTETS: usize = 6;
+const PRIMARY_BYTES: usize = 6;
 const MAGIC: u8 = 0x4C;
 /// Version 000, telemetry, secondary header: the bits above the APID.
 const IDENTIFICATION: u16 = 1 << 11;
@@ -53,26 +53,26 @@ pub struct PacketHeader {
     pub time: CucTime,
     /// Format version.
     pub version: u8,
-    /// Octets of the packet from the first of its headers to the last of its check.
-    pub octets: usize,
+    /// Bytes of the packet from the first of its headers to the last of its check.
+    pub bytes: usize,
 }
 
 impl PacketHeader {
     /// The headers as they are sent.
     ///
-    /// `octets` must be in `HEADER_OCTETS + TRAILER_OCTETS ..= PACKET_OCTETS_MAX`.
+    /// `bytes` must be in `HEADER_BYTES + TRAILER_BYTES ..= PACKET_BYTES_MAX`.
     #[must_use]
-    pub fn to_octets(&self) -> [u8; HEADER_OCTETS] {
+    pub fn to_bytes(&self) -> [u8; HEADER_BYTES] {
         let identification = IDENTIFICATION | self.kind.apid();
         let low = (self.count & ((1 << COUNT_BITS) - 1)) as u16;
         let sequence = u16::from(self.segment as u8) << COUNT_BITS | low;
-        let length = self.octets.saturating_sub(PRIMARY_OCTETS + 1) as u16;
+        let length = self.bytes.saturating_sub(PRIMARY_BYTES + 1) as u16;
         let high = (self.count >> COUNT_BITS) as u32;
-        let mut out = [0; HEADER_OCTETS];
+        let mut out = [0; HEADER_BYTES];
         out[0..2].copy_from_slice(&identification.to_be_bytes());
         out[2..4].copy_from_slice(&sequence.to_be_bytes());
         out[4..6].copy_from_slice(&length.to_be_bytes());
-        out[6..14].copy_from_slice(&self.time.to_octets());
+        out[6..14].copy_from_slice(&self.time.to_bytes());
         out[14] = MAGIC;
         out[15] = self.version;
         out[16..20].copy_from_slice(&high.to_be_bytes());
@@ -81,21 +81,21 @@ impl PacketHeader {
         out
     }
 
-    /// The headers that `octets` begin with; `None` if they are not ours or their check fails.
+    /// The headers that `bytes` begin with; `None` if they are not ours or their check fails.
     #[must_use]
-    pub fn parse(octets: &[u8]) -> Option<Self> {
-        let octets: &[u8; HEADER_OCTETS] = octets.first_chunk()?;
-        let word = |at: usize| u16::from_be_bytes([octets[at], octets[at + 1]]);
+    pub fn parse(bytes: &[u8]) -> Option<Self> {
+        let bytes: &[u8; HEADER_BYTES] = bytes.first_chunk()?;
+        let word = |at: usize| u16::from_be_bytes([bytes[at], bytes[at + 1]]);
         let kind = Kind::of_apid(word(0) ^ IDENTIFICATION)?;
-        let length = usize::from(word(4)) + PRIMARY_OCTETS + 1;
-        if octets[14] != MAGIC || length < HEADER_OCTETS + TRAILER_OCTETS {
+        let length = usize::from(word(4)) + PRIMARY_BYTES + 1;
+        if bytes[14] != MAGIC || length < HEADER_BYTES + TRAILER_BYTES {
             return None;
         }
-        let time = CucTime::from_octets(*octets[6..].first_chunk()?)?;
-        if word(20) != header_check(octets) {
+        let time = CucTime::from_bytes(*bytes[6..].first_chunk()?)?;
+        if word(20) != header_check(bytes) {
             return None;
         }
-        let high = u32::from_be_bytes(*octets[16..].first_chunk()?);
+        let high = u32::from_be_bytes(*bytes[16..].first_chunk()?);
         Some(Self {
             kind,
             segment: match word(2) >> COUNT_BITS {
@@ -106,28 +106,28 @@ impl PacketHeader {
             },
             count: u64::from(high) << COUNT_BITS | u64::from(word(2) & ((1 << COUNT_BITS) - 1)),
             time,
-            version: octets[15],
-            octets: length,
+            version: bytes[15],
+            bytes: length,
         })
     }
 
-    /// First octet of every packet: the APIDs have their upper three bits in common.
-    pub(super) const FIRST_OCTET: u8 = ((IDENTIFICATION | super::kind::APID_BASE) >> 8) as u8;
+    /// First byte of every packet: the APIDs have their upper three bits in common.
+    pub(super) const FIRST_BYTE: u8 = ((IDENTIFICATION | super::kind::APID_BASE) >> 8) as u8;
 }
 
-/// CRC-16 as CCSDS has it (0x1021, start 0xFFFF, not reflected) of the octets before the check.
-fn header_check(octets: &[u8; HEADER_OCTETS]) -> u16 {
-    checksum(CrcAlgorithm::Crc16Ibm3740, &octets[..HEADER_OCTETS - 2]) as u16
+/// CRC-16 as CCSDS has it (0x1021, start 0xFFFF, not reflected) of the bytes before the check.
+fn header_check(bytes: &[u8; HEADER_BYTES]) -> u16 {
+    checksum(CrcAlgorithm::Crc16Ibm3740, &bytes[..HEADER_BYTES - 2]) as u16
 }
 
-/// CRC-32C of a packet without its last four octets.
-pub(super) fn packet_check(octets: &[u8]) -> [u8; TRAILER_OCTETS] {
-    crc_fast::crc32_iscsi(octets).to_be_bytes()
+/// CRC-32C of a packet without its last four bytes.
+pub(super) fn packet_check(bytes: &[u8]) -> [u8; TRAILER_BYTES] {
+    crc_fast::crc32_iscsi(bytes).to_be_bytes()
 }
 
-/// Whether the last four octets of a packet are the check of the others.
-pub(super) fn packet_holds(octets: &[u8]) -> bool {
-    octets.split_last_chunk().is_some_and(|(body, check)| packet_check(body) == *check)
+/// Whether the last four bytes of a packet are the check of the others.
+pub(super) fn packet_holds(bytes: &[u8]) -> bool {
+    bytes.split_last_chunk().is_some_and(|(body, check)| packet_check(body) == *check)
 }
 
 #[cfg(test)]
@@ -141,18 +141,18 @@ mod tests {
             count: (5 << 14) | 7,
             time: CucTime(0x749E_3B80 << 24),
             version: FORMAT_VERSION,
-            octets: 100,
+            bytes: 100,
         }
     }
 
     #[test]
     fn fields_stand_where_the_standard_puts_them() {
-        let octets = header().to_octets();
+        let bytes = header().to_bytes();
         // Version 000, type 0, secondary header 1, APID 0x103; flags 11, count 7; length 100 - 7.
-        assert_eq!(octets[..6], [0x09, 0x03, 0xC0, 0x07, 0x00, 93]);
-        assert_eq!(octets[0], PacketHeader::FIRST_OCTET);
-        assert_eq!(octets[16..20], [0, 0, 0, 5]);
-        assert_eq!(PacketHeader::parse(&octets), Some(header()));
+        assert_eq!(bytes[..6], [0x09, 0x03, 0xC0, 0x07, 0x00, 93]);
+        assert_eq!(bytes[0], PacketHeader::FIRST_BYTE);
+        assert_eq!(bytes[16..20], [0, 0, 0, 5]);
+        assert_eq!(PacketHeader::parse(&bytes), Some(header()));
     }
 
     #[test]
@@ -164,9 +164,9 @@ mod tests {
 
     #[test]
     fn any_flipped_bit_of_the_header_is_noticed() {
-        let octets = header().to_octets();
-        for bit in 0..8 * HEADER_OCTETS {
-            let mut flipped = octets;
+        let bytes = header().to_bytes();
+        for bit in 0..8 * HEADER_BYTES {
+            let mut flipped = bytes;
             flipped[bit / 8] ^= 1 << (bit % 8);
             assert_eq!(PacketHeader::parse(&flipped), None, "bit {bit}");
         }
@@ -175,7 +175,7 @@ mod tests {
     #[test]
     fn greatest_count_and_length_survive() {
         let header =
-            PacketHeader { count: COUNT_MAX, octets: PACKET_OCTETS_MAX, segment: Segment::Last, ..header() };
-        assert_eq!(PacketHeader::parse(&header.to_octets()), Some(header));
+            PacketHeader { count: COUNT_MAX, bytes: PACKET_BYTES_MAX, segment: Segment::Last, ..header() };
+        assert_eq!(PacketHeader::parse(&header.to_bytes()), Some(header));
     }
 }

@@ -7,21 +7,21 @@
 //! | payload: records and arrays | own, versioned | `payload` |
 //! | space packet, time code | CCSDS 133.0-B, 301.0-B | [`Packetizer`], [`Receiver`] |
 //! | transfer frame, Reed-Solomon, randomizer, sync marker | CCSDS 732.0-B, 131.0-B | not yet |
-//! | file | | [`DownlinkWriter`], [`DownlinkReader`] |
+//! | file | | [`DownlinkWriter`], [`DownlinkReader`], [`Contents`] |
 //!
-//! A frame layer slots in between packets and files: it takes the octets that [`Packetizer::encode`] appends
+//! A frame layer slots in between packets and files: it takes the bytes that [`Packetizer::encode`] appends
 //! and hands what it recovers to [`Receiver::push`], whatever the chunks are. Idle packets are its own
 //! affair and never reach the receiver.
 //!
 //! # A packet
-//! | octet | field | |
+//! | byte | field | |
 //! |---|---|---|
 //! | 0-5 | primary header | telemetry, secondary header present, APID of the [`Kind`]; segmentation flags, low 14 bits of the packet count; length |
-//! | 6-13 | secondary header | CUC time, P-field 0x1F: TAI since 1958-01-01, 4 + 3 octets; the time at which the packet was made: it never goes back |
+//! | 6-13 | secondary header | CUC time, P-field 0x1F: TAI since 1958-01-01, 4 + 3 bytes; the time at which the packet was made: it never goes back |
 //! | 14 | magic | 0x4C |
 //! | 15 | version | [`FORMAT_VERSION`] |
 //! | 16-19 | packet count, bits 14-45 | the count of 46 bits never wraps, so a gap is never ambiguous |
-//! | 20-21 | header check | CRC-16 (0x1021, start 0xFFFF) of octets 0-19 |
+//! | 20-21 | header check | CRC-16 (0x1021, start 0xFFFF) of bytes 0-19 |
 //! | 22.. | payload, or a segment of it | |
 //! | last 4 | packet check | CRC-32C of everything before it, big-endian |
 //!
@@ -32,6 +32,7 @@
 //! given a kind, a time and a count.
 
 mod config;
+pub mod contents;
 mod counters;
 mod cuc;
 mod decoder;
@@ -45,12 +46,13 @@ mod receiver;
 mod sequence;
 
 pub use config::DownlinkConfig;
+pub use contents::Contents;
 pub use counters::{FaultCounts, KindCounts, ReceptionCounters};
 pub use cuc::CucTime;
 pub use decoder::Decoder;
 pub use error::DownlinkError;
 pub use file::{DownlinkReader, DownlinkWriter};
-pub use header::{FORMAT_VERSION, HEADER_OCTETS, PACKET_OCTETS_MAX, PacketHeader, Segment, TRAILER_OCTETS};
+pub use header::{FORMAT_VERSION, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, Segment, TRAILER_BYTES};
 pub use kind::{APID_BASE, Kind};
 pub use packetizer::Packetizer;
 pub use payload::{NODES_MIN, PayloadFault};

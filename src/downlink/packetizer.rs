@@ -4,7 +4,7 @@ use super::config::DownlinkConfig;
 use super::cuc::CucTime;
 use super::error::DownlinkError;
 use super::header::{
-    COUNT_MAX, FORMAT_VERSION, HEADER_OCTETS, PacketHeader, Segment, TRAILER_OCTETS, packet_check,
+    COUNT_MAX, FORMAT_VERSION, HEADER_BYTES, PacketHeader, Segment, TRAILER_BYTES, packet_check,
 };
 use super::kind::Kind;
 use super::payload::{
@@ -24,14 +24,15 @@ const REPEATED_SEGMENTS_MAX: usize = 8;
 /// and the latest ephemeris segments are repeated now and then.
 #[derive(Debug)]
 pub struct Packetizer {
-    packet_octets_max: usize,
-    repeat_octets: u64,
+    packet_bytes_max: usize,
+    repeat_bytes: u64,
     instrument: Option<Instrument>,
     /// The segments sent since the last frame of another kind.
     ephemeris: Vec<EphemerisSegment>,
     ephemeris_is_open: bool,
-    octets_since_repeat: u64,
-    now: MissionTime,
+    bytes_since_repeat: u64,
+    /// Latest time of anything sampled so far.
+    now: Option<MissionTime>,
     counts: [u64; Kind::ALL.len()],
     payload: Vec<u8>,
 }
@@ -46,13 +47,13 @@ impl Packetizer {
             return Err(problem);
         }
         Ok(Self {
-            packet_octets_max: config.packet_octets_max,
-            repeat_octets: config.repeat_octets,
+            packet_bytes_max: config.packet_bytes_max,
+            repeat_bytes: config.repeat_bytes,
             instrument: None,
             ephemeris: Vec::new(),
             ephemeris_is_open: false,
-            octets_since_repeat: 0,
-            now: MissionTime(0),
+            bytes_since_repeat: 0,
+            now: None,
             counts: [0; Kind::ALL.len()],
             payload: Vec::new(),
         })
@@ -70,20 +71,18 @@ impl Packetizer {
             out.truncate(start);
             (self.counts, self.now) = (counts, now);
         }
-        self.octets_since_repeat += (out.len() - start) as u64;
+        self.bytes_since_repeat += (out.len() - start) as u64;
         result
     }
 
     /// Sends instrument and ephemeris again if it is time for that.
     fn repeat(&mut self, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
-        if self.octets_since_repeat < self.repeat_octets {
+        if self.bytes_since_repeat < self.repeat_bytes {
             return Ok(());
         }
-        self.octets_since_repeat = 0;
-        if let Some(instrument) = self.instrument.take() {
-            let sent = self.send_instrument(&instrument, out);
-            self.instrument = Some(instrument);
-            sent?;
+        self.bytes_since_repeat = 0;
+        if let Some(instrument) = self.instrument.clone() {
+            self.send_instrument(&instrument, out)?;
         }
         let ephemeris = std::mem::take(&mut self.ephemeris);
         let sent = ephemeris.iter().try_for_each(|segment| self.send_ephemeris(segment, out));
@@ -110,7 +109,8 @@ impl Packetizer {
                 self.ephemeris_is_open = false;
                 self.payload.clear();
                 encode_housekeeping(counts, &mut self.payload)?;
-                self.send_payload(Kind::Housekeeping, counts.time, out)
+                let now = self.advance(counts.time);
+                self.send_payload(Kind::Housekeeping, now, out)
             }
         }
     }
@@ -118,14 +118,16 @@ impl Packetizer {
     fn send_instrument(&mut self, instrument: &Instrument, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         self.payload.clear();
         encode_instrument(instrument, &mut self.payload)?;
-        self.send_payload(Kind::Instrument, self.now, out)
+        self.send_payload(Kind::Instrument, self.now.unwrap_or_default(), out)
     }
 
     fn send_ephemeris(&mut self, segment: &EphemerisSegment, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         let instrument = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?;
         self.payload.clear();
         encode_ephemeris(segment, instrument, &mut self.payload)?;
-        self.send_payload(Kind::Ephemeris, segment.start, out)
+        // Positions are known ahead: they do not move the clock on.
+        let now = *self.now.get_or_insert(segment.start);
+        self.send_payload(Kind::Ephemeris, now, out)
     }
 
     fn remember(&mut self, segment: &EphemerisSegment) {
@@ -140,14 +142,15 @@ impl Packetizer {
     fn send_visibilities(&mut self, block: &VisibilityBlock, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         let instrument = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?;
         check_visibilities(block, instrument)?;
-        let each = visibilities_in(self.packet_octets_max - HEADER_OCTETS - TRAILER_OCTETS);
+        let each = visibilities_in(self.packet_bytes_max - HEADER_BYTES - TRAILER_BYTES);
         for first in (0..block.len()).step_by(each) {
             let range = first..block.len().min(first + each);
             let last = range.end - 1;
             let end = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);
-            let time = self.time(block.start.plus_ticks(end))?;
+            let now = self.advance(block.start.plus_ticks(end));
+            let time = self.code(now)?;
             let start = out.len();
-            out.resize(start + HEADER_OCTETS, 0);
+            out.resize(start + HEADER_BYTES, 0);
             encode_visibilities(block, range, out)?;
             self.seal(Kind::Visibilities, Segment::Whole, time, start, out);
         }
@@ -161,9 +164,9 @@ impl Packetizer {
         time: MissionTime,
         out: &mut Vec<u8>,
     ) -> Result<(), DownlinkError> {
-        let time = self.time(time)?;
+        let time = self.code(time)?;
         let payload = std::mem::take(&mut self.payload);
-        let each = self.packet_octets_max - HEADER_OCTETS - TRAILER_OCTETS;
+        let each = self.packet_bytes_max - HEADER_BYTES - TRAILER_BYTES;
         let segments = payload.len().div_ceil(each);
         for (k, part) in payload.chunks(each).enumerate() {
             let segment = match (k == 0, k + 1 == segments) {
@@ -173,7 +176,7 @@ impl Packetizer {
                 (false, false) => Segment::Continuation,
             };
             let start = out.len();
-            out.resize(start + HEADER_OCTETS, 0);
+            out.resize(start + HEADER_BYTES, 0);
             out.extend_from_slice(part);
             self.seal(kind, segment, time, start, out);
         }
@@ -183,22 +186,23 @@ impl Packetizer {
 
     /// Fills in the headers of the packet that begins at `start` and appends its check.
     fn seal(&mut self, kind: Kind, segment: Segment, time: CucTime, start: usize, out: &mut Vec<u8>) {
-        let octets = out.len() - start + TRAILER_OCTETS;
+        let bytes = out.len() - start + TRAILER_BYTES;
         let count = &mut self.counts[kind.index()];
-        let header = PacketHeader { kind, segment, count: *count, time, version: FORMAT_VERSION, octets };
+        let header = PacketHeader { kind, segment, count: *count, time, version: FORMAT_VERSION, bytes };
         *count = (*count + 1) & COUNT_MAX;
-        out[start..start + HEADER_OCTETS].copy_from_slice(&header.to_octets());
+        out[start..start + HEADER_BYTES].copy_from_slice(&header.to_bytes());
         let check = packet_check(&out[start..]);
         out.extend_from_slice(&check);
     }
 
-    /// The time code of a packet made now: the latest time of anything sent so far.
-    fn time(&mut self, time: MissionTime) -> Result<CucTime, DownlinkError> {
+    /// Moves the clock on to `time`, never back; packets are made at what it shows.
+    fn advance(&mut self, time: MissionTime) -> MissionTime {
+        *self.now.insert(self.now.map_or(time, |now| now.max(time)))
+    }
+
+    fn code(&self, time: MissionTime) -> Result<CucTime, DownlinkError> {
         let epoch_tai_s = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?.epoch_tai_s;
-        let now = self.now.max(time);
-        let error = || DownlinkError::Time { epoch_tai_s, time_s: now.seconds() };
-        let code = CucTime::new(epoch_tai_s, now).ok_or_else(error)?;
-        self.now = now;
-        Ok(code)
+        let error = || DownlinkError::Time { epoch_tai_s, time_s: time.seconds() };
+        CucTime::new(epoch_tai_s, time).ok_or_else(error)
     }
 }

@@ -1,14 +1,14 @@
-//! Octets to packets: the ground's end, robust against whatever a link or a disk does to them.
+//! Bytes to packets: the ground's end, robust against whatever a link or a disk does to them.
 
 use std::collections::VecDeque;
 use std::io::{self, Read};
 
-use super::header::{HEADER_OCTETS, PacketHeader, TRAILER_OCTETS, packet_holds};
+use super::header::{HEADER_BYTES, PacketHeader, TRAILER_BYTES, packet_holds};
 use super::kind::Kind;
 use super::sequence::{Arrival, Sequence};
 
-/// Octets that [`Receiver::fill_from`] asks for at a time.
-const CHUNK_OCTETS: usize = 1 << 18;
+/// Bytes that [`Receiver::fill_from`] asks for at a time.
+const CHUNK_BYTES: usize = 1 << 18;
 
 /// A packet whose checks hold.
 #[derive(Clone, Copy, Debug)]
@@ -23,7 +23,7 @@ pub struct Packet<'a> {
     pub late: bool,
 }
 
-/// What a stream holds, in order. The octets of all events but [`Event::Gap`] and [`Event::Restart`] together are
+/// What a stream holds, in order. The bytes of all events but [`Event::Gap`] and [`Event::Restart`] together are
 /// those of the stream.
 #[derive(Clone, Copy, Debug)]
 #[non_exhaustive]
@@ -43,86 +43,82 @@ pub enum Event<'a> {
         offset: u64,
         /// Its headers.
         header: PacketHeader,
-        /// Octets passed over: the packet, or its headers alone when no other packet follows where it
+        /// Bytes passed over: the packet, or its headers alone when no other packet follows where it
         /// should end.
-        octets: u64,
+        bytes: u64,
     },
-    /// Packets `expected .. found` of a kind are missing before the next packet.
+    /// Packets of a kind are missing, from the count `expected` to before that of the next packet.
     Gap {
         /// Place of the next packet.
         offset: u64,
-        /// Kind.
-        kind: Kind,
+        /// Headers of the next packet.
+        header: PacketHeader,
         /// Count of the first missing packet.
         expected: u64,
-        /// Count of the packet that came instead.
-        found: u64,
     },
     /// The spacecraft has begun to count anew.
     Restart {
         /// Place of the next packet.
         offset: u64,
-        /// Kind.
-        kind: Kind,
+        /// Headers of the next packet.
+        header: PacketHeader,
         /// Count that was due.
         expected: u64,
-        /// Count of the packet that came instead.
-        found: u64,
     },
-    /// Octets that belong to no packet.
+    /// Bytes that belong to no packet.
     Garbage {
         /// Place in the stream.
         offset: u64,
         /// How many.
-        octets: u64,
+        bytes: u64,
     },
     /// The stream ends within a packet.
     Truncated {
         /// Place of the packet.
         offset: u64,
-        /// Octets of it that are there.
-        octets: u64,
+        /// Bytes of it that are there.
+        bytes: u64,
     },
 }
 
-/// An event without its octets. All but gaps consume what they cover when they are handed out.
+/// An event without its bytes. All but gaps consume what they cover when they are handed out.
 #[derive(Clone, Copy, Debug)]
 enum Step {
     Packet { header: PacketHeader, late: bool },
     Duplicate(PacketHeader),
     Damaged(PacketHeader, usize),
-    Gap { kind: Kind, expected: u64, found: u64 },
-    Restart { kind: Kind, expected: u64, found: u64 },
-    Garbage { offset: u64, octets: u64 },
-    Truncated { octets: usize },
+    Gap { header: PacketHeader, expected: u64 },
+    Restart { header: PacketHeader, expected: u64 },
+    Garbage { offset: u64, bytes: u64 },
+    Truncated { bytes: usize },
 }
 
 /// What stands at some place of the buffer.
 enum Found {
     /// A whole packet.
     Good(PacketHeader),
-    /// Headers whose packet does not hold; octets to pass over.
+    /// Headers whose packet does not hold; bytes to pass over.
     Bad(PacketHeader, usize),
     /// Headers of a packet that the stream ends in.
     Cut,
-    /// More octets are needed to say.
+    /// More bytes are needed to say.
     Unknown,
     /// Nothing of ours.
     Nothing,
 }
 
-/// Finds packets in a stream of octets, given in chunks of any size.
+/// Finds packets in a stream of bytes, given in chunks of any size.
 ///
-/// Push octets, then take events until there are none; at the end call [`Receiver::finish`] and take the rest.
+/// Push bytes, then take events until there are none; at the end call [`Receiver::finish`] and take the rest.
 /// Then the memory stays below the greatest packet plus twice the greatest chunk.
 ///
 /// After damage it looks for the next headers whose check holds. Time is linear in the stream: a body is
-/// checked once for each headers with a good check of their own, which noise yields once in 10^11 octets
+/// checked once for each headers with a good check of their own, which noise yields once in 10^11 bytes
 /// and a forger at most once in 22.
 #[derive(Debug, Default)]
 pub struct Receiver {
     buffer: Vec<u8>,
-    /// Octets of the buffer that are not yet consumed.
+    /// Bytes of the buffer that are not yet consumed.
     begin: usize,
     end: usize,
     /// Place of `buffer[0]` in the stream.
@@ -143,22 +139,22 @@ impl Receiver {
         Self::default()
     }
 
-    /// Takes the next octets of the stream.
-    pub fn push(&mut self, octets: &[u8]) {
-        self.room(octets.len()).copy_from_slice(octets);
-        self.end += octets.len();
+    /// Takes the next bytes of the stream.
+    pub fn push(&mut self, bytes: &[u8]) {
+        self.room(bytes.len()).copy_from_slice(bytes);
+        self.end += bytes.len();
     }
 
-    /// Takes the next octets from a reader, without a copy in between; returns how many, 0 at its end.
+    /// Takes the next bytes from a reader, without a copy in between; returns how many, 0 at its end.
     ///
     /// # Errors
     /// Those of the reader, interruptions excepted.
     pub fn fill_from(&mut self, reader: &mut impl Read) -> io::Result<usize> {
         loop {
-            match reader.read(self.room(CHUNK_OCTETS)) {
-                Ok(octets) => {
-                    self.end += octets;
-                    return Ok(octets);
+            match reader.read(self.room(CHUNK_BYTES)) {
+                Ok(bytes) => {
+                    self.end += bytes;
+                    return Ok(bytes);
                 }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
                 Err(error) => return Err(error),
@@ -171,13 +167,13 @@ impl Receiver {
         self.finished = true;
     }
 
-    /// Octets taken so far.
+    /// Bytes taken so far.
     #[must_use]
-    pub fn octets(&self) -> u64 {
+    pub fn bytes(&self) -> u64 {
         self.offset + self.end as u64
     }
 
-    /// The next event; `None` until more octets come, or when all is said.
+    /// The next event; `None` until more bytes come, or when all is said.
     pub fn next_event(&mut self) -> Option<Event<'_>> {
         if self.steps.is_empty() {
             self.look();
@@ -186,41 +182,43 @@ impl Receiver {
         let offset = self.offset + self.begin as u64;
         Some(match step {
             Step::Packet { header, late } => {
-                let packet = &self.buffer[self.begin..self.begin + header.octets];
-                self.begin += header.octets;
-                let payload = &packet[HEADER_OCTETS..packet.len() - TRAILER_OCTETS];
+                let packet = &self.buffer[self.begin..self.begin + header.bytes];
+                self.begin += header.bytes;
+                let payload = &packet[HEADER_BYTES..packet.len() - TRAILER_BYTES];
                 Event::Packet(Packet { offset, header, payload, late })
             }
             Step::Duplicate(header) => {
-                self.begin += header.octets;
+                self.begin += header.bytes;
                 Event::Duplicate { offset, header }
             }
-            Step::Damaged(header, octets) => {
-                self.begin += octets;
-                Event::Damaged { offset, header, octets: octets as u64 }
+            Step::Damaged(header, bytes) => {
+                self.begin += bytes;
+                Event::Damaged { offset, header, bytes: bytes as u64 }
             }
-            Step::Truncated { octets } => {
-                self.begin += octets;
-                Event::Truncated { offset, octets: octets as u64 }
+            Step::Truncated { bytes } => {
+                self.begin += bytes;
+                Event::Truncated { offset, bytes: bytes as u64 }
             }
-            Step::Garbage { offset, octets } => Event::Garbage { offset, octets },
-            Step::Gap { kind, expected, found } => Event::Gap { offset, kind, expected, found },
-            Step::Restart { kind, expected, found } => Event::Restart { offset, kind, expected, found },
+            Step::Garbage { offset, bytes } => Event::Garbage { offset, bytes },
+            Step::Gap { header, expected } => Event::Gap { offset, header, expected },
+            Step::Restart { header, expected } => Event::Restart { offset, header, expected },
         })
     }
 
-    /// Room for so many octets behind those in the buffer.
-    fn room(&mut self, octets: usize) -> &mut [u8] {
-        if self.end + octets > self.buffer.len() {
-            self.buffer.copy_within(self.begin..self.end, 0);
-            self.offset += self.begin as u64;
-            self.end -= self.begin;
-            self.begin = 0;
-            if self.end + octets > self.buffer.len() {
-                self.buffer.resize(self.end + octets, 0);
+    /// Room for so many bytes behind those in the buffer.
+    fn room(&mut self, bytes: usize) -> &mut [u8] {
+        if self.end + bytes > self.buffer.len() {
+            if self.begin > 0 {
+                self.buffer.copy_within(self.begin..self.end, 0);
+                self.offset += self.begin as u64;
+                self.end -= self.begin;
+                self.begin = 0;
+            }
+            if self.end + bytes > self.buffer.len() {
+                self.buffer.resize(self.end + bytes, 0);
             }
         }
-        &mut self.buffer[self.end..self.end + octets]
+        &mut self.buffer[self.end..self.end + bytes]
     }
 
     /// Moves on to the next packet, if it is there, and lays down what is to be said.
@@ -228,7 +226,7 @@ impl Receiver {
         while self.begin < self.end {
             match self.find() {
                 Found::Good(header) => return self.take_good(header),
-                Found::Bad(header, octets) => return self.take_damaged(header, octets),
+                Found::Bad(header, bytes) => return self.take_damaged(header, bytes),
                 Found::Unknown => return,
                 Found::Cut => {
                     self.cut_at.get_or_insert(self.offset + self.begin as u64);
@@ -242,48 +240,48 @@ impl Receiver {
         }
     }
 
-    /// What stands at the beginning of the unconsumed octets.
+    /// What stands at the beginning of the unconsumed bytes.
     fn find(&self) -> Found {
         let rest = &self.buffer[self.begin..self.end];
-        let Some(octets) = rest.get(..HEADER_OCTETS) else {
+        let Some(bytes) = rest.get(..HEADER_BYTES) else {
             // Less than headers: the beginning of a packet if it follows one and looks like one.
-            return match (self.finished, rest[0] == PacketHeader::FIRST_OCTET) {
+            return match (self.finished, rest[0] == PacketHeader::FIRST_BYTE) {
                 (_, false) => Found::Nothing,
                 (false, true) => Found::Unknown,
                 (true, true) if self.garbage_from.is_none() => Found::Cut,
                 (true, true) => Found::Nothing,
             };
         };
-        let Some(header) = PacketHeader::parse(octets) else { return Found::Nothing };
-        let Some(packet) = rest.get(..header.octets) else {
+        let Some(header) = PacketHeader::parse(bytes) else { return Found::Nothing };
+        let Some(packet) = rest.get(..header.bytes) else {
             return if self.finished { Found::Cut } else { Found::Unknown };
         };
         if packet_holds(packet) {
             return Found::Good(header);
         }
-        let after = &rest[header.octets..];
-        if after.len() < HEADER_OCTETS && !self.finished {
+        let after = &rest[header.bytes..];
+        if after.len() < HEADER_BYTES && !self.finished {
             return Found::Unknown;
         }
         let another_follows = match after.first() {
             None => true,
-            Some(first) if after.len() < HEADER_OCTETS => *first == PacketHeader::FIRST_OCTET,
+            Some(first) if after.len() < HEADER_BYTES => *first == PacketHeader::FIRST_BYTE,
             Some(_) => PacketHeader::parse(after).is_some(),
         };
-        Found::Bad(header, if another_follows { header.octets } else { HEADER_OCTETS })
+        Found::Bad(header, if another_follows { header.bytes } else { HEADER_BYTES })
     }
 
-    /// Passes over one octet and on to the next that could begin a packet.
+    /// Passes over one byte and on to the next that could begin a packet.
     fn pass_garbage(&mut self) {
         self.garbage_from.get_or_insert(self.offset + self.begin as u64);
         self.begin += 1;
         let rest = &self.buffer[self.begin..self.end];
-        self.begin += rest.iter().position(|o| *o == PacketHeader::FIRST_OCTET).unwrap_or(rest.len());
+        self.begin += rest.iter().position(|o| *o == PacketHeader::FIRST_BYTE).unwrap_or(rest.len());
     }
 
     fn end_garbage(&mut self, end: u64) {
         if let Some(offset) = self.garbage_from.take().filter(|offset| *offset < end) {
-            self.steps.push_back(Step::Garbage { offset, octets: end - offset });
+            self.steps.push_back(Step::Garbage { offset, bytes: end - offset });
         }
     }
 
@@ -296,21 +294,20 @@ impl Receiver {
         });
     }
 
-    fn take_damaged(&mut self, header: PacketHeader, octets: usize) {
+    fn take_damaged(&mut self, header: PacketHeader, bytes: usize) {
         let arrival = self.sequences[header.kind.index()].pass_damaged(header.count, header.time);
         self.announce(header, arrival);
-        self.steps.push_back(Step::Damaged(header, octets));
+        self.steps.push_back(Step::Damaged(header, bytes));
     }
 
     /// What is to be said before a packet.
     fn announce(&mut self, header: PacketHeader, arrival: Arrival) {
         self.cut_at = None;
         self.end_garbage(self.offset + self.begin as u64);
-        let (kind, found) = (header.kind, header.count);
         match arrival {
-            Arrival::AfterGap { expected } => self.steps.push_back(Step::Gap { kind, expected, found }),
-            Arrival::Restart { expected } => self.steps.push_back(Step::Restart { kind, expected, found }),
-            Arrival::InOrder | Arrival::Late | Arrival::Duplicate => {}
+            Arrival::AfterGap { expected } => self.steps.push_back(Step::Gap { header, expected }),
+            Arrival::Restart { expected } => self.steps.push_back(Step::Restart { header, expected }),
+            Arrival::InOrder | Arrival::Late | Arrival::Early | Arrival::Duplicate => {}
         }
     }
 
@@ -320,9 +317,85 @@ impl Receiver {
         let cut_at = self.cut_at.take().unwrap_or(end);
         self.end_garbage(cut_at);
         if cut_at < end {
-            let octets = (end - cut_at) as usize;
-            self.begin = self.end - octets;
-            self.steps.push_back(Step::Truncated { octets });
+            let bytes = (end - cut_at) as usize;
+            self.begin = self.end - bytes;
+            self.steps.push_back(Step::Truncated { bytes });
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::Rng;
+
+    use super::*;
+    use crate::downlink::cuc::CucTime;
+    use crate::downlink::header::{FORMAT_VERSION, PACKET_BYTES_MAX, Segment};
+    use crate::units::{StreamKind, random_stream};
+
+    /// Bytes that a stream's events cover, and what the receiver ever held; it must have read all of it.
+    fn cover(stream: &mut impl Read) -> (u64, usize) {
+        let mut receiver = Receiver::new();
+        let (mut covered, mut held) = (0, 0);
+        loop {
+            if receiver.fill_from(stream).unwrap() == 0 {
+                receiver.finish();
+            }
+            while let Some(event) = receiver.next_event() {
+                covered += match event {
+                    Event::Packet(packet) => packet.header.bytes as u64,
+                    Event::Duplicate { header, .. } => header.bytes as u64,
+                    Event::Damaged { bytes, .. }
+                    | Event::Garbage { bytes, .. }
+                    | Event::Truncated { bytes, .. } => bytes,
+                    Event::Gap { .. } | Event::Restart { .. } => 0,
+                };
+            }
+            held = held.max(receiver.buffer.len());
+            if receiver.finished {
+                assert_eq!(covered, receiver.bytes());
+                return (covered, held);
+            }
+        }
+    }
+
+    const HELD_MAX: usize = PACKET_BYTES_MAX + HEADER_BYTES + CHUNK_BYTES;
+
+    #[test]
+    fn a_hundred_megabytes_of_noise_take_bounded_memory() {
+        struct Noise(rand_chacha::ChaCha8Rng, u64);
+        impl Read for Noise {
+            fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+                let bytes = out.len().min(self.1 as usize);
+                self.0.fill_bytes(&mut out[..bytes]);
+                self.1 -= bytes as u64;
+                Ok(bytes)
+            }
+        }
+        let mut noise = Noise(random_stream(2, StreamKind::Probe, [0, 0]), 100_000_000);
+        let (covered, held) = cover(&mut noise);
+        assert_eq!(covered, 100_000_000);
+        assert!(held <= HELD_MAX, "{held}");
+    }
+
+    #[test]
+    fn forged_headers_without_bodies_end_in_time() {
+        // Each names the greatest packet, so that each makes the receiver check 64 KiB.
+        let forged: Vec<u8> = (0..20_000)
+            .flat_map(|count| {
+                PacketHeader {
+                    kind: Kind::Visibilities,
+                    segment: Segment::Whole,
+                    count: 2 * count,
+                    time: CucTime(1),
+                    version: FORMAT_VERSION,
+                    bytes: PACKET_BYTES_MAX,
+                }
+                .to_bytes()
+            })
+            .collect();
+        let (covered, held) = cover(&mut forged.as_slice());
+        assert_eq!(covered, forged.len() as u64);
+        assert!(held <= HELD_MAX);
     }
 }

@@ -19,6 +19,8 @@ pub(super) enum Arrival {
     },
     /// It fills a gap that has been reported.
     Late,
+    /// It was sent before the first of its kind that came.
+    Early,
     /// It has been here before.
     Duplicate,
     /// Its count is lower, yet it was made later: the spacecraft has begun to count anew.
@@ -32,6 +34,8 @@ pub(super) enum Arrival {
 #[derive(Clone, Debug, Default)]
 pub(super) struct Sequence {
     begun: bool,
+    /// Count of the packet that came first, since the last restart.
+    first: u64,
     next: u64,
     newest: CucTime,
     /// Missing counts below `next`, in order, at most [`STRETCHES_MAX`] stretches.
@@ -44,7 +48,7 @@ impl Sequence {
         let arrival = self.judge(count, time);
         match arrival {
             Arrival::InOrder | Arrival::AfterGap { .. } | Arrival::Restart { .. } => self.next = count + 1,
-            Arrival::Late => self.fill(count),
+            Arrival::Late | Arrival::Early => self.fill(count),
             Arrival::Duplicate => {}
         }
         arrival
@@ -54,7 +58,7 @@ impl Sequence {
     /// may still be filled.
     pub(super) fn pass_damaged(&mut self, count: u64, time: CucTime) -> Arrival {
         let arrival = self.judge(count, time);
-        if !matches!(arrival, Arrival::Late | Arrival::Duplicate) {
+        if !matches!(arrival, Arrival::Late | Arrival::Early | Arrival::Duplicate) {
             self.miss(count..count + 1);
             self.next = count + 1;
         }
@@ -65,8 +69,7 @@ impl Sequence {
         let (expected, newest) = (self.next, self.newest);
         self.newest = newest.max(time);
         if !std::mem::replace(&mut self.begun, true) {
-            // What was sent before the recording began is no gap in it, but may still come in late.
-            self.miss(0..count);
+            self.begin(count);
             return Arrival::InOrder;
         }
         if count == expected {
@@ -75,14 +78,20 @@ impl Sequence {
             self.miss(expected..count);
             Arrival::AfterGap { expected }
         } else if time > newest {
-            self.missing.clear();
-            self.miss(0..count);
+            self.begin(count);
             Arrival::Restart { expected }
         } else if self.stretch_of(count).is_some() {
-            Arrival::Late
+            if count < self.first { Arrival::Early } else { Arrival::Late }
         } else {
             Arrival::Duplicate
         }
+    }
+
+    /// Begins with a packet: what was sent before it is no gap, but may still come.
+    fn begin(&mut self, count: u64) {
+        self.first = count;
+        self.missing.clear();
+        self.miss(0..count);
     }
 
     fn miss(&mut self, stretch: Range<u64>) {
@@ -139,7 +148,7 @@ mod tests {
     fn a_recording_may_begin_anywhere() {
         let mut sequence = Sequence::default();
         assert_eq!(sequence.receive(100, at(5)), Arrival::InOrder);
-        assert_eq!(sequence.receive(99, at(5)), Arrival::Late);
+        assert_eq!(sequence.receive(99, at(5)), Arrival::Early);
     }
 
     #[test]

@@ -43,10 +43,10 @@ pub(in crate::downlink) fn encode(
 }
 
 pub(in crate::downlink) fn decode(
-    octets: &[u8],
+    bytes: &[u8],
     instrument: &Instrument,
 ) -> Result<EphemerisSegment, PayloadFault> {
-    let (record, rest) = take_record::<Record>("ephemeris", octets)?;
+    let (record, rest) = take_record::<Record>("ephemeris", bytes)?;
     let positions = (record.nodes as usize).saturating_mul(usize::from(record.satellites));
     require_length("ephemeris positions", positions.saturating_mul(24), rest.len())?;
     let segment = EphemerisSegment {

@@ -21,8 +21,8 @@ pub(in crate::downlink) fn encode(counts: &Housekeeping, out: &mut Vec<u8>) -> R
     put_record("housekeeping", Record { time_ticks: time.0, sampled, dropped }, out)
 }
 
-pub(in crate::downlink) fn decode(octets: &[u8]) -> Result<Housekeeping, PayloadFault> {
-    let (record, rest) = take_record::<Record>("housekeeping", octets)?;
+pub(in crate::downlink) fn decode(bytes: &[u8]) -> Result<Housekeeping, PayloadFault> {
+    let (record, rest) = take_record::<Record>("housekeeping", bytes)?;
     require_length("housekeeping", 0, rest.len())?;
     let Record { time_ticks, sampled, dropped } = record;
     let counts = Housekeeping { time: MissionTime(time_ticks), sampled, dropped };

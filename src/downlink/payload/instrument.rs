@@ -10,7 +10,7 @@ use super::{PayloadFault, put_record, require, require_length, take_record};
 use crate::frames::{AntennaResponse, Channel, Instrument};
 use crate::units::MAX_SATELLITES;
 
-const NAME_OCTETS_MAX: usize = 256;
+const NAME_BYTES_MAX: usize = 256;
 /// The whole band in channels of 8 kHz is 3738 of them.
 const CHANNELS_MAX: usize = 4096;
 /// The band of the mission, Hz.
@@ -50,8 +50,8 @@ pub(in crate::downlink) fn encode(instrument: &Instrument, out: &mut Vec<u8>) ->
     Ok(())
 }
 
-pub(in crate::downlink) fn decode(octets: &[u8]) -> Result<Instrument, PayloadFault> {
-    let (record, rest) = take_record::<Record>("instrument", octets)?;
+pub(in crate::downlink) fn decode(bytes: &[u8]) -> Result<Instrument, PayloadFault> {
+    let (record, rest) = take_record::<Record>("instrument", bytes)?;
     let channels = usize::from(record.channels);
     require_length("instrument channels", 16 * channels, rest.len())?;
     let mut arrays = Arrays(rest);
@@ -81,7 +81,7 @@ pub(in crate::downlink) fn decode(octets: &[u8]) -> Result<Instrument, PayloadFa
 fn check(instrument: &Instrument) -> Result<(), PayloadFault> {
     let Instrument { epoch_tai_s, moon_radius_m, satellites, .. } = *instrument;
     let (name, channels) = (instrument.name.len(), instrument.channels.len());
-    require(name <= NAME_OCTETS_MAX, "instrument name (octets)", name as f64, "at most 256")?;
+    require(name <= NAME_BYTES_MAX, "instrument name (bytes)", name as f64, "at most 256")?;
     require(
         (0.0..f64::from(u32::MAX)).contains(&epoch_tai_s),
         "epoch_tai_s",

@@ -25,10 +25,10 @@ pub(super) use visibilities::{
     decode as decode_visibilities, encode as encode_visibilities,
 };
 
-/// Octets that any record may take; bincode refuses to allocate more whatever a length field says.
-const RECORD_OCTETS_MAX: usize = 512;
+/// Bytes that any record may take; bincode refuses to allocate more whatever a length field says.
+const RECORD_BYTES_MAX: usize = 512;
 
-/// Seconds that the four octets of a packet's time code can count; bounds every time in a payload.
+/// Seconds that the four bytes of a packet's time code can count; bounds every time in a payload.
 const TIME_S_MAX: i64 = 1 << 32;
 
 /// Why a payload was refused although its packet's check held.
@@ -50,7 +50,7 @@ pub enum PayloadFault {
         what: &'static str,
     },
     /// Payload and record disagree about the length.
-    #[error("{what}: {found} octets or elements where its record asks for {expected}")]
+    #[error("{what}: {found} bytes or elements where its record asks for {expected}")]
     Length {
         /// What has the length.
         what: &'static str,
@@ -90,8 +90,8 @@ fn require_time(time: MissionTime) -> Result<(), PayloadFault> {
     require(good, "time (s)", time.seconds(), "within 136 years of the mission epoch")
 }
 
-fn config() -> Configuration<LittleEndian, Fixint, Limit<RECORD_OCTETS_MAX>> {
-    bincode::config::standard().with_fixed_int_encoding().with_limit::<RECORD_OCTETS_MAX>()
+fn config() -> Configuration<LittleEndian, Fixint, Limit<RECORD_BYTES_MAX>> {
+    bincode::config::standard().with_fixed_int_encoding().with_limit::<RECORD_BYTES_MAX>()
 }
 
 /// Appends a record.
@@ -103,9 +103,9 @@ fn put_record<R: Encode>(what: &'static str, record: R, out: &mut Vec<u8>) -> Re
 /// A record and what follows it.
 fn take_record<'a, R: Decode<()>>(
     what: &'static str,
-    octets: &'a [u8],
+    bytes: &'a [u8],
 ) -> Result<(R, &'a [u8]), PayloadFault> {
     let fault = || PayloadFault::Record { what };
-    let (record, consumed) = bincode::decode_from_slice(octets, config()).map_err(|_| fault())?;
-    Ok((record, octets.get(consumed..).ok_or_else(fault)?))
+    let (record, consumed) = bincode::decode_from_slice(bytes, config()).map_err(|_| fault())?;
+    Ok((record, bytes.get(consumed..).ok_or_else(fault)?))
 }

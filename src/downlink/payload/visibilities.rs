@@ -14,10 +14,10 @@ use super::{PayloadFault, put_record, require, require_length, require_time, tak
 use crate::frames::{Flags, Instrument, VisibilityBlock};
 use crate::units::{ChannelId, MissionTime, Pair};
 
-/// Octets of the record.
-const RECORD_OCTETS: usize = 16;
-/// Octets of one visibility.
-const VISIBILITY_OCTETS: usize = 21;
+/// Bytes of the record.
+const RECORD_BYTES: usize = 16;
+/// Bytes of one visibility.
+const VISIBILITY_BYTES: usize = 21;
 
 #[derive(Encode, Decode)]
 struct Record {
@@ -28,9 +28,9 @@ struct Record {
     count: u32,
 }
 
-/// Visibilities that fit into a payload of `octets`.
-pub(in crate::downlink) fn capacity(octets: usize) -> usize {
-    octets.saturating_sub(RECORD_OCTETS) / VISIBILITY_OCTETS
+/// Visibilities that fit into a payload of `bytes`.
+pub(in crate::downlink) fn capacity(bytes: usize) -> usize {
+    bytes.saturating_sub(RECORD_BYTES) / VISIBILITY_BYTES
 }
 
 /// Appends the visibilities in `range` of a block that [`check`] has passed.
@@ -58,12 +58,12 @@ pub(in crate::downlink) fn encode(
 /// The block of a payload without its bad visibilities, and how many those were: not finite, of weight or
 /// duration zero or less.
 pub(in crate::downlink) fn decode(
-    octets: &[u8],
+    bytes: &[u8],
     instrument: &Instrument,
 ) -> Result<(VisibilityBlock, u64), PayloadFault> {
-    let (record, rest) = take_record::<Record>("visibility", octets)?;
+    let (record, rest) = take_record::<Record>("visibility", bytes)?;
     let count = record.count as usize;
-    require_length("visibility arrays", count.saturating_mul(VISIBILITY_OCTETS), rest.len())?;
+    require_length("visibility arrays", count.saturating_mul(VISIBILITY_BYTES), rest.len())?;
     let mut arrays = Arrays(rest);
     let mut block = VisibilityBlock {
         channel: ChannelId(record.channel),
@@ -81,9 +81,9 @@ pub(in crate::downlink) fn decode(
 }
 
 /// How many visibilities a payload says it has, for the account of a payload that is refused.
-pub(in crate::downlink) fn count(octets: &[u8]) -> u64 {
-    take_record::<Record>("visibility", octets)
-        .map_or(0, |(record, rest)| u64::from(record.count).min((rest.len() / VISIBILITY_OCTETS) as u64))
+pub(in crate::downlink) fn count(bytes: &[u8]) -> u64 {
+    take_record::<Record>("visibility", bytes)
+        .map_or(0, |(record, rest)| u64::from(record.count).min((rest.len() / VISIBILITY_BYTES) as u64))
 }
 
 /// What holds of a block as a whole.
