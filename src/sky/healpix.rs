@@ -66,7 +66,7 @@ pub fn ring(nside: usize, k: usize) -> Ring {
         (4 * north, 1.0 - from_pole, (from_pole * (2.0 - from_pole)).sqrt(), true)
     } else {
         let z = (2 * nside - north) as f64 * 2.0 / (3.0 * n);
-        (4 * nside, z, ((1.0 - z) * (1.0 + z)).sqrt(), (north - nside) % 2 == 0)
+        (4 * nside, z, ((1.0 - z) * (1.0 + z)).sqrt(), (north - nside).is_multiple_of(2))
     };
     let before = if north < nside {
         2 * north * (north - 1)

@@ -1,0 +1,66 @@
+//! What can be wrong with a map.
+
+use thiserror::Error;
+
+use super::healpix::NSIDE_MAX;
+
+/// Why a map, or what is asked of it, does not make sense.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[non_exhaustive]
+pub enum MapError {
+    /// The number of values is not that of a HEALPix map.
+    #[error(
+        "{pixels} values are no HEALPix map; expected 12 nside^2, nside a power of two up to {NSIDE_MAX}"
+    )]
+    PixelCount {
+        /// Number of values found.
+        pixels: usize,
+    },
+    /// Not an nside.
+    #[error("nside {nside} is not allowed; expected a power of two from 1 to {NSIDE_MAX}")]
+    Nside {
+        /// Value found.
+        nside: usize,
+    },
+    /// The target of a degradation or upgrade lies on the wrong side.
+    #[error("a map of nside {from} cannot be {verb} to nside {to}; expected {expected}")]
+    Direction {
+        /// What was asked, "degraded" or "upgraded".
+        verb: &'static str,
+        /// Own nside.
+        from: usize,
+        /// Requested nside.
+        to: usize,
+        /// What would have been allowed.
+        expected: &'static str,
+    },
+    /// Pixels without a usable value.
+    #[error(
+        "{count} of {total} pixels have no usable value, the first is RING pixel {first} with {value:e}; \
+         expected finite numbers everywhere (UNSEEN is -1.6375e30): fill or mask these pixels first"
+    )]
+    BadPixels {
+        /// Number of pixels that are NaN, infinite or UNSEEN.
+        count: usize,
+        /// Number of pixels of the map.
+        total: usize,
+        /// RING number of the first such pixel.
+        first: usize,
+        /// Its value.
+        value: f64,
+    },
+    /// Two maps that should be in one frame are not.
+    #[error("the maps are in different frames, {one} and {other}; turn one with `to_ecliptic` first")]
+    Frames {
+        /// Frame of the first map.
+        one: super::Frame,
+        /// Frame of the second map.
+        other: super::Frame,
+    },
+    /// A width of a Gaussian that is not one.
+    #[error("a beam of FWHM {fwhm_rad} rad is not allowed; expected a finite width of at least 0")]
+    Width {
+        /// Value found, rad.
+        fwhm_rad: f64,
+    },
+}

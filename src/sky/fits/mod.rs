@@ -1,0 +1,20 @@
+//! HEALPix maps in FITS files (FITS Standard 4.0; "HEALPix file format", Hivon 2013), read and written as
+//! healpy reads and writes them.
+//!
+//! A map file is a small corner of FITS: headers of 80-character cards and one binary table of fixed-width
+//! columns. It is read here in bounded memory, every size of the header being held against the length of
+//! the file before anything is allocated, and written with healpy's cards in healpy's order. General FITS
+//! libraries in Rust trust the header (a forged TFIELDS aborts the process) or bring a C library.
+
+mod card;
+mod error;
+mod header;
+mod read;
+mod table;
+mod write;
+
+pub use card::{Card, CardValue};
+pub use error::{FitsError, FitsProblem};
+pub use header::Header;
+pub use read::{MapFile, ReadOptions, read_map, read_map_file, read_map_from, read_whole_map};
+pub use write::{Column, Ordering, Precision, WriteOptions, write_columns, write_map};

@@ -1,0 +1,306 @@
+//! Reading maps.
+
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
+
+use super::error::{FitsError, FitsProblem};
+use super::header::{BLOCK_BYTES, Header};
+use super::table::{CellType, ColumnLayout, TableLayout};
+use crate::sky::healpix::{is_valid_nside, nested_to_ring, nside_of, pixel_count};
+use crate::sky::{Frame, SkyMap, is_unseen};
+use crate::units::constants::HEALPIX_UNSEEN;
+
+/// Rows are read in pieces of about this many bytes.
+const PIECE_BYTES: usize = 1 << 20;
+/// Most header-data units before the table.
+const UNITS_MAX: usize = 1000;
+/// Greatest nside that a partial map of any number of pixels may have: 100 MB when expanded.
+const NSIDE_MAX_SPARSE: usize = 1024;
+
+/// How to read a map.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ReadOptions {
+    /// Which of the table's map columns, counted from 0 (the pixel numbers of a partial map do not count).
+    pub column: usize,
+    /// The frame of a file without COORDSYS; `None` makes such a file an error.
+    pub frame_if_missing: Option<Frame>,
+}
+
+/// A map and what its file says about it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MapFile {
+    /// The map, in RING order; pixels that a partial map leaves out are UNSEEN.
+    pub map: SkyMap,
+    /// Name of the column (TTYPE), perhaps empty.
+    pub name: String,
+    /// Its unit (TUNIT), perhaps empty.
+    pub unit: String,
+    /// Whether the file has no COORDSYS, so that the frame is the one that the reader assumed.
+    pub frame_assumed: bool,
+    /// The header of the table.
+    pub header: Header,
+}
+
+/// Reads a map: RING or NESTED, full or partial, integers or floats of any precision.
+///
+/// # Errors
+/// [`FitsError`] with the file and what is wrong with it.
+pub fn read_map(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError> {
+    read_map_file(path, options).map(|file| file.map)
+}
+
+/// Reads a map that must have a usable value in every pixel.
+///
+/// # Errors
+/// [`FitsError`], also with [`crate::sky::MapError::BadPixels`] for pixels that are NaN, infinite or UNSEEN.
+pub fn read_whole_map(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError> {
+    let map = read_map(path, options)?;
+    map.check_whole().map_err(|problem| FitsError::new(path, problem.into()))?;
+    Ok(map)
+}
+
+/// Reads a map with its header.
+///
+/// # Errors
+/// [`FitsError`] with the file and what is wrong with it.
+pub fn read_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile, FitsError> {
+    let read = || {
+        let file = File::open(path).map_err(FitsProblem::io("open"))?;
+        let length = file.metadata().map_err(FitsProblem::io("examine"))?.len();
+        read_map_from(&mut BufReader::new(file), length, options)
+    };
+    read().map_err(|problem| FitsError::new(path, problem))
+}
+
+/// Reads a map from `length` bytes of anything.
+///
+/// # Errors
+/// [`FitsProblem`].
+pub fn read_map_from(
+    reader: &mut (impl Read + Seek),
+    length: u64,
+    options: &ReadOptions,
+) -> Result<MapFile, FitsProblem> {
+    check_start(reader, length)?;
+    let (header, start) = find_table(reader, length)?;
+    let table = TableLayout::new(&header, start, length)?;
+    reader.seek(SeekFrom::Start(start)).map_err(FitsProblem::io("seek"))?;
+
+    let explicit = is_explicit(&header)?;
+    let (index, column) = choose_columns(&table, explicit, options.column)?;
+    let cells = table.rows.saturating_mul(column.repeat as u64);
+    let nside = nside(&header, cells, explicit)?;
+    let nested = is_nested(&header)?;
+    let (frame, frame_assumed) = frame(&header, options)?;
+
+    let values = match index {
+        None => read_implicit(reader, &table, column, nside)?,
+        Some(index) => read_explicit(reader, &table, (index, column), nside)?,
+    };
+    let values = if nested { to_ring(nside, &values) } else { values };
+    let number = options.column + 1 + usize::from(explicit);
+    let unit = header.text(&format!("TUNIT{number}")).unwrap_or("").to_owned();
+    let map = SkyMap::new(frame, values)?;
+    Ok(MapFile { map, name: column.name.clone(), unit, frame_assumed, header })
+}
+
+fn check_start(reader: &mut (impl Read + Seek), length: u64) -> Result<(), FitsProblem> {
+    if length == 0 {
+        return Err(FitsProblem::Empty);
+    }
+    let mut start = Vec::new();
+    reader.seek(SeekFrom::Start(0)).map_err(FitsProblem::io("seek"))?;
+    reader.by_ref().take(9).read_to_end(&mut start).map_err(FitsProblem::io("read"))?;
+    if start == b"SIMPLE  =" {
+        return Ok(());
+    }
+    let found = match start.as_slice() {
+        [0x1f, 0x8b, ..] => "a gzip signature (decompress it first)".to_owned(),
+        other => format!("`{}`", other.escape_ascii()),
+    };
+    Err(FitsProblem::NotFits { found })
+}
+
+/// The header of the first binary table, and where its rows start.
+fn find_table(reader: &mut (impl Read + Seek), length: u64) -> Result<(Header, u64), FitsProblem> {
+    let mut at = 0;
+    let mut units = 0;
+    while at < length && units < UNITS_MAX {
+        let (header, data) = Header::read(reader, at, length)?;
+        units += 1;
+        if header.text("XTENSION") == Some("BINTABLE") {
+            return Ok((header, data));
+        }
+        let needed = data.saturating_add(header.data_bytes()?);
+        if needed > length {
+            return Err(FitsProblem::Truncated { expected: "data before the table", needed, length });
+        }
+        at = needed.next_multiple_of(BLOCK_BYTES as u64);
+    }
+    Err(FitsProblem::NoTable { units })
+}
+
+/// Whether the table numbers its pixels itself, by INDXSCHM or else OBJECT.
+fn is_explicit(header: &Header) -> Result<bool, FitsProblem> {
+    match (header.text("INDXSCHM"), header.text("OBJECT")) {
+        (Some("EXPLICIT"), _) => Ok(true),
+        (Some("IMPLICIT"), Some("PARTIAL")) => {
+            Err(FitsProblem::keyword("INDXSCHM", "'IMPLICIT' with OBJECT 'PARTIAL'", "EXPLICIT for that"))
+        }
+        (Some("IMPLICIT"), _) => Ok(false),
+        (None, object) => Ok(object == Some("PARTIAL")),
+        (Some(other), _) => Err(FitsProblem::keyword("INDXSCHM", other, "IMPLICIT or EXPLICIT")),
+    }
+}
+
+/// The column of pixel numbers, if there is one, and the map's.
+fn choose_columns(
+    table: &TableLayout,
+    explicit: bool,
+    column: usize,
+) -> Result<(Option<&ColumnLayout>, &ColumnLayout), FitsProblem> {
+    let (index, maps) = match table.columns.split_first() {
+        Some((first, rest)) if explicit => (Some(first), rest),
+        _ => (None, table.columns.as_slice()),
+    };
+    let no_column = || FitsProblem::NoColumn { column, columns: maps.len() };
+    let map = maps.get(column).ok_or_else(no_column)?;
+    let key = |of: usize| format!("TFORM{of}");
+    if map.cell == CellType::Other || map.repeat == 0 {
+        let found = format!("no numbers ({} cells)", map.repeat);
+        let number = column + 1 + usize::from(explicit);
+        return Err(FitsProblem::keyword(&key(number), found, "B, I, J, K, E or D cells"));
+    }
+    if let Some(index) = index
+        && !(index.is_integer() && index.repeat == map.repeat)
+    {
+        let expected = "one integer pixel number for every value";
+        return Err(FitsProblem::keyword(&key(1), format!("{} cells", index.repeat), expected));
+    }
+    Ok((index, map))
+}
+
+fn nside(header: &Header, cells: u64, explicit: bool) -> Result<usize, FitsProblem> {
+    let expected = "a power of two from 1 to 8192";
+    let Some(nside) = header.count("NSIDE")? else {
+        let known = if explicit { None } else { usize::try_from(cells).ok().and_then(nside_of) };
+        return known.ok_or_else(|| FitsProblem::missing("NSIDE", expected));
+    };
+    match usize::try_from(nside) {
+        Ok(nside) if is_valid_nside(nside) => Ok(nside),
+        _ => Err(FitsProblem::keyword("NSIDE", nside, expected)),
+    }
+}
+
+fn is_nested(header: &Header) -> Result<bool, FitsProblem> {
+    match header.text("ORDERING").map(str::to_ascii_uppercase).as_deref() {
+        Some("RING") | None => Ok(false),
+        Some("NESTED" | "NEST") => Ok(true),
+        Some(other) => Err(FitsProblem::keyword("ORDERING", other, "RING or NESTED")),
+    }
+}
+
+fn frame(header: &Header, options: &ReadOptions) -> Result<(Frame, bool), FitsProblem> {
+    match (header.get("COORDSYS"), options.frame_if_missing) {
+        (None, None) => Err(FitsProblem::NoFrame),
+        (None, Some(frame)) => Ok((frame, true)),
+        (Some(found), _) => header
+            .text("COORDSYS")
+            .and_then(Frame::from_coordsys)
+            .map(|frame| (frame, false))
+            .ok_or_else(|| FitsProblem::keyword("COORDSYS", found, "'E', 'G' or 'C'")),
+    }
+}
+
+/// Calls `use_row` with every row in turn; memory is bounded by a piece or a row.
+fn for_each_row(
+    reader: &mut impl Read,
+    table: &TableLayout,
+    mut use_row: impl FnMut(u64, &[u8]) -> Result<(), FitsProblem>,
+) -> Result<(), FitsProblem> {
+    let rows_at_once = (PIECE_BYTES / table.row_bytes).max(1) as u64;
+    let mut piece = vec![0; table.row_bytes * rows_at_once.min(table.rows) as usize];
+    let mut done = 0;
+    while done < table.rows {
+        let rows = rows_at_once.min(table.rows - done);
+        let piece = &mut piece[..table.row_bytes * rows as usize];
+        reader.read_exact(piece).map_err(FitsProblem::io("read"))?;
+        for (k, row) in piece.chunks_exact(table.row_bytes).enumerate() {
+            use_row(done + k as u64, row)?;
+        }
+        done += rows;
+    }
+    Ok(())
+}
+
+fn read_implicit(
+    reader: &mut impl Read,
+    table: &TableLayout,
+    column: &ColumnLayout,
+    nside: usize,
+) -> Result<Vec<f64>, FitsProblem> {
+    let pixels = pixel_count(nside);
+    let found = table.rows.saturating_mul(column.repeat as u64);
+    if found != pixels as u64 {
+        let name = column.name.clone();
+        return Err(FitsProblem::ValueCount { name, found, expected: pixels as u64, nside });
+    }
+    // The file has these values, as the table's layout was held against its length.
+    let mut values = Vec::with_capacity(pixels);
+    for_each_row(reader, table, |_, row| {
+        column.decode(column.cells(row), HEALPIX_UNSEEN, &mut values);
+        Ok(())
+    })?;
+    for value in values.iter_mut().filter(|value| is_unseen(**value)) {
+        *value = HEALPIX_UNSEEN;
+    }
+    Ok(values)
+}
+
+fn read_explicit(
+    reader: &mut impl Read,
+    table: &TableLayout,
+    (index, column): (&ColumnLayout, &ColumnLayout),
+    nside: usize,
+) -> Result<Vec<f64>, FitsProblem> {
+    let pixels = pixel_count(nside);
+    let found = table.rows.saturating_mul(column.repeat as u64);
+    if nside > NSIDE_MAX_SPARSE && found < pixels as u64 / 16 {
+        return Err(FitsProblem::Sparse { found, nside, limit: NSIDE_MAX_SPARSE });
+    }
+    if found > pixels as u64 {
+        let name = column.name.clone();
+        return Err(FitsProblem::ValueCount { name, found, expected: pixels as u64, nside });
+    }
+    let mut values = vec![HEALPIX_UNSEEN; pixels];
+    let mut taken = vec![false; pixels];
+    let (mut numbers, mut cells) = (Vec::new(), Vec::new());
+    for_each_row(reader, table, |row_number, row| {
+        numbers.clear();
+        cells.clear();
+        index.decode_integers(index.cells(row), &mut numbers);
+        column.decode(column.cells(row), HEALPIX_UNSEEN, &mut cells);
+        for (&pixel, &value) in numbers.iter().zip(&cells) {
+            match usize::try_from(pixel).ok().filter(|&p| p < pixels && !taken[p]) {
+                Some(p) => {
+                    taken[p] = true;
+                    values[p] = if is_unseen(value) { HEALPIX_UNSEEN } else { value };
+                }
+                None => {
+                    return Err(FitsProblem::Pixel { row: row_number, pixel, last: pixels as u64 - 1 });
+                }
+            }
+        }
+        Ok(())
+    })?;
+    Ok(values)
+}
+
+fn to_ring(nside: usize, nested: &[f64]) -> Vec<f64> {
+    let mut ring = vec![0.0; nested.len()];
+    for (pixel, &value) in nested.iter().enumerate() {
+        ring[nested_to_ring(nside, pixel)] = value;
+    }
+    ring
+}
