@@ -1,1 +1,3 @@
-//! (to come)
+//! What a run leaves behind.
+
+pub mod pictures;

@@ -1,7 +1,7 @@
 //! HEALPix pixels (Gorski et al. 2005): numbers, centres, continuous positions inside a face.
 //!
-//! Numbering and searching are `cdshealpix`'s; directions are computed here because rows of B need
-//! them to the last bits and at points that are not pixel centres.
+//! Numbering is `cdshealpix`'s. Searching is written out for its speed; directions are computed here
+//! because rows of B need them to the last bits and at points that are not pixel centres.
 
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};
 
@@ -131,14 +131,42 @@ pub fn nested_to_ring(nside: usize, pixel: usize) -> usize {
     cdshealpix::nested::get(depth).to_ring(pixel as u64) as usize
 }
 
-/// RING number of the pixel that holds a direction (any length).
+/// RING number of the pixel that holds a direction, of any length whose square is a normal number.
+///
+/// Gorski et al. 2005, Sect. 4: a direction lies between two ascending and two descending edges.
 #[must_use]
 pub fn pixel_of(nside: usize, direction: Vec3) -> usize {
-    let longitude = direction[1].atan2(direction[0]).rem_euclid(4.0 * FRAC_PI_2);
-    let latitude = direction[2].atan2(direction[0].hypot(direction[1]));
-    let depth = nside.trailing_zeros() as u8;
-    let nested = cdshealpix::nested::hash(depth, longitude, latitude);
-    cdshealpix::nested::get(depth).to_ring(nested) as usize
+    let [x, y, height] = direction;
+    let across = (x * x + y * y).sqrt();
+    let length = (across * across + height * height).sqrt();
+    let z = if length > 0.0 { height / length } else { 0.0 };
+    let n = nside as f64;
+    // Longitude in right angles, 0 <= turn < 4.
+    let turn = (y.atan2(x) / FRAC_PI_2).rem_euclid(4.0);
+    let turn = if turn < 4.0 { turn } else { 0.0 };
+    if z.abs() <= 2.0 / 3.0 {
+        // Numbers of the ascending and descending edges west of the direction.
+        let (middle, tilt) = (n * (0.5 + turn), n * z * 0.75);
+        let (ascending, descending) = ((middle - tilt) as usize, (middle + tilt) as usize);
+        // Ring counted from the last one of the northern cap.
+        let ring = (nside + 1 + ascending).saturating_sub(descending).clamp(1, 2 * nside + 1);
+        let shift = usize::from(ring.is_multiple_of(2));
+        let column = (ascending + descending + 1 + shift).saturating_sub(nside) / 2 % (4 * nside);
+        2 * nside * (nside - 1) + (ring - 1) * 4 * nside + column
+    } else {
+        let inside = turn.fract();
+        // sqrt(3 (1 - |z|)), exact near the pole.
+        let reach = n * (3.0 / (1.0 + z.abs())).sqrt() * (across / length);
+        let east = ((inside * reach) as usize).min(nside - 1);
+        let west = (((1.0 - inside) * reach) as usize).min(nside - 1);
+        let ring = (east + west + 1).min(nside);
+        let column = ((turn * ring as f64) as usize) % (4 * ring);
+        if z > 0.0 {
+            2 * ring * (ring - 1) + column
+        } else {
+            pixel_count(nside) - 2 * ring * (ring + 1) + column
+        }
+    }
 }
 
 /// Base face and integer position (ix, iy) of a NESTED pixel.
@@ -168,6 +196,39 @@ mod tests {
                 assert!(norm(sub(direction, inside)) < 1e-14, "{nside} {pixel}");
                 assert_eq!(pixel_of(nside, direction), pixel);
                 assert_eq!(nested_to_ring(nside, ring_to_nested(nside, pixel)), pixel);
+            }
+        }
+    }
+
+    #[test]
+    fn directions_fall_into_the_pixels_of_cdshealpix() {
+        let mut stream = crate::units::random_stream(1, crate::units::StreamKind::Probe, [0, 0]);
+        let mut uniform = move || 2.0 * rand::RngExt::random::<f64>(&mut stream) - 1.0;
+        for nside in [1, 2, 32, 1024, NSIDE_MAX] {
+            for k in 0..20_000_u32 {
+                // Every fourth direction close to a pole.
+                let squeeze = if k % 4 == 0 { 1e-4 } else { 1.0 };
+                let direction = [squeeze * uniform(), squeeze * uniform(), uniform()];
+                let longitude = direction[1].atan2(direction[0]).rem_euclid(4.0 * FRAC_PI_2);
+                let latitude = direction[2].atan2(direction[0].hypot(direction[1]));
+                let depth = nside.trailing_zeros() as u8;
+                let nested = cdshealpix::nested::hash(depth, longitude, latitude);
+                let expected = cdshealpix::nested::get(depth).to_ring(nested) as usize;
+                assert_eq!(pixel_of(nside, direction), expected, "{nside} {direction:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn any_numbers_fall_into_some_pixel() {
+        let hostile = [0.0, -0.0, 1.0, -1.0, 1e-308, 1e308, f64::NAN, f64::INFINITY, f64::NEG_INFINITY];
+        for nside in [1, 4, NSIDE_MAX] {
+            for x in hostile {
+                for y in hostile {
+                    for z in hostile {
+                        assert!(pixel_of(nside, [x, y, z]) < pixel_count(nside), "{x} {y} {z}");
+                    }
+                }
             }
         }
     }

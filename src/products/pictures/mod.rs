@@ -1,0 +1,25 @@
+//! Pictures: sky maps in Mollweide projection, curves, PNG files.
+//!
+//! Everything is drawn here, antialiased, with an embedded font; nothing of the machine's fonts or
+//! libraries shows in the result, so equal data give equal bytes.
+
+mod canvas;
+mod curves;
+mod error;
+mod labels;
+mod mollweide;
+mod png_file;
+mod projection;
+mod scale;
+mod sheet;
+mod text;
+
+pub use curves::{Axis, Curve, Plot, draw_plots};
+pub use error::PictureError;
+pub use mollweide::{Sampling, View};
+pub use png_file::Picture;
+pub use scale::{Palette, Scale, Stretch};
+pub use sheet::{Bars, MapPanel, Sheet, draw_map, draw_sheet};
+
+#[cfg(test)]
+mod tests;

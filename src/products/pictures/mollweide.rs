@@ -1,0 +1,302 @@
+//! A HEALPix map in Mollweide projection.
+
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
+
+use rayon::prelude::*;
+
+use super::canvas::{Canvas, Colour, FAINT, INK, Rect, Stroke, WHITE};
+use super::projection::{Parallel, forward};
+use super::scale::{Scale, is_seen};
+use super::text::{self, Align, Style};
+use crate::sky::healpix::{Ring, pixel_of, ring};
+use crate::units::vector::{Vec3, dot};
+
+/// Samples of a pixel of the picture along each side.
+const SUPERSAMPLING: usize = 3;
+
+/// How a map's values fill its picture.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Sampling {
+    /// Every pixel in its own colour, as the map is.
+    #[default]
+    Pixels,
+    /// Values between pixel centres linearly, along rings and across: easier on the eye for coarse maps.
+    Interpolated,
+}
+
+/// From where and how a map is looked at.
+#[derive(Clone, Debug, PartialEq)]
+pub struct View {
+    /// Rotation from the frame drawn to the map's frame: row `k` is the map's axis `k` in the frame drawn.
+    pub rotation: [Vec3; 3],
+    /// Name of the frame drawn, shown in the corner.
+    pub frame: String,
+    /// Longitude in the middle, degrees.
+    pub centre_deg: f64,
+    /// Whether pixels show.
+    pub sampling: Sampling,
+    /// Whether meridians and parallels are drawn, 60 and 30 degrees apart.
+    pub graticule: bool,
+}
+
+impl Default for View {
+    /// A map on ecliptic axes in its own frame.
+    fn default() -> Self {
+        Self {
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            frame: "ecliptic coordinates".to_owned(),
+            centre_deg: 0.0,
+            sampling: Sampling::Pixels,
+            graticule: true,
+        }
+    }
+}
+
+/// A map with its geometry: `values` in RING order.
+#[derive(Clone, Copy)]
+pub(super) struct Field<'a> {
+    pub values: &'a [f64],
+    pub nside: usize,
+}
+
+impl Field<'_> {
+    /// Linear between the two rings around a direction and between two pixels on each.
+    fn interpolated(&self, direction: Vec3) -> f64 {
+        let nearest = self.values[pixel_of(self.nside, direction)];
+        if !is_seen(nearest) {
+            return nearest;
+        }
+        let n = self.nside as f64;
+        let z = direction[2].clamp(-1.0, 1.0);
+        let from_north = if z.abs() <= 2.0 / 3.0 {
+            n * (2.0 - 1.5 * z)
+        } else {
+            let from_pole = n * (3.0 * (1.0 - z.abs())).sqrt();
+            if z > 0.0 { from_pole } else { 4.0 * n - from_pole }
+        };
+        let last = 4 * self.nside - 1;
+        let above = from_north.floor() as usize;
+        let weight = from_north - above as f64;
+        let longitude = direction[1].atan2(direction[0]);
+        let (mut sum, mut weights) = (0.0, 0.0);
+        for (k, ring_weight) in [(above, 1.0 - weight), (above + 1, weight)] {
+            if k == 0 || k > last {
+                // Beyond the first ring lies the pole, the mean of that ring.
+                let ring = ring(self.nside, k.clamp(1, last));
+                for value in &self.values[ring.first..ring.first + ring.len] {
+                    add(&mut sum, &mut weights, *value, ring_weight / ring.len as f64);
+                }
+                continue;
+            }
+            let ring = ring(self.nside, k);
+            let (pixels, inside) = neighbours(&ring, longitude);
+            add(&mut sum, &mut weights, self.values[pixels[0]], ring_weight * (1.0 - inside));
+            add(&mut sum, &mut weights, self.values[pixels[1]], ring_weight * inside);
+        }
+        if weights > 1e-9 { sum / weights } else { nearest }
+    }
+}
+
+fn add(sum: &mut f64, weights: &mut f64, value: f64, weight: f64) {
+    if is_seen(value) {
+        *sum += weight * value;
+        *weights += weight;
+    }
+}
+
+/// The pixels of a ring west and east of a longitude, and how far it lies between them.
+fn neighbours(ring: &Ring, longitude: f64) -> ([usize; 2], f64) {
+    let place = ((longitude - ring.phi0_rad) / TAU).rem_euclid(1.0) * ring.len as f64;
+    let west = (place.floor() as usize).min(ring.len - 1);
+    let east = if west + 1 == ring.len { 0 } else { west + 1 };
+    ([ring.first + west, ring.first + east], (place - west as f64).clamp(0.0, 1.0))
+}
+
+/// Draws a map into the greatest ellipse of a rectangle.
+pub(super) fn draw(canvas: &mut Canvas, area: Rect, field: Field<'_>, scale: &Scale, view: &View) {
+    let ellipse = Ellipse::within(area);
+    paint(canvas, &ellipse, field, scale, view);
+    let centre = view.centre_deg.to_radians();
+    if view.graticule {
+        let (colour, alpha) = if scale.is_light() { (INK, 0.28) } else { (WHITE, 0.33) };
+        let thin = Stroke::solid(colour, alpha, (ellipse.half_height / 300.0).clamp(0.6, 1.2));
+        for line in graticule(centre) {
+            canvas.polyline(&line.into_iter().map(|p| ellipse.to_page(p)).collect::<Vec<_>>(), thin);
+        }
+    }
+    let rim: Vec<(f64, f64)> = (0..=720)
+        .map(|k| (f64::from(k) * TAU / 720.0).sin_cos())
+        .map(|(s, c)| ellipse.to_page((2.0 * c, s)))
+        .collect();
+    canvas.polyline(&rim, Stroke::solid(INK, 1.0, (ellipse.half_height / 220.0).clamp(0.8, 1.6)));
+    if view.graticule && ellipse.half_height >= 180.0 {
+        label(canvas, &ellipse, scale, centre);
+    }
+}
+
+/// The map's outline on the page.
+struct Ellipse {
+    x: f64,
+    y: f64,
+    half_height: f64,
+}
+
+impl Ellipse {
+    fn within(area: Rect) -> Self {
+        let half_height = (0.25 * area.width).min(0.5 * area.height);
+        Self { x: area.middle_x(), y: area.middle_y(), half_height }
+    }
+
+    fn to_page(&self, (x, y): (f64, f64)) -> (f64, f64) {
+        (self.x + x * self.half_height, self.y - y * self.half_height)
+    }
+}
+
+/// Colours of directions of a map.
+struct Painter<'a> {
+    field: Field<'a>,
+    scale: &'a Scale,
+    /// Colour of each pixel, if pixels are shown.
+    pixels: Option<Vec<Colour>>,
+}
+
+impl<'a> Painter<'a> {
+    fn new(field: Field<'a>, scale: &'a Scale, sampling: Sampling) -> Self {
+        let pixels = match sampling {
+            Sampling::Pixels => Some(field.values.par_iter().map(|v| scale.colour(*v)).collect()),
+            Sampling::Interpolated => None,
+        };
+        Self { field, scale, pixels }
+    }
+
+    fn colour(&self, direction: Vec3) -> Colour {
+        match &self.pixels {
+            Some(pixels) => pixels[pixel_of(self.field.nside, direction)],
+            None => self.scale.colour(self.field.interpolated(direction)),
+        }
+    }
+}
+
+fn paint(canvas: &mut Canvas, ellipse: &Ellipse, field: Field<'_>, scale: &Scale, view: &View) {
+    let painter = Painter::new(field, scale, view.sampling);
+    let first_row = (ellipse.y - ellipse.half_height).floor().max(0.0) as usize;
+    let rows = (2.0 * ellipse.half_height).ceil() as usize + 1;
+    let mut lines: Vec<_> = canvas.pixel_rows_mut().enumerate().skip(first_row).take(rows).collect();
+    lines.par_iter_mut().for_each(|(y, line)| paint_row(line, *y, ellipse, &painter, view));
+}
+
+/// Paints one row of pixels; each takes the mean colour of its samples, those outside the ellipse
+/// leaving what is there.
+fn paint_row(line: &mut [[f32; 3]], y: usize, ellipse: &Ellipse, painter: &Painter<'_>, view: &View) {
+    let centre = view.centre_deg.to_radians();
+    let inside = |k: usize| (k as f64 + 0.5) / SUPERSAMPLING as f64;
+    let all = (SUPERSAMPLING * SUPERSAMPLING) as f32;
+    let first = (ellipse.x - 2.0 * ellipse.half_height).floor().max(0.0) as usize;
+    let columns = (4.0 * ellipse.half_height).ceil() as usize + 1;
+    let mut sums = vec![([0.0_f32; 3], 0.0_f32); columns.min(line.len() - first)];
+    for sub_row in 0..SUPERSAMPLING {
+        let up = (ellipse.y - (y as f64 + inside(sub_row))) / ellipse.half_height;
+        let Some(parallel) = Parallel::at(up) else { continue };
+        for (x, (sum, hits)) in sums.iter_mut().enumerate() {
+            for sub_column in 0..SUPERSAMPLING {
+                let right = ((first + x) as f64 + inside(sub_column) - ellipse.x) / ellipse.half_height;
+                let Some(longitude) = parallel.longitude(right) else { continue };
+                let (sin, cos) = (longitude + centre).sin_cos();
+                let drawn = [parallel.cos_latitude * cos, parallel.cos_latitude * sin, parallel.sin_latitude];
+                let colour = painter.colour(view.rotation.map(|row| dot(row, drawn)));
+                sum.iter_mut().zip(colour).for_each(|(sum, c)| *sum += f32::from(c));
+                *hits += 1.0;
+            }
+        }
+    }
+    for (pixel, (sum, hits)) in line[first..].iter_mut().zip(sums) {
+        for (pixel, sum) in pixel.iter_mut().zip(sum) {
+            *pixel = (*pixel * (all - hits) + sum) / all;
+        }
+    }
+}
+
+/// Meridians every 60 degrees and parallels every 30, as lines on the ellipse.
+fn graticule(centre: f64) -> Vec<Vec<(f64, f64)>> {
+    let latitudes = (0..=180).map(|k| (f64::from(k) - 90.0).to_radians());
+    let longitudes = (0..=180).map(|k| (f64::from(k) * 2.0 - 180.0).to_radians());
+    let mut lines = Vec::new();
+    for meridian in 0..6 {
+        let longitude = wrapped((f64::from(meridian) * 60.0).to_radians() - centre);
+        lines.push(latitudes.clone().map(|b| forward(longitude, b)).collect());
+    }
+    for parallel in -2..=2 {
+        let latitude = (f64::from(parallel) * 30.0).to_radians();
+        lines.push(longitudes.clone().map(|l| forward(l, latitude)).collect());
+    }
+    lines
+}
+
+/// Degrees beside the parallels and along the equator.
+fn label(canvas: &mut Canvas, ellipse: &Ellipse, scale: &Scale, centre: f64) {
+    let size = (ellipse.half_height / 19.0).clamp(10.0, 20.0);
+    let outside = Style::new(size, FAINT);
+    for parallel in [-60.0_f64, -30.0, 0.0, 30.0, 60.0] {
+        let (x, y) = ellipse.to_page(forward(PI, parallel.to_radians()));
+        let sign = if parallel > 0.0 {
+            "+"
+        } else if parallel < 0.0 {
+            "−"
+        } else {
+            ""
+        };
+        let text = format!("{sign}{}°", parallel.abs());
+        let lift = -0.45 * size * parallel.to_radians().sin() / 60_f64.to_radians().sin();
+        text::draw(canvas, &text, (x - 0.45 * size, y + lift), Align::End, outside);
+    }
+    let on_map = Style::new(0.9 * size, if scale.is_light() { INK } else { WHITE }).alpha(0.75);
+    for meridian in 0..6 {
+        let degrees = f64::from(meridian) * 60.0;
+        let longitude = wrapped(degrees.to_radians() - centre);
+        if longitude.abs() > 0.95 * PI {
+            continue;
+        }
+        let (x, y) = ellipse.to_page(forward(longitude, 0.0));
+        text::draw(canvas, &format!("{degrees}°"), (x + 0.3 * size, y + 0.7 * size), Align::Start, on_map);
+    }
+}
+
+fn wrapped(longitude: f64) -> f64 {
+    let turned = (longitude + PI).rem_euclid(TAU) - PI;
+    if turned <= -2.0 * FRAC_PI_2 { PI } else { turned }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sky::healpix::{pixel_count, pixel_directions};
+
+    #[test]
+    fn interpolation_keeps_what_is_linear_in_z_and_hits_centres() {
+        for nside in [1, 2, 8, 16] {
+            let directions = pixel_directions(nside);
+            let values: Vec<f64> = directions.iter().map(|d| d[2] + 0.3 * d[0]).collect();
+            let field = Field { values: &values, nside };
+            for (d, v) in directions.iter().zip(&values) {
+                assert!((field.interpolated(*d) - v).abs() < 1e-9, "{nside}");
+            }
+        }
+    }
+
+    #[test]
+    fn interpolation_bridges_holes_and_keeps_them() {
+        let nside = 4;
+        let mut values = vec![2.0; pixel_count(nside)];
+        values[50] = f64::NAN;
+        let field = Field { values: &values, nside };
+        let directions = pixel_directions(nside);
+        assert!(field.interpolated(directions[50]).is_nan());
+        for k in 0..1000_u32 {
+            let z = 2.0 * (f64::from(k) + 0.5) / 1000.0 - 1.0;
+            let (s, c) = (f64::from(k) * 2.4).sin_cos();
+            let across = (1.0 - z * z).sqrt();
+            let value = field.interpolated([across * c, across * s, z]);
+            assert!(value.is_nan() || (value - 2.0).abs() < 1e-12);
+        }
+    }
+}

@@ -1,0 +1,127 @@
+//! Finished pictures and their files.
+
+use std::borrow::Cow;
+use std::fs::{self, File, OpenOptions};
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use super::canvas::Canvas;
+use super::error::PictureError;
+
+/// Greatest side of a picture, pixels.
+const SIDE_MAX: usize = 16_384;
+/// Greatest number of pixels of a picture.
+const PIXELS_MAX: usize = 1 << 27;
+
+/// A finished picture, with what is to be known about it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Picture {
+    width: usize,
+    height: usize,
+    rgb: Vec<u8>,
+    texts: Vec<(String, String)>,
+}
+
+impl Picture {
+    pub(super) fn from_canvas(canvas: Canvas, width: usize, height: usize, title: &str) -> Self {
+        let software = concat!("lunarray ", env!("CARGO_PKG_VERSION")).to_owned();
+        let texts = vec![("Software".to_owned(), software), ("Title".to_owned(), title.to_owned())];
+        Self { width, height, rgb: canvas.into_rgb(), texts }
+    }
+
+    /// Whether a page of this size is drawn.
+    pub(super) fn check_size(width: usize, height: usize) -> Result<(), PictureError> {
+        for (what, value) in [("a width of", width), ("a height of", height)] {
+            if !(16..=SIDE_MAX).contains(&value) {
+                return Err(PictureError::Size { what, value, expected: "16 to 16384 pixels" });
+            }
+        }
+        if width * height > PIXELS_MAX {
+            let value = width * height;
+            return Err(PictureError::Size {
+                what: "a total of",
+                value,
+                expected: "134217728 pixels at most",
+            });
+        }
+        Ok(())
+    }
+
+    /// Adds a text chunk, as `Description` with the provenance of what is shown; NUL bytes, which PNG
+    /// cannot hold, become spaces, and keywords are cut to the 79 Latin letters that PNG allows.
+    #[must_use]
+    pub fn with_text(mut self, keyword: &str, text: &str) -> Self {
+        let keyword: String =
+            keyword.chars().filter(|c| c.is_ascii_graphic() || *c == ' ').take(79).collect();
+        let keyword =
+            if keyword.trim().is_empty() { "Comment".to_owned() } else { keyword.trim().to_owned() };
+        self.texts.push((keyword, text.replace('\0', " ")));
+        self
+    }
+
+    /// Width, pixels.
+    #[must_use]
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Height, pixels.
+    #[must_use]
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// The pixels, three bytes each, row by row from the top.
+    #[must_use]
+    pub fn rgb(&self) -> &[u8] {
+        &self.rgb
+    }
+
+    /// The picture as a PNG file's bytes.
+    ///
+    /// # Errors
+    /// What the encoder reports.
+    pub fn to_png(&self) -> Result<Vec<u8>, png::EncodingError> {
+        let mut bytes = Vec::new();
+        let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        encoder.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
+        for (keyword, text) in &self.texts {
+            encoder.add_itxt_chunk(keyword.clone(), text.clone())?;
+        }
+        let mut writer = encoder.write_header()?;
+        writer.write_image_data(&self.rgb)?;
+        writer.finish()?;
+        Ok(bytes)
+    }
+
+    /// Writes the picture; the file appears whole or not at all.
+    ///
+    /// # Errors
+    /// [`PictureError::Write`] with the system's reason, [`PictureError::Encode`].
+    pub fn write(&self, path: &Path) -> Result<(), PictureError> {
+        let bytes =
+            self.to_png().map_err(|source| PictureError::Encode { path: path.to_path_buf(), source })?;
+        let temporary = temporary_beside(path);
+        let written = write_synced(&temporary, &bytes).and_then(|()| fs::rename(&temporary, path));
+        if let Err(source) = written {
+            // What went wrong is told; that the remains may stay as well is not worth another error.
+            let _ = fs::remove_file(&temporary);
+            return Err(PictureError::Write { path: path.to_path_buf(), source });
+        }
+        Ok(())
+    }
+}
+
+fn temporary_beside(path: &Path) -> PathBuf {
+    let name = path.file_name().map_or(Cow::Borrowed("picture"), |name| name.to_string_lossy());
+    path.with_file_name(format!(".{name}.{}.partial", std::process::id()))
+}
+
+fn write_synced(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    let file = OpenOptions::new().write(true).create(true).truncate(true).open(path)?;
+    let mut writer = BufWriter::new(file);
+    writer.write_all(bytes)?;
+    writer.into_inner().map_err(std::io::IntoInnerError::into_error).and_then(|file: File| file.sync_all())
+}

@@ -1,0 +1,97 @@
+//! The Mollweide projection, as astronomers draw it: longitude grows to the left.
+
+use std::f64::consts::{FRAC_PI_2, PI};
+
+/// Place on the ellipse of half axes 2 (x, to the right) and 1 (y, up) of a longitude, relative to the
+/// middle of the map, and a latitude, rad.
+pub(super) fn forward(longitude: f64, latitude: f64) -> (f64, f64) {
+    // Newton's method on 2 t + sin 2t = pi sin(latitude), with the series at the pole where it is slow.
+    let target = PI * latitude.sin();
+    let mut t = latitude * 0.9;
+    for _ in 0..50 {
+        let slope = 2.0 + 2.0 * (2.0 * t).cos();
+        if slope < 1e-9 {
+            break;
+        }
+        let step = (2.0 * t + (2.0 * t).sin() - target) / slope;
+        t = (t - step).clamp(-FRAC_PI_2, FRAC_PI_2);
+        if step.abs() < 1e-12 {
+            break;
+        }
+    }
+    (-2.0 * longitude / PI * t.cos(), t.sin())
+}
+
+/// A parallel of latitude: a horizontal line of the ellipse.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Parallel {
+    /// Sine of the latitude.
+    pub sin_latitude: f64,
+    /// Cosine of the latitude.
+    pub cos_latitude: f64,
+    /// Half the length of the line over that of the equator's.
+    across: f64,
+}
+
+impl Parallel {
+    /// The parallel at height `y` of the ellipse; `None` outside it.
+    pub fn at(y: f64) -> Option<Self> {
+        if y.abs() > 1.0 {
+            return None;
+        }
+        let t = y.asin();
+        let across = t.cos();
+        let sin_latitude = ((2.0 * t + (2.0 * t).sin()) / PI).clamp(-1.0, 1.0);
+        let cos_latitude = ((1.0 - sin_latitude) * (1.0 + sin_latitude)).sqrt();
+        Some(Self { sin_latitude, cos_latitude, across })
+    }
+
+    /// Longitude relative to the middle, rad, at `x`; `None` outside the ellipse.
+    pub fn longitude(&self, x: f64) -> Option<f64> {
+        (x.abs() <= 2.0 * self.across && self.across > 0.0).then(|| -PI * x / (2.0 * self.across))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn there_and_back() {
+        for i in -17..=17 {
+            for j in -8..=8 {
+                let (longitude, latitude) = (f64::from(i) * 10.0, f64::from(j) * 11.0);
+                let (x, y) = forward(longitude.to_radians(), latitude.to_radians());
+                let parallel = Parallel::at(y).unwrap();
+                let (l, b) = (parallel.longitude(x).unwrap(), parallel.sin_latitude.asin());
+                assert!(
+                    (l.to_degrees() - longitude).abs() < 1e-6 && (b.to_degrees() - latitude).abs() < 1e-6
+                );
+            }
+        }
+        // East is left, north is up.
+        assert!(forward(0.1, 0.0).0 < 0.0 && forward(0.0, 0.1).1 > 0.0);
+        assert_eq!(Parallel::at(0.0).unwrap().longitude(2.1), None);
+        assert_eq!(Parallel::at(1.1), None);
+    }
+
+    #[test]
+    fn areas_are_kept() {
+        // A cap's share of the sphere is its share of the ellipse, counted on a grid.
+        let n = 800;
+        let mut inside = 0;
+        for i in 0..2 * n {
+            for j in 0..n {
+                let (x, y) = (
+                    2.0 * (f64::from(i) + 0.5) / f64::from(n) - 2.0,
+                    2.0 * (f64::from(j) + 0.5) / f64::from(n) - 1.0,
+                );
+                let seen = Parallel::at(y).filter(|p| p.longitude(x).is_some());
+                inside += i32::from(seen.is_some_and(|p| p.sin_latitude > 0.5_f64.sin()));
+            }
+        }
+        let share = f64::from(inside) * (2.0 / f64::from(n)).powi(2) / (2.0 * PI);
+        // Edge pixels of the grid.
+        assert!((share - 0.5 * (1.0 - 0.5_f64.sin())).abs() < 2e-3, "{share}");
+    }
+}

@@ -1,0 +1,161 @@
+//! From values to colours.
+
+use super::canvas::Colour;
+use super::error::PictureError;
+use super::labels::{self, Ticks};
+use crate::units::constants::HEALPIX_UNSEEN;
+
+/// How values spread over a scale.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Stretch {
+    /// Evenly.
+    #[default]
+    Linear,
+    /// Their logarithms evenly.
+    Log,
+}
+
+/// Colours of a scale.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Palette {
+    /// Black over purple and orange to light yellow: brightness.
+    #[default]
+    Inferno,
+    /// Dark blue over green to yellow.
+    Viridis,
+    /// Blue over white to red: differences.
+    Diverging,
+}
+
+/// Colour of pixels without a value.
+pub(super) const UNSEEN: Colour = [160, 160, 160];
+
+/// A colour scale; several maps may share one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Scale {
+    low: f64,
+    high: f64,
+    stretch: Stretch,
+    palette: Palette,
+}
+
+impl Scale {
+    /// A scale between given limits.
+    ///
+    /// # Errors
+    /// [`PictureError::Limits`] unless both are finite, `low < high` and, for logarithms, `low > 0`.
+    pub fn new(low: f64, high: f64, stretch: Stretch, palette: Palette) -> Result<Self, PictureError> {
+        let (positive, name, more) = match stretch {
+            Stretch::Linear => (true, "linear", ""),
+            Stretch::Log => (low > 0.0, "logarithmic", " and low > 0"),
+        };
+        if !(low < high && (high - low).is_finite() && positive) {
+            return Err(PictureError::Limits { low, high, stretch: name, more });
+        }
+        Ok(Self { low, high, stretch, palette })
+    }
+
+    /// A scale that the middle of `values` fills, from their 0.5 to their 99.5 % point, unseen ones left aside.
+    ///
+    /// Always a valid scale: constant or missing values get a little room around them, and
+    /// a logarithmic one starts at the least positive value if need be.
+    #[must_use]
+    pub fn robust(values: &[f64], stretch: Stretch, palette: Palette) -> Self {
+        let usable = |v: &f64| is_seen(*v) && (stretch == Stretch::Linear || *v > 0.0);
+        let (low, high) = percentiles(values.iter().copied().filter(usable).collect(), 0.5, 99.5);
+        Self::widened(low, high, stretch, palette)
+    }
+
+    /// A diverging scale, symmetric about zero, that reaches to the 99 % point of `|values|`.
+    #[must_use]
+    pub fn symmetric(values: &[f64]) -> Self {
+        let sizes = values.iter().copied().filter(|v| is_seen(*v)).map(f64::abs).collect();
+        let (_, reach) = percentiles(sizes, 0.0, 99.0);
+        let reach = if reach > 0.0 { reach.clamp(1e-300, 1e300) } else { 1.0 };
+        Self { low: -reach, high: reach, stretch: Stretch::Linear, palette: Palette::Diverging }
+    }
+
+    fn widened(low: f64, high: f64, stretch: Stretch, palette: Palette) -> Self {
+        let (low, high) = (low.clamp(-1e300, 1e300), high.clamp(-1e300, 1e300));
+        let enough = 1e-9 * low.abs().max(high.abs());
+        let (low, high) = match stretch {
+            _ if high - low > enough => (low, high),
+            Stretch::Linear => {
+                let room = if low == 0.0 { 1.0 } else { 0.1 * low.abs() };
+                (low - room, low + room)
+            }
+            Stretch::Log => (low / 1.2, low * 1.2),
+        };
+        Self { low, high, stretch, palette }
+    }
+
+    /// Lower limit.
+    #[must_use]
+    pub fn low(&self) -> f64 {
+        self.low
+    }
+
+    /// Upper limit.
+    #[must_use]
+    pub fn high(&self) -> f64 {
+        self.high
+    }
+
+    /// Place of a value on the scale, 0 to 1 within the limits.
+    pub(super) fn place(&self, value: f64) -> f64 {
+        match self.stretch {
+            Stretch::Linear => (value - self.low) / (self.high - self.low),
+            Stretch::Log if value > 0.0 => (value / self.low).ln() / (self.high / self.low).ln(),
+            Stretch::Log => f64::NEG_INFINITY,
+        }
+    }
+
+    /// Colour of a value; grey if there is none.
+    pub(super) fn colour(&self, value: f64) -> Colour {
+        if is_seen(value) { self.colour_at(self.place(value)) } else { UNSEEN }
+    }
+
+    /// Colour at a place of the scale.
+    pub(super) fn colour_at(&self, place: f64) -> Colour {
+        let place = place.clamp(0.0, 1.0);
+        match self.palette {
+            Palette::Inferno => colorous::INFERNO.eval_continuous(place),
+            Palette::Viridis => colorous::VIRIDIS.eval_continuous(place),
+            Palette::Diverging => colorous::RED_BLUE.eval_continuous(1.0 - place),
+        }
+        .into_array()
+    }
+
+    /// Whether lines over the map should be dark.
+    pub(super) fn is_light(&self) -> bool {
+        self.palette == Palette::Diverging
+    }
+
+    /// Round values along the scale.
+    pub(super) fn ticks(&self, wanted: usize) -> Ticks {
+        match self.stretch {
+            Stretch::Linear => labels::linear(self.low, self.high, wanted),
+            Stretch::Log => labels::logarithmic(self.low, self.high, wanted),
+        }
+    }
+}
+
+/// Whether a pixel holds a value: finite and not UNSEEN, in single precision either.
+pub(super) fn is_seen(value: f64) -> bool {
+    value.is_finite() && (value - HEALPIX_UNSEEN).abs() > 1e-5 * HEALPIX_UNSEEN.abs()
+}
+
+/// Two percentiles, linear between values; 1 and 1, which suits any scale, if there are none.
+fn percentiles(mut values: Vec<f64>, low: f64, high: f64) -> (f64, f64) {
+    if values.is_empty() {
+        return (1.0, 1.0);
+    }
+    values.sort_unstable_by(f64::total_cmp);
+    let at = |percent: f64| {
+        let place = percent / 100.0 * (values.len() - 1) as f64;
+        let before = place.floor() as usize;
+        let after = (before + 1).min(values.len() - 1);
+        values[before] + (place - before as f64) * (values[after] - values[before])
+    };
+    (at(low), at(high))
+}

@@ -1,0 +1,164 @@
+use super::*;
+use crate::sky::healpix::{pixel_count, pixel_directions};
+
+fn colour_at(picture: &Picture, x: f64, y: f64) -> [u8; 3] {
+    let place = 3 * (y as usize * picture.width() + x as usize);
+    [picture.rgb()[place], picture.rgb()[place + 1], picture.rgb()[place + 2]]
+}
+
+fn bare() -> Sheet {
+    Sheet {
+        view: View { frame: String::new(), graticule: false, ..View::default() },
+        width_px: 800,
+        ..Sheet::default()
+    }
+}
+
+fn panel(values: &[f64], scale: Scale) -> MapPanel<'_> {
+    MapPanel { values, caption: String::new(), scale, unit: "K".to_owned() }
+}
+
+#[test]
+fn longitude_grows_to_the_left_and_latitude_upwards() {
+    // One map bright in the east, one in the north.
+    for (axis, bright, dark) in [(1, (0.3, 0.5), (0.7, 0.5)), (2, (0.5, 0.3), (0.5, 0.7))] {
+        let values: Vec<f64> = pixel_directions(16).iter().map(|d| d[axis]).collect();
+        let scale = Scale::new(-1.0, 1.0, Stretch::Linear, Palette::Inferno).unwrap();
+        let picture = draw_sheet(&[panel(&values, scale)], &bare()).unwrap();
+        // The map fills the page's width but for the margins; its middle is near the page's.
+        let map_height = 0.445 * 800.0;
+        let sum = |(x, y): (f64, f64)| {
+            let c = colour_at(&picture, x * 800.0, 15.0 + y * map_height);
+            c.into_iter().map(u32::from).sum::<u32>()
+        };
+        assert!(sum(bright) > sum(dark) + 100, "axis {axis}");
+    }
+}
+
+#[test]
+fn a_rotation_turns_the_view() {
+    let values: Vec<f64> = pixel_directions(16).iter().map(|d| d[0]).collect();
+    let scale = Scale::new(-1.0, 1.0, Stretch::Linear, Palette::Inferno).unwrap();
+    // The frame drawn has its pole where the map has its x axis.
+    let turned = View { rotation: [[0., 0., 1.], [1., 0., 0.], [0., 1., 0.]], ..bare().view };
+    let picture = draw_sheet(&[panel(&values, scale)], &Sheet { view: turned, ..bare() }).unwrap();
+    let north = colour_at(&picture, 400.0, 40.0);
+    let south = colour_at(&picture, 400.0, 345.0);
+    assert!(north.map(u32::from).iter().sum::<u32>() > south.map(u32::from).iter().sum::<u32>() + 300);
+}
+
+#[test]
+fn unseen_pixels_are_grey() {
+    let scale = Scale::new(0.0, 1.0, Stretch::Linear, Palette::Inferno).unwrap();
+    for value in [f64::NAN, -1.6375e30, f64::from(-1.6375e30_f32), f64::INFINITY] {
+        let values = vec![value; pixel_count(2)];
+        for sampling in [Sampling::Pixels, Sampling::Interpolated] {
+            let sheet = Sheet { view: View { sampling, ..bare().view }, ..bare() };
+            let picture = draw_sheet(&[panel(&values, scale)], &sheet).unwrap();
+            assert_eq!(colour_at(&picture, 400.0, 200.0), [160; 3]);
+        }
+    }
+}
+
+#[test]
+fn scales_suit_what_they_are_made_from() {
+    let ramp: Vec<f64> = (0..=1000).map(f64::from).collect();
+    let scale = Scale::robust(&ramp, Stretch::Linear, Palette::Inferno);
+    assert_eq!((scale.low(), scale.high()), (5.0, 995.0));
+    let outlier: Vec<f64> = ramp.iter().copied().chain([f64::NAN, -1.6375e30]).collect();
+    assert_eq!(Scale::robust(&outlier, Stretch::Linear, Palette::Inferno), scale);
+    let errors = Scale::symmetric(&[-3.0, 1.0, 2.0, f64::NAN]);
+    assert!(errors.low() == -errors.high() && errors.high() > 2.9);
+    for hostile in [&[][..], &[0.0; 3], &[f64::NAN], &[-5.0, -5.0], &[1e308, -1e308, 5e-324]] {
+        for stretch in [Stretch::Linear, Stretch::Log] {
+            let scale = Scale::robust(hostile, stretch, Palette::Viridis);
+            let valid = Scale::new(scale.low(), scale.high(), stretch, Palette::Viridis);
+            assert!(valid.is_ok(), "{hostile:?} {stretch:?} {scale:?}");
+        }
+        let scale = Scale::symmetric(hostile);
+        assert!(scale.low() < scale.high());
+    }
+    for (low, high, stretch) in [
+        (1.0, 1.0, Stretch::Linear),
+        (f64::NAN, 1.0, Stretch::Linear),
+        (0.0, 1.0, Stretch::Log),
+        (-1.0, f64::INFINITY, Stretch::Linear),
+    ] {
+        assert!(matches!(Scale::new(low, high, stretch, Palette::Inferno), Err(PictureError::Limits { .. })));
+    }
+}
+
+#[test]
+fn what_is_no_page_is_refused() {
+    let scale = Scale::new(0.0, 1.0, Stretch::Linear, Palette::Inferno).unwrap();
+    let values = vec![0.5; 13];
+    assert!(matches!(
+        draw_sheet(&[panel(&values, scale)], &bare()),
+        Err(PictureError::PixelCount { panel: 0, pixels: 13 })
+    ));
+    assert!(matches!(draw_sheet(&[], &bare()), Err(PictureError::Size { .. })));
+    let values = vec![0.5; 12];
+    for width_px in [0, 15, 20_000, usize::MAX] {
+        let sheet = Sheet { width_px, ..bare() };
+        assert!(matches!(draw_sheet(&[panel(&values, scale)], &sheet), Err(PictureError::Size { .. })));
+    }
+    assert!(matches!(draw_plots("", &[], 1), Err(PictureError::Size { .. })));
+}
+
+#[test]
+fn plots_of_anything_are_drawn() {
+    let bad = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 0.0, -1.0, 1e308, -1e308, 5e-324, 1.0];
+    let points: Vec<(f64, f64)> = bad.iter().flat_map(|&x| bad.iter().map(move |&y| (x, y))).collect();
+    for log in [false, true] {
+        for limits in [None, Some((f64::NAN, 1.0)), Some((1.0, 0.0)), Some((0.0, 1e-320))] {
+            let axis = Axis { label: "x".to_owned(), log, limits };
+            let curve = Curve { label: "all".to_owned(), points: points.clone(), dashed: log };
+            let plot = Plot {
+                x: axis.clone(),
+                y: axis,
+                curves: vec![curve],
+                levels: bad.to_vec(),
+                ..Plot::default()
+            };
+            assert!(draw_plots("t", &[plot], 1).is_ok());
+        }
+    }
+    assert!(draw_plots("", &[Plot::default()], 5).is_ok());
+}
+
+#[test]
+fn files_hold_the_picture_and_its_texts_and_appear_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("map.png");
+    let values: Vec<f64> = pixel_directions(4).iter().map(|d| d[0]).collect();
+    let map = panel(&values, Scale::symmetric(&values));
+    let picture =
+        draw_map(&MapPanel { caption: "δT at 10 MHz".to_owned(), ..map }, "a line", &View::default())
+            .unwrap()
+            .with_text("Description", "seed 1\0 hash")
+            .with_text("\u{2603}", "no keyword");
+    picture.write(&path).unwrap();
+    picture.write(&path).unwrap();
+    let names: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+    assert_eq!(names, ["map.png"]);
+
+    let file = std::io::BufReader::new(std::fs::File::open(&path).unwrap());
+    let mut reader = png::Decoder::new(file).read_info().unwrap();
+    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+    reader.next_frame(&mut pixels).unwrap();
+    assert_eq!(pixels, picture.rgb());
+    let texts: Vec<(String, String)> = reader
+        .info()
+        .utf8_text
+        .iter()
+        .map(|chunk| (chunk.keyword.clone(), chunk.get_text().unwrap()))
+        .collect();
+    let pair = |a: &str, b: &str| (a.to_owned(), b.to_owned());
+    assert!(texts.contains(&pair("Title", "δT at 10 MHz")));
+    assert!(texts.contains(&pair("Description", "seed 1  hash")));
+    assert!(texts.contains(&pair("Comment", "no keyword")));
+    assert!(texts.iter().any(|(k, v)| k == "Software" && v.starts_with("lunarray ")));
+
+    let nowhere = folder.path().join("missing").join("map.png");
+    assert!(matches!(picture.write(&nowhere), Err(PictureError::Write { path, .. }) if path == nowhere));
+}
