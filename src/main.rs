@@ -1,3 +1,5 @@
 //! The `lunarray` command; everything it does is in the library.
 
-fn main() {}
+fn main() -> std::process::ExitCode {
+    lunarray::cli::main()
+}

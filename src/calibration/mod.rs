@@ -8,11 +8,13 @@ mod config;
 mod error;
 mod gains;
 mod gains_file;
+mod stage;
 
 pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 pub use gains::AntennaGains;
 pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation};
+pub use stage::Calibrator;
 
 use crate::frames::PlacedVisibilities;
 

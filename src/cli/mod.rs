@@ -1,1 +1,167 @@
-//! (to come)
+//! The command line: arguments, progress, output for people and for programs.
+
+mod check;
+mod compare;
+mod geometry;
+mod inspect;
+mod predict;
+mod progress;
+mod replay;
+mod run;
+mod simulate;
+mod sky;
+
+use std::io::Write;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+
+use crate::pipeline::ConfigSource;
+
+/// What went wrong with a command; every variant says where and what was expected.
+type CommandError = Box<dyn std::error::Error + Send + Sync>;
+type CommandResult = Result<Outcome, CommandError>;
+
+/// How a command that did not fail has ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Outcome {
+    /// All of it was done.
+    Done,
+    /// Ctrl-C ended it early; what it leaves is valid.
+    Interrupted,
+}
+
+/// From a sky, through a lunar-orbit interferometer and its downlink, to a map.
+///
+/// Below 30 MHz the ionosphere hides the sky. Eight small satellites that circle the Moon correlate
+/// their signals while the Moon hides the Earth, and send visibilities down when it is in sight again;
+/// lunarray simulates them, takes their downlink files, and turns them into maps of the whole sky.
+///
+/// Start with `lunarray run`: it needs no file and leaves maps in out/quicklook/.
+#[derive(Debug, Parser)]
+#[command(name = "lunarray", version, propagate_version = true, max_term_width = 100)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Run(run::RunArgs),
+    Simulate(simulate::SimulateArgs),
+    Replay(replay::ReplayArgs),
+    Inspect(inspect::InspectArgs),
+    Compare(compare::CompareArgs),
+    Geometry(geometry::GeometryArgs),
+    Predict(predict::PredictArgs),
+    Check(check::CheckArgs),
+    Sky(sky::SkyArgs),
+}
+
+/// A pipeline and what is laid over it.
+#[derive(Debug, Args)]
+struct PipelineArgs {
+    /// Pipeline file (TOML); the embedded quicklook if none is named.
+    #[arg(value_name = "PIPELINE.toml")]
+    pipeline: Option<PathBuf>,
+    /// Seed of everything random in the space segment, in place of the file's.
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Replace one setting, for example --set map.nside=32; may be given again.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+}
+
+/// An array, for commands that need no more of a pipeline.
+#[derive(Debug, Args)]
+struct ArrayArgs {
+    /// Pipeline file (TOML) whose array is meant; the paper's fiducial array if none is named.
+    #[arg(long, value_name = "PIPELINE.toml")]
+    pipeline: Option<PathBuf>,
+    /// Replace one setting, for example --set array.inclination_deg=60; may be given again.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+}
+
+impl ArrayArgs {
+    fn source(&self) -> ConfigSource {
+        ConfigSource { file: self.pipeline.clone(), overrides: self.overrides.clone(), seed: None }
+    }
+}
+
+impl PipelineArgs {
+    fn source(&self) -> ConfigSource {
+        let Self { pipeline, seed, overrides } = self;
+        ConfigSource { file: pipeline.clone(), overrides: overrides.clone(), seed: *seed }
+    }
+}
+
+/// Runs the command that the process was given; the process's exit code.
+///
+/// 0: done. 1: failed, with the reason on standard error. 2: wrong usage. 130: ended early by Ctrl-C,
+/// leaving valid products of the data so far.
+#[must_use]
+pub fn main() -> ExitCode {
+    let result = match Cli::parse().command {
+        Command::Run(args) => run::execute(&args),
+        Command::Simulate(args) => simulate::execute(&args),
+        Command::Replay(args) => replay::execute(&args),
+        Command::Inspect(args) => inspect::execute(&args),
+        Command::Compare(args) => compare::execute(&args),
+        Command::Geometry(args) => geometry::execute(&args),
+        Command::Predict(args) => predict::execute(&args),
+        Command::Check(args) => check::execute(&args),
+        Command::Sky(args) => sky::execute(&args),
+    };
+    match result {
+        Ok(Outcome::Done) => ExitCode::SUCCESS,
+        Ok(Outcome::Interrupted) => ExitCode::from(130),
+        Err(error) if is_broken_pipe(error.as_ref()) => ExitCode::SUCCESS,
+        Err(error) => {
+            report(error.as_ref());
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// The reader of our output has had enough, as `head` has: not a failure.
+fn is_broken_pipe(error: &(dyn std::error::Error + 'static)) -> bool {
+    error
+        .downcast_ref::<std::io::Error>()
+        .is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
+}
+
+/// Prints an error and its causes, leaving out causes that the message already tells.
+fn report(error: &(dyn std::error::Error + 'static)) {
+    let mut said = error.to_string();
+    eprintln!("error: {said}");
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        let text = error.to_string();
+        if !said.contains(&text) {
+            eprintln!("  because: {text}");
+        }
+        said = text;
+        cause = error.source();
+    }
+}
+
+/// Prints one JSON object on a line of its own.
+fn print_json_line(value: &impl serde::Serialize) -> Result<(), CommandError> {
+    let mut out = std::io::stdout().lock();
+    serde_json::to_writer(&mut out, value).map_err(|error| match error.io_error_kind() {
+        Some(kind) => Box::new(std::io::Error::from(kind)) as CommandError,
+        None => Box::new(error),
+    })?;
+    out.write_all(b"\n")?;
+    Ok(())
+}
+
+/// Prints text for people.
+fn print_text(text: &str) -> Result<(), CommandError> {
+    let mut out = std::io::stdout().lock();
+    out.write_all(text.as_bytes())?;
+    out.write_all(b"\n")?;
+    Ok(())
+}

@@ -138,3 +138,26 @@ impl ReceptionCounters {
         Kind::ALL.iter().map(|kind| self.kind(*kind).packets).sum()
     }
 }
+
+impl std::fmt::Display for ReceptionCounters {
+    /// A line for each kind of packet, and one for everything that was wrong.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        for kind in Kind::ALL {
+            let counts = self.kind(kind);
+            if *counts != KindCounts::default() {
+                let KindCounts { packets, bytes, damaged, duplicates, missing, .. } = counts;
+                let name = format!("{kind:?}").to_lowercase();
+                write!(f, "{name:<14} {packets:>10} packets {bytes:>14} bytes")?;
+                writeln!(f, "  {missing} missing, {damaged} damaged, {duplicates} duplicate")?;
+            }
+        }
+        write!(
+            f,
+            "{} bytes between packets, {} in a cut end, {} payloads refused, {} visibilities of bad value",
+            self.bytes_garbage,
+            self.bytes_truncated,
+            self.faults.total(),
+            self.visibilities_bad_value
+        )
+    }
+}

@@ -41,9 +41,11 @@ mod file;
 mod header;
 mod kind;
 mod packetizer;
+mod partial_file;
 mod payload;
 mod receiver;
 mod sequence;
+mod stages;
 
 pub use config::DownlinkConfig;
 pub use contents::Contents;
@@ -57,3 +59,4 @@ pub use kind::{APID_BASE, Kind};
 pub use packetizer::Packetizer;
 pub use payload::{NODES_MIN, PayloadFault};
 pub use receiver::{Event, Packet, Receiver};
+pub use stages::{FileSource, Reception, Recorder, Transmitter};

@@ -4,11 +4,13 @@
 //! checked where the data enters (the configuration on the spacecraft, the decoder on the ground).
 
 mod ephemeris;
+mod ground;
 mod housekeeping;
 mod instrument;
 mod visibility;
 
 pub use ephemeris::EphemerisSegment;
+pub use ground::PlacedFrame;
 pub use housekeeping::Housekeeping;
 pub use instrument::{AntennaResponse, Channel, Instrument};
 pub use visibility::{Flags, PlacedVisibilities, VisibilityBlock};

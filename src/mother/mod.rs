@@ -1,1 +1,21 @@
-//! (to come)
+//! The mother: integration of visibilities while the Earth is hidden, and the store that holds them
+//! until it is in sight.
+//!
+//! This is the spacecraft at the level of integrated visibilities: what the correlator would put out
+//! for a given sky, with thermal noise. Uses [`crate::frames`], [`crate::array`], [`crate::sky`].
+
+mod config;
+mod direct;
+mod integrator;
+mod model;
+mod observer;
+mod schedule;
+mod store;
+
+pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, SpacecraftConfig, SpacecraftError};
+pub use direct::DirectSum;
+pub use integrator::{Integrator, NoiseModel};
+pub use model::{PairPosition, Prediction, VisibilityModel};
+pub use observer::Observer;
+pub use schedule::{Integration, Schedule};
+pub use store::{Store, VISIBILITY_BYTES};

@@ -1,1 +1,20 @@
-//! (to come)
+//! From a configuration to a running graph: parse, validate, build, run.
+//!
+//! The only place where space and ground meet, and where concrete stages are wired.
+
+mod config;
+mod cost;
+mod error;
+mod ground;
+mod plan;
+mod run;
+mod space;
+mod summary;
+
+pub use config::{Config, ConfigError, ConfigSource, QUICKLOOK};
+pub use cost::{ChannelCost, Cost};
+pub use error::PipelineError;
+pub use plan::{Expected, Plan};
+pub use run::{DOWNLINK_FILE, Watcher, replay, run, simulate, use_threads};
+pub use space::INTEGRATE;
+pub use summary::{Segment, Summary};

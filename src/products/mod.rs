@@ -1,3 +1,21 @@
-//! What a run leaves behind.
+//! What a run leaves behind: maps, pictures, figures.
+//!
+//! Uses [`crate::solve`] and [`crate::sky`].
 
+mod channel;
+mod config;
+mod error;
 pub mod pictures;
+mod provenance;
+mod publisher;
+mod summary;
+mod truth;
+mod write;
+
+pub use config::{ProductsConfig, ProductsConfigError};
+pub use error::ProductsError;
+pub use provenance::Provenance;
+pub use publisher::Publisher;
+pub use summary::{ChannelSummary, SnapshotSummary};
+pub use truth::Truth;
+pub use write::write_atomically;

@@ -15,6 +15,7 @@
 //! [`Ledger`] is the account that a run closes with.
 
 mod cancel;
+mod config;
 mod error;
 mod graph;
 mod ledger;
@@ -30,6 +31,7 @@ mod worker;
 mod tests;
 
 pub use cancel::Cancel;
+pub use config::{RuntimeConfig, RuntimeConfigError};
 pub use error::{BoxError, Laggards, Moment, RuntimeError};
 pub use graph::{Graph, Link};
 pub use ledger::{Ledger, LedgerImbalance, LedgerReport, Loss};

@@ -2,6 +2,8 @@
 //!
 //! Uses [`crate::units`] only.
 
+pub mod compare;
+mod config;
 mod error;
 pub mod fits;
 mod frame;
@@ -10,6 +12,7 @@ pub mod harmonics;
 pub mod healpix;
 mod map;
 
+pub use config::{GENERATED_NSIDE_MAX, SkyConfig, SkyConfigError};
 pub use error::MapError;
 pub use frame::{Frame, Rotation, rotate};
 pub use map::{SkyMap, is_unseen};

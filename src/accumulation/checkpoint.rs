@@ -1,0 +1,333 @@
+//! Checkpoints of the pixel engine: versioned, bounded, with a checksum over everything.
+//!
+//! Layout: magic, length of the head (u32 LE), head (bincode), raw little-endian f64: the matrix's tiles
+//! column by column, both right-hand sides, the waiting visibilities; CRC-32C of all that (u32 LE).
+
+use std::io::{Read, Write};
+
+use bincode::config::{Configuration, Fixint, LittleEndian, Limit};
+use num_complex::Complex64;
+
+use super::error::AccumulationError;
+use super::pixel::{Pending, PixelEngine, PixelSetup, PixelSums};
+use super::SumCounts;
+use crate::array::response::PixelMethod;
+use crate::frames::AntennaResponse;
+use crate::sky::healpix::is_valid_nside;
+
+const MAGIC: &[u8; 8] = b"LNRPIX01";
+
+/// Greatest head that is read: the real one takes some 80 bytes.
+const HEAD_BYTES_MAX: usize = 4096;
+
+/// Greatest number of waiting visibilities that is believed.
+const PENDING_MAX: u32 = 65_536;
+
+/// Greatest nside that is believed.
+const NSIDE_MAX: u32 = 64;
+
+/// Numbers that a waiting visibility takes.
+const PENDING_NUMBERS: usize = 11;
+
+const CODEC: Configuration<LittleEndian, Fixint, Limit<HEAD_BYTES_MAX>> = bincode::config::standard()
+    .with_little_endian()
+    .with_fixed_int_encoding()
+    .with_limit::<HEAD_BYTES_MAX>();
+
+#[derive(bincode::Encode, bincode::Decode)]
+struct Head {
+    nside: u32,
+    frequency_hz: f64,
+    method: u8,
+    moon_radius_m: f64,
+    response: u8,
+    companion_seed: u64,
+    counts: SumCounts,
+    pending: u32,
+}
+
+/// What a checkpoint holds.
+pub(super) struct Restored {
+    pub(super) setup: PixelSetup,
+    pub(super) sums: PixelSums,
+    pub(super) pending: Vec<Pending>,
+}
+
+/// Numbers of variants on disk: never to be renumbered.
+const METHODS: [PixelMethod; 3] = [PixelMethod::Centre, PixelMethod::Average, PixelMethod::AverageExact];
+const RESPONSES: [AntennaResponse; 2] = [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal];
+
+fn number_of<T: PartialEq>(variants: &[T], variant: &T) -> u8 {
+    variants.iter().position(|v| v == variant).map_or(u8::MAX, |k| k as u8)
+}
+
+pub(super) fn write(engine: &PixelEngine, out: &mut dyn Write) -> Result<(), AccumulationError> {
+    let mut out = Summed { inner: out, crc: crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi) };
+    let setup = &engine.setup;
+    let head = Head {
+        nside: setup.nside as u32,
+        frequency_hz: setup.frequency_hz,
+        method: number_of(&METHODS, &setup.method),
+        moon_radius_m: setup.moon_radius_m,
+        response: number_of(&RESPONSES, &setup.response),
+        companion_seed: setup.companion_seed,
+        counts: engine.sums.counts,
+        pending: engine.pending.len() as u32,
+    };
+    let head = bincode::encode_to_vec(head, CODEC).map_err(|error| AccumulationError::Checkpoint {
+        found: error.to_string(),
+        expected: "a head that can be encoded",
+    })?;
+    out.write(MAGIC)?;
+    out.write(&(head.len() as u32).to_le_bytes())?;
+    out.write(&head)?;
+    for column in engine.sums.normal.columns() {
+        out.numbers(column)?;
+    }
+    out.numbers(&engine.sums.right)?;
+    out.numbers(&engine.sums.noise)?;
+    for p in &engine.pending {
+        let ([a, b, c], [d, e, f]) = (p.r_i_m, p.r_j_m);
+        let (v, n) = (p.value_k_sr, p.noise);
+        out.numbers(&[a, b, c, d, e, f, v.re, v.im, p.weight, n.re, n.im])?;
+    }
+    let crc = out.crc.finalize() as u32;
+    out.inner.write_all(&crc.to_le_bytes())?;
+    Ok(())
+}
+
+pub(super) fn read(from: &mut dyn Read) -> Result<Restored, AccumulationError> {
+    let mut from = Checked { inner: from, crc: crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi) };
+    let mut magic = [0; 8];
+    from.read(&mut magic)?;
+    if &magic != MAGIC {
+        return Err(refused(format!("{magic:02x?}"), "a pixel engine's checkpoint, version 01"));
+    }
+    let head = read_head(&mut from)?;
+    let setup = setup_of(&head)?;
+    let mut sums = PixelSums::zeros(setup.nside);
+    for column in sums.normal.columns_mut() {
+        from.numbers(column)?;
+    }
+    from.numbers(&mut sums.right)?;
+    from.numbers(&mut sums.noise)?;
+    sums.counts = head.counts;
+    let mut pending = Vec::new();
+    for _ in 0..head.pending {
+        let mut numbers = [0.0; PENDING_NUMBERS];
+        from.numbers(&mut numbers)?;
+        let [a, b, c, d, e, f, re, im, weight, noise_re, noise_im] = numbers;
+        pending.push(Pending {
+            r_i_m: [a, b, c],
+            r_j_m: [d, e, f],
+            value_k_sr: Complex64::new(re, im),
+            weight,
+            noise: Complex64::new(noise_re, noise_im),
+        });
+    }
+    let found = from.crc.finalize() as u32;
+    let mut stored = [0; 4];
+    from.inner.read_exact(&mut stored)?;
+    if found != u32::from_le_bytes(stored) {
+        return Err(refused(format!("checksum {found:08x}"), "the checksum that it was written with"));
+    }
+    Ok(Restored { setup, sums, pending })
+}
+
+fn read_head(from: &mut Checked<'_>) -> Result<Head, AccumulationError> {
+    let mut length = [0; 4];
+    from.read(&mut length)?;
+    let length = u32::from_le_bytes(length) as usize;
+    if length > HEAD_BYTES_MAX {
+        return Err(refused(format!("a head of {length} bytes"), "at most 4096"));
+    }
+    let mut bytes = vec![0; length];
+    from.read(&mut bytes)?;
+    match bincode::decode_from_slice::<Head, _>(&bytes, CODEC) {
+        Ok((head, used)) if used == length => Ok(head),
+        Ok(_) => Err(refused("bytes behind the head".into(), "none")),
+        Err(error) => Err(refused(error.to_string(), "a head")),
+    }
+}
+
+fn setup_of(head: &Head) -> Result<PixelSetup, AccumulationError> {
+    let nside = head.nside as usize;
+    if !is_valid_nside(nside) || head.nside > NSIDE_MAX {
+        return Err(refused(format!("nside {nside}"), "a power of two up to 64"));
+    }
+    if head.pending > PENDING_MAX {
+        return Err(refused(format!("{} waiting visibilities", head.pending), "at most 65536"));
+    }
+    let method = METHODS.get(usize::from(head.method)).copied();
+    let response = RESPONSES.get(usize::from(head.response)).copied();
+    Ok(PixelSetup {
+        nside,
+        frequency_hz: head.frequency_hz,
+        method: method.ok_or_else(|| refused(format!("method {}", head.method), "a known method"))?,
+        moon_radius_m: head.moon_radius_m,
+        response: response.ok_or_else(|| refused(format!("response {}", head.response), "a known one"))?,
+        companion_seed: head.companion_seed,
+    })
+}
+
+fn refused(found: String, expected: &'static str) -> AccumulationError {
+    AccumulationError::Checkpoint { found, expected }
+}
+
+/// Writes and sums up.
+struct Summed<'a> {
+    inner: &'a mut dyn Write,
+    crc: crc_fast::Digest,
+}
+
+impl Summed<'_> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<()> {
+        self.crc.update(bytes);
+        self.inner.write_all(bytes)
+    }
+
+    fn numbers(&mut self, values: &[f64]) -> std::io::Result<()> {
+        let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        self.write(&bytes)
+    }
+}
+
+/// Reads and sums up.
+struct Checked<'a> {
+    inner: &'a mut dyn Read,
+    crc: crc_fast::Digest,
+}
+
+impl Checked<'_> {
+    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<()> {
+        self.inner.read_exact(bytes)?;
+        self.crc.update(bytes);
+        Ok(())
+    }
+
+    fn numbers(&mut self, values: &mut [f64]) -> std::io::Result<()> {
+        let mut bytes = vec![0; size_of_val(values)];
+        self.read(&mut bytes)?;
+        for (value, bytes) in values.iter_mut().zip(bytes.as_chunks::<8>().0) {
+            *value = f64::from_le_bytes(*bytes);
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{NormalEngine, NormalSums};
+    use super::*;
+    use crate::array::{Array, ArrayConfig};
+    use crate::frames::PlacedVisibilities;
+    use crate::units::Pair;
+
+    fn setup() -> PixelSetup {
+        PixelSetup {
+            nside: 4,
+            frequency_hz: 3e6,
+            method: PixelMethod::Average,
+            moon_radius_m: crate::units::constants::MOON_RADIUS_M,
+            response: AntennaResponse::Isotropic,
+            companion_seed: 3,
+        }
+    }
+
+    fn visibilities(from_s: f64, count: usize) -> PlacedVisibilities {
+        let array = Array::new(&ArrayConfig::default()).unwrap();
+        let mut placed = PlacedVisibilities {
+            frequency_hz: 3e6,
+            pair: Pair { i: 0, j: 1 },
+            ..PlacedVisibilities::default()
+        };
+        for k in 0..count {
+            let time_s = from_s + 13.0 * k as f64;
+            placed.time_s.push(time_s);
+            placed.r_i_m.push(array.position_m(0, time_s));
+            placed.r_j_m.push(array.position_m(1, time_s));
+            placed.value_k_sr.push(Complex64::new((0.1 * k as f64).sin(), 0.3));
+            placed.weight.push(1.0 + 0.01 * k as f64);
+        }
+        placed
+    }
+
+    fn checkpoint(engine: &PixelEngine) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        engine.checkpoint(&mut bytes).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn an_engine_goes_on_to_the_same_bits() {
+        let (first, second) = (visibilities(0.0, 200), visibilities(5e6, 171));
+        let mut whole = PixelEngine::new(setup()).unwrap();
+        let mut stopped = PixelEngine::new(setup()).unwrap();
+        let _ = whole.add(&first).unwrap();
+        let _ = whole.add(&second).unwrap();
+        let _ = stopped.add(&first).unwrap();
+        let mut resumed = PixelEngine::restore(&mut checkpoint(&stopped).as_slice()).unwrap();
+        let _ = resumed.add(&second).unwrap();
+        assert!(whole.into_sums() == resumed.into_sums());
+    }
+
+    #[test]
+    fn blocks_and_snapshots_do_not_change_a_bit() {
+        let all = visibilities(0.0, 300);
+        let mut whole = PixelEngine::new(setup()).unwrap();
+        let _ = whole.add(&all).unwrap();
+        let mut parts = PixelEngine::new(setup()).unwrap();
+        for k in 0..300 {
+            let one = PlacedVisibilities {
+                time_s: vec![all.time_s[k]],
+                r_i_m: vec![all.r_i_m[k]],
+                r_j_m: vec![all.r_j_m[k]],
+                value_k_sr: vec![all.value_k_sr[k]],
+                weight: vec![all.weight[k]],
+                ..all.clone()
+            };
+            let _ = parts.add(&one).unwrap();
+            if k % 100 == 50 {
+                assert_eq!(parts.sums().counts().visibilities, k as u64 + 1);
+            }
+        }
+        assert!(whole.into_sums() == parts.into_sums());
+    }
+
+    #[test]
+    fn merging_is_adding() {
+        let (first, second) = (visibilities(0.0, 100), visibilities(5e6, 150));
+        let engine = |blocks: &[&PlacedVisibilities]| {
+            let mut engine = PixelEngine::new(setup()).unwrap();
+            for block in blocks {
+                let _ = engine.add(block).unwrap();
+            }
+            engine
+        };
+        let mut merged = engine(&[&first]);
+        merged.merge(engine(&[&second])).unwrap();
+        let (merged, whole) = (merged.into_sums(), engine(&[&first, &second]).into_sums());
+        assert_eq!(merged.counts.visibilities, whole.counts.visibilities);
+        let scale = whole.normal.get(0, 0);
+        for k in [0, 17, 191] {
+            // The same 500 terms in another order.
+            assert!((merged.normal.get(k, 3) - whole.normal.get(k, 3)).abs() < 1e-13 * scale);
+        }
+    }
+
+    #[test]
+    fn damage_is_found_wherever_it_is() {
+        let mut engine = PixelEngine::new(setup()).unwrap();
+        let _ = engine.add(&visibilities(0.0, 140)).unwrap();
+        let good = checkpoint(&engine);
+        assert!(PixelEngine::restore(&mut good.as_slice()).is_ok());
+        for place in [0, 7, 8, 11, 12, 16, 24, 40, 60, 80, good.len() / 2, good.len() - 5, good.len() - 1] {
+            let mut bad = good.clone();
+            bad[place] ^= 0x10;
+            assert!(PixelEngine::restore(&mut bad.as_slice()).is_err(), "byte {place}");
+        }
+        for length in [0, 5, 11, 50, good.len() / 3, good.len() - 1] {
+            assert!(PixelEngine::restore(&mut &good[..length]).is_err(), "{length} bytes");
+        }
+    }
+}

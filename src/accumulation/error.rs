@@ -1,0 +1,51 @@
+//! Why visibilities could not be summed.
+
+use thiserror::Error;
+
+use crate::array::response::ResponseError;
+use crate::units::ChannelId;
+
+/// Why visibilities could not be summed.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum AccumulationError {
+    /// Rows of B cannot be made.
+    #[error(transparent)]
+    Response(#[from] ResponseError),
+    /// Data of a channel that the instrument description does not have.
+    #[error("visibilities of channel {0} arrived, which the instrument description does not have")]
+    UnknownChannel(ChannelId),
+    /// Data of another frequency.
+    #[error("a block at {found_hz} Hz was given to an engine for {expected_hz} Hz")]
+    Frequency {
+        /// The engine's, Hz.
+        expected_hz: f64,
+        /// The block's, Hz.
+        found_hz: f64,
+    },
+    /// Settings by channel that do not fit the instrument.
+    #[error("map.{key}: the downlink has {channels} channels; expected one value, or one for each of them")]
+    Misfit {
+        /// Key.
+        key: &'static str,
+        /// Channels of the instrument.
+        channels: usize,
+    },
+    /// Engines that cannot be merged.
+    #[error("engines of different {what} cannot be merged")]
+    Mismatch {
+        /// What differs.
+        what: &'static str,
+    },
+    /// A checkpoint that cannot be read or written.
+    #[error("checkpoint: {0}")]
+    Io(#[from] std::io::Error),
+    /// A checkpoint that is damaged or foreign.
+    #[error("checkpoint: found {found}, expected {expected}")]
+    Checkpoint {
+        /// What was found.
+        found: String,
+        /// What was expected.
+        expected: &'static str,
+    },
+}

@@ -1,0 +1,133 @@
+//! The ground stage that places visibilities and calibrates them.
+
+use std::collections::HashSet;
+
+use super::{Calibration, CalibrationError};
+use crate::array::{Ephemeris, FlaggedCounts};
+use crate::frames::{GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock};
+use crate::runtime::{Ledger, Outlet, Stage, Units};
+use crate::units::{ChannelId, Pair};
+
+/// Identity of a block of visibilities: every one is used once, however often it arrives.
+type BlockKey = (ChannelId, Pair, i64, u32);
+
+/// Gives each visibility the positions of its satellites, from the ephemeris packets alone, and hands
+/// it to the calibration hook. What cannot be used is flagged in the ledger with its reason.
+///
+/// The ledger is closed against the spacecraft's own counts: sampled less dropped less received is
+/// what the link lost. Visibilities after the last housekeeping packet count as sampled when received.
+pub struct Calibrator {
+    calibration: Box<dyn Calibration>,
+    ledger: Ledger,
+    ephemeris: Ephemeris,
+    instrument: Option<Instrument>,
+    seen: HashSet<BlockKey>,
+    received: u64,
+    reported: Option<(Housekeeping, u64)>,
+}
+
+impl Calibrator {
+    /// A stage that posts to `ledger`.
+    #[must_use]
+    pub fn new(calibration: Box<dyn Calibration>, ledger: Ledger) -> Self {
+        Self {
+            calibration,
+            ledger,
+            ephemeris: Ephemeris::default(),
+            instrument: None,
+            seen: HashSet::new(),
+            received: 0,
+            reported: None,
+        }
+    }
+
+    fn visibilities(
+        &mut self,
+        block: &VisibilityBlock,
+        out: &mut Outlet<PlacedFrame>,
+    ) -> Result<(), CalibrationError> {
+        let count = block.len() as u64;
+        let Some(&first) = block.offset_ticks.first() else { return Ok(()) };
+        if !self.seen.insert((block.channel, block.pair, block.start.0, first)) {
+            self.ledger.sampled(count);
+            self.ledger.flagged("duplicate", count);
+            return Ok(());
+        }
+        self.received += count;
+        let channel = self.instrument.as_ref().and_then(|i| i.channels.get(usize::from(block.channel.0)));
+        let Some(channel) = channel else {
+            self.ledger.flagged("no instrument description", count);
+            return Ok(());
+        };
+        let (mut placed, placing) = self.ephemeris.place(block, channel.frequency_hz);
+        self.ledger.flagged("no ephemeris", placing.without_ephemeris);
+        self.post_flagged(&placing.flagged);
+        let calibrated = self.calibration.apply(&mut placed)?;
+        for (reason, count) in calibrated.removed() {
+            self.ledger.flagged(reason, count as u64);
+        }
+        if !placed.is_empty() {
+            out.push(PlacedFrame::Visibilities(placed));
+        }
+        Ok(())
+    }
+}
+
+impl Calibrator {
+    fn post_flagged(&self, flagged: &FlaggedCounts) {
+        self.ledger.flagged("interference", flagged.interference);
+        self.ledger.flagged("incomplete integration", flagged.incomplete);
+        self.ledger.flagged("saturated receiver", flagged.saturated);
+        self.ledger.flagged("uncalibrated", flagged.uncalibrated);
+        self.ledger.flagged("unknown flag", flagged.other);
+    }
+}
+
+impl Stage for Calibrator {
+    type In = GroundFrame;
+    type Out = PlacedFrame;
+    type Error = CalibrationError;
+
+    fn step(&mut self, frame: GroundFrame, out: &mut Outlet<PlacedFrame>) -> Result<(), CalibrationError> {
+        match frame {
+            GroundFrame::Instrument(instrument) => {
+                // The decoder reports descriptions that contradict the first.
+                if self.instrument.is_none() {
+                    self.instrument = Some(instrument.clone());
+                    out.push(PlacedFrame::Instrument(instrument));
+                }
+            }
+            GroundFrame::Ephemeris(segment) => {
+                // Whatever becomes of it, visibilities without positions are counted one by one.
+                self.ephemeris.insert(segment);
+            }
+            GroundFrame::Visibilities(block) => self.visibilities(&block, out)?,
+            GroundFrame::Housekeeping(report) => {
+                if self.reported.is_none_or(|(last, _)| last.sampled <= report.sampled) {
+                    self.reported = Some((report, self.received));
+                }
+                out.push(PlacedFrame::Housekeeping(report));
+            }
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self, _: &mut Outlet<PlacedFrame>) -> Result<(), CalibrationError> {
+        let Some((report, received_then)) = self.reported else {
+            self.ledger.sampled(self.received);
+            return Ok(());
+        };
+        let expected = report.sampled.saturating_sub(report.dropped);
+        let missing = expected.saturating_sub(received_then);
+        // A late packet may make up for part of it.
+        let after = self.received - received_then;
+        self.ledger.sampled(report.sampled.max(received_then + report.dropped) + after);
+        self.ledger.lost("store", "full", report.dropped);
+        self.ledger.lost("downlink", "not received", missing);
+        Ok(())
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.received, "visibilities")
+    }
+}

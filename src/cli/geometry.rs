@@ -1,0 +1,105 @@
+//! `lunarray geometry`: where everything is.
+
+use clap::Args;
+use serde::Serialize;
+
+use super::{CommandResult, Outcome, ArrayArgs, print_json_line, print_text};
+use crate::array::{Array, integration_time_s};
+use crate::mother::BAND_HZ;
+use crate::units::all_pairs;
+use crate::units::vector::{Vec3, norm, sub};
+
+/// Show where the satellites are, what they see, and how long each pair integrates.
+///
+/// Positions are Moon-centred in ecliptic axes (x to ecliptic longitude 0, z to the north ecliptic
+/// pole), m. A pair's baseline is r_i - r_j; it is observed while the Moon hides the Earth.
+#[derive(Debug, Args)]
+pub(super) struct GeometryArgs {
+    /// Times, s since the mission epoch.
+    #[arg(long = "at", value_name = "SECONDS", num_args = 1.., required = true, allow_negative_numbers = true)]
+    at_s: Vec<f64>,
+    /// Frequency for which integration times are given, Hz.
+    #[arg(long, default_value_t = 10e6)]
+    freq_hz: f64,
+    /// One JSON object a line: t_s, observing, earth_hat, satellites_m, pairs.
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    array: ArrayArgs,
+}
+
+#[derive(Serialize)]
+struct Geometry {
+    t_s: f64,
+    observing: bool,
+    earth_hat: Vec3,
+    satellites_m: Vec<Vec3>,
+    pairs: Vec<PairGeometry>,
+}
+
+#[derive(Serialize)]
+struct PairGeometry {
+    pair: String,
+    baseline_m: Vec3,
+    length_m: f64,
+    dt_s: f64,
+}
+
+pub(super) fn execute(args: &GeometryArgs) -> CommandResult {
+    if !(BAND_HZ[0]..=BAND_HZ[1]).contains(&args.freq_hz) {
+        return Err(format!(
+            "--freq-hz {}: expected {} Hz to {} Hz",
+            args.freq_hz, BAND_HZ[0], BAND_HZ[1]
+        )
+        .into());
+    }
+    let config = args.array.source().load()?;
+    let array = Array::new(&config.array)?;
+    for &t_s in &args.at_s {
+        if !t_s.is_finite() {
+            return Err(format!("--at {t_s}: expected a finite number of seconds").into());
+        }
+        let rule = config.spacecraft.rule();
+        let states: Vec<_> = (0..array.satellites()).map(|n| array.state(n, t_s)).collect();
+        let pairs = all_pairs(array.satellites()).into_iter().map(|pair| {
+            let (i, j) = (states[usize::from(pair.i)], states[usize::from(pair.j)]);
+            let baseline_m = sub(i.position_m, j.position_m);
+            PairGeometry {
+                pair: pair.to_string(),
+                baseline_m,
+                length_m: norm(baseline_m),
+                dt_s: integration_time_s(rule, args.freq_hz, i.velocity_m_s, j.velocity_m_s),
+            }
+        });
+        let geometry = Geometry {
+            t_s,
+            observing: array.observing(t_s),
+            earth_hat: array.earth_hat(t_s),
+            satellites_m: states.iter().map(|state| state.position_m).collect(),
+            pairs: pairs.collect(),
+        };
+        if args.json {
+            print_json_line(&geometry)?;
+        } else {
+            print_text(&table(&geometry))?;
+        }
+    }
+    Ok(Outcome::Done)
+}
+
+fn table(geometry: &Geometry) -> String {
+    use std::fmt::Write;
+    let mut text = String::new();
+    let state = if geometry.observing { "observing (Earth hidden)" } else { "Earth in sight" };
+    let [x, y, z] = geometry.earth_hat;
+    // Writing to a String cannot fail.
+    let _ = writeln!(text, "t = {} s: {state}; Earth towards ({x:.6}, {y:.6}, {z:.6})", geometry.t_s);
+    for (n, [x, y, z]) in geometry.satellites_m.iter().enumerate() {
+        let _ = writeln!(text, "  daughter {}  {x:>14.3} {y:>14.3} {z:>14.3} m", n + 1);
+    }
+    let _ = writeln!(text, "  pair      length (m)         dt (s)");
+    for pair in &geometry.pairs {
+        let _ = writeln!(text, "  {:<6} {:>13.3} {:>14.6}", pair.pair, pair.length_m, pair.dt_s);
+    }
+    text.trim_end().to_owned()
+}

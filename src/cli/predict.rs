@@ -1,0 +1,135 @@
+//! `lunarray predict`: model visibilities, one by one.
+
+use std::io::BufRead;
+use std::path::PathBuf;
+
+use clap::Args;
+use serde::Serialize;
+
+use super::{CommandError, CommandResult, Outcome, ArrayArgs, print_json_line, print_text};
+use crate::array::Array;
+use crate::array::response::{PairGeometry, exact};
+use crate::mother::BAND_HZ;
+use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::healpix::pixel_area_sr;
+use crate::units::Pair;
+
+/// Predict visibilities of a sky map by direct sum over its own pixels.
+///
+/// V_ij = sum over pixels of T A S_i S_j exp(-2 pi i (nu/c) n . (r_i - r_j)) dOmega, K sr, in double
+/// precision: each pixel counts at its centre, seen or hidden by the Moon as its centre is. A map in
+/// Galactic or equatorial coordinates is not resampled; its pixel centres are turned.
+///
+/// Without --at, rows `t_s,i,j,freq_hz` are read from standard input as CSV with that header.
+#[derive(Debug, Args)]
+pub(super) struct PredictArgs {
+    /// HEALPix map, K (FITS).
+    #[arg(long, value_name = "MAP.fits")]
+    sky: PathBuf,
+    /// Frequency, Hz.
+    #[arg(long, requires = "at_s")]
+    freq_hz: Option<f64>,
+    /// Time, s since the mission epoch.
+    #[arg(long = "at", value_name = "SECONDS", requires_all = ["freq_hz", "pair"])]
+    at_s: Option<f64>,
+    /// Pair of satellites, such as 1-2.
+    #[arg(long, requires = "at_s")]
+    pair: Option<Pair>,
+    /// One JSON object a line: t_s, i, j, freq_hz, re, im (K sr).
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    array: ArrayArgs,
+}
+
+#[derive(Clone, Copy)]
+struct Request {
+    t_s: f64,
+    pair: Pair,
+    freq_hz: f64,
+}
+
+#[derive(Serialize)]
+struct Answer {
+    t_s: f64,
+    i: u32,
+    j: u32,
+    freq_hz: f64,
+    re: f64,
+    im: f64,
+}
+
+pub(super) fn execute(args: &PredictArgs) -> CommandResult {
+    let config = args.array.source().load()?;
+    let array = Array::new(&config.array)?;
+    let map = read_whole_map(&args.sky, &ReadOptions::default())?;
+    let directions = map.directions_ecliptic();
+    let area_sr = pixel_area_sr(map.nside());
+    let answer = |request: Request| -> Result<(), CommandError> {
+        check(&array, request)?;
+        let Request { t_s, pair, freq_hz } = request;
+        let geometry = PairGeometry {
+            r_i_m: array.position_m(pair.i.into(), t_s),
+            r_j_m: array.position_m(pair.j.into(), t_s),
+            frequency_hz: freq_hz,
+            moon_radius_m: array.moon_radius_m(),
+            response: config.spacecraft.antenna.into(),
+        };
+        let value = exact::visibility(&geometry, &directions, map.values(), area_sr).visibility_k_sr;
+        let (i, j) = (u32::from(pair.i) + 1, u32::from(pair.j) + 1);
+        let answer = Answer { t_s, i, j, freq_hz, re: value.re, im: value.im };
+        if args.json {
+            return print_json_line(&answer);
+        }
+        print_text(&format!(
+            "t = {t_s} s, pair {pair}, {freq_hz} Hz: {:+.9e} {:+.9e} i K sr",
+            answer.re, answer.im
+        ))
+    };
+    if let (Some(t_s), Some(pair), Some(freq_hz)) = (args.at_s, args.pair, args.freq_hz) {
+        answer(Request { t_s, pair, freq_hz })?;
+        return Ok(Outcome::Done);
+    }
+    let mut lines = std::io::stdin().lock().lines();
+    let header = lines.next().transpose()?.unwrap_or_default();
+    if header.split(',').map(str::trim).ne(["t_s", "i", "j", "freq_hz"]) {
+        return Err(format!("standard input, line 1: found `{header}`, expected `t_s,i,j,freq_hz`").into());
+    }
+    for (number, line) in lines.enumerate() {
+        let line = line?;
+        if !line.trim().is_empty() {
+            let request = parse(&line).and_then(|request| check(&array, request).map(|()| request));
+            answer(request.map_err(|error| format!("standard input, line {}: {error}", number + 2))?)?;
+        }
+    }
+    Ok(Outcome::Done)
+}
+
+fn parse(line: &str) -> Result<Request, String> {
+    let fields: Vec<&str> = line.split(',').map(str::trim).collect();
+    let [t_s, i, j, freq_hz] = fields[..] else {
+        return Err(format!("found {} fields, expected the four t_s,i,j,freq_hz", fields.len()));
+    };
+    let number = |name: &str, text: &str| {
+        text.parse::<f64>().map_err(|_| format!("{name} = `{text}`: expected a number"))
+    };
+    let satellite = |name: &str, text: &str| {
+        text.parse::<usize>().map_err(|_| format!("{name} = `{text}`: expected a satellite's number"))
+    };
+    let pair = Pair::from_one_based(satellite("i", i)?, satellite("j", j)?).map_err(|e| e.to_string())?;
+    Ok(Request { t_s: number("t_s", t_s)?, pair, freq_hz: number("freq_hz", freq_hz)? })
+}
+
+fn check(array: &Array, request: Request) -> Result<(), String> {
+    let Request { t_s, pair, freq_hz } = request;
+    if !t_s.is_finite() {
+        return Err(format!("t_s = {t_s}: expected a finite number of seconds"));
+    }
+    if usize::from(pair.j) >= array.satellites() {
+        return Err(format!("pair {pair}: the array has {} satellites", array.satellites()));
+    }
+    if !(BAND_HZ[0]..=BAND_HZ[1]).contains(&freq_hz) {
+        return Err(format!("freq_hz = {freq_hz}: expected {} to {}", BAND_HZ[0], BAND_HZ[1]));
+    }
+    Ok(())
+}

@@ -1,0 +1,46 @@
+//! `lunarray run`: the whole chain in one process.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::progress::{Progress, cancel_on_interrupt};
+use super::{CommandResult, Outcome, PipelineArgs, print_json_line, print_text};
+use crate::pipeline::{INTEGRATE, Plan, run, use_threads};
+
+/// Run the whole chain: sky, spacecraft, downlink, ground, maps.
+///
+/// Without a pipeline file it runs the embedded quicklook: three channels over one precession of the
+/// orbit, in about a minute. Leaves, by channel, maps that sharpen as data arrives, the final map and a
+/// noise-only map as HEALPix FITS, pictures of map, input and error, and the downlink file; and
+/// summary.json. Ctrl-C ends it early with maps of the data so far.
+#[derive(Debug, Args)]
+pub(super) struct RunArgs {
+    #[command(flatten)]
+    pipeline: PipelineArgs,
+    /// Folder for the products; out/NAME if not given.
+    #[arg(short, long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Print the summary as one JSON object instead of tables.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn execute(args: &RunArgs) -> CommandResult {
+    let plan = Plan::new(args.pipeline.source().load()?)?;
+    use_threads(&plan.config.runtime)?;
+    let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
+    let cancel = cancel_on_interrupt()?;
+    let mut progress = None;
+    let windows = plan.windows.len() as u64;
+    let summary = run(&plan, &out, &cancel, &mut |metrics| {
+        progress = Some(Progress::watch(metrics, INTEGRATE, windows));
+    })?;
+    drop(progress);
+    if args.json {
+        print_json_line(&summary)?;
+    } else {
+        print_text(&format!("{summary}\nProducts are in {}", out.display()))?;
+    }
+    Ok(if summary.cancelled { Outcome::Interrupted } else { Outcome::Done })
+}

@@ -1,0 +1,221 @@
+//! The downlink's stages: packets out of frames, files, frames out of packets.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::config::DownlinkConfig;
+use super::counters::ReceptionCounters;
+use super::decoder::Decoder;
+use super::error::DownlinkError;
+use super::file::{io_error, require_packets};
+use super::packetizer::Packetizer;
+use super::partial_file::PartialFile;
+use super::receiver::{Event, Receiver};
+use crate::frames::GroundFrame;
+use crate::runtime::{Flow, Outlet, Sink, Source, Stage, Units};
+
+/// Bytes read from a file at a time.
+const READ_BYTES: usize = 1 << 18;
+
+/// Turns frames into packets: the spacecraft's end of the link.
+#[derive(Debug)]
+pub struct Transmitter {
+    packetizer: Packetizer,
+    bytes: u64,
+}
+
+impl Transmitter {
+    /// A transmitter at the start of a mission.
+    ///
+    /// # Errors
+    /// A bad configuration.
+    pub fn new(config: &DownlinkConfig) -> Result<Self, DownlinkError> {
+        Ok(Self { packetizer: Packetizer::new(config)?, bytes: 0 })
+    }
+}
+
+impl Stage for Transmitter {
+    type In = GroundFrame;
+    type Out = Vec<u8>;
+    type Error = DownlinkError;
+
+    fn step(&mut self, frame: GroundFrame, out: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
+        let mut bytes = Vec::new();
+        self.packetizer.encode(&frame, &mut bytes)?;
+        self.bytes += bytes.len() as u64;
+        out.push(bytes);
+        Ok(())
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.bytes, "bytes")
+    }
+}
+
+/// Keeps what passes in a file; as a stage it hands it on, as a sink it is the end.
+#[derive(Debug)]
+pub struct Recorder(PartialFile);
+
+impl Recorder {
+    /// Begins a file.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn create(path: &Path) -> Result<Self, DownlinkError> {
+        Ok(Self(PartialFile::create(path)?))
+    }
+
+    fn keep(&mut self, bytes: &[u8]) -> Result<(), DownlinkError> {
+        self.0.pending().extend_from_slice(bytes);
+        self.0.settle()
+    }
+}
+
+impl Stage for Recorder {
+    type In = Vec<u8>;
+    type Out = Vec<u8>;
+    type Error = DownlinkError;
+
+    fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
+        self.keep(&bytes)?;
+        out.push(bytes);
+        Ok(())
+    }
+
+    fn finish(&mut self, _: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
+        self.0.finish().map(|_| ())
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.0.bytes(), "bytes")
+    }
+}
+
+impl Sink for Recorder {
+    type In = Vec<u8>;
+    type Error = DownlinkError;
+
+    fn take(&mut self, bytes: Vec<u8>) -> Result<(), DownlinkError> {
+        self.keep(&bytes)
+    }
+
+    fn finish(&mut self) -> Result<(), DownlinkError> {
+        self.0.finish().map(|_| ())
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.0.bytes(), "bytes")
+    }
+}
+
+/// Reads downlink files one after the other.
+#[derive(Debug)]
+pub struct FileSource {
+    files: std::vec::IntoIter<(PathBuf, File)>,
+    now: Option<(PathBuf, File)>,
+    bytes: u64,
+}
+
+impl FileSource {
+    /// Opens all files, so that a wrong name is known at once.
+    ///
+    /// # Errors
+    /// A file that cannot be opened, is empty, or does not hold a packet of ours.
+    pub fn open(paths: &[PathBuf]) -> Result<Self, DownlinkError> {
+        let open = |path: &PathBuf| {
+            refuse_foreign(path)?;
+            File::open(path).map(|file| (path.clone(), file)).map_err(io_error(path, "open the file"))
+        };
+        let files: Vec<_> = paths.iter().map(open).collect::<Result<_, _>>()?;
+        Ok(Self { files: files.into_iter(), now: None, bytes: 0 })
+    }
+}
+
+/// Reads until the first packet of ours; all of a foreign file, in bounded memory.
+fn refuse_foreign(path: &Path) -> Result<(), DownlinkError> {
+    let mut file = File::open(path).map_err(io_error(path, "open the file"))?;
+    let mut receiver = Receiver::new();
+    loop {
+        while let Some(event) = receiver.next_event() {
+            if matches!(event, Event::Packet(_)) {
+                return Ok(());
+            }
+        }
+        if receiver.fill_from(&mut file).map_err(io_error(path, "read"))? == 0 {
+            return require_packets(path, receiver.bytes(), 0);
+        }
+    }
+}
+
+impl Source for FileSource {
+    type Out = Vec<u8>;
+    type Error = DownlinkError;
+
+    fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, DownlinkError> {
+        let Some((path, mut file)) = self.now.take().or_else(|| self.files.next()) else {
+            return Ok(Flow::Done);
+        };
+        let mut bytes = Vec::with_capacity(READ_BYTES);
+        let read = file.by_ref().take(READ_BYTES as u64).read_to_end(&mut bytes);
+        if read.map_err(io_error(&path, "read"))? > 0 {
+            self.bytes += bytes.len() as u64;
+            out.push(bytes);
+            self.now = Some((path, file));
+        }
+        Ok(Flow::Continue)
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.bytes, "bytes")
+    }
+}
+
+/// Finds packets in what arrives and makes frames of them: the ground's end of the link.
+#[derive(Debug, Default)]
+pub struct Reception {
+    receiver: Receiver,
+    decoder: Decoder,
+    account: Arc<Mutex<ReceptionCounters>>,
+}
+
+impl Reception {
+    /// Leaves its account in `account` at the end.
+    #[must_use]
+    pub fn new(account: Arc<Mutex<ReceptionCounters>>) -> Self {
+        Self { account, ..Self::default() }
+    }
+
+    fn pass_on(&mut self, out: &mut Outlet<GroundFrame>) {
+        while let Some(event) = self.receiver.next_event() {
+            if let Some(frame) = self.decoder.accept(&event) {
+                out.push(frame);
+            }
+        }
+    }
+}
+
+impl Stage for Reception {
+    type In = Vec<u8>;
+    type Out = GroundFrame;
+    type Error = DownlinkError;
+
+    fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<GroundFrame>) -> Result<(), DownlinkError> {
+        self.receiver.push(&bytes);
+        self.pass_on(out);
+        Ok(())
+    }
+
+    fn finish(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), DownlinkError> {
+        self.receiver.finish();
+        self.pass_on(out);
+        self.decoder.finish();
+        *self.account.lock().unwrap_or_else(PoisonError::into_inner) = self.decoder.counters().clone();
+        Ok(())
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.decoder.counters().bytes, "bytes")
+    }
+}

@@ -1,0 +1,196 @@
+//! What can be chosen about the spacecraft.
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use crate::array::IntegrationRule;
+use crate::frames::{AntennaResponse, Channel};
+use crate::units::PerChannel;
+use crate::units::constants::YEAR_S;
+
+/// Most channels: the mission's own number.
+pub const CHANNELS_MAX: usize = 30;
+
+/// Lowest and highest channel frequency, Hz: the mission's band.
+pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
+
+/// The space segment at the level of integrated visibilities.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SpacecraftConfig {
+    /// Centre frequencies, Hz.
+    pub channels_hz: Vec<f64>,
+    /// Width of every channel, Hz.
+    pub channel_width_hz: f64,
+    /// Length of the mission, s.
+    pub duration_s: f64,
+    /// Observe in every n-th window only.
+    pub every_nth_window: u64,
+    /// Send down every n-th integration of a window only.
+    pub every_nth_integration: PerChannel<u64>,
+    /// Longest integration, s.
+    pub integration_s_max: f64,
+    /// Wavelengths that a baseline may move in one integration.
+    pub motion_wavelengths_max: f64,
+    /// Longest baseline that is correlated, wavelengths; 0 for no limit.
+    pub baseline_wavelengths_max: PerChannel<f64>,
+    /// Whether thermal noise is added. Weights are those of the noise either way.
+    pub thermal_noise: bool,
+    /// Receiver noise T_rec / zeta, as the antenna would see it from the sky, K sr.
+    pub receiver_noise_k_sr: f64,
+    /// Antenna response of the daughters.
+    pub antenna: Antenna,
+    /// Capacity of the onboard store, bytes.
+    pub store_bytes_max: u64,
+    /// Mission epoch: TAI seconds since 1958-01-01.
+    pub epoch_tai_s: f64,
+}
+
+/// Antenna response by name.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Antenna {
+    /// A = 1.
+    #[default]
+    Isotropic,
+    /// A short dipole along the orbit normal.
+    DipoleNormal,
+}
+
+impl From<Antenna> for AntennaResponse {
+    fn from(antenna: Antenna) -> Self {
+        match antenna {
+            Antenna::Isotropic => Self::Isotropic,
+            Antenna::DipoleNormal => Self::DipoleNormal,
+        }
+    }
+}
+
+impl Default for SpacecraftConfig {
+    fn default() -> Self {
+        let rule = IntegrationRule::default();
+        Self {
+            channels_hz: vec![10e6],
+            channel_width_hz: 8_000.0,
+            duration_s: 1.3 * YEAR_S,
+            every_nth_window: 1,
+            every_nth_integration: PerChannel::All(1),
+            integration_s_max: rule.duration_s_max,
+            motion_wavelengths_max: rule.motion_wavelengths_max,
+            baseline_wavelengths_max: PerChannel::All(0.0),
+            thermal_noise: true,
+            receiver_noise_k_sr: 0.0,
+            antenna: Antenna::default(),
+            store_bytes_max: 4 << 30,
+            // 2027-01-01T00:00:00 TAI: 69 years of which 17 are leap years.
+            epoch_tai_s: (69.0 * 365.0 + 17.0) * 86_400.0,
+        }
+    }
+}
+
+/// A setting of the spacecraft that cannot be.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[non_exhaustive]
+pub enum SpacecraftError {
+    /// A frequency outside the band.
+    #[error("spacecraft.channels_hz[{index}] = {value} Hz: expected {} Hz to {} Hz", BAND_HZ[0], BAND_HZ[1])]
+    Frequency {
+        /// Place in the list.
+        index: usize,
+        /// Value found, Hz.
+        value: f64,
+    },
+    /// No or too many channels.
+    #[error("spacecraft.channels_hz has {0} channels: expected 1 to {CHANNELS_MAX}")]
+    ChannelCount(usize),
+    /// A list by channel of the wrong length.
+    #[error("spacecraft.{key}: expected one value, or one for each of the {channels} channels")]
+    PerChannel {
+        /// Key.
+        key: &'static str,
+        /// Number of channels.
+        channels: usize,
+    },
+    /// A parameter outside its range.
+    #[error("spacecraft.{key} = {value}: expected {expected}")]
+    Parameter {
+        /// Key.
+        key: &'static str,
+        /// Value found.
+        value: f64,
+        /// Range that is accepted.
+        expected: &'static str,
+    },
+}
+
+impl SpacecraftConfig {
+    /// The channels, as the instrument description has them.
+    #[must_use]
+    pub fn channels(&self) -> Vec<Channel> {
+        let width_hz = self.channel_width_hz;
+        self.channels_hz.iter().map(|&frequency_hz| Channel { frequency_hz, width_hz }).collect()
+    }
+
+    /// The rule of the adaptive integration.
+    #[must_use]
+    pub fn rule(&self) -> IntegrationRule {
+        IntegrationRule {
+            duration_s_max: self.integration_s_max,
+            motion_wavelengths_max: self.motion_wavelengths_max,
+        }
+    }
+
+    /// Everything that is wrong with the configuration; empty if it is good.
+    #[must_use]
+    pub fn problems(&self) -> Vec<SpacecraftError> {
+        let mut found = Vec::new();
+        let channels = self.channels_hz.len();
+        if channels == 0 || channels > CHANNELS_MAX {
+            found.push(SpacecraftError::ChannelCount(channels));
+        }
+        for (index, &value) in self.channels_hz.iter().enumerate() {
+            if !(BAND_HZ[0]..=BAND_HZ[1]).contains(&value) {
+                found.push(SpacecraftError::Frequency { index, value });
+            }
+        }
+        for (key, fits) in [
+            ("every_nth_integration", self.every_nth_integration.fits(channels)),
+            ("baseline_wavelengths_max", self.baseline_wavelengths_max.fits(channels)),
+        ] {
+            if !fits {
+                found.push(SpacecraftError::PerChannel { key, channels });
+            }
+        }
+        let mut require = |key, value: f64, good: bool, expected| {
+            if !(good && value.is_finite()) {
+                found.push(SpacecraftError::Parameter { key, value, expected });
+            }
+        };
+        let seconds = self.duration_s;
+        require("duration_s", seconds, seconds > 0.0 && seconds <= 1e9, "seconds, above 0 and at most 1e9");
+        let width = self.channel_width_hz;
+        require("channel_width_hz", width, width > 0.0 && width <= 1e6, "above 0 Hz and at most 1 MHz");
+        let longest = self.integration_s_max;
+        require(
+            "integration_s_max",
+            longest,
+            (1e-3..=1000.0).contains(&longest),
+            "0.001 s to 1000 s",
+        );
+        let motion = self.motion_wavelengths_max;
+        require("motion_wavelengths_max", motion, motion > 0.0 && motion <= 1.0, "above 0 and at most 1");
+        let noise = self.receiver_noise_k_sr;
+        require("receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
+        require("every_nth_window", self.every_nth_window as f64, self.every_nth_window >= 1, "at least 1");
+        for &nth in self.every_nth_integration.values() {
+            require("every_nth_integration", nth as f64, nth >= 1, "at least 1");
+        }
+        for &limit in self.baseline_wavelengths_max.values() {
+            require("baseline_wavelengths_max", limit, limit >= 0.0, "wavelengths, or 0 for no limit");
+        }
+        let epoch = self.epoch_tai_s;
+        // Four octets of whole seconds are what the time code holds.
+        require("epoch_tai_s", epoch, (0.0..=3.0e9).contains(&epoch), "0 to 3e9 s");
+        found
+    }
+}

@@ -1,0 +1,42 @@
+//! The source of the space segment: one observing window after another.
+
+use crate::array::{Array, ObservingWindows};
+use crate::frames::ObservingWindow;
+use crate::runtime::{Flow, Outlet, Source};
+
+/// Emits the observing windows of a mission in the order of time.
+#[derive(Debug)]
+pub struct Observer {
+    windows: std::vec::IntoIter<ObservingWindow>,
+}
+
+impl Observer {
+    /// Emits `windows`.
+    #[must_use]
+    pub fn new(windows: Vec<ObservingWindow>) -> Self {
+        Self { windows: windows.into_iter() }
+    }
+
+    /// Every `every_nth` window of `array` from the epoch to `duration_s`.
+    #[must_use]
+    pub fn windows(array: &Array, duration_s: f64, every_nth: u64) -> Vec<ObservingWindow> {
+        ObservingWindows::new(array, 0.0, duration_s)
+            .filter(|window| window.index.is_multiple_of(every_nth.max(1)))
+            .collect()
+    }
+}
+
+impl Source for Observer {
+    type Out = ObservingWindow;
+    type Error = std::convert::Infallible;
+
+    fn next(&mut self, out: &mut Outlet<ObservingWindow>) -> Result<Flow, Self::Error> {
+        match self.windows.next() {
+            Some(window) => {
+                out.push(window);
+                Ok(Flow::Continue)
+            }
+            None => Ok(Flow::Done),
+        }
+    }
+}

@@ -1,0 +1,321 @@
+//! Pipeline files: parsed, overridden from the command line, and checked all at once.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use crate::accumulation::{MapConfig, MapConfigError};
+use crate::array::{Array, ArrayConfig};
+use crate::calibration::CalibrationConfig;
+use crate::downlink::DownlinkConfig;
+use crate::mother::SpacecraftConfig;
+use crate::products::ProductsConfig;
+use crate::runtime::RuntimeConfig;
+use crate::sky::SkyConfig;
+
+/// The pipeline that runs when no file is named.
+pub const QUICKLOOK: &str = include_str!("../../pipelines/quicklook.toml");
+
+/// A whole pipeline: what is in the sky, what flies, and what the ground makes of it.
+///
+/// Sections stand in the order in which data passes. A ground segment reads `calibration`, `map`,
+/// `products` and `runtime` only.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Name; products go to `out/NAME` unless told otherwise.
+    pub name: String,
+    /// Seed of everything random in the space segment.
+    pub seed: u64,
+    /// The sky.
+    pub sky: SkyConfig,
+    /// The array.
+    pub array: ArrayConfig,
+    /// The spacecraft.
+    pub spacecraft: SpacecraftConfig,
+    /// The downlink.
+    pub downlink: DownlinkConfig,
+    /// Calibration.
+    pub calibration: CalibrationConfig,
+    /// Map making.
+    pub map: MapConfig,
+    /// What is written.
+    pub products: ProductsConfig,
+    /// Queues and threads.
+    pub runtime: RuntimeConfig,
+}
+
+/// Why there is no usable configuration.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("cannot read the pipeline file {}: {source}", path.display())]
+    Read {
+        /// Path.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Not TOML, or keys and types that a pipeline does not have.
+    #[error("{origin}: {source}")]
+    Parse {
+        /// File, or the embedded default's name.
+        origin: String,
+        /// Line, column and what was expected.
+        source: Box<toml::de::Error>,
+    },
+    /// A `--set` that is not `key=value`.
+    #[error("--set {0}: expected key=value, for example --set map.nside=32")]
+    Override(String),
+    /// A `--set` through something that is not a section.
+    #[error("--set {key}: `{part}` is not a section")]
+    NotASection {
+        /// Whole key.
+        key: String,
+        /// Part of the key.
+        part: String,
+    },
+    /// Values that cannot be; all of them.
+    #[error("{origin}: {} problem(s)\n{}", problems.len(), bullets(problems))]
+    Values {
+        /// File, or the embedded default's name.
+        origin: String,
+        /// What is wrong.
+        problems: Vec<Box<dyn std::error::Error + Send + Sync>>,
+    },
+}
+
+fn bullets(problems: &[Box<dyn std::error::Error + Send + Sync>]) -> String {
+    problems.iter().map(|problem| format!("  - {problem}")).collect::<Vec<_>>().join("\n")
+}
+
+/// Where a configuration comes from and what is laid over it.
+#[derive(Clone, Debug, Default)]
+pub struct ConfigSource {
+    /// Pipeline file; `None` for the embedded quicklook.
+    pub file: Option<PathBuf>,
+    /// `key=value` overrides, in order.
+    pub overrides: Vec<String>,
+    /// Seed that replaces the file's.
+    pub seed: Option<u64>,
+}
+
+impl ConfigSource {
+    /// What messages call this source.
+    #[must_use]
+    pub fn origin(&self) -> String {
+        self.file.as_deref().map_or_else(|| "embedded quicklook".into(), |path| path.display().to_string())
+    }
+
+    /// Reads, overrides and parses; values are not checked yet.
+    ///
+    /// # Errors
+    /// An unreadable file, TOML errors with line and column, unknown keys, bad overrides.
+    pub fn parse(&self) -> Result<Config, ConfigError> {
+        let origin = self.origin();
+        let text = match &self.file {
+            Some(path) => read(path)?,
+            None => QUICKLOOK.to_owned(),
+        };
+        let parse_error =
+            |origin: String| move |source| ConfigError::Parse { origin, source: Box::new(source) };
+        // Straight from the text first: these errors know their line.
+        let mut config: Config = toml::from_str(&text).map_err(parse_error(origin.clone()))?;
+        if !self.overrides.is_empty() {
+            let mut table: toml::Table = toml::from_str(&text).map_err(parse_error(origin))?;
+            for text in &self.overrides {
+                set(&mut table, text)?;
+            }
+            let origin = format!("--set {}", self.overrides.join(" --set "));
+            config = table.try_into().map_err(parse_error(origin))?;
+        }
+        if let Some(seed) = self.seed {
+            config.seed = seed;
+        }
+        if config.name.is_empty() {
+            config.name = self.default_name();
+        }
+        Ok(config)
+    }
+
+    fn default_name(&self) -> String {
+        let stem = self.file.as_deref().and_then(Path::file_stem);
+        stem.map_or_else(|| "lunarray".into(), |stem| stem.to_string_lossy().into_owned())
+    }
+
+    /// [`Self::parse`], then every check of a whole pipeline.
+    ///
+    /// # Errors
+    /// As [`Self::parse`]; [`ConfigError::Values`] with everything that is wrong.
+    pub fn load(&self) -> Result<Config, ConfigError> {
+        let config = self.parse()?;
+        self.refuse(config.problems()).map(|()| config)
+    }
+
+    /// [`Self::parse`], then the checks of the ground segment's sections.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_ground(&self) -> Result<Config, ConfigError> {
+        let config = self.parse()?;
+        self.refuse(config.ground_problems()).map(|()| config)
+    }
+
+    fn refuse(&self, problems: Problems) -> Result<(), ConfigError> {
+        if problems.is_empty() {
+            return Ok(());
+        }
+        Err(ConfigError::Values { origin: self.origin(), problems })
+    }
+}
+
+/// Things that are wrong, of any folder.
+pub type Problems = Vec<Box<dyn std::error::Error + Send + Sync>>;
+
+fn boxed<E: std::error::Error + Send + Sync + 'static>(found: Vec<E>) -> Problems {
+    found.into_iter().map(|problem| Box::new(problem) as _).collect()
+}
+
+impl Config {
+    /// Everything that is wrong with a whole pipeline; empty if it is good.
+    #[must_use]
+    pub fn problems(&self) -> Problems {
+        let channels = self.spacecraft.channels_hz.len();
+        let mut found = boxed(self.sky.problems(channels));
+        let array = self.array.problems();
+        if array.is_empty()
+            && let Err(problem) = Array::new(&self.array)
+        {
+            found.push(Box::new(problem));
+        }
+        found.extend(boxed(array));
+        found.extend(boxed(self.spacecraft.problems()));
+        found.extend(boxed(self.downlink.problems()));
+        for key in self.map.misfits(channels) {
+            found.push(Box::new(MapConfigError::Misfit { key, channels }));
+        }
+        found.extend(self.ground_problems());
+        found
+    }
+
+    /// Everything that is wrong with the ground segment's sections; empty if they are good.
+    #[must_use]
+    pub fn ground_problems(&self) -> Problems {
+        let mut found = boxed(self.calibration.problems());
+        found.extend(boxed(self.map.problems()));
+        found.extend(boxed(self.products.problems()));
+        found.extend(boxed(self.runtime.problems()));
+        found
+    }
+
+    /// A hash of the sections that shape the downlink, for provenance.
+    #[must_use]
+    pub fn space_hash(&self) -> u64 {
+        let Self { name, seed, sky, array, spacecraft, .. } = self;
+        hash(&(name, seed, sky, array, spacecraft))
+    }
+
+    /// A hash of the sections that shape maps from a downlink, for provenance.
+    #[must_use]
+    pub fn ground_hash(&self) -> u64 {
+        hash(&(&self.calibration, &self.map))
+    }
+}
+
+/// The first 64 bits of a CRC over the JSON form: stable over runs, machines and field order.
+fn hash(value: &impl Serialize) -> u64 {
+    // Maps with string keys and finite numbers always have a JSON form.
+    let text = serde_json::to_vec(value).unwrap_or_default();
+    crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
+}
+
+fn read(path: &Path) -> Result<String, ConfigError> {
+    std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })
+}
+
+/// Lays `key=value` over a table; a value that is not TOML is taken as a string.
+fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
+    let (key, value) = text.split_once('=').ok_or_else(|| ConfigError::Override(text.to_owned()))?;
+    let key = key.trim();
+    let parsed = toml::from_str::<toml::Table>(&format!("value = {value}"));
+    let value = parsed
+        .ok()
+        .and_then(|mut table| table.remove("value"))
+        .unwrap_or_else(|| toml::Value::String(value.trim().to_owned()));
+    let (sections, last) = key.rsplit_once('.').map_or(("", key), |(head, last)| (head, last));
+    if last.is_empty() {
+        return Err(ConfigError::Override(text.to_owned()));
+    }
+    let mut here = table;
+    for part in sections.split('.').filter(|part| !part.is_empty()) {
+        let next = here.entry(part).or_insert_with(|| toml::Value::Table(toml::Table::new()));
+        here = next.as_table_mut().ok_or_else(|| ConfigError::NotASection {
+            key: key.to_owned(),
+            part: part.to_owned(),
+        })?;
+    }
+    here.insert(last.to_owned(), value);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const REFERENCE: &str = include_str!("../../pipelines/reference.toml");
+
+    fn with(overrides: &[&str]) -> Result<Config, ConfigError> {
+        let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
+        ConfigSource { overrides, ..ConfigSource::default() }.parse()
+    }
+
+    #[test]
+    fn the_reference_file_holds_every_key_with_its_default() {
+        let written: toml::Table = toml::from_str(REFERENCE).unwrap();
+        let config: Config = toml::from_str(REFERENCE).unwrap();
+        assert_eq!(config, Config::default());
+        let all = toml::Table::try_from(Config::default()).unwrap();
+        fn same_keys(path: &str, all: &toml::Table, written: &toml::Table) {
+            for (key, value) in all {
+                let path = format!("{path}.{key}");
+                let found = written.get(key).unwrap_or_else(|| panic!("{path} is missing"));
+                if let (Some(all), Some(written)) = (value.as_table(), found.as_table()) {
+                    same_keys(&path, all, written);
+                }
+            }
+        }
+        same_keys("", &all, &written);
+    }
+
+    #[test]
+    fn the_embedded_pipeline_is_good() {
+        assert!(ConfigSource::default().load().is_ok());
+    }
+
+    #[test]
+    fn overrides_reach_every_depth() {
+        let config = with(&["map.nside=8", "seed=5", "array.breathing.ratio=2.0", "sky.file=some/map.fits"]);
+        let config = config.unwrap();
+        assert_eq!((config.map.nside, config.seed, config.array.breathing.ratio), (8, 5, 2.0));
+        assert_eq!(config.sky.file.unwrap().get(0), Some(PathBuf::from("some/map.fits")));
+        assert!(matches!(with(&["map.nside"]), Err(ConfigError::Override(_))));
+        assert!(matches!(with(&["seed.more=1"]), Err(ConfigError::NotASection { .. })));
+        let unknown = with(&["map.nsides=8"]).unwrap_err().to_string();
+        assert!(unknown.contains("nsides"), "{unknown}");
+    }
+
+    #[test]
+    fn hashes_follow_what_they_stand_for() {
+        let base = with(&[]).unwrap();
+        let mapped = with(&["map.nside=8"]).unwrap();
+        let flown = with(&["spacecraft.thermal_noise=false"]).unwrap();
+        let queued = with(&["runtime.queue_capacity=3"]).unwrap();
+        assert_eq!(base.space_hash(), mapped.space_hash());
+        assert_ne!(base.ground_hash(), mapped.ground_hash());
+        assert_ne!(base.space_hash(), flown.space_hash());
+        assert_eq!(base.ground_hash(), flown.ground_hash());
+        assert_eq!((base.space_hash(), base.ground_hash()), (queued.space_hash(), queued.ground_hash()));
+    }
+}

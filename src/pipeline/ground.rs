@@ -1,0 +1,73 @@
+//! The ground segment as a graph: packets, placed and calibrated visibilities, sums, maps, products.
+
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+
+use super::config::Config;
+use super::error::PipelineError;
+use crate::accumulation::Accumulator;
+use crate::calibration::Calibrator;
+use crate::downlink::{Reception, ReceptionCounters};
+use crate::products::{ChannelSummary, Provenance, Publisher, Truth};
+use crate::runtime::{Graph, Ledger, Link};
+use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::solve::{Solver, SolverSetup};
+
+/// What the ground segment leaves behind besides its files.
+#[derive(Clone, Debug, Default)]
+pub struct GroundOutcome {
+    /// What became of every visibility.
+    pub ledger: Ledger,
+    /// What was received, and what was wrong with it.
+    pub reception: Arc<Mutex<ReceptionCounters>>,
+    /// Final map of each channel, in figures.
+    pub channels: Arc<Mutex<Vec<ChannelSummary>>>,
+}
+
+/// Adds the ground segment to `graph`. It takes the bytes of a downlink and nothing else from space;
+/// `truth`, if any, only serves to compare the maps with.
+///
+/// # Errors
+/// Calibration or prior maps that cannot be read.
+pub fn add(
+    graph: &mut Graph,
+    bytes: Link<Vec<u8>>,
+    config: &Config,
+    out: &Path,
+    truth: Truth,
+) -> Result<GroundOutcome, PipelineError> {
+    let outcome = GroundOutcome::default();
+    let capacity = config.runtime.queue_capacity;
+    let setup = SolverSetup {
+        epsilon: config.map.epsilon.clone(),
+        prior_k: config.map.prior_k.clone(),
+        prior_maps: prior_maps(config)?,
+    };
+    let calibration = config.calibration.build(Path::new(""))?;
+    let publisher = Publisher::new(
+        config.products.clone(),
+        out,
+        truth,
+        Provenance { ground_hash: config.ground_hash() },
+        Arc::clone(&outcome.channels),
+    )?;
+    let frames = graph.stage("receive", capacity, bytes, Reception::new(Arc::clone(&outcome.reception)));
+    let calibrator = Calibrator::new(calibration, outcome.ledger.clone());
+    let placed = graph.stage("calibrate", capacity, frames, calibrator);
+    let accumulator = Accumulator::new(config.map.clone(), outcome.ledger.clone());
+    // Sums are large: one waits while another is solved.
+    let sums = graph.stage("accumulate", 1, placed, accumulator);
+    let maps = graph.stage("solve", 1, sums, Solver::new(setup));
+    graph.sink("publish", maps, publisher);
+    Ok(outcome)
+}
+
+fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {
+    let map = &config.map;
+    let read = |path: &std::path::PathBuf| {
+        let prior = read_whole_map(path, &ReadOptions::default())?.to_ecliptic()?;
+        let smooth = prior.smoothed(map.prior_fwhm_deg.to_radians())?;
+        Ok(smooth.degrade(map.nside)?.into_values())
+    };
+    map.prior_files.iter().map(read).collect()
+}

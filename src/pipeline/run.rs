@@ -1,0 +1,117 @@
+//! Running pipelines: the whole chain, the space segment alone, the ground segment alone.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, PoisonError};
+use std::time::Duration;
+
+use super::config::Config;
+use super::error::PipelineError;
+use super::ground::{self, GroundOutcome};
+use super::plan::Plan;
+use super::space;
+use super::summary::{Segment, Summary};
+use crate::downlink::{FileSource, Recorder};
+use crate::products::Truth;
+use crate::runtime::{Cancel, Graph, Metrics, Report, RuntimeConfig};
+
+/// Whom to tell about a graph that is about to run.
+pub type Watcher<'a> = &'a mut dyn FnMut(Arc<Metrics>);
+
+/// Name of the downlink file that `run` leaves among its products.
+pub const DOWNLINK_FILE: &str = "downlink.ccsds";
+
+/// The whole chain in one process: sky, spacecraft, downlink bytes, ground, products in `out`.
+///
+/// # Errors
+/// The first failure of any stage; a ledger that does not close.
+pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Result<Summary, PipelineError> {
+        let skies = space::skies(plan)?;
+        let mut graph = Graph::new();
+        let bytes = space::add(&mut graph, plan, &skies)?;
+        let recorder = Recorder::create(&out.join(DOWNLINK_FILE))?;
+        let capacity = plan.config.runtime.queue_capacity;
+        let bytes = graph.stage("record", capacity, bytes, recorder);
+        let truth = Truth::new(&skies, plan.config.map.nside)?;
+        drop(skies);
+        let outcome = ground::add(&mut graph, bytes, &plan.config, out, truth)?;
+        let report = start(graph, &plan.config.runtime, cancel, watch)?;
+        conclude(Segment::Whole, &plan.config, Some(out), report, outcome)
+}
+
+/// The space segment alone, to a downlink file.
+///
+/// # Errors
+/// The first failure of any stage.
+pub fn simulate(
+    plan: &Plan,
+    file: &Path,
+    cancel: &Cancel,
+    watch: Watcher<'_>,
+) -> Result<Report, PipelineError> {
+        let skies = space::skies(plan)?;
+        let mut graph = Graph::new();
+        let bytes = space::add(&mut graph, plan, &skies)?;
+        drop(skies);
+        graph.sink("record", bytes, Recorder::create(file)?);
+        start(graph, &plan.config.runtime, cancel, watch)
+}
+
+/// The ground segment alone, from downlink files in the order given.
+///
+/// # Errors
+/// A file that cannot be read or is no downlink; the first failure of any stage.
+pub fn replay(
+    files: &[PathBuf],
+    config: &Config,
+    out: &Path,
+    cancel: &Cancel,
+    watch: Watcher<'_>,
+) -> Result<Summary, PipelineError> {
+        let mut graph = Graph::new();
+        let bytes = graph.source("read", config.runtime.queue_capacity, FileSource::open(files)?);
+        let outcome = ground::add(&mut graph, bytes, config, out, Truth::unknown())?;
+        let report = start(graph, &config.runtime, cancel, watch)?;
+        conclude(Segment::Ground, config, Some(out), report, outcome)
+}
+
+fn start(
+    graph: Graph,
+    config: &RuntimeConfig,
+    cancel: &Cancel,
+    watch: Watcher<'_>,
+) -> Result<Report, PipelineError> {
+    watch(graph.metrics());
+    Ok(graph.run(cancel, Duration::from_secs_f64(config.shutdown_s))?)
+}
+
+fn conclude(
+    segment: Segment,
+    config: &Config,
+    out: Option<&Path>,
+    report: Report,
+    outcome: GroundOutcome,
+) -> Result<Summary, PipelineError> {
+    let reception = outcome.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let channels = outcome.channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let ledger = outcome.ledger.close()?;
+    let summary = Summary::new(segment, config, report, ledger, reception, channels);
+    if let Some(out) = out {
+        summary.write(out)?;
+    }
+    Ok(summary)
+}
+
+/// Gives this process as many worker threads as the configuration says; once, before anything runs.
+///
+/// # Errors
+/// Threads that cannot be started, or a number other than the one that the process already has.
+pub fn use_threads(config: &RuntimeConfig) -> Result<(), PipelineError> {
+    let threads = config.threads;
+    let built = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
+    match built {
+        Err(error) if threads != 0 && threads != rayon::current_num_threads() => {
+            Err(PipelineError::Threads { threads, reason: error.to_string() })
+        }
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,56 @@
+//! The space segment as a graph: windows, visibilities, the onboard store, packets.
+
+use std::sync::Arc;
+
+use super::error::PipelineError;
+use super::plan::Plan;
+use crate::downlink::Transmitter;
+use crate::mother::{DirectSum, Integrator, NoiseModel, Observer, Store};
+use crate::runtime::{Graph, Link};
+use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::generated::generate;
+use crate::sky::{Frame, SkyMap};
+
+/// Name of the stage by whose windows progress is measured.
+pub const INTEGRATE: &str = "integrate";
+
+/// The simulated sky of every channel, in its own pixels and frame.
+///
+/// # Errors
+/// A map that cannot be read or that has pixels without a value.
+pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
+    let config = &plan.config.sky;
+    let sky = |(channel, &frequency_hz): (usize, &f64)| match config.file.as_ref() {
+        Some(files) => {
+            let path = files.get(channel).unwrap_or_default();
+            Ok(read_whole_map(&path, &ReadOptions::default())?)
+        }
+        None => {
+            let values = generate(&config.generated, frequency_hz, config.nside, plan.config.seed)?;
+            Ok(SkyMap::new(Frame::Ecliptic, values)?)
+        }
+    };
+    plan.config.spacecraft.channels_hz.iter().enumerate().map(sky).collect()
+}
+
+/// Adds the space segment to `graph`; what comes out are the bytes of the downlink.
+///
+/// # Errors
+/// A downlink configuration that cannot be.
+pub fn add(graph: &mut Graph, plan: &Plan, skies: &[SkyMap]) -> Result<Link<Vec<u8>>, PipelineError> {
+    let Plan { config, array, instrument, schedules, windows } = plan;
+    let capacity = config.runtime.queue_capacity;
+    let frequencies = &config.spacecraft.channels_hz;
+    let model = DirectSum::new(skies, frequencies, array.moon_radius_m(), instrument.response);
+    let noise = NoiseModel {
+        seed: config.spacecraft.thermal_noise.then_some(config.seed),
+        receiver_noise_k_sr: config.spacecraft.receiver_noise_k_sr,
+    };
+    let integrator =
+        Integrator::new(Arc::clone(array), Arc::new(model), instrument.clone(), schedules.clone(), noise);
+    // A window waiting is nothing; a window's visibilities are.
+    let windows = graph.source("observe", 1, Observer::new(windows.clone()));
+    let frames = graph.stage(INTEGRATE, capacity, windows, integrator);
+    let passes = graph.stage("store", capacity, frames, Store::new(config.spacecraft.store_bytes_max));
+    Ok(graph.stage("transmit", capacity, passes, Transmitter::new(&config.downlink)?))
+}

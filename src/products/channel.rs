@@ -1,0 +1,301 @@
+//! The products of one channel.
+
+use std::path::{Path, PathBuf};
+
+use super::config::ProductsConfig;
+use super::error::ProductsError;
+use super::pictures::{
+    Axis, Bars, Curve, MapPanel, Palette, Plot, Sampling, Scale, Sheet, Stretch, View, draw_map, draw_plots,
+    draw_sheet,
+};
+use super::provenance::Provenance;
+use super::summary::{ChannelSummary, SnapshotSummary};
+use crate::sky::compare::{Comparison, compare};
+use crate::sky::fits::{WriteOptions, write_map};
+use crate::sky::{Frame, SkyMap};
+use crate::solve::Solution;
+use crate::units::constants::DAY_S;
+
+/// Most maps on the sheet that shows how they sharpen; the first, the last and some between.
+const SHEET_MAPS_MAX: usize = 6;
+
+/// A channel's folder and what is known of its maps so far.
+pub(super) struct ChannelFolder {
+    config: ProductsConfig,
+    /// Output folder of the run.
+    root: PathBuf,
+    /// Name of the channel's folder in it.
+    name: String,
+    frequency_hz: f64,
+    truth: Option<SkyMap>,
+    /// Maps so far, with their captions, for the sheet.
+    shown: Vec<(Vec<f64>, String)>,
+    snapshots: Vec<SnapshotSummary>,
+    files: Vec<String>,
+    summary: Option<ChannelSummary>,
+}
+
+impl ChannelFolder {
+    /// Makes the folder `root/3.000MHz`.
+    pub(super) fn open(
+        root: &Path,
+        config: &ProductsConfig,
+        truth: Option<&SkyMap>,
+        solution: &Solution,
+    ) -> Result<Self, ProductsError> {
+        let channel = usize::from(solution.channel.0);
+        let frequency_hz = solution.instrument.channels.get(channel).map_or(0.0, |c| c.frequency_hz);
+        let name = format!("{:.3}MHz", frequency_hz / 1e6);
+        let folder = root.join(&name);
+        std::fs::create_dir_all(&folder)
+            .map_err(|source| ProductsError::Write { path: folder.clone(), source })?;
+        Ok(Self {
+            config: config.clone(),
+            root: root.to_owned(),
+            name,
+            frequency_hz,
+            truth: truth.cloned(),
+            shown: Vec::new(),
+            snapshots: Vec::new(),
+            files: Vec::new(),
+            summary: None,
+        })
+    }
+
+    /// Writes what belongs to one solution; all of it if the solution is final.
+    pub(super) fn publish(
+        &mut self,
+        solution: &Solution,
+        provenance: &Provenance,
+    ) -> Result<(), ProductsError> {
+        let map = SkyMap::new(Frame::Ecliptic, solution.map_k.clone())?;
+        let noise = SkyMap::new(Frame::Ecliptic, solution.noise_k.clone())?;
+        let comparison = self.truth.as_ref().map(|truth| compare(&map, truth, Some(&noise))).transpose()?;
+        self.note(solution, comparison.as_ref());
+        if self.config.snapshot_maps && !solution.is_final {
+            self.write_map(&format!("snapshot-{:03}.fits", solution.number), &map, provenance, solution)?;
+        }
+        if self.config.pictures {
+            self.draw_snapshot(solution)?;
+        }
+        if solution.is_final {
+            self.write_final(solution, &map, &noise, provenance)?;
+            if self.config.pictures {
+                self.draw_final(solution, comparison.as_ref())?;
+            }
+            self.summary = Some(self.summarise(solution, comparison));
+        }
+        Ok(())
+    }
+
+    /// The figures, if a final map came.
+    pub(super) fn into_summary(self) -> Option<ChannelSummary> {
+        self.summary.map(|summary| ChannelSummary { files: self.files, ..summary })
+    }
+
+    fn note(&mut self, solution: &Solution, comparison: Option<&Comparison>) {
+        let until_s = solution.span_s[1];
+        let days = (until_s - solution.span_s[0]) / DAY_S;
+        self.shown.push((solution.map_k.clone(), format!("after {days:.0} days")));
+        self.snapshots.push(SnapshotSummary {
+            number: solution.number,
+            until_s,
+            visibilities: solution.visibilities,
+            relative_error: self.truth.as_ref().map(|truth| relative_error(&solution.map_k, truth.values())),
+            rho_mean: comparison.map(|c| mean_rho(&c.rho, 2 * solution.nside)),
+        });
+    }
+
+    fn summarise(&self, solution: &Solution, comparison: Option<Comparison>) -> ChannelSummary {
+        let pixels = solution.map_k.len() as f64;
+        let (rho, snr) = comparison.map_or((None, None), |c| (Some(c.rho), c.snr));
+        ChannelSummary {
+            frequency_hz: self.frequency_hz,
+            nside: solution.nside,
+            span_s: solution.span_s,
+            visibilities: solution.visibilities,
+            mean_k: solution.map_k.iter().sum::<f64>() / pixels,
+            noise_rms_k: (solution.noise_k.iter().map(|x| x * x).sum::<f64>() / pixels).sqrt(),
+            diagnostics: solution.diagnostics,
+            snapshots: self.snapshots.clone(),
+            rho,
+            snr,
+            files: Vec::new(),
+        }
+    }
+
+    /// A path in the channel's folder, noted as written.
+    fn file(&mut self, name: &str) -> PathBuf {
+        let relative = format!("{}/{name}", self.name);
+        let path = self.root.join(&relative);
+        self.files.push(relative);
+        path
+    }
+
+    fn write_map(
+        &mut self,
+        name: &str,
+        map: &SkyMap,
+        provenance: &Provenance,
+        solution: &Solution,
+    ) -> Result<(), ProductsError> {
+        let what = name.trim_end_matches(".fits");
+        let options = WriteOptions { cards: provenance.cards(solution, what), ..WriteOptions::default() };
+        let path = self.file(name);
+        Ok(write_map(&path, map, &options)?)
+    }
+
+    fn write_final(
+        &mut self,
+        solution: &Solution,
+        map: &SkyMap,
+        noise: &SkyMap,
+        provenance: &Provenance,
+    ) -> Result<(), ProductsError> {
+        self.write_map("map.fits", map, provenance, solution)?;
+        self.write_map("noise.fits", noise, provenance, solution)?;
+        if self.config.smooth_fwhm_deg > 0.0 {
+            let fine = map.upgrade(4 * map.nside())?;
+            let smooth = fine.smoothed(self.config.smooth_fwhm_deg.to_radians())?;
+            self.write_map("map-smooth.fits", &smooth, provenance, solution)?;
+        }
+        if let Some(truth) = self.truth.clone() {
+            self.write_map("input.fits", &truth, provenance, solution)?;
+        }
+        Ok(())
+    }
+
+    /// The scale that map and input share: what the input fills, or the map itself without one.
+    fn scale(&self, map_k: &[f64]) -> Scale {
+        let reference = self.truth.as_ref().map_or(map_k, SkyMap::values);
+        Scale::robust(reference, Stretch::Log, Palette::default())
+    }
+
+    fn panel<'a>(&self, values: &'a [f64], caption: &str, scale: Scale) -> MapPanel<'a> {
+        MapPanel { values, caption: caption.to_owned(), scale, unit: "K".to_owned() }
+    }
+
+    fn draw_snapshot(&mut self, solution: &Solution) -> Result<(), ProductsError> {
+        let Some((map, caption)) = self.shown.last().cloned() else { return Ok(()) };
+        let title = format!("{} MHz, {caption}", self.frequency_hz / 1e6);
+        let subtitle = format!("{} visibilities", solution.visibilities);
+        let panel = self.panel(&map, &title, self.scale(&map));
+        let path = self.file(&format!("snapshot-{:03}.png", solution.number));
+        Ok(draw_map(&panel, &subtitle, &view())?.write(&path)?)
+    }
+
+    fn draw_final(
+        &mut self,
+        solution: &Solution,
+        comparison: Option<&Comparison>,
+    ) -> Result<(), ProductsError> {
+        let mhz = self.frequency_hz / 1e6;
+        let map = &solution.map_k;
+        let scale = self.scale(map);
+        let subtitle = format!("{} visibilities, nside {}", solution.visibilities, solution.nside);
+        let panel = self.panel(map, &format!("Map at {mhz} MHz"), scale);
+        let path = self.file("map.png");
+        draw_map(&panel, &subtitle, &view())?.write(&path)?;
+        if let Some(truth) = self.truth.clone() {
+            let panel = self.panel(truth.values(), &format!("Input at {mhz} MHz"), scale);
+            let path = self.file("input.png");
+            draw_map(&panel, "", &view())?.write(&path)?;
+            let error: Vec<f64> = map.iter().zip(truth.values()).map(|(m, t)| (m - t) / t).collect();
+            let panel = MapPanel {
+                unit: "(map - input) / input".to_owned(),
+                ..self.panel(&error, &format!("Relative error at {mhz} MHz"), Scale::symmetric(&error))
+            };
+            let path = self.file("error.png");
+            draw_map(&panel, &subtitle, &view())?.write(&path)?;
+        }
+        if let Some(comparison) = comparison {
+            let path = self.file("spectra.png");
+            draw_comparison(&format!("{mhz} MHz"), comparison)?.write(&path)?;
+        }
+        self.draw_sheet(scale)
+    }
+
+    /// Maps on the way, side by side.
+    fn draw_sheet(&mut self, scale: Scale) -> Result<(), ProductsError> {
+        let count = self.shown.len();
+        let places = SHEET_MAPS_MAX.min(count);
+        let chosen = (0..places).map(|k| if places > 1 { k * (count - 1) / (places - 1) } else { 0 });
+        let panels: Vec<MapPanel<'_>> = chosen
+            .map(|k| {
+                let (map, caption) = &self.shown[k];
+                self.panel(map, caption, scale)
+            })
+            .collect();
+        let sheet = Sheet {
+            title: format!("The map at {} MHz sharpens", self.frequency_hz / 1e6),
+            columns: 3,
+            width_px: 1800,
+            bars: Bars::Shared,
+            view: view(),
+            ..Sheet::default()
+        };
+        let picture = draw_sheet(&panels, &sheet)?;
+        let path = self.file("sharpening.png");
+        Ok(picture.write(&path)?)
+    }
+}
+
+fn view() -> View {
+    View { sampling: Sampling::Interpolated, ..View::default() }
+}
+
+/// rms of (map - truth) over rms of truth.
+fn relative_error(map: &[f64], truth: &[f64]) -> f64 {
+    let difference: f64 = map.iter().zip(truth).map(|(m, t)| (m - t) * (m - t)).sum();
+    let scale: f64 = truth.iter().map(|t| t * t).sum();
+    (difference / scale).sqrt()
+}
+
+/// Mean of rho_l over 1 <= l <= `l_max`.
+fn mean_rho(rho: &[f64], l_max: usize) -> f64 {
+    let range = &rho[1.min(rho.len())..rho.len().min(l_max + 1)];
+    range.iter().sum::<f64>() / range.len().max(1) as f64
+}
+
+/// rho_l, the spectra and SNR_l as curves.
+pub(crate) fn draw_comparison(
+    title: &str,
+    comparison: &Comparison,
+) -> Result<super::pictures::Picture, super::pictures::PictureError> {
+    let curve = |label: &str, values: &[f64], dashed: bool| Curve {
+        label: label.to_owned(),
+        points: comparison.l.iter().map(|&l| l as f64).zip(values.iter().copied()).collect(),
+        dashed,
+    };
+    let l = Axis { label: "degree l".to_owned(), ..Axis::default() };
+    let mut plots = vec![
+        Plot {
+            title: "Correlation with the input".to_owned(),
+            x: l.clone(),
+            y: Axis { label: "rho_{l}".to_owned(), limits: Some((0.0, 1.05)), log: false },
+            curves: vec![curve("", &comparison.rho, false)],
+            levels: vec![1.0],
+        },
+        Plot {
+            title: "Angular power".to_owned(),
+            x: l.clone(),
+            y: Axis { label: "C_{l} (K^{2} sr)".replace("^{2}", "²"), log: true, limits: None },
+            curves: vec![
+                curve("map", &comparison.cl_map, false),
+                curve("input", &comparison.cl_truth, true),
+                curve("cross", &comparison.cl_cross, false),
+            ],
+            levels: Vec::new(),
+        },
+    ];
+    if let Some(snr) = &comparison.snr {
+        plots.push(Plot {
+            title: "Signal to noise".to_owned(),
+            x: l,
+            y: Axis { label: "SNR_{l}".to_owned(), log: true, limits: None },
+            curves: vec![curve("", snr, false)],
+            levels: vec![1.0],
+        });
+    }
+    draw_plots(title, &plots, plots.len())
+}

@@ -1,0 +1,76 @@
+//! A channel's maps in figures.
+
+use std::fmt;
+
+use serde::Serialize;
+
+use crate::solve::Diagnostics;
+
+/// One map on the way.
+#[derive(Clone, Debug, Serialize)]
+pub struct SnapshotSummary {
+    /// Number, from 1.
+    pub number: u32,
+    /// Mission time of the last data in it, s.
+    pub until_s: f64,
+    /// Visibilities in it.
+    pub visibilities: u64,
+    /// rms of (map - truth) / rms of truth; absent without a truth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub relative_error: Option<f64>,
+    /// Mean of rho_l over 1 <= l <= 2 nside; absent without a truth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rho_mean: Option<f64>,
+}
+
+/// One channel: its maps and how good they are.
+#[derive(Clone, Debug, Serialize)]
+pub struct ChannelSummary {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// nside of the maps.
+    pub nside: usize,
+    /// Mission time of the first and the last data, s.
+    pub span_s: [f64; 2],
+    /// Visibilities in the final map.
+    pub visibilities: u64,
+    /// Mean of the final map, K.
+    pub mean_k: f64,
+    /// rms of the noise-only companion map, K.
+    pub noise_rms_k: f64,
+    /// Regularisation, and how the final solution was found.
+    pub diagnostics: Diagnostics,
+    /// Maps on the way and the final one.
+    pub snapshots: Vec<SnapshotSummary>,
+    /// rho_l of the final map, l = 0, 1, ..; absent without a truth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rho: Option<Vec<f64>>,
+    /// SNR_l of the final map; absent without a truth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub snr: Option<Vec<f64>>,
+    /// Files written, relative to the output folder.
+    pub files: Vec<String>,
+}
+
+impl fmt::Display for ChannelSummary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "{:>8.3} MHz  nside {}  {} visibilities  mean {:.3e} K  noise {:.2e} K rms",
+            self.frequency_hz / 1e6,
+            self.nside,
+            self.visibilities,
+            self.mean_k,
+            self.noise_rms_k
+        )?;
+        if let Some(rho) = &self.rho {
+            write!(f, "\n             rho_l:")?;
+            let l_max = rho.len().saturating_sub(1).min(2 * self.nside);
+            let step = (l_max / 8).max(1);
+            for l in (step..=l_max).step_by(step) {
+                write!(f, "  {l}: {:.3}", rho[l])?;
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,53 @@
+//! What can be chosen about queues and threads.
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// Queues and threads; no choice changes a single byte of the results.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RuntimeConfig {
+    /// Items that wait between two stages at most.
+    pub queue_capacity: usize,
+    /// Threads for the work inside stages; 0 for one a core.
+    pub threads: usize,
+    /// Time that stages have to end after a failure, s.
+    pub shutdown_s: f64,
+}
+
+impl Default for RuntimeConfig {
+    fn default() -> Self {
+        Self { queue_capacity: 64, threads: 0, shutdown_s: 10.0 }
+    }
+}
+
+/// A setting of the runtime that cannot be.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[error("runtime.{key} = {value}: expected {expected}")]
+pub struct RuntimeConfigError {
+    /// Key.
+    pub key: &'static str,
+    /// Value found.
+    pub value: f64,
+    /// Range that is accepted.
+    pub expected: &'static str,
+}
+
+impl RuntimeConfig {
+    /// Everything that is wrong with the configuration; empty if it is good.
+    #[must_use]
+    pub fn problems(&self) -> Vec<RuntimeConfigError> {
+        let mut found = Vec::new();
+        let mut require = |key, value: f64, good: bool, expected| {
+            if !(good && value.is_finite()) {
+                found.push(RuntimeConfigError { key, value, expected });
+            }
+        };
+        let capacity = self.queue_capacity;
+        require("queue_capacity", capacity as f64, (1..=65_536).contains(&capacity), "1 to 65536 items");
+        require("threads", self.threads as f64, self.threads <= 1024, "at most 1024, or 0 for one a core");
+        let seconds = self.shutdown_s;
+        require("shutdown_s", seconds, (0.0..=3600.0).contains(&seconds), "0 s to 3600 s");
+        found
+    }
+}

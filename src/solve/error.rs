@@ -1,0 +1,42 @@
+//! Why there is no map.
+
+use thiserror::Error;
+
+use crate::units::ChannelId;
+
+/// Why there is no map.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[non_exhaustive]
+pub enum SolveError {
+    /// Nothing to solve.
+    #[error("there is no data to make a map of")]
+    NoData,
+    /// epsilon is missing for a channel.
+    #[error("map.epsilon has no value for channel {0}; expected one value, or one for each channel")]
+    NoEpsilon(ChannelId),
+    /// epsilon is not a regularisation.
+    #[error("epsilon = {0}: expected a number above 0")]
+    Epsilon(f64),
+    /// A prior of another size.
+    #[error("a prior of {found} pixels was given for a map of {expected}")]
+    PriorLength {
+        /// Pixels of the prior.
+        found: usize,
+        /// Pixels of the map.
+        expected: usize,
+    },
+    /// The matrix has no Cholesky factor.
+    #[error(
+        "the regularised normal matrix is not positive definite at pixel {pixel}; expected it to be for \
+         epsilon = {epsilon:e}: raise epsilon"
+    )]
+    NotPositive {
+        /// First pixel of the tile in which it failed.
+        pixel: usize,
+        /// Regularisation.
+        epsilon: f64,
+    },
+    /// An eigenvalue decomposition that did not converge.
+    #[error("the eigenvalues of the normal matrix did not converge; expected finite numbers in it")]
+    Eigenvalues,
+}

@@ -1,0 +1,105 @@
+//! The largest eigenvalue by Lanczos iteration.
+
+use rand_distr::{Distribution, StandardNormal};
+
+use crate::accumulation::NormalSums;
+use crate::units::{StreamKind, random_stream};
+
+/// Relative change of the estimate, twice in a row, at which the iteration stops.
+const TOLERANCE: f64 = 1e-10;
+
+/// Most iterations; 20 to 40 are usual.
+const ITERATIONS_MAX: usize = 200;
+
+/// The largest eigenvalue, and how it was found.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct LargestEigenvalue {
+    /// W_max, K^-2.
+    pub value: f64,
+    /// Products with the matrix.
+    pub iterations: usize,
+    /// Relative change in the last iteration.
+    pub change: f64,
+}
+
+/// W_max of `BtN^-1B`.
+///
+/// Lanczos from a fixed random vector with full reorthogonalisation; the Ritz value rises towards W_max,
+/// and the iteration ends when it has twice risen by less than 1e-10 of itself. The error is then of the
+/// same order: it falls by a constant factor an iteration.
+#[must_use]
+pub fn largest_eigenvalue(sums: &dyn NormalSums) -> LargestEigenvalue {
+    let order = sums.unknowns();
+    let mut stream = random_stream(0, StreamKind::Probe, [order as u64, 0]);
+    let start: Vec<f64> = (0..order).map(|_| StandardNormal.sample(&mut stream)).collect();
+    let mut basis = vec![normalised(start)];
+    let (mut alphas, mut betas) = (Vec::new(), Vec::new());
+    let mut found = LargestEigenvalue { value: 0.0, iterations: 0, change: f64::INFINITY };
+    let mut calm = 0;
+    while found.iterations < ITERATIONS_MAX.min(order) && calm < 2 {
+        let Some(last) = basis.last() else { break };
+        let mut next = vec![0.0; order];
+        sums.apply(last, &mut next);
+        alphas.push(dot(last, &next));
+        // Twice, so that what rounding leaves of the first time goes too.
+        for _ in 0..2 {
+            for vector in &basis {
+                let part = dot(vector, &next);
+                next.iter_mut().zip(vector).for_each(|(x, v)| *x -= part * v);
+            }
+        }
+        let value = largest_of_tridiagonal(&alphas, &betas);
+        found.iterations += 1;
+        found.change = ((value - found.value) / value).abs();
+        found.value = value;
+        calm = if found.change < TOLERANCE { calm + 1 } else { 0 };
+        let beta = dot(&next, &next).sqrt();
+        // An invariant subspace: the Ritz value is exact.
+        if beta.is_nan() || beta <= f64::EPSILON * value.abs() {
+            break;
+        }
+        betas.push(beta);
+        basis.push(normalised(next));
+    }
+    found
+}
+
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(x, y)| x * y).sum()
+}
+
+fn normalised(mut vector: Vec<f64>) -> Vec<f64> {
+    let norm = dot(&vector, &vector).sqrt();
+    vector.iter_mut().for_each(|x| *x /= norm);
+    vector
+}
+
+/// Largest eigenvalue of a symmetric tridiagonal matrix by bisection on Sturm counts.
+fn largest_of_tridiagonal(diagonal: &[f64], beside: &[f64]) -> f64 {
+    let radius = |k: usize| {
+        let left = if k > 0 { beside[k - 1].abs() } else { 0.0 };
+        let right = if k + 1 < diagonal.len() { beside[k].abs() } else { 0.0 };
+        left + right
+    };
+    // Gershgorin's circles hold all eigenvalues.
+    let mut high = (0..diagonal.len()).map(|k| diagonal[k] + radius(k)).fold(f64::MIN, f64::max);
+    let mut low = diagonal.iter().copied().fold(f64::MIN, f64::max);
+    let is_above_all = |x: f64| {
+        let mut pivot = diagonal[0] - x;
+        for k in 1..diagonal.len() {
+            if pivot >= 0.0 {
+                return false;
+            }
+            pivot = diagonal[k] - x - beside[k - 1] * beside[k - 1] / pivot;
+        }
+        pivot < 0.0
+    };
+    for _ in 0..200 {
+        let middle = 0.5 * (low + high);
+        if middle <= low || middle >= high {
+            break;
+        }
+        if is_above_all(middle) { high = middle } else { low = middle }
+    }
+    high
+}

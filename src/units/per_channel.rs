@@ -1,0 +1,41 @@
+//! Settings that may differ from channel to channel.
+
+use serde::{Deserialize, Serialize};
+
+/// One value for all channels, or one for each.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum PerChannel<T> {
+    /// The same for all channels.
+    All(T),
+    /// One for each channel, in their order.
+    Each(Vec<T>),
+}
+
+impl<T: Clone> PerChannel<T> {
+    /// The value for `channel`; `None` if the list is too short.
+    #[must_use]
+    pub fn get(&self, channel: usize) -> Option<T> {
+        match self {
+            Self::All(value) => Some(value.clone()),
+            Self::Each(values) => values.get(channel).cloned(),
+        }
+    }
+
+    /// Whether the list, if it is one, has `channels` values.
+    #[must_use]
+    pub fn fits(&self, channels: usize) -> bool {
+        match self {
+            Self::All(_) => true,
+            Self::Each(values) => values.len() == channels,
+        }
+    }
+
+    /// All values given.
+    pub fn values(&self) -> &[T] {
+        match self {
+            Self::All(value) => std::slice::from_ref(value),
+            Self::Each(values) => values,
+        }
+    }
+}

@@ -1,0 +1,224 @@
+//! The whole chain through the command: space and ground apart give what they give together, and
+//! nothing but the seed and the configuration changes a byte.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use assert_cmd::Command;
+use serde_json::Value;
+
+/// A mission of a few minutes of work at most: real geometry, small maps.
+const SMALL: &str = r#"
+name = "small"
+seed = 7
+[sky]
+nside = 16
+[spacecraft]
+channels_hz = [3.0e6, 10.0e6]
+every_nth_window = 200
+every_nth_integration = 3
+baseline_wavelengths_max = 16.0
+[map]
+nside = 8
+epsilon = [1e-6, 1e-4]
+snapshot_every_s = 1.5e7
+"#;
+
+fn lunarray(args: &[&str]) -> std::process::Output {
+    Command::cargo_bin("lunarray").unwrap().args(args).output().unwrap()
+}
+
+fn succeed(args: &[&str]) -> String {
+    let output = lunarray(args);
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success(), "{args:?}: {text}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+struct Workplace {
+    folder: tempfile::TempDir,
+    pipeline: String,
+}
+
+impl Workplace {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("small.toml");
+        std::fs::write(&path, SMALL).unwrap();
+        Self { pipeline: path.to_str().unwrap().to_owned(), folder }
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.folder.path().join(name).to_str().unwrap().to_owned()
+    }
+
+    fn run(&self, out: &str, more: &[&str]) -> BTreeMap<PathBuf, Vec<u8>> {
+        let out = self.path(out);
+        succeed(&[&["run", self.pipeline.as_str(), "--out", &out], more].concat());
+        files(Path::new(&out))
+    }
+}
+
+/// All files below a folder but the summary, which holds times.
+fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(next) = folders.pop() {
+        for entry in std::fs::read_dir(next).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.file_name().unwrap() != "summary.json" {
+                found.insert(path.strip_prefix(folder).unwrap().to_owned(), std::fs::read(path).unwrap());
+            }
+        }
+    }
+    assert!(!found.is_empty());
+    found
+}
+
+fn assert_same(one: &BTreeMap<PathBuf, Vec<u8>>, other: &BTreeMap<PathBuf, Vec<u8>>) {
+    assert!(one.keys().eq(other.keys()), "{:?} {:?}", one.keys(), other.keys());
+    for (path, bytes) in one {
+        assert!(bytes == &other[path], "{} differs", path.display());
+    }
+}
+
+#[test]
+fn space_and_ground_apart_give_what_they_give_together() {
+    let place = Workplace::new();
+    let whole = place.run("whole", &[]);
+    let downlink = place.path("small.ccsds");
+    succeed(&["simulate", &place.pipeline, "--out", &downlink]);
+    assert!(std::fs::read(&downlink).unwrap() == whole[Path::new("downlink.ccsds")]);
+    let out = place.path("ground");
+    succeed(&["replay", &downlink, "--map", &place.pipeline, "--out", &out]);
+    let ground = files(Path::new(&out));
+    let maps = |files: &BTreeMap<PathBuf, Vec<u8>>| {
+        files.iter().filter(|(path, _)| path.extension().is_some_and(|e| e == "fits")).count()
+    };
+    assert!(maps(&ground) >= 4, "a map and a noise map for each of two channels");
+    // The ground does not know the truth, so it leaves fewer pictures; what it leaves is the same.
+    for (path, bytes) in &ground {
+        if path.extension().is_some_and(|e| e == "fits") {
+            assert!(bytes == &whole[path], "{} differs", path.display());
+        }
+    }
+}
+
+#[test]
+fn capacities_and_threads_do_not_change_a_byte() {
+    let place = Workplace::new();
+    let reference = place.run("reference", &[]);
+    for (name, capacity, threads) in [("one", "1", "1"), ("three", "3", "3"), ("many", "999", "2")] {
+        let capacity = format!("runtime.queue_capacity={capacity}");
+        let threads = format!("runtime.threads={threads}");
+        let other = place.run(name, &["--set", &capacity, "--set", &threads]);
+        assert_same(&reference, &other);
+    }
+}
+
+#[test]
+fn the_seed_changes_the_noise() {
+    let place = Workplace::new();
+    let one = place.run("one", &["--set", "products.pictures=false"]);
+    let other = place.run("other", &["--set", "products.pictures=false", "--seed", "8"]);
+    assert!(one[Path::new("downlink.ccsds")] != other[Path::new("downlink.ccsds")]);
+}
+
+#[test]
+fn the_ledger_closes_and_the_summary_tells() {
+    let place = Workplace::new();
+    let out = place.path("out");
+    let text = succeed(&["run", &place.pipeline, "--out", &out, "--json"]);
+    let printed: Value = serde_json::from_str(&text).unwrap();
+    let written: Value =
+        serde_json::from_slice(&std::fs::read(Path::new(&out).join("summary.json")).unwrap()).unwrap();
+    assert_eq!(printed, written);
+    let count = |value: &Value| value.as_u64().unwrap();
+    let ledger = &written["ledger"];
+    let flagged: u64 = ledger["flagged"].as_object().unwrap().values().map(count).sum();
+    assert!(ledger["lost"].as_array().unwrap().is_empty());
+    assert_eq!(count(&ledger["sampled"]), count(&ledger["accumulated"]) + flagged);
+    assert_eq!(written["channels"].as_array().unwrap().len(), 2);
+    for channel in written["channels"].as_array().unwrap() {
+        for file in channel["files"].as_array().unwrap() {
+            assert!(Path::new(&out).join(file.as_str().unwrap()).exists(), "{file}");
+        }
+    }
+}
+
+#[test]
+fn a_lost_stretch_is_counted_and_the_rest_is_used() {
+    let place = Workplace::new();
+    let downlink = place.path("small.ccsds");
+    succeed(&["simulate", &place.pipeline, "--out", &downlink]);
+    let mut bytes = std::fs::read(&downlink).unwrap();
+    let middle = bytes.len() / 2;
+    bytes.drain(middle..middle + bytes.len() / 20);
+    let damaged = place.path("damaged.ccsds");
+    std::fs::write(&damaged, bytes).unwrap();
+    let out = place.path("out");
+    let text =
+        succeed(&["replay", &damaged, "--map", &place.pipeline, "--out", &out, "--json"]);
+    let summary: Value = serde_json::from_str(&text).unwrap();
+    let lost = &summary["ledger"]["lost"];
+    assert!(lost.as_array().unwrap().iter().any(|loss| loss["count"].as_u64().unwrap() > 0), "{lost}");
+    assert!(summary["ledger"]["accumulated"].as_u64().unwrap() > 0);
+}
+
+#[test]
+fn a_file_given_twice_counts_once() {
+    let place = Workplace::new();
+    let downlink = place.path("small.ccsds");
+    succeed(&["simulate", &place.pipeline, "--out", &downlink]);
+    let replay = |out: &str, files: &[&str]| {
+        let out = place.path(out);
+        let args = ["--map", &place.pipeline, "--out", &out, "--json"];
+        let text = succeed(&[&["replay"], files, &args].concat());
+        (serde_json::from_str::<Value>(&text).unwrap(), files_of_maps(Path::new(&out)))
+    };
+    let (once, maps_once) = replay("once", &[&downlink]);
+    let (twice, maps_twice) = replay("twice", &[&downlink, &downlink]);
+    assert_eq!(once["ledger"]["accumulated"], twice["ledger"]["accumulated"]);
+    assert_same(&maps_once, &maps_twice);
+}
+
+fn files_of_maps(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = files(folder);
+    found.retain(|path, _| path.file_name().is_some_and(|name| name == "map.fits"));
+    found
+}
+
+#[cfg(unix)]
+#[test]
+fn an_interrupt_leaves_maps_of_the_data_so_far() {
+    let place = Workplace::new();
+    let out = place.path("out");
+    let binary = assert_cmd::cargo::cargo_bin("lunarray");
+    let mut child = std::process::Command::new(binary)
+        .args(["run", &place.pipeline, "--out", &out, "--json"])
+        // Far more than the test waits for.
+        .args(["--set", "spacecraft.every_nth_window=1", "--set", "sky.nside=64"])
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    std::thread::sleep(Duration::from_secs(4));
+    let id = child.id().to_string();
+    assert!(std::process::Command::new("kill").args(["-INT", &id]).status().unwrap().success());
+    let since = Instant::now();
+    while child.try_wait().unwrap().is_none() {
+        assert!(since.elapsed() < Duration::from_secs(120), "still running two minutes after Ctrl-C");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130));
+    let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(summary["cancelled"], true);
+    assert!(summary["channels"][0]["visibilities"].as_u64().unwrap() > 0);
+    let downlink = Path::new(&out).join("downlink.ccsds");
+    let contents = succeed(&["inspect", downlink.to_str().unwrap(), "--json"]);
+    assert!(serde_json::from_str::<Value>(&contents).is_ok());
+}
