@@ -26,7 +26,16 @@
 //! | last 4 | packet check | CRC-32C of everything before it, big-endian |
 //!
 //! Headers are big-endian as CCSDS has them, payloads little-endian. A payload is a bincode-2 record of fixed
-//! width, followed by raw arrays; the `payload` modules list the fields.
+//! width, followed by raw arrays:
+//!
+//! | kind | record | arrays |
+//! |---|---|---|
+//! | instrument | name (u64 length, UTF-8), epoch_tai_s f64, moon_radius_m f64, satellites u8, response u8, seed u64, configuration_hash u64, channels u16 | channels x (frequency_hz, width_hz) f64 |
+//! | ephemeris | start_ticks i64, step_ticks u32, satellites u8, nodes u32 | nodes x satellites x 3 positions f64, m |
+//! | visibilities | channel u16, i u8, j u8, start_ticks i64, count u32 | count each: offset_ticks u32, duration_ticks u32, value (re, im) f32 x 2, weight f32, flags u8 |
+//! | housekeeping | time_ticks i64, sampled u64, dropped u64 | |
+//!
+//! A packet of visibilities stands for itself; other payloads are segmented when they exceed a packet.
 //!
 //! The header has a check of its own so that a damaged packet can still be told from noise, and its loss
 //! given a kind, a time and a count.

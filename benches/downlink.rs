@@ -1,0 +1,180 @@
+//! Packets: how fast frames become bytes and bytes frames.
+//!
+//! `cargo bench --bench downlink`. Limits, measured in the same run over the same bytes: a plain copy, and a pass
+//! that only forms the checksum. One thread throughout.
+#![allow(clippy::unwrap_used)] // A bench may stop at anything.
+
+use std::hint::black_box;
+use std::path::Path;
+use std::time::Instant;
+
+use lunarray::array::{Array, ArrayConfig, Ephemeris, segments_for};
+use lunarray::downlink::{DownlinkConfig, DownlinkReader, Packetizer, Receiver};
+use lunarray::frames::{AntennaResponse, Channel, Flags, GroundFrame, Instrument, VisibilityBlock};
+use lunarray::units::{ChannelId, MissionTime, Pair, StreamKind, all_pairs, random_stream};
+use num_complex::Complex32;
+use rand::Rng;
+
+/// Best of so many runs.
+const RUNS: usize = 7;
+/// Visibilities of one block: the longest baseline at 10 MHz in one window.
+const VISIBILITIES: u32 = 50_000;
+
+fn instrument() -> Instrument {
+    Instrument {
+        name: "bench".to_owned(),
+        epoch_tai_s: 2.5e9,
+        moon_radius_m: 1_737_100.0,
+        satellites: 8,
+        channels: vec![Channel { frequency_hz: 1e7, width_hz: 8e3 }; 3],
+        response: AntennaResponse::Isotropic,
+        seed: 0,
+        configuration_hash: 0,
+    }
+}
+
+fn frames() -> Vec<GroundFrame> {
+    let array = Array::new(&ArrayConfig::default()).unwrap();
+    let (start, end) = (MissionTime(0), MissionTime(2_750_000_000));
+    let mut frames = vec![GroundFrame::Instrument(instrument())];
+    frames.extend(segments_for(&array, start, end, 60.0).into_iter().map(GroundFrame::Ephemeris));
+    for channel in 0..3 {
+        frames.extend(all_pairs(8).into_iter().map(|pair| GroundFrame::Visibilities(block(channel, pair))));
+    }
+    frames
+}
+
+fn block(channel: u16, pair: Pair) -> VisibilityBlock {
+    let n = VISIBILITIES as usize;
+    VisibilityBlock {
+        channel: ChannelId(channel),
+        pair,
+        start: MissionTime(0),
+        offset_ticks: (0..VISIBILITIES).map(|k| 54_000 * k).collect(),
+        duration_ticks: vec![54_000; n],
+        value_k_sr: (0..n).map(|k| Complex32::new(k as f32, 0.5)).collect(),
+        weight: vec![0.25; n],
+        flags: vec![Flags::GOOD; n],
+    }
+}
+
+/// Shortest time of a few runs, s.
+fn best_s(mut run: impl FnMut()) -> f64 {
+    let time = |_| {
+        let start = Instant::now();
+        run();
+        start.elapsed().as_secs_f64()
+    };
+    (0..RUNS).map(time).fold(f64::INFINITY, f64::min)
+}
+
+struct Report {
+    bytes: f64,
+    copy_s: f64,
+    crc_s: f64,
+}
+
+impl Report {
+    fn line(&self, what: &str, s: f64) {
+        println!(
+            "{what:<38} {:>7.2} GB/s   {:>5.1} % of a copy   {:>5.1} % of CRC-32C alone",
+            self.bytes / s / 1e9,
+            100.0 * self.copy_s / s,
+            100.0 * self.crc_s / s
+        );
+    }
+}
+
+fn encode(frames: &[GroundFrame], out: &mut Vec<u8>) {
+    let mut packetizer = Packetizer::new(&DownlinkConfig::default()).unwrap();
+    out.clear();
+    for frame in frames {
+        packetizer.encode(frame, out).unwrap();
+    }
+}
+
+fn decode(bytes: &[u8], mut each: impl FnMut(GroundFrame)) -> u64 {
+    let mut reader = DownlinkReader::new(bytes, Path::new("memory"));
+    while let Some(frame) = reader.next_frame().unwrap() {
+        each(frame);
+    }
+    reader.counters().visibilities_decoded
+}
+
+fn receive(bytes: &[u8]) -> u64 {
+    let mut receiver = Receiver::new();
+    let (mut source, mut events) = (bytes, 0);
+    while receiver.fill_from(&mut source).unwrap() > 0 {
+        while receiver.next_event().is_some() {
+            events += 1;
+        }
+    }
+    events
+}
+
+fn main() {
+    let frames = frames();
+    let sent = 3 * 28 * u64::from(VISIBILITIES);
+    let mut bytes = Vec::new();
+    encode(&frames, &mut bytes);
+    let mut copy = vec![0_u8; bytes.len()];
+    let copy_s = best_s(|| black_box(&mut copy).copy_from_slice(black_box(&bytes)));
+    let crc_s = best_s(|| {
+        black_box(crc_fast::checksum(crc_fast::CrcAlgorithm::Crc32Iscsi, black_box(&bytes)));
+    });
+    let report = Report { bytes: bytes.len() as f64, copy_s, crc_s };
+    println!("downlink: {:.1} MB, {sent} visibilities, best of {RUNS} runs, one thread", report.bytes / 1e6);
+    report.line("copy", copy_s);
+    report.line("CRC-32C alone", crc_s);
+    let mut out = Vec::with_capacity(bytes.len());
+    report.line("encode frames", best_s(|| encode(black_box(&frames), &mut out)));
+    report.line(
+        "receive packets",
+        best_s(|| {
+            black_box(receive(black_box(&bytes)));
+        }),
+    );
+    report.line("decode frames", best_s(|| assert_eq!(decode(black_box(&bytes), drop), sent)));
+    place(&bytes, sent);
+    resynchronise(report.bytes as usize);
+}
+
+/// Decoding and placing: what a map-maker waits for.
+fn place(bytes: &[u8], sent: u64) {
+    let mut placed = 0;
+    let s = best_s(|| {
+        let mut ephemeris = Ephemeris::default();
+        placed = 0;
+        decode(bytes, |frame| match frame {
+            GroundFrame::Ephemeris(segment) => {
+                ephemeris.insert(segment);
+            }
+            GroundFrame::Visibilities(block) => placed += black_box(ephemeris.place(&block, 1e7)).1.placed,
+            _ => {}
+        });
+    });
+    assert_eq!(placed, sent);
+    println!("{:<38} {:>7.2} M visibilities/s", "decode and place", sent as f64 / s / 1e6);
+}
+
+/// Noise, and the worst that a forger can do: headers that each ask for a check of 64 KiB.
+fn resynchronise(bytes: usize) {
+    let mut noise = vec![0; bytes];
+    random_stream(1, StreamKind::Probe, [0, 0]).fill_bytes(&mut noise);
+    let start = Instant::now();
+    black_box(receive(&noise));
+    println!("{:<38} {:>7.2} GB/s", "noise", bytes as f64 / start.elapsed().as_secs_f64() / 1e9);
+    let header = lunarray::downlink::PacketHeader {
+        kind: lunarray::downlink::Kind::Visibilities,
+        segment: lunarray::downlink::Segment::Whole,
+        count: 0,
+        time: lunarray::downlink::CucTime(0),
+        version: lunarray::downlink::FORMAT_VERSION,
+        bytes: lunarray::downlink::PACKET_BYTES_MAX,
+    };
+    let forged = header.to_bytes().repeat(100_000);
+    let start = Instant::now();
+    black_box(receive(&forged));
+    let rate = forged.len() as f64 / start.elapsed().as_secs_f64() / 1e6;
+    println!("{:<38} {rate:>7.2} MB/s", "forged headers, 64 KiB each");
+}
