@@ -1,6 +1,5 @@
 use super::*;
 use crate::sky::healpix::pixel_directions;
-use crate::units::vector::dot;
 
 /// Published ULSA statistics (see the module): MHz; mean, 5, 50, 95 %; b > 60, b < -60, |b| < 5 deg; K.
 const ULSA: [(f64, [f64; 4], [f64; 3]); 3] = [
@@ -26,9 +25,10 @@ fn points(map: &[f64]) -> [f64; 4] {
 
 /// Means over b > 60, b < -60 and |b| < 5 degrees.
 fn zones(map: &[f64], nside: usize) -> [f64; 3] {
+    let to_galactic = Frame::Ecliptic.to_frame(Frame::Galactic);
     let latitudes: Vec<f64> = pixel_directions(nside)
         .iter()
-        .map(|&d| dot(ECLIPTIC_TO_GALACTIC[2], d).clamp(-1.0, 1.0).asin().to_degrees())
+        .map(|&d| rotate(&to_galactic, d)[2].clamp(-1.0, 1.0).asin().to_degrees())
         .collect();
     let zone = |inside: &dyn Fn(f64) -> bool| {
         let values: Vec<f64> =
