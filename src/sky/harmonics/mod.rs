@@ -1,5 +1,15 @@
 //! Spherical harmonics: orthonormal, Condon-Shortley phase.
 
+mod analysis;
 mod coefficients;
+mod error;
+mod kernel;
+mod lanes;
+mod recurrence;
+mod rings;
+mod transform;
 
+pub use analysis::{Analysis, AnalysisOptions, Method, analysis, synthesis};
 pub use coefficients::Alm;
+pub use error::HarmonicsError;
+pub use transform::{L_MAX, Transform};

@@ -1,0 +1,177 @@
+//! Coefficients of a map.
+//!
+//! HEALPix pixels are no exact quadrature: sum over pixels of map conj(Y_lm) errs by 15 % for white
+//! coefficients up to l = 3 nside - 1, and healpy's three improvements leave 14 % at nside 128. The
+//! coefficients whose synthesis comes nearest the map (least squares) are exact for a band-limited map, and
+//! conjugate gradients on the normal equations find them. Measured, for white coefficients and a relative
+//! error of 1e-6: 5 iterations for l_max up to 2.25 nside and 8 up to 2.5 nside, at any nside from 16 to 256;
+//! at l_max = 3 nside - 1, 33 at nside 16 and 170 at nside 32 (where the map is met to 1e-6, the coefficients
+//! to 2e-5). Beyond, no method can: the pixel lattice near the poles and along the faces' meridians is too
+//! coarse in one direction for l > 2.5 nside or so, so that some waves hardly differ from others in any
+//! pixel, by factors that fall exponentially with nside.
+
+use num_complex::Complex64;
+
+use super::{Alm, HarmonicsError, Transform};
+
+/// How coefficients are found.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Method {
+    /// Least squares by conjugate gradients, to a residual.
+    LeastSquares {
+        /// Norm of the normal equations' residual relative to that of their right side; the coefficients'
+        /// own relative error is up to a few times this.
+        tolerance: f64,
+        /// Most iterations before giving up.
+        iterations_max: usize,
+    },
+    /// Quadrature, improved this many times by the quadrature of what is left (healpy's `iter`).
+    Jacobi {
+        /// Number of improvements.
+        iterations: usize,
+    },
+}
+
+impl Method {
+    /// Least squares to 3e-7 in at most 200 iterations, which leaves a relative error of some 1e-7 where that
+    /// can be had: for l_max up to 2.5 nside.
+    pub const ACCURATE: Self = Self::LeastSquares { tolerance: 3e-7, iterations_max: 200 };
+}
+
+/// Three improvements, as healpy does by default: what spectra in the literature mean.
+impl Default for Method {
+    fn default() -> Self {
+        Self::Jacobi { iterations: 3 }
+    }
+}
+
+/// Options of an analysis.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct AnalysisOptions {
+    /// How coefficients are found.
+    pub method: Method,
+}
+
+/// Coefficients and what it took to find them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Analysis {
+    /// The coefficients.
+    pub alm: Alm,
+    /// Iterations done.
+    pub iterations: usize,
+    /// Relative norm of the residual of the normal equations, before the last improvement for
+    /// [`Method::Jacobi`].
+    pub residual: f64,
+}
+
+/// The map of `alm` at the pixel centres of `nside`, RING order.
+///
+/// # Errors
+/// [`HarmonicsError`] for an nside or degree out of bounds.
+pub fn synthesis(alm: &Alm, nside: usize) -> Result<Vec<f64>, HarmonicsError> {
+    Transform::new(nside, alm.l_max())?.synthesis(alm)
+}
+
+/// Coefficients up to `l_max` of a map in RING order.
+///
+/// # Errors
+/// As [`Transform::analysis`], and [`HarmonicsError::Pixels`] for a number of pixels that no nside has.
+pub fn analysis(map: &[f64], l_max: usize, options: &AnalysisOptions) -> Result<Analysis, HarmonicsError> {
+    let nside = crate::sky::healpix::nside_of(map.len());
+    let nside = nside.ok_or(HarmonicsError::Pixels { found: map.len(), nside: 0 })?;
+    Transform::new(nside, l_max)?.analysis(map, options)
+}
+
+impl Transform {
+    /// Coefficients of a map in RING order.
+    ///
+    /// # Errors
+    /// [`HarmonicsError::Pixels`] unless the map has the transform's nside, [`HarmonicsError::Degree`] unless
+    /// `l_max <= 3 nside - 1`, [`HarmonicsError::NotFinite`] for NaN and infinities,
+    /// [`HarmonicsError::NotConverged`].
+    pub fn analysis(&self, map: &[f64], options: &AnalysisOptions) -> Result<Analysis, HarmonicsError> {
+        let most = 3 * self.nside() - 1;
+        if self.l_max() > most {
+            return Err(HarmonicsError::Degree { l_max: self.l_max(), most });
+        }
+        if let Some(pixel) = map.iter().position(|value| !value.is_finite()) {
+            return Err(HarmonicsError::NotFinite { pixel, value: map[pixel] });
+        }
+        match options.method {
+            Method::Jacobi { iterations } => self.jacobi(map, iterations),
+            Method::LeastSquares { tolerance, iterations_max } => {
+                self.least_squares(map, tolerance, iterations_max)
+            }
+        }
+    }
+
+    fn jacobi(&self, map: &[f64], iterations: usize) -> Result<Analysis, HarmonicsError> {
+        let mut alm = self.adjoint(map)?;
+        let scale = squared_norm(&alm).sqrt();
+        let mut residual = 0.0;
+        for _ in 0..iterations {
+            let mut left = self.synthesis(&alm)?;
+            for (left, value) in left.iter_mut().zip(map) {
+                *left = value - *left;
+            }
+            let correction = self.adjoint(&left)?;
+            add_scaled(&mut alm, 1.0, &correction);
+            residual = squared_norm(&correction).sqrt() / scale.max(f64::MIN_POSITIVE);
+        }
+        Ok(Analysis { alm, iterations, residual })
+    }
+
+    /// Conjugate gradients on A^T A a = A^T map with A the synthesis and A^T its transpose (Hestenes &
+    /// Stiefel 1952, the form that keeps the residual of the map).
+    fn least_squares(
+        &self,
+        map: &[f64],
+        tolerance: f64,
+        iterations_max: usize,
+    ) -> Result<Analysis, HarmonicsError> {
+        let pixel_area = crate::sky::healpix::pixel_area_sr(self.nside());
+        let mut left = map.to_vec();
+        let mut gradient = self.adjoint(&left)?;
+        let mut direction = gradient.clone();
+        let mut alm = Alm::zeros(self.l_max());
+        let first = squared_norm(&gradient);
+        let mut now = first;
+        let mut iterations = 0;
+        while now > tolerance * tolerance * first {
+            if iterations == iterations_max {
+                let residual = (now / first).sqrt();
+                return Err(HarmonicsError::NotConverged { iterations, residual, tolerance });
+            }
+            let image = self.synthesis(&direction)?;
+            let length: f64 = image.iter().map(|value| value * value).sum::<f64>() * pixel_area;
+            let step = now / length;
+            add_scaled(&mut alm, step, &direction);
+            for (left, image) in left.iter_mut().zip(&image) {
+                *left -= step * image;
+            }
+            gradient = self.adjoint(&left)?;
+            let next = squared_norm(&gradient);
+            let ratio = next / now;
+            for (direction, gradient) in direction.values_mut().iter_mut().zip(gradient.values()) {
+                *direction = gradient + *direction * ratio;
+            }
+            now = next;
+            iterations += 1;
+        }
+        let residual = if first > 0.0 { (now / first).sqrt() } else { 0.0 };
+        Ok(Analysis { alm, iterations, residual })
+    }
+}
+
+/// Squared norm over all orders, m < 0 included; the field's mean square times 4 pi.
+fn squared_norm(alm: &Alm) -> f64 {
+    let sum = |values: &[Complex64]| values.iter().map(Complex64::norm_sqr).sum::<f64>();
+    let (zeroth, others) = alm.values().split_at(alm.l_max() + 1);
+    sum(zeroth) + 2.0 * sum(others)
+}
+
+fn add_scaled(alm: &mut Alm, factor: f64, other: &Alm) {
+    for (value, other) in alm.values_mut().iter_mut().zip(other.values()) {
+        *value += other * factor;
+    }
+}

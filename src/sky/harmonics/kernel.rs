@@ -1,0 +1,338 @@
+//! The sums over degrees, the hot part of the transforms: SIMD over rings.
+//!
+//! A block of ring pairs (a ring and its mirror image south of the equator) shares the recurrence. Functions
+//! start as small as (sin theta)^m, far below the least f64; each ring carries a scale until its function
+//! has grown to 2^-100, below which a term is left out.
+#![expect(clippy::needless_range_loop, reason = "arrays of registers are walked in step")]
+
+use std::ops::Range;
+
+use pulp::{Simd, WithSimd};
+
+use super::lanes::RingLanes;
+use super::recurrence::Order;
+
+/// A value counts 2^`SCALE_EXPONENT` for each unit of its scale.
+pub(super) const SCALE_EXPONENT: i32 = 400;
+/// Functions below this, times their scale, do not count.
+const LEAST: f64 = power_of_two(-100);
+/// Functions above this have their scale raised: `LEAST` times 2^400.
+const GREATEST: f64 = power_of_two(300);
+/// Steps between looks at the scales. A step multiplies by less than 2^16 for any l up to 8191.
+const STEPS_BETWEEN_LOOKS: usize = 4;
+
+/// Most ring pairs of a block; tables of rings are padded to a multiple of it.
+pub(super) const BLOCK_MAX: usize = 32;
+
+/// Ring pairs of an even and an odd part are passed between stages in groups of this.
+pub(super) const GROUP: usize = 8;
+
+pub(super) const fn power_of_two(exponent: i32) -> f64 {
+    f64::from_bits(((1023 + exponent) as u64) << 52)
+}
+
+/// Greatest order that matters on a ring: beyond, all functions up to `l_max` are below 1e-30 or so
+/// (libsharp's rule).
+pub(super) fn greatest_order(l_max: usize, sin_theta: f64) -> usize {
+    let l = l_max as f64;
+    let reach = l * sin_theta + (0.01 * l).max(100.0);
+    (reach as usize).min(l_max)
+}
+
+/// Sums over degrees of one order for all rings: `out` is four planes (north real, imaginary; south real,
+/// imaginary) of `stride` values each; rings that the order does not reach are left alone.
+pub(super) struct Synthesis<'a> {
+    pub order: &'a Order,
+    pub l_max: usize,
+    pub mixed: &'a [[f64; 4]],
+    pub rings: &'a RingLanes,
+    /// The lanes to work on: whole blocks.
+    pub chunk: Range<usize>,
+    pub out: &'a mut [f64],
+    pub stride: usize,
+}
+
+/// The transpose: sums over rings for every formed function, added to `sums`.
+pub(super) struct Adjoint<'a> {
+    pub order: &'a Order,
+    pub l_max: usize,
+    pub rings: &'a RingLanes,
+    /// The lanes to work on: whole blocks.
+    pub chunk: Range<usize>,
+    /// Even part (real, imaginary) and cos theta times odd part of `GROUP` rings each, for group `g` at
+    /// `g * group_stride`.
+    pub parts: &'a [f64],
+    pub group_stride: usize,
+    /// Scratch for sums by SIMD lane.
+    pub by_lane: &'a mut Vec<f64>,
+    pub sums: &'a mut Vec<[f64; 4]>,
+}
+
+/// What is done with the functions of a block of rings.
+trait Sink<S: Simd, const U: usize> {
+    fn take(&mut self, j: usize, q: &[S::f64s; U]);
+}
+
+struct Block<S: Simd, const U: usize> {
+    simd: S,
+    x2: [S::f64s; U],
+    below: [S::f64s; U],
+    q: [S::f64s; U],
+    scale: [S::f64s; U],
+}
+
+impl<S: Simd, const U: usize> Block<S, U> {
+    #[inline(always)]
+    fn new(simd: S, order: &Order, rings: &RingLanes, at: usize) -> Self {
+        let lanes = at..at + U * S::F64_LANES;
+        let cos = load::<S, U>(&rings.cos[lanes.clone()]);
+        let (low, high, high_scale) = rings.powers(order.m, lanes);
+        let (low, high, scale) = (load::<S, U>(low), load::<S, U>(high), load::<S, U>(high_scale));
+        let start = simd.splat_f64s(order.start);
+        let zero = simd.splat_f64s(0.0);
+        let (mut x2, mut q) = ([zero; U], [zero; U]);
+        for u in 0..U {
+            x2[u] = simd.mul_f64s(cos[u], cos[u]);
+            q[u] = simd.mul_f64s(start, simd.mul_f64s(low[u], high[u]));
+        }
+        let mut block = Self { simd, x2, below: [zero; U], q, scale };
+        // The product is at least 2^-800.
+        block.lift(LEAST);
+        block.lift(LEAST);
+        block
+    }
+
+    /// Multiplies values below `limit` by 2^400.
+    #[inline(always)]
+    fn lift(&mut self, limit: f64) {
+        let simd = self.simd;
+        let factor = simd.splat_f64s(power_of_two(SCALE_EXPONENT));
+        let (limit, one) = (simd.splat_f64s(limit), simd.splat_f64s(1.0));
+        for u in 0..U {
+            let small = simd.less_than_f64s(simd.abs_f64s(self.q[u]), limit);
+            self.q[u] = simd.select_f64s(small, simd.mul_f64s(self.q[u], factor), self.q[u]);
+            self.scale[u] = simd.select_f64s(small, simd.sub_f64s(self.scale[u], one), self.scale[u]);
+        }
+    }
+
+    /// Divides values above `limit`, and what comes before them, by 2^400.
+    #[inline(always)]
+    fn lower(&mut self, limit: f64) {
+        let simd = self.simd;
+        let factor = simd.splat_f64s(power_of_two(-SCALE_EXPONENT));
+        let (limit, one) = (simd.splat_f64s(limit), simd.splat_f64s(1.0));
+        for u in 0..U {
+            let great = simd.greater_than_f64s(simd.abs_f64s(self.q[u]), limit);
+            self.q[u] = simd.select_f64s(great, simd.mul_f64s(self.q[u], factor), self.q[u]);
+            self.below[u] = simd.select_f64s(great, simd.mul_f64s(self.below[u], factor), self.below[u]);
+            self.scale[u] = simd.select_f64s(great, simd.add_f64s(self.scale[u], one), self.scale[u]);
+        }
+    }
+
+    /// Least and greatest scale.
+    #[inline(always)]
+    fn scales(&self) -> (f64, f64) {
+        let simd = self.simd;
+        let (mut least, mut greatest) = (self.scale[0], self.scale[0]);
+        for u in 1..U {
+            least = simd.min_f64s(least, self.scale[u]);
+            greatest = simd.max_f64s(greatest, self.scale[u]);
+        }
+        (simd.reduce_min_f64s(least), simd.reduce_max_f64s(greatest))
+    }
+
+    #[inline(always)]
+    fn step(&mut self, step: [f64; 2]) {
+        let next = self.next(step, &self.q, &self.below);
+        self.below = self.q;
+        self.q = next;
+    }
+
+    #[inline(always)]
+    fn next(&self, [a, b]: [f64; 2], q: &[S::f64s; U], below: &[S::f64s; U]) -> [S::f64s; U] {
+        let simd = self.simd;
+        let (a, b) = (simd.splat_f64s(a), simd.splat_f64s(b));
+        let mut next = *below;
+        for u in 0..U {
+            let factor = simd.mul_add_e_f64s(a, self.x2[u], b);
+            next[u] = simd.mul_add_e_f64s(factor, q[u], below[u]);
+        }
+        next
+    }
+
+    /// Runs through all functions and hands those that count to `sink`.
+    #[inline(always)]
+    fn run(mut self, steps: &[[f64; 2]], sink: &mut impl Sink<S, U>) {
+        let simd = self.simd;
+        let zero = simd.splat_f64s(0.0);
+        let mut j = 0;
+        let (mut least, mut greatest) = self.scales();
+        while greatest < 0.0 && j + STEPS_BETWEEN_LOOKS <= steps.len() {
+            for &step in &steps[j..j + STEPS_BETWEEN_LOOKS] {
+                self.step(step);
+            }
+            j += STEPS_BETWEEN_LOOKS;
+            self.lower(GREATEST);
+            (least, greatest) = self.scales();
+        }
+        while least < 0.0 && j < steps.len() {
+            for _ in 0..STEPS_BETWEEN_LOOKS.min(steps.len() - j) {
+                let mut counting = self.q;
+                for u in 0..U {
+                    let counts = simd.greater_than_or_equal_f64s(self.scale[u], zero);
+                    counting[u] = simd.select_f64s(counts, self.q[u], zero);
+                }
+                sink.take(j, &counting);
+                self.step(steps[j]);
+                j += 1;
+            }
+            self.lower(GREATEST);
+            least = self.scales().0;
+        }
+        // Two steps a turn, so that nothing has to be moved.
+        let (mut even, mut odd) = (self.q, self.below);
+        let (pairs, rest) = steps[j..].as_chunks::<2>();
+        for pair in pairs {
+            sink.take(j, &even);
+            odd = self.next(pair[0], &even, &odd);
+            sink.take(j + 1, &odd);
+            even = self.next(pair[1], &odd, &even);
+            j += 2;
+        }
+        if !rest.is_empty() {
+            sink.take(j, &even);
+        }
+    }
+}
+
+struct SumDegrees<'a, S: Simd, const U: usize> {
+    simd: S,
+    mixed: &'a [[f64; 4]],
+    sums: [[S::f64s; U]; 4],
+}
+
+impl<S: Simd, const U: usize> Sink<S, U> for SumDegrees<'_, S, U> {
+    #[inline(always)]
+    fn take(&mut self, j: usize, q: &[S::f64s; U]) {
+        let simd = self.simd;
+        let mixed = &self.mixed[j];
+        for part in 0..4 {
+            let coefficient = simd.splat_f64s(mixed[part]);
+            for u in 0..U {
+                self.sums[part][u] = simd.mul_add_e_f64s(coefficient, q[u], self.sums[part][u]);
+            }
+        }
+    }
+}
+
+struct SumRings<'a, S: Simd, const U: usize> {
+    simd: S,
+    parts: [[S::f64s; U]; 4],
+    lanes: &'a mut [[S::f64s; 4]],
+}
+
+impl<S: Simd, const U: usize> Sink<S, U> for SumRings<'_, S, U> {
+    #[inline(always)]
+    fn take(&mut self, j: usize, q: &[S::f64s; U]) {
+        let simd = self.simd;
+        let lanes = &mut self.lanes[j];
+        for part in 0..4 {
+            let mut sum = lanes[part];
+            for u in 0..U {
+                sum = simd.mul_add_e_f64s(self.parts[part][u], q[u], sum);
+            }
+            lanes[part] = sum;
+        }
+    }
+}
+
+/// `U` vectors from a slice.
+#[inline(always)]
+fn load<S: Simd, const U: usize>(values: &[f64]) -> [S::f64s; U] {
+    let vectors = S::as_simd_f64s(values).0;
+    std::array::from_fn(
+        #[inline(always)]
+        |u| vectors[u],
+    )
+}
+
+impl Synthesis<'_> {
+    #[inline(always)]
+    fn run<S: Simd, const U: usize>(self, simd: S) {
+        let width = U * S::F64_LANES;
+        let planes = self.out;
+        for at in self.chunk.clone().step_by(width) {
+            if self.order.m > greatest_order(self.l_max, self.rings.sin[at + width - 1]) {
+                continue;
+            }
+            let zero = simd.splat_f64s(0.0);
+            let mut sink = SumDegrees { simd, mixed: self.mixed, sums: [[zero; U]; 4] };
+            Block::new(simd, self.order, self.rings, at).run(&self.order.steps, &mut sink);
+            let cos = load::<S, U>(&self.rings.cos[at..at + width]);
+            for part in 0..2 {
+                for u in 0..U {
+                    let (even, odd) = (sink.sums[part][u], simd.mul_f64s(cos[u], sink.sums[part + 2][u]));
+                    let lane = at - self.chunk.start + u * S::F64_LANES;
+                    let north = &mut planes[part * self.stride + lane..][..S::F64_LANES];
+                    S::as_mut_simd_f64s(north).0[0] = simd.add_f64s(even, odd);
+                    let south = &mut planes[(part + 2) * self.stride + lane..][..S::F64_LANES];
+                    S::as_mut_simd_f64s(south).0[0] = simd.sub_f64s(even, odd);
+                }
+            }
+        }
+    }
+}
+
+impl Adjoint<'_> {
+    #[inline(always)]
+    fn run<S: Simd, const U: usize>(self, simd: S) {
+        let width = U * S::F64_LANES;
+        let count = self.order.len();
+        self.by_lane.clear();
+        self.by_lane.resize(4 * S::F64_LANES * count, 0.0);
+        let lanes = S::as_mut_simd_f64s(self.by_lane.as_mut_slice()).0.as_chunks_mut::<4>().0;
+        for at in self.chunk.clone().step_by(width) {
+            if self.order.m > greatest_order(self.l_max, self.rings.sin[at + width - 1]) {
+                continue;
+            }
+            let zero = simd.splat_f64s(0.0);
+            let mut parts = [[zero; U]; 4];
+            for (part, vectors) in parts.iter_mut().enumerate() {
+                for (u, vector) in vectors.iter_mut().enumerate() {
+                    let lane = at - self.chunk.start + u * S::F64_LANES;
+                    let group = lane / GROUP * self.group_stride + part * GROUP + lane % GROUP;
+                    *vector = S::as_simd_f64s(&self.parts[group..group + S::F64_LANES]).0[0];
+                }
+            }
+            let mut sink = SumRings { simd, parts, lanes: &mut *lanes };
+            Block::new(simd, self.order, self.rings, at).run(&self.order.steps, &mut sink);
+        }
+        self.sums.clear();
+        for vectors in lanes.iter() {
+            let mut sum = [0.0; 4];
+            for part in 0..4 {
+                sum[part] = simd.reduce_sum_f64s(vectors[part]);
+            }
+            self.sums.push(sum);
+        }
+    }
+}
+
+impl WithSimd for Synthesis<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        // As many vectors as the registers hold with sums, functions and geometry (7 U).
+        if S::REGISTER_COUNT >= 32 { self.run::<S, 4>(simd) } else { self.run::<S, 2>(simd) }
+    }
+}
+
+impl WithSimd for Adjoint<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        if S::REGISTER_COUNT >= 32 { self.run::<S, 4>(simd) } else { self.run::<S, 2>(simd) }
+    }
+}

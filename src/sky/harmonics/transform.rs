@@ -1,0 +1,188 @@
+//! Synthesis and its transpose between coefficients and RING maps.
+
+use num_complex::Complex64;
+use pulp::Arch;
+use rayon::prelude::*;
+
+use super::kernel::{Adjoint, BLOCK_MAX, GROUP, Synthesis};
+use super::lanes::RingLanes;
+use super::recurrence::{Order, all_orders};
+use super::rings::{RingFourier, RingPair, Scratch};
+use super::{Alm, HarmonicsError};
+use crate::sky::healpix::{is_valid_nside, pixel_count, ring};
+
+/// Greatest degree: bounds the tables (0.7 GB) and the growth of a step of the recurrence.
+pub const L_MAX: usize = 8191;
+
+/// Ring pairs whose sums are held at once: bounds memory to 130 kB for each order.
+const CHUNK: usize = 512;
+
+/// The transforms between coefficients up to `l_max` and maps of `nside`, with their tables.
+///
+/// Making one costs about as much as using it once; keep it for repeated use. The same input gives the same
+/// bytes whatever the number of threads.
+pub struct Transform {
+    nside: usize,
+    l_max: usize,
+    arch: Arch,
+    orders: Vec<Order>,
+    lanes: RingLanes,
+    fourier: RingFourier,
+}
+
+impl std::fmt::Debug for Transform {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Transform")
+            .field("nside", &self.nside)
+            .field("l_max", &self.l_max)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Transform {
+    /// Tables for maps of `nside` and coefficients up to `l_max`, which may be beyond 3 nside - 1.
+    ///
+    /// # Errors
+    /// [`HarmonicsError::Nside`], [`HarmonicsError::Degree`].
+    pub fn new(nside: usize, l_max: usize) -> Result<Self, HarmonicsError> {
+        if !is_valid_nside(nside) {
+            return Err(HarmonicsError::Nside { nside });
+        }
+        if l_max > L_MAX {
+            return Err(HarmonicsError::Degree { l_max, most: L_MAX });
+        }
+        Ok(Self {
+            nside,
+            l_max,
+            arch: Arch::new(),
+            orders: all_orders(l_max),
+            lanes: RingLanes::new(nside, l_max),
+            fourier: RingFourier::new(nside, l_max),
+        })
+    }
+
+    /// Resolution of the maps.
+    #[must_use]
+    pub fn nside(&self) -> usize {
+        self.nside
+    }
+
+    /// Greatest degree of the coefficients.
+    #[must_use]
+    pub fn l_max(&self) -> usize {
+        self.l_max
+    }
+
+    /// The map of a real field at pixel centres, RING order: sum of a_lm Y_lm.
+    ///
+    /// # Errors
+    /// [`HarmonicsError::Coefficients`] unless `alm` has the transform's `l_max`.
+    pub fn synthesis(&self, alm: &Alm) -> Result<Vec<f64>, HarmonicsError> {
+        if alm.l_max() != self.l_max {
+            return Err(HarmonicsError::Coefficients { found: alm.l_max(), expected: self.l_max });
+        }
+        let mut map = vec![0.0; pixel_count(self.nside)];
+        let mut pairs = self.ring_pairs_mut(&mut map);
+        for (chunk, pairs) in pairs.chunks_mut(CHUNK).enumerate() {
+            let first = chunk * CHUNK;
+            let lanes = first..(first + pairs.len()).next_multiple_of(BLOCK_MAX);
+            // Rows that are no power of two long spread over the cache's sets.
+            let stride = lanes.len() + GROUP;
+            let mut planes = vec![0.0; 4 * stride * (self.l_max + 1)];
+            let order_planes = planes.par_chunks_mut(4 * stride);
+            order_planes.zip(&self.orders).for_each_init(Vec::new, |mixed, (out, order)| {
+                order.mix(alm.order(order.m), mixed);
+                let (rings, chunk) = (&self.lanes, lanes.clone());
+                let task = Synthesis { order, l_max: self.l_max, mixed, rings, chunk, out, stride };
+                self.arch.dispatch(task);
+            });
+            pairs.par_chunks_mut(GROUP).enumerate().for_each_init(Scratch::new, |scratch, (group, pairs)| {
+                for (k, pixels) in pairs.iter_mut().enumerate() {
+                    let lane = group * GROUP + k;
+                    self.fourier.synthesise(first + lane, &planes[lane..], stride, pixels, scratch);
+                }
+            });
+        }
+        Ok(map)
+    }
+
+    /// The transpose of synthesis times the pixel area: sum over pixels of map conj(Y_lm) 4 pi / N_pix.
+    ///
+    /// This is the plain quadrature for a_lm; see [`super::analysis`] for the coefficients themselves.
+    ///
+    /// # Errors
+    /// [`HarmonicsError::Pixels`] unless `map` has the transform's `nside`.
+    pub fn adjoint(&self, map: &[f64]) -> Result<Alm, HarmonicsError> {
+        if map.len() != pixel_count(self.nside) {
+            return Err(HarmonicsError::Pixels { found: map.len(), nside: self.nside });
+        }
+        let mut alm = Alm::zeros(self.l_max);
+        let pairs = self.ring_pairs(map);
+        for (chunk, pairs) in pairs.chunks(CHUNK).enumerate() {
+            let first = chunk * CHUNK;
+            let lanes = first..(first + pairs.len()).next_multiple_of(BLOCK_MAX);
+            let group_stride = 4 * GROUP * (self.l_max + 1);
+            let mut parts = vec![0.0; lanes.len() / GROUP * group_stride];
+            let groups = parts.par_chunks_mut(group_stride).zip(pairs.par_chunks(GROUP)).enumerate();
+            groups.for_each_init(Scratch::new, |scratch, (group, (out, pairs))| {
+                for (k, pixels) in pairs.iter().enumerate() {
+                    self.fourier.analyse(first + group * GROUP + k, pixels, &mut out[k..], scratch);
+                }
+            });
+            let orders = self.split_orders(&mut alm);
+            let room = || (Vec::new(), Vec::new());
+            orders.into_par_iter().zip(&self.orders).for_each_init(room, |(by_lane, sums), (out, order)| {
+                let (rings, chunk) = (&self.lanes, lanes.clone());
+                let parts = &parts[4 * GROUP * order.m..];
+                self.arch.dispatch(Adjoint {
+                    order,
+                    l_max: self.l_max,
+                    rings,
+                    chunk,
+                    parts,
+                    group_stride,
+                    by_lane,
+                    sums,
+                });
+                order.unmix(sums, out);
+            });
+        }
+        Ok(alm)
+    }
+
+    /// The rings of a map as pairs, from the poles to the equator.
+    fn ring_pairs<'a>(&self, map: &'a [f64]) -> Vec<RingPair<&'a [f64]>> {
+        let of = |k: usize| {
+            let ring = ring(self.nside, k);
+            &map[ring.first..ring.first + ring.len]
+        };
+        let equator = 2 * self.nside;
+        (1..=equator)
+            .map(|k| RingPair { north: of(k), south: if k < equator { of(4 * self.nside - k) } else { &[] } })
+            .collect()
+    }
+
+    fn ring_pairs_mut<'a>(&self, mut map: &'a mut [f64]) -> Vec<RingPair<&'a mut [f64]>> {
+        let mut pairs = Vec::with_capacity(2 * self.nside);
+        for k in 1..=2 * self.nside {
+            let len = ring(self.nside, k).len;
+            let (north, rest) = map.split_at_mut(len);
+            let southern = if rest.is_empty() { 0 } else { len };
+            let (rest, south) = rest.split_at_mut(rest.len() - southern);
+            pairs.push(RingPair { north, south });
+            map = rest;
+        }
+        pairs
+    }
+
+    fn split_orders<'a>(&self, alm: &'a mut Alm) -> Vec<&'a mut [Complex64]> {
+        let mut rest = alm.values_mut();
+        let mut orders = Vec::with_capacity(self.l_max + 1);
+        for m in 0..=self.l_max {
+            let (order, after) = rest.split_at_mut(self.l_max + 1 - m);
+            orders.push(order);
+            rest = after;
+        }
+        orders
+    }
+}
