@@ -22,13 +22,13 @@ mod features;
 mod fluctuations;
 mod galaxy;
 mod sources;
-mod synthesis;
 
 pub use config::{GeneratedSky, GeneratedSkyError};
 
 use rayon::prelude::*;
 
 use super::frame::{Frame, Rotation, rotate};
+use super::harmonics::HarmonicsError;
 use super::healpix::{pixel_area_sr, pixel_count, pixel_of, ring, ring_to_nested};
 use crate::units::vector::Vec3;
 use features::Features;
@@ -69,7 +69,7 @@ pub fn generate(
     }
     let fine = nside.max(NSIDE_MIN);
     let scene = Scene::new(config, frequency_hz);
-    let fields = Fields::new(config, fine, seed);
+    let fields = Fields::new(config, fine, seed)?;
     let mut kelvin = vec![0.0; pixel_count(fine)];
     let mut depth = vec![0.0; pixel_count(fine)];
     let mut rings: Vec<(usize, &mut [f64], &mut [f64])> = Vec::with_capacity(4 * fine);
@@ -166,20 +166,20 @@ struct Fields {
 }
 
 impl Fields {
-    fn new(config: &GeneratedSky, nside: usize, seed: u64) -> Self {
+    fn new(config: &GeneratedSky, nside: usize, seed: u64) -> Result<Self, HarmonicsError> {
         let l_max = 3 * nside - 1;
         let field = |wanted: bool, power: &dyn Fn() -> Vec<f64>, field: Field| {
-            if wanted { gaussian_field(&power(), nside, seed, field) } else { Vec::new() }
+            if wanted { gaussian_field(&power(), nside, seed, field) } else { Ok(Vec::new()) }
         };
         let small = || {
             let l_max = l_max.min(config.small_scale_l_max);
             small_scale_power(l_max, config.small_scale_fwhm_deg.to_radians())
         };
-        Self {
-            small: field(config.small_scales, &small, Field::SmallScales),
-            cloud: field(config.cloud_log_rms > 0.0, &|| large_scale_power(l_max), Field::Clouds),
-            index: field(config.index_rms > 0.0, &|| large_scale_power(l_max), Field::Index),
-        }
+        Ok(Self {
+            small: field(config.small_scales, &small, Field::SmallScales)?,
+            cloud: field(config.cloud_log_rms > 0.0, &|| large_scale_power(l_max), Field::Clouds)?,
+            index: field(config.index_rms > 0.0, &|| large_scale_power(l_max), Field::Index)?,
+        })
     }
 
     fn at(&self, pixel: usize) -> FieldValues {
