@@ -72,10 +72,8 @@ fn the_mean_follows_cane_where_ulsa_ends() {
 
 #[test]
 fn never_negative_at_any_frequency() {
-    for mhz in [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0] {
-        for seed in [5, 6] {
-            assert!(sky(mhz, 64, seed).iter().all(|t| t.is_finite() && *t > 0.0), "{mhz} MHz");
-        }
+    for mhz in [0.1, 0.3, 1.0, 3.0, 10.0, 30.0] {
+        assert!(sky(mhz, 64, 5).iter().all(|t| t.is_finite() && *t > 0.0), "{mhz} MHz");
     }
     let wild = GeneratedSky {
         small_scale_amplitude: 10.0,
@@ -94,6 +92,10 @@ fn seeds_make_skies() {
     let (a, b) = (sky(3.0, 64, 7), sky(3.0, 64, 8));
     let different = a.iter().zip(&b).filter(|(a, b)| (*a / *b - 1.0).abs() > 1e-3).count();
     assert!(different > a.len() / 2);
+    for threads in [1, 3] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        assert_eq!(pool.install(|| sky(3.0, 64, 7)), a, "{threads} threads");
+    }
 }
 
 #[test]
