@@ -3,7 +3,7 @@
 use super::canvas::Colour;
 use super::error::PictureError;
 use super::labels::{self, Ticks};
-use crate::units::constants::HEALPIX_UNSEEN;
+use crate::sky::is_unseen;
 
 /// How values spread over a scale.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -140,9 +140,9 @@ impl Scale {
     }
 }
 
-/// Whether a pixel holds a value: finite and not UNSEEN, in single precision either.
+/// Whether a pixel holds a value: finite and not UNSEEN.
 pub(super) fn is_seen(value: f64) -> bool {
-    value.is_finite() && (value - HEALPIX_UNSEEN).abs() > 1e-5 * HEALPIX_UNSEEN.abs()
+    value.is_finite() && !is_unseen(value)
 }
 
 /// Two percentiles, linear between values; 1 and 1, which suits any scale, if there are none.

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::sky::harmonics::HarmonicsError;
 use crate::sky::healpix::is_valid_nside;
 
 /// Frequencies for which there is a sky, Hz.
@@ -88,6 +89,9 @@ pub enum GeneratedSkyError {
         /// Value found.
         nside: usize,
     },
+    /// The fluctuations could not be synthesised.
+    #[error("generated sky: fluctuations")]
+    Fluctuations(#[from] HarmonicsError),
 }
 
 impl GeneratedSky {

@@ -3,8 +3,7 @@
 use rand::RngExt;
 use rand_distr::StandardNormal;
 
-use super::synthesis::synthesise;
-use crate::sky::harmonics::Alm;
+use crate::sky::harmonics::{Alm, HarmonicsError, synthesis};
 use crate::units::{StreamKind, random_stream};
 
 /// Slope of the power of small scales (Remazeilles et al. 2015, Eq. 23 ff.).
@@ -69,7 +68,15 @@ fn variance(power: impl Iterator<Item = f64>) -> f64 {
 /// A Gaussian field of power C_l = `power[l]` in RING order.
 ///
 /// Coefficients are drawn by l, then m, so that a longer `power` only adds degrees.
-pub(super) fn gaussian_field(power: &[f64], nside: usize, seed: u64, field: Field) -> Vec<f64> {
+///
+/// # Errors
+/// As [`synthesis`].
+pub(super) fn gaussian_field(
+    power: &[f64],
+    nside: usize,
+    seed: u64,
+    field: Field,
+) -> Result<Vec<f64>, HarmonicsError> {
     let mut stream = random_stream(seed, StreamKind::SkyFluctuations, [field as u64, 0]);
     let mut alm = Alm::zeros(power.len().saturating_sub(1));
     for (l, c) in power.iter().enumerate() {
@@ -81,5 +88,5 @@ pub(super) fn gaussian_field(power: &[f64], nside: usize, seed: u64, field: Fiel
             value.im = amplitude * std::f64::consts::FRAC_1_SQRT_2 * stream.sample::<f64, _>(StandardNormal);
         }
     }
-    synthesise(&alm, nside)
+    synthesis(&alm, nside)
 }

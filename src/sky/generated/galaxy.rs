@@ -67,9 +67,9 @@ fn medium(direction: Vec3, s_kpc: f64) -> (f64, f64) {
     let x = SUN_RADIUS_KPC - s_kpc * direction[0];
     let y = s_kpc * direction[1];
     let z = SUN_HEIGHT_KPC + s_kpc * direction[2];
-    let radius = x.hypot(y);
+    let radius = (x * x + y * y).sqrt();
     let outward = radius - SUN_RADIUS_KPC;
-    let outward_spherical = radius.hypot(z) - SUN_RADIUS_KPC;
+    let outward_spherical = (radius * radius + z * z).sqrt() - SUN_RADIUS_KPC;
     let emission = DISK_K_KPC * (-outward / DISK_LENGTH_KPC).exp() * sech2(z / DISK_HEIGHT_KPC)
         + HALO_K_KPC * (-outward_spherical / HALO_LENGTH_KPC).exp() * sech2(z / HALO_HEIGHT_KPC);
     let from_ring = (radius - RING_RADIUS_KPC) / RING_WIDTH_KPC;

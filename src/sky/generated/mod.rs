@@ -22,12 +22,13 @@ mod features;
 mod fluctuations;
 mod galaxy;
 mod sources;
-mod synthesis;
 
 pub use config::{GeneratedSky, GeneratedSkyError};
 
 use rayon::prelude::*;
 
+use super::frame::{Frame, Rotation, rotate};
+use super::harmonics::HarmonicsError;
 use super::healpix::{pixel_area_sr, pixel_count, pixel_of, ring, ring_to_nested};
 use crate::units::vector::Vec3;
 use features::Features;
@@ -68,7 +69,7 @@ pub fn generate(
     }
     let fine = nside.max(NSIDE_MIN);
     let scene = Scene::new(config, frequency_hz);
-    let fields = Fields::new(config, fine, seed);
+    let fields = Fields::new(config, fine, seed)?;
     let mut kelvin = vec![0.0; pixel_count(fine)];
     let mut depth = vec![0.0; pixel_count(fine)];
     let mut rings: Vec<(usize, &mut [f64], &mut [f64])> = Vec::with_capacity(4 * fine);
@@ -102,7 +103,7 @@ pub fn generate(
 /// The deterministic sky at one frequency.
 struct Scene<'a> {
     config: &'a GeneratedSky,
-    to_galactic: [Vec3; 3],
+    to_galactic: Rotation,
     galaxy: Galaxy,
     features: Features,
     /// The part of the background that is not drawn as sources, K.
@@ -120,7 +121,7 @@ impl<'a> Scene<'a> {
         let drawn = if config.point_sources { sources::mean_k(config, frequency_hz) } else { 0.0 };
         Self {
             config,
-            to_galactic: ECLIPTIC_TO_GALACTIC,
+            to_galactic: Frame::Ecliptic.to_frame(Frame::Galactic),
             galaxy,
             features,
             background_k: (background - drawn).max(0.0),
@@ -130,7 +131,7 @@ impl<'a> Scene<'a> {
 
     /// Temperature, K, and optical depth to the outside in an ecliptic direction.
     fn look(&self, ecliptic: Vec3, fields: FieldValues) -> (f64, f64) {
-        let direction = self.to_galactic.map(|row| crate::units::vector::dot(row, ecliptic));
+        let direction = rotate(&self.to_galactic, ecliptic);
         let sight = self.galaxy.sight(direction, fields.cloud);
         let index_factor = (-self.config.index_rms * fields.index * self.log_ratio).exp();
         let mut fluctuation = 1.0;
@@ -165,20 +166,20 @@ struct Fields {
 }
 
 impl Fields {
-    fn new(config: &GeneratedSky, nside: usize, seed: u64) -> Self {
+    fn new(config: &GeneratedSky, nside: usize, seed: u64) -> Result<Self, HarmonicsError> {
         let l_max = 3 * nside - 1;
         let field = |wanted: bool, power: &dyn Fn() -> Vec<f64>, field: Field| {
-            if wanted { gaussian_field(&power(), nside, seed, field) } else { Vec::new() }
+            if wanted { gaussian_field(&power(), nside, seed, field) } else { Ok(Vec::new()) }
         };
         let small = || {
             let l_max = l_max.min(config.small_scale_l_max);
             small_scale_power(l_max, config.small_scale_fwhm_deg.to_radians())
         };
-        Self {
-            small: field(config.small_scales, &small, Field::SmallScales),
-            cloud: field(config.cloud_log_rms > 0.0, &|| large_scale_power(l_max), Field::Clouds),
-            index: field(config.index_rms > 0.0, &|| large_scale_power(l_max), Field::Index),
-        }
+        Ok(Self {
+            small: field(config.small_scales, &small, Field::SmallScales)?,
+            cloud: field(config.cloud_log_rms > 0.0, &|| large_scale_power(l_max), Field::Clouds)?,
+            index: field(config.index_rms > 0.0, &|| large_scale_power(l_max), Field::Index)?,
+        })
     }
 
     fn at(&self, pixel: usize) -> FieldValues {
@@ -207,13 +208,6 @@ fn direction_of(longitude_rad: f64, latitude_rad: f64) -> Vec3 {
     let (sin_latitude, cos_latitude) = latitude_rad.sin_cos();
     [cos_latitude * cos_longitude, cos_latitude * sin_longitude, sin_latitude]
 }
-
-/// Rows: the Galactic axes in ecliptic coordinates (J2000).
-const ECLIPTIC_TO_GALACTIC: [Vec3; 3] = [
-    [-5.487_563_486_628_312e-2, -9.938_213_523_891_737e-1, -9.647_685_853_808_478e-2],
-    [4.941_095_288_578_971_6e-1, -1.109_909_720_383_277_8e-1, 8.622_857_865_103_742e-1],
-    [-8.676_660_868_040_493e-1, -3.516_551_470_140_832e-4, 4.971_473_002_529_609_5e-1],
-];
 
 #[cfg(test)]
 mod tests;

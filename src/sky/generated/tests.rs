@@ -1,6 +1,5 @@
 use super::*;
 use crate::sky::healpix::pixel_directions;
-use crate::units::vector::dot;
 
 /// Published ULSA statistics (see the module): MHz; mean, 5, 50, 95 %; b > 60, b < -60, |b| < 5 deg; K.
 const ULSA: [(f64, [f64; 4], [f64; 3]); 3] = [
@@ -26,9 +25,10 @@ fn points(map: &[f64]) -> [f64; 4] {
 
 /// Means over b > 60, b < -60 and |b| < 5 degrees.
 fn zones(map: &[f64], nside: usize) -> [f64; 3] {
+    let to_galactic = Frame::Ecliptic.to_frame(Frame::Galactic);
     let latitudes: Vec<f64> = pixel_directions(nside)
         .iter()
-        .map(|&d| dot(ECLIPTIC_TO_GALACTIC[2], d).clamp(-1.0, 1.0).asin().to_degrees())
+        .map(|&d| rotate(&to_galactic, d)[2].clamp(-1.0, 1.0).asin().to_degrees())
         .collect();
     let zone = |inside: &dyn Fn(f64) -> bool| {
         let values: Vec<f64> =
@@ -72,10 +72,8 @@ fn the_mean_follows_cane_where_ulsa_ends() {
 
 #[test]
 fn never_negative_at_any_frequency() {
-    for mhz in [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0] {
-        for seed in [5, 6] {
-            assert!(sky(mhz, 64, seed).iter().all(|t| t.is_finite() && *t > 0.0), "{mhz} MHz");
-        }
+    for mhz in [0.1, 0.3, 1.0, 3.0, 10.0, 30.0] {
+        assert!(sky(mhz, 64, 5).iter().all(|t| t.is_finite() && *t > 0.0), "{mhz} MHz");
     }
     let wild = GeneratedSky {
         small_scale_amplitude: 10.0,
@@ -94,6 +92,10 @@ fn seeds_make_skies() {
     let (a, b) = (sky(3.0, 64, 7), sky(3.0, 64, 8));
     let different = a.iter().zip(&b).filter(|(a, b)| (*a / *b - 1.0).abs() > 1e-3).count();
     assert!(different > a.len() / 2);
+    for threads in [1, 3] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        assert_eq!(pool.install(|| sky(3.0, 64, 7)), a, "{threads} threads");
+    }
 }
 
 #[test]
@@ -136,7 +138,7 @@ fn small_scales_have_the_slope_of_the_formula() {
     let slope = (power[180] / power[120]).ln() / (180.0_f64 / 120.0).ln();
     assert!((slope + 2.703).abs() < 0.01, "{slope}");
     // A realisation's variance against the sum over its power: 2 / sum (2l + 1) C_l^2 weights, a few percent.
-    let field = gaussian_field(&power, 64, 11, Field::SmallScales);
+    let field = gaussian_field(&power, 64, 11, Field::SmallScales).unwrap();
     let variance = mean(&field.iter().map(|v| v * v).collect::<Vec<_>>());
     let expected = power.iter().enumerate().map(|(l, c)| (2 * l + 1) as f64 * c).sum::<f64>()
         / (4.0 * std::f64::consts::PI);
