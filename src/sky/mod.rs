@@ -2,7 +2,6 @@
 //!
 //! Uses [`crate::units`] only.
 
-pub mod compare;
 mod config;
 mod error;
 pub mod fits;
