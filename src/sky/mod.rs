@@ -2,13 +2,18 @@
 //!
 //! Uses [`crate::units`] only.
 
+mod compare;
 mod error;
 pub mod fits;
 mod frame;
 pub mod harmonics;
 pub mod healpix;
 mod map;
+mod rotation;
+pub mod spectra;
 
+pub use compare::{Comparison, ErrorSummary, compare};
 pub use error::MapError;
 pub use frame::{Frame, Rotation, rotate};
 pub use map::{SkyMap, is_unseen};
+pub use rotation::Bilinear;
