@@ -1,18 +1,109 @@
 //! `lunarray compare`: a map against the truth.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::{CommandResult, Outcome};
+use super::{CommandError, CommandResult, Outcome, print_json_line, print_text};
+use crate::products::draw_comparison;
+use crate::products::pictures::{MapPanel, Scale, Sampling, View, draw_map};
+use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::{Comparison, Frame, SkyMap, compare};
 
-/// Compare.
+/// Compare a map with the truth, degree by degree.
+///
+/// Both are HEALPix FITS maps in K; they are brought to ecliptic axes and to the coarser of their
+/// resolutions. rho_l = C_l^X / sqrt(C_l^in C_l^re) says how much of the truth's structure at degree l
+/// the map has, whatever its scale; with a noise-only map, SNR_l = C_l^X / sqrt(C_l^in C_l^ns). Draws
+/// the curves, and the relative error (map - truth) / truth over the sky.
 #[derive(Debug, Args)]
 pub(super) struct CompareArgs {
-    /// Map.
+    /// Map (FITS).
+    #[arg(value_name = "MAP.fits")]
     map: PathBuf,
+    /// Truth (FITS).
+    #[arg(value_name = "TRUTH.fits")]
+    truth: PathBuf,
+    /// Noise-only map (FITS), for SNR_l.
+    #[arg(long, value_name = "NOISE.fits")]
+    noise: Option<PathBuf>,
+    /// Greatest degree; 3 nside - 1 if not given.
+    #[arg(long)]
+    l_max: Option<usize>,
+    /// Picture of the curves (PNG); MAP-spectra.png if not given. The relative error goes beside it,
+    /// with -error before the ending.
+    #[arg(long, value_name = "FILE")]
+    plot: Option<PathBuf>,
+    /// Draw no pictures.
+    #[arg(long, conflicts_with = "plot")]
+    no_plot: bool,
+    /// One JSON object: l, cl_map, cl_truth, cl_cross, rho and, with noise, snr as arrays.
+    #[arg(long)]
+    json: bool,
 }
 
-pub(super) fn execute(_: &CompareArgs) -> CommandResult {
+pub(super) fn execute(args: &CompareArgs) -> CommandResult {
+    let map = read(&args.map)?;
+    let truth = read(&args.truth)?;
+    let noise = args.noise.as_deref().map(read).transpose()?;
+    let comparison = compare(&map, &truth, noise.as_ref(), args.l_max)?;
+    let pictures = if args.no_plot { Vec::new() } else { draw(args, &comparison)? };
+    if args.json {
+        print_json_line(&comparison)?;
+        return Ok(Outcome::Done);
+    }
+    print_text(&table(&comparison))?;
+    for picture in pictures {
+        print_text(&format!("{}", picture.display()))?;
+    }
     Ok(Outcome::Done)
+}
+
+/// A file that does not say its frame is taken to be ecliptic, as all maps of this program are.
+fn read(path: impl AsRef<Path>) -> Result<SkyMap, CommandError> {
+    let options = ReadOptions { frame_if_missing: Some(Frame::Ecliptic), ..ReadOptions::default() };
+    Ok(read_whole_map(path.as_ref(), &options)?)
+}
+
+fn draw(args: &CompareArgs, comparison: &Comparison) -> Result<Vec<PathBuf>, CommandError> {
+    let name = |path: &Path| path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
+    let title = format!("{} against {}", name(&args.map), name(&args.truth));
+    let plot = args.plot.clone().unwrap_or_else(|| beside(&args.map, "-spectra"));
+    let error = beside(&plot, "-error");
+    draw_comparison(&title, comparison)?.write(&plot)?;
+    let values = comparison.relative_error_map.values();
+    let panel = MapPanel {
+        values,
+        caption: title,
+        scale: Scale::symmetric(values),
+        unit: "(map - truth) / truth".to_owned(),
+    };
+    let view = View { sampling: Sampling::Interpolated, ..View::default() };
+    draw_map(&panel, "", &view)?.write(&error)?;
+    Ok(vec![plot, error])
+}
+
+/// `folder/name` + `suffix` + `.png`.
+fn beside(path: &Path, suffix: &str) -> PathBuf {
+    let stem = path.file_stem().map_or_else(|| "map".into(), |stem| stem.to_string_lossy().into_owned());
+    path.with_file_name(format!("{stem}{suffix}.png"))
+}
+
+fn table(comparison: &Comparison) -> String {
+    let mut lines = vec![format!("{:>5} {:>12} {:>12} {:>9} {:>12}", "l", "C_l map", "C_l truth", "rho_l", "SNR_l")];
+    let l_max = comparison.l.last().copied().unwrap_or(0);
+    let step = (l_max / 24).max(1);
+    for &l in comparison.l.iter().step_by(step) {
+        let snr = comparison.snr.as_ref().and_then(|snr| snr.get(l));
+        lines.push(format!(
+            "{l:>5} {:>12.4e} {:>12.4e} {:>9.4} {:>12}",
+            comparison.cl_map[l],
+            comparison.cl_truth[l],
+            comparison.rho[l],
+            snr.map_or_else(|| "-".to_owned(), |snr| format!("{snr:.3}"))
+        ));
+    }
+    let error = &comparison.relative_error;
+    lines.push(format!("relative error: mean {:+.4}, rms {:.4}", error.mean, error.rms));
+    lines.join("\n")
 }

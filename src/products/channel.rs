@@ -10,9 +10,8 @@ use super::pictures::{
 };
 use super::provenance::Provenance;
 use super::summary::{ChannelSummary, SnapshotSummary};
-use crate::sky::compare::{Comparison, compare};
 use crate::sky::fits::{WriteOptions, write_map};
-use crate::sky::{Frame, SkyMap};
+use crate::sky::{Comparison, Frame, SkyMap, compare};
 use crate::solve::Solution;
 use crate::units::constants::DAY_S;
 
@@ -70,7 +69,7 @@ impl ChannelFolder {
     ) -> Result<(), ProductsError> {
         let map = SkyMap::new(Frame::Ecliptic, solution.map_k.clone())?;
         let noise = SkyMap::new(Frame::Ecliptic, solution.noise_k.clone())?;
-        let comparison = self.truth.as_ref().map(|truth| compare(&map, truth, Some(&noise))).transpose()?;
+        let comparison = self.truth.as_ref().map(|truth| compare(&map, truth, Some(&noise), None)).transpose()?;
         self.note(solution, comparison.as_ref());
         if self.config.snapshot_maps && !solution.is_final {
             self.write_map(&format!("snapshot-{:03}.fits", solution.number), &map, provenance, solution)?;
@@ -258,7 +257,10 @@ fn mean_rho(rho: &[f64], l_max: usize) -> f64 {
 }
 
 /// rho_l, the spectra and SNR_l as curves.
-pub(crate) fn draw_comparison(
+///
+/// # Errors
+/// None but a page too large, which three plots are not.
+pub fn draw_comparison(
     title: &str,
     comparison: &Comparison,
 ) -> Result<super::pictures::Picture, super::pictures::PictureError> {

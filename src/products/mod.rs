@@ -12,6 +12,7 @@ mod summary;
 mod truth;
 mod write;
 
+pub use channel::draw_comparison;
 pub use config::{ProductsConfig, ProductsConfigError};
 pub use error::ProductsError;
 pub use provenance::Provenance;

@@ -49,18 +49,13 @@ pub enum MapError {
         /// Its value.
         value: f64,
     },
-    /// Two maps that should be in one frame are not.
-    #[error("the maps are in different frames, {one} and {other}; turn one with `to_ecliptic` first")]
-    Frames {
-        /// Frame of the first map.
-        one: super::Frame,
-        /// Frame of the second map.
-        other: super::Frame,
-    },
     /// A width of a Gaussian that is not one.
     #[error("a beam of FWHM {fwhm_rad} rad is not allowed; expected a finite width of at least 0")]
     Width {
         /// Value found, rad.
         fwhm_rad: f64,
     },
+    /// A transform of the map failed.
+    #[error(transparent)]
+    Harmonics(#[from] super::harmonics::HarmonicsError),
 }

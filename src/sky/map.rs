@@ -77,6 +77,12 @@ impl SkyMap {
         self.values
     }
 
+    /// Other values of the map's own nside.
+    pub(super) fn with_values(&self, frame: Frame, values: Vec<f64>) -> Self {
+        debug_assert_eq!(values.len(), self.values.len());
+        Self { nside: self.nside, frame, values }
+    }
+
     /// Directions of the map's own pixel centres on ecliptic axes, in the order of its values.
     ///
     /// With these a map in any frame is used as it is, without interpolation.
@@ -159,7 +165,7 @@ impl SkyMap {
     }
 }
 
-fn check_nside(nside: usize) -> Result<(), MapError> {
+pub(super) fn check_nside(nside: usize) -> Result<(), MapError> {
     if is_valid_nside(nside) { Ok(()) } else { Err(MapError::Nside { nside }) }
 }
 

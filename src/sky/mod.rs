@@ -2,6 +2,7 @@
 //!
 //! Uses [`crate::units`] only.
 
+mod compare;
 mod config;
 mod error;
 pub mod fits;
@@ -10,8 +11,12 @@ pub mod generated;
 pub mod harmonics;
 pub mod healpix;
 mod map;
+mod rotation;
+pub mod spectra;
 
+pub use compare::{Comparison, ErrorSummary, compare};
 pub use config::{GENERATED_NSIDE_MAX, SkyConfig, SkyConfigError};
 pub use error::MapError;
 pub use frame::{Frame, Rotation, rotate};
 pub use map::{SkyMap, is_unseen};
+pub use rotation::Bilinear;

@@ -2,9 +2,9 @@
 
 usage: sky_harmonics.py FOLDER CASE...   with cases NSIDE:L_MAX
 For each case, files of raw little-endian float64 in FOLDER: alm_CASE (real, imaginary, healpy's order), map_CASE (its
-synthesis), noise_CASE (a map of white noise), jacobi_CASE (its coefficients with iter=3, up to l_max <= 3 nside - 1)
-and, for the smallest, smooth_CASE (the map smoothed to a FWHM of 0.1 rad) and rotated_CASE (the map turned from
-Galactic to ecliptic axes by interpolation).
+synthesis), cl_CASE (their spectrum), smooth_CASE (the synthesis with a beam of FWHM 0.1 rad), smoothing_CASE (the map
+smoothed to that FWHM), rotated_CASE (the map turned from Galactic to ecliptic axes by interpolation), and up to
+l_max = 3 nside - 1 noise_CASE (a map of white noise) and jacobi_CASE (its coefficients with iter=3).
 """
 
 import sys
@@ -34,7 +34,9 @@ def main(folder, cases):
             noise = rng.normal(size=12 * nside**2)
             save("noise", noise)
             save("jacobi", hp.map2alm(noise, lmax=l_max, iter=3))
-        save("smooth", hp.alm2map(hp.smoothalm(alm, fwhm=0.1), nside, lmax=l_max))
+        save("smooth", hp.alm2map(hp.smoothalm(alm, fwhm=0.1, inplace=False), nside, lmax=l_max))
+        if nside <= 64:
+            save("smoothing", hp.smoothing(synthesis, fwhm=0.1))
         save("rotated", hp.Rotator(coord=["G", "E"]).rotate_map_pixel(synthesis))
         save("cl", hp.alm2cl(alm))
 

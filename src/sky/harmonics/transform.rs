@@ -186,3 +186,31 @@ impl Transform {
         orders
     }
 }
+
+#[cfg(all(test, target_arch = "x86_64"))]
+mod tests {
+    use super::*;
+    use pulp::x86::V3;
+
+    #[test]
+    fn every_instruction_set_gives_the_same_fields() {
+        let (nside, l_max) = (32, 300);
+        let mut alm = Alm::zeros(l_max);
+        for (k, value) in alm.values_mut().iter_mut().enumerate() {
+            *value = Complex64::new((k as f64).sin(), if k <= l_max { 0.0 } else { (0.7 * k as f64).cos() });
+        }
+        let run = |arch| {
+            let transform = Transform { arch, ..Transform::new(nside, l_max).unwrap() };
+            let map = transform.synthesis(&alm).unwrap();
+            let back = transform.adjoint(&map).unwrap();
+            (map, back)
+        };
+        let (map, back) = run(Arch::Scalar);
+        let others = [Some(Arch::new()), V3::try_new().map(Arch::V3)];
+        for (other_map, other_back) in others.into_iter().flatten().map(run) {
+            // Fused and separate roundings differ: 1e-16 each, over hundreds of degrees, of values up to 100.
+            assert!(map.iter().zip(&other_map).all(|(a, b)| (a - b).abs() < 1e-10));
+            assert!(back.values().iter().zip(other_back.values()).all(|(a, b)| (a - b).norm() < 1e-10));
+        }
+    }
+}

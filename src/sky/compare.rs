@@ -1,0 +1,195 @@
+//! A map against the truth: spectra, correlation, signal to noise, relative error.
+
+use serde::Serialize;
+
+use super::error::MapError;
+use super::frame::Frame;
+use super::harmonics::{Alm, AnalysisOptions, Transform};
+use super::map::SkyMap;
+use super::spectra::{auto_cl, cross_cl, normalised};
+use crate::units::constants::HEALPIX_UNSEEN;
+
+/// What a comparison finds. Arrays run over `l` = 0 .. l_max; monopole and dipole are kept.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Comparison {
+    /// The nside at which the maps were compared: the coarsest of theirs.
+    pub nside: usize,
+    /// Their frame: the common one of all maps, or ecliptic.
+    pub frame: Frame,
+    /// Degrees.
+    pub l: Vec<usize>,
+    /// C_l of the map, K^2.
+    pub cl_map: Vec<f64>,
+    /// C_l of the truth, K^2.
+    pub cl_truth: Vec<f64>,
+    /// Cross C_l, K^2.
+    pub cl_cross: Vec<f64>,
+    /// rho_l = C_l^X / sqrt(C_l^in C_l^re); NaN where a spectrum is zero (null in JSON).
+    pub rho: Vec<f64>,
+    /// SNR_l = C_l^X / sqrt(C_l^in C_l^ns), if there is a noise map.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub snr: Option<Vec<f64>>,
+    /// The relative error's mean, root mean square and percentiles.
+    pub relative_error: ErrorSummary,
+    /// (map - truth) / truth; UNSEEN where the truth is zero.
+    #[serde(skip)]
+    pub relative_error_map: SkyMap,
+}
+
+/// Statistics of (map - truth) / truth over all pixels in which the truth is not zero.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct ErrorSummary {
+    /// Mean.
+    pub mean: f64,
+    /// Root mean square.
+    pub rms: f64,
+    /// 5 % of pixels are below this.
+    pub percentile_5: f64,
+    /// Half of the pixels are below this.
+    pub median: f64,
+    /// 95 % of pixels are below this.
+    pub percentile_95: f64,
+}
+
+/// Compares a map with the truth, and with a map of nothing but noise for SNR_l.
+///
+/// All are brought to one frame (turned to ecliptic axes by interpolation if theirs differ) and then to the
+/// coarsest nside by averaging. `l_max` is 3 nside - 1 unless given. Coefficients are found as healpy's
+/// `anafast` finds them.
+///
+/// # Errors
+/// [`MapError::BadPixels`] for a map with unusable pixels; [`MapError::Harmonics`] for `l_max` above
+/// 3 nside - 1.
+pub fn compare(
+    map: &SkyMap,
+    truth: &SkyMap,
+    noise: Option<&SkyMap>,
+    l_max: Option<usize>,
+) -> Result<Comparison, MapError> {
+    let all: Vec<&SkyMap> = [Some(map), Some(truth), noise].into_iter().flatten().collect();
+    for map in &all {
+        map.check_whole()?;
+    }
+    let one_frame = all.iter().all(|other| other.frame() == map.frame());
+    let frame = if one_frame { map.frame() } else { Frame::Ecliptic };
+    let nside = all.iter().map(|map| map.nside()).fold(map.nside(), usize::min);
+    let alike = |map: &SkyMap| map.rotate_pixels(frame).degrade(nside);
+    let (map, truth) = (alike(map)?, alike(truth)?);
+    let noise = noise.map(alike).transpose()?;
+
+    let l_max = l_max.unwrap_or(3 * nside - 1);
+    let transform = Transform::new(nside, l_max)?;
+    let options = AnalysisOptions::default();
+    let harmonics =
+        |map: &SkyMap| -> Result<Alm, MapError> { Ok(transform.analysis(map.values(), &options)?.alm) };
+    let (of_map, of_truth) = (harmonics(&map)?, harmonics(&truth)?);
+    let (cl_map, cl_truth) = (auto_cl(&of_map), auto_cl(&of_truth));
+    let cl_cross = cross_cl(&of_map, &of_truth);
+    let snr = match &noise {
+        Some(noise) => Some(normalised(&cl_cross, &cl_truth, &auto_cl(&harmonics(noise)?))),
+        None => None,
+    };
+    let errors: Vec<f64> = map.values().iter().zip(truth.values()).map(relative_error).collect();
+    Ok(Comparison {
+        nside,
+        frame,
+        l: (0..=l_max).collect(),
+        rho: normalised(&cl_cross, &cl_truth, &cl_map),
+        cl_map,
+        cl_truth,
+        cl_cross,
+        snr,
+        relative_error: summary(&errors, truth.values()),
+        relative_error_map: map.with_values(frame, errors),
+    })
+}
+
+fn relative_error((value, truth): (&f64, &f64)) -> f64 {
+    if *truth == 0.0 { HEALPIX_UNSEEN } else { (value - truth) / truth }
+}
+
+fn summary(errors: &[f64], truth: &[f64]) -> ErrorSummary {
+    let known = errors.iter().zip(truth).filter(|(_, truth)| **truth != 0.0);
+    let mut sorted: Vec<f64> = known.map(|(error, _)| *error).collect();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let mean_of = |of: fn(f64) -> f64| sorted.iter().copied().map(of).sum::<f64>() / sorted.len() as f64;
+    let percentile = |percent: usize| {
+        let place = percent * sorted.len().saturating_sub(1) / 100;
+        sorted.get(place).copied().unwrap_or(f64::NAN)
+    };
+    ErrorSummary {
+        mean: mean_of(|error| error),
+        rms: mean_of(|error| error * error).sqrt(),
+        percentile_5: percentile(5),
+        median: percentile(50),
+        percentile_95: percentile(95),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sky::healpix::pixel_directions;
+
+    fn field(nside: usize, frame: Frame) -> SkyMap {
+        let value = |[x, y, z]: [f64; 3]| 3.0 + x + 0.5 * y * z + 0.2 * (9.0 * z + 4.0 * x).sin();
+        SkyMap::new(frame, pixel_directions(nside).into_iter().map(value).collect()).unwrap()
+    }
+
+    fn scaled(map: &SkyMap, factor: f64) -> SkyMap {
+        let mut map = map.clone();
+        map.values_mut().iter_mut().for_each(|value| *value *= factor);
+        map
+    }
+
+    #[test]
+    fn a_scaled_copy_correlates_wholly() {
+        let truth = field(16, Frame::Ecliptic);
+        let noise = scaled(&truth, 0.1);
+        let found = compare(&scaled(&truth, 1.25), &truth, Some(&noise), Some(20)).unwrap();
+        assert_eq!((found.nside, found.l.len(), found.l[20]), (16, 21, 20));
+        // Coefficients as small as 1e-6 beside a monopole of 10, each good to some 1e-16 of the latter.
+        for l in 0..=20 {
+            assert!((found.rho[l] - 1.0).abs() < 1e-7, "l {l}: {}", found.rho[l]);
+            assert!((found.cl_map[l] / found.cl_truth[l] - 1.5625).abs() < 1e-7);
+            assert!((found.snr.as_ref().unwrap()[l] - 12.5).abs() < 1e-6);
+        }
+        for error in found.relative_error_map.values() {
+            assert!((error - 0.25).abs() < 1e-14);
+        }
+        assert!((found.relative_error.rms - 0.25).abs() < 1e-14);
+        assert!((found.relative_error.median - 0.25).abs() < 1e-14);
+    }
+
+    #[test]
+    fn maps_of_other_nside_and_frame_are_brought_together() {
+        let truth = field(64, Frame::Galactic);
+        let map = truth.to_ecliptic().degrade(16).unwrap();
+        let found = compare(&map, &truth, None, None).unwrap();
+        assert_eq!((found.nside, found.frame, found.l.len()), (16, Frame::Ecliptic, 48));
+        assert!(found.rho.iter().take(12).all(|rho| (rho - 1.0).abs() < 1e-12));
+        assert!(found.snr.is_none());
+        let same = compare(&truth, &field(32, Frame::Galactic), None, Some(4)).unwrap();
+        assert_eq!((same.nside, same.frame), (32, Frame::Galactic));
+    }
+
+    #[test]
+    fn json_has_the_promised_names() {
+        let truth = field(4, Frame::Ecliptic);
+        let found = compare(&truth, &truth, Some(&truth), None).unwrap();
+        let json = serde_json::to_value(&found).unwrap();
+        for name in ["l", "cl_map", "cl_truth", "cl_cross", "rho", "snr"] {
+            assert_eq!(json[name].as_array().map(Vec::len), Some(12), "{name}");
+        }
+    }
+
+    #[test]
+    fn unusable_maps_are_refused() {
+        let truth = field(4, Frame::Ecliptic);
+        let mut holed = truth.clone();
+        holed.values_mut()[9] = HEALPIX_UNSEEN;
+        assert!(matches!(compare(&holed, &truth, None, None), Err(MapError::BadPixels { first: 9, .. })));
+        assert!(matches!(compare(&truth, &truth, Some(&holed), None), Err(MapError::BadPixels { .. })));
+        assert!(matches!(compare(&truth, &truth, None, Some(12)), Err(MapError::Harmonics(_))));
+    }
+}
