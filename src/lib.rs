@@ -13,6 +13,8 @@
 
 pub mod units;
 
+pub mod files;
+
 pub mod frames;
 
 pub mod sky;

@@ -1,6 +1,6 @@
 //! Downlink files.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
@@ -10,10 +10,8 @@ use super::decoder::Decoder;
 use super::error::DownlinkError;
 use super::packetizer::Packetizer;
 use super::receiver::{Event, Receiver};
+use crate::files::{AtomicFile, Unfinished};
 use crate::frames::GroundFrame;
-
-/// Bytes that are gathered before they are written.
-const WRITE_BYTES: usize = 1 << 20;
 
 /// Writes frames to a file of packets.
 ///
@@ -22,11 +20,9 @@ const WRITE_BYTES: usize = 1 << 20;
 #[derive(Debug)]
 pub struct DownlinkWriter {
     path: PathBuf,
-    partial_path: PathBuf,
-    file: File,
+    file: AtomicFile,
     packetizer: Packetizer,
     pending: Vec<u8>,
-    bytes: u64,
 }
 
 impl DownlinkWriter {
@@ -36,11 +32,8 @@ impl DownlinkWriter {
     /// A bad configuration, or a file that cannot be written.
     pub fn create(path: &Path, config: &DownlinkConfig) -> Result<Self, DownlinkError> {
         let packetizer = Packetizer::new(config)?;
-        let mut name = path.as_os_str().to_owned();
-        name.push(".partial");
-        let partial_path = PathBuf::from(name);
-        let file = File::create(&partial_path).map_err(io_error(&partial_path, "create the file"))?;
-        Ok(Self { path: path.to_owned(), partial_path, file, packetizer, pending: Vec::new(), bytes: 0 })
+        let file = AtomicFile::create(path, Unfinished::Keep).map_err(io_error(path, "create the file"))?;
+        Ok(Self { path: path.to_owned(), file, packetizer, pending: Vec::new() })
     }
 
     /// Appends the packets of a frame.
@@ -48,37 +41,23 @@ impl DownlinkWriter {
     /// # Errors
     /// Those of [`Packetizer::encode`], and a file that cannot be written.
     pub fn write(&mut self, frame: &GroundFrame) -> Result<(), DownlinkError> {
+        self.pending.clear();
         self.packetizer.encode(frame, &mut self.pending)?;
-        if self.pending.len() >= WRITE_BYTES { self.flush() } else { Ok(()) }
+        self.file.write_all(&self.pending).map_err(io_error(&self.path, "write"))
     }
 
     /// Bytes of all packets so far.
     #[must_use]
     pub fn bytes(&self) -> u64 {
-        self.bytes + self.pending.len() as u64
+        self.file.bytes()
     }
 
     /// Puts everything on the disk and gives the file its name; returns its length in bytes.
     ///
     /// # Errors
     /// A file that cannot be written or renamed.
-    pub fn finish(mut self) -> Result<u64, DownlinkError> {
-        self.flush()?;
-        self.file.sync_all().map_err(io_error(&self.partial_path, "put the file on the disk"))?;
-        fs::rename(&self.partial_path, &self.path).map_err(io_error(&self.path, "rename the file"))?;
-        let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
-        let folder = folder.unwrap_or(Path::new("."));
-        File::open(folder)
-            .and_then(|folder| folder.sync_all())
-            .map_err(io_error(folder, "put the folder on the disk"))?;
-        Ok(self.bytes)
-    }
-
-    fn flush(&mut self) -> Result<(), DownlinkError> {
-        self.file.write_all(&self.pending).map_err(io_error(&self.partial_path, "write"))?;
-        self.bytes += self.pending.len() as u64;
-        self.pending.clear();
-        Ok(())
+    pub fn finish(self) -> Result<u64, DownlinkError> {
+        self.file.finish().map_err(io_error(&self.path, "finish the file"))
     }
 }
 

@@ -50,7 +50,6 @@ mod file;
 mod header;
 mod kind;
 mod packetizer;
-mod partial_file;
 mod payload;
 mod receiver;
 mod sequence;

@@ -1,7 +1,7 @@
 //! The downlink's stages: packets out of frames, files, frames out of packets.
 
 use std::fs::File;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -11,8 +11,8 @@ use super::decoder::Decoder;
 use super::error::DownlinkError;
 use super::file::{io_error, require_packets};
 use super::packetizer::Packetizer;
-use super::partial_file::PartialFile;
 use super::receiver::{Event, Receiver};
+use crate::files::{AtomicFile, Unfinished};
 use crate::frames::GroundFrame;
 use crate::runtime::{Flow, Outlet, Sink, Source, Stage, Units};
 
@@ -56,7 +56,12 @@ impl Stage for Transmitter {
 
 /// Keeps what passes in a file; as a stage it hands it on, as a sink it is the end.
 #[derive(Debug)]
-pub struct Recorder(PartialFile);
+pub struct Recorder {
+    path: PathBuf,
+    /// `None` once finished.
+    file: Option<AtomicFile>,
+    bytes: u64,
+}
 
 impl Recorder {
     /// Begins a file.
@@ -64,12 +69,23 @@ impl Recorder {
     /// # Errors
     /// A file that cannot be written.
     pub fn create(path: &Path) -> Result<Self, DownlinkError> {
-        Ok(Self(PartialFile::create(path)?))
+        let file = AtomicFile::create(path, Unfinished::Keep).map_err(io_error(path, "create the file"))?;
+        Ok(Self { path: path.to_owned(), file: Some(file), bytes: 0 })
     }
 
     fn keep(&mut self, bytes: &[u8]) -> Result<(), DownlinkError> {
-        self.0.pending().extend_from_slice(bytes);
-        self.0.settle()
+        self.bytes += bytes.len() as u64;
+        match &mut self.file {
+            Some(file) => file.write_all(bytes).map_err(io_error(&self.path, "write")),
+            None => Ok(()),
+        }
+    }
+
+    fn close(&mut self) -> Result<(), DownlinkError> {
+        match self.file.take() {
+            Some(file) => file.finish().map(|_| ()).map_err(io_error(&self.path, "finish the file")),
+            None => Ok(()),
+        }
     }
 }
 
@@ -85,11 +101,11 @@ impl Stage for Recorder {
     }
 
     fn finish(&mut self, _: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
-        self.0.finish().map(|_| ())
+        self.close()
     }
 
     fn units(&self) -> Units {
-        Units::of(self.0.bytes(), "bytes")
+        Units::of(self.bytes, "bytes")
     }
 }
 
@@ -102,11 +118,11 @@ impl Sink for Recorder {
     }
 
     fn finish(&mut self) -> Result<(), DownlinkError> {
-        self.0.finish().map(|_| ())
+        self.close()
     }
 
     fn units(&self) -> Units {
-        Units::of(self.0.bytes(), "bytes")
+        Units::of(self.bytes, "bytes")
     }
 }
 
@@ -158,7 +174,7 @@ impl Source for FileSource {
             return Ok(Flow::Done);
         };
         let mut bytes = Vec::with_capacity(READ_BYTES);
-        let read = file.by_ref().take(READ_BYTES as u64).read_to_end(&mut bytes);
+        let read = Read::by_ref(&mut file).take(READ_BYTES as u64).read_to_end(&mut bytes);
         if read.map_err(io_error(&path, "read"))? > 0 {
             self.bytes += bytes.len() as u64;
             out.push(bytes);

@@ -65,7 +65,7 @@ pub fn add(
 fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {
     let map = &config.map;
     let read = |path: &std::path::PathBuf| {
-        let prior = read_whole_map(path, &ReadOptions::default())?.to_ecliptic()?;
+        let prior = read_whole_map(path, &ReadOptions::default())?.to_ecliptic();
         let smooth = prior.smoothed(map.prior_fwhm_deg.to_radians())?;
         Ok(smooth.degrade(map.nside)?.into_values())
     };

@@ -7,7 +7,8 @@ use serde::Serialize;
 
 use super::config::Config;
 use crate::downlink::ReceptionCounters;
-use crate::products::{ChannelSummary, ProductsError, write_atomically};
+use crate::files::write_atomically;
+use crate::products::{ChannelSummary, ProductsError};
 use crate::runtime::{LedgerReport, Report};
 
 /// Which part of the chain ran.
@@ -75,7 +76,7 @@ impl Summary {
         let path = folder.join("summary.json");
         let text = serde_json::to_vec_pretty(self)
             .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
-        write_atomically(&path, &text)
+        write_atomically(&path, &text).map_err(|source| ProductsError::Write { path, source })
     }
 }
 

@@ -69,7 +69,8 @@ impl ChannelFolder {
     ) -> Result<(), ProductsError> {
         let map = SkyMap::new(Frame::Ecliptic, solution.map_k.clone())?;
         let noise = SkyMap::new(Frame::Ecliptic, solution.noise_k.clone())?;
-        let comparison = self.truth.as_ref().map(|truth| compare(&map, truth, Some(&noise), None)).transpose()?;
+        let comparison =
+            self.truth.as_ref().map(|truth| compare(&map, truth, Some(&noise), None)).transpose()?;
         self.note(solution, comparison.as_ref());
         if self.config.snapshot_maps && !solution.is_final {
             self.write_map(&format!("snapshot-{:03}.fits", solution.number), &map, provenance, solution)?;
@@ -178,9 +179,11 @@ impl ChannelFolder {
         let Some((map, caption)) = self.shown.last().cloned() else { return Ok(()) };
         let title = format!("{} MHz, {caption}", self.frequency_hz / 1e6);
         let subtitle = format!("{} visibilities", solution.visibilities);
-        let panel = self.panel(&map, &title, self.scale(&map));
+        let panel = self.panel(&map, "", self.scale(&map));
         let path = self.file(&format!("snapshot-{:03}.png", solution.number));
-        Ok(draw_map(&panel, &subtitle, &view())?.write(&path)?)
+        // Half the size of the final picture: there are many.
+        let sheet = Sheet { title, subtitle, width_px: 800, view: view(), ..Sheet::default() };
+        Ok(draw_sheet(&[panel], &sheet)?.write(&path)?)
     }
 
     fn draw_final(

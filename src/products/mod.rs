@@ -10,7 +10,6 @@ mod provenance;
 mod publisher;
 mod summary;
 mod truth;
-mod write;
 
 pub use channel::draw_comparison;
 pub use config::{ProductsConfig, ProductsConfigError};
@@ -19,4 +18,3 @@ pub use provenance::Provenance;
 pub use publisher::Publisher;
 pub use summary::{ChannelSummary, SnapshotSummary};
 pub use truth::Truth;
-pub use write::write_atomically;

@@ -1,12 +1,10 @@
 //! Finished pictures and their files.
 
-use std::borrow::Cow;
-use std::fs::{self, File, OpenOptions};
-use std::io::{BufWriter, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use super::canvas::Canvas;
 use super::error::PictureError;
+use crate::files::write_atomically;
 
 /// Greatest side of a picture, pixels.
 const SIDE_MAX: usize = 16_384;
@@ -103,25 +101,7 @@ impl Picture {
     pub fn write(&self, path: &Path) -> Result<(), PictureError> {
         let bytes =
             self.to_png().map_err(|source| PictureError::Encode { path: path.to_path_buf(), source })?;
-        let temporary = temporary_beside(path);
-        let written = write_synced(&temporary, &bytes).and_then(|()| fs::rename(&temporary, path));
-        if let Err(source) = written {
-            // What went wrong is told; that the remains may stay as well is not worth another error.
-            let _ = fs::remove_file(&temporary);
-            return Err(PictureError::Write { path: path.to_path_buf(), source });
-        }
-        Ok(())
+        write_atomically(path, &bytes)
+            .map_err(|source| PictureError::Write { path: path.to_path_buf(), source })
     }
-}
-
-fn temporary_beside(path: &Path) -> PathBuf {
-    let name = path.file_name().map_or(Cow::Borrowed("picture"), |name| name.to_string_lossy());
-    path.with_file_name(format!(".{name}.{}.partial", std::process::id()))
-}
-
-fn write_synced(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
-    let file = OpenOptions::new().write(true).create(true).truncate(true).open(path)?;
-    let mut writer = BufWriter::new(file);
-    writer.write_all(bytes)?;
-    writer.into_inner().map_err(std::io::IntoInnerError::into_error).and_then(|file: File| file.sync_all())
 }

@@ -1,13 +1,12 @@
 //! Writing maps: healpy's cards in healpy's order, whole files or none.
 
-use std::ffi::OsString;
-use std::fs::{self, File};
-use std::io::{BufWriter, Write};
-use std::path::{Path, PathBuf};
+use std::io::Write;
+use std::path::Path;
 
 use super::card::Card;
 use super::error::{FitsError, FitsProblem};
 use super::header::BLOCK_BYTES;
+use crate::files::{AtomicFile, Unfinished};
 use crate::sky::healpix::{nested_to_ring, nside_of};
 use crate::sky::{Frame, MapError, SkyMap, is_unseen};
 use crate::units::constants::HEALPIX_UNSEEN;
@@ -283,34 +282,10 @@ fn end_header(header: &mut Vec<u8>) {
 /// any failure.
 fn write_whole(
     path: &Path,
-    write: impl FnOnce(&mut BufWriter<File>) -> Result<(), FitsProblem>,
+    write: impl FnOnce(&mut AtomicFile) -> Result<(), FitsProblem>,
 ) -> Result<(), FitsProblem> {
-    let (temporary, file) = create_beside(path)?;
-    let finish = || {
-        let mut out = BufWriter::new(file);
-        write(&mut out)?;
-        let file = out.into_inner().map_err(|error| FitsProblem::io("write")(error.into_error()))?;
-        file.sync_all().map_err(FitsProblem::io("flush to the disk"))?;
-        fs::rename(&temporary, path).map_err(FitsProblem::io("put the written file in place"))
-    };
-    finish().inspect_err(|_| {
-        // The first failure is the one to report.
-        let _ = fs::remove_file(&temporary);
-    })
-}
-
-fn create_beside(path: &Path) -> Result<(PathBuf, File), FitsProblem> {
-    let name = path.file_name().unwrap_or_default();
-    let mut attempt = 0_u32;
-    loop {
-        let mut hidden = OsString::from(".");
-        hidden.push(name);
-        hidden.push(format!(".{}.{attempt}.part", std::process::id()));
-        let temporary = path.with_file_name(hidden);
-        match File::create_new(&temporary) {
-            Ok(file) => return Ok((temporary, file)),
-            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists && attempt < 1000 => attempt += 1,
-            Err(error) => return Err(FitsProblem::io("create a file in its folder")(error)),
-        }
-    }
+    let mut file =
+        AtomicFile::create(path, Unfinished::Remove).map_err(FitsProblem::io("create the file"))?;
+    write(&mut file)?;
+    file.finish().map(|_| ()).map_err(FitsProblem::io("put the file in place"))
 }
