@@ -15,7 +15,7 @@ pub use config::{MapConfig, MapConfigError};
 pub use error::AccumulationError;
 pub use pixel::{PixelEngine, PixelSetup, PixelSums};
 pub use stage::{Accumulator, Snapshot};
-pub use tiles::{SymmetricTiles, TILE};
+pub use tiles::{Columns, SymmetricTiles, TILE};
 
 use serde::Serialize;
 
