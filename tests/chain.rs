@@ -160,8 +160,7 @@ fn a_lost_stretch_is_counted_and_the_rest_is_used() {
     let damaged = place.path("damaged.ccsds");
     std::fs::write(&damaged, bytes).unwrap();
     let out = place.path("out");
-    let text =
-        succeed(&["replay", &damaged, "--map", &place.pipeline, "--out", &out, "--json"]);
+    let text = succeed(&["replay", &damaged, "--map", &place.pipeline, "--out", &out, "--json"]);
     let summary: Value = serde_json::from_str(&text).unwrap();
     let lost = &summary["ledger"]["lost"];
     assert!(lost.as_array().unwrap().iter().any(|loss| loss["count"].as_u64().unwrap() > 0), "{lost}");

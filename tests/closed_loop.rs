@@ -141,8 +141,8 @@ fn correlations<const N: usize>(
         .zip(sums)
         .map(|(observation, sum)| {
             // sigma = T_sys / sqrt(2 dnu dt), the sky dominating T_sys.
-            let weight =
-                2.0 * CHANNEL_WIDTH_HZ * observation.duration_s / (sum.zero_spacing_k_sr * sum.zero_spacing_k_sr);
+            let weight = 2.0 * CHANNEL_WIDTH_HZ * observation.duration_s
+                / (sum.zero_spacing_k_sr * sum.zero_spacing_k_sr);
             (observation, sum.visibility_k_sr, weight)
         })
         .collect();

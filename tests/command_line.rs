@@ -29,8 +29,7 @@ fn write(folder: &Path, name: &str, text: &str) -> String {
 
 #[test]
 fn every_command_has_help_that_teaches() {
-    for command in
-        ["run", "simulate", "replay", "inspect", "compare", "geometry", "predict", "check", "sky"]
+    for command in ["run", "simulate", "replay", "inspect", "compare", "geometry", "predict", "check", "sky"]
     {
         let output = lunarray().args([command, "--help"]).output().unwrap();
         assert!(output.status.success());
@@ -67,8 +66,8 @@ fn geometry_agrees_with_independent_values() {
         assert_eq!(found["observing"], epoch["observing"]);
         for n in 0..8 {
             for k in 0..3 {
-                let difference = found["satellites_m"][n][k].as_f64().unwrap()
-                    - epoch["sat_m"][n][k].as_f64().unwrap();
+                let difference =
+                    found["satellites_m"][n][k].as_f64().unwrap() - epoch["sat_m"][n][k].as_f64().unwrap();
                 assert!(difference.abs() < 1e-6, "t = {at}, daughter {n}: {difference} m");
             }
         }
@@ -80,7 +79,8 @@ fn test_sky(n: [f64; 3]) -> f64 {
     let near = |s: [f64; 3]| lunarray::units::vector::dot(n, s) - 1.0;
     let [x, y, z] = n;
     let smooth = 1.0 + 0.3 * x - 0.2 * y * z + 0.1 * (7.0 * z + 3.0 * x).sin();
-    let spots = 2.0 * (near([0.36, 0.48, 0.8]) / 0.01).exp() + 1.5 * (near([-0.6, 0.64, -0.48]) / 0.004).exp();
+    let spots =
+        2.0 * (near([0.36, 0.48, 0.8]) / 0.01).exp() + 1.5 * (near([-0.6, 0.64, -0.48]) / 0.004).exp();
     3e5 * (smooth + spots)
 }
 
@@ -90,8 +90,7 @@ fn predict_agrees_with_independent_values() {
     let reference: Value = serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
     let values = reference["values"].as_array().unwrap();
     let folder = tempfile::tempdir().unwrap();
-    let sky: Vec<f64> =
-        lunarray::sky::healpix::pixel_directions(64).into_iter().map(test_sky).collect();
+    let sky: Vec<f64> = lunarray::sky::healpix::pixel_directions(64).into_iter().map(test_sky).collect();
     let file = folder.path().join("sky.fits");
     let map = lunarray::sky::SkyMap::new(lunarray::sky::Frame::Ecliptic, sky).unwrap();
     let options = WriteOptions { precision: Precision::Double, ..WriteOptions::default() };
@@ -112,8 +111,8 @@ fn predict_agrees_with_independent_values() {
         let found: Value = serde_json::from_str(line).unwrap();
         assert_eq!((&found["i"], &found["j"]), (&value["i"], &value["j"]));
         let number = |of: &Value, key: &str| of[key].as_f64().unwrap();
-        let difference = (number(&found, "re") - number(value, "re"))
-            .hypot(number(&found, "im") - number(value, "im"));
+        let difference =
+            (number(&found, "re") - number(value, "re")).hypot(number(&found, "im") - number(value, "im"));
         // Relative to the sky's whole flux in view, of which a visibility is what fringes leave over:
         // 49152 roundings of a sum, and positions to 1e-6 m.
         let scale = number(value, "re").hypot(number(value, "im"));

@@ -5,12 +5,12 @@
 
 use std::io::{Read, Write};
 
-use bincode::config::{Configuration, Fixint, LittleEndian, Limit};
+use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
 use num_complex::Complex64;
 
+use super::SumCounts;
 use super::error::AccumulationError;
 use super::pixel::{Pending, PixelEngine, PixelSetup, PixelSums};
-use super::SumCounts;
 use crate::array::response::PixelMethod;
 use crate::frames::AntennaResponse;
 use crate::sky::healpix::is_valid_nside;
@@ -29,10 +29,8 @@ const NSIDE_MAX: u32 = 64;
 /// Numbers that a waiting visibility takes.
 const PENDING_NUMBERS: usize = 11;
 
-const CODEC: Configuration<LittleEndian, Fixint, Limit<HEAD_BYTES_MAX>> = bincode::config::standard()
-    .with_little_endian()
-    .with_fixed_int_encoding()
-    .with_limit::<HEAD_BYTES_MAX>();
+const CODEC: Configuration<LittleEndian, Fixint, Limit<HEAD_BYTES_MAX>> =
+    bincode::config::standard().with_little_endian().with_fixed_int_encoding().with_limit::<HEAD_BYTES_MAX>();
 
 #[derive(bincode::Encode, bincode::Decode)]
 struct Head {

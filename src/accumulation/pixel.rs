@@ -176,10 +176,8 @@ impl PixelEngine {
 
     fn noise(&self, placed: &PlacedVisibilities, k: usize) -> Complex64 {
         let pair = u64::from(placed.pair.i) << 8 | u64::from(placed.pair.j);
-        let identity = [
-            u64::from(placed.channel.0) << 32 | pair,
-            MissionTime::from_seconds(placed.time_s[k]).0 as u64,
-        ];
+        let identity =
+            [u64::from(placed.channel.0) << 32 | pair, MissionTime::from_seconds(placed.time_s[k]).0 as u64];
         let mut stream = random_stream(self.setup.companion_seed, StreamKind::CompanionNoise, identity);
         let mut draw = || -> f64 { StandardNormal.sample(&mut stream) };
         let re = draw();
@@ -219,10 +217,7 @@ impl NormalEngine for PixelEngine {
         self.settle();
         other.settle();
         self.sums.normal.add(&other.sums.normal);
-        let sides = [
-            (&mut self.sums.right, &other.sums.right),
-            (&mut self.sums.noise, &other.sums.noise),
-        ];
+        let sides = [(&mut self.sums.right, &other.sums.right), (&mut self.sums.noise, &other.sums.noise)];
         for (sums, others) in sides {
             for (sum, term) in sums.iter_mut().zip(others) {
                 *sum += term;

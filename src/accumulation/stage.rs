@@ -5,8 +5,8 @@ use std::sync::Arc;
 use super::{AccumulationError, MapConfig, NormalEngine, PixelEngine, PixelSetup, PixelSums};
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities};
 use crate::runtime::{Ledger, Outlet, Stage, Units};
-use crate::units::vector::{norm, sub};
 use crate::units::ChannelId;
+use crate::units::vector::{norm, sub};
 
 /// The sums of one channel at a moment, for solving on the side.
 pub struct Snapshot {

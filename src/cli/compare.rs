@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::{CommandError, CommandResult, Outcome, print_json_line, print_text};
 use crate::products::draw_comparison;
-use crate::products::pictures::{MapPanel, Scale, Sampling, View, draw_map};
+use crate::products::pictures::{MapPanel, Sampling, Scale, View, draw_map};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::{Comparison, Frame, SkyMap, compare};
 
@@ -90,7 +90,8 @@ fn beside(path: &Path, suffix: &str) -> PathBuf {
 }
 
 fn table(comparison: &Comparison) -> String {
-    let mut lines = vec![format!("{:>5} {:>12} {:>12} {:>9} {:>12}", "l", "C_l map", "C_l truth", "rho_l", "SNR_l")];
+    let mut lines =
+        vec![format!("{:>5} {:>12} {:>12} {:>9} {:>12}", "l", "C_l map", "C_l truth", "rho_l", "SNR_l")];
     let l_max = comparison.l.last().copied().unwrap_or(0);
     let step = (l_max / 24).max(1);
     for &l in comparison.l.iter().step_by(step) {

@@ -3,7 +3,7 @@
 use clap::Args;
 use serde::Serialize;
 
-use super::{CommandResult, Outcome, ArrayArgs, print_json_line, print_text};
+use super::{ArrayArgs, CommandResult, Outcome, print_json_line, print_text};
 use crate::array::{Array, integration_time_s};
 use crate::mother::BAND_HZ;
 use crate::units::all_pairs;
@@ -47,11 +47,9 @@ struct PairGeometry {
 
 pub(super) fn execute(args: &GeometryArgs) -> CommandResult {
     if !(BAND_HZ[0]..=BAND_HZ[1]).contains(&args.freq_hz) {
-        return Err(format!(
-            "--freq-hz {}: expected {} Hz to {} Hz",
-            args.freq_hz, BAND_HZ[0], BAND_HZ[1]
-        )
-        .into());
+        return Err(
+            format!("--freq-hz {}: expected {} Hz to {} Hz", args.freq_hz, BAND_HZ[0], BAND_HZ[1]).into()
+        );
     }
     let config = args.array.source().load()?;
     let array = Array::new(&config.array)?;

@@ -127,9 +127,7 @@ pub fn main() -> ExitCode {
 
 /// The reader of our output has had enough, as `head` has: not a failure.
 fn is_broken_pipe(error: &(dyn std::error::Error + 'static)) -> bool {
-    error
-        .downcast_ref::<std::io::Error>()
-        .is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
+    error.downcast_ref::<std::io::Error>().is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
 }
 
 /// Prints an error and its causes, leaving out causes that the message already tells.

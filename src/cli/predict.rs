@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::{CommandError, CommandResult, Outcome, ArrayArgs, print_json_line, print_text};
+use super::{ArrayArgs, CommandError, CommandResult, Outcome, print_json_line, print_text};
 use crate::array::Array;
 use crate::array::response::{PairGeometry, exact};
 use crate::mother::BAND_HZ;

@@ -100,7 +100,8 @@ impl Shown {
             }
             None => {
                 let elapsed_s = self.since.elapsed().as_secs();
-                let of = if self.total > 0 { format!(" {done}/{} windows,", self.total) } else { String::new() };
+                let of =
+                    if self.total > 0 { format!(" {done}/{} windows,", self.total) } else { String::new() };
                 eprintln!("{elapsed_s:>5} s:{of} {message}");
             }
         }

@@ -40,7 +40,9 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
         return Err(format!("--freq-hz {freq_hz}: expected {} Hz to {} Hz", BAND_HZ[0], BAND_HZ[1]).into());
     }
     if !nside.is_power_of_two() || nside > GENERATED_NSIDE_MAX {
-        return Err(format!("--nside {nside}: expected a power of two from 1 to {GENERATED_NSIDE_MAX}").into());
+        return Err(
+            format!("--nside {nside}: expected a power of two from 1 to {GENERATED_NSIDE_MAX}").into()
+        );
     }
     let values = generate(&GeneratedSky::default(), freq_hz, nside, seed)?;
     let mean = values.iter().sum::<f64>() / values.len() as f64;

@@ -171,12 +171,7 @@ impl SpacecraftConfig {
         let width = self.channel_width_hz;
         require("channel_width_hz", width, width > 0.0 && width <= 1e6, "above 0 Hz and at most 1 MHz");
         let longest = self.integration_s_max;
-        require(
-            "integration_s_max",
-            longest,
-            (1e-3..=1000.0).contains(&longest),
-            "0.001 s to 1000 s",
-        );
+        require("integration_s_max", longest, (1e-3..=1000.0).contains(&longest), "0.001 s to 1000 s");
         let motion = self.motion_wavelengths_max;
         require("motion_wavelengths_max", motion, motion > 0.0 && motion <= 1.0, "above 0 and at most 1");
         let noise = self.receiver_noise_k_sr;

@@ -60,10 +60,8 @@ impl VisibilityModel for DirectSum {
         // Lengths agree by construction, so there is always an answer.
         let sums = sky_sums(&pairs, &sky.directions, &sky.values, sky.area_sr).unwrap_or_default();
         for (out, sum) in out.iter_mut().zip(sums) {
-            *out = Prediction {
-                visibility_k_sr: sum.visibility_k_sr,
-                zero_spacing_k_sr: sum.zero_spacing_k_sr,
-            };
+            *out =
+                Prediction { visibility_k_sr: sum.visibility_k_sr, zero_spacing_k_sr: sum.zero_spacing_k_sr };
         }
     }
 }

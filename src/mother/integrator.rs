@@ -91,11 +91,11 @@ impl Integrator {
     ) -> VisibilityBlock {
         let width_hz = self.instrument.channels[usize::from(channel.0)].width_hz;
         let identity = u64::from(channel.0) << 32 | u64::from(pair.i) << 8 | u64::from(pair.j);
-        let mut noise = self.noise.seed.map(|seed| {
-            random_stream(seed, StreamKind::VisibilityNoise, [identity, window.start.0 as u64])
-        });
-        let mut block =
-            VisibilityBlock { channel, pair, start: window.start, ..VisibilityBlock::default() };
+        let mut noise = self
+            .noise
+            .seed
+            .map(|seed| random_stream(seed, StreamKind::VisibilityNoise, [identity, window.start.0 as u64]));
+        let mut block = VisibilityBlock { channel, pair, start: window.start, ..VisibilityBlock::default() };
         for (integration, prediction) in integrations.iter().zip(predictions) {
             let dt_s = f64::from(integration.duration_ticks) / TICKS_PER_SECOND as f64;
             let sigma = self.noise.sigma_k_sr(prediction.zero_spacing_k_sr, width_hz, dt_s);
@@ -120,11 +120,7 @@ impl Stage for Integrator {
     type Out = GroundFrame;
     type Error = Infallible;
 
-    fn step(
-        &mut self,
-        window: ObservingWindow,
-        out: &mut Outlet<GroundFrame>,
-    ) -> Result<(), Infallible> {
+    fn step(&mut self, window: ObservingWindow, out: &mut Outlet<GroundFrame>) -> Result<(), Infallible> {
         out.push(GroundFrame::Instrument(self.instrument.clone()));
         for segment in segments_for(&self.array, window.start, window.end, EPHEMERIS_STEP_S) {
             out.push(GroundFrame::Ephemeris(segment));

@@ -251,10 +251,9 @@ fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
     let mut here = table;
     for part in sections.split('.').filter(|part| !part.is_empty()) {
         let next = here.entry(part).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        here = next.as_table_mut().ok_or_else(|| ConfigError::NotASection {
-            key: key.to_owned(),
-            part: part.to_owned(),
-        })?;
+        here = next
+            .as_table_mut()
+            .ok_or_else(|| ConfigError::NotASection { key: key.to_owned(), part: part.to_owned() })?;
     }
     here.insert(last.to_owned(), value);
     Ok(())

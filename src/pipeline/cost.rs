@@ -91,7 +91,8 @@ impl Plan {
         // A Cholesky factorisation runs at about the rate of the rank-k updates (one core of it: half).
         let flops = rates.accumulated_per_s * pixels * pixels;
         let solving: f64 = channels.iter().map(|c| c.solution_multiply_adds).sum::<f64>() * solutions as f64;
-        let predicted_s = sent / rates.simulated_per_s + mapped / rates.accumulated_per_s + 2.0 * solving / flops;
+        let predicted_s =
+            sent / rates.simulated_per_s + mapped / rates.accumulated_per_s + 2.0 * solving / flops;
         Cost {
             channels,
             windows: self.windows.len(),
@@ -133,7 +134,8 @@ impl Plan {
         let few = &pairs[..SAMPLES.min(64)];
         let since = Instant::now();
         let summed = sky_sums(few, &directions, &sky_k, pixel_area_sr(nside)).is_ok();
-        let simulated_per_s = if summed { few.len() as f64 / since.elapsed().as_secs_f64() } else { f64::NAN };
+        let simulated_per_s =
+            if summed { few.len() as f64 / since.elapsed().as_secs_f64() } else { f64::NAN };
         let placed = PlacedVisibilities {
             frequency_hz,
             pair: Pair { i: 0, j: 1 },

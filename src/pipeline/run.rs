@@ -25,17 +25,17 @@ pub const DOWNLINK_FILE: &str = "downlink.ccsds";
 /// # Errors
 /// The first failure of any stage; a ledger that does not close.
 pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Result<Summary, PipelineError> {
-        let skies = space::skies(plan)?;
-        let mut graph = Graph::new();
-        let bytes = space::add(&mut graph, plan, &skies)?;
-        let recorder = Recorder::create(&out.join(DOWNLINK_FILE))?;
-        let capacity = plan.config.runtime.queue_capacity;
-        let bytes = graph.stage("record", capacity, bytes, recorder);
-        let truth = Truth::new(&skies, plan.config.map.nside)?;
-        drop(skies);
-        let outcome = ground::add(&mut graph, bytes, &plan.config, out, truth)?;
-        let report = start(graph, &plan.config.runtime, cancel, watch)?;
-        conclude(Segment::Whole, &plan.config, Some(out), report, outcome)
+    let skies = space::skies(plan)?;
+    let mut graph = Graph::new();
+    let bytes = space::add(&mut graph, plan, &skies)?;
+    let recorder = Recorder::create(&out.join(DOWNLINK_FILE))?;
+    let capacity = plan.config.runtime.queue_capacity;
+    let bytes = graph.stage("record", capacity, bytes, recorder);
+    let truth = Truth::new(&skies, plan.config.map.nside)?;
+    drop(skies);
+    let outcome = ground::add(&mut graph, bytes, &plan.config, out, truth)?;
+    let report = start(graph, &plan.config.runtime, cancel, watch)?;
+    conclude(Segment::Whole, &plan.config, Some(out), report, outcome)
 }
 
 /// The space segment alone, to a downlink file.
@@ -48,12 +48,12 @@ pub fn simulate(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<Report, PipelineError> {
-        let skies = space::skies(plan)?;
-        let mut graph = Graph::new();
-        let bytes = space::add(&mut graph, plan, &skies)?;
-        drop(skies);
-        graph.sink("record", bytes, Recorder::create(file)?);
-        start(graph, &plan.config.runtime, cancel, watch)
+    let skies = space::skies(plan)?;
+    let mut graph = Graph::new();
+    let bytes = space::add(&mut graph, plan, &skies)?;
+    drop(skies);
+    graph.sink("record", bytes, Recorder::create(file)?);
+    start(graph, &plan.config.runtime, cancel, watch)
 }
 
 /// The ground segment alone, from downlink files in the order given.
@@ -67,11 +67,11 @@ pub fn replay(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<Summary, PipelineError> {
-        let mut graph = Graph::new();
-        let bytes = graph.source("read", config.runtime.queue_capacity, FileSource::open(files)?);
-        let outcome = ground::add(&mut graph, bytes, config, out, Truth::unknown())?;
-        let report = start(graph, &config.runtime, cancel, watch)?;
-        conclude(Segment::Ground, config, Some(out), report, outcome)
+    let mut graph = Graph::new();
+    let bytes = graph.source("read", config.runtime.queue_capacity, FileSource::open(files)?);
+    let outcome = ground::add(&mut graph, bytes, config, out, Truth::unknown())?;
+    let report = start(graph, &config.runtime, cancel, watch)?;
+    conclude(Segment::Ground, config, Some(out), report, outcome)
 }
 
 fn start(

@@ -69,7 +69,8 @@ impl ChannelFolder {
     ) -> Result<(), ProductsError> {
         let map = SkyMap::new(Frame::Ecliptic, solution.map_k.clone())?;
         let noise = SkyMap::new(Frame::Ecliptic, solution.noise_k.clone())?;
-        let comparison = self.truth.as_ref().map(|truth| compare(&map, truth, Some(&noise), None)).transpose()?;
+        let comparison =
+            self.truth.as_ref().map(|truth| compare(&map, truth, Some(&noise), None)).transpose()?;
         self.note(solution, comparison.as_ref());
         if self.config.snapshot_maps && !solution.is_final {
             self.write_map(&format!("snapshot-{:03}.fits", solution.number), &map, provenance, solution)?;

@@ -20,7 +20,11 @@ impl Provenance {
         let frequency_hz = channels.get(usize::from(solution.channel.0)).map_or(0.0, |c| c.frequency_hz);
         vec![
             Card::text("CREATOR", concat!("lunarray ", env!("CARGO_PKG_VERSION")), "program"),
-            Card::text("PIPELINE", &name.chars().take(60).collect::<String>(), "instrument description's name"),
+            Card::text(
+                "PIPELINE",
+                &name.chars().take(60).collect::<String>(),
+                "instrument description's name",
+            ),
             Card::text("CONTENT", what, "what the map shows"),
             Card::real("FREQ", frequency_hz, "[Hz] centre frequency"),
             Card::integer("NVIS", solution.visibilities.try_into().unwrap_or(i64::MAX), "visibilities used"),

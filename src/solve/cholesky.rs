@@ -97,9 +97,8 @@ fn take_out(matrix: &mut SymmetricTiles, step: usize) {
     let order = matrix.order();
     let along = matrix.along();
     // The column is read while others are written: taken out for that time.
-    let column: Vec<Vec<f64>> = (step + 1..along)
-        .map(|i| std::mem::take(&mut matrix.tiles_mut()[i * (i + 1) / 2 + step]))
-        .collect();
+    let column: Vec<Vec<f64>> =
+        (step + 1..along).map(|i| std::mem::take(&mut matrix.tiles_mut()[i * (i + 1) / 2 + step])).collect();
     let size = matrix.rows(step).len();
     let rows_of = |i: usize| (order - i * TILE).min(TILE);
     matrix.tiles_mut().par_iter_mut().enumerate().for_each(|(index, tile)| {
@@ -113,7 +112,15 @@ fn take_out(matrix: &mut SymmetricTiles, step: usize) {
         if i == j {
             use triangular::BlockStructure::{Rectangular, TriangularLower};
             triangular::matmul(
-                tile, TriangularLower, Accum::Add, left, Rectangular, right, Rectangular, -1.0, Par::Seq,
+                tile,
+                TriangularLower,
+                Accum::Add,
+                left,
+                Rectangular,
+                right,
+                Rectangular,
+                -1.0,
+                Par::Seq,
             );
         } else {
             matmul(tile, Accum::Add, left, right, -1.0, Par::Seq);

@@ -66,5 +66,9 @@ pub fn solve_pixels(
     if let Some(prior_k) = prior_k {
         map_k.iter_mut().zip(prior_k).for_each(|(map, prior)| *map += prior);
     }
-    Ok(PixelSolution { map_k, noise_k, diagnostics: Diagnostics { epsilon, w_max, w_max_iterations: iterations } })
+    Ok(PixelSolution {
+        map_k,
+        noise_k,
+        diagnostics: Diagnostics { epsilon, w_max, w_max_iterations: iterations },
+    })
 }
