@@ -10,7 +10,7 @@ mod lanczos;
 mod stage;
 mod tikhonov;
 
-pub use cholesky::Cholesky;
+pub use cholesky::{Cholesky, NotPositive};
 pub use diagnostics::{Spectrum, spectrum};
 pub use error::SolveError;
 pub use lanczos::{LargestEigenvalue, largest_eigenvalue};
