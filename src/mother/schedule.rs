@@ -42,6 +42,9 @@ impl Schedule {
             0.0 => f64::INFINITY,
             limit => limit * SPEED_OF_LIGHT_M_S / self.frequency_hz,
         };
+        if shortest_m(array, window, pair) >= longest_m {
+            return Vec::new();
+        }
         let mut found = Vec::new();
         let mut offset_ticks = 0;
         let mut number = window.index;
@@ -76,5 +79,79 @@ impl Schedule {
         }
         let dt_s = integration_time_s(self.rule, self.frequency_hz, i.velocity_m_s, j.velocity_m_s);
         ((end_s - start_s) / dt_s / self.every_nth as f64, length_m)
+    }
+}
+
+/// Shortest length of a pair's baseline in a window, m. A chord depends on the daughters' arcs alone, which
+/// are linear in time between turnarounds, so it is shortest at an end or where breathing turns.
+fn shortest_m(array: &Array, window: ObservingWindow, pair: Pair) -> f64 {
+    let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
+    let turn_s = array.formation().next_turnaround_s(start_s).min(end_s);
+    let length_m =
+        |t_s: f64| norm(sub(array.position_m(pair.i.into(), t_s), array.position_m(pair.j.into(), t_s)));
+    [start_s, turn_s, end_s].into_iter().map(length_m).fold(f64::INFINITY, f64::min)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::array::{ArrayConfig, ObservingWindows};
+    use crate::units::all_pairs;
+
+    fn schedule(baseline_wavelengths_max: f64, every_nth: u64) -> Schedule {
+        let rule = IntegrationRule::default();
+        Schedule { rule, frequency_hz: 10e6, baseline_wavelengths_max, every_nth }
+    }
+
+    #[test]
+    fn integrations_fill_the_window_and_move_an_eighth_of_a_wavelength() {
+        let array = Array::new(&ArrayConfig::default()).unwrap();
+        let window = ObservingWindows::new(&array, 0.0, 1e5).next().unwrap();
+        for pair in all_pairs(4) {
+            let found = schedule(0.0, 1).integrations(&array, window, pair);
+            let mut expected = 0;
+            for Integration { offset_ticks, duration_ticks } in &found {
+                assert_eq!(*offset_ticks, expected);
+                expected += duration_ticks;
+                let from = window.start.plus_ticks(i64::from(*offset_ticks)).seconds();
+                let baseline = |t_s: f64| {
+                    sub(array.position_m(pair.i.into(), t_s), array.position_m(pair.j.into(), t_s))
+                };
+                let until = from + f64::from(*duration_ticks) * 1e-6;
+                let moved_m = norm(sub(baseline(until), baseline(from)));
+                // A chord of the motion is at most its path; lambda / 8 at 10 MHz.
+                assert!(moved_m <= 0.125 * SPEED_OF_LIGHT_M_S / 10e6 * (1.0 + 1e-6), "{pair}: {moved_m} m");
+            }
+            assert_eq!(i64::from(expected), window.end.0 - window.start.0);
+        }
+    }
+
+    #[test]
+    fn long_baselines_are_left_out_exactly() {
+        let array = Array::new(&ArrayConfig::default()).unwrap();
+        for window in ObservingWindows::new(&array, 0.0, 15.0 * 86_400.0).step_by(7) {
+            for pair in all_pairs(8) {
+                let limit_m = 31.3 * SPEED_OF_LIGHT_M_S / 10e6;
+                let near = schedule(31.3, 1).integrations(&array, window, pair);
+                let kept = schedule(0.0, 1).integrations(&array, window, pair).into_iter().filter(|one| {
+                    let t_s = window.start.plus_ticks(i64::from(one.offset_ticks)).seconds();
+                    let (i, j) = (usize::from(pair.i), usize::from(pair.j));
+                    norm(sub(array.position_m(i, t_s), array.position_m(j, t_s))) < limit_m
+                });
+                assert_eq!(near, kept.collect::<Vec<_>>(), "{pair} in window {}", window.index);
+            }
+        }
+    }
+
+    #[test]
+    fn estimates_are_close() {
+        let array = Array::new(&ArrayConfig::default()).unwrap();
+        let window = ObservingWindows::new(&array, 2e6, 3e6).next().unwrap();
+        for pair in all_pairs(5) {
+            let count = schedule(0.0, 1).integrations(&array, window, pair).len() as f64;
+            let (estimate, _) = schedule(0.0, 1).estimate(&array, window, pair);
+            // Whole integrations, and a baseline that changes by less than a percent in a window.
+            assert!((count - estimate).abs() <= 1.0 + 0.01 * count, "{pair}: {count} {estimate}");
+        }
     }
 }

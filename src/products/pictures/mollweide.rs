@@ -169,6 +169,11 @@ impl<'a> Painter<'a> {
         Self { field, scale, pixels }
     }
 
+    /// Whether one sample stands for a whole pixel of the page.
+    fn is_smooth(&self) -> bool {
+        self.pixels.is_none()
+    }
+
     fn colour(&self, direction: Vec3) -> Colour {
         match &self.pixels {
             Some(pixels) => pixels[pixel_of(self.field.nside, direction)],
@@ -201,17 +206,22 @@ fn paint_row(line: &mut [[f32; 3]], y: usize, ellipse: &Ellipse, painter: &Paint
             for sub_column in 0..SUPERSAMPLING {
                 let right = ((first + x) as f64 + inside(sub_column) - ellipse.x) / ellipse.half_height;
                 let Some(longitude) = parallel.longitude(right) else { continue };
+                *hits += 1.0;
+                if painter.is_smooth() && *hits > 1.0 {
+                    // Between pixel centres colours change less than from one pixel of the page to the next.
+                    continue;
+                }
                 let (sin, cos) = (longitude + centre).sin_cos();
                 let drawn = [parallel.cos_latitude * cos, parallel.cos_latitude * sin, parallel.sin_latitude];
                 let colour = painter.colour(view.rotation.map(|row| dot(row, drawn)));
                 sum.iter_mut().zip(colour).for_each(|(sum, c)| *sum += f32::from(c));
-                *hits += 1.0;
             }
         }
     }
     for (pixel, (sum, hits)) in line[first..].iter_mut().zip(sums) {
+        let share = if painter.is_smooth() { hits } else { 1.0 };
         for (pixel, sum) in pixel.iter_mut().zip(sum) {
-            *pixel = (*pixel * (all - hits) + sum) / all;
+            *pixel = (*pixel * (all - hits) + sum * share) / all;
         }
     }
 }
