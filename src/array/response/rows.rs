@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use multiversion::multiversion;
 
 use super::average::{Means, block_means};
-use super::blocks::{BlockClass, BlockSet, GROUP};
+use super::blocks::{BlockClass, BlockSet, GROUP, Group};
 use super::edge::cut_mean;
 use super::exact::{self, child_directions};
 use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused};
@@ -139,8 +139,8 @@ impl RowMaker {
                 to[..re.len()].copy_from_slice(&from[range.clone()]);
             }
             fringes(pair, &n, &mut values);
-            store(&values[0], factor, re);
-            store(&values[1], factor, im);
+            scale(&values[0], factor, re);
+            scale(&values[1], factor, im);
         }
     }
 
@@ -155,9 +155,15 @@ impl RowMaker {
             let (longest, per_side) = CLASSES[class];
             BlockClass::new(self.nside, per_side, longest / self.pixel_width_rad)
         });
-        for set in &blocks.sets {
-            fill_set(&prepared, set, factor, re, im);
+        // Sums over blocks are kept apart from what is written, which may be anything before.
+        let mut row = vec![[0.0_f32; GROUP]; 2 * re.len().div_ceil(GROUP)];
+        let (row_re, row_im) = row.as_flattened_mut().split_at_mut(re.len().next_multiple_of(GROUP));
+        sum_whole(&prepared, blocks, row_re, row_im);
+        for set in &blocks.finer {
+            add_finer(&prepared, set, row_re, row_im);
         }
+        scale(row_re, factor, re);
+        scale(row_im, factor, im);
     }
 
     /// Averages child by child in the fast path's precision.
@@ -181,37 +187,55 @@ impl RowMaker {
     }
 }
 
-/// Writes the pixels of one set of blocks.
-fn fill_set<R: RowValue>(pair: &Prepared, set: &BlockSet, factor: f64, re: &mut [R], im: &mut [R]) {
-    let per_pixel = set.per_pixel();
-    let factor = (factor / per_pixel as f64) as f32;
-    let mut means = Means::default();
-    let mut sum = [0.0_f32; 2];
-    let mut filled = 0;
-    let mut pixels = set.pixels.iter();
-    for group in &set.groups {
-        if block_means(pair, set.children, group, &mut means) {
-            for lane in 0..GROUP {
-                if means.cut[lane] != 0.0 {
-                    (means.re[lane], means.im[lane]) = cut_mean(pair, set.children, group, lane);
-                }
-            }
-        }
-        for (block_re, block_im) in means.re.iter().zip(&means.im) {
-            sum = [sum[0] + block_re, sum[1] + block_im];
-            filled += 1;
-            if filled == per_pixel {
-                // The last group's empty blocks belong to no pixel.
-                let Some(&pixel) = pixels.next() else { return };
-                re[pixel as usize] = R::of_f32(sum[0] * factor);
-                im[pixel as usize] = R::of_f32(sum[1] * factor);
-                (filled, sum) = (0, [0.0; 2]);
+/// Means over a group of blocks, cut or not.
+fn means_of_group(pair: &Prepared, children: usize, group: &Group, means: &mut Means) {
+    if block_means(pair, children, group, means) {
+        for lane in 0..GROUP {
+            if means.cut[lane] != 0.0 {
+                (means.re[lane], means.im[lane]) = cut_mean(pair, children, group, lane);
             }
         }
     }
 }
 
-fn store<R: RowValue>(values: &[f32; CHUNK], factor: f64, out: &mut [R]) {
+/// Sums the blocks of all pixels; a whole pixel counts 1.
+fn sum_whole(pair: &Prepared, class: &BlockClass, re: &mut [f32], im: &mut [f32]) {
+    let mut means = Means::default();
+    let per_pixel = class.per_side * class.per_side;
+    let pixels = GROUP / per_pixel;
+    let outputs = re.chunks_exact_mut(pixels).zip(im.chunks_exact_mut(pixels));
+    for (group, (re, im)) in class.whole.groups.iter().zip(outputs) {
+        means_of_group(pair, class.whole.children, group, &mut means);
+        average(&means.re, per_pixel, re);
+        average(&means.im, per_pixel, im);
+    }
+}
+
+/// Averages of `per_pixel` blocks after each other.
+fn average(blocks: &[f32; GROUP], per_pixel: usize, pixels: &mut [f32]) {
+    if per_pixel == 1 {
+        return pixels.copy_from_slice(blocks);
+    }
+    let share = 1.0 / per_pixel as f32;
+    for (pixel, blocks) in pixels.iter_mut().zip(blocks.chunks_exact(per_pixel)) {
+        *pixel = share * blocks.iter().sum::<f32>();
+    }
+}
+
+/// Adds the blocks that fill gaps.
+fn add_finer(pair: &Prepared, set: &BlockSet, re: &mut [f32], im: &mut [f32]) {
+    let mut means = Means::default();
+    let share = (set.children * set.children) as f32 / (CHILDREN * CHILDREN) as f32;
+    for (group, pixels) in set.groups.iter().zip(set.pixels.chunks(GROUP)) {
+        means_of_group(pair, set.children, group, &mut means);
+        for (lane, &pixel) in pixels.iter().enumerate() {
+            re[pixel as usize] += share * means.re[lane];
+            im[pixel as usize] += share * means.im[lane];
+        }
+    }
+}
+
+fn scale<R: RowValue>(values: &[f32], factor: f64, out: &mut [R]) {
     let factor = factor as f32;
     for (out, &value) in out.iter_mut().zip(values) {
         *out = R::of_f32(value * factor);
