@@ -67,7 +67,7 @@ fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {
     let read = |path: &std::path::PathBuf| {
         let prior = read_whole_map(path, &ReadOptions::default())?.to_ecliptic();
         let smooth = prior.smoothed(map.prior_fwhm_deg.to_radians())?;
-        Ok(smooth.degrade(map.nside)?.into_values())
+        Ok(smooth.resized(map.nside)?.into_values())
     };
     map.prior_files.iter().map(read).collect()
 }

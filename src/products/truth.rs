@@ -19,10 +19,7 @@ impl Truth {
     /// # Errors
     /// A sky that cannot be turned or resized.
     pub fn new(skies: &[SkyMap], nside: usize) -> Result<Self, MapError> {
-        let at_map_size = |sky: &SkyMap| {
-            let sky = sky.to_ecliptic();
-            if sky.nside() >= nside { sky.degrade(nside) } else { sky.upgrade(nside) }
-        };
+        let at_map_size = |sky: &SkyMap| sky.to_ecliptic().resized(nside);
         skies.iter().map(at_map_size).collect::<Result<_, _>>().map(Self)
     }
 

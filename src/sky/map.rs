@@ -124,6 +124,14 @@ impl SkyMap {
         Ok(Self { nside, frame: self.frame, values })
     }
 
+    /// The map at another nside: averaged or split, or as it is.
+    ///
+    /// # Errors
+    /// [`MapError::Nside`] unless `nside` is a power of two that maps may have.
+    pub fn resized(&self, nside: usize) -> Result<Self, MapError> {
+        if nside <= self.nside { self.degrade(nside) } else { self.upgrade(nside) }
+    }
+
     /// Every pixel split into its children, up to `nside`.
     ///
     /// # Errors
