@@ -109,11 +109,8 @@ impl<T: Real> PatternTable<T> {
             |(solver, orders_of_ring), (chunk, ring)| {
                 for (k, &u) in u.iter().enumerate() {
                     let half = half_separation(geometry, u);
-                    solver.solve(
-                        std::f64::consts::TAU * u * ring.sin_theta,
-                        ring.edge - half,
-                        orders_of_ring,
-                    );
+                    let edge = if ring.whole { ring.edge } else { ring.edge - half };
+                    solver.solve(std::f64::consts::TAU * u * ring.sin_theta, edge, orders_of_ring);
                     for (place, value) in chunk[k..].iter_mut().step_by(count).zip(&*orders_of_ring) {
                         *place = T::of(*value);
                     }
@@ -239,7 +236,7 @@ mod tests {
     /// More points change nothing: the points chosen suffice.
     #[test]
     fn quadrature_has_converged() {
-        for (l_max, u) in [(8, 3.0), (100, 0.0), (20, 60.0), (120, 30.0)] {
+        for (l_max, u) in [(8, 3.0), (60, 0.0), (12, 60.0), (50, 20.0)] {
             let (rings, weights) = ring_points(geometry(), l_max, u, 1);
             let (finer, finer_weights) = ring_points(geometry(), l_max, u, 2);
             let project = |rings: &[RingPoint], weights: &[f64], mu: usize| {
