@@ -162,7 +162,7 @@ fn window(count: usize, node: f64, phase: f64, u: f64, growth: f64) -> Vec<PairS
 
 #[test]
 fn visibilities_are_sums_over_directions() {
-    let sky = sky(24, 7);
+    let sky = sky(18, 7);
     let mut model = model(&sky, 40.0);
     for (u, growth) in [(0.0, 0.0), (3.3, 0.02), (12.0, -0.06), (39.0, 0.1)] {
         let mut states = window(200, 5.9, 2.3, u, growth);
@@ -170,7 +170,7 @@ fn visibilities_are_sums_over_directions() {
         let mut values = vec![Complex64::ZERO; states.len()];
         model.visibilities(&states, &mut values).expect("states in range");
         let rms = (values.iter().map(Complex64::norm_sqr).sum::<f64>() / values.len() as f64).sqrt();
-        let picked = [0, 77, 199, 201, 350];
+        let picked = [0, 77, 201];
         let mut square = 0.0;
         for k in picked {
             let expected = direct(&sky, &states[k]);

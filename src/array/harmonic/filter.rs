@@ -26,17 +26,18 @@ impl FilteredPatterns {
     /// Nodes that are needed beyond each end of what is wanted.
     pub(crate) const MARGIN: usize = REACH;
 
-    /// Filters every coefficient as a function of u; `response(u, f)` is what the component
-    /// `exp(2 pi i f k)` of node k is to be multiplied by, for f up to `band` cycles a node.
+    /// Filters every coefficient as a function of u: the component `exp(2 pi i f k)` of node k is
+    /// multiplied by `response(f) sinc(pi width(u) f)`, for f up to `band` cycles a node.
     pub(crate) fn new(
         mut table: PatternTable<f32>,
         band: f64,
-        response: impl Fn(f64, f64) -> f64 + Sync,
+        response: impl Fn(&[f64]) -> Vec<f64>,
+        width: impl Fn(f64) -> f64,
     ) -> Self {
         let from = table.grid();
         let count = from.count - 2 * REACH;
         let grid = NodeGrid { first: from.u(REACH), step: from.step, count };
-        let taps = fit(grid, band, response);
+        let taps = fit(grid, band, response, width);
         let l_max = table.l_max();
         let orders = table
             .orders_mut()
@@ -71,7 +72,12 @@ fn tap(values: &[f32], taps: &[f32; 2 * REACH + 1]) -> f32 {
 }
 
 /// Symmetric taps by least squares over the band; the rest of the spectrum is left free.
-fn fit(grid: NodeGrid, band: f64, response: impl Fn(f64, f64) -> f64) -> Vec<[f32; 2 * REACH + 1]> {
+fn fit(
+    grid: NodeGrid,
+    band: f64,
+    response: impl Fn(&[f64]) -> Vec<f64>,
+    width: impl Fn(f64) -> f64,
+) -> Vec<[f32; 2 * REACH + 1]> {
     let samples = SAMPLES_PER_TAP * REACH;
     // Chebyshev-spaced, so that the ends of the band fit as well as its middle.
     let frequency = |k: usize| band * (std::f64::consts::PI * (k as f64 + 0.5) / (2 * samples) as f64).cos();
@@ -79,7 +85,13 @@ fn fit(grid: NodeGrid, band: f64, response: impl Fn(f64, f64) -> f64) -> Vec<[f3
         let wave = (std::f64::consts::TAU * frequency(k) * j as f64).cos();
         if j == 0 { 1.0 } else { 2.0 * wave }
     });
-    let wanted = Mat::from_fn(samples, grid.count, |k, node| response(grid.u(node), frequency(k)));
+    let frequencies: Vec<f64> = (0..samples).map(frequency).collect();
+    let response = response(&frequencies);
+    let wanted = Mat::from_fn(samples, grid.count, |k, node| {
+        let phase = std::f64::consts::PI * width(grid.u(node)) * frequencies[k];
+        let mean = if phase.abs() < 1e-8 { 1.0 } else { phase.sin() / phase };
+        response[k] * mean
+    });
     let solution = basis.qr().solve_lstsq(&wanted);
     (0..grid.count).map(|node| std::array::from_fn(|j| solution[(j.abs_diff(REACH), node)] as f32)).collect()
 }

@@ -62,33 +62,32 @@ pub(crate) fn project(
     offsets: &[usize],
 ) -> Vec<f32> {
     let mut out = vec![0.0; 4 * ORDER_LANES * offsets[plans.len()]];
-    let mut turned = Vec::new();
     let count = 2 * patterns.grid.count;
-    for group in groups {
-        let width = 2 * group.alphas.len();
-        let first_l = block.order(0);
-        turn(block, l_max, skies, group, &mut turned);
-        let rows = (l_max - first_l) / 2 + 1;
-        for lane in 0..ORDER_LANES {
-            let mu = block.order(lane);
-            if mu > l_max {
-                break;
-            }
-            let sky = &turned[(lane * rows + lane) * width..(lane + 1) * rows * width];
-            let pattern = patterns.order(mu);
+    let rows = (l_max - block.order(0)) / 2 + 1;
+    let turned: Vec<Vec<f32>> = groups.iter().map(|group| turn(block, l_max, skies, group)).collect();
+    // Order by order: the patterns of one stay in the cache while all runs pass.
+    for lane in 0..ORDER_LANES {
+        let mu = block.order(lane);
+        if mu > l_max {
+            break;
+        }
+        let pattern = patterns.order(mu);
+        for (group, turned) in groups.iter().zip(&turned) {
+            let alphas = group.alphas.len();
+            let sky = &turned[(lane * rows + lane) * 2 * alphas..(lane + 1) * rows * 2 * alphas];
             for &run in &group.runs {
                 let plan = &plans[run];
                 let from = &pattern[2 * plan.first_node..];
-                let products = match group.alphas.len() {
-                    1 => products::<2>(sky, from, count),
-                    2 => products::<4>(sky, from, count),
-                    3 => products::<6>(sky, from, count),
-                    4 => products::<8>(sky, from, count),
-                    5 => products::<10>(sky, from, count),
-                    _ => products::<12>(sky, from, count),
+                let products = match alphas {
+                    1 => products::<2, 0>(sky, from, count),
+                    2 => products::<4, 0>(sky, from, count),
+                    3 => products::<4, 2>(sky, from, count),
+                    4 => products::<4, 4>(sky, from, count),
+                    5 => products::<6, 4>(sky, from, count),
+                    _ => products::<6, 6>(sky, from, count),
                 };
                 let place = 4 * (offsets[run] * ORDER_LANES + lane);
-                reduce(&products, group.alphas.len(), plan, &mut out[place..]);
+                reduce(&products, alphas, plan, &mut out[place..]);
             }
         }
     }
@@ -96,12 +95,11 @@ pub(crate) fn project(
 }
 
 /// The rotated sky at a group's alphas, `[lane][l][alpha][re, im]`, l from the block's first order in steps of 2.
-fn turn(block: OrderBlock, l_max: usize, skies: &[RotatedSky<f32>], group: &Group, out: &mut Vec<f32>) {
+fn turn(block: OrderBlock, l_max: usize, skies: &[RotatedSky<f32>], group: &Group) -> Vec<f32> {
     let first_l = block.order(0);
     let rows = (l_max - first_l) / 2 + 1;
     let width = 2 * group.alphas.len();
-    out.clear();
-    out.resize(ORDER_LANES * rows * width, 0.0);
+    let mut out = vec![0.0; ORDER_LANES * rows * width];
     for row in 0..rows {
         let l = first_l + 2 * row;
         let stride = orders(l);
@@ -117,6 +115,7 @@ fn turn(block: OrderBlock, l_max: usize, skies: &[RotatedSky<f32>], group: &Grou
             }
         }
     }
+    out
 }
 
 /// `sum_k weights[k] values[k stride + lane]`.
@@ -138,28 +137,47 @@ fn combine(values: &[f32], stride: usize, lanes: usize, weights: &[f32]) -> [f32
     sums
 }
 
-/// `sum_l sky[l][r] pattern[l][lane]`, unused r zero.
+/// `sums + factor values`, lane by lane; by value, so that the sums stay in a register.
+#[inline(always)]
+fn add_scaled(
+    sums: [f32; PATTERN_LANES],
+    factor: f32,
+    values: &[f32; PATTERN_LANES],
+) -> [f32; PATTERN_LANES] {
+    let mut out = sums;
+    for (out, value) in out.iter_mut().zip(values) {
+        *out = factor.mul_add(*value, *out);
+    }
+    out
+}
+
+/// `sum_l sky[l][r] pattern[l][lane]` for r < A + B, the rest zero.
+///
+/// Two short arrays instead of a long one: loops over eight sums are turned into gathers and scatters
+/// instead of being unrolled.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
-fn products<const R: usize>(
+fn products<const A: usize, const B: usize>(
     sky: &[f32],
     pattern: &[f32],
     stride: usize,
 ) -> [[f32; PATTERN_LANES]; 2 * ALPHAS_MAX] {
-    let mut sums = [[0.0_f32; PATTERN_LANES]; R];
-    for (row, sky) in sky.chunks_exact(R).enumerate() {
+    let mut first = [[0.0_f32; PATTERN_LANES]; A];
+    let mut second = [[0.0_f32; PATTERN_LANES]; B];
+    for (row, sky) in sky.chunks_exact(A + B).enumerate() {
         let start = row * stride;
-        let Ok(sky) = <&[f32; R]>::try_from(sky) else { continue };
         let Ok(values) = <&[f32; PATTERN_LANES]>::try_from(&pattern[start..start + PATTERN_LANES]) else {
             continue;
         };
-        for r in 0..R {
-            for lane in 0..PATTERN_LANES {
-                sums[r][lane] = sky[r].mul_add(values[lane], sums[r][lane]);
-            }
+        for (sums, factor) in first.iter_mut().zip(sky) {
+            *sums = add_scaled(*sums, *factor, values);
+        }
+        for (sums, factor) in second.iter_mut().zip(&sky[A..]) {
+            *sums = add_scaled(*sums, *factor, values);
         }
     }
     let mut out = [[0.0; PATTERN_LANES]; 2 * ALPHAS_MAX];
-    out[..R].copy_from_slice(&sums);
+    out[..A].copy_from_slice(&first);
+    out[A..A + B].copy_from_slice(&second);
     out
 }
 

@@ -16,7 +16,8 @@ pub(crate) struct Legendre {
 
 impl Legendre {
     /// For `l <= l_max` at the colatitudes with these cosines and sines.
-    pub(crate) fn new(l_max: usize, z: Vec<f64>, sin_theta: &[f64]) -> Self {
+    pub(crate) fn new(l_max: usize, points: impl Iterator<Item = (f64, f64)>) -> Self {
+        let (z, ln_sin) = points.map(|(z, sin_theta)| (z, sin_theta.ln())).unzip();
         let mut ln_product = 0.0;
         let ln_first = (0..=l_max)
             .map(|mu| {
@@ -26,12 +27,13 @@ impl Legendre {
                 0.5 * (((2 * mu + 1) as f64 / (4.0 * std::f64::consts::PI)).ln() + ln_product)
             })
             .collect();
-        Self { z, ln_sin: sin_theta.iter().map(|s| s.ln()).collect(), ln_first, l_max }
+        Self { z, ln_sin, ln_first, l_max }
     }
 
-    /// `weight(theta) lambda_{l mu}(theta)` for l = mu, mu + 2, .. <= l_max: a row of all colatitudes each.
+    /// `weight(theta) lambda_{l mu}(theta)` for l = mu, mu + 2, .. <= l_max: a row of the first colatitudes
+    /// each, as many as there are weights.
     pub(crate) fn even_rows<T: Real>(&self, mu: usize, weights: &[f64]) -> Vec<T> {
-        let points = self.z.len();
+        let points = weights.len().min(self.z.len());
         let mut rows = Vec::with_capacity(points * ((self.l_max - mu) / 2 + 1));
         let sign = if mu % 2 == 0 { 1.0 } else { -1.0 };
         let mut lanes = Lanes {
@@ -58,7 +60,7 @@ impl Legendre {
                 } else {
                     ((twice + 1.0) / (twice - 3.0) * square(l - 1) * above).sqrt()
                 };
-                step(forward, behind, &self.z, &mut lanes);
+                step(forward, behind, &self.z[..points], &mut lanes);
             }
             if (l - mu) % 2 == 0 {
                 rows.extend(lanes.value.iter().zip(weights).map(|(v, w)| T::of(v * w)));

@@ -163,11 +163,12 @@ impl HarmonicModel {
         let table = PatternTable::new(settings.geometry, l_max, grid);
         // exp(-2 pi i u n_y): |f| = |n_y| / density; the kernel's transform is divided out, and the
         // mean over the channel multiplies by a sinc.
-        let patterns = FilteredPatterns::new(table, 1.002 * step, |u, f| {
-            let phase = std::f64::consts::PI * u * settings.fractional_bandwidth * f / step;
-            let mean = if phase.abs() < 1e-8 { 1.0 } else { phase.sin() / phase };
-            mean / u_kernel.transform(f)
-        });
+        let patterns = FilteredPatterns::new(
+            table,
+            1.002 * step,
+            |f| u_kernel.transforms(f).iter().map(|t| 1.0 / t).collect(),
+            |u| u * settings.fractional_bandwidth / step,
+        );
         let gamma = PeriodicGrid::new(l_max, settings.tolerance);
         Ok(Self {
             settings,

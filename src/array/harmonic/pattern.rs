@@ -102,32 +102,35 @@ impl<T: Real> PatternTable<T> {
         let u_max = u.iter().fold(0.0_f64, |a, b| a.max(b.abs()));
         let (rings, weights) = ring_points(geometry, l_max, u_max, 1);
         let orders = 2 * l_max + 1;
-        let solver = RingSolver::new(l_max, std::f64::consts::TAU * u_max);
+        let solver = RingSolver::new(std::f64::consts::TAU * u_max);
         let mut coefficients = vec![T::default(); rings.len() * orders * count];
         coefficients.par_chunks_mut(orders * count).zip(&rings).for_each_init(
             || (solver.clone(), vec![0.0; orders]),
             |(solver, orders_of_ring), (chunk, ring)| {
+                let reach = ring.orders(l_max);
+                let orders_of_ring = &mut orders_of_ring[..2 * reach + 1];
+                let chunk = &mut chunk[(l_max - reach) * count..];
                 for (k, &u) in u.iter().enumerate() {
                     let half = half_separation(geometry, u);
                     let edge = if ring.whole { ring.edge } else { ring.edge - half };
                     solver.solve(std::f64::consts::TAU * u * ring.sin_theta, edge, orders_of_ring);
-                    for (place, value) in chunk[k..].iter_mut().step_by(count).zip(&*orders_of_ring) {
+                    for (place, value) in chunk[k..].iter_mut().step_by(count).zip(orders_of_ring.iter()) {
                         *place = T::of(*value);
                     }
                 }
             },
         );
-        let sines: Vec<f64> = rings.iter().map(|ring| ring.sin_theta).collect();
-        let legendre = Legendre::new(l_max, rings.iter().map(|ring| ring.z).collect(), &sines);
+        let legendre = Legendre::new(l_max, rings.iter().map(|ring| (ring.z, ring.sin_theta)));
         self.blocks.par_iter_mut().enumerate().for_each(|(mu, block)| {
-            let rows = legendre.even_rows::<T>(mu, &weights);
-            let lambda = MatRef::from_column_major_slice(&rows, rings.len(), degrees(l_max, mu));
+            let reached = rings.partition_point(|ring| ring.orders(l_max) >= mu);
+            let rows = legendre.even_rows::<T>(mu, &weights[..reached]);
+            let lambda = MatRef::from_column_major_slice(&rows, reached, degrees(l_max, mu));
             let mut out = MatMut::from_column_major_slice_mut(block, 2 * grid.count, degrees(l_max, mu));
             for (sign, order) in [(0, l_max + mu), (1, l_max - mu)] {
                 let ring = MatRef::from_column_major_slice_with_stride(
                     &coefficients[order * count..],
                     count,
-                    rings.len(),
+                    reached,
                     orders * count,
                 );
                 let out = out.as_mut().subrows_mut(sign * grid.count + first, count);
@@ -184,8 +187,17 @@ struct RingPoint {
     whole: bool,
 }
 
-/// Rings of the northern half and their weights (both halves and the antennas' response included),
-/// for degrees up to `l_max` and |u| up to `u_max`; `refine` multiplies the number of points.
+impl RingPoint {
+    /// The greatest order whose Legendre functions of degree `l_max` are not negligible here: beyond
+    /// l sin(theta) they fall off like Airy functions, whose width is the cube root's.
+    fn orders(&self, l_max: usize) -> usize {
+        let turning = l_max as f64 * self.sin_theta;
+        l_max.min((turning + 8.0 * turning.cbrt()) as usize + 8)
+    }
+}
+
+/// Rings of the northern half, equator first, and their weights (both halves and the antennas' response
+/// included), for degrees up to `l_max` and |u| up to `u_max`; `refine` multiplies the number of points.
 fn ring_points(
     geometry: PatternGeometry,
     l_max: usize,
@@ -200,13 +212,6 @@ fn ring_points(
         AntennaResponse::DipoleNormal => 1.0 - z * z,
     };
     let (mut rings, mut weights) = (Vec::new(), Vec::new());
-    let whole = cos_limb.asin();
-    let rule = GaussLegendre::new(refine * GaussLegendre::points_for(0.5 * whole * wave_number));
-    for (t, w) in rule.abscissae.iter().zip(&rule.weights) {
-        let (sin_theta, z) = (whole * t).sin_cos();
-        rings.push(RingPoint { z, sin_theta, edge: std::f64::consts::PI, whole: true });
-        weights.push(2.0 * w * whole * sin_theta * response(z));
-    }
     let quarter = std::f64::consts::FRAC_PI_2;
     let omega = 0.5 * quarter * sin_limb * wave_number;
     let rule = GaussLegendre::new(refine * GaussLegendre::points_for(omega));
@@ -216,6 +221,13 @@ fn ring_points(
         let sin_theta = (1.0 - z * z).sqrt();
         rings.push(RingPoint { z, sin_theta, edge: (sin_limb * cos_chi).atan2(-cos_limb), whole: false });
         weights.push(2.0 * w * quarter * sin_limb * cos_chi * response(z));
+    }
+    let whole = cos_limb.asin();
+    let rule = GaussLegendre::new(refine * GaussLegendre::points_for(0.5 * whole * wave_number));
+    for (t, w) in rule.abscissae.iter().zip(&rule.weights).rev() {
+        let (sin_theta, z) = (whole * t).sin_cos();
+        rings.push(RingPoint { z, sin_theta, edge: std::f64::consts::PI, whole: true });
+        weights.push(2.0 * w * whole * sin_theta * response(z));
     }
     (rings, weights)
 }
@@ -240,9 +252,8 @@ mod tests {
             let (rings, weights) = ring_points(geometry(), l_max, u, 1);
             let (finer, finer_weights) = ring_points(geometry(), l_max, u, 2);
             let project = |rings: &[RingPoint], weights: &[f64], mu: usize| {
-                let mut solver = RingSolver::new(l_max, 400.0);
-                let sines: Vec<f64> = rings.iter().map(|ring| ring.sin_theta).collect();
-                let legendre = Legendre::new(l_max, rings.iter().map(|ring| ring.z).collect(), &sines);
+                let mut solver = RingSolver::new(400.0);
+                let legendre = Legendre::new(l_max, rings.iter().map(|ring| (ring.z, ring.sin_theta)));
                 let rows = legendre.even_rows::<f64>(mu, weights);
                 let mut orders = vec![0.0; 2 * l_max + 1];
                 let mut sums = vec![0.0; rows.len() / rings.len()];

@@ -36,15 +36,17 @@ pub(crate) struct RingSolver {
 const RULE_STEP: usize = 16;
 
 impl RingSolver {
-    /// For orders |mu| <= `order_max` and |x| <= `x_max`.
-    pub(crate) fn new(order_max: usize, x_max: f64) -> Self {
+    /// For |x| <= `x_max`.
+    pub(crate) fn new(x_max: f64) -> Self {
         let points = GaussLegendre::points_for(0.5 * PI * x_max.abs());
         let rules = (0..=points / RULE_STEP + 1).map(|k| GaussLegendre::new(RULE_STEP * k.max(1))).collect();
-        Self { rules: std::sync::Arc::new(rules), order_max, ratio: Vec::new(), values: Vec::new() }
+        Self { rules: std::sync::Arc::new(rules), order_max: 0, ratio: Vec::new(), values: Vec::new() }
     }
 
-    /// Writes `I_mu`, mu = -order_max ..= order_max, for a ring visible at |psi| <= `edge` <= pi.
+    /// Writes `I_mu`, mu = -order_max ..= order_max, for a ring visible at |psi| <= `edge` <= pi;
+    /// `out` has room for these `2 order_max + 1`.
     pub(crate) fn solve(&mut self, x: f64, edge: f64, out: &mut [f64]) {
+        self.order_max = out.len() / 2;
         let centre = self.order_max;
         let edge = edge.clamp(0.0, PI);
         let start = self.start(x.abs(), edge);
@@ -155,7 +157,7 @@ mod tests {
     #[test]
     fn coefficients_are_the_integrals() {
         let order_max = 40;
-        let mut solver = RingSolver::new(order_max, 210.0);
+        let mut solver = RingSolver::new(210.0);
         let mut out = vec![0.0; 2 * order_max + 1];
         for x in [0.0, 1e-9, 0.3, 1.0, 2.5, 17.3, 37.0, 40.0, 41.2, 75.0, 200.0, -13.0, -80.0] {
             for edge in [1e-4, 0.7, 1.9, 2.1, 3.0, PI] {
