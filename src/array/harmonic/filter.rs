@@ -3,6 +3,7 @@
 use faer::Mat;
 use faer::prelude::*;
 
+use super::Real;
 use super::pattern::{NodeGrid, PatternTable, degrees};
 use rayon::prelude::*;
 
@@ -68,7 +69,8 @@ impl FilteredPatterns {
 
 #[inline]
 fn tap(values: &[f32], taps: &[f32; 2 * REACH + 1]) -> f32 {
-    values.iter().zip(taps).map(|(v, t)| v * t).sum()
+    let sum: f32 = values.iter().zip(taps).map(|(v, t)| v * t).sum();
+    f32::entry(f64::from(sum))
 }
 
 /// Symmetric taps by least squares over the band; the rest of the spectrum is left free.

@@ -63,7 +63,7 @@ impl Legendre {
                 step(forward, behind, &self.z[..points], &mut lanes);
             }
             if (l - mu) % 2 == 0 {
-                rows.extend(lanes.value.iter().zip(weights).map(|(v, w)| T::of(v * w)));
+                rows.extend(lanes.value.iter().zip(weights).map(|(v, w)| T::entry(v * w)));
             }
         }
         rows

@@ -115,7 +115,7 @@ impl<T: Real> PatternTable<T> {
                     let edge = if ring.whole { ring.edge } else { ring.edge - half };
                     solver.solve(std::f64::consts::TAU * u * ring.sin_theta, edge, orders_of_ring);
                     for (place, value) in chunk[k..].iter_mut().step_by(count).zip(orders_of_ring.iter()) {
-                        *place = T::of(*value);
+                        *place = T::entry(*value);
                     }
                 }
             },

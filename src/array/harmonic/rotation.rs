@@ -64,10 +64,10 @@ fn folded_rows<T: Real>(wigner: &WignerTable, mu: usize) -> Vec<T> {
             continue;
         }
         for sign in [1.0, -1.0] {
-            folded.push(T::of(row[l]));
+            folded.push(T::entry(row[l]));
             for m in 1..=l {
                 let parity = if m % 2 == 0 { sign } else { -sign };
-                folded.push(T::of(row[l + m] + parity * row[l - m]));
+                folded.push(T::entry(row[l + m] + parity * row[l - m]));
             }
         }
     }
