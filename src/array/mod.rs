@@ -12,6 +12,7 @@ mod orbit;
 mod placing;
 mod windows;
 
+pub mod harmonic;
 pub mod response;
 
 pub use config::{ArrayConfig, ArrayError, BreathingConfig, NodeMotion};

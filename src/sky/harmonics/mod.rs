@@ -8,8 +8,11 @@ mod lanes;
 mod recurrence;
 mod rings;
 mod transform;
+pub(crate) mod scaled;
+mod wigner;
 
 pub use analysis::{Analysis, AnalysisOptions, Method, analysis, synthesis};
 pub use coefficients::Alm;
 pub use error::HarmonicsError;
 pub use transform::{L_MAX, Transform};
+pub use wigner::{WignerRows, WignerTable, wigner_d};

@@ -1,0 +1,258 @@
+//! One batch of runs, from groups of common alphas to visibilities.
+
+use std::f64::consts::{FRAC_PI_2, TAU};
+
+use num_complex::{Complex32, Complex64};
+use rayon::prelude::*;
+
+use super::PairState;
+use super::chebyshev;
+use super::forward::{
+    ALPHAS_MAX, AlphaNode, Group, ORDER_LANES, OrderBlock, PATTERN_LANES, RunPlan, project,
+};
+use super::kernel::LANES;
+use super::model::{ALPHA_TOLERANCE, HarmonicModel, TERMS};
+use super::rotation::orders;
+use super::runs::Run;
+
+/// Alphas of the grid for which the sky is turned at once.
+pub(super) const ALPHA_BLOCK: usize = 48;
+/// Blocks of alphas that are kept, and most that a batch may use.
+pub(super) const BLOCKS_KEPT: usize = 4;
+/// Most runs of a batch; bounds its memory.
+const RUNS_AT_ONCE: usize = 256;
+/// Alphas that groups of several runs aim at.
+const ALPHAS_AIMED_AT: usize = 4;
+
+/// Groups of runs and how to evaluate them. Runs are numbered in the order of the batch.
+pub(super) struct Batch {
+    runs: Vec<Run>,
+    groups: Vec<Group>,
+    plans: Vec<RunPlan>,
+    blocks: Vec<usize>,
+}
+
+/// A stretch of alpha that a group covers.
+#[derive(Clone, Copy)]
+struct Stretch {
+    low: f64,
+    high: f64,
+}
+
+impl Batch {
+    /// As many of the runs `order` (sorted by alpha) as make a batch, and their number.
+    pub(super) fn new(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (Self, usize) {
+        let mut batch = Self { runs: Vec::new(), groups: Vec::new(), plans: Vec::new(), blocks: Vec::new() };
+        let mut taken = 0;
+        while taken < order.len() && taken < RUNS_AT_ONCE {
+            let (stretch, count) = group(model, runs, &order[taken..]);
+            let (group, needs) = batch.alphas(model, stretch);
+            if needs.len() > BLOCKS_KEPT && taken > 0 {
+                break;
+            }
+            batch.blocks = needs;
+            let mut group = group;
+            for &run in &order[taken..taken + count] {
+                group.runs.push(batch.runs.len());
+                batch.plans.push(plan(model, &runs[run], stretch, group.alphas.len()));
+                batch.runs.push(runs[run]);
+            }
+            batch.groups.push(group);
+            taken += count;
+        }
+        (batch, taken)
+    }
+
+    /// A group's alphas, and the blocks that the batch needs with them.
+    fn alphas(&self, model: &HarmonicModel, stretch: Stretch) -> (Group, Vec<usize>) {
+        let mut needs = self.blocks.clone();
+        let half = 0.5 * (stretch.high - stretch.low);
+        let terms = alpha_terms(model, half);
+        let per_radian = model.alpha.count as f64 / TAU;
+        let alphas = chebyshev::points(terms)
+            .into_iter()
+            .map(|t| {
+                let x = (0.5 * (stretch.high + stretch.low) + half * t).rem_euclid(TAU) * per_radian;
+                let (first, lanes) = model.alpha.kernel.spread(x);
+                let first = first.rem_euclid(model.alpha.count as i64) as usize;
+                let block = first / ALPHA_BLOCK;
+                if !needs.contains(&block) {
+                    needs.push(block);
+                }
+                AlphaNode {
+                    block,
+                    first: first % ALPHA_BLOCK,
+                    weights: lanes[..model.alpha.kernel.width()].to_vec(),
+                }
+            })
+            .collect();
+        (Group { alphas, runs: Vec::new() }, needs)
+    }
+}
+
+/// Alphas that carry a stretch of this half width.
+fn alpha_terms(model: &HarmonicModel, half: f64) -> usize {
+    let tolerance = ALPHA_TOLERANCE * model.settings().tolerance;
+    let h = half * model.sky.l_max() as f64;
+    chebyshev::terms_for(h, tolerance).unwrap_or(ALPHAS_MAX).min(ALPHAS_MAX)
+}
+
+/// The runs at the head of `order` that share alphas, and the stretch they cover.
+fn group(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (Stretch, usize) {
+    let reach = chebyshev::reach(ALPHAS_AIMED_AT, ALPHA_TOLERANCE * model.settings().tolerance)
+        / model.sky.l_max().max(1) as f64;
+    let stretch = |k: usize| {
+        let run = &runs[k];
+        let middle = (run.node[0] - FRAC_PI_2).rem_euclid(TAU);
+        Stretch { low: middle - run.node[1].abs(), high: middle + run.node[1].abs() }
+    };
+    let mut whole = stretch(order[0]);
+    let mut count = 1;
+    for &k in order[1..].iter().take(RUNS_AT_ONCE / 4) {
+        let next = stretch(k);
+        let joined = Stretch { low: whole.low.min(next.low), high: whole.high.max(next.high) };
+        if joined.high - joined.low > 2.0 * reach {
+            break;
+        }
+        whole = joined;
+        count += 1;
+    }
+    (whole, count)
+}
+
+/// Where a run's Chebyshev coefficients come from.
+fn plan(model: &HarmonicModel, run: &Run, stretch: Stretch, alphas: usize) -> RunPlan {
+    let tolerance = model.settings().tolerance;
+    let drift = TAU * run.u[1].abs() + model.sky.l_max() as f64 * run.node[1].abs();
+    let terms = chebyshev::terms_for(drift, tolerance).unwrap_or(TERMS).min(TERMS);
+    let grid = model.patterns.grid;
+    let node = |u: f64| (u - grid.first) / grid.step;
+    let lowest = node(run.u[0] - run.u[1].abs());
+    let first_node = (lowest - 0.5 * model.u_kernel.width() as f64).ceil().max(0.0);
+    let middle = 0.5 * (stretch.high + stretch.low);
+    let half = (0.5 * (stretch.high - stretch.low)).max(1e-300);
+    let run_middle = (run.node[0] - FRAC_PI_2).rem_euclid(TAU);
+    let mut weights = vec![[0.0_f64; PATTERN_LANES]; terms * alphas];
+    let analysis = chebyshev::analysis(terms);
+    for (k, tau) in chebyshev::points(terms).into_iter().enumerate() {
+        let u = node(run.u[0] + run.u[1] * tau) - first_node;
+        let at = ((run_middle + run.node[1] * tau - middle) / half).clamp(-1.0, 1.0);
+        for (a, lagrange) in chebyshev::lagrange(alphas, at).into_iter().enumerate() {
+            for (n, row) in analysis.iter().enumerate() {
+                for (lane, weight) in weights[n * alphas + a].iter_mut().enumerate() {
+                    *weight += row[k] * lagrange * model.u_kernel.value((lane / 2) as f64 - u);
+                }
+            }
+        }
+    }
+    let weights = weights.into_iter().map(|row| row.map(|w| w as f32)).collect();
+    RunPlan { first_node: first_node as usize, terms, weights }
+}
+
+impl HarmonicModel {
+    /// The visibilities of each run of a batch.
+    pub(super) fn evaluate(&mut self, states: &[PairState], batch: &Batch) -> Vec<Vec<Complex64>> {
+        self.turn_sky(&batch.blocks);
+        let l_max = self.sky.l_max();
+        let groups: Vec<Group> = batch.groups.iter().map(|group| self.located(group)).collect();
+        let mut offsets = vec![0];
+        for plan in &batch.plans {
+            offsets.push(offsets[offsets.len() - 1] + plan.terms);
+        }
+        let tasks: Vec<OrderBlock> = (0..orders(l_max))
+            .step_by(ORDER_LANES)
+            .flat_map(|first| [0, 1].map(|parity| OrderBlock { parity, first }))
+            .filter(|block| block.order(0) <= l_max)
+            .collect();
+        let projected: Vec<Vec<f32>> = tasks
+            .par_iter()
+            .map(|&task| {
+                let tables = (&self.skies[..], &self.patterns);
+                project(task, l_max, tables, (&groups, &batch.plans), &offsets)
+            })
+            .collect();
+        batch
+            .runs
+            .par_iter()
+            .zip(&batch.plans)
+            .enumerate()
+            .map(|(k, (run, plan))| {
+                let rows = self.rows(&tasks, &projected, offsets[k], plan.terms, run.span);
+                self.sample(&rows, plan.terms, run, &states[run.first..run.first + run.len])
+            })
+            .collect()
+    }
+
+    /// A group with its blocks' places among the skies that are at hand.
+    fn located(&self, group: &Group) -> Group {
+        let mut group = group.clone();
+        for alpha in &mut group.alphas {
+            alpha.block = self.blocks.iter().position(|b| *b == alpha.block).unwrap_or_default();
+        }
+        group
+    }
+
+    /// Chebyshev coefficients on the grid in gamma: a row a term, its first values repeated at its end.
+    fn rows(
+        &self,
+        tasks: &[OrderBlock],
+        projected: &[Vec<f32>],
+        offset: usize,
+        terms: usize,
+        span: f64,
+    ) -> Vec<Complex32> {
+        let (l_max, count) = (self.sky.l_max(), self.gamma.count);
+        let mut rows = vec![Complex32::ZERO; terms * (count + LANES)];
+        let mut scratch = vec![Complex32::ZERO; self.fft.get_inplace_scratch_len()];
+        for (term, row) in rows.chunks_exact_mut(count + LANES).enumerate() {
+            for (task, values) in tasks.iter().zip(projected) {
+                let place = 4 * ORDER_LANES * (offset + term);
+                let lanes = values[place..place + 4 * ORDER_LANES].chunks_exact(4);
+                for (lane, value) in lanes.enumerate() {
+                    let mu = task.order(lane);
+                    if mu > l_max {
+                        break;
+                    }
+                    let factor = (self.gamma.correction[mu] * sinc(0.5 * mu as f64 * span)) as f32;
+                    row[mu] = Complex32::new(value[0], value[1]) * factor;
+                    if mu > 0 {
+                        row[count - mu] = Complex32::new(value[2], -value[3]) * factor;
+                    }
+                }
+            }
+            let (circle, repeated) = row.split_at_mut(count);
+            self.fft.process_with_scratch(circle, &mut scratch);
+            repeated.copy_from_slice(&circle[..LANES]);
+        }
+        rows
+    }
+
+    /// The visibilities of a run's states from its rows.
+    fn sample(&self, rows: &[Complex32], terms: usize, run: &Run, states: &[PairState]) -> Vec<Complex64> {
+        let count = self.gamma.count;
+        let per_radian = count as f64 / TAU;
+        states
+            .iter()
+            .map(|state| {
+                let x = (state.phase_rad + FRAC_PI_2) * per_radian;
+                let (first, lanes) = self.gamma.kernel.spread(x);
+                let first = first.rem_euclid(count as i64) as usize;
+                let polynomials = chebyshev::polynomials(terms, run.tau(state.phase_rad));
+                let mut sums = [Complex32::ZERO; LANES];
+                for (row, t) in rows.chunks_exact(count + LANES).zip(polynomials) {
+                    let t = t as f32;
+                    for (sum, value) in sums.iter_mut().zip(&row[first..first + LANES]) {
+                        *sum += value * t;
+                    }
+                }
+                let total: Complex32 = sums.iter().zip(lanes).map(|(s, w)| s * w).sum();
+                Complex64::new(f64::from(total.re), f64::from(total.im))
+            })
+            .collect()
+    }
+}
+
+/// sin(x) / x.
+fn sinc(x: f64) -> f64 {
+    if x.abs() < 1e-8 { 1.0 } else { x.sin() / x }
+}

@@ -1,0 +1,99 @@
+//! Linear filters along the nodes.
+
+use faer::Mat;
+use faer::prelude::*;
+
+use super::Real;
+use super::pattern::{NodeGrid, PatternTable, degrees};
+use rayon::prelude::*;
+
+/// Taps on each side of a node.
+const REACH: usize = 10;
+/// Frequencies at which a filter is fitted, a tap.
+const SAMPLES_PER_TAP: usize = 12;
+
+/// Patterns after a symmetric filter along the nodes, signs interleaved for the forward kernel.
+#[derive(Clone, Debug)]
+pub(crate) struct FilteredPatterns {
+    pub(crate) grid: NodeGrid,
+    /// By mu: for l = mu, mu + 2, ..: `f_{l,mu}` and `(-1)^mu f_{l,-mu}` of node after node; padding at the end.
+    orders: Vec<Vec<f32>>,
+}
+
+/// Floats after the last row, so that a full vector may be read from any node.
+const PADDING: usize = 32;
+
+impl FilteredPatterns {
+    /// Nodes that are needed beyond each end of what is wanted.
+    pub(crate) const MARGIN: usize = REACH;
+
+    /// Filters every coefficient as a function of u: the component `exp(2 pi i f k)` of node k is
+    /// multiplied by `response(f) sinc(pi width(u) f)`, for f up to `band` cycles a node.
+    pub(crate) fn new(
+        mut table: PatternTable<f32>,
+        band: f64,
+        response: impl Fn(&[f64]) -> Vec<f64>,
+        width: impl Fn(f64) -> f64,
+    ) -> Self {
+        let from = table.grid();
+        let count = from.count - 2 * REACH;
+        let grid = NodeGrid { first: from.u(REACH), step: from.step, count };
+        let taps = fit(grid, band, response, width);
+        let l_max = table.l_max();
+        let orders = table
+            .orders_mut()
+            .par_iter_mut()
+            .enumerate()
+            .map(|(mu, rows)| {
+                let rows = std::mem::take(rows);
+                let mut out = Vec::with_capacity(2 * count * degrees(l_max, mu) + PADDING);
+                for row in rows.chunks_exact(2 * from.count) {
+                    let (plus, minus) = row.split_at(from.count);
+                    for (k, taps) in taps.iter().enumerate() {
+                        out.push(tap(&plus[k..=k + 2 * REACH], taps));
+                        out.push(tap(&minus[k..=k + 2 * REACH], taps));
+                    }
+                }
+                out.resize(out.len() + PADDING, 0.0);
+                out
+            })
+            .collect();
+        Self { grid, orders }
+    }
+
+    /// Rows of order mu: `2 count` values for each l = mu, mu + 2, .., then padding.
+    pub(crate) fn order(&self, mu: usize) -> &[f32] {
+        &self.orders[mu]
+    }
+}
+
+#[inline]
+fn tap(values: &[f32], taps: &[f32; 2 * REACH + 1]) -> f32 {
+    let sum: f32 = values.iter().zip(taps).map(|(v, t)| v * t).sum();
+    f32::entry(f64::from(sum))
+}
+
+/// Symmetric taps by least squares over the band; the rest of the spectrum is left free.
+fn fit(
+    grid: NodeGrid,
+    band: f64,
+    response: impl Fn(&[f64]) -> Vec<f64>,
+    width: impl Fn(f64) -> f64,
+) -> Vec<[f32; 2 * REACH + 1]> {
+    let samples = SAMPLES_PER_TAP * REACH;
+    // Chebyshev-spaced, so that the ends of the band fit as well as its middle.
+    let frequency = |k: usize| band * (std::f64::consts::PI * (k as f64 + 0.5) / (2 * samples) as f64).cos();
+    let basis = Mat::from_fn(samples, REACH + 1, |k, j| {
+        let wave = (std::f64::consts::TAU * frequency(k) * j as f64).cos();
+        if j == 0 { 1.0 } else { 2.0 * wave }
+    });
+    let frequencies: Vec<f64> = (0..samples).map(frequency).collect();
+    let response = response(&frequencies);
+    let wanted = Mat::from_fn(samples, grid.count, |k, node| {
+        let phase = std::f64::consts::PI * width(grid.u(node)) * frequencies[k];
+        let mean = if phase.abs() < 1e-8 { 1.0 } else { phase.sin() / phase };
+        response[k] * mean
+    });
+    let solution = basis.qr().solve_lstsq(&wanted);
+    (0..grid.count).map(|node| std::array::from_fn(|j| solution[(j.abs_diff(REACH), node)] as f32)).collect()
+}

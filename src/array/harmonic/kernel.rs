@@ -1,0 +1,219 @@
+//! Compact kernels: how a value between nodes is made from the nodes around it.
+//!
+//! Two kinds:
+//! - the *exponential of semicircle* `phi(x) = exp(beta (sqrt(1 - (2x/w)^2) - 1))`, |x| <= w/2 (Barnett,
+//!   Magland & af Klinteberg 2019). Its transform is divided out of what is interpolated. With oversampling
+//!   sigma its error is about `exp(-pi w sqrt(1 - 1/sigma))`;
+//! - the *windowed sinc* `sinc(x) K(2x/w)`, K the Kaiser window: longer, but with a transform that is 1 over the
+//!   band, so nothing has to be divided out. That is what the weights need: they multiply products of
+//!   two patterns, whose transforms cannot be divided out of one.
+
+use std::f64::consts::PI;
+
+use super::quadrature::GaussLegendre;
+
+/// Most nodes that a kernel reaches.
+pub(crate) const LANES: usize = 16;
+
+/// An exponential of semicircle over a grid with a given oversampling.
+#[derive(Clone, Debug)]
+pub(crate) struct Kernel {
+    width: usize,
+    beta: f64,
+    /// Coefficients of the polynomials in the distance to the middle, highest power first, one lane a node.
+    polynomial: Vec<[f32; LANES]>,
+}
+
+impl Kernel {
+    /// The narrowest kernel that errs by less than `tolerance` on a grid with `oversampling` > 1.
+    pub(crate) fn new(tolerance: f64, oversampling: f64) -> Self {
+        let rate = PI * (1.0 - 1.0 / oversampling).sqrt();
+        let width = ((1.0 / tolerance).ln() / rate + 0.7).ceil().clamp(3.0, LANES as f64) as usize;
+        let beta = 0.976 * PI * width as f64 * (1.0 - 0.5 / oversampling);
+        let mut kernel = Self { width, beta, polynomial: Vec::new() };
+        kernel.polynomial = kernel.fit(width + 3);
+        kernel
+    }
+
+    /// Number of nodes it reaches.
+    pub(crate) fn width(&self) -> usize {
+        self.width
+    }
+
+    /// At `x` grid steps from the middle.
+    pub(crate) fn value(&self, x: f64) -> f64 {
+        let t = 2.0 * x / self.width as f64;
+        let inside = 1.0 - t * t;
+        if inside >= 0.0 { (self.beta * (inside.sqrt() - 1.0)).exp() } else { 0.0 }
+    }
+
+    /// `Int phi(x) cos(2 pi f x) dx` at `f` cycles a step.
+    pub(crate) fn transform(&self, frequency: f64) -> f64 {
+        self.transforms(&[frequency])[0]
+    }
+
+    /// The same at many frequencies.
+    pub(crate) fn transforms(&self, frequencies: &[f64]) -> Vec<f64> {
+        let rule = GaussLegendre::new(64 + 8 * self.width);
+        let half = 0.5 * self.width as f64;
+        let values: Vec<f64> = rule.abscissae.iter().map(|t| self.value(half * t)).collect();
+        let at = |f: f64| -> f64 {
+            let terms = rule.abscissae.iter().zip(&rule.weights).zip(&values);
+            2.0 * half * terms.map(|((t, w), v)| w * v * (2.0 * PI * f * half * t).cos()).sum::<f64>()
+        };
+        frequencies.iter().map(|&f| at(f)).collect()
+    }
+
+    /// The first node reached from `x` (in grid steps), and the kernel at the nodes from there on.
+    #[inline(always)]
+    pub(crate) fn spread(&self, x: f64) -> (i64, [f32; LANES]) {
+        let first = (x - 0.5 * self.width as f64).ceil();
+        // From -1 to 1 as x goes from one node to the next.
+        let t = (2.0 * (first - (x - 0.5 * self.width as f64)) - 1.0) as f32;
+        let mut lanes = [0.0; LANES];
+        for row in &self.polynomial {
+            for (lane, c) in lanes.iter_mut().zip(row) {
+                *lane = *lane * t + c;
+            }
+        }
+        (first as i64, lanes)
+    }
+
+    /// Polynomials of `degree` in t that reproduce the kernel at each node, through Chebyshev points.
+    fn fit(&self, degree: usize) -> Vec<[f32; LANES]> {
+        let n = degree + 1;
+        let points: Vec<f64> = (0..n).map(|k| (PI * (k as f64 + 0.5) / n as f64).cos()).collect();
+        let mut rows = vec![[0.0_f32; LANES]; n];
+        for node in 0..self.width {
+            let half = 0.5 * self.width as f64;
+            // The node lies at (t + 1) / 2 + node - w / 2 steps from x.
+            let values: Vec<f64> =
+                points.iter().map(|t| self.value(0.5 * (t + 1.0) + node as f64 - half)).collect();
+            for (row, c) in rows.iter_mut().zip(monomials(&points, &values).iter().rev()) {
+                row[node] = *c as f32;
+            }
+        }
+        rows
+    }
+}
+
+/// Coefficients, lowest power first, of the polynomial through the points (Newton's form, expanded).
+fn monomials(points: &[f64], values: &[f64]) -> Vec<f64> {
+    let n = points.len();
+    let mut divided = values.to_vec();
+    for order in 1..n {
+        for k in (order..n).rev() {
+            divided[k] = (divided[k] - divided[k - 1]) / (points[k] - points[k - order]);
+        }
+    }
+    let mut coefficients = vec![0.0; n];
+    for k in (0..n).rev() {
+        for power in (1..n).rev() {
+            coefficients[power] = coefficients[power - 1] - points[k] * coefficients[power];
+        }
+        coefficients[0] = divided[k] - points[k] * coefficients[0];
+    }
+    coefficients
+}
+
+/// A Kaiser-windowed sinc over nodes with a given density.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct WindowedSinc {
+    width: usize,
+    beta: f64,
+}
+
+impl WindowedSinc {
+    /// For functions band-limited to `band` cycles a unit, on nodes `density` a unit (> 2 band): the
+    /// shortest that errs by less than `tolerance` (Kaiser's design rule).
+    pub(crate) fn new(tolerance: f64, band: f64, density: f64) -> Self {
+        let attenuation_db = -20.0 * tolerance.log10();
+        let beta = 0.1102 * (attenuation_db - 8.7).max(1.0);
+        let transition = (density - 2.0 * band) / density;
+        let width = ((attenuation_db - 7.95).max(8.0) / (14.36 * transition)).ceil() as usize + 1;
+        Self { width, beta }
+    }
+
+    /// Number of nodes it reaches.
+    pub(crate) fn width(&self) -> usize {
+        self.width
+    }
+
+    /// At `x` nodes from the middle.
+    pub(crate) fn value(&self, x: f64) -> f64 {
+        let t = 2.0 * x / self.width as f64;
+        let inside = 1.0 - t * t;
+        if inside < 0.0 {
+            return 0.0;
+        }
+        let sinc = if x.abs() < 1e-8 { 1.0 } else { (PI * x).sin() / (PI * x) };
+        sinc * bessel_i0(self.beta * inside.sqrt()) / bessel_i0(self.beta)
+    }
+}
+
+/// Modified Bessel function I_0 by its series, all of whose terms are positive.
+fn bessel_i0(x: f64) -> f64 {
+    let quarter = 0.25 * x * x;
+    let (mut term, mut sum, mut k) = (1.0, 1.0, 1.0);
+    while term > 1e-17 * sum {
+        term *= quarter / (k * k);
+        sum += term;
+        k += 1.0;
+    }
+    sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn spreading_with_the_transform_divided_out_interpolates() {
+        for (tolerance, oversampling) in [(1e-4, 2.0), (1e-5, 1.5), (1e-6, 1.25), (1e-6, 2.0)] {
+            let kernel = Kernel::new(tolerance, oversampling);
+            for frequency in [0.0, 0.11, -0.3 / oversampling, 0.5 / oversampling] {
+                let transform = kernel.transform(frequency);
+                for k in 0..50 {
+                    let x = 0.137 * f64::from(k) - 3.0;
+                    let (first, lanes) = kernel.spread(x);
+                    let phase = |x: f64| 2.0 * PI * frequency * x;
+                    let (mut re, mut im) = (0.0, 0.0);
+                    for (j, lane) in lanes.iter().enumerate().take(kernel.width()) {
+                        let node = (first + j as i64) as f64;
+                        assert!((f64::from(*lane) - kernel.value(node - x)).abs() < 0.1 * tolerance + 2e-7);
+                        re += f64::from(*lane) / transform * phase(node).cos();
+                        im += f64::from(*lane) / transform * phase(node).sin();
+                    }
+                    let error = (re - phase(x).cos()).hypot(im - phase(x).sin());
+                    // The design rule is asymptotic, and worst at the end of the band; f32 adds 1e-6.
+                    assert!(
+                        error < 5.0 * tolerance + 1e-6,
+                        "{tolerance} {oversampling} {frequency}: {error:e}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn windowed_sinc_interpolates_without_correction() {
+        for (tolerance, band, density) in [(1e-6, 2.0, 5.0), (1e-7, 2.0, 5.0), (1e-6, 1.0, 5.0)] {
+            let kernel = WindowedSinc::new(tolerance, band, density);
+            let half = kernel.width() as i64 / 2 + 1;
+            for frequency in [0.0, 0.5 * band, band] {
+                for k in 0..40 {
+                    let x = 0.0731 * f64::from(k);
+                    let (mut re, mut im) = (0.0, 0.0);
+                    for node in x as i64 - half..=x as i64 + half {
+                        let value = kernel.value(node as f64 - x);
+                        let phase = 2.0 * PI * frequency / density * (node as f64 - x);
+                        re += value * phase.cos();
+                        im += value * phase.sin();
+                    }
+                    let error = (re - 1.0).hypot(im);
+                    assert!(error < 5.0 * tolerance, "{tolerance} {band} {frequency}: {error:e}");
+                }
+            }
+        }
+    }
+}

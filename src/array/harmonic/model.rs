@@ -1,0 +1,272 @@
+//! Visibilities of a band-limited sky.
+
+use std::f64::consts::{FRAC_PI_2, TAU};
+use std::sync::Arc;
+
+use num_complex::Complex64;
+use rustfft::{Fft, FftPlanner};
+
+use super::batch::{ALPHA_BLOCK, BLOCKS_KEPT, Batch};
+use super::filter::FilteredPatterns;
+use super::forward::{ALPHAS_MAX, PATTERN_LANES};
+use super::kernel::{Kernel, LANES};
+use super::rotation::{RotatedSky, RotationTable};
+use super::runs::{RunLimits, split};
+use super::sizes::fft_length;
+use super::{HarmonicError, NodeGrid, PairState, PatternGeometry, PatternTable, chebyshev};
+use crate::sky::harmonics::Alm;
+
+/// Nodes in u, a wavelength: 2.25 times what a band of |n_y| <= 1 asks for. Eight nodes then hold a kernel of six, and a stretch of u.
+const NODES_PER_WAVELENGTH: f64 = 4.5;
+/// Nodes that one pattern vector holds.
+const NODES: usize = PATTERN_LANES / 2;
+/// Chebyshev terms along a run.
+pub(super) const TERMS: usize = 8;
+
+/// How much larger the error in alpha may be at the greatest order m, which few coefficients have.
+pub(super) const ALPHA_TOLERANCE: f64 = 3.0;
+
+/// What a model is made for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ModelSettings {
+    /// Orbit, Moon, wavelength, antennas.
+    pub geometry: PatternGeometry,
+    /// Inclination of the orbit, rad, 0 to pi.
+    pub inclination_rad: f64,
+    /// Longest baseline, wavelengths.
+    pub u_max: f64,
+    /// Bandwidth over frequency: each visibility is a mean over the channel's width; 0 for one frequency.
+    pub fractional_bandwidth: f64,
+    /// Error, relative to the rms visibility, at the end of the band.
+    pub tolerance: f64,
+}
+
+impl ModelSettings {
+    /// One frequency, and a tolerance of 1e-5.
+    #[must_use]
+    pub fn new(geometry: PatternGeometry, inclination_rad: f64, u_max: f64) -> Self {
+        Self { geometry, inclination_rad, u_max, fractional_bandwidth: 0.0, tolerance: 1e-5 }
+    }
+
+    fn check(&self) -> Result<(), HarmonicError> {
+        let geometry = &self.geometry;
+        let orbit = geometry.orbit_radius_m;
+        for (name, value, good, expected) in [
+            ("orbit_radius_m", orbit, orbit > 0.0, "a positive number"),
+            (
+                "moon_radius_m",
+                geometry.moon_radius_m,
+                geometry.moon_radius_m > 0.0 && geometry.moon_radius_m < orbit,
+                "between 0 and the orbit's radius",
+            ),
+            ("wavelength_m", geometry.wavelength_m, geometry.wavelength_m > 0.0, "a positive number"),
+            (
+                "inclination_rad",
+                self.inclination_rad,
+                (0.0..=std::f64::consts::PI).contains(&self.inclination_rad),
+                "0 to pi",
+            ),
+            (
+                "u_max",
+                self.u_max,
+                self.u_max >= 0.0 && self.u_max * geometry.wavelength_m < 2.0 * orbit,
+                "0 to the orbit's diameter in wavelengths",
+            ),
+            (
+                "fractional_bandwidth",
+                self.fractional_bandwidth,
+                (0.0..=0.5).contains(&self.fractional_bandwidth),
+                "0 to 0.5",
+            ),
+            ("tolerance", self.tolerance, (1e-5..=1e-2).contains(&self.tolerance), "1e-5 to 1e-2"),
+        ] {
+            if !(good && value.is_finite()) {
+                return Err(HarmonicError::Parameter { name, value, expected });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A sky as a pair on the orbit sees it, at one frequency.
+pub struct HarmonicModel {
+    settings: ModelSettings,
+    pub(super) sky: Alm,
+    pub(super) rotation: Arc<RotationTable<f32>>,
+    pub(super) patterns: FilteredPatterns,
+    pub(super) u_kernel: Kernel,
+    pub(super) alpha: PeriodicGrid,
+    pub(super) gamma: PeriodicGrid,
+    pub(super) fft: Arc<dyn Fft<f32>>,
+    /// Which blocks of alphas `skies` holds.
+    pub(super) blocks: Vec<usize>,
+    pub(super) skies: Vec<RotatedSky<f32>>,
+}
+
+/// A grid on the circle and the kernel over it.
+pub(super) struct PeriodicGrid {
+    pub(super) count: usize,
+    pub(super) kernel: Kernel,
+    /// One over the kernel's transform at the orders 0, 1, ..
+    pub(super) correction: Vec<f64>,
+}
+
+impl PeriodicGrid {
+    fn new(l_max: usize, tolerance: f64) -> Self {
+        let count = fft_length((2 * l_max + 1) * 5 / 4 + 2 * LANES);
+        let kernel = Kernel::new(tolerance, count as f64 / (2 * l_max + 1) as f64);
+        let frequencies: Vec<f64> = (0..=l_max).map(|m| m as f64 / count as f64).collect();
+        let correction = kernel.transforms(&frequencies).iter().map(|t| 1.0 / t).collect();
+        Self { count, kernel, correction }
+    }
+}
+
+impl HarmonicModel {
+    /// The model of `sky` (K) for `settings`. Takes seconds at l = 1024.
+    ///
+    /// # Errors
+    /// [`HarmonicError::Parameter`].
+    pub fn new(sky: Alm, settings: ModelSettings) -> Result<Self, HarmonicError> {
+        settings.check()?;
+        let rotation = Arc::new(RotationTable::new(sky.l_max(), settings.inclination_rad));
+        Self::with_rotation(sky, settings, rotation)
+    }
+
+    /// The same with a rotation table that other channels share; it must be for the sky's `l_max` and the
+    /// settings' inclination.
+    ///
+    /// # Errors
+    /// [`HarmonicError::Parameter`].
+    pub fn with_rotation(
+        sky: Alm,
+        settings: ModelSettings,
+        rotation: Arc<RotationTable<f32>>,
+    ) -> Result<Self, HarmonicError> {
+        settings.check()?;
+        let l_max = sky.l_max();
+        if rotation.l_max() != l_max {
+            let value = rotation.l_max() as f64;
+            return Err(HarmonicError::Parameter {
+                name: "rotation.l_max",
+                value,
+                expected: "the sky's l_max",
+            });
+        }
+        let u_kernel = Kernel::new(settings.tolerance, 0.5 * NODES_PER_WAVELENGTH);
+        let step = 1.0 / NODES_PER_WAVELENGTH;
+        let margin = FilteredPatterns::MARGIN + u_kernel.width() / 2 + 1;
+        let grid = NodeGrid {
+            first: -(margin as f64) * step,
+            step,
+            count: (settings.u_max / step).ceil() as usize + 2 * margin + NODES,
+        };
+        let table = PatternTable::new(settings.geometry, l_max, grid);
+        // exp(-2 pi i u n_y): |f| = |n_y| / density; the kernel's transform is divided out, and the
+        // mean over the channel multiplies by a sinc.
+        let patterns = FilteredPatterns::new(
+            table,
+            1.002 * step,
+            |f| u_kernel.transforms(f).iter().map(|t| 1.0 / t).collect(),
+            |u| u * settings.fractional_bandwidth / step,
+        );
+        let gamma = PeriodicGrid::new(l_max, settings.tolerance);
+        Ok(Self {
+            settings,
+            rotation,
+            patterns,
+            u_kernel,
+            alpha: PeriodicGrid::new(l_max, settings.tolerance),
+            fft: FftPlanner::new().plan_fft_forward(gamma.count),
+            gamma,
+            sky,
+            blocks: Vec::new(),
+            skies: Vec::new(),
+        })
+    }
+
+    /// The settings it was made for.
+    #[must_use]
+    pub fn settings(&self) -> &ModelSettings {
+        &self.settings
+    }
+
+    /// Visibilities (K sr) of `states`, in order.
+    ///
+    /// Fast for consecutive integrations of a pair, and best for those of many pairs over several
+    /// observing windows at once; any order is correct. At a baseline of zero it is the sky temperature over
+    /// the visible sky, `Int T S A dn`.
+    ///
+    /// # Errors
+    /// A state that is not finite or beyond the longest baseline; different lengths.
+    pub fn visibilities(
+        &mut self,
+        states: &[PairState],
+        values: &mut [Complex64],
+    ) -> Result<(), HarmonicError> {
+        if states.len() != values.len() {
+            return Err(HarmonicError::Lengths { states: states.len(), values: values.len() });
+        }
+        self.check_states(states)?;
+        let runs = split(states, self.limits());
+        let mut order: Vec<usize> = (0..runs.len()).collect();
+        let alpha = |k: &usize| (runs[*k].node[0] - FRAC_PI_2).rem_euclid(TAU);
+        order.sort_by(|a, b| alpha(a).total_cmp(&alpha(b)).then(a.cmp(b)));
+        let mut rest = &order[..];
+        while !rest.is_empty() {
+            let (batch, taken) = Batch::new(self, &runs, rest);
+            for (run, piece) in rest[..taken].iter().zip(self.evaluate(states, &batch)) {
+                let first = runs[*run].first;
+                values[first..first + piece.len()].copy_from_slice(&piece);
+            }
+            rest = &rest[taken..];
+        }
+        Ok(())
+    }
+
+    fn check_states(&self, states: &[PairState]) -> Result<(), HarmonicError> {
+        let u_max = self.settings.u_max;
+        for (index, state) in states.iter().enumerate() {
+            let all = [state.node_rad, state.phase_rad, state.baseline_wavelengths, state.span_rad];
+            if all.iter().any(|x| !x.is_finite()) {
+                return Err(HarmonicError::NotFinite { index });
+            }
+            let u = state.baseline_wavelengths;
+            if !(0.0..=u_max).contains(&u) {
+                return Err(HarmonicError::Baseline { index, u, u_max });
+            }
+        }
+        Ok(())
+    }
+
+    /// Sky turned to the alphas of the blocks that are asked for, besides some that were used before.
+    pub(super) fn turn_sky(&mut self, needed: &[usize]) {
+        let missing: Vec<usize> = needed.iter().copied().filter(|b| !self.blocks.contains(b)).collect();
+        for block in missing {
+            if self.blocks.len() >= BLOCKS_KEPT
+                && let Some(oldest) = self.blocks.iter().position(|b| !needed.contains(b))
+            {
+                self.blocks.remove(oldest);
+                self.skies.remove(oldest);
+            }
+            let alphas: Vec<f64> = (0..ALPHA_BLOCK + LANES)
+                .map(|k| TAU * (block * ALPHA_BLOCK + k) as f64 / self.alpha.count as f64)
+                .collect();
+            let sky = RotatedSky::new(&self.rotation, &self.sky, &self.alpha.correction, &alphas);
+            self.blocks.push(block);
+            self.skies.push(sky);
+        }
+    }
+
+    fn limits(&self) -> RunLimits {
+        let tolerance = self.settings.tolerance;
+        RunLimits {
+            l_max: self.sky.l_max() as f64,
+            // Nodes within half a kernel of any u of the run fit the vector.
+            u_half: 0.5 * (NODES - self.u_kernel.width()).saturating_sub(1) as f64 / NODES_PER_WAVELENGTH,
+            drift_half: chebyshev::reach(TERMS, tolerance),
+            node_half: chebyshev::reach(ALPHAS_MAX, ALPHA_TOLERANCE * tolerance)
+                / self.sky.l_max().max(1) as f64,
+            residual: 10.0 * tolerance,
+        }
+    }
+}
