@@ -117,7 +117,9 @@ fn main() {
     let runs = |name: &str| wanted.is_empty() || wanted.iter().any(|w| name.contains(w.as_str()));
     for (l_max, u_max) in [(64, 125.0), (191, 125.0), (1023, 21.0), (1024, 125.0)] {
         if runs(&format!("forward-{l_max}")) {
-            for at_once in [4, 16, 41] { forward(&array, &windows, l_max, u_max, at_once); }
+            for at_once in [4, 16, 41] {
+                forward(&array, &windows, l_max, u_max, at_once);
+            }
         }
     }
 }

@@ -47,12 +47,7 @@ impl Kernel {
         if inside >= 0.0 { (self.beta * (inside.sqrt() - 1.0)).exp() } else { 0.0 }
     }
 
-    /// `Int phi(x) cos(2 pi f x) dx` at `f` cycles a step.
-    pub(crate) fn transform(&self, frequency: f64) -> f64 {
-        self.transforms(&[frequency])[0]
-    }
-
-    /// The same at many frequencies.
+    /// `Int phi(x) cos(2 pi f x) dx` at each of `frequencies`, cycles a step.
     pub(crate) fn transforms(&self, frequencies: &[f64]) -> Vec<f64> {
         let rule = GaussLegendre::new(64 + 8 * self.width);
         let half = 0.5 * self.width as f64;
@@ -116,53 +111,6 @@ fn monomials(points: &[f64], values: &[f64]) -> Vec<f64> {
     coefficients
 }
 
-/// A Kaiser-windowed sinc over nodes with a given density.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct WindowedSinc {
-    width: usize,
-    beta: f64,
-}
-
-impl WindowedSinc {
-    /// For functions band-limited to `band` cycles a unit, on nodes `density` a unit (> 2 band): the
-    /// shortest that errs by less than `tolerance` (Kaiser's design rule).
-    pub(crate) fn new(tolerance: f64, band: f64, density: f64) -> Self {
-        let attenuation_db = -20.0 * tolerance.log10();
-        let beta = 0.1102 * (attenuation_db - 8.7).max(1.0);
-        let transition = (density - 2.0 * band) / density;
-        let width = ((attenuation_db - 7.95).max(8.0) / (14.36 * transition)).ceil() as usize + 1;
-        Self { width, beta }
-    }
-
-    /// Number of nodes it reaches.
-    pub(crate) fn width(&self) -> usize {
-        self.width
-    }
-
-    /// At `x` nodes from the middle.
-    pub(crate) fn value(&self, x: f64) -> f64 {
-        let t = 2.0 * x / self.width as f64;
-        let inside = 1.0 - t * t;
-        if inside < 0.0 {
-            return 0.0;
-        }
-        let sinc = if x.abs() < 1e-8 { 1.0 } else { (PI * x).sin() / (PI * x) };
-        sinc * bessel_i0(self.beta * inside.sqrt()) / bessel_i0(self.beta)
-    }
-}
-
-/// Modified Bessel function I_0 by its series, all of whose terms are positive.
-fn bessel_i0(x: f64) -> f64 {
-    let quarter = 0.25 * x * x;
-    let (mut term, mut sum, mut k) = (1.0, 1.0, 1.0);
-    while term > 1e-17 * sum {
-        term *= quarter / (k * k);
-        sum += term;
-        k += 1.0;
-    }
-    sum
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -172,7 +120,7 @@ mod tests {
         for (tolerance, oversampling) in [(1e-4, 2.0), (1e-5, 1.5), (1e-6, 1.25), (1e-6, 2.0)] {
             let kernel = Kernel::new(tolerance, oversampling);
             for frequency in [0.0, 0.11, -0.3 / oversampling, 0.5 / oversampling] {
-                let transform = kernel.transform(frequency);
+                let transform = kernel.transforms(&[frequency])[0];
                 for k in 0..50 {
                     let x = 0.137 * f64::from(k) - 3.0;
                     let (first, lanes) = kernel.spread(x);
@@ -190,28 +138,6 @@ mod tests {
                         error < 5.0 * tolerance + 1e-6,
                         "{tolerance} {oversampling} {frequency}: {error:e}"
                     );
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn windowed_sinc_interpolates_without_correction() {
-        for (tolerance, band, density) in [(1e-6, 2.0, 5.0), (1e-7, 2.0, 5.0), (1e-6, 1.0, 5.0)] {
-            let kernel = WindowedSinc::new(tolerance, band, density);
-            let half = kernel.width() as i64 / 2 + 1;
-            for frequency in [0.0, 0.5 * band, band] {
-                for k in 0..40 {
-                    let x = 0.0731 * f64::from(k);
-                    let (mut re, mut im) = (0.0, 0.0);
-                    for node in x as i64 - half..=x as i64 + half {
-                        let value = kernel.value(node as f64 - x);
-                        let phase = 2.0 * PI * frequency / density * (node as f64 - x);
-                        re += value * phase.cos();
-                        im += value * phase.sin();
-                    }
-                    let error = (re - 1.0).hypot(im);
-                    assert!(error < 5.0 * tolerance, "{tolerance} {band} {frequency}: {error:e}");
                 }
             }
         }

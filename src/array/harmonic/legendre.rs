@@ -35,7 +35,7 @@ impl Legendre {
     pub(crate) fn even_rows<T: Real>(&self, mu: usize, weights: &[f64]) -> Vec<T> {
         let points = weights.len().min(self.z.len());
         let mut rows = Vec::with_capacity(points * ((self.l_max - mu) / 2 + 1));
-        let sign = if mu % 2 == 0 { 1.0 } else { -1.0 };
+        let sign = if mu.is_multiple_of(2) { 1.0 } else { -1.0 };
         let mut lanes = Lanes {
             current: vec![0.0; points],
             previous: vec![0.0; points],
@@ -62,7 +62,7 @@ impl Legendre {
                 };
                 step(forward, behind, &self.z[..points], &mut lanes);
             }
-            if (l - mu) % 2 == 0 {
+            if (l - mu).is_multiple_of(2) {
                 rows.extend(lanes.value.iter().zip(weights).map(|(v, w)| T::entry(v * w)));
             }
         }

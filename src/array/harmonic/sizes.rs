@@ -22,7 +22,7 @@ mod tests {
     fn lengths_are_enough_and_not_wasteful() {
         for n in 2..3000 {
             let length = fft_length(n);
-            assert!(length >= n && length % 2 == 0);
+            assert!(length >= n && length.is_multiple_of(2));
             assert!(n < 16 || (length as f64) < 1.2 * n as f64 + 1.0, "{n} {length}");
         }
     }

@@ -18,7 +18,7 @@ pub(crate) fn sin_cos(v: f64) -> (f64, f64) {
     let sin = 1.589_623_015_765_465_7e-10;
     let sin = sin * z - 2.505_074_776_285_780_7e-8;
     let sin = sin * z + 2.755_731_362_138_572_5e-6;
-    let sin = sin * z - 1.984_126_982_958_953_9e-4;
+    let sin = sin * z - 1.984_126_982_958_954e-4;
     let sin = sin * z + 8.333_333_333_322_119e-3;
     let sin = sin * z - 1.666_666_666_666_663e-1;
     let sin = r + r * z * sin;

@@ -7,8 +7,8 @@ mod kernel;
 mod lanes;
 mod recurrence;
 mod rings;
-mod transform;
 pub(crate) mod scaled;
+mod transform;
 mod wigner;
 
 pub use analysis::{Analysis, AnalysisOptions, Method, analysis, synthesis};

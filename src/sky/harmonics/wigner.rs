@@ -142,7 +142,7 @@ impl<'a> WignerRows<'a> {
         self.binomial = self.binomial.times(ratio.sqrt());
         let (cos, sin) = (&self.table.cos_powers, &self.table.sin_powers);
         let last = self.binomial.product(cos[l + mu]).product(sin[l - mu]);
-        let sign = if (l - mu) % 2 == 0 { 1.0 } else { -1.0 };
+        let sign = if (l - mu).is_multiple_of(2) { 1.0 } else { -1.0 };
         self.lanes.set(centre + l, last.times(sign));
         self.lanes.set(centre - l, self.binomial.product(cos[l - mu]).product(sin[l + mu]));
     }
