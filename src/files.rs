@@ -38,6 +38,10 @@ impl AtomicFile {
         if let Some(folder) = folder_of(path) {
             fs::create_dir_all(folder)?;
         }
+        if fs::metadata(path).is_ok_and(|found| !found.is_file()) {
+            let reason = "something is there that is not a regular file; expected a file or a new name";
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
+        }
         let mut name = path.as_os_str().to_owned();
         name.push(".partial");
         let partial_path = PathBuf::from(name);

@@ -169,6 +169,44 @@ fn a_lost_stretch_is_counted_and_the_rest_is_used() {
 }
 
 #[test]
+fn a_channel_without_usable_data_leaves_the_others_alone() {
+    let place = Workplace::new();
+    let out = place.path("out");
+    // At nside 1, 10 MHz, no baseline is short enough.
+    let sets = ["--set", "map.nside=1", "--set", "map.epsilon=1e-4", "--set", "products.pictures=false"];
+    let text = succeed(&[&["run", place.pipeline.as_str(), "--out", &out, "--json"], &sets[..]].concat());
+    let summary: Value = serde_json::from_str(&text).unwrap();
+    let channels = summary["channels"].as_array().unwrap();
+    assert_eq!(channels.len(), 1, "{channels:?}");
+    assert_eq!(channels[0]["frequency_hz"], 3e6);
+}
+
+#[test]
+fn files_out_of_order_lose_nothing_but_the_cut_packet() {
+    let place = Workplace::new();
+    let downlink = place.path("small.ccsds");
+    succeed(&["simulate", &place.pipeline, "--out", &downlink]);
+    let bytes = std::fs::read(&downlink).unwrap();
+    let (first, second) = bytes.split_at(bytes.len() / 2);
+    let (one, two) = (place.path("one"), place.path("two"));
+    std::fs::write(&one, first).unwrap();
+    std::fs::write(&two, second).unwrap();
+    let ledger = |files: &[&str]| {
+        let out = place.path("ground");
+        let args = ["--map", &place.pipeline, "--out", &out, "--json"];
+        let text = succeed(&[&["replay"], files, &args].concat());
+        serde_json::from_str::<Value>(&text).unwrap()["ledger"].clone()
+    };
+    let whole = ledger(&[&downlink]);
+    let swapped = ledger(&[&two, &one]);
+    assert_eq!(whole["sampled"], swapped["sampled"]);
+    let lost: u64 =
+        swapped["lost"].as_array().unwrap().iter().map(|loss| loss["count"].as_u64().unwrap()).sum();
+    // A packet of 8192 bytes holds 21 bytes a visibility.
+    assert!(lost <= 8192 / 21, "{lost}");
+}
+
+#[test]
 fn a_file_given_twice_counts_once() {
     let place = Workplace::new();
     let downlink = place.path("small.ccsds");

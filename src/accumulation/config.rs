@@ -10,7 +10,7 @@ use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
 use crate::units::PerChannel;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// Greatest nside of the pixel engine: 49152 pixels, 9.7 GB of sums a channel in single precision.
+/// Greatest nside of the pixel engine: 49152 pixels, 9.7 GB of sums a channel (half of a symmetric matrix, f64).
 pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
 
 /// The ground's map making.

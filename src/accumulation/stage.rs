@@ -27,7 +27,6 @@ pub struct Snapshot {
 /// One channel's engine and what it holds.
 struct ChannelSums {
     engine: PixelEngine,
-    baseline_m_max: f64,
     span_s: [f64; 2],
     snapshots: u32,
 }
@@ -74,19 +73,19 @@ impl Accumulator {
                 response: instrument.response,
                 companion_seed: self.config.companion_seed,
             })?;
-            *slot = Some(ChannelSums {
-                engine,
-                baseline_m_max: self.config.baseline_m_max(frequency_hz),
-                span_s: [f64::INFINITY, f64::NEG_INFINITY],
-                snapshots: 0,
-            });
+            *slot = Some(ChannelSums { engine, span_s: [f64::INFINITY, f64::NEG_INFINITY], snapshots: 0 });
         }
         slot.as_mut().ok_or_else(unknown)
     }
 
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<(), AccumulationError> {
+        let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
+        self.ledger.flagged("baseline beyond the map's limit", (placed.len() - near.len()) as u64);
+        if near.is_empty() {
+            // A channel of which nothing is used has no sums, and no map.
+            return Ok(());
+        }
         let sums = self.sums(placed.channel)?;
-        let near = within(placed, sums.baseline_m_max);
         let added = sums.engine.add(&near)?.visibilities;
         if let (Some(first), Some(last)) = (near.time_s.first(), near.time_s.last()) {
             sums.span_s = [sums.span_s[0].min(*first), sums.span_s[1].max(*last)];
@@ -94,7 +93,6 @@ impl Accumulator {
         self.accumulated += added;
         self.ledger.accumulated(added);
         self.ledger.flagged("refused by the engine", near.len() as u64 - added);
-        self.ledger.flagged("baseline beyond the map's limit", (placed.len() - near.len()) as u64);
         Ok(())
     }
 

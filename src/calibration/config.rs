@@ -23,7 +23,7 @@ pub enum CalibrationHook {
 pub struct CalibrationConfig {
     /// Which calibration is applied.
     pub hook: CalibrationHook,
-    /// File of gains, for `antenna-gains`; relative to the folder of the configuration.
+    /// File of gains, for `antenna-gains`; relative to the folder that [`CalibrationConfig::build`] is given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gains_file: Option<PathBuf>,
 }

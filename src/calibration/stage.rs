@@ -1,6 +1,6 @@
 //! The ground stage that places visibilities and calibrates them.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 
 use super::{Calibration, CalibrationError};
 use crate::array::{Ephemeris, FlaggedCounts};
@@ -22,8 +22,10 @@ pub struct Calibrator {
     ephemeris: Ephemeris,
     instrument: Option<Instrument>,
     seen: HashSet<BlockKey>,
-    received: u64,
-    reported: Option<(Housekeeping, u64)>,
+    /// Visibilities received, by the start of their window (ticks).
+    received: BTreeMap<i64, u64>,
+    /// The spacecraft's latest counts.
+    reported: Option<Housekeeping>,
 }
 
 impl Calibrator {
@@ -36,7 +38,7 @@ impl Calibrator {
             ephemeris: Ephemeris::default(),
             instrument: None,
             seen: HashSet::new(),
-            received: 0,
+            received: BTreeMap::new(),
             reported: None,
         }
     }
@@ -53,7 +55,7 @@ impl Calibrator {
             self.ledger.flagged("duplicate", count);
             return Ok(());
         }
-        self.received += count;
+        *self.received.entry(block.start.0).or_default() += count;
         let channel = self.instrument.as_ref().and_then(|i| i.channels.get(usize::from(block.channel.0)));
         let Some(channel) = channel else {
             self.ledger.flagged("no instrument description", count);
@@ -103,8 +105,8 @@ impl Stage for Calibrator {
             }
             GroundFrame::Visibilities(block) => self.visibilities(&block, out)?,
             GroundFrame::Housekeeping(report) => {
-                if self.reported.is_none_or(|(last, _)| last.sampled <= report.sampled) {
-                    self.reported = Some((report, self.received));
+                if self.reported.is_none_or(|last| last.time <= report.time) {
+                    self.reported = Some(report);
                 }
                 out.push(PlacedFrame::Housekeeping(report));
             }
@@ -113,21 +115,20 @@ impl Stage for Calibrator {
     }
 
     fn finish(&mut self, _: &mut Outlet<PlacedFrame>) -> Result<(), CalibrationError> {
-        let Some((report, received_then)) = self.reported else {
-            self.ledger.sampled(self.received);
+        let all: u64 = self.received.values().sum();
+        let Some(report) = self.reported else {
+            self.ledger.sampled(all);
             return Ok(());
         };
-        let expected = report.sampled.saturating_sub(report.dropped);
-        let missing = expected.saturating_sub(received_then);
-        // A late packet may make up for part of it.
-        let after = self.received - received_then;
-        self.ledger.sampled(report.sampled.max(received_then + report.dropped) + after);
+        let counted: u64 = self.received.range(..report.time.0).map(|(_, count)| count).sum();
+        let missing = report.sampled.saturating_sub(report.dropped).saturating_sub(counted);
+        self.ledger.sampled(counted + missing + report.dropped + (all - counted));
         self.ledger.lost("store", "full", report.dropped);
         self.ledger.lost("downlink", "not received", missing);
         Ok(())
     }
 
     fn units(&self) -> Units {
-        Units::of(self.received, "visibilities")
+        Units::of(self.received.values().sum(), "visibilities")
     }
 }

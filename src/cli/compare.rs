@@ -30,8 +30,8 @@ pub(super) struct CompareArgs {
     /// Greatest degree; 3 nside - 1 if not given.
     #[arg(long)]
     l_max: Option<usize>,
-    /// Picture of the curves (PNG); MAP-spectra.png if not given. The relative error goes beside it,
-    /// with -error before the ending.
+    /// Picture of the curves (PNG); MAP-spectra.png if not given, none with --json. The relative error
+    /// goes beside it, with -error before the ending.
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
     /// Draw no pictures.
@@ -47,12 +47,17 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     let truth = read(&args.truth)?;
     let noise = args.noise.as_deref().map(read).transpose()?;
     let comparison = compare(&map, &truth, noise.as_ref(), args.l_max)?;
-    let pictures = if args.no_plot { Vec::new() } else { draw(args, &comparison)? };
     if args.json {
         print_json_line(&comparison)?;
+    } else {
+        print_text(&table(&comparison))?;
+    }
+    // Programs read; they get pictures if they ask.
+    let wanted = !args.no_plot && (args.plot.is_some() || !args.json);
+    let pictures = if wanted { draw(args, &comparison)? } else { Vec::new() };
+    if args.json {
         return Ok(Outcome::Done);
     }
-    print_text(&table(&comparison))?;
     for picture in pictures {
         print_text(&format!("{}", picture.display()))?;
     }

@@ -54,8 +54,8 @@ pub(super) fn execute(args: &GeometryArgs) -> CommandResult {
     let config = args.array.source().load()?;
     let array = Array::new(&config.array)?;
     for &t_s in &args.at_s {
-        if !t_s.is_finite() {
-            return Err(format!("--at {t_s}: expected a finite number of seconds").into());
+        if !(-1e9..=1e9).contains(&t_s) {
+            return Err(format!("--at {t_s}: expected seconds, -1e9 to 1e9").into());
         }
         let rule = config.spacecraft.rule();
         let states: Vec<_> = (0..array.satellites()).map(|n| array.state(n, t_s)).collect();

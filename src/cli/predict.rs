@@ -122,8 +122,8 @@ fn parse(line: &str) -> Result<Request, String> {
 
 fn check(array: &Array, request: Request) -> Result<(), String> {
     let Request { t_s, pair, freq_hz } = request;
-    if !t_s.is_finite() {
-        return Err(format!("t_s = {t_s}: expected a finite number of seconds"));
+    if !(-1e9..=1e9).contains(&t_s) {
+        return Err(format!("t_s = {t_s}: expected seconds, -1e9 to 1e9"));
     }
     if usize::from(pair.j) >= array.satellites() {
         return Err(format!("pair {pair}: the array has {} satellites", array.satellites()));

@@ -1,5 +1,6 @@
 //! The downlink's stages: packets out of frames, files, frames out of packets.
 
+use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
@@ -129,23 +130,19 @@ impl Sink for Recorder {
 /// Reads downlink files one after the other.
 #[derive(Debug)]
 pub struct FileSource {
-    files: std::vec::IntoIter<(PathBuf, File)>,
+    files: VecDeque<PathBuf>,
     now: Option<(PathBuf, File)>,
     bytes: u64,
 }
 
 impl FileSource {
-    /// Opens all files, so that a wrong name is known at once.
+    /// Looks into all files, so that a wrong one is known at once.
     ///
     /// # Errors
     /// A file that cannot be opened, is empty, or does not hold a packet of ours.
     pub fn open(paths: &[PathBuf]) -> Result<Self, DownlinkError> {
-        let open = |path: &PathBuf| {
-            refuse_foreign(path)?;
-            File::open(path).map(|file| (path.clone(), file)).map_err(io_error(path, "open the file"))
-        };
-        let files: Vec<_> = paths.iter().map(open).collect::<Result<_, _>>()?;
-        Ok(Self { files: files.into_iter(), now: None, bytes: 0 })
+        paths.iter().try_for_each(|path| refuse_foreign(path))?;
+        Ok(Self { files: paths.iter().cloned().collect(), now: None, bytes: 0 })
     }
 }
 
@@ -170,8 +167,13 @@ impl Source for FileSource {
     type Error = DownlinkError;
 
     fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, DownlinkError> {
-        let Some((path, mut file)) = self.now.take().or_else(|| self.files.next()) else {
-            return Ok(Flow::Done);
+        let (path, mut file) = match self.now.take() {
+            Some(now) => now,
+            None => {
+                let Some(path) = self.files.pop_front() else { return Ok(Flow::Done) };
+                let file = File::open(&path).map_err(io_error(&path, "open the file"))?;
+                (path, file)
+            }
         };
         let mut bytes = Vec::with_capacity(READ_BYTES);
         let read = Read::by_ref(&mut file).take(READ_BYTES as u64).read_to_end(&mut bytes);

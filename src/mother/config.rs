@@ -100,6 +100,19 @@ pub enum SpacecraftError {
         /// Value found, Hz.
         value: f64,
     },
+    /// Two channels that overlap.
+    #[error(
+        "spacecraft.channels_hz[{first}] and [{second}] are {distance_hz} Hz apart: expected at least \
+         channel_width_hz, and 1 kHz"
+    )]
+    Overlap {
+        /// Place of one in the list.
+        first: usize,
+        /// Place of the other.
+        second: usize,
+        /// Distance, Hz.
+        distance_hz: f64,
+    },
     /// No or too many channels.
     #[error("spacecraft.channels_hz has {0} channels: expected 1 to {CHANNELS_MAX}")]
     ChannelCount(usize),
@@ -153,6 +166,14 @@ impl SpacecraftConfig {
                 found.push(SpacecraftError::Frequency { index, value });
             }
         }
+        for (second, &high) in self.channels_hz.iter().enumerate() {
+            for (first, &low) in self.channels_hz[..second].iter().enumerate() {
+                let distance_hz = (high - low).abs();
+                if distance_hz < self.channel_width_hz.max(1e3) {
+                    found.push(SpacecraftError::Overlap { first, second, distance_hz });
+                }
+            }
+        }
         for (key, fits) in [
             ("every_nth_integration", self.every_nth_integration.fits(channels)),
             ("baseline_wavelengths_max", self.baseline_wavelengths_max.fits(channels)),
@@ -173,7 +194,9 @@ impl SpacecraftConfig {
         let longest = self.integration_s_max;
         require("integration_s_max", longest, (1e-3..=1000.0).contains(&longest), "0.001 s to 1000 s");
         let motion = self.motion_wavelengths_max;
-        require("motion_wavelengths_max", motion, motion > 0.0 && motion <= 1.0, "above 0 and at most 1");
+        require("motion_wavelengths_max", motion, (1e-3..=1.0).contains(&motion), "0.001 to 1");
+        let store = self.store_bytes_max;
+        require("store_bytes_max", store as f64, store >= 1 << 20, "at least 1 MiB (1048576)");
         let noise = self.receiver_noise_k_sr;
         require("receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
         require("every_nth_window", self.every_nth_window as f64, self.every_nth_window >= 1, "at least 1");

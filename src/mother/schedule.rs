@@ -27,6 +27,8 @@ pub struct Schedule {
     pub baseline_wavelengths_max: f64,
     /// Keep every n-th integration.
     pub every_nth: u64,
+    /// Of how many windows one is observed; so that thinning of both does not keep step.
+    pub every_nth_window: u64,
 }
 
 impl Schedule {
@@ -47,7 +49,7 @@ impl Schedule {
         }
         let mut found = Vec::new();
         let mut offset_ticks = 0;
-        let mut number = window.index;
+        let mut number = window.index / self.every_nth_window.max(1);
         while offset_ticks < length_ticks {
             let t_s = window.start.plus_ticks(i64::from(offset_ticks)).seconds();
             let (i, j) = (array.state(pair.i.into(), t_s), array.state(pair.j.into(), t_s));
@@ -100,7 +102,7 @@ mod tests {
 
     fn schedule(baseline_wavelengths_max: f64, every_nth: u64) -> Schedule {
         let rule = IntegrationRule::default();
-        Schedule { rule, frequency_hz: 10e6, baseline_wavelengths_max, every_nth }
+        Schedule { rule, frequency_hz: 10e6, baseline_wavelengths_max, every_nth, every_nth_window: 1 }
     }
 
     #[test]

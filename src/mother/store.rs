@@ -11,8 +11,8 @@ pub const VISIBILITY_BYTES: u64 = 21;
 
 /// Holds frames while the Earth is hidden, and releases them in the pass that follows the window.
 ///
-/// A housekeeping frame closes a window: the Earth is in sight from then on. Visibilities that do not
-/// fit are dropped, newest first, and counted in the housekeeping frame; nothing else is ever dropped.
+/// A housekeeping frame closes a window: the Earth is in sight from then on. A block that does not fit
+/// is dropped and counted in the housekeeping frame; nothing else is ever dropped.
 #[derive(Debug)]
 pub struct Store {
     capacity_bytes: u64,

@@ -77,6 +77,9 @@ pub enum ConfigError {
         /// Part of the key.
         part: String,
     },
+    /// A name that cannot be a folder's.
+    #[error("name = {0:?}: expected at most 60 bytes, without slashes and control characters")]
+    Name(String),
     /// Values that cannot be; all of them.
     #[error("{origin}: {} problem(s)\n{}", problems.len(), bullets(problems))]
     Values {
@@ -184,6 +187,10 @@ impl Config {
     pub fn problems(&self) -> Problems {
         let channels = self.spacecraft.channels_hz.len();
         let mut found = boxed(self.sky.problems(channels));
+        let bad = |c: char| c.is_control() || c == '/' || c == '\\';
+        if self.name.len() > 60 || self.name.contains(bad) || [".", ".."].contains(&self.name.as_str()) {
+            found.push(Box::new(ConfigError::Name(self.name.clone())));
+        }
         let array = self.array.problems();
         if array.is_empty()
             && let Err(problem) = Array::new(&self.array)

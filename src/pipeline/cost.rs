@@ -83,9 +83,9 @@ impl Plan {
         let mapped: f64 = expected.iter().map(|e| e.mapped).sum();
         let solutions = self.solutions();
         let engine_bytes = PixelEngine::memory_bytes(map.nside) as f64;
-        // One engine a channel; one snapshot in the queue, one in the solver, and its factor in f64.
-        let memory_bytes = engine_bytes * (frequencies.len() as f64 + 2.0)
-            + 8.0 * pixels * pixels
+        // One engine a channel; a snapshot being made, one in the queue, one in the solver, which works in it.
+        let snapshots = if solutions > 1 { 3.0 } else { 0.0 };
+        let memory_bytes = engine_bytes * (frequencies.len() as f64 + snapshots)
             + sky_pixels * 8.0 * (frequencies.len() + 3) as f64;
         let rates = self.measure();
         // A Cholesky factorisation runs at about the rate of the rank-k updates (one core of it: half).
@@ -116,6 +116,8 @@ impl Plan {
     /// Times a few visibilities of the shortest pair through simulation and accumulation.
     fn measure(&self) -> Rates {
         const SAMPLES: usize = 512;
+        // No larger than what is measured in a fraction of a second and a fraction of a gigabyte.
+        let measured_nside = self.config.map.nside.min(16);
         let frequency_hz = self.config.spacecraft.channels_hz.first().copied().unwrap_or(10e6);
         let time_s = self.windows.first().map_or(0.0, |window| window.start.seconds());
         let at = |k: usize| time_s + k as f64;
@@ -147,20 +149,23 @@ impl Plan {
             ..PlacedVisibilities::default()
         };
         let setup = PixelSetup {
-            nside: self.config.map.nside,
+            nside: measured_nside,
             frequency_hz,
             method: self.config.map.rows,
             moon_radius_m,
             response,
             companion_seed: 0,
         };
-        let accumulated_per_s = PixelEngine::new(setup).map_or(f64::NAN, |mut engine| {
+        let rate = PixelEngine::new(setup).map_or(f64::NAN, |mut engine| {
             // The first time makes tables and touches memory for the first time.
             let warmed = engine.add(&placed).is_ok();
             let since = Instant::now();
             let added = warmed && engine.add(&placed).is_ok();
             if added { SAMPLES as f64 / since.elapsed().as_secs_f64() } else { f64::NAN }
         });
+        // The work of a visibility grows as the number of pixels squared.
+        let shrink = pixel_count(measured_nside) as f64 / pixel_count(self.config.map.nside) as f64;
+        let accumulated_per_s = rate * shrink * shrink;
         Rates { simulated_per_s, accumulated_per_s }
     }
 }

@@ -1,7 +1,5 @@
 //! Why a pipeline did not run.
 
-use std::path::PathBuf;
-
 use thiserror::Error;
 
 use super::config::ConfigError;
@@ -50,16 +48,6 @@ pub enum PipelineError {
         /// Threads asked for.
         threads: usize,
         /// What the system said.
-        reason: String,
-    },
-    /// A prior map that does not fit.
-    #[error("map.prior_files: {} is for channel {channel}: {reason}", path.display())]
-    Prior {
-        /// File.
-        path: PathBuf,
-        /// Channel.
-        channel: usize,
-        /// What is wrong.
         reason: String,
     },
 }

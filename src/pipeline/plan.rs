@@ -48,6 +48,7 @@ impl Plan {
             frequency_hz,
             baseline_wavelengths_max: spacecraft.baseline_wavelengths_max.get(channel).unwrap_or(0.0),
             every_nth: spacecraft.every_nth_integration.get(channel).unwrap_or(1),
+            every_nth_window: spacecraft.every_nth_window,
         };
         let schedules = spacecraft.channels_hz.iter().enumerate().map(schedule).collect();
         let windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.every_nth_window);

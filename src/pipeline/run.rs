@@ -11,7 +11,7 @@ use super::plan::Plan;
 use super::space;
 use super::summary::{Segment, Summary};
 use crate::downlink::{FileSource, Recorder};
-use crate::products::Truth;
+use crate::products::{ProductsError, Truth};
 use crate::runtime::{Cancel, Graph, Metrics, Report, RuntimeConfig};
 
 /// Whom to tell about a graph that is about to run.
@@ -25,6 +25,7 @@ pub const DOWNLINK_FILE: &str = "downlink.ccsds";
 /// # Errors
 /// The first failure of any stage; a ledger that does not close.
 pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Result<Summary, PipelineError> {
+    make_folder(out)?;
     let skies = space::skies(plan)?;
     let mut graph = Graph::new();
     let bytes = space::add(&mut graph, plan, &skies)?;
@@ -67,11 +68,18 @@ pub fn replay(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<Summary, PipelineError> {
+    make_folder(out)?;
     let mut graph = Graph::new();
     let bytes = graph.source("read", config.runtime.queue_capacity, FileSource::open(files)?);
     let outcome = ground::add(&mut graph, bytes, config, out, Truth::unknown())?;
     let report = start(graph, &config.runtime, cancel, watch)?;
     conclude(Segment::Ground, config, Some(out), report, outcome)
+}
+
+/// Before anything is computed, so that a bad place is known at once.
+fn make_folder(out: &Path) -> Result<(), PipelineError> {
+    let made = std::fs::create_dir_all(out);
+    made.map_err(|source| ProductsError::Write { path: out.to_owned(), source }.into())
 }
 
 fn start(

@@ -32,6 +32,10 @@ pub struct Summary {
     pub segment: Segment,
     /// Whether it was ended early.
     pub cancelled: bool,
+    /// Seed of the space segment, as the instrument description has it.
+    pub seed: Option<u64>,
+    /// Hash of the space segment's configuration, as the instrument description has it.
+    pub space_hash: Option<String>,
     /// Hash of the ground's configuration.
     pub ground_hash: String,
     /// The maps, channel by channel.
@@ -60,6 +64,8 @@ impl Summary {
             name: config.name.clone(),
             segment,
             cancelled: report.cancelled,
+            seed: channels.first().map(|channel| channel.seed),
+            space_hash: channels.first().map(|channel| channel.space_hash.clone()),
             ground_hash: format!("{:016x}", config.ground_hash()),
             channels,
             ledger,

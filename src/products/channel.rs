@@ -111,6 +111,8 @@ impl ChannelFolder {
         let (rho, snr) = comparison.map_or((None, None), |c| (Some(c.rho), c.snr));
         ChannelSummary {
             frequency_hz: self.frequency_hz,
+            seed: solution.instrument.seed,
+            space_hash: format!("{:016x}", solution.instrument.configuration_hash),
             nside: solution.nside,
             span_s: solution.span_s,
             visibilities: solution.visibilities,

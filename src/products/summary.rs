@@ -28,6 +28,10 @@ pub struct SnapshotSummary {
 pub struct ChannelSummary {
     /// Frequency, Hz.
     pub frequency_hz: f64,
+    /// Seed of the space segment.
+    pub seed: u64,
+    /// Hash of the space segment's configuration.
+    pub space_hash: String,
     /// nside of the maps.
     pub nside: usize,
     /// Mission time of the first and the last data, s.

@@ -159,6 +159,7 @@ fn files_hold_the_picture_and_its_texts_and_appear_whole() {
     assert!(texts.contains(&pair("Comment", "no keyword")));
     assert!(texts.iter().any(|(k, v)| k == "Software" && v.starts_with("lunarray ")));
 
-    let nowhere = folder.path().join("missing").join("map.png");
+    // Folders are made; a file in the way of one is an error.
+    let nowhere = path.join("below").join("map.png");
     assert!(matches!(picture.write(&nowhere), Err(PictureError::Write { path, .. }) if path == nowhere));
 }
