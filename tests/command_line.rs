@@ -151,6 +151,14 @@ fn all_errors_come_at_once() {
 }
 
 #[test]
+fn check_reads_the_files_that_a_pipeline_names() {
+    let set = ["--set", "sky.file=/nowhere/sky.fits", "--set", "spacecraft.channels_hz=[1e7]"];
+    let rest = ["--set", "map.epsilon=1e-4", "--set", "spacecraft.every_nth_integration=1"];
+    let complaint = complaint(&[&["check"], &set[..], &rest[..]].concat());
+    assert!(complaint.contains("/nowhere/sky.fits"), "{complaint}");
+}
+
+#[test]
 fn bad_files_are_named_with_what_was_expected() {
     let folder = tempfile::tempdir().unwrap();
     let empty = write(folder.path(), "empty", "");

@@ -3,7 +3,7 @@
 use clap::Args;
 
 use super::{CommandResult, Outcome, PipelineArgs, print_json_line, print_text};
-use crate::pipeline::Plan;
+use crate::pipeline::{ConfigError, Plan};
 
 /// Check a pipeline and say what it will cost, without running it.
 ///
@@ -21,6 +21,10 @@ pub(super) struct CheckArgs {
 pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let source = args.pipeline.source();
     let plan = Plan::new(source.load()?)?;
+    let problems = plan.file_problems();
+    if !problems.is_empty() {
+        return Err(Box::new(ConfigError::Values { origin: source.origin(), problems }));
+    }
     let cost = plan.cost();
     if args.json {
         print_json_line(&cost)?;

@@ -80,6 +80,9 @@ pub enum ConfigError {
     /// A name that cannot be a folder's.
     #[error("name = {0:?}: expected at most 60 bytes, without slashes and control characters")]
     Name(String),
+    /// A key that pipelines do not have.
+    #[error("{0}: no such key; pipelines/reference.toml holds all of them")]
+    Unknown(String),
     /// Values that cannot be; all of them.
     #[error("{origin}: {} problem(s)\n{}", problems.len(), bullets(problems))]
     Values {
@@ -122,17 +125,26 @@ impl ConfigSource {
             Some(path) => read(path)?,
             None => QUICKLOOK.to_owned(),
         };
-        let parse_error =
-            |origin: String| move |source| ConfigError::Parse { origin, source: Box::new(source) };
+        let parse_error = |origin: String, table: Option<&toml::Table>, source: toml::de::Error| {
+            let unknown = table.map(unknown_keys).unwrap_or_default();
+            // One alone is told by the parser, which knows its line.
+            if unknown.len() > 1 {
+                let problems = unknown.into_iter().map(|key| Box::new(ConfigError::Unknown(key)) as _);
+                return ConfigError::Values { origin, problems: problems.collect() };
+            }
+            ConfigError::Parse { origin, source: Box::new(source) }
+        };
         // Straight from the text first: these errors know their line.
-        let mut config: Config = toml::from_str(&text).map_err(parse_error(origin.clone()))?;
+        let mut config: Config = toml::from_str(&text)
+            .map_err(|source| parse_error(origin.clone(), toml::from_str(&text).ok().as_ref(), source))?;
         if !self.overrides.is_empty() {
-            let mut table: toml::Table = toml::from_str(&text).map_err(parse_error(origin))?;
+            let mut table: toml::Table =
+                toml::from_str(&text).map_err(|source| parse_error(origin, None, source))?;
             for text in &self.overrides {
                 set(&mut table, text)?;
             }
             let origin = format!("--set {}", self.overrides.join(" --set "));
-            config = table.try_into().map_err(parse_error(origin))?;
+            config = table.clone().try_into().map_err(|source| parse_error(origin, Some(&table), source))?;
         }
         if let Some(seed) = self.seed {
             config.seed = seed;
@@ -242,6 +254,31 @@ fn read(path: &Path) -> Result<String, ConfigError> {
     std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })
 }
 
+/// Keys that have no default because they may be absent.
+const OPTIONAL_KEYS: [&str; 2] = ["sky.file", "calibration.gains_file"];
+
+/// All keys of a table that pipelines do not have, with their sections.
+fn unknown_keys(table: &toml::Table) -> Vec<String> {
+    fn walk(prefix: &str, table: &toml::Table, known: &toml::Table, found: &mut Vec<String>) {
+        for (key, value) in table {
+            let path = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+            match (known.get(key), value) {
+                (Some(toml::Value::Table(known)), toml::Value::Table(table)) => {
+                    walk(&path, table, known, found);
+                }
+                (Some(_), _) => {}
+                (None, _) if OPTIONAL_KEYS.contains(&path.as_str()) => {}
+                (None, _) => found.push(path),
+            }
+        }
+    }
+    let mut found = Vec::new();
+    // The default configuration always has a TOML form: the reference file's test relies on it too.
+    let known = toml::Table::try_from(Config::default()).unwrap_or_default();
+    walk("", table, &known, &mut found);
+    found
+}
+
 /// Lays `key=value` over a table; a value that is not TOML is taken as a string.
 fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
     let (key, value) = text.split_once('=').ok_or_else(|| ConfigError::Override(text.to_owned()))?;
@@ -310,6 +347,15 @@ mod tests {
         assert!(matches!(with(&["seed.more=1"]), Err(ConfigError::NotASection { .. })));
         let unknown = with(&["map.nsides=8"]).unwrap_err().to_string();
         assert!(unknown.contains("nsides"), "{unknown}");
+    }
+
+    #[test]
+    fn unknown_keys_are_told_all_at_once() {
+        let told = with(&["map.nsides=8", "sky.fil=x", "map.nside=8", "seeds=1"]).unwrap_err().to_string();
+        for key in ["map.nsides", "sky.fil:", "seeds"] {
+            assert!(told.contains(key), "{key} is not in {told}");
+        }
+        assert!(!told.contains("map.nside:"), "{told}");
     }
 
     #[test]

@@ -11,7 +11,7 @@ mod run;
 mod space;
 mod summary;
 
-pub use config::{Config, ConfigError, ConfigSource, QUICKLOOK};
+pub use config::{Config, ConfigError, ConfigSource, Problems, QUICKLOOK};
 pub use cost::{ChannelCost, Cost};
 pub use error::PipelineError;
 pub use plan::{Expected, Plan};

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::config::Config;
+use super::config::{Config, Problems};
 use super::error::PipelineError;
 use crate::array::Array;
 use crate::frames::{Instrument, ObservingWindow};
@@ -53,6 +53,12 @@ impl Plan {
         let schedules = spacecraft.channels_hz.iter().enumerate().map(schedule).collect();
         let windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.every_nth_window);
         Ok(Self { config, array, instrument, schedules, windows })
+    }
+
+    /// What is wrong with the files that the configuration names; reads them.
+    #[must_use]
+    pub fn file_problems(&self) -> Problems {
+        super::space::file_problems(self)
     }
 
     /// About how many visibilities each channel will have, sent down and within the map's limit.

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::config::Problems;
 use super::error::PipelineError;
 use super::plan::Plan;
 use crate::downlink::Transmitter;
@@ -13,6 +14,21 @@ use crate::sky::{Frame, SkyMap};
 
 /// Name of the stage by whose windows progress is measured.
 pub const INTEGRATE: &str = "integrate";
+
+/// What is wrong with the files that a pipeline names; each is read.
+pub(super) fn file_problems(plan: &Plan) -> Problems {
+    let mut found = Problems::new();
+    let skies = plan.config.sky.file.iter().flat_map(|files| files.values());
+    for path in skies.chain(&plan.config.map.prior_files) {
+        if let Err(problem) = read_whole_map(path, &ReadOptions::default()) {
+            found.push(Box::new(problem));
+        }
+    }
+    if let Err(problem) = plan.config.calibration.build(std::path::Path::new("")) {
+        found.push(Box::new(problem));
+    }
+    found
+}
 
 /// The simulated sky of every channel, in its own pixels and frame.
 ///
