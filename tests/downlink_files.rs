@@ -217,7 +217,10 @@ fn empty_foreign_and_missing_files_are_named() {
 #[test]
 fn an_output_that_cannot_be_written_is_named() {
     let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("no such folder").join("pass.ccsds");
+    // Folders are made; a file in the way of one is an error.
+    let path = folder.path().join("no such folder");
+    fs::write(&path, "").unwrap();
+    let path = path.join("pass.ccsds");
     let error = DownlinkWriter::create(&path, &DownlinkConfig::default()).unwrap_err();
     assert!(error.to_string().contains("no such folder"), "{error}");
     let config = DownlinkConfig { packet_bytes_max: 10, repeat_bytes: 0 };

@@ -116,8 +116,8 @@ fn a_failed_write_leaves_the_old_file_and_nothing_else() {
     let huge = SkyMap::constant(2, Frame::Ecliptic, 1e300).unwrap();
     let error = write_map(&path, &huge, &WriteOptions::default()).unwrap_err();
     assert!(matches!(*error.problem, FitsProblem::Overflow { pixel: 0, .. }));
-    assert!(write_map(&folder.path().join("no/such.fits"), &map(2), &WriteOptions::default()).is_err());
-    // A folder cannot be replaced by a file: the failure comes after everything is written.
+    assert!(write_map(&path.join("such.fits"), &map(2), &WriteOptions::default()).is_err());
+    // A folder cannot be replaced by a file.
     let taken = folder.path().join("folder");
     fs::create_dir(&taken).unwrap();
     assert!(write_map(&taken, &map(2), &WriteOptions::default()).is_err());

@@ -152,14 +152,6 @@ impl ArrayConfig {
         ] {
             require(key, value, value > 0.0, POSITIVE);
         }
-        // No window then holds more than one turnaround.
-        let period = breathing.period_s;
-        require(
-            "breathing.period_s",
-            period,
-            period >= 2.0 * self.orbital_period_s,
-            "two orbital periods or more",
-        );
         for (key, value) in
             [("breathing.first_ratio", breathing.first_ratio), ("breathing.ratio", breathing.ratio)]
         {

@@ -61,6 +61,12 @@ impl Formation {
         self.arc_m_max.len()
     }
 
+    /// Breathing period, s.
+    #[must_use]
+    pub fn period_s(&self) -> f64 {
+        self.period_s
+    }
+
     /// Arc of daughter `n` (from 0), m, and its rate, m/s, at `t_s`.
     #[must_use]
     pub fn arc_m(&self, n: usize, t_s: f64) -> (f64, f64) {

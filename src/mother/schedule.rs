@@ -88,11 +88,20 @@ impl Schedule {
 /// are linear in time between turnarounds, so it is shortest at an end or where breathing turns.
 fn shortest_m(array: &Array, window: ObservingWindow, pair: Pair) -> f64 {
     let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
-    let turn_s = array.formation().next_turnaround_s(start_s).min(end_s);
     let length_m =
         |t_s: f64| norm(sub(array.position_m(pair.i.into(), t_s), array.position_m(pair.j.into(), t_s)));
-    [start_s, turn_s, end_s].into_iter().map(length_m).fold(f64::INFINITY, f64::min)
+    let next = |t_s: &f64| Some(array.formation().next_turnaround_s(*t_s)).filter(|turn_s| *turn_s < end_s);
+    let instants = std::iter::successors(Some(start_s), next).take(TURNAROUNDS_MAX);
+    let shortest = instants.chain([end_s]).map(length_m).fold(f64::INFINITY, f64::min);
+    // Of a formation that turns more often than that, nothing is said.
+    if (end_s - start_s) * 2.0 > TURNAROUNDS_MAX as f64 * array.formation().period_s() {
+        return 0.0;
+    }
+    shortest
 }
+
+/// Most turnarounds looked at in a window; the paper's formation has at most one.
+const TURNAROUNDS_MAX: usize = 64;
 
 #[cfg(test)]
 mod tests {
