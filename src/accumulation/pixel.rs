@@ -98,15 +98,16 @@ impl PixelSums {
         let pixels = rows.pixels();
         let stride = pixels + PADDING;
         let area_sr = pixel_area_sr(setup.nside);
+        let pair = |visibility: &Pending| PairGeometry {
+            r_i_m: visibility.r_i_m,
+            r_j_m: visibility.r_j_m,
+            frequency_hz: setup.frequency_hz,
+            moon_radius_m: setup.moon_radius_m,
+            response: setup.response,
+        };
+        block.iter().for_each(|visibility| rows.prepare(&pair(visibility)));
         let fill = |visibility: &Pending, re: &mut [f64], im: &mut [f64]| {
-            let pair = PairGeometry {
-                r_i_m: visibility.r_i_m,
-                r_j_m: visibility.r_j_m,
-                frequency_hz: setup.frequency_hz,
-                moon_radius_m: setup.moon_radius_m,
-                response: setup.response,
-            };
-            rows.fill(&pair, area_sr * visibility.weight.sqrt(), re, im);
+            rows.fill(&pair(visibility), area_sr * visibility.weight.sqrt(), re, im);
         };
         let mut a = vec![0.0_f64; 2 * block.len() * stride];
         a.par_chunks_exact_mut(2 * stride).zip(block).for_each(|(rows, visibility)| {

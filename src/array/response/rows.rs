@@ -111,6 +111,27 @@ impl RowMaker {
         self.pixel_width_rad
     }
 
+    /// Makes the tables that rows of this pair need. To be called before rows are filled by tasks side by
+    /// side: making tables is parallel too, and tasks that wait for them would keep its workers.
+    pub fn prepare(&self, pair: &PairGeometry) {
+        if self.method == PixelMethod::Average {
+            let pixels_long = norm(pair.baseline_wavelengths()) * self.pixel_width_rad;
+            // A little more than that, so that rounding cannot choose a class that was not made.
+            for reach in [pixels_long * (1.0 - 1e-12), pixels_long * (1.0 + 1e-12)] {
+                if let Some(class) = CLASSES.iter().position(|&(longest, _)| reach <= longest) {
+                    self.class(class);
+                }
+            }
+        }
+    }
+
+    fn class(&self, class: usize) -> &BlockClass {
+        self.classes[class].get_or_init(|| {
+            let (longest, per_side) = CLASSES[class];
+            BlockClass::new(self.nside, per_side, longest / self.pixel_width_rad)
+        })
+    }
+
     /// Writes the pair's row, real and imaginary parts, times `factor` (pixel area and root of weight).
     ///
     /// Both slices have [`Self::pixels`] elements; what is beyond the shorter one is left alone.
@@ -151,10 +172,7 @@ impl RowMaker {
         let Some(class) = class else {
             return self.fill_children(&prepared, factor, re, im);
         };
-        let blocks = self.classes[class].get_or_init(|| {
-            let (longest, per_side) = CLASSES[class];
-            BlockClass::new(self.nside, per_side, longest / self.pixel_width_rad)
-        });
+        let blocks = self.class(class);
         // Sums over blocks are kept apart from what is written, which may be anything before.
         let mut row = vec![[0.0_f32; GROUP]; 2 * re.len().div_ceil(GROUP)];
         let (row_re, row_im) = row.as_flattened_mut().split_at_mut(re.len().next_multiple_of(GROUP));
