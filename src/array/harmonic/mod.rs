@@ -10,6 +10,7 @@ mod chebyshev;
 mod error;
 pub(crate) mod filter;
 mod forward;
+mod geometry;
 pub(crate) mod kernel;
 mod legendre;
 mod model;
@@ -23,6 +24,7 @@ pub(crate) mod sizes;
 mod trigonometry;
 
 pub use error::HarmonicError;
+pub use geometry::{GeometryLimits, GeometryRefusal, NominalOrbit, NominalPair, PairOrientation};
 pub use model::{HarmonicModel, ModelSettings};
 pub use pattern::{NodeGrid, PatternGeometry, PatternTable, degrees};
 pub use real::Real;
