@@ -13,9 +13,19 @@ use super::summary::{Segment, Summary};
 use crate::downlink::{FileSource, Recorder};
 use crate::products::{ProductsError, Truth};
 use crate::runtime::{Cancel, Graph, Metrics, Report, RuntimeConfig};
+use crate::solve::SolveWatch;
+
+/// What can be watched of a graph while it runs.
+#[derive(Clone, Debug)]
+pub struct Watched {
+    /// Counters and times of its stages.
+    pub metrics: Arc<Metrics>,
+    /// The solution that is being worked on.
+    pub solving: SolveWatch,
+}
 
 /// Whom to tell about a graph that is about to run.
-pub type Watcher<'a> = &'a mut dyn FnMut(Arc<Metrics>);
+pub type Watcher<'a> = &'a mut dyn FnMut(Watched);
 
 /// Name of the downlink file that `run` leaves among its products.
 pub const DOWNLINK_FILE: &str = "downlink.ccsds";
@@ -34,8 +44,9 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     let bytes = graph.stage("record", capacity, bytes, recorder);
     let truth = Truth::new(&skies, plan.config.map.nside)?;
     drop(skies);
-    let outcome = ground::add(&mut graph, bytes, &plan.config, out, truth)?;
-    let report = start(graph, &plan.config.runtime, cancel, watch)?;
+    let solving = SolveWatch::new(cancel.clone());
+    let outcome = ground::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()))?;
+    let report = start(graph, &plan.config.runtime, (cancel, solving), watch)?;
     conclude(Segment::Whole, &plan.config, Some(out), report, outcome)
 }
 
@@ -54,7 +65,7 @@ pub fn simulate(
     let bytes = space::add(&mut graph, plan, &skies)?;
     drop(skies);
     graph.sink("record", bytes, Recorder::create(file)?);
-    start(graph, &plan.config.runtime, cancel, watch)
+    start(graph, &plan.config.runtime, (cancel, SolveWatch::default()), watch)
 }
 
 /// The ground segment alone, from downlink files in the order given.
@@ -71,8 +82,9 @@ pub fn replay(
     make_folder(out)?;
     let mut graph = Graph::new();
     let bytes = graph.source("read", config.runtime.queue_capacity, FileSource::open(files)?);
-    let outcome = ground::add(&mut graph, bytes, config, out, Truth::unknown())?;
-    let report = start(graph, &config.runtime, cancel, watch)?;
+    let solving = SolveWatch::new(cancel.clone());
+    let outcome = ground::add(&mut graph, bytes, config, out, (Truth::unknown(), solving.clone()))?;
+    let report = start(graph, &config.runtime, (cancel, solving), watch)?;
     conclude(Segment::Ground, config, Some(out), report, outcome)
 }
 
@@ -85,10 +97,10 @@ fn make_folder(out: &Path) -> Result<(), PipelineError> {
 fn start(
     graph: Graph,
     config: &RuntimeConfig,
-    cancel: &Cancel,
+    (cancel, solving): (&Cancel, SolveWatch),
     watch: Watcher<'_>,
 ) -> Result<Report, PipelineError> {
-    watch(graph.metrics());
+    watch(Watched { metrics: graph.metrics(), solving });
     Ok(graph.run(cancel, Duration::from_secs_f64(config.shutdown_s))?)
 }
 

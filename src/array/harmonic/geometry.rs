@@ -23,6 +23,7 @@
 //! `2 pi u |i - i0|` radians at the end of the pattern, so it matters for long baselines first.
 //! [`GeometryLimits`] bounds it, and everything beyond is refused.
 
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::PairState;
@@ -46,27 +47,40 @@ pub struct PairOrientation {
 }
 
 /// Departures from the orbit that an engine takes; all of them small angles and lengths.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct GeometryLimits {
-    /// Greatest angle between a baseline and the plane of the orbit, rad.
-    pub out_of_track_rad_max: f64,
-    /// Greatest difference of the orbit's inclination from its nominal value, rad.
-    pub inclination_rad_max: f64,
+    /// Greatest angle between a baseline and the plane of the orbit, degrees.
+    pub out_of_track_deg_max: f64,
+    /// Greatest difference of the orbit's inclination from its nominal value, degrees.
+    pub inclination_deg_max: f64,
     /// Greatest difference of the altitude from its nominal value, m.
     pub altitude_m_max: f64,
-    /// Greatest angle between a baseline and the horizontal of its mid-point, rad: what unequal altitudes make.
-    pub radial_rad_max: f64,
+    /// Greatest angle between a baseline and the horizontal of its mid-point, degrees: what unequal altitudes make.
+    pub radial_deg_max: f64,
+}
+
+impl GeometryLimits {
+    /// Keys and values.
+    #[must_use]
+    pub fn values(&self) -> [(&'static str, f64); 4] {
+        [
+            ("limits.out_of_track_deg_max", self.out_of_track_deg_max),
+            ("limits.inclination_deg_max", self.inclination_deg_max),
+            ("limits.altitude_m_max", self.altitude_m_max),
+            ("limits.radial_deg_max", self.radial_deg_max),
+        ]
+    }
 }
 
 impl Default for GeometryLimits {
     /// 0.1 deg, 0.1 deg, 5 km, 0.1 deg.
     fn default() -> Self {
-        let tenth = 0.1_f64.to_radians();
         Self {
-            out_of_track_rad_max: tenth,
-            inclination_rad_max: tenth,
+            out_of_track_deg_max: 0.1,
+            inclination_deg_max: 0.1,
             altitude_m_max: 5e3,
-            radial_rad_max: tenth,
+            radial_deg_max: 0.1,
         }
     }
 }
@@ -185,14 +199,14 @@ impl NominalOrbit {
             (orientation.node_rad, orientation.inclination_rad, orientation.phase_rad)
         };
         // Two positions do not tell a tilted pair from a tilted orbit.
-        let tilt_rad_max = limits.out_of_track_rad_max + limits.inclination_rad_max;
+        let tilt_rad_max = (limits.out_of_track_deg_max + limits.inclination_deg_max).to_radians();
         if (inclination_rad - self.inclination_rad).abs() > tilt_rad_max {
             return Err(GeometryRefusal::Inclination);
         }
         if (orientation.radius_m - self.radius_m).abs() > limits.altitude_m_max {
             return Err(GeometryRefusal::Altitude);
         }
-        if orientation.radius_difference_m.abs() > limits.radial_rad_max * orientation.baseline_m {
+        if orientation.radius_difference_m.abs() > limits.radial_deg_max.to_radians() * orientation.baseline_m {
             return Err(GeometryRefusal::UnequalRadii);
         }
         let baseline_wavelengths = orientation.baseline_m / wavelength_m;
