@@ -103,6 +103,17 @@ impl Operator {
         (4 * (l_max + 1) * 2 * ALPHAS * (2 * grids.nodes.count + l_max / 4)) as u64
     }
 
+    /// Operations of the products with patterns and rotations in one application.
+    pub(super) fn matrix_product_flops(&self, tori: &Tori) -> f64 {
+        let reach = self.reach(tori);
+        let used = tori.alphas(self.grids.points, |node| &node.weights);
+        let alphas = used.iter().filter(|used| **used).count().next_multiple_of(ALPHAS);
+        let patterns: usize = (0..=self.l_max).map(|mu| 2 * reach.count * degrees(self.l_max, mu)).sum();
+        let rotations: usize = (0..=self.l_max).map(|l| orders(l) * (l + 1)).sum();
+        // Forth and back, real and imaginary parts, multiplications and additions.
+        (2 * 2 * 2 * alphas * (patterns + rotations)) as f64
+    }
+
     fn reach(&self, tori: &Tori) -> Reach {
         let reached = tori.reached();
         let first = reached.start / NODE_GROUP * NODE_GROUP;
@@ -474,31 +485,57 @@ fn put(
     products[im + 1] = -minus.im;
 }
 
+/// Terms of one node's product: its own weights with itself and those above, theirs with those below.
+const TERMS: usize = 2 * NODES - 1;
+
 /// `line = sum_d W_d z_{+d} + sum_{d > 0} W'_d z_{-d}`, where `rows[d]` are the weights of the node d below: its
 /// diagonal d couples it to this one, and `rows[0]` couples this one to those above.
 fn multiply_line<'a>(
     line: &mut [Complex32],
-    rows: &[Option<&[f32]>; NODES],
+    rows: &[Option<&'a [f32]>; NODES],
     stride: usize,
     z: impl Fn(isize) -> &'a [Complex32],
 ) {
-    line.fill(Complex32::ZERO);
+    let mut terms: [(&[f32], &[Complex32]); TERMS] = [(&[], &[]); TERMS];
+    let mut count = 0;
+    let points = line.len();
     for d in 0..NODES {
         if let Some(own) = rows[0] {
-            add_product(line, &own[d * stride..(d + 1) * stride], z(d as isize));
+            terms[count] = (&own[d * stride..d * stride + points], z(d as isize));
+            count += 1;
         }
         if d > 0
             && let Some(below) = rows[d]
         {
-            add_product(line, &below[d * stride..(d + 1) * stride], z(-(d as isize)));
+            terms[count] = (&below[d * stride..d * stride + points], z(-(d as isize)));
+            count += 1;
         }
     }
+    sum_products(line, &terms[..count]);
 }
 
+/// Points that are summed over all terms in registers.
+const CHUNK: usize = 16;
+
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
-fn add_product(line: &mut [Complex32], weights: &[f32], z: &[Complex32]) {
-    for ((out, w), z) in line.iter_mut().zip(weights).zip(z) {
-        out.re += w * z.re;
-        out.im += w * z.im;
+fn sum_products(line: &mut [Complex32], terms: &[(&[f32], &[Complex32])]) {
+    let (chunks, rest) = line.as_chunks_mut::<CHUNK>();
+    let tail = chunks.len() * CHUNK;
+    for (k, out) in chunks.iter_mut().enumerate() {
+        let mut sums = [Complex32::ZERO; CHUNK];
+        for (weights, z) in terms {
+            let (Some(weights), Some(z)) = (weights.as_chunks::<CHUNK>().0.get(k), z.as_chunks::<CHUNK>().0.get(k))
+            else {
+                continue;
+            };
+            for ((sum, w), z) in sums.iter_mut().zip(weights).zip(z) {
+                sum.re += w * z.re;
+                sum.im += w * z.im;
+            }
+        }
+        *out = sums;
+    }
+    for (k, out) in rest.iter_mut().enumerate() {
+        *out = terms.iter().map(|(weights, z)| z[tail + k] * weights[tail + k]).sum();
     }
 }

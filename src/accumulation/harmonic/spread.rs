@@ -57,31 +57,67 @@ impl Located {
         }
     }
 
-    /// Adds to the sums at one of its nodes; the first is 0.
-    pub(super) fn spread(&self, grids: &Grids, at: usize, node: &mut Node) {
+    /// Weights of one of its nodes with itself and with those above; the first node is 0.
+    fn diagonals(&self, at: usize) -> [f32; NODES] {
         let mut diagonals = [0.0; NODES];
         for (diagonal, other) in diagonals.iter_mut().zip(&self.u[at..NODES]) {
             *diagonal = self.weight * self.u[at] * other;
         }
-        let alphas = &self.weight_alpha[..grids.weight_alpha.width()];
-        let weights = Rows {
-            sums: &mut node.weights,
-            stride: grids.weight_stride(),
-            first: self.weight_first,
-            points: grids.points,
-        };
-        spread_rows::<NODES>(weights, NODES - at, (&diagonals, alphas, &self.weight_gamma));
-        let sides = self.sides.map(|side| side * self.u[at]);
-        let alphas = &self.data_alpha[..grids.data.width()];
-        let data = Rows {
-            sums: &mut node.sides,
-            stride: grids.data_stride(),
-            first: self.data_first,
-            points: grids.data_points(),
-        };
-        spread_rows::<4>(data, 4, (&sides, alphas, &self.data_gamma));
+        diagonals
     }
 }
+
+/// Adds visibilities, in their order, to the sums at node `index`, which all of them reach.
+///
+/// Consecutive ones in one cell of the grid are added together in registers; that changes no bit.
+pub(super) fn spread(grids: &Grids, index: usize, located: &[Located], reaching: &[u32], node: &mut Node) {
+    let of = |k: &u32| &located[*k as usize];
+    let cell = |k: &u32| (of(k).first_node, of(k).weight_first);
+    for run in reaching.chunk_by(|a, b| cell(a) == cell(b)) {
+        for group in run.chunks(GROUP) {
+            let at = index - of(&group[0]).first_node;
+            let rows = Rows {
+                sums: &mut node.weights,
+                stride: grids.weight_stride(),
+                first: of(&group[0]).weight_first,
+                points: grids.points,
+                alphas: grids.weight_alpha.width(),
+                used: NODES - at,
+            };
+            let mut terms = [Term::EMPTY; GROUP];
+            for (term, k) in terms.iter_mut().zip(group) {
+                let one = of(k);
+                *term =
+                    Term { values: one.diagonals(at), alphas: &one.weight_alpha, gammas: &one.weight_gamma };
+            }
+            spread_rows(rows, &terms[..group.len()]);
+        }
+    }
+    let cell = |k: &u32| (of(k).first_node, of(k).data_first);
+    for run in reaching.chunk_by(|a, b| cell(a) == cell(b)) {
+        for group in run.chunks(GROUP) {
+            let at = index - of(&group[0]).first_node;
+            let rows = Rows {
+                sums: &mut node.sides,
+                stride: grids.data_stride(),
+                first: of(&group[0]).data_first,
+                points: grids.data_points(),
+                alphas: grids.data.width(),
+                used: 4,
+            };
+            let mut terms = [Term::EMPTY; GROUP];
+            for (term, k) in terms.iter_mut().zip(group) {
+                let one = of(k);
+                let values = one.sides.map(|side| side * one.u[at]);
+                *term = Term { values, alphas: &one.data_alpha, gammas: &one.data_gamma };
+            }
+            spread_rows(rows, &terms[..group.len()]);
+        }
+    }
+}
+
+/// Most visibilities that are added at once.
+const GROUP: usize = 8;
 
 /// Sums `[alpha][K][gamma]`, and the first point in alpha and gamma to add to.
 struct Rows<'a> {
@@ -89,27 +125,41 @@ struct Rows<'a> {
     stride: usize,
     first: [u32; 2],
     points: usize,
+    /// Alphas that are reached.
+    alphas: usize,
+    /// Of K.
+    used: usize,
 }
 
-/// Adds the outer product of `values` (the first `used` of K), alphas and gammas.
+/// One visibility's factors.
+#[derive(Clone, Copy)]
+struct Term<'a, const K: usize> {
+    values: [f32; K],
+    alphas: &'a [f32; LANES],
+    gammas: &'a [f32; LANES],
+}
+
+impl<const K: usize> Term<'_, K> {
+    const EMPTY: Self = Self { values: [0.0; K], alphas: &[0.0; LANES], gammas: &[0.0; LANES] };
+}
+
+/// Adds the outer products of values, alphas and gammas.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
-fn spread_rows<const K: usize>(
-    rows: Rows<'_>,
-    used: usize,
-    (values, alphas, gammas): (&[f32; K], &[f32], &[f32; LANES]),
-) {
+fn spread_rows<const K: usize>(rows: Rows<'_>, terms: &[Term<'_, K>]) {
     let [first, gamma] = rows.first.map(|x| x as usize);
     let mut alpha = first;
-    for weight in alphas {
-        let start = alpha * K * rows.stride + gamma;
-        for (k, value) in values[..used].iter().enumerate() {
-            let factor = value * weight;
-            let start = start + k * rows.stride;
-            if let Some(sums) = rows.sums.get_mut(start..start + LANES) {
-                for (sum, lane) in sums.iter_mut().zip(gammas) {
-                    *sum += factor * lane;
+    for lane in 0..rows.alphas {
+        for k in 0..rows.used {
+            let start = (alpha * K + k) * rows.stride + gamma;
+            let Some(sums) = rows.sums[start..].first_chunk_mut::<LANES>() else { return };
+            let mut sum = *sums;
+            for term in terms {
+                let factor = term.values[k] * term.alphas[lane];
+                for (sum, gamma) in sum.iter_mut().zip(term.gammas) {
+                    *sum += factor * gamma;
                 }
             }
+            *sums = sum;
         }
         alpha = if alpha + 1 == rows.points { 0 } else { alpha + 1 };
     }

@@ -36,6 +36,12 @@ impl HarmonicSums {
         self.tables.get_or_init(|| self.setup.operator(&self.grids))
     }
 
+    /// Floating-point operations of the matrix products in one [`NormalSums::apply`].
+    #[must_use]
+    pub fn matrix_product_flops(&self) -> f64 {
+        self.operator().matrix_product_flops(&self.tori)
+    }
+
     /// The parts of BtN^-1B that do not change m, with weights that do not depend on the phase: what is left of
     /// it when the orbit has swept all nodes and phases evenly.
     #[must_use]

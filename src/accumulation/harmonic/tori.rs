@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::grid::{Grids, NODES, OVERHANG};
-use super::spread::{Located, Pending};
+use super::spread::{Located, Pending, spread};
 
 /// The sums at one node.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,6 +39,10 @@ impl Node {
         for (part, stride) in self.parts_mut().into_iter().zip(strides) {
             for row in part.chunks_exact_mut(stride) {
                 let (circle, beyond) = row.split_at_mut(stride - OVERHANG);
+                // Memory that was never touched stays so.
+                if beyond.iter().all(|x| *x == 0.0) {
+                    continue;
+                }
                 for (sum, term) in circle.iter_mut().zip(beyond) {
                     *sum += *term;
                     *term = 0.0;
@@ -68,10 +72,7 @@ impl Tori {
                 return;
             }
             let node = node.get_or_insert_with(|| Node::zeros(grids));
-            for &k in reaching {
-                let visibility = &located[k as usize];
-                visibility.spread(grids, index - visibility.first_node, node);
-            }
+            spread(grids, index, &located, reaching, node);
         });
     }
 
