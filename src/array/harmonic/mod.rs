@@ -5,6 +5,7 @@ mod chebyshev;
 mod error;
 mod filter;
 mod forward;
+mod geometry;
 mod kernel;
 mod legendre;
 mod model;
@@ -18,6 +19,7 @@ mod sizes;
 mod trigonometry;
 
 pub use error::HarmonicError;
+pub use geometry::{GeometryLimits, GeometryRefusal, NominalOrbit, NominalPair, PairOrientation};
 pub use model::{HarmonicModel, ModelSettings};
 pub use pattern::{NodeGrid, PatternGeometry, PatternTable, degrees};
 pub use real::Real;
