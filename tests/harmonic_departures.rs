@@ -88,8 +88,11 @@ fn error(real: &mut HarmonicModel, nominal: &mut HarmonicModel, u: f64) -> f64 {
     (square(&difference) / square(&values[0])).sqrt()
 }
 
-/// The table in the documentation of `GeometryLimits`' module: u, 0.1 deg, 5 km.
-const DOCUMENTED: [(usize, [(f64, f64, f64); 4]); 2] = [
+/// u, error of 0.1 deg, error of 5 km.
+type Row = (f64, f64, f64);
+
+/// The table in the documentation of `GeometryLimits`' module, by l_max.
+const DOCUMENTED: [(usize, [Row; 4]); 2] = [
     (64, [(3.0, 0.004, 0.09), (10.0, 0.008, 0.13), (30.0, 0.011, 0.34), (120.0, 0.009, 0.57)]),
     (191, [(3.0, 0.004, 0.10), (10.0, 0.009, 0.14), (30.0, 0.031, 0.39), (120.0, 0.021, 0.68)]),
 ];
