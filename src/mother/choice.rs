@@ -126,21 +126,6 @@ impl ModelPlan {
             bytes,
         }
     }
-
-    /// Cost of the chosen model in fringes.
-    #[must_use]
-    pub fn fringes(&self, visibilities: f64) -> f64 {
-        match self.kind {
-            ModelKind::Direct => self.direct_fringes,
-            ModelKind::Harmonic => self.harmonic_fringes(visibilities),
-        }
-    }
-
-    /// Cost of the harmonic model in fringes.
-    #[must_use]
-    pub fn harmonic_fringes(&self, visibilities: f64) -> f64 {
-        self.set_up_fringes + self.visibility_fringes * visibilities
-    }
 }
 
 /// Greatest degree to which fringes of `u_max` wavelengths reach: 2 pi u and the width of the Airy function's
