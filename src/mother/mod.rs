@@ -4,18 +4,22 @@
 //! This is the spacecraft at the level of integrated visibilities: what the correlator would put out
 //! for a given sky, with thermal noise. Uses [`crate::frames`], [`crate::array`], [`crate::sky`].
 
+mod choice;
 mod config;
 mod direct;
+mod harmonic;
 mod integrator;
 mod model;
 mod observer;
 mod schedule;
 mod store;
 
+pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
 pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, SpacecraftConfig, SpacecraftError};
 pub use direct::DirectSum;
-pub use integrator::{Integrator, NoiseModel};
-pub use model::{PairPosition, Prediction, VisibilityModel};
+pub use harmonic::{HarmonicSetup, HarmonicSum};
+pub use integrator::{Integrator, MeasurementOptions, NoiseModel};
+pub use model::{ModelError, PairPosition, Prediction, VisibilityModel};
 pub use observer::Observer;
 pub use schedule::{Integration, Schedule};
 pub use store::{Store, VISIBILITY_BYTES};

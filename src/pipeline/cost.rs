@@ -10,7 +10,7 @@ use super::plan::Plan;
 use crate::accumulation::{NormalEngine, PixelEngine, PixelSetup};
 use crate::array::response::{Directions, PairGeometry, sky_sums};
 use crate::frames::PlacedVisibilities;
-use crate::mother::VISIBILITY_BYTES;
+use crate::mother::{ModelKind, ModelPlan, VISIBILITY_BYTES};
 use crate::sky::healpix::{pixel_area_sr, pixel_count, pixel_directions};
 use crate::units::Pair;
 
@@ -25,8 +25,13 @@ pub struct ChannelCost {
     pub visibilities_mapped: f64,
     /// Longest baseline used in the map, m.
     pub baseline_m_max: f64,
-    /// Multiply-adds of the simulation by direct sum, one a pixel and visibility (of some 30 operations).
-    pub simulation_fringes: f64,
+    /// How the visibilities are simulated and what it costs, in fringes: of a direct sum one a pixel and
+    /// visibility (some 30 operations), of harmonics what takes as long.
+    pub simulation: ModelPlan,
+    /// Time of the simulation by direct sums, s, at the rate measured on this machine.
+    pub simulation_direct_s: f64,
+    /// Time of the simulation through harmonics, s: set-up and visibilities.
+    pub simulation_harmonic_s: [f64; 2],
     /// Multiply-adds of the normal equations.
     pub accumulation_multiply_adds: f64,
     /// Multiply-adds of one solution.
@@ -50,10 +55,20 @@ pub struct Cost {
     pub predicted_s: f64,
 }
 
+impl ChannelCost {
+    /// Time of the simulation as it will be done, s.
+    fn simulation_s(&self) -> f64 {
+        match self.simulation.kind {
+            ModelKind::Direct => self.simulation_direct_s,
+            ModelKind::Harmonic => self.simulation_harmonic_s.iter().sum(),
+        }
+    }
+}
+
 /// Rates of this machine, measured with this pipeline's own sizes.
 struct Rates {
-    /// Visibilities simulated in a second, all cores.
-    simulated_per_s: f64,
+    /// Fringes summed in a second, all cores.
+    fringes_per_s: f64,
     /// Visibilities accumulated in a second, all cores.
     accumulated_per_s: f64,
 }
@@ -64,17 +79,24 @@ impl Plan {
     pub fn cost(&self) -> Cost {
         let map = &self.config.map;
         let (pixels, sky_pixels) = (pixel_count(map.nside) as f64, self.sky_pixels() as f64);
+        let rates = self.measure();
         let expected = self.visibilities();
         let frequencies = &self.config.spacecraft.channels_hz;
         let channels: Vec<ChannelCost> = frequencies
             .iter()
             .zip(&expected)
-            .map(|(&frequency_hz, expected)| ChannelCost {
+            .zip(self.model_plans(&vec![self.config.sky.nside; frequencies.len()]))
+            .map(|((&frequency_hz, expected), simulation)| ChannelCost {
                 frequency_hz,
                 visibilities_sent: expected.sent.round(),
                 visibilities_mapped: expected.mapped.round(),
                 baseline_m_max: map.baseline_m_max(frequency_hz),
-                simulation_fringes: expected.sent * sky_pixels,
+                simulation,
+                simulation_direct_s: simulation.direct_fringes / rates.fringes_per_s,
+                simulation_harmonic_s: [
+                    simulation.set_up_fringes / rates.fringes_per_s,
+                    simulation.visibility_fringes * expected.sent / rates.fringes_per_s,
+                ],
                 accumulation_multiply_adds: expected.mapped * pixels * pixels,
                 solution_multiply_adds: pixels.powi(3) / 6.0,
             })
@@ -86,13 +108,13 @@ impl Plan {
         // One engine a channel; a snapshot being made, one in the queue, one in the solver, which works in it.
         let snapshots = if solutions > 1 { 3.0 } else { 0.0 };
         let memory_bytes = engine_bytes * (frequencies.len() as f64 + snapshots)
-            + sky_pixels * 8.0 * (frequencies.len() + 3) as f64;
-        let rates = self.measure();
+            + sky_pixels * 8.0 * (frequencies.len() + 3) as f64
+            + channels.iter().map(|channel| channel.simulation.bytes).sum::<f64>();
         // A Cholesky factorisation runs at about the rate of the rank-k updates (one core of it: half).
         let flops = rates.accumulated_per_s * pixels * pixels;
         let solving: f64 = channels.iter().map(|c| c.solution_multiply_adds).sum::<f64>() * solutions as f64;
-        let predicted_s =
-            sent / rates.simulated_per_s + mapped / rates.accumulated_per_s + 2.0 * solving / flops;
+        let simulating: f64 = channels.iter().map(ChannelCost::simulation_s).sum();
+        let predicted_s = simulating + mapped / rates.accumulated_per_s + 2.0 * solving / flops;
         Cost {
             channels,
             windows: self.windows.len(),
@@ -136,8 +158,8 @@ impl Plan {
         let few = &pairs[..SAMPLES.min(64)];
         let since = Instant::now();
         let summed = sky_sums(few, &directions, &sky_k, pixel_area_sr(nside)).is_ok();
-        let simulated_per_s =
-            if summed { few.len() as f64 / since.elapsed().as_secs_f64() } else { f64::NAN };
+        let fringes = (few.len() * directions.len()) as f64;
+        let fringes_per_s = if summed { fringes / since.elapsed().as_secs_f64() } else { f64::NAN };
         let placed = PlacedVisibilities {
             frequency_hz,
             pair: Pair { i: 0, j: 1 },
@@ -166,7 +188,7 @@ impl Plan {
         // The work of a visibility grows as the number of pixels squared.
         let shrink = pixel_count(measured_nside) as f64 / pixel_count(self.config.map.nside) as f64;
         let accumulated_per_s = rate * shrink * shrink;
-        Rates { simulated_per_s, accumulated_per_s }
+        Rates { fringes_per_s, accumulated_per_s }
     }
 }
 
@@ -174,19 +196,30 @@ impl fmt::Display for Cost {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "{:>12} {:>14} {:>14} {:>14} {:>16} {:>16}",
-            "channel", "visibilities", "in the map", "b max (m)", "fringes", "multiply-adds"
+            "{:>12} {:>14} {:>14} {:>14} {:>16}",
+            "channel", "visibilities", "in the map", "b max (m)", "multiply-adds"
         )?;
         for channel in &self.channels {
             writeln!(
                 f,
-                "{:>8.3} MHz {:>14.0} {:>14.0} {:>14.1} {:>16.2e} {:>16.2e}",
+                "{:>8.3} MHz {:>14.0} {:>14.0} {:>14.1} {:>16.2e}",
                 channel.frequency_hz / 1e6,
                 channel.visibilities_sent,
                 channel.visibilities_mapped,
                 channel.baseline_m_max,
-                channel.simulation_fringes,
                 channel.accumulation_multiply_adds + channel.solution_multiply_adds * self.solutions as f64
+            )?;
+        }
+        writeln!(f)?;
+        for channel in &self.channels {
+            let ModelPlan { kind, why, l_max, .. } = channel.simulation;
+            let [set_up_s, visibilities_s] = channel.simulation_harmonic_s;
+            writeln!(
+                f,
+                "{:>8.3} MHz simulated by {kind} ({why}): direct sums {:.3e} s, harmonics to l = {l_max} \
+                 {set_up_s:.0} s + {visibilities_s:.1} s",
+                channel.frequency_hz / 1e6,
+                channel.simulation_direct_s
             )?;
         }
         writeln!(f)?;

@@ -6,6 +6,7 @@ mod config;
 mod cost;
 mod error;
 mod ground;
+mod models;
 mod plan;
 mod run;
 mod space;

@@ -6,7 +6,7 @@ use super::config::Problems;
 use super::error::PipelineError;
 use super::plan::Plan;
 use crate::downlink::Transmitter;
-use crate::mother::{DirectSum, Integrator, NoiseModel, Observer, Store};
+use crate::mother::{Integrator, MeasurementOptions, NoiseModel, Observer, Store};
 use crate::runtime::{Graph, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::generated::generate;
@@ -52,18 +52,18 @@ pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
 /// Adds the space segment to `graph`; what comes out are the bytes of the downlink.
 ///
 /// # Errors
-/// A downlink configuration that cannot be.
+/// A model of the visibilities or a downlink configuration that cannot be.
 pub fn add(graph: &mut Graph, plan: &Plan, skies: &[SkyMap]) -> Result<Link<Vec<u8>>, PipelineError> {
     let Plan { config, array, instrument, schedules, windows } = plan;
     let capacity = config.runtime.queue_capacity;
-    let frequencies = &config.spacecraft.channels_hz;
-    let model = DirectSum::new(skies, frequencies, array.moon_radius_m(), instrument.response);
     let noise = NoiseModel {
         seed: config.spacecraft.thermal_noise.then_some(config.seed),
         receiver_noise_k_sr: config.spacecraft.receiver_noise_k_sr,
     };
+    let options = MeasurementOptions { noise, smear_integrations: config.spacecraft.smear_integrations };
+    let models = super::models::build(plan, skies)?;
     let integrator =
-        Integrator::new(Arc::clone(array), Arc::new(model), instrument.clone(), schedules.clone(), noise);
+        Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options);
     // A window waiting is nothing; a window's visibilities are.
     let windows = graph.source("observe", 1, Observer::new(windows.clone()));
     let frames = graph.stage(INTEGRATE, capacity, windows, integrator);
