@@ -4,7 +4,6 @@
 //! symmetric rank-k updates alone on matrices of the same size, measured just before and after: the share
 //! of the time that the machine spends on what no pixel engine can avoid.
 
-use std::sync::Arc;
 use std::time::Instant;
 
 use lunarray::accumulation::{Columns, SymmetricTiles};

@@ -102,6 +102,9 @@ pub trait NormalEngine: Send {
     /// counted as refused instead.
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 
+    /// Adds what waits for company, if anything does; changes no bit of the sums.
+    fn settle(&mut self) {}
+
     /// Adds what another engine of the same setup holds.
     ///
     /// # Errors

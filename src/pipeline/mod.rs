@@ -4,6 +4,7 @@
 
 mod config;
 mod cost;
+mod engine_cost;
 mod error;
 mod ground;
 mod models;

@@ -23,6 +23,11 @@ const DATA_TOLERANCE: f64 = 1e-4;
 /// Points of the weights' grid, a degree: products of two sky orders have differences up to 2 `l_max`.
 const POINTS_PER_DEGREE: f64 = 4.5;
 
+/// Multiply-adds of spreading one visibility: pairs of nodes and alphas of weights, nodes and about 11 alphas of four
+/// sums of data, each over the lanes of a kernel in gamma.
+pub const SPREAD_MULTIPLY_ADDS: f64 =
+    ((NODES * (NODES + 1) / 2 * WEIGHT_ALPHAS + NODES * 11 * 4) * LANES) as f64;
+
 /// Floats beyond a row's end, into which a kernel may reach.
 pub(super) const OVERHANG: usize = LANES;
 

@@ -28,6 +28,7 @@ mod tori;
 use std::sync::{Arc, OnceLock};
 
 pub use blocks::{OrderBlocks, OrderFactors};
+pub use grid::SPREAD_MULTIPLY_ADDS;
 pub use setup::{HarmonicMemory, HarmonicSetup, L_MAX, memory, orbit_of};
 pub use sums::{HarmonicSums, coefficients, unknowns};
 
@@ -75,14 +76,6 @@ impl HarmonicEngine {
     #[must_use]
     pub fn setup(&self) -> &HarmonicSetup {
         &self.sums.setup
-    }
-
-    /// Spreads what waits.
-    fn settle(&mut self) {
-        if !self.pending.is_empty() {
-            self.sums.tori.add(&self.sums.grids, &self.pending);
-            self.pending.clear();
-        }
     }
 
     /// Where a visibility goes, or why it cannot.
@@ -161,6 +154,13 @@ impl NormalEngine for HarmonicEngine {
             }
         }
         Ok(added)
+    }
+
+    fn settle(&mut self) {
+        if !self.pending.is_empty() {
+            self.sums.tori.add(&self.sums.grids, &self.pending);
+            self.pending.clear();
+        }
     }
 
     fn merge(&mut self, other: Self) -> Result<(), AccumulationError> {
