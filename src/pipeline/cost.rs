@@ -85,7 +85,7 @@ impl Plan {
         let channels: Vec<ChannelCost> = frequencies
             .iter()
             .zip(&expected)
-            .zip(self.model_plans(&vec![self.config.sky.nside; frequencies.len()]))
+            .zip(self.model_plans(&self.sky_nsides()))
             .map(|((&frequency_hz, expected), simulation)| ChannelCost {
                 frequency_hz,
                 visibilities_sent: expected.sent.round(),
