@@ -131,7 +131,12 @@ fn matrix_product_flops() -> f64 {
 }
 
 /// Visibilities of every pair below `length_m_max` over a window, as the ground places them.
-fn placed(array: &Array, window: ObservingWindow, frequency_hz: f64, length_m_max: f64) -> Vec<PlacedVisibilities> {
+fn placed(
+    array: &Array,
+    window: ObservingWindow,
+    frequency_hz: f64,
+    length_m_max: f64,
+) -> Vec<PlacedVisibilities> {
     let rate = TAU / array.orbital_period_s();
     let wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz;
     let mut blocks = Vec::new();

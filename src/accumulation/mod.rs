@@ -59,7 +59,9 @@ impl Refusal {
     pub fn reason(self) -> &'static str {
         match self {
             Self::Geometry(GeometryRefusal::NotFinite) => "refused by the engine: a position is not finite",
-            Self::Geometry(GeometryRefusal::Degenerate) => "refused by the engine: the baseline has no direction",
+            Self::Geometry(GeometryRefusal::Degenerate) => {
+                "refused by the engine: the baseline has no direction"
+            }
             Self::Geometry(GeometryRefusal::Inclination) => "refused by the engine: out of the orbit's plane",
             Self::Geometry(GeometryRefusal::Altitude) => "refused by the engine: off the orbit's altitude",
             Self::Geometry(GeometryRefusal::UnequalRadii) => {

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use super::harmonic::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
 use super::{
-    AccumulationError, Added, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums,
-    Refusal, SumCounts,
+    AccumulationError, Added, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine, PixelSetup,
+    PixelSums, Refusal, SumCounts,
 };
 use crate::array::harmonic::GeometryRefusal;
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities};

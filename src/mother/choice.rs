@@ -46,7 +46,7 @@ pub struct Load {
     pub sky_nside: usize,
     /// Longest baseline, wavelengths.
     pub baseline_wavelengths_max: f64,
-    /// Band limit that is asked for; 0 for what the baselines ask for.
+    /// Greatest band limit; 0 for what the baselines ask for. A map that holds less has less.
     pub l_max: usize,
     /// Whether visibilities are averages over their integrations.
     pub smeared: bool,
@@ -88,13 +88,23 @@ impl ModelPlan {
     #[must_use]
     pub fn new(choice: ModelChoice, load: Load) -> Self {
         let u_max = load.baseline_wavelengths_max;
-        let l_max = if load.l_max > 0 { load.l_max } else { band_limit(u_max, load.sky_nside) };
+        let l_max = match load.l_max {
+            0 => band_limit(u_max).min(held(load.sky_nside)),
+            // A little more can be asked for than is taken unasked.
+            most => {
+                if most > 5 * load.sky_nside / 2 {
+                    held(load.sky_nside)
+                } else {
+                    most
+                }
+            }
+        };
         let pixels = 12.0 * (load.sky_nside as f64).powi(2);
         let direct_fringes = pixels * load.visibilities;
         let (l, nodes) = (l_max as f64, 4.5 * u_max + 40.0);
         // Measured, in fringes of 0.45 ns (two cores): patterns and rotation; rotated sky, products, sampling.
         let set_up_fringes = 2e8 + 40.0 * l * l * nodes + 6.0 * l * l * l;
-        let visibility_fringes = 500.0 + 9.0 * l;
+        let visibility_fringes = 500.0 + 8.0 * l;
         let harmonic_fringes = set_up_fringes + visibility_fringes * load.visibilities;
         // Patterns of both signs of mu; d+ and d-; rotated skies.
         let harmonic_bytes = 2.2 * l * l * nodes + 4.0 / 3.0 * l * l * l + 600.0 * l * l;
@@ -129,12 +139,17 @@ impl ModelPlan {
 }
 
 /// Greatest degree to which fringes of `u_max` wavelengths reach: 2 pi u and the width of the Airy function's
-/// fall beyond it; no more than 1024 and what a map of `nside` holds.
-fn band_limit(u_max: f64, nside: usize) -> usize {
+/// fall beyond it; no more than 1024.
+fn band_limit(u_max: f64) -> usize {
     let turning = TAU * u_max;
     let wanted = (turning + 6.0 * turning.cbrt()).ceil() as usize + 8;
+    wanted.min(L_MAX)
+}
+
+/// Greatest degree that a map of `nside` holds well.
+fn held(nside: usize) -> usize {
     let (of, nsides) = DEGREES_OF_NSIDE;
-    wanted.min(L_MAX).min(of * nside / nsides)
+    of * nside / nsides
 }
 
 #[cfg(test)]
@@ -154,6 +169,8 @@ mod tests {
         // 2 pi 125.2 = 787, and the fall beyond.
         assert!((840..860).contains(&paper.l_max), "{}", paper.l_max);
         assert_eq!(plan(load(2.6e7, 64, 125.2)).l_max, 144);
+        assert_eq!(plan(Load { l_max: 1024, ..load(2.6e7, 64, 125.2) }).l_max, 144);
+        assert_eq!(plan(Load { l_max: 1024, ..load(2.6e7, 512, 125.2) }).l_max, 1024);
         // All pairs at 10 MHz ask for gigabytes of patterns.
         assert_eq!(plan(load(1.9e9, 512, 3336.0)).kind, ModelKind::Direct);
         assert_eq!(plan(Load { smeared: true, ..load(5e4, 64, 31.3) }).kind, ModelKind::Harmonic);

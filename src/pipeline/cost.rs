@@ -78,7 +78,7 @@ impl Plan {
         let channels: Vec<ChannelCost> = frequencies
             .iter()
             .zip(&expected)
-            .zip(self.model_plans(&vec![self.config.sky.nside; frequencies.len()]))
+            .zip(self.model_plans(&self.sky_nsides()))
             .zip(&engines)
             .map(|(((&frequency_hz, expected), simulation), engine)| ChannelCost {
                 frequency_hz,

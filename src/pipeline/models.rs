@@ -10,6 +10,7 @@ use crate::array::harmonic::RotationTable;
 use crate::mother::{
     DirectSum, HarmonicSetup, HarmonicSum, Load, ModelKind, ModelPlan, Schedule, VisibilityModel,
 };
+use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
 use crate::sky::{Frame, SkyConfig, SkyConfigError, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
@@ -31,6 +32,20 @@ impl Plan {
             ModelPlan::new(spacecraft.model, load)
         };
         self.schedules.iter().zip(self.visibilities()).zip(nsides).map(plan).collect()
+    }
+}
+
+impl Plan {
+    /// nside of each channel's simulated sky; a map file that cannot be read counts as a generated sky.
+    #[must_use]
+    pub fn sky_nsides(&self) -> Vec<usize> {
+        let sky = &self.config.sky;
+        let nside = |channel: usize| {
+            let path = sky.file.as_ref().and_then(|files| files.get(channel));
+            let map = path.and_then(|path| read_whole_map(&path, &ReadOptions::default()).ok());
+            map.map_or(sky.nside, |map| map.nside())
+        };
+        (0..self.schedules.len()).map(nside).collect()
     }
 }
 

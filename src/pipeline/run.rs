@@ -10,6 +10,7 @@ use super::ground::{self, GroundOutcome};
 use super::plan::Plan;
 use super::space;
 use super::summary::{Segment, Summary};
+use crate::accumulation::EngineKind;
 use crate::downlink::{FileSource, Recorder};
 use crate::products::{ProductsError, Truth};
 use crate::runtime::{Cancel, Graph, Metrics, Report, RuntimeConfig};
@@ -42,7 +43,11 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     let recorder = Recorder::create(&out.join(DOWNLINK_FILE))?;
     let capacity = plan.config.runtime.queue_capacity;
     let bytes = graph.stage("record", capacity, bytes, recorder);
-    let truth = Truth::new(&skies, plan.config.map.nside)?;
+    let map = &plan.config.map;
+    let truth = match map.engine {
+        EngineKind::Harmonic => Truth::band_limited(&skies, map.nside, map.degree())?,
+        _ => Truth::new(&skies, map.nside)?,
+    };
     drop(skies);
     let solving = SolveWatch::new(cancel.clone());
     let outcome = ground::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()))?;

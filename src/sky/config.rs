@@ -17,7 +17,8 @@ pub struct SkyConfig {
     pub file: Option<PerChannel<PathBuf>>,
     /// nside of the generated sky.
     pub nside: usize,
-    /// Band limit of skies that are simulated through harmonics; 0 for what the baselines ask for.
+    /// Greatest band limit of skies that are simulated through harmonics, less for a map that holds less; 0 for
+    /// what the baselines ask for.
     pub l_max: usize,
     /// The generated sky's parts.
     pub generated: GeneratedSky,

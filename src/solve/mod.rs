@@ -15,9 +15,9 @@ mod tikhonov;
 mod watch;
 
 pub use cholesky::{Cholesky, NotPositive};
+pub use conjugate_gradients::{Convergence, StoppingRule};
 pub use diagnostics::{Spectrum, spectrum};
 pub use error::SolveError;
-pub use conjugate_gradients::{Convergence, StoppingRule};
 pub use harmonic::{HarmonicRequest, HarmonicSolution, solve_harmonics};
 pub use lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
 pub use probing::{Estimate, Traces, effective_beam, noise_variance, regularisation, traces};

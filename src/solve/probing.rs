@@ -187,7 +187,8 @@ impl Space {
         for (row, vector) in self.krylov.basis.iter().enumerate().take(self.eigenvalues.len()) {
             let terms = self.eigenvalues.iter().enumerate();
             let factor: f64 =
-                terms.map(|(k, w)| f(*w) * self.vectors[(0, k)] * self.vectors[(row, k)]).sum::<f64>() * length;
+                terms.map(|(k, w)| f(*w) * self.vectors[(0, k)] * self.vectors[(row, k)]).sum::<f64>()
+                    * length;
             result.iter_mut().zip(vector).for_each(|(sum, x)| *sum += factor * x);
         }
         result

@@ -3,8 +3,8 @@
 use serde::Serialize;
 
 use super::cholesky::{Cholesky, NotPositive};
-use super::error::SolveError;
 use super::conjugate_gradients::Convergence;
+use super::error::SolveError;
 use super::lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
 use super::probing::Traces;
 use crate::accumulation::{NormalSums, PixelSums};
@@ -62,7 +62,8 @@ pub fn solve_pixels(
     if epsilon.is_nan() || epsilon <= 0.0 {
         return Err(SolveError::Epsilon(epsilon));
     }
-    let LargestEigenvalue { value: w_max, iterations, .. } = largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| true);
+    let LargestEigenvalue { value: w_max, iterations, .. } =
+        largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| true);
     let mut map_k = sums.right.clone();
     if let Some(prior_k) = prior_k {
         if prior_k.len() != pixels {

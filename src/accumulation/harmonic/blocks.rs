@@ -175,7 +175,8 @@ impl MuPart {
                 rows.push(row.to_vec());
             }
         }
-        let powers = Mat::from_fn(count, count, |i, j| 0.5 * f64::from(powers[i + count * j] + powers[j + count * i]));
+        let powers =
+            Mat::from_fn(count, count, |i, j| 0.5 * f64::from(powers[i + count * j] + powers[j + count * i]));
         Self { mu, l_max, powers, rows }
     }
 

@@ -103,7 +103,8 @@ pub(super) fn read(from: &mut dyn Read) -> Result<HarmonicEngine, AccumulationEr
         let mut numbers = [0.0; PENDING_NUMBERS];
         from.numbers(&mut numbers)?;
         let [alpha_rad, gamma_rad, u, weight, sides @ ..] = numbers;
-        let in_range = (0.0..=engine.sums.setup.baseline_m_max / engine.sums.setup.wavelength_m()).contains(&u);
+        let in_range =
+            (0.0..=engine.sums.setup.baseline_m_max / engine.sums.setup.wavelength_m()).contains(&u);
         if !in_range || numbers.iter().any(|x| !x.is_finite()) || grids.nodes.count == 0 {
             return Err(refused(format!("a baseline of {u} wavelengths"), "one within the engine's limit"));
         }

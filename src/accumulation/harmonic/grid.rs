@@ -47,10 +47,12 @@ impl Grids {
     pub(super) fn new(l_max: usize, u_max: f64) -> Self {
         let degrees = l_max as f64;
         // Half of it is a good length too, and holds 2 l_max + 1 orders with room to spare.
-        let points = 2 * fft_length((0.5 * POINTS_PER_DEGREE * degrees).max(2.0 * degrees + 16.0).ceil() as usize);
+        let points =
+            2 * fft_length((0.5 * POINTS_PER_DEGREE * degrees).max(2.0 * degrees + 16.0).ceil() as usize);
         let step = 1.0 / NODES_PER_WAVELENGTH;
         let count = (u_max / step).ceil() as usize + 2 * NODES;
-        let nodes = NodeGrid { first: -(NODES as f64) * step, step, count: count.next_multiple_of(NODE_GROUP) };
+        let nodes =
+            NodeGrid { first: -(NODES as f64) * step, step, count: count.next_multiple_of(NODE_GROUP) };
         Self {
             points,
             nodes,

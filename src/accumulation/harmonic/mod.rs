@@ -113,7 +113,9 @@ impl HarmonicEngine {
 
     fn combine(&mut self, mut other: Self, sign: f64) -> Result<(), AccumulationError> {
         if self.sums.setup != other.sums.setup {
-            return Err(AccumulationError::Mismatch { what: "degrees, frequencies, baselines, orbits or seeds" });
+            return Err(AccumulationError::Mismatch {
+                what: "degrees, frequencies, baselines, orbits or seeds",
+            });
         }
         self.settle();
         other.settle();

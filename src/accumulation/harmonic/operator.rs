@@ -524,7 +524,8 @@ fn sum_products(line: &mut [Complex32], terms: &[(&[f32], &[Complex32])]) {
     for (k, out) in chunks.iter_mut().enumerate() {
         let mut sums = [Complex32::ZERO; CHUNK];
         for (weights, z) in terms {
-            let (Some(weights), Some(z)) = (weights.as_chunks::<CHUNK>().0.get(k), z.as_chunks::<CHUNK>().0.get(k))
+            let (Some(weights), Some(z)) =
+                (weights.as_chunks::<CHUNK>().0.get(k), z.as_chunks::<CHUNK>().0.get(k))
             else {
                 continue;
             };

@@ -43,7 +43,8 @@ pub fn orbit_of(placed: &PlacedVisibilities, limits: GeometryLimits) -> Option<N
     let found = pairs.find_map(|(&r_i_m, &r_j_m)| PairOrientation::of(r_i_m, r_j_m).ok())?;
     // A satellite j that leads turns the pair's plane upside down; orbits are taken as prograde.
     let inclination_rad = found.inclination_rad.min(std::f64::consts::PI - found.inclination_rad);
-    let inclination_deg = (inclination_rad.to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
+    let inclination_deg =
+        (inclination_rad.to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
     Some(NominalOrbit {
         inclination_rad: inclination_deg.to_radians(),
         radius_m: (found.radius_m / RADIUS_STEP_M).round() * RADIUS_STEP_M,

@@ -128,8 +128,16 @@ fn the_operator_is_the_sum_over_rows() {
         let mut y = vec![0.0; x.len()];
         sums.apply(&x, &mut y);
         let scale = (form(&vx, &vx) * form(&vz, &vz)).sqrt();
-        assert!((dot(&x, &y) / form(&vx, &vx) - 1.0).abs() < INTERPOLATION, "{}", dot(&x, &y) / form(&vx, &vx) - 1.0);
-        assert!((dot(&z, &y) - form(&vz, &vx)).abs() < INTERPOLATION * scale, "{}", (dot(&z, &y) - form(&vz, &vx))/scale);
+        assert!(
+            (dot(&x, &y) / form(&vx, &vx) - 1.0).abs() < INTERPOLATION,
+            "{}",
+            dot(&x, &y) / form(&vx, &vx) - 1.0
+        );
+        assert!(
+            (dot(&z, &y) - form(&vz, &vx)).abs() < INTERPOLATION * scale,
+            "{}",
+            (dot(&z, &y) - form(&vz, &vx)) / scale
+        );
     }
 }
 
@@ -157,7 +165,8 @@ fn data_is_projected_by_the_adjoint() {
         let vx = forward(&x, &blocks);
         let expected: f64 =
             vx.iter().zip(&values).zip(&weights).map(|((a, b), w)| w * (a.conj() * b).re).sum();
-        let length = |v: &[Complex64]| v.iter().zip(&weights).map(|(v, w)| w * v.norm_sqr()).sum::<f64>().sqrt();
+        let length =
+            |v: &[Complex64]| v.iter().zip(&weights).map(|(v, w)| w * v.norm_sqr()).sum::<f64>().sqrt();
         let found = dot(&x, sums.right_hand_side());
         let scale = length(&vx) * length(&values);
         assert!((found - expected).abs() < 1e-5 * scale, "{:e}", (found - expected) / scale);

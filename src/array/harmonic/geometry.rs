@@ -218,7 +218,8 @@ impl NominalOrbit {
         if (orientation.radius_m - self.radius_m).abs() > limits.altitude_m_max {
             return Err(GeometryRefusal::Altitude);
         }
-        if orientation.radius_difference_m.abs() > limits.radial_deg_max.to_radians() * orientation.baseline_m {
+        if orientation.radius_difference_m.abs() > limits.radial_deg_max.to_radians() * orientation.baseline_m
+        {
             return Err(GeometryRefusal::UnequalRadii);
         }
         let baseline_wavelengths = orientation.baseline_m / wavelength_m;

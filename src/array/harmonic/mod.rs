@@ -6,6 +6,7 @@
 //! [`HarmonicModel`] makes visibilities of them; [`mod@crate::accumulation`] has the normal equations.
 
 mod batch;
+mod blocked;
 mod chebyshev;
 mod error;
 pub(crate) mod filter;
