@@ -71,6 +71,9 @@ struct PipelineArgs {
     /// Replace one setting, for example --set map.nside=32; may be given again.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
+    /// Format of the downlink, in place of the file's: space packets as they are, or in coded transfer frames.
+    #[arg(long, value_name = "packets|cadu")]
+    format: Option<String>,
 }
 
 /// An array, for commands that need no more of a pipeline.
@@ -92,8 +95,10 @@ impl ArrayArgs {
 
 impl PipelineArgs {
     fn source(&self) -> ConfigSource {
-        let Self { pipeline, seed, overrides } = self;
-        ConfigSource { file: pipeline.clone(), overrides: overrides.clone(), seed: *seed }
+        let Self { pipeline, seed, overrides, format } = self;
+        let format = format.iter().map(|format| format!("downlink.format={format:?}"));
+        let overrides = overrides.iter().cloned().chain(format).collect();
+        ConfigSource { file: pipeline.clone(), overrides, seed: *seed }
     }
 }
 

@@ -54,10 +54,21 @@ pub enum DownlinkError {
         /// The file.
         path: PathBuf,
     },
+    /// Files of both formats together.
+    #[error(
+        "{} and {} are of different formats (packets, and coded frames of packets); replay them apart",
+        other.display(), path.display()
+    )]
+    Mixed {
+        /// The file.
+        path: PathBuf,
+        /// One before it, of the other format.
+        other: PathBuf,
+    },
     /// A file in which nothing of ours was found.
     #[error(
         "{}: not one downlink packet in {bytes} bytes; expected CCSDS space packets with APIDs 0x101 to \
-         0x105 and CUC times (P-field 0x1F), as `lunarray simulate` writes them",
+         0x105 and CUC times (P-field 0x1F), plain or in CADUs of AOS frames, as `lunarray simulate` writes them",
         path.display()
     )]
     Foreign {

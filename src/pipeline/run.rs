@@ -10,15 +10,21 @@ use super::ground::{self, GroundOutcome};
 use super::plan::Plan;
 use super::space;
 use super::summary::{Segment, Summary};
-use crate::downlink::{FileSource, Recorder};
+use crate::downlink::{FileSource, Format, Recorder};
 use crate::products::{ProductsError, Truth};
 use crate::runtime::{Cancel, Graph, Metrics, Report, RuntimeConfig};
 
 /// Whom to tell about a graph that is about to run.
 pub type Watcher<'a> = &'a mut dyn FnMut(Arc<Metrics>);
 
-/// Name of the downlink file that `run` leaves among its products.
-pub const DOWNLINK_FILE: &str = "downlink.ccsds";
+/// Name of the downlink file that `run` leaves among its products, by its format.
+#[must_use]
+pub fn downlink_file(format: Format) -> &'static str {
+    match format {
+        Format::Packets => "downlink.ccsds",
+        Format::Cadu => "downlink.cadu",
+    }
+}
 
 /// The whole chain in one process: sky, spacecraft, downlink bytes, ground, products in `out`.
 ///
@@ -29,7 +35,7 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     let skies = space::skies(plan)?;
     let mut graph = Graph::new();
     let bytes = space::add(&mut graph, plan, &skies)?;
-    let recorder = Recorder::create(&out.join(DOWNLINK_FILE))?;
+    let recorder = Recorder::create(&out.join(downlink_file(plan.config.downlink.format)))?;
     let capacity = plan.config.runtime.queue_capacity;
     let bytes = graph.stage("record", capacity, bytes, recorder);
     let truth = Truth::new(&skies, plan.config.map.nside)?;
