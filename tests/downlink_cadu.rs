@@ -6,6 +6,8 @@ mod common;
 use common::downlink::{mission, packets_of, transmit};
 use lunarray::downlink::cadu::{CaduReceiver, FrameCounters, HOUSEKEEPING, INTERLEAVES, SCIENCE};
 use lunarray::downlink::{DownlinkConfig, Format};
+use lunarray::units::{StreamKind, random_stream};
+use rand::Rng;
 
 fn config(interleave: usize) -> DownlinkConfig {
     DownlinkConfig { format: Format::Cadu, interleave, ..DownlinkConfig::default() }
@@ -174,4 +176,40 @@ fn other_peoples_codecs_read_our_frames_and_we_theirs() {
     assert!(account.bytes_corrected > 500 && account.frames_uncorrectable == 0, "{account:?}");
     // Its counts have 24 bits and wrap after 16 frames: no gap.
     assert!(account.channels[0].frames > 20 && account.channels[0].gaps == 0);
+}
+
+#[test]
+fn noise_holds_no_frame_and_takes_bounded_memory() {
+    let mut noise = vec![0; 1 << 20];
+    let mut random = random_stream(11, StreamKind::Probe, [0, 0]);
+    let (mut receiver, mut recovered) = (CaduReceiver::new(), Vec::new());
+    for _ in 0..20 {
+        random.fill_bytes(&mut noise);
+        noise.chunks(1 << 16).for_each(|chunk| receiver.push(chunk, &mut recovered));
+        // A chunk, what is let go of at once, and two of the longest frames, twice for growth.
+        assert!(receiver.held_bytes() < 2 * ((1 << 16) + (1 << 18) + 2 * 2_044), "{}", receiver.held_bytes());
+    }
+    receiver.finish(&mut recovered);
+    let account = receiver.counters();
+    assert!(recovered.is_empty() && account.frames == 0);
+    assert_eq!((account.bytes, account.bits_skipped), (20 << 20, 160 << 20));
+}
+
+#[test]
+fn noise_around_a_stream_costs_nothing_of_it() {
+    let frames = mission(1, 1_000);
+    let sent = transmit(&frames, &DownlinkConfig::default());
+    let coded = transmit(&frames, &config(5));
+    let mut noise = vec![0; 1_000_000];
+    random_stream(12, StreamKind::Probe, [0, 0]).fill_bytes(&mut noise);
+    let (first, second) = coded.split_at(40 * 1279);
+    let stream = [&noise, first, &noise, second, &noise].concat();
+    let (recovered, account) = receive(&stream, 100_000);
+    assert!(recovered == sent);
+    assert_eq!(account.frames * 1279, coded.len() as u64);
+    // Noise is passed over, but for what might have been whole frames.
+    assert!(
+        account.bits_skipped + 8 * 1279 * account.frames_uncorrectable + 8 * account.bytes_truncated
+            >= 24_000_000
+    );
 }

@@ -2,6 +2,7 @@
 
 mod check;
 mod compare;
+mod corrupt;
 mod geometry;
 mod inspect;
 mod predict;
@@ -52,6 +53,7 @@ enum Command {
     Simulate(simulate::SimulateArgs),
     Replay(replay::ReplayArgs),
     Inspect(inspect::InspectArgs),
+    Corrupt(corrupt::CorruptArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
     Predict(predict::PredictArgs),
@@ -113,6 +115,7 @@ pub fn main() -> ExitCode {
         Command::Simulate(args) => simulate::execute(&args),
         Command::Replay(args) => replay::execute(&args),
         Command::Inspect(args) => inspect::execute(&args),
+        Command::Corrupt(args) => corrupt::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
         Command::Predict(args) => predict::execute(&args),

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::cadu::{CaduEncoder, INTERLEAVES, ReedSolomon};
 use super::error::DownlinkError;
 use super::header::PACKET_BYTES_MAX;
+use super::link::LinkConfig;
 
 /// Least packet that holds headers and more than one record of any kind.
 const PACKET_BYTES_MIN: usize = 256;
@@ -40,6 +41,8 @@ pub struct DownlinkConfig {
     pub spacecraft_id: u8,
     /// Frames of idle data that begin each pass, for `cadu`: the ground needs one to find the stream.
     pub idle_frames: u32,
+    /// Faults of the link; none unless asked for.
+    pub link: LinkConfig,
 }
 
 impl Default for DownlinkConfig {
@@ -52,6 +55,7 @@ impl Default for DownlinkConfig {
             interleave: 5,
             spacecraft_id: 0x4C,
             idle_frames: 2,
+            link: LinkConfig::default(),
         }
     }
 }
@@ -89,7 +93,14 @@ impl DownlinkConfig {
                 expected: "at most 1000",
             });
         }
+        found.extend(self.link.problems(self.format));
         found
+    }
+
+    /// The code of the frames; `None` for plain packets.
+    #[must_use]
+    pub fn code(&self) -> Option<ReedSolomon> {
+        ReedSolomon::new(self.interleave).filter(|_| self.format == Format::Cadu)
     }
 
     /// Bytes sent for each byte of packets: 1279 for 1107 with five codewords a frame.
@@ -104,7 +115,6 @@ impl DownlinkConfig {
     /// The encoder of frames that the format asks for; `None` for plain packets.
     #[must_use]
     pub fn encoder(&self) -> Option<CaduEncoder> {
-        let code = ReedSolomon::new(self.interleave).filter(|_| self.format == Format::Cadu)?;
-        Some(CaduEncoder::new(code, self.spacecraft_id, self.idle_frames))
+        self.code().map(|code| CaduEncoder::new(code, self.spacecraft_id, self.idle_frames))
     }
 }

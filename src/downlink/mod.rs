@@ -51,6 +51,7 @@ mod file;
 mod header;
 mod intake;
 mod kind;
+pub mod link;
 mod packetizer;
 mod payload;
 mod receiver;

@@ -10,9 +10,10 @@ use super::ground::{self, GroundOutcome};
 use super::plan::Plan;
 use super::space;
 use super::summary::{Segment, Summary};
+use crate::downlink::link::LinkStage;
 use crate::downlink::{FileSource, Format, Recorder};
 use crate::products::{ProductsError, Truth};
-use crate::runtime::{Cancel, Graph, Metrics, Report, RuntimeConfig};
+use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig};
 
 /// Whom to tell about a graph that is about to run.
 pub type Watcher<'a> = &'a mut dyn FnMut(Arc<Metrics>);
@@ -35,7 +36,9 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     let skies = space::skies(plan)?;
     let mut graph = Graph::new();
     let bytes = space::add(&mut graph, plan, &skies)?;
-    let recorder = Recorder::create(&out.join(downlink_file(plan.config.downlink.format)))?;
+    let file = out.join(downlink_file(plan.config.downlink.format));
+    let bytes = add_link(&mut graph, bytes, &plan.config, &file)?;
+    let recorder = Recorder::create(&file)?;
     let capacity = plan.config.runtime.queue_capacity;
     let bytes = graph.stage("record", capacity, bytes, recorder);
     let truth = Truth::new(&skies, plan.config.map.nside)?;
@@ -59,6 +62,7 @@ pub fn simulate(
     let mut graph = Graph::new();
     let bytes = space::add(&mut graph, plan, &skies)?;
     drop(skies);
+    let bytes = add_link(&mut graph, bytes, &plan.config, file)?;
     graph.sink("record", bytes, Recorder::create(file)?);
     start(graph, &plan.config.runtime, cancel, watch)
 }
@@ -80,6 +84,19 @@ pub fn replay(
     let outcome = ground::add(&mut graph, bytes, config, out, Truth::unknown())?;
     let report = start(graph, &config.runtime, cancel, watch)?;
     conclude(Segment::Ground, config, Some(out), report, outcome)
+}
+
+/// The link's faults, if any are asked for; the truth about them goes beside the downlink file.
+fn add_link(
+    graph: &mut Graph,
+    bytes: Link<Vec<u8>>,
+    config: &Config,
+    file: &Path,
+) -> Result<Link<Vec<u8>>, PipelineError> {
+    Ok(match LinkStage::new(&config.downlink, config.seed, file)? {
+        Some(link) => graph.stage("link", config.runtime.queue_capacity, bytes, link),
+        None => bytes,
+    })
 }
 
 /// Before anything is computed, so that a bad place is known at once.

@@ -21,10 +21,11 @@ const SPENT_BYTES: usize = 1 << 18;
 /// Finds frames in a stream of bits, corrects them, and puts their packets together.
 ///
 /// Three states, as receivers have them. *Search*: the stream is searched bit by bit for a marker with 3 wrong bits
-/// at most, upright or inverted. *Check*: a place that was found counts if a block that can be corrected
-/// follows it, or another marker where the next frame should begin. *Lock*: frames follow one another; a bad
-/// marker is passed over if its block can be corrected; otherwise the search begins where the last block might
-/// have ended had bits been lost in it. Interleave and polarity are found out.
+/// at most, upright or inverted, and looked at where a frame would be due. *Check*: a place that was found counts if a block that can be corrected
+/// follows it. *Lock*: frames follow one another; a bad
+/// marker is passed over if its block can be corrected, a bad block if another marker follows; otherwise the
+/// search begins there, or where the last block might have ended had bits been lost in it. Interleave and
+/// polarity are found out.
 #[derive(Debug, Default)]
 pub struct CaduReceiver {
     buffer: Vec<u8>,
@@ -83,6 +84,12 @@ impl CaduReceiver {
         self.code.is_some()
     }
 
+    /// Memory taken for bytes of the stream; bounded by twice the greatest chunk and half a megabyte.
+    #[must_use]
+    pub fn held_bytes(&self) -> usize {
+        self.buffer.capacity()
+    }
+
     /// The account so far.
     #[must_use]
     pub fn counters(&self) -> FrameCounters {
@@ -110,7 +117,7 @@ impl CaduReceiver {
     /// Goes on as far as the bytes that are there allow.
     fn look(&mut self, at_end: bool, out: &mut Vec<u8>) {
         loop {
-            let go_on = if self.locked { self.follow(out) } else { self.search(at_end, out) };
+            let go_on = if self.locked { self.follow(at_end, out) } else { self.search(at_end, out) };
             if !go_on {
                 return;
             }
@@ -118,7 +125,7 @@ impl CaduReceiver {
     }
 
     /// In lock: the frame that is due. False if more bytes are needed.
-    fn follow(&mut self, out: &mut Vec<u8>) -> bool {
+    fn follow(&mut self, at_end: bool, out: &mut Vec<u8>) -> bool {
         let frame = self.frame_bits();
         if self.at + frame > 8 * self.buffer.len() {
             return false;
@@ -127,15 +134,20 @@ impl CaduReceiver {
         let good = self.correct(self.at, self.code, polarity.unwrap_or(self.polarity));
         match (good, polarity) {
             (Some(corrected), _) => self.deliver(corrected, polarity.unwrap_or(self.polarity), out),
-            (None, Some(polarity)) => {
+            (None, _) if self.at + frame + MARKER_BITS > 8 * self.buffer.len() && !at_end => return false,
+            (None, Some(polarity)) if at_end || self.another_follows(self.at, self.code, polarity) => {
                 self.turn(polarity);
                 self.account.frames_uncorrectable += 1;
             }
-            (None, None) => {
+            // Bits may have got lost in this frame, or, if its marker is bad too, in the one before.
+            (None, _) => {
                 self.account.sync_losses += 1;
                 self.locked = false;
                 self.lost_at = Some(self.before + self.at as u64);
-                self.at = self.at.saturating_sub(self.slack_bits());
+                self.at = match polarity {
+                    Some(_) => self.at + 1,
+                    None => self.at.saturating_sub(self.slack_bits()),
+                };
                 return true;
             }
         }
@@ -149,30 +161,35 @@ impl CaduReceiver {
         // At the end a block may be shorter than the longest, and no other need follow.
         let needed = match (at_end, self.code) {
             (true, _) => MARKER_BITS,
-            (false, Some(_)) => self.frame_bits() + MARKER_BITS,
+            (false, Some(_)) => self.frame_bits(),
             (false, None) => 2 * self.frame_bits(),
         };
         let to = (bits + 1).saturating_sub(needed);
-        let Some(found) = find_marker(&self.buffer, self.at, to) else {
+        let due = self.due_at().filter(|due| *due < to);
+        let found = find_marker(&self.buffer, self.at, due.unwrap_or(to));
+        let Some(found) = found.or(due) else {
             self.pass(to.max(self.at));
             return false;
         };
-        let Some(polarity) = marker(word_at(&self.buffer, found)) else { return false };
+        let polarity = marker(word_at(&self.buffer, found)).unwrap_or(self.polarity);
         if let Some((code, corrected)) = self.check(found, polarity, at_end) {
             self.code = Some(code);
             self.account.interleave = code.interleave();
             self.lock(found);
             self.deliver(corrected, polarity, out);
             self.at = found + self.frame_bits();
-        } else if self.another_follows(found, self.code, polarity) {
-            self.lock(found);
-            self.turn(polarity);
-            self.account.frames_uncorrectable += 1;
-            self.at = found + self.frame_bits();
         } else {
+            // Not even if another marker follows: data repeated at the distance of a frame brings forth such pairs.
             self.pass(found + 1);
         }
         true
+    }
+
+    /// Where the next frame begins if the stream has gone on as it was before it was lost.
+    fn due_at(&self) -> Option<usize> {
+        let (frame, now, lost_at) = (self.frame_bits() as u64, self.before + self.at as u64, self.lost_at?);
+        let due = lost_at + now.saturating_sub(lost_at).next_multiple_of(frame);
+        Some(self.at + (due - now) as usize)
     }
 
     /// Corrects the block at `found`, and finds out the depth of interleaving if it is not known.
