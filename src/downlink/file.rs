@@ -41,7 +41,7 @@ impl DownlinkWriter {
     /// Appends what a frame adds to the downlink.
     ///
     /// # Errors
-    /// Those of [`Packetizer::encode`], and a file that cannot be written.
+    /// Those of [`Transmission::send`], and a file that cannot be written.
     pub fn write(&mut self, frame: &GroundFrame) -> Result<(), DownlinkError> {
         self.pending.clear();
         self.transmission.send(frame, &mut self.pending)?;

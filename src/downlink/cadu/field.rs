@@ -10,13 +10,16 @@ const TO_DUAL: [u8; 8] = [0x8D, 0xEF, 0xEC, 0x86, 0xFA, 0x99, 0xAF, 0x7B];
 /// Number of powers of the primitive element.
 pub(super) const ORDER: usize = 255;
 
+/// Stands for the logarithm of 0: beyond all sums of two others.
+const LOG_OF_ZERO: u16 = 511;
+
 /// Tables of the field.
 #[derive(Debug)]
 pub(super) struct Field {
-    /// Powers of the primitive element, twice over, so that sums of two logarithms need no reduction.
-    pub(super) exp: [u8; 2 * ORDER],
-    /// Logarithms; that of 0 is never asked for.
-    pub(super) log: [u8; 256],
+    /// Powers of the primitive element, twice over, so that sums of two logarithms need no reduction; then zeros.
+    exp: [u8; 1024],
+    /// Logarithms; that of 0 is so great that its sum with any other leads to a zero.
+    log: [u16; 256],
     /// Symbols in the dual basis by those in the conventional one.
     pub(super) to_dual: [u8; 256],
     /// Symbols in the conventional basis by those in the dual one.
@@ -27,12 +30,12 @@ pub(super) struct Field {
 pub(super) static FIELD: Field = tables();
 
 const fn tables() -> Field {
-    let (mut exp, mut log) = ([0; 2 * ORDER], [0; 256]);
+    let (mut exp, mut log) = ([0; 1024], [LOG_OF_ZERO; 256]);
     let (mut power, mut element) = (0, 1_u8);
     while power < ORDER {
         exp[power] = element;
         exp[power + ORDER] = element;
-        log[element as usize] = power as u8;
+        log[element as usize] = power as u16;
         element = times_primitive(element);
         power += 1;
     }
@@ -60,18 +63,17 @@ pub(super) const fn times_primitive(element: u8) -> u8 {
 
 impl Field {
     pub(super) fn multiply(&self, a: u8, b: u8) -> u8 {
-        if a == 0 || b == 0 {
-            return 0;
-        }
-        self.exp[usize::from(self.log[usize::from(a)]) + usize::from(self.log[usize::from(b)])]
+        self.exp[self.log(a) + self.log(b)]
+    }
+
+    /// Logarithm of an element other than 0.
+    pub(super) fn log(&self, a: u8) -> usize {
+        usize::from(self.log[usize::from(a)])
     }
 
     /// `a` over `b`, which is not 0.
     pub(super) fn divide(&self, a: u8, b: u8) -> u8 {
-        if a == 0 {
-            return 0;
-        }
-        self.exp[usize::from(self.log[usize::from(a)]) + ORDER - usize::from(self.log[usize::from(b)])]
+        self.exp[self.log(a) + ORDER - self.log(b)]
     }
 
     /// The primitive element to the power of `exponent`.

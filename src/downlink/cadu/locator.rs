@@ -53,7 +53,7 @@ pub(super) fn locate(syndromes: &[u8; PARITY_BYTES]) -> Option<Errors> {
 fn shortest_register(syndromes: &[u8; PARITY_BYTES]) -> Option<(Polynomial, usize)> {
     let (mut locator, mut previous) = ([0; PARITY_BYTES + 1], [0; PARITY_BYTES + 1]);
     (locator[0], previous[0]) = (1, 1);
-    let (mut length, mut shift, mut last) = (0, 1, 1);
+    let (mut length, mut shift, mut last, mut previous_length) = (0, 1, 1, 0);
     for n in 0..PARITY_BYTES {
         let products = (1..=length).map(|k| FIELD.multiply(locator[k], syndromes[n - k]));
         let discrepancy = products.fold(syndromes[n], |sum, product| sum ^ product);
@@ -63,17 +63,20 @@ fn shortest_register(syndromes: &[u8; PARITY_BYTES]) -> Option<(Polynomial, usiz
         }
         let factor = FIELD.divide(discrepancy, last);
         let before = locator;
-        for k in shift..=PARITY_BYTES {
-            locator[k] ^= FIELD.multiply(factor, previous[k - shift]);
+        for (new, old) in locator[shift..].iter_mut().zip(&previous[..=previous_length]) {
+            *new ^= FIELD.multiply(factor, *old);
         }
         if 2 * length <= n {
+            (previous, last, shift, previous_length) = (before, discrepancy, 1, length);
             length = n + 1 - length;
-            (previous, last, shift) = (before, discrepancy, 1);
+            if length > ERRORS_MAX {
+                return None;
+            }
         } else {
             shift += 1;
         }
     }
-    (length <= ERRORS_MAX && locator[length] != 0).then_some((locator, length))
+    (locator[length] != 0).then_some((locator, length))
 }
 
 /// S(x) times the locator, modulo x^count: all that Forney's formula needs.
@@ -98,7 +101,7 @@ fn forney(evaluator: &[u8], locator: &[u8], place: usize) -> Option<u8> {
     if below == 0 || above == 0 {
         return None;
     }
-    let log = usize::from(FIELD.log[usize::from(inverse)]) * (ROOT_FIRST - 1);
+    let log = FIELD.log(inverse) * (ROOT_FIRST - 1);
     Some(FIELD.multiply(FIELD.divide(above, below), FIELD.power(log)))
 }
 

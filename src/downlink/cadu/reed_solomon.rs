@@ -86,8 +86,10 @@ impl ReedSolomon {
     /// Fills in the parity of a block, which is [`ReedSolomon::block_bytes`] long and begins with its data.
     pub fn encode(self, block: &mut [u8]) {
         let found = self.remainders(block);
-        for (at, octet) in block[self.data_bytes()..].iter_mut().enumerate() {
-            *octet = octet_of(&found[at % self.interleave], at / self.interleave);
+        for (at, row) in block[self.data_bytes()..].chunks_exact_mut(self.interleave).enumerate() {
+            for (octet, parity) in row.iter_mut().zip(&found) {
+                *octet = octet_of(parity, at);
+            }
         }
     }
 
@@ -98,9 +100,10 @@ impl ReedSolomon {
     pub fn decode(self, block: &mut [u8]) -> Result<usize, Uncorrectable> {
         let mut found = self.remainders(block);
         let mut wrong = 0;
-        for (at, octet) in block[self.data_bytes()..].iter().enumerate() {
-            let word = &mut found[at % self.interleave][at / self.interleave / 4];
-            *word ^= u32::from(*octet) << (24 - 8 * (at / self.interleave % 4));
+        for (at, row) in block[self.data_bytes()..].chunks_exact(self.interleave).enumerate() {
+            for (octet, parity) in row.iter().zip(&mut found) {
+                parity[at / 4] ^= u32::from(*octet) << (24 - 8 * (at % 4));
+            }
         }
         for (codeword, difference) in found.iter().enumerate().take(self.interleave) {
             if *difference == Parity::default() {
