@@ -4,9 +4,13 @@
 mod common;
 
 use common::downlink::{mission, packets_of, transmit};
-use lunarray::downlink::cadu::{CaduReceiver, FrameCounters, HOUSEKEEPING, INTERLEAVES, SCIENCE};
+use lunarray::downlink::cadu::{
+    CaduReceiver, DATA_BYTES, FrameCounters, HOUSEKEEPING, INTERLEAVES, ReedSolomon, SCIENCE, SYNC_MARKER,
+    randomize,
+};
 use lunarray::downlink::{DownlinkConfig, Format};
 use lunarray::units::{StreamKind, random_stream};
+use proptest::prelude::*;
 use rand::Rng;
 
 fn config(interleave: usize) -> DownlinkConfig {
@@ -212,4 +216,57 @@ fn noise_around_a_stream_costs_nothing_of_it() {
         account.bits_skipped + 8 * 1279 * account.frames_uncorrectable + 8 * account.bytes_truncated
             >= 24_000_000
     );
+}
+
+/// A CADU of one codeword with that frame.
+fn cadu_of(frame: &[u8]) -> Vec<u8> {
+    let code = ReedSolomon::new(1).unwrap();
+    let mut block = frame.to_vec();
+    block.resize(code.block_bytes(), 0);
+    code.encode(&mut block);
+    randomize(&mut block);
+    [&SYNC_MARKER.to_be_bytes()[..], &block].concat()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(300) })]
+
+    #[test]
+    fn forged_frames_give_no_more_than_they_hold(
+        frames in proptest::collection::vec(
+            // Virtual channel, count, pointer, and how the zone begins; few counts, so that pieces meet.
+            (0_u8..4, 0_u32..40, prop_oneof![0_u16..230, 0x7FD_u16..=0x7FF], any::<[u8; 24]>(), 0_u8..3),
+            1..120,
+        ),
+    ) {
+        let (mut receiver, mut recovered) = (CaduReceiver::new(), Vec::new());
+        let mut stream = Vec::new();
+        for (channel, count, pointer, start, length) in &frames {
+            let mut frame = vec![0; DATA_BYTES];
+            frame[..2].copy_from_slice(&(1_u16 << 14 | 5 << 6 | u16::from(*channel)).to_be_bytes());
+            // Counts about the wrap of 24 bits.
+            frame[2..5].copy_from_slice(&(0xFF_FFF0_u32.wrapping_add(*count)).to_be_bytes()[1..]);
+            frame[6..8].copy_from_slice(&pointer.to_be_bytes());
+            for part in frame[8..].chunks_mut(24) {
+                part.copy_from_slice(&start[..part.len()]);
+            }
+            // Where a packet is said to begin: one of some hundred bytes, or of any length.
+            if let Some(field) = frame.get_mut(12 + usize::from(*pointer)..14 + usize::from(*pointer)).filter(|_| *length > 0) {
+                field.copy_from_slice(&(u16::from(*length) * 300).to_be_bytes());
+            }
+            stream.extend(cadu_of(&frame));
+        }
+        for part in stream.chunks(1_000) {
+            receiver.push(part, &mut recovered);
+        }
+        receiver.finish(&mut recovered);
+        let account = receiver.counters();
+        prop_assert_eq!(account.frames, frames.len() as u64);
+        prop_assert_eq!(account.frames_uncorrectable + account.bits_skipped + account.bytes_truncated, 0);
+        // Each byte of a zone is part of one packet or piece at most.
+        let given = recovered.len() as u64 + account.bytes_idle_packets + account.bytes_fragments;
+        prop_assert!(given <= frames.len() as u64 * (DATA_BYTES as u64 - 8));
+        // What is given are packets, one after the other.
+        packets_of(&recovered);
+    }
 }

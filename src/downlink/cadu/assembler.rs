@@ -10,11 +10,16 @@ use std::collections::BTreeMap;
 use super::counters::{ChannelCounts, FrameCounters};
 use super::frame::{FrameHeader, IDLE_ZONE, NO_HEADER, ZONE_START};
 use super::framer::{IDLE_APID, PACKET_HEADER_BYTES};
+use super::reed_solomon::DATA_BYTES;
 use crate::downlink::cuc::CucTime;
+use crate::downlink::header::PACKET_BYTES_MAX;
 use crate::downlink::sequence::{Arrival, Sequence};
 
 /// Frames whose pieces are kept; bounds the memory to some megabytes a channel.
 const PIECES_MAX: usize = 4096;
+
+/// Frames that the longest packet touches where frames are shortest.
+const FRAMES_A_PACKET_MAX: u64 = (PACKET_BYTES_MAX / (DATA_BYTES - ZONE_START) + 2) as u64;
 
 /// Frames that are remembered to tell duplicates.
 const SEEN_MAX: usize = 1 << 16;
@@ -143,9 +148,7 @@ impl Assembler {
         if self.pieces.get(&count).is_none_or(|pieces| pieces.tail.is_none()) {
             return;
         }
-        let mut at = count;
-        loop {
-            at -= 1;
+        for at in (count.saturating_sub(FRAMES_A_PACKET_MAX)..count).rev() {
             match self.pieces.get(&at) {
                 Some(Pieces { head: Some(_), .. }) => return self.complete_from(at, account, out),
                 Some(Pieces { tail: Some((_, Reach::Frame)), .. }) => {}
@@ -156,45 +159,42 @@ impl Assembler {
 
     /// Completes the packet that begins in frame `count`, if all of it is there.
     fn complete_from(&mut self, count: u64, account: &mut FrameCounters, out: &mut Vec<u8>) {
-        let Some(head) = self.pieces.get(&count).and_then(|pieces| pieces.head.as_ref()) else { return };
-        let (start, mut at) = (out.len(), count);
-        out.extend_from_slice(head);
-        let fits = loop {
-            let found = out.len() - start;
-            match packet_bytes(&out[start..]) {
-                Some(bytes) if found == bytes => break true,
-                Some(bytes) if found > bytes => break false,
-                _ => {}
-            }
-            if at > count && self.reach(at) == Some(Reach::Packet) {
-                break false;
-            }
-            at += 1;
-            let Some((tail, _)) = self.pieces.get(&at).and_then(|pieces| pieces.tail.as_ref()) else {
-                // Not all there yet.
-                out.truncate(start);
-                return;
-            };
-            out.extend_from_slice(tail);
-        };
+        let Some((last, fits)) = self.extent(count) else { return };
+        let start = out.len();
+        for at in count..=last {
+            let Some(pieces) = self.pieces.get_mut(&at) else { continue };
+            let piece =
+                if at == count { pieces.head.take() } else { pieces.tail.take().map(|(tail, _)| tail) };
+            out.extend(piece.unwrap_or_default());
+            self.forget(at);
+        }
+        let bytes = (out.len() - start) as u64;
         if !fits {
             // Frames of the same counts that do not belong together, or a forged length.
-            account.fragments += 1 + at - count;
-            account.bytes_fragments += (out.len() - start) as u64;
+            account.fragments += 1 + last - count;
+            account.bytes_fragments += bytes;
             out.truncate(start);
         } else if is_idle(&out[start..]) {
-            account.bytes_idle_packets += (out.len() - start) as u64;
+            account.bytes_idle_packets += bytes;
             out.truncate(start);
         }
-        if let Some(pieces) = self.pieces.get_mut(&count) {
-            pieces.head = None;
-        }
-        self.forget(count);
-        for used in count + 1..=at {
-            if let Some(pieces) = self.pieces.get_mut(&used) {
-                pieces.tail = None;
+    }
+
+    /// The last frame of the packet that begins in frame `count`, and whether its pieces are as long as it says;
+    /// `None` if not all of it is there.
+    fn extent(&self, count: u64) -> Option<(u64, bool)> {
+        let mut piece = self.pieces.get(&count)?.head.as_ref()?;
+        let (mut header, mut found, mut at) = (Vec::with_capacity(PACKET_HEADER_BYTES), 0, count);
+        loop {
+            header.extend(piece.iter().take(PACKET_HEADER_BYTES - header.len()));
+            found += piece.len();
+            match packet_bytes(&header) {
+                Some(bytes) if found >= bytes => return Some((at, found == bytes)),
+                _ if at > count && self.reach(at) == Some(Reach::Packet) => return Some((at, false)),
+                _ => {}
             }
-            self.forget(used);
+            at += 1;
+            piece = &self.pieces.get(&at)?.tail.as_ref()?.0;
         }
     }
 
