@@ -114,7 +114,8 @@ impl Plan {
             channels,
             windows: self.windows.len(),
             solutions,
-            downlink_bytes: sent * VISIBILITY_BYTES as f64 + self.windows.len() as f64 * 10_000.0,
+            downlink_bytes: self.config.downlink.expansion()
+                * (sent * VISIBILITY_BYTES as f64 + self.windows.len() as f64 * 10_000.0),
             memory_bytes,
             predicted_s,
         }

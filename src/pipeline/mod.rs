@@ -17,6 +17,6 @@ pub use config::{Config, ConfigError, ConfigSource, Problems, QUICKLOOK};
 pub use cost::{ChannelCost, Cost};
 pub use error::PipelineError;
 pub use plan::{Expected, Plan};
-pub use run::{DOWNLINK_FILE, Watched, Watcher, replay, run, simulate, use_threads};
+pub use run::{Watched, Watcher, downlink_file, replay, run, simulate, use_threads};
 pub use space::INTEGRATE;
 pub use summary::{Segment, Summary};

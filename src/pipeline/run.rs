@@ -11,9 +11,10 @@ use super::plan::Plan;
 use super::space;
 use super::summary::{Segment, Summary};
 use crate::accumulation::EngineKind;
-use crate::downlink::{FileSource, Recorder};
+use crate::downlink::link::LinkStage;
+use crate::downlink::{FileSource, Format, Recorder};
 use crate::products::{ProductsError, Truth};
-use crate::runtime::{Cancel, Graph, Metrics, Report, RuntimeConfig};
+use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig};
 use crate::solve::SolveWatch;
 
 /// What can be watched of a graph while it runs.
@@ -28,8 +29,14 @@ pub struct Watched {
 /// Whom to tell about a graph that is about to run.
 pub type Watcher<'a> = &'a mut dyn FnMut(Watched);
 
-/// Name of the downlink file that `run` leaves among its products.
-pub const DOWNLINK_FILE: &str = "downlink.ccsds";
+/// Name of the downlink file that `run` leaves among its products, by its format.
+#[must_use]
+pub fn downlink_file(format: Format) -> &'static str {
+    match format {
+        Format::Packets => "downlink.ccsds",
+        Format::Cadu => "downlink.cadu",
+    }
+}
 
 /// The whole chain in one process: sky, spacecraft, downlink bytes, ground, products in `out`.
 ///
@@ -40,7 +47,9 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     let skies = space::skies(plan)?;
     let mut graph = Graph::new();
     let bytes = space::add(&mut graph, plan, &skies)?;
-    let recorder = Recorder::create(&out.join(DOWNLINK_FILE))?;
+    let file = out.join(downlink_file(plan.config.downlink.format));
+    let bytes = add_link(&mut graph, bytes, &plan.config, &file)?;
+    let recorder = Recorder::create(&file)?;
     let capacity = plan.config.runtime.queue_capacity;
     let bytes = graph.stage("record", capacity, bytes, recorder);
     let map = &plan.config.map;
@@ -69,6 +78,7 @@ pub fn simulate(
     let mut graph = Graph::new();
     let bytes = space::add(&mut graph, plan, &skies)?;
     drop(skies);
+    let bytes = add_link(&mut graph, bytes, &plan.config, file)?;
     graph.sink("record", bytes, Recorder::create(file)?);
     start(graph, &plan.config.runtime, (cancel, SolveWatch::default()), watch)
 }
@@ -91,6 +101,19 @@ pub fn replay(
     let outcome = ground::add(&mut graph, bytes, config, out, (Truth::unknown(), solving.clone()))?;
     let report = start(graph, &config.runtime, (cancel, solving), watch)?;
     conclude(Segment::Ground, config, Some(out), report, outcome)
+}
+
+/// The link's faults, if any are asked for; the truth about them goes beside the downlink file.
+fn add_link(
+    graph: &mut Graph,
+    bytes: Link<Vec<u8>>,
+    config: &Config,
+    file: &Path,
+) -> Result<Link<Vec<u8>>, PipelineError> {
+    Ok(match LinkStage::new(&config.downlink, config.seed, file)? {
+        Some(link) => graph.stage("link", config.runtime.queue_capacity, bytes, link),
+        None => bytes,
+    })
 }
 
 /// Before anything is computed, so that a bad place is known at once.

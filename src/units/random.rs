@@ -17,6 +17,8 @@ pub enum StreamKind {
     SkySources = 4,
     /// Starting vectors of eigenvalue iterations and probing vectors.
     Probe = 5,
+    /// Faults of a simulated link.
+    Link = 20,
 }
 
 /// The random stream of `seed`, `kind` and two words of identity (for a block of visibilities:

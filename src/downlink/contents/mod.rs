@@ -13,12 +13,14 @@ use std::path::Path;
 
 use serde::Serialize;
 
+use super::cadu::FrameCounters;
+use super::config::Format;
 use super::counters::ReceptionCounters;
 use super::decoder::Decoder;
 use super::error::DownlinkError;
 use super::file::{io_error, require_packets};
+use super::intake::Intake;
 use super::kind::Kind;
-use super::receiver::Receiver;
 
 pub use calendar::tai_text;
 
@@ -228,6 +230,8 @@ pub struct Contents {
     pub file: String,
     /// Its length.
     pub bytes: u64,
+    /// Plain packets, or packets in coded frames; the places below then count in what was recovered.
+    pub format: Format,
     /// From the first to the last integration.
     pub span: Option<Span>,
     /// The instrument description.
@@ -272,7 +276,7 @@ impl Contents {
     /// # Errors
     /// Those of [`Contents::read`].
     pub fn read_from(mut source: impl Read, path: &Path) -> Result<Self, DownlinkError> {
-        let mut receiver = Receiver::new();
+        let mut receiver = Intake::new();
         let mut decoder = Decoder::new();
         let mut survey = survey::Survey::default();
         let mut at_end = false;
@@ -293,13 +297,16 @@ impl Contents {
         }
         decoder.finish();
         require_packets(path, receiver.bytes(), decoder.counters().packets())?;
-        Ok(survey.conclude(path, decoder.counters()))
+        let frames = receiver.frames();
+        let bytes = receiver.bytes();
+        Ok(survey.conclude(path, bytes, &ReceptionCounters { frames, ..decoder.counters().clone() }))
     }
 
     /// Whether nothing is missing or damaged.
     #[must_use]
     pub fn is_sound(&self) -> bool {
         let clean = self.gaps.count + self.bad_checksums.count + self.garbage.count + self.faults.count == 0;
-        clean && self.truncated_bytes == 0 && self.reception.instruments_contradictory == 0
+        let frames_sound = self.reception.frames.as_ref().is_none_or(FrameCounters::is_sound);
+        frames_sound && clean && self.truncated_bytes == 0 && self.reception.instruments_contradictory == 0
     }
 }
