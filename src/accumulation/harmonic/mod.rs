@@ -16,6 +16,7 @@
 
 mod blocks;
 mod checkpoint;
+mod coverage;
 mod grid;
 mod operator;
 mod setup;
@@ -28,6 +29,7 @@ mod tori;
 use std::sync::{Arc, OnceLock};
 
 pub use blocks::{OrderBlocks, OrderFactors};
+pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
 pub use setup::{HarmonicMemory, HarmonicSetup, L_MAX, memory, orbit_of};
 pub use sums::{HarmonicSums, coefficients, unknowns};

@@ -21,8 +21,10 @@ use super::error::DownlinkError;
 use super::file::{io_error, require_packets};
 use super::intake::Intake;
 use super::kind::Kind;
+use crate::frames::GroundFrame;
 
 pub use calendar::tai_text;
+
 
 /// Entries of a list that are kept; the others are counted.
 pub const LISTED_MAX: usize = 1_000;
@@ -268,14 +270,26 @@ impl Contents {
     /// # Errors
     /// A file that cannot be read, is empty, or holds no packet at all; damage is told in the result.
     pub fn read(path: &Path) -> Result<Self, DownlinkError> {
-        Self::read_from(File::open(path).map_err(io_error(path, "open the file"))?, path)
+        Self::read_with(path, &mut |_| {})
     }
 
-    /// Looks through any source; `path` names it.
+    /// Looks through a file, and shows `see` every frame.
     ///
     /// # Errors
     /// Those of [`Contents::read`].
-    pub fn read_from(mut source: impl Read, path: &Path) -> Result<Self, DownlinkError> {
+    pub fn read_with(path: &Path, see: &mut dyn FnMut(&GroundFrame)) -> Result<Self, DownlinkError> {
+        Self::read_from(File::open(path).map_err(io_error(path, "open the file"))?, path, see)
+    }
+
+    /// Looks through any source; `path` names it, `see` is shown every frame.
+    ///
+    /// # Errors
+    /// Those of [`Contents::read`].
+    pub fn read_from(
+        mut source: impl Read,
+        path: &Path,
+        see: &mut dyn FnMut(&GroundFrame),
+    ) -> Result<Self, DownlinkError> {
         let mut receiver = Intake::new();
         let mut decoder = Decoder::new();
         let mut survey = survey::Survey::default();
@@ -289,6 +303,7 @@ impl Contents {
                 survey.see_event(&event);
                 if let Some(frame) = decoder.accept(&event) {
                     survey.see_frame(&frame);
+                    see(&frame);
                 }
                 if let Some((offset, fault)) = decoder.take_fault() {
                     survey.faults.push(FaultEntry { offset, reason: fault.to_string() });
