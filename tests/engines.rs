@@ -9,6 +9,7 @@ use lunarray::array::harmonic::GeometryLimits;
 use lunarray::array::response::{Directions, PairGeometry, PixelMethod, sky_sums};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::runtime::Cancel;
 use lunarray::sky::generated::{GeneratedSky, generate};
 use lunarray::sky::healpix::pixel_area_sr;
 use lunarray::sky::{Frame, SkyMap, compare};
@@ -240,4 +241,56 @@ fn traces_agree_with_the_pixel_engine() {
         // over l by half of that. (At 1e-3 modes beyond the band's end count, 768 in one and 529 in the other.)
         assert!((found.value / exact - 1.0).abs() < 0.05 + 4.0 * found.error / exact, "{found:?} {exact}");
     }
+}
+
+/// A solution that starts from the last one, with a little more data, is found sooner; one that is interrupted
+/// leaves what it has.
+#[test]
+fn solutions_start_warm_and_end_early() {
+    let sky = generate(&GeneratedSky::default(), 3e6, 32, 5).unwrap();
+    let sky = SkyMap::new(Frame::Ecliptic, sky).unwrap();
+    let blocks = observe(&sky, 3e6, 1_500.0, 4_000);
+    let most = blocks.len() * 19 / 20;
+    let (early, late) = (harmonic_sums(&blocks[..most], 24, 1_500.0), harmonic_sums(&blocks, 24, 1_500.0));
+    let request = HarmonicRequest { epsilon: 1e-4, nside: 8, rule: RULE, probes: 0 };
+    let watch = SolveWatch::default();
+    let first = solve_harmonics(&early, request, None, None, (&watch, "test")).unwrap();
+    let cold = solve_harmonics(&late, request, None, None, (&watch, "test")).unwrap();
+    let warm = solve_harmonics(&late, request, None, Some(&first.unknowns), (&watch, "test")).unwrap();
+    let steps = |solved: &lunarray::solve::HarmonicSolution| solved.diagnostics.convergence.unwrap().iterations;
+    assert!(steps(&warm) < steps(&cold), "{} {}", steps(&warm), steps(&cold));
+    let distance = |a: &[f64], b: &[f64]| {
+        let square: f64 = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();
+        (square / b.iter().map(|b| b * b).sum::<f64>()).sqrt()
+    };
+    // Both end at the same residual, 1e-5 of the right-hand side.
+    assert!(distance(&warm.map_k, &cold.map_k) < 1e-2);
+
+    let cancel = Cancel::new();
+    cancel.cancel();
+    let hurried = SolveWatch::new(cancel);
+    let request = HarmonicRequest { rule: StoppingRule { residual_max: 1e-9, ..RULE }, ..request };
+    let ended = solve_harmonics(&late, request, None, None, (&hurried, "test")).unwrap();
+    let convergence = ended.diagnostics.convergence.unwrap();
+    assert!(!convergence.converged && convergence.iterations <= 12);
+    assert!(distance(&ended.map_k, &cold.map_k) < 0.1, "{}", distance(&ended.map_k, &cold.map_k));
+    assert!(hurried.now().is_none());
+}
+
+/// With a prior the map goes to it where nothing was measured.
+#[test]
+fn a_prior_fills_what_is_not_measured() {
+    let level_k = 5e5;
+    let sky = SkyMap::new(Frame::Ecliptic, vec![level_k; 12 * 16 * 16]).unwrap();
+    // Baselines of 10 wavelengths and more see little of a uniform sky.
+    let blocks: Vec<_> = observe(&sky, 10e6, 3_000.0, 3_000);
+    let sums = harmonic_sums(&blocks, 24, 3_000.0);
+    let request = HarmonicRequest { epsilon: 1e-3, nside: 8, rule: RULE, probes: 0 };
+    let prior = vec![level_k; 12 * 16 * 16];
+    let watch = SolveWatch::default();
+    let without = solve_harmonics(&sums, request, None, None, (&watch, "test")).unwrap();
+    let with = solve_harmonics(&sums, request, Some(&prior), None, (&watch, "test")).unwrap();
+    let mean = |map: &[f64]| map.iter().sum::<f64>() / map.len() as f64;
+    assert!((mean(&with.map_k) / level_k - 1.0).abs() < 0.01, "{}", mean(&with.map_k));
+    assert!(mean(&without.map_k) < 0.9 * level_k, "{}", mean(&without.map_k));
 }
