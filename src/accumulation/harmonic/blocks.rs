@@ -171,7 +171,7 @@ impl MuPart {
         let mut rows = Vec::with_capacity(count);
         let mut all = wigner.rows(mu);
         while let Some((l, row)) = all.next_row() {
-            if (l - mu) % 2 == 0 {
+            if (l - mu).is_multiple_of(2) {
                 rows.push(row.to_vec());
             }
         }
