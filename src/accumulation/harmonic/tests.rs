@@ -153,7 +153,10 @@ fn the_operator_is_symmetric() {
     assert!((dot(&z, &ax) - dot(&x, &az)).abs() < 1e-6 * scale);
 }
 
-/// `<B x, N^-1 V> = <x, Bt N^-1 V>`, to the stated 1e-5 of the lengths of both.
+/// `<B x, N^-1 V> = <x, Bt N^-1 V>`: B by the forward operator, Bt by the engine, which share no kernel.
+///
+/// The bound is the engine's interpolation between nodes, 1.2e-4 of the greatest row, averaged over 600 rows; the
+/// forward operator errs by 1e-5.
 #[test]
 fn data_is_projected_by_the_adjoint() {
     let blocks = blocks(0, 60);
@@ -169,8 +172,47 @@ fn data_is_projected_by_the_adjoint() {
             |v: &[Complex64]| v.iter().zip(&weights).map(|(v, w)| w * v.norm_sqr()).sum::<f64>().sqrt();
         let found = dot(&x, sums.right_hand_side());
         let scale = length(&vx) * length(&values);
-        assert!((found - expected).abs() < 1e-5 * scale, "{:e}", (found - expected) / scale);
+        assert!((found - expected).abs() < 5e-5 * scale, "{:e}", (found - expected) / scale);
     }
+}
+
+/// The engine's own rows: `x.A z = sum_t w_t Re(conj(v_t(x)) v_t(z))` with `v_t(x) = x.Bt e_t` from the projections of
+/// unit visibilities one by one.
+#[test]
+fn the_operator_and_the_projection_are_of_one_matrix() {
+    let mut blocks = blocks(0, 3);
+    blocks.truncate(3);
+    let sums = engine(&blocks).into_sums();
+    let (x, z) = (vector(21), vector(22));
+    let mut expected = 0.0;
+    let mut lengths = [0.0, 0.0];
+    for block in &blocks {
+        for k in 0..block.len() {
+            let mut parts = [[0.0; 2]; 2];
+            for (part, value) in [Complex64::ONE, Complex64::I].into_iter().enumerate() {
+                let one = PlacedVisibilities {
+                    time_s: vec![block.time_s[k]],
+                    r_i_m: vec![block.r_i_m[k]],
+                    r_j_m: vec![block.r_j_m[k]],
+                    value_k_sr: vec![value],
+                    weight: vec![1.0],
+                    ..block.clone()
+                };
+                let unit = engine(&[one]).into_sums();
+                parts[part] = [dot(&x, unit.right_hand_side()), dot(&z, unit.right_hand_side())];
+            }
+            let weight = block.weight[k];
+            expected += weight * (parts[0][0] * parts[0][1] + parts[1][0] * parts[1][1]);
+            for (length, which) in lengths.iter_mut().zip([0, 1]) {
+                *length += weight * (parts[0][which].powi(2) + parts[1][which].powi(2));
+            }
+        }
+    }
+    let mut y = vec![0.0; x.len()];
+    sums.apply(&x, &mut y);
+    let scale = (lengths[0] * lengths[1]).sqrt();
+    // Kernels: 1e-4 on the data's side, twice, and 1e-3 at the end of the weights' band.
+    assert!((dot(&z, &y) - expected).abs() < 1e-3 * scale, "{:e}", (dot(&z, &y) - expected) / scale);
 }
 
 /// The companion is projected as data is: equal when it is given as data.

@@ -194,7 +194,7 @@ mod tests {
     #[test]
     fn a_windowed_sinc_interpolates_as_it_is() {
         let kernel = Kernel::windowed_sinc(16, 7.0);
-        for (frequency, tolerance) in [(0.0, 4e-4), (0.2, 4e-4), (0.35, 1e-3), (0.444, 0.2)] {
+        for (frequency, tolerance) in [(0.0, 4e-4), (0.2, 4e-4), (0.35, 1e-3), (0.444, 0.32)] {
             for k in 0..50 {
                 let x = 0.137 * f64::from(k) - 3.0;
                 let (first, lanes) = kernel.spread(x);
@@ -206,7 +206,8 @@ mod tests {
                     im += f64::from(*lane) * phase(node).sin();
                 }
                 let error = (re - phase(x).cos()).hypot(im - phase(x).sin());
-                // Kaiser's rule for beta = 7: ripples of 72 dB up to 0.36 cycles a node.
+                // Kaiser's rule for beta = 7: ripples of 72 dB up to 0.36 cycles a node; the last is on the edge, where
+                // half of the fall, from 1 to 0 over 0.14 either side of 0.5, has not yet come.
                 assert!(error < tolerance, "{frequency}: {error:e}");
             }
         }
