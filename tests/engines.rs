@@ -14,8 +14,8 @@ use lunarray::sky::generated::{GeneratedSky, generate};
 use lunarray::sky::healpix::pixel_area_sr;
 use lunarray::sky::{Frame, SkyMap, compare};
 use lunarray::solve::{
-    HarmonicRequest, SolveWatch, StoppingRule, effective_beam, noise_variance, regularisation, solve_harmonics,
-    solve_pixels, spectrum, traces,
+    HarmonicRequest, SolveWatch, StoppingRule, effective_beam, noise_variance, regularisation,
+    solve_harmonics, solve_pixels, spectrum, traces,
 };
 use lunarray::units::all_pairs;
 use lunarray::units::constants::YEAR_S;
@@ -206,13 +206,17 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
         map[pixel] = 1.0 / pixel_area_sr(nside);
         // Rows of the synthesis: Y_lm at the pixel's centre.
         let y = lunarray::accumulation::harmonic::unknowns(&transform.adjoint(&map).unwrap());
-        let exact: f64 = apply(&|w| w.max(0.0) / (w + eps).powi(2), &y).iter().zip(&y).map(|(a, b)| a * b).sum();
+        let exact: f64 =
+            apply(&|w| w.max(0.0) / (w + eps).powi(2), &y).iter().zip(&y).map(|(a, b)| a * b).sum();
         ratios.push(variance[pixel] / exact);
         let beam = effective_beam(&sums, eps, (nside, pixel), (&watch, "test")).unwrap();
         let area = pixel_area_sr(nside);
         let delta: Vec<f64> = y.iter().map(|y| y * area).collect();
         let exact = transform
-            .synthesis(&lunarray::accumulation::harmonic::coefficients(&apply(&|w| w / (w + eps), &delta), 16))
+            .synthesis(&lunarray::accumulation::harmonic::coefficients(
+                &apply(&|w| w / (w + eps), &delta),
+                16,
+            ))
             .unwrap();
         for (a, b) in beam.iter().zip(&exact) {
             assert!((a - b).abs() < 2e-3 * exact[pixel], "{pixel}: {a} {b}");
@@ -257,7 +261,8 @@ fn solutions_start_warm_and_end_early() {
     let first = solve_harmonics(&early, request, None, None, (&watch, "test")).unwrap();
     let cold = solve_harmonics(&late, request, None, None, (&watch, "test")).unwrap();
     let warm = solve_harmonics(&late, request, None, Some(&first.unknowns), (&watch, "test")).unwrap();
-    let steps = |solved: &lunarray::solve::HarmonicSolution| solved.diagnostics.convergence.unwrap().iterations;
+    let steps =
+        |solved: &lunarray::solve::HarmonicSolution| solved.diagnostics.convergence.unwrap().iterations;
     assert!(steps(&warm) < steps(&cold), "{} {}", steps(&warm), steps(&cold));
     let distance = |a: &[f64], b: &[f64]| {
         let square: f64 = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();

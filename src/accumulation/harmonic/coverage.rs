@@ -56,7 +56,9 @@ impl GeometrySurvey {
             }
             GroundFrame::Visibilities(block) => {
                 let channel = usize::from(block.channel.0);
-                let Some(channel) = self.instrument.as_ref().and_then(|i| i.channels.get(channel)) else { return };
+                let Some(channel) = self.instrument.as_ref().and_then(|i| i.channels.get(channel)) else {
+                    return;
+                };
                 let wavelength_m = SPEED_OF_LIGHT_M_S / channel.frequency_hz;
                 let (placed, counts) = self.ephemeris.place(block, channel.frequency_hz);
                 self.coverage.without_ephemeris += counts.without_ephemeris;

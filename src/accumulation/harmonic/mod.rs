@@ -28,6 +28,8 @@ mod tori;
 
 use std::sync::{Arc, OnceLock};
 
+use rayon::prelude::*;
+
 pub use blocks::{OrderBlocks, OrderFactors};
 pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
@@ -143,8 +145,9 @@ impl NormalEngine for HarmonicEngine {
             return Err(AccumulationError::Frequency { expected_hz, found_hz });
         }
         let mut added = Added::default();
-        for k in 0..placed.len() {
-            match self.place(placed, k) {
+        let found: Vec<_> = (0..placed.len()).into_par_iter().map(|k| self.place(placed, k)).collect();
+        for found in found {
+            match found {
                 Ok(pending) => {
                     added.visibilities += 1;
                     self.sums.counts.visibilities += 1;

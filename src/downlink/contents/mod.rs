@@ -25,7 +25,6 @@ use crate::frames::GroundFrame;
 
 pub use calendar::tai_text;
 
-
 /// Entries of a list that are kept; the others are counted.
 pub const LISTED_MAX: usize = 1_000;
 
