@@ -2,11 +2,14 @@
 
 use std::time::Instant;
 
-use num_complex::Complex64;
+use num_complex::{Complex32, Complex64};
+use rustfft::FftPlanner;
 
 use super::plan::Plan;
-use crate::accumulation::harmonic::{HarmonicEngine, HarmonicSetup, SPREAD_MULTIPLY_ADDS, memory, orbit_of};
-use crate::accumulation::{EngineKind, NormalEngine, NormalSums, PixelEngine, PixelSetup};
+use crate::accumulation::harmonic::{
+    HarmonicEngine, HarmonicSetup, SPREAD_MULTIPLY_ADDS, application_size, memory, orbit_of,
+};
+use crate::accumulation::{EngineKind, NormalEngine, PixelEngine, PixelSetup};
 use crate::frames::PlacedVisibilities;
 use crate::sky::healpix::pixel_count;
 use crate::units::Pair;
@@ -20,6 +23,10 @@ const NSIDE_MEASURED: usize = 16;
 const DEGREE_MEASURED: usize = 24;
 /// Products with BtN^-1B in one harmonic solution: some 15 for W_max, 25 each for the map and the noise map.
 const APPLICATIONS: f64 = 65.0;
+
+/// Transforms that take as long as all that is done to a line of phases in one product with BtN^-1B: two of them, the
+/// products with the weights, and the way from the matrix products and back (benches/harmonic).
+const TRANSFORMS_PER_LINE: f64 = 4.0;
 
 /// Cost of one channel's engine.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -112,29 +119,34 @@ impl Plan {
             };
             HarmonicEngine::new(setup).ok()
         });
-        let (mut visibility_s, mut application_s, mut flops) = (f64::NAN, f64::NAN, 0.0);
-        if let Some(mut engine) = engine {
-            visibility_s = time_of(&mut engine, &placed) / SAMPLES as f64;
-            let sums = engine.into_sums();
-            let mut x = vec![1.0; sums.unknowns()];
-            let y = x.clone();
-            sums.apply(&y, &mut x);
-            let since = Instant::now();
-            sums.apply(&y, &mut x);
-            // Nodes and alphas in use grow to all of them; the rest as transforms and products do.
-            let growth = sums.share_of_whole(l_max);
-            application_s = since.elapsed().as_secs_f64() * growth;
-            flops = sums.matrix_product_flops() * growth * l_max as f64 / measured as f64;
-        }
+        let visibility_s =
+            engine.map_or(f64::NAN, |mut engine| time_of(&mut engine, &placed) / SAMPLES as f64);
+        let size = application_size(l_max, u_max);
+        let application_s = size.lines as f64 * TRANSFORMS_PER_LINE * transform_s(size.points)
+            / rayon::current_num_threads() as f64;
         EngineCost {
             sums_bytes: memory.sums as f64,
             other_bytes: (memory.tables + memory.workspace) as f64,
             visibility_s,
             solution_s: APPLICATIONS * application_s,
             visibility_multiply_adds: SPREAD_MULTIPLY_ADDS,
-            solution_multiply_adds: APPLICATIONS * 0.5 * flops,
+            solution_multiply_adds: APPLICATIONS * size.matrix_multiply_adds,
         }
     }
+}
+
+/// Time of one transform of `points`, s, on one core.
+fn transform_s(points: usize) -> f64 {
+    const REPEATS: usize = 400;
+    let plan = FftPlanner::<f32>::new().plan_fft_forward(points);
+    let mut line = vec![Complex32::ONE; points];
+    let mut scratch = vec![Complex32::ZERO; plan.get_inplace_scratch_len()];
+    let since = Instant::now();
+    for _ in 0..REPEATS {
+        plan.process_with_scratch(&mut line, &mut scratch);
+        line.fill(Complex32::ONE);
+    }
+    since.elapsed().as_secs_f64() / REPEATS as f64
 }
 
 /// Time to add, s, the second time: the first makes tables and touches memory.

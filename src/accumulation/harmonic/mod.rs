@@ -33,7 +33,7 @@ use rayon::prelude::*;
 pub use blocks::{OrderBlocks, OrderFactors};
 pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
-pub use setup::{HarmonicMemory, HarmonicSetup, L_MAX, memory, orbit_of};
+pub use setup::{ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, application_size, memory, orbit_of};
 pub use sums::{HarmonicSums, coefficients, unknowns};
 
 use self::spread::Pending;

@@ -3,7 +3,7 @@
 use super::grid::Grids;
 use super::operator::Operator;
 use crate::accumulation::AccumulationError;
-use crate::array::harmonic::{GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry};
+use crate::array::harmonic::{GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry, degrees};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
@@ -122,4 +122,26 @@ pub fn memory(l_max: usize, u_max: f64, threads: usize) -> HarmonicMemory {
         tables: Operator::table_bytes(l_max, &grids),
         workspace: threads as u64 * Operator::workspace_bytes(l_max, &grids),
     }
+}
+
+/// How much work one product with BtN^-1B is when all nodes and phases hold data.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ApplicationSize {
+    /// Points of a line of phases.
+    pub points: usize,
+    /// Lines: alphas times nodes.
+    pub lines: usize,
+    /// Multiply-adds of its matrix products.
+    pub matrix_multiply_adds: f64,
+}
+
+/// The size of a product for maps up to `l_max` from baselines up to `u_max` wavelengths.
+#[must_use]
+pub fn application_size(l_max: usize, u_max: f64) -> ApplicationSize {
+    let grids = Grids::new(l_max, u_max);
+    let (points, nodes) = (grids.points, grids.nodes.count);
+    let patterns: usize = (0..=l_max).map(|mu| degrees(l_max, mu)).sum();
+    // Forth and back; real and imaginary parts; both signs of mu.
+    let matrix_multiply_adds = (2 * 2 * 2 * points * nodes * patterns) as f64;
+    ApplicationSize { points, lines: points * nodes, matrix_multiply_adds }
 }

@@ -4,7 +4,7 @@ use std::sync::{Arc, OnceLock};
 
 use super::HarmonicSetup;
 use super::blocks::OrderBlocks;
-use super::grid::{Grids, NODE_GROUP};
+use super::grid::Grids;
 use super::operator::Operator;
 use super::tori::Tori;
 use crate::accumulation::{NormalSums, SumCounts};
@@ -40,20 +40,6 @@ impl HarmonicSums {
     #[must_use]
     pub fn matrix_product_flops(&self) -> f64 {
         self.operator().matrix_product_flops(&self.tori)
-    }
-
-    /// About how much longer an application takes when all nodes and phases hold data and the map has degree `l_max`:
-    /// as the number of alphas and nodes, and of phases and their logarithm.
-    #[must_use]
-    pub fn share_of_whole(&self, l_max: usize) -> f64 {
-        let u_max = self.setup.baseline_m_max / self.setup.wavelength_m();
-        let whole = Grids::new(l_max, u_max);
-        let used = self.tori.alphas(self.grids.points, |node| &node.weights);
-        let alphas = used.iter().filter(|used| **used).count().max(1);
-        let nodes = self.tori.reached().len().next_multiple_of(NODE_GROUP).max(NODE_GROUP);
-        let line = |points: usize| points as f64 * (points as f64).log2();
-        (whole.points * whole.nodes.count) as f64 * line(whole.points)
-            / ((alphas * nodes) as f64 * line(self.grids.points))
     }
 
     /// The parts of BtN^-1B that do not change m, with weights that do not depend on the phase: what is left of
