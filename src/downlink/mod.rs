@@ -41,6 +41,7 @@
 //! given a kind, a time and a count.
 
 pub mod cadu;
+mod collector;
 mod config;
 pub mod contents;
 mod counters;
@@ -61,6 +62,7 @@ mod taken;
 mod transmission;
 mod waiting;
 
+pub use collector::{Collector, CollectorState};
 pub use config::{DownlinkConfig, Format};
 pub use contents::Contents;
 pub use counters::{FaultCounts, KindCounts, ReceptionCounters};
@@ -74,7 +76,7 @@ pub use kind::{APID_BASE, Kind};
 pub use packetizer::Packetizer;
 pub use payload::{NODES_MIN, PayloadFault};
 pub use receiver::{Event, Packet, Receiver};
-pub use taken::Taken;
 pub use stages::{FileSource, Reception, Recorder, Transmitter};
+pub use taken::Taken;
 pub use transmission::Transmission;
 pub use waiting::{Waiting, WaitingPacket};

@@ -86,10 +86,16 @@ impl Taken {
     /// Counts that are missing, era by era: between packets that came, and from the era's beginning to the first.
     #[must_use]
     pub fn missing(&self) -> Vec<Vec<Range<u64>>> {
+        self.eras().into_iter().map(|(_, missing)| missing).collect()
+    }
+
+    /// [`Taken::missing`], with the time of the earliest packet of each era.
+    #[must_use]
+    pub fn eras(&self) -> Vec<(CucTime, Vec<Range<u64>>)> {
         let missing = |era: &Era| {
             let ends = std::iter::once(0).chain(era.stretches.values().copied());
             let gaps = ends.zip(era.stretches.keys()).map(|(end, &start)| end..start);
-            gaps.filter(|gap| !gap.is_empty()).collect()
+            (era.from, gaps.filter(|gap| !gap.is_empty()).collect())
         };
         self.eras.iter().map(missing).collect()
     }

@@ -69,9 +69,9 @@ impl Waiting {
         None
     }
 
-    /// The first of the packets, if more wait than may; call it until it gives none.
-    pub fn next_due(&mut self) -> Option<WaitingPacket> {
-        if self.bytes > self.bytes_max { self.next_waiting() } else { None }
+    /// The first of the packets, if so many times more wait than may; call it until it gives none.
+    pub fn next_due(&mut self, times: u64) -> Option<WaitingPacket> {
+        if self.bytes > self.bytes_max.saturating_mul(times) { self.next_waiting() } else { None }
     }
 
     /// The first of the packets.
@@ -107,7 +107,7 @@ mod tests {
         let mut order = Vec::new();
         for &count in counts {
             order.extend(waiting.put(packet(count)).map(|packet| packet.header.count));
-            order.extend(std::iter::from_fn(|| waiting.next_due()).map(|packet| packet.header.count));
+            order.extend(std::iter::from_fn(|| waiting.next_due(1)).map(|packet| packet.header.count));
         }
         (order, waiting)
     }
