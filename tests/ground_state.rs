@@ -1,9 +1,10 @@
 //! A ground that remembers: every packet once, whatever comes twice, late, or is ended by force.
 #![allow(clippy::unwrap_used)] // Also in the helpers.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command as Process, Stdio};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use assert_cmd::Command;
 use serde_json::Value;
@@ -285,4 +286,25 @@ fn gaps_are_told_in_packets_and_in_integration_time() {
     assert_eq!(gaps(&place.path("state"))["gaps"].as_array().unwrap().len(), 0);
     let once = place.replay("once", &[&file], &[]);
     assert_eq!(whole["ledger"], once["ledger"]);
+}
+
+#[test]
+fn a_growing_file_is_followed_to_the_same_bits() {
+    let place = Workplace::new();
+    let file = place.downlink();
+    place.replay("once", &[&file], &[]);
+    let bytes = std::fs::read(&file).unwrap();
+    let growing = place.path("growing.ccsds");
+    // Cut within packets, and nothing at first.
+    std::fs::write(&growing, b"").unwrap();
+    let args = place.session("followed", &[&growing], &["--follow", "--idle-s", "2"]);
+    let mut command = Process::new(assert_cmd::cargo::cargo_bin("lunarray"));
+    let mut child = command.args(&args).stdout(Stdio::null()).spawn().unwrap();
+    let mut out = std::fs::OpenOptions::new().append(true).open(&growing).unwrap();
+    for part in bytes.chunks(bytes.len() / 5 + 7) {
+        std::thread::sleep(Duration::from_millis(150));
+        out.write_all(part).unwrap();
+    }
+    assert!(child.wait().unwrap().success());
+    assert!(place.bytes("followed") == place.bytes("once"));
 }

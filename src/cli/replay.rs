@@ -6,6 +6,7 @@ use clap::Args;
 
 use super::progress::{Progress, cancel_on_interrupt};
 use super::{CommandError, CommandResult, Outcome, print_json_line, print_text};
+use crate::downlink::FileSource;
 use crate::pipeline::state::Keeper;
 use crate::pipeline::{ConfigSource, replay, use_threads};
 use crate::units::constants::DAY_S;
@@ -38,6 +39,12 @@ pub(super) struct ReplayArgs {
     /// an old one keeps its own.
     #[arg(long, value_name = "BYTES", default_value_t = 1 << 24, requires = "state")]
     wait_bytes: u64,
+    /// Read on in the last FILE as it grows, until Ctrl-C, which leaves maps of the data so far.
+    #[arg(long, requires = "files")]
+    follow: bool,
+    /// Seconds without growth after which a followed file is taken to be whole; 0 for never.
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.0, requires = "follow")]
+    idle_s: f64,
     /// Mission time between snapshot maps: a number with s, h or d, such as 7d; 0 for a final map alone.
     #[arg(long, value_name = "TIME", value_parser = seconds)]
     snapshot_every: Option<f64>,
@@ -78,9 +85,13 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     for note in keeper.iter().flat_map(Keeper::notes) {
         eprintln!("note: {note}");
     }
+    let files = match args.follow {
+        true => FileSource::follow(&args.files, args.idle_s)?,
+        false => FileSource::open(&args.files)?,
+    };
     let cancel = cancel_on_interrupt()?;
     let mut progress = None;
-    let summary = replay(&args.files, &config, keeper, &args.out, &cancel, &mut |metrics| {
+    let summary = replay(files, &config, keeper, &args.out, &cancel, &mut |metrics| {
         progress = Some(Progress::watch(metrics, "read", 0));
     })?;
     drop(progress);
