@@ -30,9 +30,10 @@ fn write(folder: &Path, name: &str, text: &str) -> String {
 
 #[test]
 fn every_command_has_help_that_teaches() {
-    for command in
-        ["run", "simulate", "replay", "inspect", "compare", "geometry", "predict", "check", "sky", "corrupt"]
-    {
+    for command in [
+        "run", "simulate", "replay", "inspect", "compare", "geometry", "predict", "check", "sky", "corrupt",
+        "gaps",
+    ] {
         let output = lunarray().args([command, "--help"]).output().unwrap();
         assert!(output.status.success());
         let text = String::from_utf8(output.stdout).unwrap();

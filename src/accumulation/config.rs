@@ -178,6 +178,26 @@ impl MapConfig {
         if self.l_max > 0 { self.l_max } else { (DEGREES_PER_NSIDE * self.nside as f64) as usize }
     }
 
+    /// The settings that shape sums, by key; the others only shape what is made of them.
+    #[must_use]
+    pub fn of_sums(&self) -> Vec<(&'static str, String)> {
+        let Self { nside, engine, rows, baseline_bp_max, companion_seed, limits, .. } = self;
+        let mut settings = vec![
+            ("map.nside", nside.to_string()),
+            ("map.engine", format!("{engine:?}")),
+            ("map.baseline_bp_max", format!("{baseline_bp_max:?}")),
+            ("map.companion_seed", companion_seed.to_string()),
+        ];
+        match engine {
+            EngineKind::Pixel => settings.push(("map.rows", format!("{rows:?}"))),
+            EngineKind::Harmonic => {
+                settings.push(("map.l_max", self.degree().to_string()));
+                settings.push(("map.limits", format!("{limits:?}")));
+            }
+        }
+        settings
+    }
+
     /// Longest baseline used at a frequency, m.
     ///
     /// b_p = wavelength / sqrt(4 pi / N_pix) is the baseline that a pixel just resolves (the paper, Sect. 4).

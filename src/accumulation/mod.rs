@@ -18,7 +18,7 @@ mod tiles;
 pub use config::{EngineKind, MapConfig, MapConfigError};
 pub use error::AccumulationError;
 pub use pixel::{PixelEngine, PixelSetup, PixelSums};
-pub use stage::{Accumulator, Snapshot, Sums};
+pub use stage::{Accumulator, AccumulatorState, Snapshot, Sums};
 pub use tiles::{Columns, SymmetricTiles, TILE};
 
 use std::collections::BTreeMap;

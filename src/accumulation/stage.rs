@@ -1,5 +1,6 @@
 //! The ground stage that sums normal equations, channel by channel.
 
+use std::io::{Read, Write};
 use std::sync::Arc;
 
 use super::harmonic::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
@@ -79,6 +80,16 @@ impl Engine {
     }
 }
 
+/// What an accumulator holds besides its engines, for another to go on with; its ledger is apart.
+#[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
+pub struct AccumulatorState {
+    instrument: Option<Instrument>,
+    /// First and last time, and number of snapshots, of channels that have an engine.
+    channels: Vec<Option<([f64; 2], u32)>>,
+    next_snapshot_s: Option<f64>,
+    accumulated: u64,
+}
+
 /// One channel's engine and what it holds.
 struct ChannelSums {
     engine: Engine,
@@ -101,6 +112,53 @@ impl Accumulator {
     #[must_use]
     pub fn new(config: MapConfig, ledger: Ledger) -> Self {
         Self { config, ledger, instrument: None, channels: Vec::new(), next_snapshot_s: None, accumulated: 0 }
+    }
+
+    /// What it holds besides its engines.
+    #[must_use]
+    pub fn state(&self) -> AccumulatorState {
+        let kept = |sums: &ChannelSums| (sums.span_s, sums.snapshots);
+        AccumulatorState {
+            instrument: self.instrument.as_deref().cloned(),
+            channels: self.channels.iter().map(|slot| slot.as_ref().map(kept)).collect(),
+            next_snapshot_s: self.next_snapshot_s,
+            accumulated: self.accumulated,
+        }
+    }
+
+    /// Writes its engines, one behind the other.
+    ///
+    /// # Errors
+    /// What the writer says.
+    pub fn write_engines(&self, out: &mut dyn Write) -> Result<(), AccumulationError> {
+        for sums in self.channels.iter().flatten() {
+            match &sums.engine {
+                Engine::Pixel(engine) => engine.checkpoint(out)?,
+                Engine::Harmonic(engine) => engine.checkpoint(out)?,
+            }
+        }
+        Ok(())
+    }
+
+    /// Goes on with what another held, its engines read as [`Accumulator::write_engines`] wrote them.
+    ///
+    /// # Errors
+    /// Engines that are damaged, or of another kind than the configuration asks for.
+    pub fn resume(self, state: AccumulatorState, from: &mut dyn Read) -> Result<Self, AccumulationError> {
+        let AccumulatorState { instrument, channels: kept, next_snapshot_s, accumulated } = state;
+        let mut channels = Vec::new();
+        for kept in kept {
+            let Some((span_s, snapshots)) = kept else {
+                channels.push(None);
+                continue;
+            };
+            let engine = match self.config.engine {
+                EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
+                EngineKind::Harmonic => Engine::Harmonic(Box::new(HarmonicEngine::restore(from)?)),
+            };
+            channels.push(Some(ChannelSums { engine, span_s, snapshots }));
+        }
+        Ok(Self { instrument: instrument.map(Arc::new), channels, next_snapshot_s, accumulated, ..self })
     }
 
     fn open(&mut self, instrument: Instrument) -> Result<(), AccumulationError> {

@@ -121,6 +121,11 @@ impl Ephemeris {
         self.segments.is_empty()
     }
 
+    /// All segments, in the order of their beginnings.
+    pub fn segments(&self) -> impl Iterator<Item = &EphemerisSegment> {
+        self.segments.values()
+    }
+
     /// Offers a segment.
     pub fn insert(&mut self, segment: EphemerisSegment) -> Insertion {
         let positions = segment.nodes() * usize::from(segment.satellites);

@@ -14,7 +14,7 @@ pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 pub use gains::AntennaGains;
 pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation};
-pub use stage::Calibrator;
+pub use stage::{Calibrator, CalibratorState};
 
 use crate::frames::PlacedVisibilities;
 

@@ -4,12 +4,23 @@ use std::collections::{BTreeMap, HashSet};
 
 use super::{Calibration, CalibrationError};
 use crate::array::{Ephemeris, FlaggedCounts};
-use crate::frames::{GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock};
+use crate::frames::{EphemerisSegment, GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock};
 use crate::runtime::{Ledger, Outlet, Stage, Units};
 use crate::units::{ChannelId, Pair};
 
 /// Identity of a block of visibilities: every one is used once, however often it arrives.
 type BlockKey = (ChannelId, Pair, i64, u32);
+
+/// What a calibrator has learnt and counted, for another to go on with; its ledger is apart.
+#[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
+pub struct CalibratorState {
+    instrument: Option<Instrument>,
+    ephemeris: Vec<EphemerisSegment>,
+    /// Sorted.
+    seen: Vec<BlockKey>,
+    received: BTreeMap<i64, u64>,
+    reported: Option<Housekeeping>,
+}
 
 /// Gives each visibility the positions of its satellites, from the ephemeris packets alone, and hands
 /// it to the calibration hook. What cannot be used is flagged in the ledger with its reason.
@@ -41,6 +52,31 @@ impl Calibrator {
             received: BTreeMap::new(),
             reported: None,
         }
+    }
+
+    /// What it knows.
+    #[must_use]
+    pub fn state(&self) -> CalibratorState {
+        let mut seen: Vec<BlockKey> = self.seen.iter().copied().collect();
+        seen.sort_unstable();
+        CalibratorState {
+            instrument: self.instrument.clone(),
+            ephemeris: self.ephemeris.segments().cloned().collect(),
+            seen,
+            received: self.received.clone(),
+            reported: self.reported,
+        }
+    }
+
+    /// Goes on with what another knew.
+    #[must_use]
+    pub fn resume(self, state: CalibratorState) -> Self {
+        let CalibratorState { instrument, ephemeris: segments, seen, received, reported } = state;
+        let mut ephemeris = Ephemeris::default();
+        for segment in segments {
+            ephemeris.insert(segment);
+        }
+        Self { ephemeris, instrument, seen: seen.into_iter().collect(), received, reported, ..self }
     }
 
     fn visibilities(

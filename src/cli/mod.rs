@@ -3,6 +3,7 @@
 mod check;
 mod compare;
 mod corrupt;
+mod gaps;
 mod geometry;
 mod inspect;
 mod predict;
@@ -54,6 +55,7 @@ enum Command {
     Replay(replay::ReplayArgs),
     Inspect(inspect::InspectArgs),
     Corrupt(corrupt::CorruptArgs),
+    Gaps(gaps::GapsArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
     Predict(predict::PredictArgs),
@@ -116,6 +118,7 @@ pub fn main() -> ExitCode {
         Command::Replay(args) => replay::execute(&args),
         Command::Inspect(args) => inspect::execute(&args),
         Command::Corrupt(args) => corrupt::execute(&args),
+        Command::Gaps(args) => gaps::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
         Command::Predict(args) => predict::execute(&args),

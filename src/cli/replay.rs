@@ -6,6 +6,8 @@ use clap::Args;
 
 use super::progress::{Progress, cancel_on_interrupt};
 use super::{CommandError, CommandResult, Outcome, print_json_line, print_text};
+use crate::downlink::FileSource;
+use crate::pipeline::state::Keeper;
 use crate::pipeline::{ConfigSource, replay, use_threads};
 use crate::units::constants::DAY_S;
 
@@ -18,7 +20,7 @@ use crate::units::constants::DAY_S;
 #[derive(Debug, Args)]
 pub(super) struct ReplayArgs {
     /// Downlink files, in the order of time.
-    #[arg(required = true, value_name = "FILE")]
+    #[arg(required_unless_present = "state", value_name = "FILE")]
     files: Vec<PathBuf>,
     /// How to make the maps; the embedded quicklook's settings if not given.
     #[arg(long, value_name = "MAP.toml")]
@@ -26,6 +28,23 @@ pub(super) struct ReplayArgs {
     /// Folder for the products.
     #[arg(short, long, value_name = "DIR")]
     out: PathBuf,
+    /// Folder in which everything received is kept: every packet is applied once, in this session and all later
+    /// ones, however often and in whatever order it comes. Ended at any moment, give the same command again.
+    #[arg(long, value_name = "DIR")]
+    state: Option<PathBuf>,
+    /// Visibilities between two checkpoints of the state; there is one at the end in any case.
+    #[arg(long, value_name = "NUMBER", default_value_t = 1_000_000, requires = "state")]
+    checkpoint_every: u64,
+    /// Bytes of later packets that a packet may come after and still be applied in its order; of a new state,
+    /// an old one keeps its own.
+    #[arg(long, value_name = "BYTES", default_value_t = 1 << 24, requires = "state")]
+    wait_bytes: u64,
+    /// Read on in the last FILE as it grows, until Ctrl-C, which leaves maps of the data so far.
+    #[arg(long, requires = "files")]
+    follow: bool,
+    /// Seconds without growth after which a followed file is taken to be whole; 0 for never.
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.0, requires = "follow")]
+    idle_s: f64,
     /// Mission time between snapshot maps: a number with s, h or d, such as 7d; 0 for a final map alone.
     #[arg(long, value_name = "TIME", value_parser = seconds)]
     snapshot_every: Option<f64>,
@@ -59,9 +78,20 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     }
     let config = ConfigSource { file: args.map.clone(), overrides, seed: None }.load_ground()?;
     use_threads(&config.runtime)?;
+    let keeper = match &args.state {
+        Some(folder) => Some(Keeper::open(folder, &config, args.wait_bytes, args.checkpoint_every)?),
+        None => None,
+    };
+    for note in keeper.iter().flat_map(Keeper::notes) {
+        eprintln!("note: {note}");
+    }
+    let files = match args.follow {
+        true => FileSource::follow(&args.files, args.idle_s)?,
+        false => FileSource::open(&args.files)?,
+    };
     let cancel = cancel_on_interrupt()?;
     let mut progress = None;
-    let summary = replay(&args.files, &config, &args.out, &cancel, &mut |metrics| {
+    let summary = replay(files, &config, keeper, &args.out, &cancel, &mut |metrics| {
         progress = Some(Progress::watch(metrics, "read", 0));
     })?;
     drop(progress);

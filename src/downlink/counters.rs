@@ -7,7 +7,7 @@ use super::kind::Kind;
 use super::payload::PayloadFault;
 
 /// Packets of one kind.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct KindCounts {
     /// Good packets, duplicates left out.
     pub packets: u64,
@@ -30,7 +30,7 @@ pub struct KindCounts {
 }
 
 /// Payloads that were refused although their packets' checks held, by reason.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct FaultCounts {
     /// Unknown format version.
     pub version: u64,
@@ -66,7 +66,7 @@ impl FaultCounts {
 ///
 /// `bytes = bytes_garbage + bytes_truncated + bytes_damaged + bytes_duplicate +` those of the kinds'
 /// packets. Visibilities in good packets are `decoded + bad_value + refused + before_instrument + foreign`.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct ReceptionCounters {
     /// Coded frames, if packets came in such; all other counts are of what was recovered from them.
     pub frames: Option<FrameCounters>,

@@ -11,7 +11,20 @@ pub(super) const P_FIELD: u8 = 0x1F;
 const SECONDS_MAX: f64 = u32::MAX as f64;
 
 /// TAI since 1958-01-01 in units of 2^-24 s (60 ns).
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[derive(
+    Clone,
+    Copy,
+    Debug,
+    Default,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Hash,
+    Serialize,
+    bincode::Encode,
+    bincode::Decode,
+)]
 pub struct CucTime(pub u64);
 
 impl CucTime {

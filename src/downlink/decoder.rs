@@ -15,7 +15,7 @@ use crate::frames::{GroundFrame, Instrument};
 const PAYLOAD_BYTES_MAX: usize = 1 << 24;
 
 /// A payload of which not all segments have come.
-#[derive(Debug)]
+#[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 struct Partial {
     next: u64,
     time: CucTime,
@@ -23,13 +23,30 @@ struct Partial {
 }
 
 /// What an instrument description says, compared with what is known.
-#[derive(Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 enum Standing {
     #[default]
     Unknown,
     Known,
     /// The latest description contradicts the first: what follows it belongs to another array.
     Contradicted,
+}
+
+/// What a decoder has learnt and counted, for another to go on with.
+#[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
+pub struct DecoderState {
+    instrument: Option<Instrument>,
+    standing: Standing,
+    partial: Vec<Option<Partial>>,
+    counters: ReceptionCounters,
+}
+
+impl DecoderState {
+    /// The account.
+    #[must_use]
+    pub fn counters(&self) -> &ReceptionCounters {
+        &self.counters
+    }
 }
 
 /// Makes frames of packets and keeps the account.
@@ -50,6 +67,34 @@ impl Decoder {
     #[must_use]
     pub fn new() -> Self {
         Self::default()
+    }
+
+    /// What it knows.
+    #[must_use]
+    pub fn state(&self) -> DecoderState {
+        let Self { instrument, standing, partial, counters, .. } = self;
+        DecoderState {
+            instrument: instrument.clone(),
+            standing: *standing,
+            partial: partial.to_vec(),
+            counters: counters.clone(),
+        }
+    }
+
+    /// A decoder that knows what another knew.
+    #[must_use]
+    pub fn resume(state: DecoderState) -> Self {
+        let DecoderState { instrument, standing, mut partial, counters } = state;
+        partial.resize(Kind::ALL.len(), None);
+        let partial = partial.try_into().unwrap_or_default();
+        Self { instrument, standing, partial, counters, fault: None }
+    }
+
+    /// Whether this is the payload of another instrument's description than the one that holds.
+    #[must_use]
+    pub fn contradicts(&self, payload: &[u8]) -> bool {
+        let known = self.instrument.as_ref();
+        known.is_some_and(|known| decode_instrument(payload).is_ok_and(|found| found != *known))
     }
 
     /// Takes an event into the account; gives the frame that it completes.

@@ -64,6 +64,15 @@ pub enum DownlinkError {
         /// Range that is accepted.
         expected: &'static str,
     },
+    /// Packets of another mission among those of one.
+    #[error(
+        "at byte {offset} of the packets: the description of another instrument than the one that the state is of; \
+         expected one mission a state"
+    )]
+    OtherInstrument {
+        /// Place in the stream.
+        offset: u64,
+    },
     /// A downlink that was to be damaged and already is.
     #[error(
         "at byte {offset}: no sound frame or packet; expected a whole downlink, as `lunarray simulate` writes it"

@@ -27,7 +27,7 @@ const COUNT_BITS: u32 = 14;
 pub(super) const COUNT_MAX: u64 = (1 << 46) - 1;
 
 /// Segmentation flags: where in its payload a packet stands.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 #[repr(u8)]
 pub enum Segment {
     /// Neither first nor last.
@@ -41,7 +41,7 @@ pub enum Segment {
 }
 
 /// The headers of one packet.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 pub struct PacketHeader {
     /// Kind, by APID.
     pub kind: Kind,

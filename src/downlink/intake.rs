@@ -22,6 +22,7 @@ pub struct Intake {
     bytes: u64,
     chunk: Vec<u8>,
     recovered: Vec<u8>,
+    unjudged: bool,
 }
 
 impl Intake {
@@ -29,6 +30,12 @@ impl Intake {
     #[must_use]
     pub fn new() -> Self {
         Self::default()
+    }
+
+    /// An intake whose receiver is [`Receiver::unjudged`].
+    #[must_use]
+    pub fn unjudged() -> Self {
+        Self { unjudged: true, packets: Receiver::unjudged(), ..Self::default() }
     }
 
     /// Takes the next bytes of the stream.
@@ -114,7 +121,7 @@ impl Intake {
     fn take_recovered(&mut self) {
         if self.format.is_none() && self.frames.has_frame() {
             self.format = Some(Format::Cadu);
-            self.packets = Receiver::new();
+            self.packets = if self.unjudged { Receiver::unjudged() } else { Receiver::new() };
         }
         if !self.recovered.is_empty() {
             self.packets.push(&self.recovered);

@@ -8,7 +8,9 @@ use serde::Serialize;
 pub const APID_BASE: u16 = 0x100;
 
 /// What a packet carries; each kind has an APID and a packet count of its own.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[derive(
+    Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, bincode::Encode, bincode::Decode,
+)]
 #[serde(rename_all = "lowercase")]
 #[repr(u8)]
 pub enum Kind {

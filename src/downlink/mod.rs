@@ -41,6 +41,7 @@
 //! given a kind, a time and a count.
 
 pub mod cadu;
+mod collector;
 mod config;
 pub mod contents;
 mod counters;
@@ -57,13 +58,16 @@ mod payload;
 mod receiver;
 mod sequence;
 mod stages;
+mod taken;
 mod transmission;
+mod waiting;
 
+pub use collector::{Collector, CollectorState};
 pub use config::{DownlinkConfig, Format};
 pub use contents::Contents;
 pub use counters::{FaultCounts, KindCounts, ReceptionCounters};
 pub use cuc::CucTime;
-pub use decoder::Decoder;
+pub use decoder::{Decoder, DecoderState};
 pub use error::DownlinkError;
 pub use file::{DownlinkReader, DownlinkWriter};
 pub use header::{FORMAT_VERSION, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, Segment, TRAILER_BYTES};
@@ -73,4 +77,6 @@ pub use packetizer::Packetizer;
 pub use payload::{NODES_MIN, PayloadFault};
 pub use receiver::{Event, Packet, Receiver};
 pub use stages::{FileSource, Reception, Recorder, Transmitter};
+pub use taken::Taken;
 pub use transmission::Transmission;
+pub use waiting::{Waiting, WaitingPacket};

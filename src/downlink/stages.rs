@@ -5,6 +5,7 @@ use std::fs::File;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use super::config::{DownlinkConfig, Format};
 use super::counters::ReceptionCounters;
@@ -140,12 +141,25 @@ impl Sink for Recorder {
     }
 }
 
+/// Between two looks at a file that may have grown.
+const POLL: Duration = Duration::from_millis(100);
+
+/// How long to wait for a file to grow.
+#[derive(Debug)]
+struct Patience {
+    /// Looks in vain after which the file is taken to be whole; `None` for ever.
+    polls_max: Option<u64>,
+    polls: u64,
+}
+
 /// Reads downlink files one after the other.
 #[derive(Debug)]
 pub struct FileSource {
     files: VecDeque<PathBuf>,
     now: Option<(PathBuf, File)>,
     bytes: u64,
+    /// Of the last file, if it is followed.
+    patience: Option<Patience>,
 }
 
 impl FileSource {
@@ -164,7 +178,33 @@ impl FileSource {
                 _ => first = Some((path, format)),
             }
         }
-        Ok(Self { files: paths.iter().cloned().collect(), now: None, bytes: 0 })
+        Ok(Self { files: paths.iter().cloned().collect(), now: None, bytes: 0, patience: None })
+    }
+
+    /// As [`FileSource::open`], but the last file, which may hold nothing yet, is read on as it grows: until it has not
+    /// for `idle_s` seconds, or until the run is ended if that is 0.
+    ///
+    /// # Errors
+    /// Those of [`FileSource::open`] for all files but the last, which need only be there.
+    pub fn follow(paths: &[PathBuf], idle_s: f64) -> Result<Self, DownlinkError> {
+        let Some((last, others)) = paths.split_last() else { return Self::open(paths) };
+        File::open(last).map_err(io_error(last, "open the file"))?;
+        let mut source = Self::open(others)?;
+        source.files.push_back(last.clone());
+        let polls_max = (idle_s > 0.0).then(|| (idle_s / POLL.as_secs_f64()).ceil() as u64);
+        source.patience = Some(Patience { polls_max, polls: 0 });
+        Ok(source)
+    }
+
+    /// Waits a little for the last file to grow; whether to look again.
+    fn wait(&mut self) -> bool {
+        let Some(patience) = self.patience.as_mut().filter(|_| self.files.is_empty()) else { return false };
+        patience.polls += 1;
+        if patience.polls_max.is_some_and(|most| patience.polls > most) {
+            return false;
+        }
+        std::thread::sleep(POLL);
+        true
     }
 }
 
@@ -207,6 +247,11 @@ impl Source for FileSource {
         if read.map_err(io_error(&path, "read"))? > 0 {
             self.bytes += bytes.len() as u64;
             out.push(bytes);
+            self.now = Some((path, file));
+            if let Some(patience) = &mut self.patience {
+                patience.polls = 0;
+            }
+        } else if self.wait() {
             self.now = Some((path, file));
         }
         Ok(Flow::Continue)

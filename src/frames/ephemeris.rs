@@ -6,7 +6,7 @@ use crate::units::vector::Vec3;
 /// Positions of all satellites at equal steps over a stretch of time without manoeuvres.
 ///
 /// The stretch is smooth: interpolation never crosses a segment's ends.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct EphemerisSegment {
     /// Time of the first node.
     pub start: MissionTime,

@@ -3,7 +3,7 @@
 use crate::units::MissionTime;
 
 /// Visibilities counted on board since the mission epoch, so that the ground can close its ledger.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 pub struct Housekeeping {
     /// Time up to which the counts hold.
     pub time: MissionTime,

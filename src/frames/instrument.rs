@@ -1,7 +1,7 @@
 //! The instrument description: all that the ground knows of the array besides its ephemeris.
 
 /// One frequency channel.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct Channel {
     /// Centre frequency, Hz.
     pub frequency_hz: f64,
@@ -10,7 +10,7 @@ pub struct Channel {
 }
 
 /// Antenna power response A of a daughter.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 #[non_exhaustive]
 pub enum AntennaResponse {
     /// A = 1, the paper's choice.
@@ -21,7 +21,7 @@ pub enum AntennaResponse {
 }
 
 /// What the spacecraft says of itself at the start of a downlink.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct Instrument {
     /// Name of the pipeline or mission.
     pub name: String,

@@ -51,6 +51,9 @@ pub enum PipelineError {
     /// Products cannot be written.
     #[error(transparent)]
     Products(#[from] crate::products::ProductsError),
+    /// The state of the ground cannot be kept.
+    #[error(transparent)]
+    State(#[from] super::state::StateError),
     /// No thread pool.
     #[error("cannot start {threads} worker threads: {reason}")]
     Threads {

@@ -5,7 +5,8 @@ use std::sync::{Arc, Mutex};
 
 use super::config::Config;
 use super::error::PipelineError;
-use crate::accumulation::Accumulator;
+use super::state::Keeper;
+use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::Calibrator;
 use crate::downlink::{Reception, ReceptionCounters};
 use crate::products::{ChannelSummary, Provenance, Publisher, Truth};
@@ -26,6 +27,7 @@ pub struct GroundOutcome {
 
 /// Adds the ground segment to `graph`. It takes the bytes of a downlink and nothing else from space;
 /// `truth`, if any, only serves to compare the maps with; `watch` follows solutions.
+/// With a `keeper`, what has been received is kept for later sessions.
 ///
 /// # Errors
 /// Calibration or prior maps that cannot be read.
@@ -35,9 +37,9 @@ pub fn add(
     config: &Config,
     out: &Path,
     (truth, watch): (Truth, SolveWatch),
+    keeper: Option<Keeper>,
 ) -> Result<GroundOutcome, PipelineError> {
-    let outcome = GroundOutcome::default();
-    let capacity = config.runtime.queue_capacity;
+    let outcome = keeper.as_ref().map(Keeper::outcome).unwrap_or_default();
     let setup = SolverSetup {
         epsilon: config.map.epsilon.clone(),
         prior_k: config.map.prior_k.clone(),
@@ -49,7 +51,6 @@ pub fn add(
         trace_probes: config.map.trace_probes,
         watch,
     };
-    let calibration = config.calibration.build(Path::new(""))?;
     let publisher = Publisher::new(
         config.products.clone(),
         out,
@@ -57,15 +58,30 @@ pub fn add(
         Provenance { ground_hash: config.ground_hash() },
         Arc::clone(&outcome.channels),
     )?;
+    // Sums are large: one waits while another is solved.
+    let sums = match keeper {
+        Some(keeper) => graph.stage("keep", 1, bytes, keeper),
+        None => add_sums(graph, bytes, config, &outcome)?,
+    };
+    let maps = graph.stage("solve", 1, sums, Solver::new(setup));
+    graph.sink("publish", maps, publisher);
+    Ok(outcome)
+}
+
+/// The stages from bytes to sums, when nothing is kept.
+fn add_sums(
+    graph: &mut Graph,
+    bytes: Link<Vec<u8>>,
+    config: &Config,
+    outcome: &GroundOutcome,
+) -> Result<Link<Snapshot>, PipelineError> {
+    let capacity = config.runtime.queue_capacity;
+    let calibration = config.calibration.build(Path::new(""))?;
     let frames = graph.stage("receive", capacity, bytes, Reception::new(Arc::clone(&outcome.reception)));
     let calibrator = Calibrator::new(calibration, outcome.ledger.clone());
     let placed = graph.stage("calibrate", capacity, frames, calibrator);
     let accumulator = Accumulator::new(config.map.clone(), outcome.ledger.clone());
-    // Sums are large: one waits while another is solved.
-    let sums = graph.stage("accumulate", 1, placed, accumulator);
-    let maps = graph.stage("solve", 1, sums, Solver::new(setup));
-    graph.sink("publish", maps, publisher);
-    Ok(outcome)
+    Ok(graph.stage("accumulate", 1, placed, accumulator))
 }
 
 fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {

@@ -11,6 +11,7 @@ mod models;
 mod plan;
 mod run;
 mod space;
+pub mod state;
 mod summary;
 
 pub use config::{Config, ConfigError, ConfigSource, Problems, QUICKLOOK};

@@ -1,6 +1,6 @@
 //! Running pipelines: the whole chain, the space segment alone, the ground segment alone.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
@@ -9,6 +9,7 @@ use super::error::PipelineError;
 use super::ground::{self, GroundOutcome};
 use super::plan::Plan;
 use super::space;
+use super::state::Keeper;
 use super::summary::{Segment, Summary};
 use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
@@ -59,7 +60,7 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     };
     drop(skies);
     let solving = SolveWatch::new(cancel.clone());
-    let outcome = ground::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()))?;
+    let outcome = ground::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()), None)?;
     let report = start(graph, &plan.config.runtime, (cancel, solving), watch)?;
     conclude(Segment::Whole, &plan.config, Some(out), report, outcome)
 }
@@ -83,22 +84,23 @@ pub fn simulate(
     start(graph, &plan.config.runtime, (cancel, SolveWatch::default()), watch)
 }
 
-/// The ground segment alone, from downlink files in the order given.
+/// The ground segment alone, from downlink files; with a `keeper`, on top of what it holds.
 ///
 /// # Errors
-/// A file that cannot be read or is no downlink; the first failure of any stage.
+/// A file that cannot be read; the first failure of any stage.
 pub fn replay(
-    files: &[PathBuf],
+    files: FileSource,
     config: &Config,
+    keeper: Option<Keeper>,
     out: &Path,
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<Summary, PipelineError> {
     make_folder(out)?;
     let mut graph = Graph::new();
-    let bytes = graph.source("read", config.runtime.queue_capacity, FileSource::open(files)?);
+    let bytes = graph.source("read", config.runtime.queue_capacity, files);
     let solving = SolveWatch::new(cancel.clone());
-    let outcome = ground::add(&mut graph, bytes, config, out, (Truth::unknown(), solving.clone()))?;
+    let outcome = ground::add(&mut graph, bytes, config, out, (Truth::unknown(), solving.clone()), keeper)?;
     let report = start(graph, &config.runtime, (cancel, solving), watch)?;
     conclude(Segment::Ground, config, Some(out), report, outcome)
 }

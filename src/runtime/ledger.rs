@@ -31,6 +31,18 @@ impl Ledger {
         Self::default()
     }
 
+    /// Posts all that another account reports.
+    pub fn post_report(&self, report: &LedgerReport) {
+        self.sampled(report.sampled);
+        self.accumulated(report.accumulated);
+        for (reason, &count) in &report.flagged {
+            self.flagged(reason.clone(), count);
+        }
+        for Loss { stage, reason, count } in &report.lost {
+            self.lost(stage.clone(), reason.clone(), *count);
+        }
+    }
+
     /// Posts `count` samples that came into being.
     pub fn sampled(&self, count: u64) {
         self.post(|accounts| &mut accounts.sampled, count);
@@ -90,7 +102,7 @@ impl Ledger {
 }
 
 /// Samples lost in one stage for one reason.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct Loss {
     /// Where.
     pub stage: String,
@@ -101,7 +113,7 @@ pub struct Loss {
 }
 
 /// The accounts of a run; shown as a table.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct LedgerReport {
     /// Samples that came into being.
     pub sampled: u64,

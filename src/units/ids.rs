@@ -9,7 +9,9 @@ use thiserror::Error;
 pub const MAX_SATELLITES: usize = 64;
 
 /// Index of a frequency channel in the instrument description.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, bincode::Encode, bincode::Decode,
+)]
 pub struct ChannelId(pub u16);
 
 impl fmt::Display for ChannelId {
@@ -19,7 +21,9 @@ impl fmt::Display for ChannelId {
 }
 
 /// Two daughters `i < j`, counted from 0; shown and parsed counted from 1, as in "1-2".
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, bincode::Encode, bincode::Decode,
+)]
 pub struct Pair {
     /// The leading daughter.
     pub i: u8,

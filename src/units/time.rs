@@ -9,7 +9,9 @@ pub const TICKS_PER_SECOND: i64 = 1_000_000;
 ///
 /// Time tags travel in this unit, so that a tag means the same on both sides of the downlink. One
 /// tick moves a 100 km baseline by 76 micrometres: 3e-5 rad of phase at 30 MHz.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, bincode::Encode, bincode::Decode,
+)]
 pub struct MissionTime(pub i64);
 
 impl MissionTime {

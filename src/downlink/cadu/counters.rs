@@ -5,7 +5,7 @@ use std::fmt;
 use serde::Serialize;
 
 /// Frames of one virtual channel.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct ChannelCounts {
     /// Virtual channel.
     pub channel: u8,
@@ -22,7 +22,7 @@ pub struct ChannelCounts {
 }
 
 /// The account of a coded stream.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct FrameCounters {
     /// Bytes received.
     pub bytes: u64,

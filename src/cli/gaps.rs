@@ -1,0 +1,95 @@
+//! `lunarray gaps`: what is missing, and what it is worth.
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::{CommandResult, Outcome, print_json_line, print_text};
+use crate::pipeline::state::{GapReport, Gaps, Survey};
+
+/// List packets that are missing, and what they would add to the map.
+///
+/// Takes a folder of `lunarray replay --state`, one of its checkpoints, or a downlink file. Gaps stand in the order of
+/// what their recovery would add: their weight over that received in the same channel, summed over channels. The range
+/// of packet counts is what to ask the spacecraft for (the sequence count is its lower 14 bits). What a gap held
+/// is estimated from the order in which channels and pairs are sent and the packets that did arrive. What
+/// was sent after the last packet that arrived is not known to be missing.
+#[derive(Debug, Args)]
+pub(super) struct GapsArgs {
+    /// State, checkpoint or downlink file.
+    #[arg(value_name = "STATE|FILE")]
+    path: PathBuf,
+    /// Gaps shown, at most; --json has all.
+    #[arg(long, default_value_t = 20)]
+    most: usize,
+    /// Write a picture of integration time over mission time, channel by channel.
+    #[arg(long, value_name = "FILE.png")]
+    picture: Option<PathBuf>,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn execute(args: &GapsArgs) -> CommandResult {
+    let survey = Survey::of(&args.path)?;
+    let gaps = survey.gaps();
+    if let Some(path) = &args.picture {
+        survey.picture(&gaps)?.write(path)?;
+    }
+    if args.json {
+        print_json_line(&gaps)?;
+    } else {
+        print_text(table(&gaps, args.most).trim_end())?;
+    }
+    Ok(Outcome::Done)
+}
+
+fn table(gaps: &Gaps, most: usize) -> String {
+    let mut text = String::new();
+    // Writing to a string does not fail.
+    let _ = writeln!(text, "channel     packets  received, h  missing, h  missing weight");
+    for channel in &gaps.channels {
+        let all = channel.weight + channel.missing_weight;
+        let share = if all > 0.0 { 100.0 * channel.missing_weight / all } else { 0.0 };
+        let (received_h, missing_h) =
+            (channel.integration_s / 3600.0, channel.missing_integration_s / 3600.0);
+        let (number, packets) = (channel.channel, channel.packets);
+        let _ =
+            writeln!(text, "{number:<8} {packets:>10} {received_h:>12.2} {missing_h:>11.2} {share:>13.3} %");
+    }
+    if gaps.gaps.is_empty() {
+        text.push_str("\nNothing is missing between the packets that arrived.");
+        return text;
+    }
+    let _ = writeln!(text, "\n APID        from          to  lost, h   adds %  lost by channel and pair");
+    for gap in gaps.gaps.iter().take(most) {
+        let GapReport { apid, from, to, integration_s, gain, .. } = gap;
+        let (lost_h, adds) = (integration_s / 3600.0, 100.0 * gain);
+        let _ = write!(text, "{apid:#05x} {from:>11} {to:>11} {lost_h:>8.3} {adds:>8.4}  ");
+        text.push_str(&streams(gap));
+        text.push('\n');
+    }
+    if gaps.gaps.len() > most {
+        let _ = writeln!(text, "and {} more; see --most and --json", gaps.gaps.len() - most);
+    }
+    text
+}
+
+/// The greatest losses of a gap.
+fn streams(gap: &GapReport) -> String {
+    const SHOWN: usize = 3;
+    if gap.lost.is_empty() {
+        return gap.kind.to_string();
+    }
+    let mut lost: Vec<_> = gap.lost.iter().collect();
+    lost.sort_by(|a, b| b.integration_s.total_cmp(&a.integration_s));
+    let shown: Vec<String> = lost
+        .iter()
+        .take(SHOWN)
+        .map(|lost| format!("{}: {} {:.0} s", lost.channel, lost.pair, lost.integration_s))
+        .collect();
+    let more = lost.len().saturating_sub(SHOWN);
+    let rest = if more > 0 { format!(", and {more} more") } else { String::new() };
+    shown.join(", ") + &rest
+}

@@ -1,0 +1,87 @@
+//! Why a state cannot be kept or gone on with.
+
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+/// Why a state cannot be kept or gone on with.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum StateError {
+    /// The operating system refused.
+    #[error("{}: cannot {action}: {source}", path.display())]
+    Io {
+        /// File or folder.
+        path: PathBuf,
+        /// What was tried.
+        action: &'static str,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Another process has the folder.
+    #[error("{}: another process is keeping its state there; expected one at a time", path.display())]
+    Locked {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// A checkpoint that does not hold.
+    #[error("{}: found {found}; expected {expected}", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What was found.
+        found: String,
+        /// What was expected.
+        expected: &'static str,
+    },
+    /// No checkpoint holds, though there are some.
+    #[error(
+        "{}: none of its {checkpoints} checkpoints holds, the newest because of: {newest}; move the folder away to \
+         begin anew from the files",
+        path.display()
+    )]
+    NoneHolds {
+        /// The folder.
+        path: PathBuf,
+        /// How many there are.
+        checkpoints: usize,
+        /// What is wrong with the newest.
+        newest: Box<StateError>,
+    },
+    /// The state was summed with other settings.
+    #[error(
+        "{}: the state was summed with {key} = {found}; expected {expected}, as this session is to sum: give the \
+         settings that the state was made with, or another folder",
+        path.display()
+    )]
+    Settings {
+        /// The file.
+        path: PathBuf,
+        /// Key.
+        key: String,
+        /// Its value in the state.
+        found: String,
+        /// Its value now.
+        expected: String,
+    },
+    /// Received bytes.
+    #[error(transparent)]
+    Downlink(#[from] crate::downlink::DownlinkError),
+    /// Calibration.
+    #[error(transparent)]
+    Calibration(#[from] crate::calibration::CalibrationError),
+    /// Sums.
+    #[error(transparent)]
+    Accumulation(#[from] crate::accumulation::AccumulationError),
+}
+
+impl StateError {
+    /// Names what was tried when the operating system refused.
+    pub(super) fn io(
+        path: &std::path::Path,
+        action: &'static str,
+    ) -> impl FnOnce(std::io::Error) -> Self + use<> {
+        let path = path.to_owned();
+        move |source| Self::Io { path, action, source }
+    }
+}

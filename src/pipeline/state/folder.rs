@@ -1,0 +1,118 @@
+//! The folder of a state: numbered checkpoints, of which the newest two are kept.
+
+use std::fs::{self, File, TryLockError};
+use std::path::{Path, PathBuf};
+
+use super::error::StateError;
+use crate::files::{AtomicFile, Unfinished};
+
+const PREFIX: &str = "checkpoint-";
+const SUFFIX: &str = ".lunarray";
+
+/// A folder that no other process keeps a state in at the same time.
+#[derive(Debug)]
+pub(super) struct StateFolder {
+    path: PathBuf,
+    /// Number of the newest checkpoint.
+    newest: u64,
+    /// Locked as long as it is open, by the system, which unlocks it whatever becomes of the process.
+    _lock: File,
+}
+
+impl StateFolder {
+    /// Makes the folder if it is not there, and locks it.
+    pub(super) fn open(path: &Path) -> Result<Self, StateError> {
+        fs::create_dir_all(path).map_err(StateError::io(path, "make the folder"))?;
+        let lock_path = path.join("lock");
+        let lock = File::options().create(true).append(true).open(&lock_path);
+        let lock = lock.map_err(StateError::io(&lock_path, "open the lock"))?;
+        match lock.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => return Err(StateError::Locked { path: path.to_owned() }),
+            Err(TryLockError::Error(source)) => return Err(StateError::io(&lock_path, "lock")(source)),
+        }
+        let mut folder = Self { path: path.to_owned(), newest: 0, _lock: lock };
+        folder.newest = numbers(&folder.path)?.last().copied().unwrap_or(0);
+        Ok(folder)
+    }
+
+    /// The newest checkpoint that `read` can read, and what is to be said of those that it cannot, which get
+    /// another name; `None` if there is none at all.
+    pub(super) fn load<T>(
+        &mut self,
+        read: impl Fn(&Path) -> Result<T, StateError>,
+    ) -> Result<(Option<T>, Vec<String>), StateError> {
+        let numbers = numbers(&self.path)?;
+        let mut bad: Vec<(PathBuf, StateError)> = Vec::new();
+        for &number in numbers.iter().rev() {
+            let path = self.name(number);
+            match read(&path) {
+                Ok(found) => {
+                    self.newest = number;
+                    let note = |(path, error): (PathBuf, StateError)| -> Result<String, StateError> {
+                        let mut aside = path.clone().into_os_string();
+                        aside.push(".damaged");
+                        fs::rename(&path, aside).map_err(StateError::io(&path, "rename"))?;
+                        let used = self.name(number);
+                        Ok(format!("{error}; going on from the one before, {}", used.display()))
+                    };
+                    return Ok((Some(found), bad.into_iter().map(note).collect::<Result<_, _>>()?));
+                }
+                Err(error @ (StateError::Damaged { .. } | StateError::Io { .. })) => bad.push((path, error)),
+                Err(error) => return Err(error),
+            }
+        }
+        let checkpoints = bad.len();
+        match bad.into_iter().next() {
+            None => Ok((None, Vec::new())),
+            Some((_, newest)) => {
+                let (path, newest) = (self.path.clone(), Box::new(newest));
+                Err(StateError::NoneHolds { path, checkpoints, newest })
+            }
+        }
+    }
+
+    /// Writes a checkpoint, whole or not at all, and removes those before the last.
+    pub(super) fn save(
+        &mut self,
+        write: impl FnOnce(&mut AtomicFile, &Path) -> Result<(), StateError>,
+    ) -> Result<(), StateError> {
+        let path = self.name(self.newest + 1);
+        let file = AtomicFile::create(&path, Unfinished::Remove);
+        let mut file = file.map_err(StateError::io(&path, "create the file"))?;
+        write(&mut file, &path)?;
+        file.finish().map_err(StateError::io(&path, "finish the file"))?;
+        self.newest += 1;
+        for number in numbers(&self.path)?.into_iter().filter(|number| number + 1 < self.newest) {
+            let old = self.name(number);
+            fs::remove_file(&old).map_err(StateError::io(&old, "remove the file"))?;
+        }
+        Ok(())
+    }
+
+    fn name(&self, number: u64) -> PathBuf {
+        name(&self.path, number)
+    }
+}
+
+/// The checkpoints in a folder, oldest first.
+pub(super) fn checkpoints(folder: &Path) -> Result<Vec<PathBuf>, StateError> {
+    Ok(numbers(folder)?.into_iter().map(|number| name(folder, number)).collect())
+}
+
+fn name(folder: &Path, number: u64) -> PathBuf {
+    folder.join(format!("{PREFIX}{number:08}{SUFFIX}"))
+}
+
+/// Numbers of the checkpoints that are there, in order.
+fn numbers(folder: &Path) -> Result<Vec<u64>, StateError> {
+    let mut numbers = Vec::new();
+    for entry in fs::read_dir(folder).map_err(StateError::io(folder, "read the folder"))? {
+        let name = entry.map_err(StateError::io(folder, "read the folder"))?.file_name();
+        let name = name.to_string_lossy();
+        let number = name.strip_prefix(PREFIX).and_then(|name| name.strip_suffix(SUFFIX));
+        numbers.extend(number.and_then(|number| number.parse::<u64>().ok()));
+    }
+    numbers.sort_unstable();
+    Ok(numbers)
+}
