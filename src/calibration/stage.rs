@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use super::{Calibration, CalibrationError};
+use super::{Calibration, CalibrationError, VanVleck};
 use crate::array::{Ephemeris, FlaggedCounts};
 use crate::frames::{GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock};
 use crate::runtime::{Ledger, Outlet, Stage, Units};
@@ -17,6 +17,7 @@ type BlockKey = (ChannelId, Pair, i64, u32);
 /// The ledger is closed against the spacecraft's own counts: sampled less dropped less received is
 /// what the link lost. Visibilities after the last housekeeping packet count as sampled when received.
 pub struct Calibrator {
+    van_vleck: Option<VanVleck>,
     calibration: Box<dyn Calibration>,
     ledger: Ledger,
     ephemeris: Ephemeris,
@@ -33,6 +34,7 @@ impl Calibrator {
     #[must_use]
     pub fn new(calibration: Box<dyn Calibration>, ledger: Ledger) -> Self {
         Self {
+            van_vleck: None,
             calibration,
             ledger,
             ephemeris: Ephemeris::default(),
@@ -43,9 +45,15 @@ impl Calibrator {
         }
     }
 
+    /// Takes out first what quantisers of few bits do.
+    #[must_use]
+    pub fn with_van_vleck(self, van_vleck: Option<VanVleck>) -> Self {
+        Self { van_vleck, ..self }
+    }
+
     fn visibilities(
         &mut self,
-        block: &VisibilityBlock,
+        mut block: VisibilityBlock,
         out: &mut Outlet<PlacedFrame>,
     ) -> Result<(), CalibrationError> {
         let count = block.len() as u64;
@@ -61,7 +69,10 @@ impl Calibrator {
             self.ledger.flagged("no instrument description", count);
             return Ok(());
         };
-        let (mut placed, placing) = self.ephemeris.place(block, channel.frequency_hz);
+        if let Some(van_vleck) = &self.van_vleck {
+            van_vleck.apply(&mut block, channel.width_hz);
+        }
+        let (mut placed, placing) = self.ephemeris.place(&block, channel.frequency_hz);
         self.ledger.flagged("no ephemeris", placing.without_ephemeris);
         self.post_flagged(&placing.flagged);
         let calibrated = self.calibration.apply(&mut placed)?;
@@ -103,7 +114,7 @@ impl Stage for Calibrator {
                 // Whatever becomes of it, visibilities without positions are counted one by one.
                 self.ephemeris.insert(segment);
             }
-            GroundFrame::Visibilities(block) => self.visibilities(&block, out)?,
+            GroundFrame::Visibilities(block) => self.visibilities(block, out)?,
             GroundFrame::Housekeeping(report) => {
                 if self.reported.is_none_or(|last| last.time <= report.time) {
                     self.reported = Some(report);

@@ -6,7 +6,10 @@ use multiversion::multiversion;
 pub(super) const TILE: usize = 32;
 
 /// Smallest pivot of a covariance, as a part of its diagonal: below lies the rounding of `f32`.
-const PIVOT_MIN: f32 = 4e-6;
+const PIVOT_MIN: f32 = 1e-6;
+
+/// Changes of a correlation that are counted; smaller ones are rounding.
+const CHANGE_COUNTED: f32 = 1e-5;
 
 /// Matrices of one tile of frequencies: lower triangles, row after row, `TILE` values an element.
 #[derive(Clone, Debug)]
@@ -18,20 +21,20 @@ pub(super) struct Tile {
 /// What had to be done to covariances.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Repairs {
-    /// Matrices' diagonal elements looked at.
-    pub pivots: u64,
-    /// Those to which noise was added so that a matrix became one of a covariance.
-    pub repaired: u64,
-    /// Most noise that was added, as a part of the daughter's power.
-    pub added_max: f32,
+    /// Correlations looked at.
+    pub elements: u64,
+    /// Those made smaller by more than `CHANGE_COUNTED` so that a matrix became a covariance.
+    pub changed: u64,
+    /// Greatest change, as a part of the two daughters' powers.
+    pub change_max: f32,
 }
 
 impl Repairs {
     /// Adds what another part has counted.
     pub fn absorb(&mut self, other: Self) {
-        self.pivots += other.pivots;
-        self.repaired += other.repaired;
-        self.added_max = self.added_max.max(other.added_max);
+        self.elements += other.elements;
+        self.changed += other.changed;
+        self.change_max = self.change_max.max(other.change_max);
     }
 }
 
@@ -63,14 +66,24 @@ pub(super) fn expand(coefficients: &[f32], basis: &[[f32; TILE]], sign: f32, out
 
 /// Replaces covariances C by L with C = L L*, for `order` daughters.
 ///
-/// A pivot that is too small or negative, as rounding and interpolation make it, is raised: that adds noise of its
-/// own to one daughter, and leaves what the daughters have in common as it is.
+/// Rounding and interpolation can make C a little less than a covariance. A daughter then has less power left than
+/// its correlation with another asks for; the correlation is made as small as the power that is left. Powers
+/// stay, and no correlation changes by more than C lacks.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 pub(super) fn factor(tile: &mut Tile, order: usize) -> Repairs {
-    let mut repairs = Repairs { pivots: (order * TILE) as u64, ..Repairs::default() };
+    let mut repairs = Repairs { elements: (order * (order - 1) / 2 * TILE) as u64, ..Repairs::default() };
+    let powers: Vec<[f32; TILE]> = (0..order).map(|i| tile.re[element(i, i)]).collect();
+    let mut left = powers.clone();
     for j in 0..order {
-        let mut inverse = [0.0_f32; TILE];
-        for i in j..order {
+        let (mut pivot, mut inverse) = ([0.0_f32; TILE], [0.0_f32; TILE]);
+        for t in 0..TILE {
+            // No power at all is a daughter that hears nothing.
+            pivot[t] = left[j][t].max(PIVOT_MIN * powers[j][t]).max(f32::MIN_POSITIVE).sqrt();
+            inverse[t] = 1.0 / pivot[t];
+        }
+        tile.re[element(j, j)] = pivot;
+        tile.im[element(j, j)] = [0.0; TILE];
+        for i in j + 1..order {
             let at = element(i, j);
             let (mut re, mut im) = (tile.re[at], tile.im[at]);
             for k in 0..j {
@@ -81,30 +94,25 @@ pub(super) fn factor(tile: &mut Tile, order: usize) -> Repairs {
                     im[t] -= a_im[t] * b_re[t] - a_re[t] * b_im[t];
                 }
             }
-            if i == j {
-                let power = tile.re[at];
-                let mut repaired = 0_u32;
-                let mut added_max = 0.0_f32;
-                for t in 0..TILE {
-                    let least = PIVOT_MIN * power[t];
-                    let low = re[t] < least;
-                    repaired += u32::from(low);
-                    let added = if low { (least - re[t]) / power[t].max(f32::MIN_POSITIVE) } else { 0.0 };
-                    added_max = added_max.max(added);
-                    // No power at all is a daughter that hears nothing.
-                    let pivot = re[t].max(least).max(f32::MIN_POSITIVE).sqrt();
-                    re[t] = pivot;
-                    inverse[t] = 1.0 / pivot;
-                }
-                im = [0.0; TILE];
-                repairs.repaired += u64::from(repaired);
-                repairs.added_max = repairs.added_max.max(added_max);
-            } else {
-                for t in 0..TILE {
-                    re[t] *= inverse[t];
-                    im[t] *= inverse[t];
-                }
+            let mut changed = 0_u32;
+            let mut change_max = 0.0_f32;
+            for t in 0..TILE {
+                re[t] *= inverse[t];
+                im[t] *= inverse[t];
+                let asked = re[t] * re[t] + im[t] * im[t];
+                let taken = asked.min(left[i][t]);
+                let scale = (taken / asked.max(f32::MIN_POSITIVE)).sqrt();
+                let scale = if asked > left[i][t] { scale } else { 1.0 };
+                left[i][t] -= taken;
+                let change = pivot[t] * asked.sqrt() * (1.0 - scale);
+                let change = change / (powers[i][t] * powers[j][t]).sqrt().max(f32::MIN_POSITIVE);
+                changed += u32::from(change > CHANGE_COUNTED);
+                change_max = change_max.max(change);
+                re[t] *= scale;
+                im[t] *= scale;
             }
+            repairs.changed += u64::from(changed);
+            repairs.change_max = repairs.change_max.max(change_max);
             tile.re[at] = re;
             tile.im[at] = im;
         }
@@ -157,7 +165,7 @@ mod tests {
         }
         let wanted = tile.clone();
         let repairs = factor(&mut tile, ORDER);
-        assert_eq!((repairs.repaired, repairs.pivots), (0, 160));
+        assert_eq!((repairs.changed, repairs.elements), (0, 320));
         for i in 0..ORDER {
             for j in 0..=i {
                 for t in 0..TILE {
@@ -176,18 +184,18 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_covariance_gains_noise_and_keeps_its_correlations() {
+    fn what_is_no_covariance_keeps_its_powers_and_loses_correlation() {
         // Two daughters of power 1 that correlate by 1.01.
         let mut tile = Tile::new(2);
         for t in 0..TILE {
             (tile.re[0][t], tile.re[2][t], tile.re[1][t], tile.im[1][t]) = (1.0, 1.0, 0.0, 1.01);
         }
         let repairs = factor(&mut tile, 2);
-        assert_eq!(repairs.repaired, TILE as u64);
-        // 1.01^2 - 1, and the least pivot; rounding.
-        assert!((repairs.added_max - 0.0201).abs() < 1e-5, "{}", repairs.added_max);
-        assert!((tile.im[1][0] * tile.re[0][0] - 1.01).abs() < 1e-6);
+        assert_eq!(repairs.changed, TILE as u64);
+        assert!((repairs.change_max - 0.01).abs() < 1e-5, "{}", repairs.change_max);
+        assert!((tile.im[1][0] * tile.re[0][0] - 1.0).abs() < 1e-6);
         let power = tile.im[1][0].powi(2) + tile.re[2][0].powi(2);
-        assert!((power - 1.0201).abs() < 1e-5, "{power}");
+        // The least pivot is added.
+        assert!((power - 1.0).abs() < 2e-6, "{power}");
     }
 }

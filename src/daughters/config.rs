@@ -16,8 +16,6 @@ pub struct DaughtersConfig {
     pub level_time_constant_s: f64,
     /// Samples in a block.
     pub block_samples: usize,
-    /// Sample each window so long only, from its start, s; 0 for all of it.
-    pub window_s_max: f64,
     /// Greatest rate of the link from one daughter to the mother, bit/s; 0 for no limit.
     pub link_bits_per_s_max: f64,
     /// Buffer of one daughter before the link, bytes.
@@ -75,7 +73,6 @@ impl Default for DaughtersConfig {
             bits: 8,
             level_time_constant_s: 10.0,
             block_samples: 1024,
-            window_s_max: 0.0,
             link_bits_per_s_max: 0.0,
             link_buffer_bytes: 16 << 20,
             link_drop: DropPolicy::Newest,
@@ -113,7 +110,6 @@ impl DaughtersConfig {
         let block = self.block_samples;
         let fits = block.is_power_of_two() && (256..=65_536).contains(&block);
         require("block_samples", block as f64, fits, "a power of two from 256 to 65536");
-        require("window_s_max", self.window_s_max, self.window_s_max >= 0.0, "seconds, or 0 for all");
         let rate = self.link_bits_per_s_max;
         require("link_bits_per_s_max", rate, rate >= 0.0, "bit/s, or 0 for no limit");
         let buffer = self.link_buffer_bytes;

@@ -83,11 +83,7 @@ impl Sampler {
 
     fn begin(&self, mut window: ObservingWindow) -> Progress {
         let width_hz = self.width_hz();
-        let limit_s = self.config.window_s_max;
-        let mut length_s = (window.end.0 - window.start.0) as f64 / TICKS_PER_SECOND as f64;
-        if limit_s > 0.0 {
-            length_s = length_s.min(limit_s);
-        }
+        let length_s = (window.end.0 - window.start.0) as f64 / TICKS_PER_SECOND as f64;
         let samples = (length_s * width_hz) as usize / HOP * HOP;
         window.end = self.time(window.start, samples);
         let block_s = self.config.block_samples as f64 / width_hz;

@@ -14,7 +14,7 @@ use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{ChannelId, Pair, StreamKind, TICKS_PER_SECOND, all_pairs, random_stream};
 
 /// Greatest distance of tabulated positions, s; interpolation is then good to micrometres.
-const EPHEMERIS_STEP_S: f64 = 60.0;
+pub(super) const EPHEMERIS_STEP_S: f64 = 60.0;
 
 /// Integrates all pairs and channels over each window.
 ///

@@ -2,19 +2,23 @@
 //!
 //! The only place where space and ground meet, and where concrete stages are wired.
 
+mod bench;
 mod config;
 mod cost;
 mod error;
 mod ground;
 mod plan;
 mod run;
+mod sampling;
 mod space;
 mod summary;
 
+pub use bench::{BENCH_STAGES, Bench, BenchSettings, Machine, Rate, bench, bench_config};
 pub use config::{Config, ConfigError, ConfigSource, Problems, QUICKLOOK};
 pub use cost::{ChannelCost, Cost};
 pub use error::PipelineError;
 pub use plan::{Expected, Plan};
 pub use run::{DOWNLINK_FILE, Watcher, replay, run, simulate, use_threads};
+pub use sampling::{SampleCounts, sample_stages};
 pub use space::INTEGRATE;
 pub use summary::{Segment, Summary};

@@ -5,8 +5,9 @@ use std::sync::Arc;
 use super::config::Problems;
 use super::error::PipelineError;
 use super::plan::Plan;
+use super::sampling::samples;
 use crate::downlink::Transmitter;
-use crate::mother::{DirectSum, Integrator, NoiseModel, Observer, Store};
+use crate::mother::{DirectSum, Fidelity, Integrator, NoiseModel, Observer, Store, VisibilityModel};
 use crate::runtime::{Graph, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::generated::generate;
@@ -57,16 +58,22 @@ pub fn add(graph: &mut Graph, plan: &Plan, skies: &[SkyMap]) -> Result<Link<Vec<
     let Plan { config, array, instrument, schedules, windows } = plan;
     let capacity = config.runtime.queue_capacity;
     let frequencies = &config.spacecraft.channels_hz;
-    let model = DirectSum::new(skies, frequencies, array.moon_radius_m(), instrument.response);
+    let model: Arc<dyn VisibilityModel> =
+        Arc::new(DirectSum::new(skies, frequencies, array.moon_radius_m(), instrument.response));
     let noise = NoiseModel {
         seed: config.spacecraft.thermal_noise.then_some(config.seed),
         receiver_noise_k_sr: config.spacecraft.receiver_noise_k_sr,
     };
     let integrator =
-        Integrator::new(Arc::clone(array), Arc::new(model), instrument.clone(), schedules.clone(), noise);
-    // A window waiting is nothing; a window's visibilities are.
-    let windows = graph.source("observe", 1, Observer::new(windows.clone()));
-    let frames = graph.stage(INTEGRATE, capacity, windows, integrator);
+        Integrator::new(Arc::clone(array), Arc::clone(&model), instrument.clone(), schedules.clone(), noise);
+    let frames = match config.spacecraft.fidelity {
+        Fidelity::Visibilities => {
+            // A window waiting is nothing; a window's visibilities are.
+            let windows = graph.source("observe", 1, Observer::new(windows.clone()));
+            graph.stage(INTEGRATE, capacity, windows, integrator)
+        }
+        Fidelity::Samples => samples(graph, plan, model),
+    };
     let passes = graph.stage("store", capacity, frames, Store::new(config.spacecraft.store_bytes_max));
     Ok(graph.stage("transmit", capacity, passes, Transmitter::new(&config.downlink)?))
 }
