@@ -67,8 +67,8 @@ fn main() {
     let matrices: Vec<Vec<Complex32>> = (0..LANES).map(matrix).collect();
     let slices = SAMPLES / SLICE;
     let mut packed = Packed::new(DAUGHTERS);
-    for (n, block) in blocks.iter().enumerate() {
-        packed.put(n % DAUGHTERS, n / DAUGHTERS, block, 0);
+    for daughter in 0..DAUGHTERS {
+        packed.put_all(daughter, |lane| Some(&blocks[lane * DAUGHTERS + daughter]), 0);
     }
     let operations = (Packed::multiply_adds(DAUGHTERS) * slices) as f64;
     let [mut peak, mut kernel, mut packing] = [0.0_f64; 3];
@@ -85,8 +85,12 @@ fn main() {
         kernel = kernel.max(operations / spent);
         let spent = seconds(|| {
             for slice in 0..slices {
-                for (n, block) in blocks.iter().enumerate() {
-                    packed.put(n % DAUGHTERS, n / DAUGHTERS, block, slice * SLICE);
+                for daughter in 0..DAUGHTERS {
+                    packed.put_all(
+                        daughter,
+                        |lane| Some(&blocks[lane * DAUGHTERS + daughter]),
+                        slice * SLICE,
+                    );
                 }
                 correlate(arch, &packed, &mut sums);
             }
@@ -108,7 +112,11 @@ fn main() {
     }
     println!("multiply-adds a second of one core, f32");
     println!("peak                                  {:8.2e}", peak);
-    println!("kernel                                {:8.2e}  {:5.1} % of the peak", kernel, 100.0 * kernel / peak);
+    println!(
+        "kernel                                {:8.2e}  {:5.1} % of the peak",
+        kernel,
+        100.0 * kernel / peak
+    );
     println!(
         "kernel with unpacking of 8 bits       {:8.2e}  {:5.1} % of the peak",
         packing,

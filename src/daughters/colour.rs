@@ -94,25 +94,22 @@ pub(super) fn factor(tile: &mut Tile, order: usize) -> Repairs {
                     im[t] -= a_im[t] * b_re[t] - a_re[t] * b_im[t];
                 }
             }
-            let mut changed = 0_u32;
-            let mut change_max = 0.0_f32;
+            let mut lacking = 0_u32;
             for t in 0..TILE {
                 re[t] *= inverse[t];
                 im[t] *= inverse[t];
                 let asked = re[t] * re[t] + im[t] * im[t];
-                let taken = asked.min(left[i][t]);
-                let scale = (taken / asked.max(f32::MIN_POSITIVE)).sqrt();
-                let scale = if asked > left[i][t] { scale } else { 1.0 };
-                left[i][t] -= taken;
-                let change = pivot[t] * asked.sqrt() * (1.0 - scale);
-                let change = change / (powers[i][t] * powers[j][t]).sqrt().max(f32::MIN_POSITIVE);
-                changed += u32::from(change > CHANGE_COUNTED);
-                change_max = change_max.max(change);
-                re[t] *= scale;
-                im[t] *= scale;
+                lacking += u32::from(asked > left[i][t]);
+                left[i][t] -= asked;
             }
-            repairs.changed += u64::from(changed);
-            repairs.change_max = repairs.change_max.max(change_max);
+            if lacking > 0 {
+                shrink(
+                    [&mut re, &mut im],
+                    &mut left[i],
+                    |t| pivot[t] / (powers[i][t] * powers[j][t]).sqrt(),
+                    &mut repairs,
+                );
+            }
             tile.re[at] = re;
             tile.im[at] = im;
         }
@@ -120,9 +117,38 @@ pub(super) fn factor(tile: &mut Tile, order: usize) -> Repairs {
     repairs
 }
 
+/// Makes the elements smaller that took more power than was left; `unit` is a change of one, as a part of the powers.
+fn shrink(
+    [re, im]: [&mut [f32; TILE]; 2],
+    left: &mut [f32; TILE],
+    unit: impl Fn(usize) -> f32,
+    repairs: &mut Repairs,
+) {
+    for t in 0..TILE {
+        if left[t] >= 0.0 {
+            continue;
+        }
+        let asked = re[t] * re[t] + im[t] * im[t];
+        let there = (left[t] + asked).max(0.0);
+        left[t] = 0.0;
+        let scale = (there / asked).sqrt();
+        let change = unit(t) * asked.sqrt() * (1.0 - scale);
+        repairs.changed += u64::from(change > CHANGE_COUNTED);
+        repairs.change_max = repairs.change_max.max(change);
+        re[t] *= scale;
+        im[t] *= scale;
+    }
+}
+
 /// `x_i = sum over j <= i of L_ij z_j`: row `i` of the factor times independent noise, `stride` apart.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn colour(tile: &Tile, i: usize, noise: [&[[f32; TILE]]; 2], stride: usize, x: &mut [[f32; TILE]; 2]) {
+pub(super) fn colour(
+    tile: &Tile,
+    i: usize,
+    noise: [&[[f32; TILE]]; 2],
+    stride: usize,
+    x: &mut [[f32; TILE]; 2],
+) {
     let [mut re, mut im] = [[0.0_f32; TILE]; 2];
     for j in 0..=i {
         let at = element(i, j);

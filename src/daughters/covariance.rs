@@ -5,6 +5,9 @@
 //! expanded by interpolation at Chebyshev points, as many as that sweep asks for: `z + 2.5 z^(1/3) + 2` for
 //! a phase of +-z, which leaves 5e-4 of the visibility.
 
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
 use crate::array::Array;
 use crate::frames::Channel;
 use crate::mother::{PairPosition, Prediction, VisibilityModel};
@@ -42,6 +45,31 @@ pub struct Covariances {
     powers: Vec<Vec<f32>>,
 }
 
+/// Interpolations from Chebyshev points in time to epochs, which channels and stretches have in common.
+#[derive(Debug, Default)]
+pub struct Tables(Mutex<HashMap<(usize, usize), Arc<[f32]>>>);
+
+/// Most tables that are kept: some 200 kB each.
+const TABLES_MAX: usize = 256;
+
+impl Tables {
+    /// The table of `instants` points for `count` epochs.
+    fn get(&self, instants: usize, count: usize) -> Arc<[f32]> {
+        let lock = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(table) = lock().get(&(instants, count)) {
+            return Arc::clone(table);
+        }
+        // Two threads may both make one; they are equal.
+        let table: Arc<[f32]> = time_matrix(instants, count).into();
+        let mut tables = lock();
+        if tables.len() >= TABLES_MAX {
+            tables.clear();
+        }
+        tables.insert((instants, count), Arc::clone(&table));
+        table
+    }
+}
+
 /// Where a model of one channel is asked.
 pub struct Request<'a> {
     /// The model.
@@ -56,6 +84,8 @@ pub struct Request<'a> {
     pub receiver_noise_k_sr: f64,
     /// When.
     pub epochs: Epochs,
+    /// Tables to be shared.
+    pub tables: &'a Tables,
 }
 
 impl Covariances {
@@ -63,12 +93,13 @@ impl Covariances {
     #[must_use]
     pub fn predict(request: &Request<'_>) -> Self {
         let daughters = request.array.satellites();
-        let plans: Vec<Plan> = all_pairs(daughters).into_iter().map(|pair| Plan::new(request, pair)).collect();
+        let plans: Vec<Plan> =
+            all_pairs(daughters).into_iter().map(|pair| Plan::new(request, pair)).collect();
         let mut positions = Vec::new();
         for plan in &plans {
             plan.positions(request, &mut positions);
         }
-        let steady = Plan::steady(request);
+        let steady = Plan::steady();
         for daughter in 0..daughters {
             positions.extend(steady.instants_s(request.epochs).map(|t_s| {
                 // The plane of the orbit, which a dipole stands on, asks for two places: 1.5 m apart.
@@ -83,15 +114,18 @@ impl Covariances {
         for plan in &plans {
             let (own, others) = rest.split_at(plan.instants * plan.points);
             rest = others;
-            series.push(plan.series(request.epochs, own));
+            series.push(plan.series(request, own));
         }
-        let matrix = steady.matrix(request.epochs);
+        let matrix = request.tables.get(steady.instants, request.epochs.count);
         let powers = (0..daughters).map(|daughter| {
             let own: Vec<f32> = rest[daughter * steady.instants..][..steady.instants]
                 .iter()
                 .map(|p| (p.zero_spacing_k_sr + request.receiver_noise_k_sr) as f32)
                 .collect();
-            matrix.chunks_exact(steady.instants).map(|row| row.iter().zip(&own).map(|(a, b)| a * b).sum()).collect()
+            matrix
+                .chunks_exact(steady.instants)
+                .map(|row| row.iter().zip(&own).map(|(a, b)| a * b).sum())
+                .collect()
         });
         let powers = powers.collect();
         Self { series, powers }
@@ -136,7 +170,8 @@ impl Plan {
         let Epochs { start_s, step_s, count } = request.epochs;
         let half_s = 0.5 * step_s * (count + 1) as f64;
         let middle_s = start_s + half_s - step_s;
-        let (i, j) = (request.array.state(pair.i.into(), middle_s), request.array.state(pair.j.into(), middle_s));
+        let (i, j) =
+            (request.array.state(pair.i.into(), middle_s), request.array.state(pair.j.into(), middle_s));
         // Speeds and lengths change by less than 1 % in seconds.
         let per_m = 1.01 * std::f64::consts::TAU / SPEED_OF_LIGHT_M_S;
         let speed_m_s = norm(sub(i.velocity_m_s, j.velocity_m_s));
@@ -149,8 +184,7 @@ impl Plan {
     }
 
     /// For powers, which change as the Moon's limb moves over the sky.
-    fn steady(request: &Request<'_>) -> Self {
-        let _ = request;
+    fn steady() -> Self {
         Self { pair: Pair::default(), instants: 6, points: 1 }
     }
 
@@ -170,42 +204,38 @@ impl Plan {
         }
     }
 
-    /// Weights of the instants at each epoch, by epoch.
-    fn matrix(&self, epochs: Epochs) -> Vec<f32> {
-        // Variance of a density cos^2 of half width 1, halved.
-        let flattening = 0.5 * (1.0 / 3.0 - 2.0 / std::f64::consts::PI.powi(2));
-        let points: Vec<f64> = chebyshev_points(self.instants).collect();
-        let step = 2.0 / (epochs.count + 1) as f64;
-        let mut matrix = Vec::with_capacity(epochs.count * self.instants);
-        let mut rows: [Vec<f64>; 3] = std::array::from_fn(|_| vec![0.0; self.instants]);
-        for epoch in 0..epochs.count {
-            for (row, k) in rows.iter_mut().zip(0..) {
-                interpolate(&points, -1.0 + step * (epoch + k) as f64, row);
-            }
-            let [before, here, after] = &rows;
-            matrix.extend(
-                (0..self.instants)
-                    .map(|k| here[k] - flattening * (after[k] - 2.0 * here[k] + before[k]))
-                    .map(|weight| weight as f32),
-            );
-        }
-        matrix
-    }
-
-    fn series(&self, epochs: Epochs, predictions: &[Prediction]) -> PairSeries {
+    fn series(&self, request: &Request<'_>, predictions: &[Prediction]) -> PairSeries {
+        let count = request.epochs.count;
         let width = 2 * self.points;
         let mut known = Vec::with_capacity(self.instants * width);
         for row in predictions.chunks_exact(self.points) {
             known.extend(row.iter().map(|p| p.visibility_k_sr.re as f32));
             known.extend(row.iter().map(|p| p.visibility_k_sr.im as f32));
         }
-        let mut values = vec![0.0; epochs.count * width];
-        let matrix = self.matrix(epochs);
+        let mut values = vec![0.0; count * width];
+        let matrix = request.tables.get(self.instants, count);
         for (out, weights) in values.chunks_exact_mut(width).zip(matrix.chunks_exact(self.instants)) {
             combine(weights, &known, out);
         }
         PairSeries { pair: self.pair, points: self.points, values }
     }
+}
+
+/// Weights of the instants at each epoch, by epoch: interpolation, and sharpening for the blending of epochs.
+fn time_matrix(instants: usize, count: usize) -> Vec<f32> {
+    // Variance of a density cos^2 of half width 1, halved.
+    let flattening = 0.5 * (1.0 / 3.0 - 2.0 / std::f64::consts::PI.powi(2));
+    let points: Vec<f64> = chebyshev_points(instants).collect();
+    let step = 2.0 / (count + 1) as f64;
+    let mut weights = vec![0.0; (count + 2) * instants];
+    for (k, row) in weights.chunks_exact_mut(instants).enumerate() {
+        interpolate(&points, -1.0 + step * k as f64, row);
+    }
+    let sharpened = |k: usize| {
+        let (before, here, after) = (weights[k - instants], weights[k], weights[k + instants]);
+        (here - flattening * (after - 2.0 * here + before)) as f32
+    };
+    (instants..(count + 1) * instants).map(sharpened).collect()
 }
 
 /// `out = sum of weight x row`.
@@ -296,6 +326,7 @@ mod tests {
             channel: Channel { frequency_hz: FREQUENCY_HZ, width_hz: 8e3 },
             receiver_noise_k_sr: 0.5,
             epochs: Epochs { start_s: from_s, step_s, count },
+            tables: &Tables::default(),
         };
         let found = Covariances::predict(&request);
         assert!((found.power(3, 100) - 1.5).abs() < 1e-5);

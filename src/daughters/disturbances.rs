@@ -92,7 +92,12 @@ impl Stretch<'_> {
             let along_m = dot(self.array.earth_hat(t_s), self.array.position_m(self.daughter, t_s));
             let frequency_hz = self.channel.frequency_hz + d.interference_offset_hz;
             let fringe = (turns - frequency_hz / SPEED_OF_LIGHT_M_S * along_m).fract();
-            self.add(gain * Complex64::from_polar(power.sqrt(), TAU * fringe), d.interference_offset_hz, re, im);
+            self.add(
+                gain * Complex64::from_polar(power.sqrt(), TAU * fringe),
+                d.interference_offset_hz,
+                re,
+                im,
+            );
         }
     }
 

@@ -206,9 +206,10 @@ mod tests {
     #[test]
     fn a_slow_link_drops_what_its_policy_says_and_counts_it() {
         // One block leaves in 0.2 s, two fit the buffer.
-        for (policy, expected) in
-            [(DropPolicy::Newest, vec![0, 1, 2, 4, 6, 8, 10]), (DropPolicy::Oldest, vec![0, 1, 3, 5, 7, 9, 11])]
-        {
+        for (policy, expected) in [
+            (DropPolicy::Newest, vec![0, 1, 2, 4, 6, 8, 10]),
+            (DropPolicy::Oldest, vec![0, 1, 3, 5, 7, 9, 11]),
+        ] {
             let (sent, counts) = numbers(80e3, 4096, policy);
             assert_eq!(counts.sent + counts.dropped, 12);
             assert_eq!(counts.sent, sent.len() as u64);

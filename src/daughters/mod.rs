@@ -18,7 +18,7 @@ mod synthesis;
 
 pub use colour::Repairs;
 pub use config::{DaughtersConfig, DaughtersError, Disturbances, DropPolicy, FLOAT_BITS};
-pub use covariance::{Covariances, Epochs, Request};
+pub use covariance::{Covariances, Epochs, Request, Tables};
 pub use link::{LinkCounts, SampleLink};
 pub use quantiser::Quantiser;
 pub(crate) use sampler::sample_ticks;

@@ -80,12 +80,9 @@ mod tests {
         let mut values: Vec<f32> = (0..1000).map(|k| if k % 2 == 0 { 1.0 } else { -1.0 }).collect();
         (values[0], values[1], values[2], values[3]) = (0.1, -0.1, 1.9, -2.1);
         values[4] = (1000.0 - 994.0 - 2.0 * 0.01 - 1.9 * 1.9 - 2.1 * 2.1_f32).abs().sqrt();
-        for (bits, expected) in [
-            (1, [0, -1, 0, -1]),
-            (2, [0, -1, 1, -2]),
-            (4, [0, -1, 5, -7]),
-            (8, [2, -3, 47, -53]),
-        ] {
+        for (bits, expected) in
+            [(1, [0, -1, 0, -1]), (2, [0, -1, 1, -2]), (4, [0, -1, 5, -7]), (8, [2, -3, 47, -53])]
+        {
             let mut quantiser = Quantiser::new(bits, 0.1, 10.0);
             quantiser.power = Some(2.0);
             let (samples, saturated) = quantiser.quantise(values.clone(), values.clone());

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::colour::Repairs;
 use super::config::DaughtersConfig;
-use super::covariance::{Covariances, Epochs, Request};
+use super::covariance::{Covariances, Epochs, Request, Tables};
 use super::disturbances::Stretch;
 use super::quantiser::Quantiser;
 use super::synthesis::{DrawKey, HOP, Response, Synthesis};
@@ -55,6 +55,7 @@ pub struct Sampler {
     windows: std::vec::IntoIter<ObservingWindow>,
     current: Option<Progress>,
     synthesis: Synthesis,
+    tables: Tables,
     counts: Arc<Mutex<SamplerCounts>>,
 }
 
@@ -78,7 +79,15 @@ impl Sampler {
         counts: Arc<Mutex<SamplerCounts>>,
     ) -> Self {
         let windows = windows.into_iter();
-        Self { scene, config, windows, current: None, synthesis: Synthesis::new(), counts }
+        Self {
+            scene,
+            config,
+            windows,
+            current: None,
+            synthesis: Synthesis::new(),
+            tables: Tables::default(),
+            counts,
+        }
     }
 
     fn begin(&self, mut window: ObservingWindow) -> Progress {
@@ -105,11 +114,8 @@ impl Sampler {
         let samples = CHUNK_SAMPLES.max(self.config.block_samples).min(progress.samples - progress.done);
         let width_hz = self.width_hz();
         let from = self.time(progress.window.start, progress.done);
-        let epochs = Epochs {
-            start_s: from.seconds(),
-            step_s: HOP as f64 / width_hz,
-            count: samples / HOP + 1,
-        };
+        let epochs =
+            Epochs { start_s: from.seconds(), step_s: HOP as f64 / width_hz, count: samples / HOP + 1 };
         let scene = &self.scene;
         let covariances: Vec<Covariances> = (0..scene.channels.len())
             .into_par_iter()
@@ -121,6 +127,7 @@ impl Sampler {
                     channel: scene.channels[k],
                     receiver_noise_k_sr: scene.receiver_noise_k_sr,
                     epochs,
+                    tables: &self.tables,
                 })
             })
             .collect();

@@ -222,7 +222,8 @@ fn time_stage(
             timed(|| never(stage(correlator, input))).0
         }
         "transmit" => {
-            let (input, transmitter) = (material.visibilities.clone(), Transmitter::new(&plan.config.downlink)?);
+            let (input, transmitter) =
+                (material.visibilities.clone(), Transmitter::new(&plan.config.downlink)?);
             let (seconds, sent) = timed(|| stage(transmitter, input));
             sent?;
             seconds
@@ -325,11 +326,18 @@ impl fmt::Display for Bench {
             writeln!(
                 f,
                 "{:<10} {:>11.3e} {range:>23} {:>15.3e} {:>12.3e} {:>16.1}",
-                rate.stage, rate.samples_per_s, rate.visibilities_per_s, rate.bytes_per_s, rate.times_real_time
+                rate.stage,
+                rate.samples_per_s,
+                rate.visibilities_per_s,
+                rate.bytes_per_s,
+                rate.times_real_time
             )?;
         }
         if let Some(chain) = &self.chain {
-            writeln!(f, "\nThe chain's last run; \"since source\" is from sample to what the stage made\n{chain}")?;
+            writeln!(
+                f,
+                "\nThe chain's last run; \"since source\" is from sample to what the stage made\n{chain}"
+            )?;
         }
         if let Some(stage) = &self.saturates_first {
             write!(f, "\nsaturates first: {stage}")?;

@@ -52,8 +52,8 @@ pub fn add(
         Arc::clone(&outcome.channels),
     )?;
     let frames = graph.stage("receive", capacity, bytes, Reception::new(Arc::clone(&outcome.reception)));
-    let calibrator = Calibrator::new(calibration, outcome.ledger.clone())
-        .with_van_vleck(config.calibration.van_vleck()?);
+    let calibrator =
+        Calibrator::new(calibration, outcome.ledger.clone()).with_van_vleck(config.calibration.van_vleck()?);
     let placed = graph.stage("calibrate", capacity, frames, calibrator);
     let accumulator = Accumulator::new(config.map.clone(), outcome.ledger.clone());
     // Sums are large: one waits while another is solved.

@@ -104,8 +104,10 @@ impl Aligner {
             rows.push(self.release());
         }
         let Streams { daughters, channels, .. } = self.streams;
-        let waiting = self.waiting.entry(number).or_insert_with(|| Waiting::new(number, length, daughters * channels));
-        let slot = &mut waiting.row.blocks[usize::from(block.channel.0) * daughters + usize::from(block.daughter)];
+        let waiting =
+            self.waiting.entry(number).or_insert_with(|| Waiting::new(number, length, daughters * channels));
+        let slot =
+            &mut waiting.row.blocks[usize::from(block.channel.0) * daughters + usize::from(block.daughter)];
         if slot.is_some() {
             self.counts.duplicate += 1;
             return rows;
@@ -190,7 +192,9 @@ mod tests {
     }
 
     fn shape(rows: &[Row]) -> Vec<(u64, usize, Vec<bool>)> {
-        rows.iter().map(|row| (row.number, row.samples, row.blocks.iter().map(Option::is_some).collect())).collect()
+        rows.iter()
+            .map(|row| (row.number, row.samples, row.blocks.iter().map(Option::is_some).collect()))
+            .collect()
     }
 
     #[test]

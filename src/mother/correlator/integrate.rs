@@ -167,13 +167,7 @@ impl GroupIntegrator {
         own.due = own.until[..self.schedules.len()].iter().copied().min().unwrap_or(u64::MAX);
     }
 
-    fn close(
-        &mut self,
-        at: usize,
-        lane: usize,
-        powers: &[[f64; LANES]],
-        out: &mut Vec<VisibilityBlock>,
-    ) {
+    fn close(&mut self, at: usize, lane: usize, powers: &[[f64; LANES]], out: &mut Vec<VisibilityBlock>) {
         let (rule, own) = (self.rule, &mut self.pairs[at]);
         if !own.keep[lane] {
             return;

@@ -4,6 +4,7 @@
 //! `SLICE` that stay in the first-level cache, and each tile of two daughters by two keeps its sums in
 //! registers.
 
+use multiversion::multiversion;
 use pulp::{Arch, Simd, WithSimd};
 
 use crate::frames::Samples;
@@ -38,37 +39,45 @@ impl Packed {
         Self { groups, data: vec![0.0; SLICE * groups * PLANES * LANES] }
     }
 
-    /// Puts `SLICE` samples of one daughter and channel from `first` on into their lane.
+    /// Puts `SLICE` samples of one daughter from `first` on into their lanes, a block a channel; zeros for those
+    /// that are not there.
     ///
     /// # Panics
-    /// If there are no such samples, daughter or lane.
-    pub fn put(&mut self, daughter: usize, lane: usize, samples: &Samples, first: usize) {
-        match samples {
-            Samples::Float { re, im } => {
-                let (re, im) = (&re[first..first + SLICE], &im[first..first + SLICE]);
-                self.scatter(daughter, lane, |k| re[k], |k| im[k]);
-            }
-            Samples::Codes { step, re, im, .. } => {
-                let (re, im) = (&re[first..first + SLICE], &im[first..first + SLICE]);
-                let level = |code: i8| (f32::from(code) + 0.5) * step;
-                self.scatter(daughter, lane, |k| level(re[k]), |k| level(im[k]));
+    /// If a block has no such samples, or there is no such daughter or lane.
+    pub fn put_all<'a>(
+        &mut self,
+        daughter: usize,
+        blocks: impl Fn(usize) -> Option<&'a Samples>,
+        first: usize,
+    ) {
+        let mut planes = [[[0.0; SLICE]; LANES]; 2];
+        let mut codes = [[[0; SLICE]; LANES]; 2];
+        // Of what is not quantised, levels add nothing.
+        let mut steps = [0.0; LANES];
+        let range = first..first + SLICE;
+        for lane in 0..LANES {
+            match blocks(lane) {
+                Some(Samples::Float { re, im }) => {
+                    planes[0][lane].copy_from_slice(&re[range.clone()]);
+                    planes[1][lane].copy_from_slice(&im[range.clone()]);
+                }
+                Some(Samples::Codes { step, re, im, .. }) => {
+                    codes[0][lane].copy_from_slice(&re[range.clone()]);
+                    codes[1][lane].copy_from_slice(&im[range.clone()]);
+                    steps[lane] = *step;
+                }
+                None => {}
             }
         }
-    }
-
-    /// Puts zeros: samples that are not there.
-    pub fn clear(&mut self, daughter: usize, lane: usize) {
-        self.scatter(daughter, lane, |_| 0.0, |_| 0.0);
-    }
-
-    #[inline(always)]
-    fn scatter(&mut self, daughter: usize, lane: usize, re: impl Fn(usize) -> f32, im: impl Fn(usize) -> f32) {
+        for (plane, codes) in planes.iter_mut().zip(&codes) {
+            turn(plane, codes, &steps);
+        }
         let stride = self.groups * PLANES * LANES;
-        let at = daughter * 2 * LANES + lane;
-        for (k, sample) in self.data.chunks_exact_mut(stride).enumerate() {
-            let pair = &mut sample[at..=at + LANES];
-            pair[0] = re(k);
-            pair[LANES] = im(k);
+        let at = daughter * 2 * LANES;
+        let [re, im] = &planes;
+        for (sample, (re, im)) in self.data.chunks_exact_mut(stride).zip(re.iter().zip(im)) {
+            sample[at..at + LANES].copy_from_slice(re);
+            sample[at + LANES..at + 2 * LANES].copy_from_slice(im);
         }
     }
 
@@ -76,6 +85,28 @@ impl Packed {
     #[must_use]
     pub fn multiply_adds(daughters: usize) -> usize {
         (daughters * (daughters - 1) / 2 * 4 + daughters * 2) * SLICE * LANES
+    }
+}
+
+/// Adds the levels of codes, and turns rows into columns: four times the rows of one half between those of the
+/// other.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq", "x86_64+avx2", "aarch64+neon"))]
+fn turn(matrix: &mut [[f32; SLICE]; LANES], codes: &[[i8; SLICE]; LANES], steps: &[f32; LANES]) {
+    const HALF: usize = LANES / 2;
+    for lane in 0..LANES {
+        for k in 0..SLICE {
+            matrix[lane][k] += (f32::from(codes[lane][k]) + 0.5) * steps[lane];
+        }
+    }
+    for _ in 0..4 {
+        let mut next = [[0.0; SLICE]; LANES];
+        for k in 0..HALF {
+            let (a, b) = (matrix[k], matrix[k + HALF]);
+            next[2 * k] = std::array::from_fn(|n| if n % 2 == 0 { a[n / 2] } else { b[n / 2] });
+            next[2 * k + 1] =
+                std::array::from_fn(|n| if n % 2 == 0 { a[HALF + n / 2] } else { b[HALF + n / 2] });
+        }
+        *matrix = next;
     }
 }
 
@@ -129,7 +160,12 @@ fn run<S: Simd, const PARTS: usize>(simd: S, work: Correlate<'_>) {
 }
 
 #[inline(always)]
-fn add<S: Simd, const PARTS: usize>(simd: S, part: usize, values: [S::f32s; 2], sums: &mut [[f32; LANES]; 2]) {
+fn add<S: Simd, const PARTS: usize>(
+    simd: S,
+    part: usize,
+    values: [S::f32s; 2],
+    sums: &mut [[f32; LANES]; 2],
+) {
     for (sum, value) in sums.iter_mut().zip(values) {
         let sum = S::as_mut_simd_f32s(sum).0;
         sum[part] = simd.add_f32s(sum[part], value);
@@ -208,7 +244,9 @@ mod tests {
     /// Small whole numbers, so that sums are exact.
     fn codes(daughter: usize, lane: usize) -> Samples {
         let code = |part: usize| {
-            (0..2 * SLICE).map(move |k| ((k * 31 + daughter * 7 + lane * 13 + part * 5) % 11) as i8 - 5).collect()
+            (0..2 * SLICE)
+                .map(move |k| ((k * 31 + daughter * 7 + lane * 13 + part * 5) % 11) as i8 - 5)
+                .collect()
         };
         Samples::Codes { bits: 4, step: 2.0, re: code(0), im: code(1) }
     }
@@ -223,11 +261,10 @@ mod tests {
         for daughters in [2, 3, 8] {
             let mut packed = Packed::new(daughters);
             for daughter in 0..daughters {
-                for lane in 0..LANES {
-                    packed.put(daughter, lane, &codes(daughter, lane), SLICE);
-                }
+                let blocks: Vec<Samples> = (0..LANES).map(|lane| codes(daughter, lane)).collect();
+                let there = |lane: usize| (daughter != 1 || lane != 3).then(|| &blocks[lane]);
+                packed.put_all(daughter, there, SLICE);
             }
-            packed.clear(1, 3);
             for arch in [Arch::new(), Arch::Scalar] {
                 let mut sums = no_sums(daughters);
                 correlate(arch, &packed, &mut sums);

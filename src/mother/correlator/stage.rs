@@ -150,13 +150,13 @@ impl Correlator {
         for lane in 0..channels {
             for daughter in 0..daughters {
                 let Some(block) = block(lane, daughter) else {
-                    group.packed.clear(daughter, lane);
                     autos.push((0.0, 0));
                     continue;
                 };
                 presence.there[daughter][lane] = true;
                 let parts = 2 * row.samples;
-                presence.saturated[daughter][lane] = f64::from(block.saturated) > SATURATED_MAX * parts as f64;
+                presence.saturated[daughter][lane] =
+                    f64::from(block.saturated) > SATURATED_MAX * parts as f64;
                 let sum = square(&block.samples);
                 autos.push((sum, row.samples as u64));
                 let power = &mut group.powers[daughter][lane];
@@ -169,12 +169,10 @@ impl Correlator {
             let mut sums = no_sums(daughters);
             for slice in 0..self.rule.dump_samples / SLICE {
                 let first = dump * self.rule.dump_samples + slice * SLICE;
-                for lane in 0..channels {
-                    for daughter in 0..daughters {
-                        if let Some(block) = block(lane, daughter) {
-                            group.packed.put(daughter, lane, &block.samples, first);
-                        }
-                    }
+                for daughter in 0..daughters {
+                    let samples =
+                        |lane: usize| (lane < channels).then(|| block(lane, daughter))?.map(|b| &b.samples);
+                    group.packed.put_all(daughter, samples, first);
                 }
                 correlate(self.arch, &group.packed, &mut sums);
             }
@@ -232,9 +230,7 @@ fn lock(counts: &Mutex<CorrelatorCounts>) -> std::sync::MutexGuard<'_, Correlato
 /// Sum of |x|^2, K sr.
 fn square(samples: &Samples) -> f64 {
     match samples {
-        Samples::Float { re, im } => {
-            re.iter().zip(im).map(|(re, im)| f64::from(re * re + im * im)).sum()
-        }
+        Samples::Float { re, im } => re.iter().zip(im).map(|(re, im)| f64::from(re * re + im * im)).sum(),
         Samples::Codes { step, re, im, .. } => {
             // (c + 1/2)^2 = c (c + 1) + 1/4, in whole numbers.
             let part = |c: i8| i64::from(i32::from(c) * (i32::from(c) + 1));
