@@ -2,6 +2,8 @@
 
 use multiversion::multiversion;
 
+use crate::array::response::kernel::fused;
+
 /// Frequencies that are worked on together: two registers of the widest kind.
 pub(super) const TILE: usize = 32;
 
@@ -53,10 +55,12 @@ impl Tile {
 /// `out = sum of coefficient x basis row`, `sign` times.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 pub(super) fn expand(coefficients: &[f32], basis: &[[f32; TILE]], sign: f32, out: &mut [f32; TILE]) {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let mut sum = [0.0_f32; TILE];
     for (coefficient, row) in coefficients.iter().zip(basis) {
         for k in 0..TILE {
-            sum[k] += coefficient * row[k];
+            sum[k] = fused::<FMA>(*coefficient, row[k], sum[k]);
         }
     }
     for k in 0..TILE {
@@ -71,6 +75,8 @@ pub(super) fn expand(coefficients: &[f32], basis: &[[f32; TILE]], sign: f32, out
 /// stay, and no correlation changes by more than C lacks.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 pub(super) fn factor(tile: &mut Tile, order: usize) -> Repairs {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let mut repairs = Repairs { elements: (order * (order - 1) / 2 * TILE) as u64, ..Repairs::default() };
     let powers: Vec<[f32; TILE]> = (0..order).map(|i| tile.re[element(i, i)]).collect();
     let mut left = powers.clone();
@@ -90,8 +96,8 @@ pub(super) fn factor(tile: &mut Tile, order: usize) -> Repairs {
                 let (a, b) = (element(i, k), element(j, k));
                 let (a_re, a_im, b_re, b_im) = (&tile.re[a], &tile.im[a], &tile.re[b], &tile.im[b]);
                 for t in 0..TILE {
-                    re[t] -= a_re[t] * b_re[t] + a_im[t] * b_im[t];
-                    im[t] -= a_im[t] * b_re[t] - a_re[t] * b_im[t];
+                    re[t] = fused::<FMA>(-a_re[t], b_re[t], fused::<FMA>(-a_im[t], b_im[t], re[t]));
+                    im[t] = fused::<FMA>(-a_im[t], b_re[t], fused::<FMA>(a_re[t], b_im[t], im[t]));
                 }
             }
             let mut lacking = 0_u32;
@@ -149,14 +155,16 @@ pub(super) fn colour(
     stride: usize,
     x: &mut [[f32; TILE]; 2],
 ) {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let [mut re, mut im] = [[0.0_f32; TILE]; 2];
     for j in 0..=i {
         let at = element(i, j);
         let (l_re, l_im) = (&tile.re[at], &tile.im[at]);
         let (z_re, z_im) = (&noise[0][j * stride], &noise[1][j * stride]);
         for t in 0..TILE {
-            re[t] += l_re[t] * z_re[t] - l_im[t] * z_im[t];
-            im[t] += l_re[t] * z_im[t] + l_im[t] * z_re[t];
+            re[t] = fused::<FMA>(l_re[t], z_re[t], fused::<FMA>(-l_im[t], z_im[t], re[t]));
+            im[t] = fused::<FMA>(l_re[t], z_im[t], fused::<FMA>(l_im[t], z_re[t], im[t]));
         }
     }
     *x = [re, im];

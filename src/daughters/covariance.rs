@@ -9,6 +9,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use crate::array::Array;
+use crate::array::response::kernel::fused;
 use crate::frames::Channel;
 use crate::mother::{PairPosition, Prediction, VisibilityModel};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
@@ -47,7 +48,10 @@ pub struct Covariances {
 
 /// Interpolations from Chebyshev points in time to epochs, which channels and stretches have in common.
 #[derive(Debug, Default)]
-pub struct Tables(Mutex<HashMap<(usize, usize), Arc<[f32]>>>);
+pub struct Tables(Mutex<TableMap>);
+
+/// By numbers of instants and of epochs.
+type TableMap = HashMap<(usize, usize), Arc<[f32]>>;
 
 /// Most tables that are kept: some 200 kB each.
 const TABLES_MAX: usize = 256;
@@ -241,9 +245,11 @@ fn time_matrix(instants: usize, count: usize) -> Vec<f32> {
 /// `out = sum of weight x row`.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn combine(weights: &[f32], rows: &[f32], out: &mut [f32]) {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     for (weight, row) in weights.iter().zip(rows.chunks_exact(out.len())) {
         for (out, value) in out.iter_mut().zip(row) {
-            *out += weight * value;
+            *out = fused::<FMA>(*weight, *value, *out);
         }
     }
 }

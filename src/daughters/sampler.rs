@@ -208,7 +208,7 @@ impl ChannelWork<'_> {
                 im.extend(samples.iter().map(|x| x.im));
             }
             let made = (hop + 1) * HOP;
-            if made % block_samples == 0 || made == self.samples {
+            if made.is_multiple_of(block_samples) || made == self.samples {
                 for (daughter, (plane, quantiser)) in planes.iter_mut().zip(&mut *quantisers).enumerate() {
                     let plane = std::mem::take(plane);
                     blocks.push(self.block(daughter, made, plane, quantiser));

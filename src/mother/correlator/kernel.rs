@@ -50,21 +50,22 @@ impl Packed {
         blocks: impl Fn(usize) -> Option<&'a Samples>,
         first: usize,
     ) {
-        let mut planes = [[[0.0; SLICE]; LANES]; 2];
-        let mut codes = [[[0; SLICE]; LANES]; 2];
+        let mut planes = [[0.0; SLICE * LANES]; 2];
+        let mut codes = [[0; SLICE * LANES]; 2];
         // Of what is not quantised, levels add nothing.
-        let mut steps = [0.0; LANES];
+        let mut steps = [0.0; SLICE * LANES];
         let range = first..first + SLICE;
         for lane in 0..LANES {
+            let row = lane * SLICE..(lane + 1) * SLICE;
             match blocks(lane) {
                 Some(Samples::Float { re, im }) => {
-                    planes[0][lane].copy_from_slice(&re[range.clone()]);
-                    planes[1][lane].copy_from_slice(&im[range.clone()]);
+                    planes[0][row.clone()].copy_from_slice(&re[range.clone()]);
+                    planes[1][row].copy_from_slice(&im[range.clone()]);
                 }
                 Some(Samples::Codes { step, re, im, .. }) => {
-                    codes[0][lane].copy_from_slice(&re[range.clone()]);
-                    codes[1][lane].copy_from_slice(&im[range.clone()]);
-                    steps[lane] = *step;
+                    codes[0][row.clone()].copy_from_slice(&re[range.clone()]);
+                    codes[1][row.clone()].copy_from_slice(&im[range.clone()]);
+                    steps[row].fill(*step);
                 }
                 None => {}
             }
@@ -72,9 +73,10 @@ impl Packed {
         for (plane, codes) in planes.iter_mut().zip(&codes) {
             turn(plane, codes, &steps);
         }
+        let [re, im] = &planes;
+        let [re, im] = [re.as_chunks::<LANES>().0, im.as_chunks::<LANES>().0];
         let stride = self.groups * PLANES * LANES;
         let at = daughter * 2 * LANES;
-        let [re, im] = &planes;
         for (sample, (re, im)) in self.data.chunks_exact_mut(stride).zip(re.iter().zip(im)) {
             sample[at..at + LANES].copy_from_slice(re);
             sample[at + LANES..at + 2 * LANES].copy_from_slice(im);
@@ -88,25 +90,26 @@ impl Packed {
     }
 }
 
-/// Adds the levels of codes, and turns rows into columns: four times the rows of one half between those of the
-/// other.
+/// Adds the levels of codes to rows of samples, a lane each, and turns rows into columns.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq", "x86_64+avx2", "aarch64+neon"))]
-fn turn(matrix: &mut [[f32; SLICE]; LANES], codes: &[[i8; SLICE]; LANES], steps: &[f32; LANES]) {
-    const HALF: usize = LANES / 2;
-    for lane in 0..LANES {
-        for k in 0..SLICE {
-            matrix[lane][k] += (f32::from(codes[lane][k]) + 0.5) * steps[lane];
-        }
+fn turn(matrix: &mut [f32; SLICE * LANES], codes: &[i8; SLICE * LANES], steps: &[f32; SLICE * LANES]) {
+    for ((value, code), step) in matrix.iter_mut().zip(codes).zip(steps) {
+        *value += (f32::from(*code) + 0.5) * step;
     }
-    for _ in 0..4 {
-        let mut next = [[0.0; SLICE]; LANES];
-        for k in 0..HALF {
-            let (a, b) = (matrix[k], matrix[k + HALF]);
-            next[2 * k] = std::array::from_fn(|n| if n % 2 == 0 { a[n / 2] } else { b[n / 2] });
-            next[2 * k + 1] =
-                std::array::from_fn(|n| if n % 2 == 0 { a[HALF + n / 2] } else { b[HALF + n / 2] });
-        }
-        *matrix = next;
+    let mut other = [0.0; SLICE * LANES];
+    weave(matrix, &mut other);
+    weave(&other, matrix);
+    weave(matrix, &mut other);
+    weave(&other, matrix);
+}
+
+/// Puts the elements of one half between those of the other; four times that is a transposition.
+#[inline(always)]
+fn weave(from: &[f32; SLICE * LANES], to: &mut [f32; SLICE * LANES]) {
+    const HALF: usize = SLICE * LANES / 2;
+    for k in 0..HALF {
+        to[2 * k] = from[k];
+        to[2 * k + 1] = from[k + HALF];
     }
 }
 
