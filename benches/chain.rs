@@ -4,7 +4,6 @@
 //! symmetric rank-k updates alone on matrices of the same size, measured just before and after: the share
 //! of the time that the machine spends on what no pixel engine can avoid.
 
-use std::sync::Arc;
 use std::time::Instant;
 
 use lunarray::accumulation::{Columns, SymmetricTiles};
@@ -52,7 +51,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for round in 1..=5 {
         let before = rank_k_limit(nside);
         let since = Instant::now();
-        let summary = run(&plan, &out, &Cancel::new(), &mut |_: Arc<_>| {})?;
+        let summary = run(&plan, &out, &Cancel::new(), &mut |_: lunarray::pipeline::Watched| {})?;
         let elapsed_s = since.elapsed().as_secs_f64();
         let limit = 0.5 * (before + rank_k_limit(nside));
         let rate = summary.ledger.accumulated as f64 / elapsed_s;

@@ -9,11 +9,12 @@ use std::path::Path;
 use std::time::Instant;
 
 use lunarray::array::{Array, ArrayConfig, Ephemeris, segments_for};
+use lunarray::downlink::cadu::{CaduEncoder, CaduReceiver, ReedSolomon, randomize};
 use lunarray::downlink::{DownlinkConfig, DownlinkReader, Packetizer, Receiver};
 use lunarray::frames::{AntennaResponse, Channel, Flags, GroundFrame, Instrument, VisibilityBlock};
 use lunarray::units::{ChannelId, MissionTime, Pair, StreamKind, all_pairs, random_stream};
 use num_complex::Complex32;
-use rand::Rng;
+use rand::{Rng, RngExt};
 
 /// Best of so many runs.
 const RUNS: usize = 7;
@@ -112,6 +113,84 @@ fn receive(bytes: &[u8]) -> u64 {
     events
 }
 
+/// The layers of the coded link, each over the bytes that pass it.
+fn layers(packets: &[u8], copy_gb_s: f64) {
+    let code = ReedSolomon::new(5).unwrap();
+    let line = |what: &str, bytes: usize, s: f64| {
+        let gb_s = bytes as f64 / s / 1e9;
+        println!("{what:<38} {gb_s:>7.3} GB/s   {:>5.1} % of a copy", 100.0 * gb_s / copy_gb_s);
+    };
+    let mut blocks = vec![0; packets.len() / code.block_bytes() * code.block_bytes()];
+    random_stream(3, StreamKind::Probe, [0, 0]).fill_bytes(&mut blocks);
+    let each = |blocks: &mut [u8], run: &mut dyn FnMut(&mut [u8])| {
+        blocks.chunks_exact_mut(code.block_bytes()).for_each(run);
+    };
+    line("randomizer", blocks.len(), best_s(|| each(&mut blocks, &mut |block| randomize(block))));
+    line("Reed-Solomon: encode", blocks.len(), best_s(|| each(&mut blocks, &mut |block| code.encode(block))));
+    let decode = |what: &str, blocks: &[u8]| {
+        let mut spoilt = blocks.to_vec();
+        let s = (0..RUNS).fold(f64::INFINITY, |best, _| {
+            spoilt.copy_from_slice(blocks);
+            let start = Instant::now();
+            each(&mut spoilt, &mut |block| {
+                let _ = black_box(code.decode(block));
+            });
+            best.min(start.elapsed().as_secs_f64())
+        });
+        line(what, blocks.len(), s);
+    };
+    decode("Reed-Solomon: decode, clean", &blocks);
+    for (what, wrong) in [("1", 1), ("5", 5), ("16", 16), ("17 (too many)", 17)] {
+        let mut spoilt = blocks.clone();
+        // So many of every codeword, evenly spread.
+        each(&mut spoilt, &mut |block| (0..5 * wrong).for_each(|k| block[13 * k] ^= 1 + (k % 255) as u8));
+        decode(&format!("Reed-Solomon: decode, {what} wrong each"), &spoilt);
+    }
+    let mut coded = Vec::with_capacity(2 * packets.len());
+    let encode = |coded: &mut Vec<u8>| {
+        let mut encoder = CaduEncoder::new(code, 1, 2);
+        coded.clear();
+        encoder.encode(packets, coded);
+        encoder.flush(coded);
+    };
+    line("packets to CADUs", packets.len(), best_s(|| encode(&mut coded)));
+    let mut recovered = Vec::with_capacity(packets.len());
+    let mut receive = |what: &str, coded: &[u8]| {
+        let s = best_s(|| {
+            let mut receiver = CaduReceiver::new();
+            recovered.clear();
+            coded.chunks(1 << 18).for_each(|chunk| receiver.push(chunk, &mut recovered));
+            receiver.finish(&mut recovered);
+        });
+        line(what, coded.len(), s);
+        assert!(recovered == packets);
+    };
+    receive("CADUs to packets, clean", &coded);
+    let mut slipped = vec![0_u8];
+    slipped.extend(coded.windows(2).map(|pair| pair[0] << 3 | pair[1] >> 5));
+    slipped.push(coded[coded.len() - 1] << 3);
+    slipped[0] = coded[0] >> 5;
+    receive("CADUs to packets, three bits off", &slipped);
+    let mut noisy = coded.clone();
+    let bits = 8 * noisy.len();
+    let mut random = random_stream(4, StreamKind::Probe, [0, 0]);
+    for _ in 0..bits / 10_000 {
+        let bit = random.random_range(0..bits);
+        noisy[bit / 8] ^= 1 << (bit % 8);
+    }
+    receive("CADUs to packets, bit error rate 1e-4", &noisy);
+    let mut noise = vec![0; packets.len()];
+    random.fill_bytes(&mut noise);
+    let s = best_s(|| {
+        let mut receiver = CaduReceiver::new();
+        let mut none = Vec::new();
+        noise.chunks(1 << 18).for_each(|chunk| receiver.push(chunk, &mut none));
+        receiver.finish(&mut none);
+        assert!(none.is_empty());
+    });
+    line("search for CADUs in noise", noise.len(), s);
+}
+
 fn main() {
     let frames = frames();
     let sent = 3 * 28 * u64::from(VISIBILITIES);
@@ -135,6 +214,7 @@ fn main() {
         }),
     );
     report.line("decode frames", best_s(|| assert_eq!(decode(black_box(&bytes), drop), sent)));
+    layers(&bytes, report.bytes / copy_s / 1e9);
     place(&bytes, sent);
     resynchronise(report.bytes as usize);
 }

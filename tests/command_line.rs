@@ -30,7 +30,8 @@ fn write(folder: &Path, name: &str, text: &str) -> String {
 
 #[test]
 fn every_command_has_help_that_teaches() {
-    for command in ["run", "simulate", "replay", "inspect", "compare", "geometry", "predict", "check", "sky"]
+    for command in
+        ["run", "simulate", "replay", "inspect", "compare", "geometry", "predict", "check", "sky", "corrupt"]
     {
         let output = lunarray().args([command, "--help"]).output().unwrap();
         assert!(output.status.success());

@@ -223,7 +223,7 @@ fn an_output_that_cannot_be_written_is_named() {
     let path = path.join("pass.ccsds");
     let error = DownlinkWriter::create(&path, &DownlinkConfig::default()).unwrap_err();
     assert!(error.to_string().contains("no such folder"), "{error}");
-    let config = DownlinkConfig { packet_bytes_max: 10, repeat_bytes: 0 };
+    let config = DownlinkConfig { packet_bytes_max: 10, repeat_bytes: 0, ..DownlinkConfig::default() };
     assert_eq!(config.problems().len(), 2);
     assert!(DownlinkWriter::create(&folder.path().join("x"), &config).is_err());
 }

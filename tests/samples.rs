@@ -15,7 +15,7 @@ use lunarray::frames::{
     SpaceFrame, VisibilityBlock,
 };
 use lunarray::mother::correlator::{Correlator, CorrelatorCounts, CorrelatorSetup};
-use lunarray::mother::{DirectSum, PairPosition, Prediction, Schedule, VisibilityModel};
+use lunarray::mother::{DirectSum, ModelError, PairPosition, Prediction, Schedule, VisibilityModel};
 use lunarray::runtime::{Flow, Outlet, Source, Stage};
 use lunarray::sky::SkyMap;
 use lunarray::sky::fits::{ReadOptions, read_map};
@@ -32,15 +32,16 @@ struct Constant {
 }
 
 impl VisibilityModel for Constant {
-    fn predict(&self, _: ChannelId, _: &[PairPosition], out: &mut [Prediction]) {
+    fn predict(&mut self, _: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError> {
         out.fill(Prediction { visibility_k_sr: Complex64::new(self.cross, 0.0), zero_spacing_k_sr: 1.0 });
+        Ok(())
     }
 }
 
-/// A source of flux one in one direction that nothing hides, one frequency a channel.
+/// A source of flux one in one direction that nothing hides.
 struct Point {
     n_hat: Vec3,
-    frequencies_hz: Vec<f64>,
+    frequency_hz: f64,
 }
 
 fn fringe(n_hat: Vec3, frequency_hz: f64, r_i_m: Vec3, r_j_m: Vec3) -> Complex64 {
@@ -48,19 +49,30 @@ fn fringe(n_hat: Vec3, frequency_hz: f64, r_i_m: Vec3, r_j_m: Vec3) -> Complex64
 }
 
 impl VisibilityModel for Point {
-    fn predict(&self, channel: ChannelId, positions: &[PairPosition], out: &mut [Prediction]) {
-        let frequency_hz = self.frequencies_hz[usize::from(channel.0)];
+    fn predict(&mut self, positions: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError> {
         for (out, at) in out.iter_mut().zip(positions) {
-            let visibility_k_sr = fringe(self.n_hat, frequency_hz, at.r_i_m, at.r_j_m);
+            let visibility_k_sr = fringe(self.n_hat, self.frequency_hz, at.r_i_m, at.r_j_m);
             *out = Prediction { visibility_k_sr, zero_spacing_k_sr: 1.0 };
         }
+        Ok(())
     }
+}
+
+/// The model of a channel at some frequency, Hz.
+type Sky = Box<dyn Fn(f64) -> Box<dyn VisibilityModel> + Send + Sync>;
+
+fn constant(cross: f64) -> Sky {
+    Box::new(move |_| Box::new(Constant { cross }))
+}
+
+fn point(n_hat: Vec3) -> Sky {
+    Box::new(move |frequency_hz| Box::new(Point { n_hat, frequency_hz }))
 }
 
 /// A spacecraft in sample fidelity, without links.
 struct Spacecraft {
     array: Arc<Array>,
-    model: Arc<dyn VisibilityModel>,
+    sky: Sky,
     frequencies_hz: Vec<f64>,
     receiver_noise_k_sr: f64,
     rule: IntegrationRule,
@@ -69,18 +81,13 @@ struct Spacecraft {
 }
 
 impl Spacecraft {
-    fn new(
-        array: ArrayConfig,
-        frequencies_hz: Vec<f64>,
-        model: Arc<dyn VisibilityModel>,
-        seconds: f64,
-    ) -> Self {
+    fn new(array: ArrayConfig, frequencies_hz: Vec<f64>, sky: Sky, seconds: f64) -> Self {
         let array = Arc::new(Array::new(&array).unwrap());
         let start = ObservingWindows::new(&array, 0.0, 1e9).next().unwrap().start;
         let end = MissionTime::from_seconds(start.seconds() + seconds);
         Self {
             array,
-            model,
+            sky,
             frequencies_hz,
             receiver_noise_k_sr: 0.0,
             rule: IntegrationRule::default(),
@@ -97,7 +104,7 @@ impl Spacecraft {
     fn sample(&self, seed: u64) -> (Vec<SpaceFrame>, SamplerCounts) {
         let scene = Scene {
             array: Arc::clone(&self.array),
-            model: Arc::clone(&self.model),
+            models: self.frequencies_hz.iter().map(|&frequency_hz| (self.sky)(frequency_hz)).collect(),
             channels: self.channels(),
             receiver_noise_k_sr: self.receiver_noise_k_sr,
             seed,
@@ -179,8 +186,7 @@ fn moments(values: &[Complex64]) -> (Complex64, f64) {
 #[test]
 fn noise_is_what_the_radiometer_equation_says_for_any_integration_time() {
     // An empty sky and receivers of 2 K sr.
-    let mut craft =
-        Spacecraft::new(ArrayConfig::default(), frequencies(30), Arc::new(Constant { cross: 0.0 }), 4.0);
+    let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies(30), constant(0.0), 4.0);
     craft.receiver_noise_k_sr = 1.0;
     let frames = craft.sample(1).0;
     for dt_s in [0.008, 0.08, 0.4] {
@@ -209,7 +215,7 @@ fn noise_is_what_the_radiometer_equation_says_for_any_integration_time() {
 fn quantisers_lose_what_they_are_known_to_lose() {
     // Signal to noise of a correlation of 0.05, against that of perfect samples (Thompson, Moran & Swenson).
     for (bits, efficiency) in [(1, FRAC_2_PI), (2, 0.881), (4, 0.9881), (8, 1.0), (32, 1.0)] {
-        let sky = Arc::new(Constant { cross: 0.05 });
+        let sky = constant(0.05);
         let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies(30), sky, 4.0);
         let dt_s = 0.04;
         craft.rule.duration_s_max = dt_s;
@@ -234,7 +240,7 @@ fn van_vleck_returns_the_amplitude_of_weak_and_strong_correlations() {
     for bits in [1, 2, 4] {
         let relation = VanVleck::new(bits).unwrap();
         for cross in [0.01, 0.1, 0.3, 0.6, 0.9] {
-            let sky = Arc::new(Constant { cross });
+            let sky = constant(cross);
             // All integrations are of the same 0.4 s: no baseline moves far enough in it at these frequencies.
             let frequencies_hz = (0..16).map(|k| 3e5 + 1e4 * f64::from(k)).collect();
             let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies_hz, sky, 4.0);
@@ -290,7 +296,7 @@ fn smeared(
 fn a_point_source_has_the_visibilities_of_the_model() {
     let frequencies_hz = vec![1e6, 10e6, 30e6];
     let n_hat = unit([0.3, -0.8, 0.4]);
-    let sky = Arc::new(Point { n_hat, frequencies_hz: frequencies_hz.clone() });
+    let sky = point(n_hat);
     let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies_hz, sky, 30.0);
     craft.receiver_noise_k_sr = 1.0;
     let blocks = craft.run(3);
@@ -335,20 +341,19 @@ fn the_real_sky_has_the_visibilities_of_the_model() {
     let Some(path) = common::shared("sky/ulsa_1mhz_galactic_nside64.fits") else { return };
     let sky: SkyMap = read_map(&path, &ReadOptions::default()).unwrap();
     let array = Array::new(&ArrayConfig::default()).unwrap();
-    let model = |frequencies: &[f64]| {
-        let skies = vec![sky.clone(); frequencies.len()];
-        DirectSum::new(&skies, frequencies, array.moon_radius_m(), AntennaResponse::Isotropic)
-    };
+    let moon_radius_m = array.moon_radius_m();
+    let model =
+        move |frequency_hz| DirectSum::new(&sky, frequency_hz, moon_radius_m, AntennaResponse::Isotropic);
     let frequency_hz = 1e6;
-    let craft =
-        Spacecraft::new(ArrayConfig::default(), vec![frequency_hz], Arc::new(model(&[frequency_hz])), 16.0);
+    let centre = model(frequency_hz);
+    let sky: Sky = Box::new(move |_| Box::new(centre.clone()));
+    let craft = Spacecraft::new(ArrayConfig::default(), vec![frequency_hz], sky, 16.0);
     let (frames, counts) = craft.sample(4);
     assert!(f64::from(counts.repairs.change_max) < 1e-3, "{:?}", counts.repairs);
     let (blocks, _) = craft.correlate(frames);
     // Frequencies over the channel as channels of their own.
     let offsets: Vec<f64> =
         (0..16).map(|k| frequency_hz + WIDTH_HZ * ((k as f64 + 0.5) / 16.0 - 0.5)).collect();
-    let reference = model(&offsets);
     let mut positions = Vec::new();
     for block in &blocks {
         for k in 0..block.len() {
@@ -359,14 +364,15 @@ fn the_real_sky_has_the_visibilities_of_the_model() {
                 PairPosition {
                     r_i_m: array.position_m(block.pair.i.into(), t_s),
                     r_j_m: array.position_m(block.pair.j.into(), t_s),
+                    span_rad: 0.0,
                 }
             }));
         }
     }
     let mut expected = vec![Complex64::ZERO; positions.len() / 4];
     let mut predicted = vec![Prediction::default(); positions.len()];
-    for channel in 0..16 {
-        reference.predict(ChannelId(channel), &positions, &mut predicted);
+    for frequency_hz in offsets {
+        model(frequency_hz).predict(&positions, &mut predicted).unwrap();
         for (sum, four) in expected.iter_mut().zip(predicted.chunks_exact(4)) {
             *sum += four.iter().map(|p| p.visibility_k_sr).sum::<Complex64>() / 64.0;
         }
@@ -416,7 +422,7 @@ fn delays_decorrelate_as_a_sinc_and_offsets_restore() {
         let t_s = ObservingWindows::new(&array, 0.0, 1e9).next().unwrap().start.seconds();
         unit(sub(array.position_m(0, t_s), array.position_m(7, t_s)))
     };
-    let sky = Arc::new(Point { n_hat: start, frequencies_hz: vec![1e6] });
+    let sky = point(start);
     // At 1 MHz breathing turns the longest baseline's fringe by 0.015 in this time: 4e-4 of the amplitude.
     let craft = Spacecraft::new(slow, vec![1e6], sky, 40.0);
     let t_s = craft.window.start.seconds() + 20.0;
@@ -450,8 +456,7 @@ fn delays_decorrelate_as_a_sinc_and_offsets_restore() {
 #[test]
 fn no_baseline_moves_more_than_an_eighth_of_a_wavelength() {
     let frequencies_hz = vec![3e6, 10e6, 30e6];
-    let craft =
-        Spacecraft::new(ArrayConfig::default(), frequencies_hz, Arc::new(Constant { cross: 0.0 }), 60.0);
+    let craft = Spacecraft::new(ArrayConfig::default(), frequencies_hz, constant(0.0), 60.0);
     for (channel, frequency_hz) in craft.frequencies_hz.iter().enumerate() {
         // Silence costs nothing to correlate: what is missing is integrated all the same.
         let ends = vec![SpaceFrame::WindowStart(craft.window), SpaceFrame::WindowEnd(craft.window)];
@@ -486,8 +491,7 @@ fn no_baseline_moves_more_than_an_eighth_of_a_wavelength() {
 
 #[test]
 fn weights_add_up_to_the_samples_that_arrived() {
-    let craft =
-        Spacecraft::new(ArrayConfig::default(), vec![5e6, 20e6], Arc::new(Constant { cross: 0.0 }), 12.288);
+    let craft = Spacecraft::new(ArrayConfig::default(), vec![5e6, 20e6], constant(0.0), 12.288);
     let ones = |block: SampleBlock| {
         let length = block.samples.len();
         SampleBlock { samples: Samples::Float { re: vec![1.0; length], im: vec![0.0; length] }, ..block }
@@ -555,7 +559,7 @@ fn weights_add_up_to_the_samples_that_arrived() {
 
 #[test]
 fn the_same_seed_gives_the_same_samples_whatever_the_threads() {
-    let sky = Arc::new(Point { n_hat: unit([1.0, 2.0, 3.0]), frequencies_hz: frequencies(5) });
+    let sky = point(unit([1.0, 2.0, 3.0]));
     let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies(5), sky, 6.0);
     craft.receiver_noise_k_sr = 1.0;
     craft.daughters.bits = 4;

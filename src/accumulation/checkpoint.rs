@@ -5,20 +5,16 @@
 
 use std::io::{Read, Write};
 
-use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
 use num_complex::Complex64;
 
 use super::SumCounts;
+use super::checked::{Checked, RESPONSES, Summed, number_of, refused};
 use super::error::AccumulationError;
 use super::pixel::{Pending, PixelEngine, PixelSetup, PixelSums};
 use crate::array::response::PixelMethod;
-use crate::frames::AntennaResponse;
 use crate::sky::healpix::is_valid_nside;
 
 const MAGIC: &[u8; 8] = b"LNRPIX01";
-
-/// Greatest head that is read: the real one takes some 80 bytes.
-const HEAD_BYTES_MAX: usize = 4096;
 
 /// Greatest number of waiting visibilities that is believed.
 const PENDING_MAX: u32 = 65_536;
@@ -28,9 +24,6 @@ const NSIDE_MAX: u32 = 64;
 
 /// Numbers that a waiting visibility takes.
 const PENDING_NUMBERS: usize = 11;
-
-const CODEC: Configuration<LittleEndian, Fixint, Limit<HEAD_BYTES_MAX>> =
-    bincode::config::standard().with_little_endian().with_fixed_int_encoding().with_limit::<HEAD_BYTES_MAX>();
 
 #[derive(bincode::Encode, bincode::Decode)]
 struct Head {
@@ -53,14 +46,9 @@ pub(super) struct Restored {
 
 /// Numbers of variants on disk: never to be renumbered.
 const METHODS: [PixelMethod; 3] = [PixelMethod::Centre, PixelMethod::Average, PixelMethod::AverageExact];
-const RESPONSES: [AntennaResponse; 2] = [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal];
-
-fn number_of<T: PartialEq>(variants: &[T], variant: &T) -> u8 {
-    variants.iter().position(|v| v == variant).map_or(u8::MAX, |k| k as u8)
-}
 
 pub(super) fn write(engine: &PixelEngine, out: &mut dyn Write) -> Result<(), AccumulationError> {
-    let mut out = Summed { inner: out, crc: crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi) };
+    let mut out = Summed::new(out);
     let setup = &engine.setup;
     let head = Head {
         nside: setup.nside as u32,
@@ -72,13 +60,8 @@ pub(super) fn write(engine: &PixelEngine, out: &mut dyn Write) -> Result<(), Acc
         counts: engine.sums.counts,
         pending: engine.pending.len() as u32,
     };
-    let head = bincode::encode_to_vec(head, CODEC).map_err(|error| AccumulationError::Checkpoint {
-        found: error.to_string(),
-        expected: "a head that can be encoded",
-    })?;
     out.write(MAGIC)?;
-    out.write(&(head.len() as u32).to_le_bytes())?;
-    out.write(&head)?;
+    out.head(head)?;
     for column in engine.sums.normal.columns() {
         out.numbers(column)?;
     }
@@ -89,19 +72,18 @@ pub(super) fn write(engine: &PixelEngine, out: &mut dyn Write) -> Result<(), Acc
         let (v, n) = (p.value_k_sr, p.noise);
         out.numbers(&[a, b, c, d, e, f, v.re, v.im, p.weight, n.re, n.im])?;
     }
-    let crc = out.crc.finalize() as u32;
-    out.inner.write_all(&crc.to_le_bytes())?;
+    out.finish()?;
     Ok(())
 }
 
 pub(super) fn read(from: &mut dyn Read) -> Result<Restored, AccumulationError> {
-    let mut from = Checked { inner: from, crc: crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi) };
+    let mut from = Checked::new(from);
     let mut magic = [0; 8];
     from.read(&mut magic)?;
     if &magic != MAGIC {
         return Err(refused(format!("{magic:02x?}"), "a pixel engine's checkpoint, version 01"));
     }
-    let head = read_head(&mut from)?;
+    let head: Head = from.head()?;
     let setup = setup_of(&head)?;
     let mut sums = PixelSums::zeros(setup.nside);
     for column in sums.normal.columns_mut() {
@@ -123,29 +105,8 @@ pub(super) fn read(from: &mut dyn Read) -> Result<Restored, AccumulationError> {
             noise: Complex64::new(noise_re, noise_im),
         });
     }
-    let found = from.crc.finalize() as u32;
-    let mut stored = [0; 4];
-    from.inner.read_exact(&mut stored)?;
-    if found != u32::from_le_bytes(stored) {
-        return Err(refused(format!("checksum {found:08x}"), "the checksum that it was written with"));
-    }
+    from.finish()?;
     Ok(Restored { setup, sums, pending })
-}
-
-fn read_head(from: &mut Checked<'_>) -> Result<Head, AccumulationError> {
-    let mut length = [0; 4];
-    from.read(&mut length)?;
-    let length = u32::from_le_bytes(length) as usize;
-    if length > HEAD_BYTES_MAX {
-        return Err(refused(format!("a head of {length} bytes"), "at most 4096"));
-    }
-    let mut bytes = vec![0; length];
-    from.read(&mut bytes)?;
-    match bincode::decode_from_slice::<Head, _>(&bytes, CODEC) {
-        Ok((head, used)) if used == length => Ok(head),
-        Ok(_) => Err(refused("bytes behind the head".into(), "none")),
-        Err(error) => Err(refused(error.to_string(), "a head")),
-    }
 }
 
 fn setup_of(head: &Head) -> Result<PixelSetup, AccumulationError> {
@@ -168,57 +129,12 @@ fn setup_of(head: &Head) -> Result<PixelSetup, AccumulationError> {
     })
 }
 
-fn refused(found: String, expected: &'static str) -> AccumulationError {
-    AccumulationError::Checkpoint { found, expected }
-}
-
-/// Writes and sums up.
-struct Summed<'a> {
-    inner: &'a mut dyn Write,
-    crc: crc_fast::Digest,
-}
-
-impl Summed<'_> {
-    fn write(&mut self, bytes: &[u8]) -> std::io::Result<()> {
-        self.crc.update(bytes);
-        self.inner.write_all(bytes)
-    }
-
-    fn numbers(&mut self, values: &[f64]) -> std::io::Result<()> {
-        let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
-        self.write(&bytes)
-    }
-}
-
-/// Reads and sums up.
-struct Checked<'a> {
-    inner: &'a mut dyn Read,
-    crc: crc_fast::Digest,
-}
-
-impl Checked<'_> {
-    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<()> {
-        self.inner.read_exact(bytes)?;
-        self.crc.update(bytes);
-        Ok(())
-    }
-
-    fn numbers(&mut self, values: &mut [f64]) -> std::io::Result<()> {
-        let mut bytes = vec![0; size_of_val(values)];
-        self.read(&mut bytes)?;
-        for (value, bytes) in values.iter_mut().zip(bytes.as_chunks::<8>().0) {
-            *value = f64::from_le_bytes(*bytes);
-        }
-        Ok(())
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::{NormalEngine, NormalSums};
     use super::*;
     use crate::array::{Array, ArrayConfig};
-    use crate::frames::PlacedVisibilities;
+    use crate::frames::{AntennaResponse, PlacedVisibilities};
     use crate::units::Pair;
 
     fn setup() -> PixelSetup {

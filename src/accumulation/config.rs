@@ -5,6 +5,8 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::harmonic::L_MAX;
+use crate::array::harmonic::GeometryLimits;
 use crate::array::response::PixelMethod;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
 use crate::units::PerChannel;
@@ -13,14 +15,36 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 /// Greatest nside of the pixel engine: 49152 pixels, 9.7 GB of sums a channel (half of a symmetric matrix, f64).
 pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
 
+/// Greatest nside of maps from the harmonic engine: pixels ten times finer than its greatest degree.
+pub const HARMONIC_ENGINE_NSIDE_MAX: usize = 1024;
+
+/// Degrees of a harmonic map, a nside, if none are given: as many as pixels carry with 1e-6.
+const DEGREES_PER_NSIDE: f64 = 2.5;
+
+/// What the normal equations are summed over.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[non_exhaustive]
+pub enum EngineKind {
+    /// Pixels: exact, for any orbit; N_pix^2 operations a visibility.
+    #[default]
+    Pixel,
+    /// Spherical harmonics: thousands of operations a visibility; needs satellites on one circle.
+    Harmonic,
+}
+
 /// The ground's map making.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MapConfig {
     /// HEALPix nside of the maps.
     pub nside: usize,
-    /// How rows of B are made.
+    /// What the normal equations are summed over: `pixel` or `harmonic`.
+    pub engine: EngineKind,
+    /// How rows of B are made by the pixel engine.
     pub rows: PixelMethod,
+    /// Greatest degree of a map from the harmonic engine; 0 for 2.5 nside.
+    pub l_max: usize,
     /// Longest baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
     pub baseline_bp_max: f64,
     /// Regularisation epsilon: R = epsilon W_max I.
@@ -35,13 +59,23 @@ pub struct MapConfig {
     pub snapshot_every_s: f64,
     /// Seed of the noise-only companion map.
     pub companion_seed: u64,
+    /// Residual at which the harmonic solution ends, relative to the right-hand side, in the preconditioner's norm.
+    pub residual_max: f64,
+    /// Most iterations of a harmonic solution.
+    pub iterations_max: usize,
+    /// Random vectors for the traces of the covariances of a final harmonic map; 0 for none.
+    pub trace_probes: usize,
+    /// Departures from the common circle that the harmonic engine takes.
+    pub limits: GeometryLimits,
 }
 
 impl Default for MapConfig {
     fn default() -> Self {
         Self {
             nside: 16,
+            engine: EngineKind::Pixel,
             rows: PixelMethod::Average,
+            l_max: 0,
             baseline_bp_max: 2.0,
             epsilon: PerChannel::All(1e-4),
             prior_k: PerChannel::All(0.0),
@@ -49,6 +83,10 @@ impl Default for MapConfig {
             prior_fwhm_deg: 5.0,
             snapshot_every_s: 0.0,
             companion_seed: 1,
+            residual_max: 1e-4,
+            iterations_max: 300,
+            trace_probes: 0,
+            limits: GeometryLimits::default(),
         }
     }
 }
@@ -58,8 +96,13 @@ impl Default for MapConfig {
 #[non_exhaustive]
 pub enum MapConfigError {
     /// Not a map size.
-    #[error("map.nside = {0}: expected a power of two from 1 to {PIXEL_ENGINE_NSIDE_MAX}")]
-    Nside(usize),
+    #[error("map.nside = {nside}: expected a power of two from 1 to {most} for this engine")]
+    Nside {
+        /// Value found.
+        nside: usize,
+        /// Greatest that the engine takes.
+        most: usize,
+    },
     /// A number outside its range.
     #[error("map.{key} = {value}: expected {expected}")]
     Parameter {
@@ -88,8 +131,10 @@ impl MapConfig {
     #[must_use]
     pub fn problems(&self) -> Vec<MapConfigError> {
         let mut found = Vec::new();
-        if !is_valid_nside(self.nside) || self.nside > PIXEL_ENGINE_NSIDE_MAX {
-            found.push(MapConfigError::Nside(self.nside));
+        let is_harmonic = self.engine == EngineKind::Harmonic;
+        let most = if is_harmonic { HARMONIC_ENGINE_NSIDE_MAX } else { PIXEL_ENGINE_NSIDE_MAX };
+        if !is_valid_nside(self.nside) || self.nside > most {
+            found.push(MapConfigError::Nside { nside: self.nside, most });
         }
         let mut require = |key, value: f64, good: bool, expected| {
             if !(good && value.is_finite()) {
@@ -106,12 +151,31 @@ impl MapConfig {
         }
         let fwhm = self.prior_fwhm_deg;
         require("prior_fwhm_deg", fwhm, (0.0..=180.0).contains(&fwhm), "0 to 180");
+        if is_harmonic {
+            let l_max = self.l_max as f64;
+            require("l_max", l_max, self.l_max < 3 * self.nside, "0, or 1 to 3 nside - 1");
+            let degree = self.degree() as f64;
+            require("l_max", degree, self.degree() <= L_MAX, "at most 383; 0 stands for 2.5 nside");
+        }
+        let residual = self.residual_max;
+        require("residual_max", residual, residual > 0.0 && residual < 1.0, "above 0 and below 1");
+        let iterations = self.iterations_max as f64;
+        require("iterations_max", iterations, self.iterations_max > 0, "at least 1");
+        for (key, value) in self.limits.values() {
+            require(key, value, value >= 0.0, "not negative");
+        }
         let every = self.snapshot_every_s;
         require("snapshot_every_s", every, every >= 0.0, "seconds, or 0 for a final map alone");
         if !self.prior_files.is_empty() && self.prior_k.values().iter().any(|&k| k != 0.0) {
             found.push(MapConfigError::TwoPriors);
         }
         found
+    }
+
+    /// Greatest degree of a map from the harmonic engine.
+    #[must_use]
+    pub fn degree(&self) -> usize {
+        if self.l_max > 0 { self.l_max } else { (DEGREES_PER_NSIDE * self.nside as f64) as usize }
     }
 
     /// Longest baseline used at a frequency, m.

@@ -12,6 +12,16 @@ pub enum AccumulationError {
     /// Rows of B cannot be made.
     #[error(transparent)]
     Response(#[from] ResponseError),
+    /// A harmonic engine that cannot be.
+    #[error("harmonic engine: {name} = {value}: expected {expected}")]
+    Setup {
+        /// Quantity.
+        name: &'static str,
+        /// Value found.
+        value: f64,
+        /// Range that is accepted.
+        expected: &'static str,
+    },
     /// Data of a channel that the instrument description does not have.
     #[error("visibilities of channel {0} arrived, which the instrument description does not have")]
     UnknownChannel(ChannelId),

@@ -1,24 +1,32 @@
 //! Normal equations, summed as data arrives.
 //!
 //! An engine turns placed visibilities into `BtN^-1B` and `BtN^-1V` in whatever form serves it; the
-//! solver asks for no more than their action on a vector. [`PixelEngine`] holds the matrix itself.
+//! solver asks for no more than their action on a vector. [`PixelEngine`] holds the matrix itself;
+//! [`harmonic::HarmonicEngine`] holds what makes the matrix act on spherical harmonics.
 //! Uses [`crate::frames`], [`mod@crate::array`], [`crate::sky`].
 
+mod checked;
 mod checkpoint;
 mod config;
 mod error;
+pub mod harmonic;
+mod noise;
 mod pixel;
 mod stage;
 mod tiles;
 
-pub use config::{MapConfig, MapConfigError};
+pub use config::{EngineKind, MapConfig, MapConfigError};
 pub use error::AccumulationError;
 pub use pixel::{PixelEngine, PixelSetup, PixelSums};
-pub use stage::{Accumulator, Snapshot};
+pub use stage::{Accumulator, Snapshot, Sums};
 pub use tiles::{Columns, SymmetricTiles, TILE};
 
-use serde::Serialize;
+use std::collections::BTreeMap;
 
+use serde::Serialize;
+use thiserror::Error;
+
+use crate::array::harmonic::GeometryRefusal;
 use crate::frames::PlacedVisibilities;
 
 /// What an engine or its sums hold.
@@ -30,14 +38,55 @@ pub struct SumCounts {
     pub weight: f64,
 }
 
+/// Why an engine does not take a visibility.
+#[derive(Clone, Copy, Debug, Error, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[non_exhaustive]
+pub enum Refusal {
+    /// Its satellites are not where the engine's basis needs them.
+    #[error(transparent)]
+    Geometry(#[from] GeometryRefusal),
+    /// Its baseline is longer than the engine was made for.
+    #[error("baseline beyond the engine's limit")]
+    TooLong,
+    /// Its value or weight is no number that can be summed.
+    #[error("value or weight not finite, or weight not positive")]
+    NotFinite,
+}
+
+impl Refusal {
+    /// The reason as the ledger names it.
+    #[must_use]
+    pub fn reason(self) -> &'static str {
+        match self {
+            Self::Geometry(GeometryRefusal::NotFinite) => "refused by the engine: a position is not finite",
+            Self::Geometry(GeometryRefusal::Degenerate) => {
+                "refused by the engine: the baseline has no direction"
+            }
+            Self::Geometry(GeometryRefusal::Inclination) => "refused by the engine: out of the orbit's plane",
+            Self::Geometry(GeometryRefusal::Altitude) => "refused by the engine: off the orbit's altitude",
+            Self::Geometry(GeometryRefusal::UnequalRadii) => {
+                "refused by the engine: unequal altitudes of a pair"
+            }
+            Self::TooLong => "refused by the engine: baseline beyond its limit",
+            Self::NotFinite => "refused by the engine: value or weight not finite, or weight not positive",
+        }
+    }
+}
+
 /// What became of the visibilities of one call; the two parts make up the call.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 #[must_use]
 pub struct Added {
     /// Taken into the sums.
     pub visibilities: u64,
-    /// Refused: their geometry lies outside what the engine covers.
-    pub refused: u64,
+    /// Refused, by reason.
+    pub refused: BTreeMap<Refusal, u64>,
+}
+
+impl Added {
+    fn refuse(&mut self, reason: Refusal) {
+        *self.refused.entry(reason).or_default() += 1;
+    }
 }
 
 /// Takes visibilities of one channel, one block after another.
@@ -54,6 +103,9 @@ pub trait NormalEngine: Send {
     /// A block that is none of this engine's channel. Geometry that the engine does not cover is
     /// counted as refused instead.
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
+
+    /// Adds what waits for company, if anything does; changes no bit of the sums.
+    fn settle(&mut self) {}
 
     /// Adds what another engine of the same setup holds.
     ///

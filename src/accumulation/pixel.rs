@@ -1,18 +1,17 @@
 //! The pixel engine: BtN^-1B itself, pixel by pixel.
 
 use num_complex::Complex64;
-use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
 use super::checkpoint;
 use super::error::AccumulationError;
+use super::noise::companion_noise;
 use super::tiles::{Columns, SymmetricTiles};
 use super::{Added, NormalEngine, NormalSums, SumCounts};
 use crate::array::response::{PairGeometry, PixelMethod, RowMaker};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::sky::healpix::{pixel_area_sr, pixel_count};
 use crate::units::vector::Vec3;
-use crate::units::{MissionTime, StreamKind, random_stream};
 
 /// Visibilities whose rows are made and multiplied together: 256 columns, so that a product reads and
 /// writes the matrix rarely, and its rows stay in cache.
@@ -174,16 +173,6 @@ impl PixelEngine {
         let pending = std::mem::take(&mut self.pending);
         self.sums.add_block(&self.setup, &self.rows, &pending);
     }
-
-    fn noise(&self, placed: &PlacedVisibilities, k: usize) -> Complex64 {
-        let pair = u64::from(placed.pair.i) << 8 | u64::from(placed.pair.j);
-        let identity =
-            [u64::from(placed.channel.0) << 32 | pair, MissionTime::from_seconds(placed.time_s[k]).0 as u64];
-        let mut stream = random_stream(self.setup.companion_seed, StreamKind::CompanionNoise, identity);
-        let mut draw = || -> f64 { StandardNormal.sample(&mut stream) };
-        let re = draw();
-        Complex64::new(re, draw())
-    }
 }
 
 impl NormalEngine for PixelEngine {
@@ -202,13 +191,13 @@ impl NormalEngine for PixelEngine {
                 r_j_m: placed.r_j_m[k],
                 value_k_sr: placed.value_k_sr[k],
                 weight: placed.weight[k],
-                noise: self.noise(placed, k),
+                noise: companion_noise(self.setup.companion_seed, placed, k),
             });
             if self.pending.len() == BLOCK {
                 self.settle();
             }
         }
-        Ok(Added { visibilities: placed.len() as u64, refused: 0 })
+        Ok(Added { visibilities: placed.len() as u64, ..Added::default() })
     }
 
     fn merge(&mut self, mut other: Self) -> Result<(), AccumulationError> {

@@ -2,7 +2,12 @@
 
 use std::sync::Arc;
 
-use super::{AccumulationError, MapConfig, NormalEngine, PixelEngine, PixelSetup, PixelSums};
+use super::harmonic::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
+use super::{
+    AccumulationError, Added, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine, PixelSetup,
+    PixelSums, Refusal, SumCounts,
+};
+use crate::array::harmonic::GeometryRefusal;
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities};
 use crate::runtime::{Ledger, Outlet, Stage, Units};
 use crate::units::ChannelId;
@@ -20,13 +25,63 @@ pub struct Snapshot {
     pub is_final: bool,
     /// First and last mission time of the data in it, s.
     pub span_s: [f64; 2],
+    /// nside of the map that is wanted.
+    pub nside: usize,
     /// The sums.
-    pub sums: PixelSums,
+    pub sums: Sums,
+}
+
+/// Sums of either engine.
+pub enum Sums {
+    /// Over pixels.
+    Pixel(PixelSums),
+    /// Over harmonics.
+    Harmonic(Box<HarmonicSums>),
+}
+
+impl Sums {
+    /// What is in the sums.
+    #[must_use]
+    pub fn counts(&self) -> SumCounts {
+        match self {
+            Self::Pixel(sums) => sums.counts(),
+            Self::Harmonic(sums) => sums.counts(),
+        }
+    }
+}
+
+/// Either engine.
+enum Engine {
+    Pixel(Box<PixelEngine>),
+    Harmonic(Box<HarmonicEngine>),
+}
+
+impl Engine {
+    fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        match self {
+            Self::Pixel(engine) => engine.add(placed),
+            Self::Harmonic(engine) => engine.add(placed),
+        }
+    }
+
+    fn sums(&self) -> Sums {
+        match self {
+            Self::Pixel(engine) => Sums::Pixel(engine.sums()),
+            Self::Harmonic(engine) => Sums::Harmonic(Box::new(engine.sums())),
+        }
+    }
+
+    fn into_sums(self) -> Sums {
+        match self {
+            Self::Pixel(engine) => Sums::Pixel(engine.into_sums()),
+            Self::Harmonic(engine) => Sums::Harmonic(Box::new(engine.into_sums())),
+        }
+    }
 }
 
 /// One channel's engine and what it holds.
 struct ChannelSums {
-    engine: PixelEngine,
+    engine: Engine,
     span_s: [f64; 2],
     snapshots: u32,
 }
@@ -58,24 +113,19 @@ impl Accumulator {
         Ok(())
     }
 
-    fn sums(&mut self, channel: ChannelId) -> Result<&mut ChannelSums, AccumulationError> {
+    /// The sums that `placed` belongs to, made if it is the first data; `None` if it does not tell where it was
+    /// measured.
+    fn sums(&mut self, placed: &PlacedVisibilities) -> Result<Option<&mut ChannelSums>, AccumulationError> {
+        let channel = placed.channel;
         let index = usize::from(channel.0);
         let unknown = || AccumulationError::UnknownChannel(channel);
         let instrument = self.instrument.as_ref().ok_or_else(unknown)?;
         let slot = self.channels.get_mut(index).ok_or_else(unknown)?;
         if slot.is_none() {
-            let Channel { frequency_hz, .. } = instrument.channels[index];
-            let engine = PixelEngine::new(PixelSetup {
-                nside: self.config.nside,
-                frequency_hz,
-                method: self.config.rows,
-                moon_radius_m: instrument.moon_radius_m,
-                response: instrument.response,
-                companion_seed: self.config.companion_seed,
-            })?;
+            let Some(engine) = engine(&self.config, instrument, placed)? else { return Ok(None) };
             *slot = Some(ChannelSums { engine, span_s: [f64::INFINITY, f64::NEG_INFINITY], snapshots: 0 });
         }
-        slot.as_mut().ok_or_else(unknown)
+        Ok(slot.as_mut())
     }
 
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<(), AccumulationError> {
@@ -85,14 +135,20 @@ impl Accumulator {
             // A channel of which nothing is used has no sums, and no map.
             return Ok(());
         }
-        let sums = self.sums(placed.channel)?;
-        let added = sums.engine.add(&near)?.visibilities;
+        let Some(sums) = self.sums(&near)? else {
+            let reason = Refusal::Geometry(GeometryRefusal::Degenerate);
+            self.ledger.flagged(reason.reason(), near.len() as u64);
+            return Ok(());
+        };
+        let Added { visibilities, refused } = sums.engine.add(&near)?;
         if let (Some(first), Some(last)) = (near.time_s.first(), near.time_s.last()) {
             sums.span_s = [sums.span_s[0].min(*first), sums.span_s[1].max(*last)];
         }
-        self.accumulated += added;
-        self.ledger.accumulated(added);
-        self.ledger.flagged("refused by the engine", near.len() as u64 - added);
+        self.accumulated += visibilities;
+        self.ledger.accumulated(visibilities);
+        for (reason, count) in refused {
+            self.ledger.flagged(reason.reason(), count);
+        }
         Ok(())
     }
 
@@ -108,6 +164,7 @@ impl Accumulator {
                 number: channel.snapshots,
                 is_final: false,
                 span_s: channel.span_s,
+                nside: self.config.nside,
                 sums: channel.engine.sums(),
             });
         }
@@ -129,6 +186,40 @@ impl Accumulator {
             None => self.next_snapshot_s = Some(next_s),
         }
     }
+}
+
+/// The engine for the channel of `placed`, its first data.
+fn engine(
+    config: &MapConfig,
+    instrument: &Instrument,
+    placed: &PlacedVisibilities,
+) -> Result<Option<Engine>, AccumulationError> {
+    let Some(&Channel { frequency_hz, .. }) = instrument.channels.get(usize::from(placed.channel.0)) else {
+        return Err(AccumulationError::UnknownChannel(placed.channel));
+    };
+    let (moon_radius_m, response) = (instrument.moon_radius_m, instrument.response);
+    Ok(match config.engine {
+        EngineKind::Pixel => Some(Engine::Pixel(Box::new(PixelEngine::new(PixelSetup {
+            nside: config.nside,
+            frequency_hz,
+            method: config.rows,
+            moon_radius_m,
+            response,
+            companion_seed: config.companion_seed,
+        })?))),
+        EngineKind::Harmonic => match orbit_of(placed, config.limits) {
+            Some(orbit) => Some(Engine::Harmonic(Box::new(HarmonicEngine::new(HarmonicSetup {
+                l_max: config.degree(),
+                frequency_hz,
+                baseline_m_max: config.baseline_m_max(frequency_hz),
+                moon_radius_m,
+                response,
+                orbit,
+                companion_seed: config.companion_seed,
+            })?))),
+            None => None,
+        },
+    })
 }
 
 /// The visibilities whose baseline is shorter than `baseline_m_max`.
@@ -179,6 +270,7 @@ impl Stage for Accumulator {
                 number: snapshots + 1,
                 is_final: true,
                 span_s,
+                nside: self.config.nside,
                 sums: engine.into_sums(),
             });
         }

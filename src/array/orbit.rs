@@ -74,6 +74,12 @@ impl Array {
         self.orbit_radius_m
     }
 
+    /// Inclination of the orbit to the ecliptic, rad.
+    #[must_use]
+    pub fn inclination_rad(&self) -> f64 {
+        self.inclination_rad
+    }
+
     /// Orbital period, s.
     #[must_use]
     pub fn orbital_period_s(&self) -> f64 {

@@ -27,6 +27,10 @@ pub(super) struct CompareArgs {
     /// Noise-only map (FITS), for SNR_l.
     #[arg(long, value_name = "NOISE.fits")]
     noise: Option<PathBuf>,
+    /// Leave the degrees beyond L out of the truth, instead of averaging it over the map's pixels: for maps of
+    /// harmonics up to L.
+    #[arg(long, value_name = "L")]
+    band_limit: Option<usize>,
     /// Greatest degree; 3 nside - 1 if not given.
     #[arg(long)]
     l_max: Option<usize>,
@@ -44,7 +48,10 @@ pub(super) struct CompareArgs {
 
 pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     let map = read(&args.map)?;
-    let truth = read(&args.truth)?;
+    let mut truth = read(&args.truth)?;
+    if let Some(l_max) = args.band_limit {
+        truth = truth.band_limited(map.nside(), l_max)?;
+    }
     let noise = args.noise.as_deref().map(read).transpose()?;
     let comparison = compare(&map, &truth, noise.as_ref(), args.l_max)?;
     if args.json {

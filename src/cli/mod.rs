@@ -3,6 +3,7 @@
 mod bench;
 mod check;
 mod compare;
+mod corrupt;
 mod geometry;
 mod inspect;
 mod predict;
@@ -53,6 +54,7 @@ enum Command {
     Simulate(simulate::SimulateArgs),
     Replay(replay::ReplayArgs),
     Inspect(inspect::InspectArgs),
+    Corrupt(corrupt::CorruptArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
     Predict(predict::PredictArgs),
@@ -73,6 +75,9 @@ struct PipelineArgs {
     /// Replace one setting, for example --set map.nside=32; may be given again.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
+    /// Format of the downlink, in place of the file's: space packets as they are, or in coded transfer frames.
+    #[arg(long, value_name = "packets|cadu")]
+    format: Option<String>,
 }
 
 /// An array, for commands that need no more of a pipeline.
@@ -94,8 +99,10 @@ impl ArrayArgs {
 
 impl PipelineArgs {
     fn source(&self) -> ConfigSource {
-        let Self { pipeline, seed, overrides } = self;
-        ConfigSource { file: pipeline.clone(), overrides: overrides.clone(), seed: *seed }
+        let Self { pipeline, seed, overrides, format } = self;
+        let format = format.iter().map(|format| format!("downlink.format={format:?}"));
+        let overrides = overrides.iter().cloned().chain(format).collect();
+        ConfigSource { file: pipeline.clone(), overrides, seed: *seed }
     }
 }
 
@@ -110,6 +117,7 @@ pub fn main() -> ExitCode {
         Command::Simulate(args) => simulate::execute(&args),
         Command::Replay(args) => replay::execute(&args),
         Command::Inspect(args) => inspect::execute(&args),
+        Command::Corrupt(args) => corrupt::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
         Command::Predict(args) => predict::execute(&args),

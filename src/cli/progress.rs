@@ -1,7 +1,6 @@
 //! Progress of long work: a bar on a terminal, plain lines otherwise; and Ctrl-C.
 
 use std::io::IsTerminal;
-use std::sync::Arc;
 use std::sync::mpsc::{Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -9,7 +8,9 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::CommandError;
-use crate::runtime::{Cancel, Metrics};
+use crate::pipeline::Watched;
+use crate::runtime::Cancel;
+use crate::solve::Solving;
 
 /// Time between looks at the counters on a terminal.
 const POLL: Duration = Duration::from_millis(200);
@@ -38,13 +39,13 @@ pub(super) struct Progress {
 
 impl Progress {
     /// Shows how far stage `stage` is, of `total` items taken or given; `total` 0 if that is unknown.
-    pub(super) fn watch(metrics: Arc<Metrics>, stage: &'static str, total: u64) -> Self {
+    pub(super) fn watch(watched: Watched, stage: &'static str, total: u64) -> Self {
         let (stop, stopped) = channel();
         let thread = std::thread::spawn(move || {
-            let shown = Shown::new(total);
+            let mut shown = Shown::new(total);
             let wait = if shown.bar.is_some() { POLL } else { LINE_EVERY };
             while stopped.recv_timeout(wait).is_err_and(|e| e == std::sync::mpsc::RecvTimeoutError::Timeout) {
-                shown.show(&metrics, stage);
+                shown.show(&watched, stage);
             }
             if let Some(bar) = shown.bar {
                 bar.finish_and_clear();
@@ -68,6 +69,8 @@ struct Shown {
     bar: Option<ProgressBar>,
     total: u64,
     since: Instant,
+    /// The solution on view: its number, when it was first seen, and its residual then.
+    solution: Option<(u64, Instant, f64)>,
 }
 
 impl Shown {
@@ -81,17 +84,37 @@ impl Shown {
             let style = ProgressStyle::with_template(template);
             ProgressBar::new(total).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
         });
-        Self { bar, total, since: Instant::now() }
+        Self { bar, total, since: Instant::now(), solution: None }
     }
 
-    fn show(&self, metrics: &Metrics, stage: &str) {
-        let stages = metrics.snapshot();
+    /// What is being solved, and how long it will take if the residual goes on falling as it has.
+    fn solution(&mut self, solving: &Solving) -> String {
+        let Solving { number, what, iteration, residual, target } = solving;
+        let (_, since, first) = match self.solution {
+            Some(seen) if seen.0 == *number => seen,
+            _ => *self.solution.insert((*number, Instant::now(), *residual)),
+        };
+        let (done, whole) = ((first / residual).ln(), (first / target).ln());
+        let elapsed_s = since.elapsed().as_secs_f64();
+        let left = if done > 0.05 * whole && elapsed_s > 1.0 {
+            format!(", about {:.0} s left", elapsed_s * (whole / done - 1.0).max(0.0))
+        } else {
+            String::new()
+        };
+        format!("{what}: step {iteration}, residual {residual:.1e} of {target:.0e}{left}")
+    }
+
+    fn show(&mut self, watched: &Watched, stage: &str) {
+        let stages = watched.metrics.snapshot();
         let done = stages.iter().find(|s| s.name == stage).map_or(0, |s| s.items_in.saturating_sub(1));
-        let message: Vec<String> = stages
+        let mut message: Vec<String> = stages
             .iter()
             .filter(|s| !s.units.name.is_empty() && s.units.count > 0)
             .map(|s| format!("{} {} {}", s.name, s.units.count, s.units.name))
             .collect();
+        if let Some(solving) = watched.solving.now() {
+            message.push(self.solution(&solving));
+        }
         let message = message.join(", ");
         match &self.bar {
             Some(bar) => {

@@ -11,10 +11,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use crate::array::Array;
 use crate::array::response::kernel::fused;
 use crate::frames::Channel;
-use crate::mother::{PairPosition, Prediction, VisibilityModel};
+use crate::mother::{ModelError, PairPosition, Prediction, VisibilityModel};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, add, norm, scale, sub};
-use crate::units::{ChannelId, Pair, all_pairs};
+use crate::units::{Pair, all_pairs};
 
 /// Equally spaced instants at which covariances are wanted.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -76,13 +76,9 @@ impl Tables {
 
 /// Where a model of one channel is asked.
 pub struct Request<'a> {
-    /// The model.
-    pub model: &'a dyn VisibilityModel,
     /// The array.
     pub array: &'a Array,
-    /// Which channel.
-    pub id: ChannelId,
-    /// Its frequency and width.
+    /// The channel's frequency and width.
     pub channel: Channel,
     /// Receiver noise of each daughter, K sr.
     pub receiver_noise_k_sr: f64,
@@ -94,8 +90,10 @@ pub struct Request<'a> {
 
 impl Covariances {
     /// Asks the model and interpolates to the epochs.
-    #[must_use]
-    pub fn predict(request: &Request<'_>) -> Self {
+    ///
+    /// # Errors
+    /// [`ModelError`], for positions that the model does not cover.
+    pub fn predict(model: &mut dyn VisibilityModel, request: &Request<'_>) -> Result<Self, ModelError> {
         let daughters = request.array.satellites();
         let plans: Vec<Plan> =
             all_pairs(daughters).into_iter().map(|pair| Plan::new(request, pair)).collect();
@@ -108,11 +106,11 @@ impl Covariances {
             positions.extend(steady.instants_s(request.epochs).map(|t_s| {
                 // The plane of the orbit, which a dipole stands on, asks for two places: 1.5 m apart.
                 let place = |t_s| request.array.position_m(daughter, t_s);
-                PairPosition { r_i_m: place(t_s), r_j_m: place(t_s + 1e-3) }
+                PairPosition { r_i_m: place(t_s), r_j_m: place(t_s + 1e-3), span_rad: 0.0 }
             }));
         }
         let mut predictions = vec![Prediction::default(); positions.len()];
-        request.model.predict(request.id, &positions, &mut predictions);
+        model.predict(&positions, &mut predictions)?;
         let mut rest = &predictions[..];
         let mut series = Vec::with_capacity(plans.len());
         for plan in &plans {
@@ -132,7 +130,7 @@ impl Covariances {
                 .collect()
         });
         let powers = powers.collect();
-        Self { series, powers }
+        Ok(Self { series, powers })
     }
 
     /// Number of daughters.
@@ -292,7 +290,7 @@ pub(super) fn stretched(r_i_m: Vec3, r_j_m: Vec3, factor: f64) -> PairPosition {
     let (middle_m, half_m, radius_m) = (norm(middle), norm(half), norm(r_i_m));
     let depth_m = (radius_m * radius_m - half_m * half_m).max(0.0).sqrt();
     let centre = scale(depth_m / middle_m, middle);
-    PairPosition { r_i_m: add(centre, half), r_j_m: sub(centre, half) }
+    PairPosition { r_i_m: add(centre, half), r_j_m: sub(centre, half), span_rad: 0.0 }
 }
 
 #[cfg(test)]
@@ -311,11 +309,12 @@ mod tests {
     }
 
     impl VisibilityModel for Point {
-        fn predict(&self, _: ChannelId, positions: &[PairPosition], out: &mut [Prediction]) {
+        fn predict(&mut self, positions: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError> {
             for (out, at) in out.iter_mut().zip(positions) {
                 let visibility_k_sr = fringe(self.0, FREQUENCY_HZ, at.r_i_m, at.r_j_m);
                 *out = Prediction { visibility_k_sr, zero_spacing_k_sr: 1.0 };
             }
+            Ok(())
         }
     }
 
@@ -326,15 +325,13 @@ mod tests {
         let (from_s, step_s, count) = (5000.0, 8e-3, 257);
         let n_hat = crate::units::vector::unit(sub(array.position_m(0, from_s), array.position_m(7, from_s)));
         let request = Request {
-            model: &Point(n_hat),
             array: &array,
-            id: ChannelId(0),
             channel: Channel { frequency_hz: FREQUENCY_HZ, width_hz: 8e3 },
             receiver_noise_k_sr: 0.5,
             epochs: Epochs { start_s: from_s, step_s, count },
             tables: &Tables::default(),
         };
-        let found = Covariances::predict(&request);
+        let found = Covariances::predict(&mut Point(n_hat), &request).unwrap();
         assert!((found.power(3, 100) - 1.5).abs() < 1e-5);
         for epoch in [0, 100, 256] {
             let t_s = from_s + step_s * epoch as f64;

@@ -1,6 +1,5 @@
 //! The source of the space segment in sample fidelity: windows, as samples of all daughters and channels.
 
-use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
@@ -13,7 +12,7 @@ use super::quantiser::Quantiser;
 use super::synthesis::{DrawKey, HOP, Response, Synthesis};
 use crate::array::Array;
 use crate::frames::{Channel, ObservingWindow, SampleBlock, SpaceFrame};
-use crate::mother::VisibilityModel;
+use crate::mother::{ModelError, VisibilityModel};
 use crate::runtime::{Flow, Outlet, Source, Units};
 use crate::units::{ChannelId, MissionTime, TICKS_PER_SECOND};
 
@@ -21,12 +20,11 @@ use crate::units::{ChannelId, MissionTime, TICKS_PER_SECOND};
 const CHUNK_SAMPLES: usize = 1 << 15;
 
 /// What the daughters listen to, and where they are.
-#[derive(Clone)]
 pub struct Scene {
     /// The array.
     pub array: Arc<Array>,
-    /// The sky, as the array sees it.
-    pub model: Arc<dyn VisibilityModel>,
+    /// The sky, as the array sees it: one model a channel.
+    pub models: Vec<Box<dyn VisibilityModel>>,
     /// Channels.
     pub channels: Vec<Channel>,
     /// Receiver noise T_rec / zeta of each daughter, K sr.
@@ -110,27 +108,25 @@ impl Sampler {
     }
 
     /// The next stretch of the current window.
-    fn stretch(&mut self, progress: &mut Progress, out: &mut Outlet<SpaceFrame>) {
+    fn stretch(&mut self, progress: &mut Progress, out: &mut Outlet<SpaceFrame>) -> Result<(), ModelError> {
         let samples = CHUNK_SAMPLES.max(self.config.block_samples).min(progress.samples - progress.done);
         let width_hz = self.width_hz();
         let from = self.time(progress.window.start, progress.done);
         let epochs =
             Epochs { start_s: from.seconds(), step_s: HOP as f64 / width_hz, count: samples / HOP + 1 };
-        let scene = &self.scene;
-        let covariances: Vec<Covariances> = (0..scene.channels.len())
-            .into_par_iter()
-            .map(|k| {
-                Covariances::predict(&Request {
-                    model: scene.model.as_ref(),
-                    array: &scene.array,
-                    id: ChannelId(k as u16),
-                    channel: scene.channels[k],
-                    receiver_noise_k_sr: scene.receiver_noise_k_sr,
-                    epochs,
-                    tables: &self.tables,
-                })
-            })
-            .collect();
+        let Scene { array, models, channels, receiver_noise_k_sr, .. } = &mut self.scene;
+        let request = |channel| Request {
+            array: &*array,
+            channel,
+            receiver_noise_k_sr: *receiver_noise_k_sr,
+            epochs,
+            tables: &self.tables,
+        };
+        let asked = models.par_iter_mut().zip(&*channels);
+        let predicted: Vec<Result<Covariances, ModelError>> =
+            asked.map(|(model, &channel)| Covariances::predict(model.as_mut(), &request(channel))).collect();
+        // The first error in the order of channels, whichever thread was first.
+        let covariances = predicted.into_iter().collect::<Result<Vec<_>, _>>()?;
         for covariances in &covariances {
             self.synthesis.prepare(covariances);
         }
@@ -148,6 +144,7 @@ impl Sampler {
             progress.quantisers.par_iter_mut().enumerate().map(job).collect();
         progress.done += samples;
         self.hand_on(made, out);
+        Ok(())
     }
 
     /// Blocks in the order of time, channel, daughter.
@@ -271,9 +268,9 @@ impl ChannelWork<'_> {
 
 impl Source for Sampler {
     type Out = SpaceFrame;
-    type Error = Infallible;
+    type Error = ModelError;
 
-    fn next(&mut self, out: &mut Outlet<SpaceFrame>) -> Result<Flow, Infallible> {
+    fn next(&mut self, out: &mut Outlet<SpaceFrame>) -> Result<Flow, ModelError> {
         let mut progress = match self.current.take() {
             Some(progress) => progress,
             None => {
@@ -284,7 +281,7 @@ impl Source for Sampler {
             }
         };
         if progress.done < progress.samples {
-            self.stretch(&mut progress, out);
+            self.stretch(&mut progress, out)?;
         }
         if progress.done < progress.samples {
             self.current = Some(progress);
@@ -295,7 +292,7 @@ impl Source for Sampler {
     }
 
     /// A window that is broken off ends where its samples end.
-    fn finish(&mut self, out: &mut Outlet<SpaceFrame>) -> Result<(), Infallible> {
+    fn finish(&mut self, out: &mut Outlet<SpaceFrame>) -> Result<(), ModelError> {
         if let Some(progress) = self.current.take() {
             let end = self.time(progress.window.start, progress.done);
             out.push(SpaceFrame::WindowEnd(ObservingWindow { end, ..progress.window }));

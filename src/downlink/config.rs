@@ -2,27 +2,61 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::cadu::{CaduEncoder, INTERLEAVES, ReedSolomon};
 use super::error::DownlinkError;
 use super::header::PACKET_BYTES_MAX;
+use super::link::LinkConfig;
 
 /// Least packet that holds headers and more than one record of any kind.
 const PACKET_BYTES_MIN: usize = 256;
 
+/// Most frames of idle data before a pass: a megabyte.
+const IDLE_FRAMES_MAX: u32 = 1_000;
+
+/// What a downlink is made of.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Format {
+    /// Space packets, one after the other.
+    #[default]
+    Packets,
+    /// Packets in coded transfer frames (CADU).
+    Cadu,
+}
+
 /// The `[downlink]` section.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DownlinkConfig {
+    /// Plain packets, or packets in coded frames.
+    pub format: Format,
     /// Greatest packet, bytes. A lost packet loses its own visibilities only (21 bytes each).
     pub packet_bytes_max: usize,
     /// After so many bytes the instrument description and the present ephemeris are sent again, so that
     /// no single damaged packet costs more than this.
     pub repeat_bytes: u64,
+    /// Reed-Solomon codewords interleaved in a block, for `cadu`: 1, 2, 3, 4, 5 or 8. A frame has 223 bytes each.
+    pub interleave: usize,
+    /// Spacecraft identifier of the frames, for `cadu`.
+    pub spacecraft_id: u8,
+    /// Frames of idle data that begin each pass, for `cadu`: the ground needs one to find the stream.
+    pub idle_frames: u32,
+    /// Faults of the link; none unless asked for.
+    pub link: LinkConfig,
 }
 
 impl Default for DownlinkConfig {
     /// Packets of 8 KiB (about eight transfer frames of 1115 bytes), repeats once a MiB (about 1 %).
     fn default() -> Self {
-        Self { packet_bytes_max: 8_192, repeat_bytes: 1 << 20 }
+        Self {
+            format: Format::Packets,
+            packet_bytes_max: 8_192,
+            repeat_bytes: 1 << 20,
+            interleave: 5,
+            spacecraft_id: 0x4C,
+            idle_frames: 2,
+            link: LinkConfig::default(),
+        }
     }
 }
 
@@ -45,6 +79,42 @@ impl DownlinkConfig {
                 expected: "at least 65536",
             });
         }
+        if !INTERLEAVES.contains(&self.interleave) {
+            found.push(DownlinkError::Parameter {
+                key: "interleave",
+                value: self.interleave as u64,
+                expected: "1, 2, 3, 4, 5 or 8",
+            });
+        }
+        if self.idle_frames > IDLE_FRAMES_MAX {
+            found.push(DownlinkError::Parameter {
+                key: "idle_frames",
+                value: u64::from(self.idle_frames),
+                expected: "at most 1000",
+            });
+        }
+        found.extend(self.link.problems(self.format));
         found
+    }
+
+    /// The code of the frames; `None` for plain packets.
+    #[must_use]
+    pub fn code(&self) -> Option<ReedSolomon> {
+        ReedSolomon::new(self.interleave).filter(|_| self.format == Format::Cadu)
+    }
+
+    /// Bytes sent for each byte of packets: 1279 for 1107 with five codewords a frame.
+    #[must_use]
+    pub fn expansion(&self) -> f64 {
+        match self.format {
+            Format::Packets => 1.0,
+            Format::Cadu => (4 + 255 * self.interleave) as f64 / (223 * self.interleave - 8) as f64,
+        }
+    }
+
+    /// The encoder of frames that the format asks for; `None` for plain packets.
+    #[must_use]
+    pub fn encoder(&self) -> Option<CaduEncoder> {
+        self.code().map(|code| CaduEncoder::new(code, self.spacecraft_id, self.idle_frames))
     }
 }

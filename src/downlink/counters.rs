@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::cadu::FrameCounters;
 use super::kind::Kind;
 use super::payload::PayloadFault;
 
@@ -67,7 +68,9 @@ impl FaultCounts {
 /// packets. Visibilities in good packets are `decoded + bad_value + refused + before_instrument + foreign`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ReceptionCounters {
-    /// Bytes received.
+    /// Coded frames, if packets came in such; all other counts are of what was recovered from them.
+    pub frames: Option<FrameCounters>,
+    /// Bytes received; of coded frames, those of packets.
     pub bytes: u64,
     /// Bytes that belong to no packet.
     pub bytes_garbage: u64,
@@ -142,6 +145,9 @@ impl ReceptionCounters {
 impl std::fmt::Display for ReceptionCounters {
     /// A line for each kind of packet, and one for everything that was wrong.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        if let Some(frames) = &self.frames {
+            writeln!(f, "{frames}")?;
+        }
         for kind in Kind::ALL {
             let counts = self.kind(kind);
             if *counts != KindCounts::default() {

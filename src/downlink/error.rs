@@ -54,10 +54,47 @@ pub enum DownlinkError {
         /// The file.
         path: PathBuf,
     },
+    /// A configuration value of the link outside its range.
+    #[error("downlink.link.{key} = {value}: expected {expected}")]
+    Link {
+        /// Key in the `[downlink.link]` section.
+        key: &'static str,
+        /// Value found.
+        value: f64,
+        /// Range that is accepted.
+        expected: &'static str,
+    },
+    /// A downlink that was to be damaged and already is.
+    #[error(
+        "at byte {offset}: no sound frame or packet; expected a whole downlink, as `lunarray simulate` writes it"
+    )]
+    Unsound {
+        /// Place in it.
+        offset: u64,
+    },
+    /// What is wrong with a file.
+    #[error("{}: {source}", path.display())]
+    At {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: Box<DownlinkError>,
+    },
+    /// Files of both formats together.
+    #[error(
+        "{} and {} are of different formats (packets, and coded frames of packets); replay them apart",
+        other.display(), path.display()
+    )]
+    Mixed {
+        /// The file.
+        path: PathBuf,
+        /// One before it, of the other format.
+        other: PathBuf,
+    },
     /// A file in which nothing of ours was found.
     #[error(
         "{}: not one downlink packet in {bytes} bytes; expected CCSDS space packets with APIDs 0x101 to \
-         0x105 and CUC times (P-field 0x1F), as `lunarray simulate` writes them",
+         0x105 and CUC times (P-field 0x1F), plain or in CADUs of AOS frames, as `lunarray simulate` writes them",
         path.display()
     )]
     Foreign {
@@ -66,4 +103,11 @@ pub enum DownlinkError {
         /// Its length.
         bytes: u64,
     },
+}
+
+impl DownlinkError {
+    /// The error with the file that it is about.
+    pub(super) fn at(self, path: &std::path::Path) -> Self {
+        Self::At { path: path.to_owned(), source: Box::new(self) }
+    }
 }

@@ -1,19 +1,21 @@
-//! Downlink files.
+//! Downlink files of either format.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
+use super::cadu::FrameCounters;
 use super::config::DownlinkConfig;
 use super::counters::ReceptionCounters;
 use super::decoder::Decoder;
 use super::error::DownlinkError;
-use super::packetizer::Packetizer;
-use super::receiver::{Event, Receiver};
+use super::intake::Intake;
+use super::receiver::Event;
+use super::transmission::Transmission;
 use crate::files::{AtomicFile, Unfinished};
 use crate::frames::GroundFrame;
 
-/// Writes frames to a file of packets.
+/// Writes frames to a file of packets, or of coded frames of packets.
 ///
 /// The file is called `NAME.partial` until [`DownlinkWriter::finish`] has put all of it on the disk; then it takes its
 /// name, replacing an older one. Cut short by whatever it is, what is there can be read.
@@ -21,7 +23,7 @@ use crate::frames::GroundFrame;
 pub struct DownlinkWriter {
     path: PathBuf,
     file: AtomicFile,
-    packetizer: Packetizer,
+    transmission: Transmission,
     pending: Vec<u8>,
 }
 
@@ -31,18 +33,18 @@ impl DownlinkWriter {
     /// # Errors
     /// A bad configuration, or a file that cannot be written.
     pub fn create(path: &Path, config: &DownlinkConfig) -> Result<Self, DownlinkError> {
-        let packetizer = Packetizer::new(config)?;
+        let transmission = Transmission::new(config)?;
         let file = AtomicFile::create(path, Unfinished::Keep).map_err(io_error(path, "create the file"))?;
-        Ok(Self { path: path.to_owned(), file, packetizer, pending: Vec::new() })
+        Ok(Self { path: path.to_owned(), file, transmission, pending: Vec::new() })
     }
 
-    /// Appends the packets of a frame.
+    /// Appends what a frame adds to the downlink.
     ///
     /// # Errors
-    /// Those of [`Packetizer::encode`], and a file that cannot be written.
+    /// Those of [`Transmission::send`], and a file that cannot be written.
     pub fn write(&mut self, frame: &GroundFrame) -> Result<(), DownlinkError> {
         self.pending.clear();
-        self.packetizer.encode(frame, &mut self.pending)?;
+        self.transmission.send(frame, &mut self.pending)?;
         self.file.write_all(&self.pending).map_err(io_error(&self.path, "write"))
     }
 
@@ -56,17 +58,20 @@ impl DownlinkWriter {
     ///
     /// # Errors
     /// A file that cannot be written or renamed.
-    pub fn finish(self) -> Result<u64, DownlinkError> {
+    pub fn finish(mut self) -> Result<u64, DownlinkError> {
+        self.pending.clear();
+        self.transmission.finish(&mut self.pending);
+        self.file.write_all(&self.pending).map_err(io_error(&self.path, "write"))?;
         self.file.finish().map_err(io_error(&self.path, "finish the file"))
     }
 }
 
-/// Reads frames from a file of packets, in bounded memory.
+/// Reads frames from a file of either format, in bounded memory.
 #[derive(Debug)]
 pub struct DownlinkReader<R = File> {
     path: PathBuf,
     source: R,
-    receiver: Receiver,
+    receiver: Intake,
     decoder: Decoder,
     packets: u64,
     finished: bool,
@@ -89,7 +94,7 @@ impl<R: Read> DownlinkReader<R> {
         Self {
             path: path.to_owned(),
             source,
-            receiver: Receiver::new(),
+            receiver: Intake::new(),
             decoder: Decoder::new(),
             packets: 0,
             finished: false,
@@ -134,6 +139,12 @@ impl<R: Read> DownlinkReader<R> {
     #[must_use]
     pub fn counters(&self) -> &ReceptionCounters {
         self.decoder.counters()
+    }
+
+    /// The account of the coded frames, if the file holds such.
+    #[must_use]
+    pub fn frames(&self) -> Option<FrameCounters> {
+        self.receiver.frames()
     }
 
     fn end(&mut self) -> Result<(), DownlinkError> {

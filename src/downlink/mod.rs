@@ -6,12 +6,12 @@
 //! |---|---|---|
 //! | payload: records and arrays | own, versioned | `payload` |
 //! | space packet, time code | CCSDS 133.0-B, 301.0-B | [`Packetizer`], [`Receiver`] |
-//! | transfer frame, Reed-Solomon, randomizer, sync marker | CCSDS 732.0-B, 131.0-B | not yet |
+//! | transfer frame, Reed-Solomon, randomizer, sync marker | CCSDS 732.0-B, 131.0-B | [`cadu`] |
+//! | either of the two | | [`Intake`] |
 //! | file | | [`DownlinkWriter`], [`DownlinkReader`], [`Contents`] |
 //!
-//! A frame layer slots in between packets and files: it takes the bytes that [`Packetizer::encode`] appends
-//! and hands what it recovers to [`Receiver::push`], whatever the chunks are. Idle packets are its own
-//! affair and never reach the receiver.
+//! The frame layer takes the bytes that [`Packetizer::encode`] appends and hands what it recovers to
+//! [`Receiver::push`]. Idle packets are its own affair and never reach the receiver.
 //!
 //! # A packet
 //! | byte | field | |
@@ -40,6 +40,7 @@
 //! The header has a check of its own so that a damaged packet can still be told from noise, and its loss
 //! given a kind, a time and a count.
 
+pub mod cadu;
 mod config;
 pub mod contents;
 mod counters;
@@ -48,14 +49,17 @@ mod decoder;
 mod error;
 mod file;
 mod header;
+mod intake;
 mod kind;
+pub mod link;
 mod packetizer;
 mod payload;
 mod receiver;
 mod sequence;
 mod stages;
+mod transmission;
 
-pub use config::DownlinkConfig;
+pub use config::{DownlinkConfig, Format};
 pub use contents::Contents;
 pub use counters::{FaultCounts, KindCounts, ReceptionCounters};
 pub use cuc::CucTime;
@@ -63,8 +67,10 @@ pub use decoder::Decoder;
 pub use error::DownlinkError;
 pub use file::{DownlinkReader, DownlinkWriter};
 pub use header::{FORMAT_VERSION, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, Segment, TRAILER_BYTES};
+pub use intake::Intake;
 pub use kind::{APID_BASE, Kind};
 pub use packetizer::Packetizer;
 pub use payload::{NODES_MIN, PayloadFault};
 pub use receiver::{Event, Packet, Receiver};
 pub use stages::{FileSource, Reception, Recorder, Transmitter};
+pub use transmission::Transmission;

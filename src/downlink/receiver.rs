@@ -167,6 +167,21 @@ impl Receiver {
         self.finished = true;
     }
 
+    /// Whether the stream is at its end.
+    pub(super) fn is_finished(&self) -> bool {
+        self.finished
+    }
+
+    /// Whether headers of a packet, sound or damaged, are what comes next after garbage.
+    pub(super) fn has_header(&mut self) -> bool {
+        if self.steps.is_empty() {
+            self.look();
+        }
+        let of_packet =
+            |step: &Step| matches!(step, Step::Packet { .. } | Step::Duplicate(_) | Step::Damaged(..));
+        self.steps.iter().any(of_packet)
+    }
+
     /// Bytes taken so far.
     #[must_use]
     pub fn bytes(&self) -> u64 {

@@ -6,13 +6,14 @@ use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::config::DownlinkConfig;
+use super::config::{DownlinkConfig, Format};
 use super::counters::ReceptionCounters;
 use super::decoder::Decoder;
 use super::error::DownlinkError;
 use super::file::{io_error, require_packets};
-use super::packetizer::Packetizer;
-use super::receiver::{Event, Receiver};
+use super::intake::Intake;
+use super::receiver::Event;
+use super::transmission::Transmission;
 use crate::files::{AtomicFile, Unfinished};
 use crate::frames::GroundFrame;
 use crate::runtime::{Flow, Outlet, Sink, Source, Stage, Units};
@@ -20,10 +21,10 @@ use crate::runtime::{Flow, Outlet, Sink, Source, Stage, Units};
 /// Bytes read from a file at a time.
 const READ_BYTES: usize = 1 << 18;
 
-/// Turns frames into packets: the spacecraft's end of the link.
+/// Turns frames into packets or coded frames of packets: the spacecraft's end of the link.
 #[derive(Debug)]
 pub struct Transmitter {
-    packetizer: Packetizer,
+    transmission: Transmission,
     bytes: u64,
 }
 
@@ -33,7 +34,7 @@ impl Transmitter {
     /// # Errors
     /// A bad configuration.
     pub fn new(config: &DownlinkConfig) -> Result<Self, DownlinkError> {
-        Ok(Self { packetizer: Packetizer::new(config)?, bytes: 0 })
+        Ok(Self { transmission: Transmission::new(config)?, bytes: 0 })
     }
 }
 
@@ -44,9 +45,21 @@ impl Stage for Transmitter {
 
     fn step(&mut self, frame: GroundFrame, out: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
         let mut bytes = Vec::new();
-        self.packetizer.encode(&frame, &mut bytes)?;
+        self.transmission.send(&frame, &mut bytes)?;
         self.bytes += bytes.len() as u64;
-        out.push(bytes);
+        if !bytes.is_empty() {
+            out.push(bytes);
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
+        let mut bytes = Vec::new();
+        self.transmission.finish(&mut bytes);
+        self.bytes += bytes.len() as u64;
+        if !bytes.is_empty() {
+            out.push(bytes);
+        }
         Ok(())
     }
 
@@ -139,25 +152,39 @@ impl FileSource {
     /// Looks into all files, so that a wrong one is known at once.
     ///
     /// # Errors
-    /// A file that cannot be opened, is empty, or does not hold a packet of ours.
+    /// A file that cannot be opened, is empty, does not hold a packet of ours, or is of another format than the first.
     pub fn open(paths: &[PathBuf]) -> Result<Self, DownlinkError> {
-        paths.iter().try_for_each(|path| refuse_foreign(path))?;
+        let mut first: Option<(&PathBuf, Format)> = None;
+        for path in paths {
+            let format = format_of(path)?;
+            match first {
+                Some((other, expected)) if expected != format => {
+                    return Err(DownlinkError::Mixed { path: path.clone(), other: other.clone() });
+                }
+                _ => first = Some((path, format)),
+            }
+        }
         Ok(Self { files: paths.iter().cloned().collect(), now: None, bytes: 0 })
     }
 }
 
 /// Reads until the first packet of ours; all of a foreign file, in bounded memory.
-fn refuse_foreign(path: &Path) -> Result<(), DownlinkError> {
+fn format_of(path: &Path) -> Result<Format, DownlinkError> {
     let mut file = File::open(path).map_err(io_error(path, "open the file"))?;
-    let mut receiver = Receiver::new();
+    let mut receiver = Intake::new();
+    let mut at_end = false;
     loop {
         while let Some(event) = receiver.next_event() {
             if matches!(event, Event::Packet(_)) {
-                return Ok(());
+                return Ok(receiver.format().unwrap_or_default());
             }
         }
+        if at_end {
+            return require_packets(path, receiver.bytes(), 0).map(|()| Format::default());
+        }
         if receiver.fill_from(&mut file).map_err(io_error(path, "read"))? == 0 {
-            return require_packets(path, receiver.bytes(), 0);
+            receiver.finish();
+            at_end = true;
         }
     }
 }
@@ -193,7 +220,7 @@ impl Source for FileSource {
 /// Finds packets in what arrives and makes frames of them: the ground's end of the link.
 #[derive(Debug, Default)]
 pub struct Reception {
-    receiver: Receiver,
+    receiver: Intake,
     decoder: Decoder,
     account: Arc<Mutex<ReceptionCounters>>,
 }
@@ -229,11 +256,12 @@ impl Stage for Reception {
         self.receiver.finish();
         self.pass_on(out);
         self.decoder.finish();
-        *self.account.lock().unwrap_or_else(PoisonError::into_inner) = self.decoder.counters().clone();
+        *self.account.lock().unwrap_or_else(PoisonError::into_inner) =
+            ReceptionCounters { frames: self.receiver.frames(), ..self.decoder.counters().clone() };
         Ok(())
     }
 
     fn units(&self) -> Units {
-        Units::of(self.decoder.counters().bytes, "bytes")
+        Units::of(self.receiver.bytes(), "bytes")
     }
 }

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::choice::ModelChoice;
 use crate::array::IntegrationRule;
 use crate::frames::{AntennaResponse, Channel};
 use crate::units::PerChannel;
@@ -38,6 +39,11 @@ pub struct SpacecraftConfig {
     pub motion_wavelengths_max: f64,
     /// Longest baseline that is correlated, wavelengths; 0 for no limit.
     pub baseline_wavelengths_max: PerChannel<f64>,
+    /// How visibilities are simulated.
+    pub model: ModelChoice,
+    /// Whether visibilities are averages over their integrations (motion along the orbit; harmonic model only) or
+    /// of the instants in their middle.
+    pub smear_integrations: bool,
     /// Whether thermal noise is added. Weights are those of the noise either way.
     pub thermal_noise: bool,
     /// Receiver noise T_rec / zeta, as the antenna would see it from the sky, K sr.
@@ -97,6 +103,8 @@ impl Default for SpacecraftConfig {
             integration_s_max: rule.duration_s_max,
             motion_wavelengths_max: rule.motion_wavelengths_max,
             baseline_wavelengths_max: PerChannel::All(0.0),
+            model: ModelChoice::default(),
+            smear_integrations: false,
             thermal_noise: true,
             receiver_noise_k_sr: 0.0,
             antenna: Antenna::default(),
@@ -144,6 +152,18 @@ pub enum SpacecraftError {
         /// Number of channels.
         channels: usize,
     },
+    /// Averages asked of direct sums.
+    #[error(
+        "spacecraft.smear_integrations: direct sums are of instants; expected spacecraft.model = \"harmonic\" or \
+         \"auto\" with it"
+    )]
+    Smearing,
+    /// Samples asked of a model that they do not have.
+    #[error(
+        "spacecraft.fidelity = \"samples\" takes direct sums of instants: expected spacecraft.model = \"auto\" or \
+         \"direct\", and spacecraft.smear_integrations = false"
+    )]
+    SamplesModel,
     /// A parameter outside its range.
     #[error("spacecraft.{key} = {value}: expected {expected}")]
     Parameter {
@@ -201,6 +221,13 @@ impl SpacecraftConfig {
             if !fits {
                 found.push(SpacecraftError::PerChannel { key, channels });
             }
+        }
+        let direct = self.model != ModelChoice::Harmonic && !self.smear_integrations;
+        if self.fidelity == Fidelity::Samples && !direct {
+            found.push(SpacecraftError::SamplesModel);
+        }
+        if self.smear_integrations && self.model == ModelChoice::Direct {
+            found.push(SpacecraftError::Smearing);
         }
         let mut require = |key, value: f64, good: bool, expected| {
             if !(good && value.is_finite()) {

@@ -5,19 +5,23 @@
 //! integrated visibilities, what the correlator would put out for a given sky, with thermal noise;
 //! [`correlator`] makes them from the samples of [`crate::daughters`]. Uses [`crate::frames`], [`crate::array`], [`crate::sky`].
 
+mod choice;
 mod config;
 pub mod correlator;
 mod direct;
+mod harmonic;
 mod integrator;
 mod model;
 mod observer;
 mod schedule;
 mod store;
 
+pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
 pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, SpacecraftError};
 pub use direct::DirectSum;
-pub use integrator::{Integrator, NoiseModel};
-pub use model::{PairPosition, Prediction, VisibilityModel};
+pub use harmonic::{HarmonicSetup, HarmonicSum};
+pub use integrator::{Integrator, MeasurementOptions, NoiseModel};
+pub use model::{ModelError, PairPosition, Prediction, VisibilityModel};
 pub use observer::Observer;
 pub use schedule::{Integration, Schedule};
 pub use store::{Store, VISIBILITY_BYTES};

@@ -1,8 +1,9 @@
 //! What the array would measure without noise.
 
 use num_complex::Complex64;
+use thiserror::Error;
 
-use crate::units::ChannelId;
+use crate::array::harmonic::{GeometryRefusal, HarmonicError};
 use crate::units::vector::Vec3;
 
 /// Where the two daughters of a pair are.
@@ -12,6 +13,8 @@ pub struct PairPosition {
     pub r_i_m: Vec3,
     /// Position of daughter j, m.
     pub r_j_m: Vec3,
+    /// Orbital phase swept while the visibility is averaged, rad; 0 for an instant.
+    pub span_rad: f64,
 }
 
 /// A visibility without noise.
@@ -23,10 +26,52 @@ pub struct Prediction {
     pub zero_spacing_k_sr: f64,
 }
 
-/// A sky seen by the array: visibilities of any pair, channel by channel.
+/// Why visibilities cannot be predicted.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[non_exhaustive]
+pub enum ModelError {
+    /// A pair off the orbit that the model holds for.
+    #[error(
+        "visibility model at {frequency_hz} Hz: {refusal}; set spacecraft.model = \"direct\" for such an array"
+    )]
+    Geometry {
+        /// Frequency, Hz.
+        frequency_hz: f64,
+        /// What is not covered.
+        refusal: GeometryRefusal,
+    },
+    /// The harmonic model refused.
+    #[error("visibility model at {frequency_hz} Hz: {source}")]
+    Harmonic {
+        /// Frequency, Hz.
+        frequency_hz: f64,
+        /// What it said.
+        source: HarmonicError,
+    },
+    /// Averages over integrations were asked of a model that has instants only.
+    #[error(
+        "visibility model at {frequency_hz} Hz: direct sums are of instants; set spacecraft.model = \"harmonic\" \
+         or spacecraft.smear_integrations = false"
+    )]
+    Smearing {
+        /// Frequency, Hz.
+        frequency_hz: f64,
+    },
+}
+
+/// A sky at one frequency, seen by the array: visibilities of any pair.
 ///
-/// Equal arguments give equal results, whatever the threads.
+/// Equal arguments give equal results, whatever the threads and whatever was asked before.
 pub trait VisibilityModel: Send + Sync {
-    /// Predicts one visibility for each position; `out` has the length of `positions`.
-    fn predict(&self, channel: ChannelId, positions: &[PairPosition], out: &mut [Prediction]);
+    /// How many visibilities it likes to be asked for at once; fewer cost more each.
+    fn batch(&self) -> usize {
+        1
+    }
+
+    /// Predicts one visibility for each position; `out` has the length of `positions`. Fastest for
+    /// consecutive integrations of one pair after another.
+    ///
+    /// # Errors
+    /// [`ModelError`], for positions that the model does not cover.
+    fn predict(&mut self, positions: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError>;
 }

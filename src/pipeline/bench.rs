@@ -14,8 +14,9 @@ use super::sampling::{SampleCounts, sample_stages};
 use super::space;
 use crate::downlink::{Reception, Transmitter};
 use crate::frames::{GroundFrame, SpaceFrame};
-use crate::mother::{DirectSum, Fidelity, Store, VisibilityModel};
+use crate::mother::{Fidelity, Store};
 use crate::runtime::{Cancel, Flow, Graph, Outlet, Report, Sink, Source, Stage, Units};
+use crate::sky::SkyMap;
 
 /// Stages that can be measured alone, and the chain of them.
 pub const BENCH_STAGES: [&str; 6] = ["sample", "link", "correlate", "transmit", "receive", "chain"];
@@ -115,13 +116,7 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
     let skies = space::skies(&plan)?;
     let sky_pixels = skies.first().map_or(0, |sky| sky.values().len());
     let config = &plan.config;
-    let model: Arc<dyn VisibilityModel> = Arc::new(DirectSum::new(
-        &skies,
-        &config.spacecraft.channels_hz,
-        plan.array.moon_radius_m(),
-        plan.instrument.response,
-    ));
-    let material = material(&plan, &model)?;
+    let material = material(&plan, &skies)?;
     let wanted = |stage: &str| settings.stage.as_deref().is_none_or(|only| only == stage);
     let mut rates = Vec::new();
     let mut chain = None;
@@ -130,10 +125,10 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
         for _ in 0..settings.runs.max(1) {
             if stage == "chain" {
                 let since = Instant::now();
-                chain = Some(run_chain(&plan, &model)?);
+                chain = Some(run_chain(&plan, &skies)?);
                 seconds.push(since.elapsed().as_secs_f64());
             } else {
-                seconds.push(time_stage(&plan, &model, &material, stage)?);
+                seconds.push(time_stage(&plan, &skies, &material, stage)?);
             }
         }
         rates.push(material.rate(stage, seconds));
@@ -156,10 +151,10 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
     })
 }
 
-fn source<S: Source<Error = Infallible>>(mut source: S) -> Vec<S::Out> {
+fn source<S: Source>(mut source: S) -> Result<Vec<S::Out>, S::Error> {
     let mut out = Outlet::collect();
-    while let Ok(Flow::Continue) = source.next(&mut out) {}
-    out.into_vec()
+    while source.next(&mut out)? == Flow::Continue {}
+    Ok(out.into_vec())
 }
 
 fn stage<S: Stage>(mut stage: S, input: Vec<S::In>) -> Result<Vec<S::Out>, S::Error> {
@@ -178,9 +173,10 @@ fn never<T>(result: Result<T, Infallible>) -> T {
     }
 }
 
-fn material(plan: &Plan, model: &Arc<dyn VisibilityModel>) -> Result<Material, PipelineError> {
-    let (sampler, _, correlator) = sample_stages(plan, Arc::clone(model), &SampleCounts::default());
-    let samples = source(sampler);
+fn material(plan: &Plan, skies: &[SkyMap]) -> Result<Material, PipelineError> {
+    let (sampler, _, correlator) =
+        sample_stages(plan, super::models::build(plan, skies)?, &SampleCounts::default());
+    let samples = source(sampler)?;
     let visibilities = never(stage(correlator, samples.clone()));
     let packets = stage(Transmitter::new(&plan.config.downlink)?, visibilities.clone())?;
     let length = |frame: &SpaceFrame| match frame {
@@ -203,16 +199,16 @@ fn material(plan: &Plan, model: &Arc<dyn VisibilityModel>) -> Result<Material, P
 }
 
 /// Seconds of one run of a stage alone.
-fn time_stage(
-    plan: &Plan,
-    model: &Arc<dyn VisibilityModel>,
-    material: &Material,
-    name: &str,
-) -> Result<f64, PipelineError> {
-    let (sampler, link, correlator) = sample_stages(plan, Arc::clone(model), &SampleCounts::default());
+fn time_stage(plan: &Plan, skies: &[SkyMap], material: &Material, name: &str) -> Result<f64, PipelineError> {
+    let (sampler, link, correlator) =
+        sample_stages(plan, super::models::build(plan, skies)?, &SampleCounts::default());
     // Input is copied before the clock starts, and output dropped after it has stopped.
     Ok(match name {
-        "sample" => timed(|| source(sampler)).0,
+        "sample" => {
+            let (seconds, sampled) = timed(|| source(sampler));
+            sampled?;
+            seconds
+        }
         "link" => {
             let input = material.samples.clone();
             timed(|| never(stage(link, input))).0
@@ -243,9 +239,10 @@ fn timed<T>(work: impl FnOnce() -> T) -> (f64, T) {
     (since.elapsed().as_secs_f64(), value)
 }
 
-fn run_chain(plan: &Plan, model: &Arc<dyn VisibilityModel>) -> Result<Report, PipelineError> {
+fn run_chain(plan: &Plan, skies: &[SkyMap]) -> Result<Report, PipelineError> {
     let capacity = plan.config.runtime.queue_capacity;
-    let (sampler, link, correlator) = sample_stages(plan, Arc::clone(model), &SampleCounts::default());
+    let (sampler, link, correlator) =
+        sample_stages(plan, super::models::build(plan, skies)?, &SampleCounts::default());
     let mut graph = Graph::new();
     let samples = graph.source("sample", capacity, sampler);
     let samples = graph.stage("link", capacity, samples, link);

@@ -3,16 +3,16 @@
 use std::fmt;
 use std::time::Instant;
 
-use num_complex::Complex64;
 use serde::Serialize;
 
+use super::engine_cost::EngineCost;
 use super::plan::Plan;
-use crate::accumulation::{NormalEngine, PixelEngine, PixelSetup};
 use crate::array::response::{Directions, PairGeometry, sky_sums};
-use crate::frames::PlacedVisibilities;
-use crate::mother::VISIBILITY_BYTES;
+use crate::mother::{ModelKind, ModelPlan, VISIBILITY_BYTES};
 use crate::sky::healpix::{pixel_area_sr, pixel_count, pixel_directions};
-use crate::units::Pair;
+
+/// Greatest nside on which fringes are timed.
+const NSIDE_MEASURED: usize = 64;
 
 /// The cost of one channel.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -25,8 +25,13 @@ pub struct ChannelCost {
     pub visibilities_mapped: f64,
     /// Longest baseline used in the map, m.
     pub baseline_m_max: f64,
-    /// Multiply-adds of the simulation by direct sum, one a pixel and visibility (of some 30 operations).
-    pub simulation_fringes: f64,
+    /// How the visibilities are simulated and what it costs, in fringes: of a direct sum one a pixel and
+    /// visibility (some 30 operations), of harmonics what takes as long.
+    pub simulation: ModelPlan,
+    /// Time of the simulation by direct sums, s, at the rate measured on this machine.
+    pub simulation_direct_s: f64,
+    /// Time of the simulation through harmonics, s: set-up and visibilities.
+    pub simulation_harmonic_s: [f64; 2],
     /// Multiply-adds of the normal equations.
     pub accumulation_multiply_adds: f64,
     /// Multiply-adds of one solution.
@@ -53,12 +58,14 @@ pub struct Cost {
     pub predicted_s: f64,
 }
 
-/// Rates of this machine, measured with this pipeline's own sizes.
-struct Rates {
-    /// Visibilities simulated in a second, all cores.
-    simulated_per_s: f64,
-    /// Visibilities accumulated in a second, all cores.
-    accumulated_per_s: f64,
+impl ChannelCost {
+    /// Time of the simulation as it will be done, s.
+    fn simulation_s(&self) -> f64 {
+        match self.simulation.kind {
+            ModelKind::Direct => self.simulation_direct_s,
+            ModelKind::Harmonic => self.simulation_harmonic_s.iter().sum(),
+        }
+    }
 }
 
 impl Plan {
@@ -66,41 +73,52 @@ impl Plan {
     #[must_use]
     pub fn cost(&self) -> Cost {
         let map = &self.config.map;
-        let (pixels, sky_pixels) = (pixel_count(map.nside) as f64, self.sky_pixels() as f64);
+        let sky_pixels = self.sky_pixels() as f64;
+        let fringes_per_s = self.fringes_per_s();
         let expected = self.visibilities();
         let frequencies = &self.config.spacecraft.channels_hz;
+        let engines: Vec<EngineCost> = frequencies.iter().map(|&f| self.engine_cost(f)).collect();
         let channels: Vec<ChannelCost> = frequencies
             .iter()
             .zip(&expected)
-            .map(|(&frequency_hz, expected)| ChannelCost {
+            .zip(self.model_plans(&self.sky_nsides()))
+            .zip(&engines)
+            .map(|(((&frequency_hz, expected), simulation), engine)| ChannelCost {
                 frequency_hz,
                 visibilities_sent: expected.sent.round(),
                 visibilities_mapped: expected.mapped.round(),
                 baseline_m_max: map.baseline_m_max(frequency_hz),
-                simulation_fringes: expected.sent * sky_pixels,
-                accumulation_multiply_adds: expected.mapped * pixels * pixels,
-                solution_multiply_adds: pixels.powi(3) / 6.0,
+                simulation,
+                simulation_direct_s: simulation.direct_fringes / fringes_per_s,
+                simulation_harmonic_s: [
+                    simulation.set_up_fringes / fringes_per_s,
+                    simulation.visibility_fringes * expected.sent / fringes_per_s,
+                ],
+                accumulation_multiply_adds: expected.mapped * engine.visibility_multiply_adds,
+                solution_multiply_adds: engine.solution_multiply_adds,
             })
             .collect();
         let sent: f64 = expected.iter().map(|e| e.sent).sum();
-        let mapped: f64 = expected.iter().map(|e| e.mapped).sum();
         let solutions = self.solutions();
-        let engine_bytes = PixelEngine::memory_bytes(map.nside) as f64;
         // One engine a channel; a snapshot being made, one in the queue, one in the solver, which works in it.
         let snapshots = if solutions > 1 { 3.0 } else { 0.0 };
-        let memory_bytes = engine_bytes * (frequencies.len() as f64 + snapshots)
-            + sky_pixels * 8.0 * (frequencies.len() + 3) as f64;
-        let rates = self.measure();
-        // A Cholesky factorisation runs at about the rate of the rank-k updates (one core of it: half).
-        let flops = rates.accumulated_per_s * pixels * pixels;
-        let solving: f64 = channels.iter().map(|c| c.solution_multiply_adds).sum::<f64>() * solutions as f64;
-        let predicted_s =
-            sent / rates.simulated_per_s + mapped / rates.accumulated_per_s + 2.0 * solving / flops;
+        let greatest = |of: fn(&EngineCost) -> f64| engines.iter().map(of).fold(0.0, f64::max);
+        let memory_bytes = engines.iter().map(|engine| engine.sums_bytes).sum::<f64>()
+            + snapshots * greatest(|engine| engine.sums_bytes)
+            + greatest(|engine| engine.other_bytes)
+            + sky_pixels * 8.0 * (frequencies.len() + 3) as f64
+            + channels.iter().map(|channel| channel.simulation.bytes).sum::<f64>();
+        let solving_s = solutions as f64 * engines.iter().map(|engine| engine.solution_s).sum::<f64>();
+        let simulating_s: f64 = channels.iter().map(ChannelCost::simulation_s).sum();
+        let accumulating_s: f64 =
+            engines.iter().zip(&expected).map(|(engine, e)| engine.visibility_s * e.mapped).sum();
+        let predicted_s = simulating_s + accumulating_s + solving_s;
         Cost {
             channels,
             windows: self.windows.len(),
             solutions,
-            downlink_bytes: sent * VISIBILITY_BYTES as f64 + self.windows.len() as f64 * 10_000.0,
+            downlink_bytes: self.config.downlink.expansion()
+                * (sent * VISIBILITY_BYTES as f64 + self.windows.len() as f64 * 10_000.0),
             memory_bytes,
             samples_bits_per_s: self.samples_bits_per_s(),
             predicted_s,
@@ -117,60 +135,26 @@ impl Plan {
         pixel_count(self.config.sky.nside)
     }
 
-    /// Times a few visibilities of the shortest pair through simulation and accumulation.
-    fn measure(&self) -> Rates {
-        const SAMPLES: usize = 512;
-        // No larger than what is measured in a fraction of a second and a fraction of a gigabyte.
-        let measured_nside = self.config.map.nside.min(16);
+    /// Fringes that all cores sum in a second.
+    fn fringes_per_s(&self) -> f64 {
+        const SAMPLES: usize = 64;
         let frequency_hz = self.config.spacecraft.channels_hz.first().copied().unwrap_or(10e6);
         let time_s = self.windows.first().map_or(0.0, |window| window.start.seconds());
-        let at = |k: usize| time_s + k as f64;
-        let positions = |n| (0..SAMPLES).map(|k| self.array.position_m(n, at(k))).collect::<Vec<_>>();
-        let (r_i_m, r_j_m) = (positions(0), positions(1));
-        let response = self.instrument.response;
-        let moon_radius_m = self.instrument.moon_radius_m;
-        let pairs: Vec<PairGeometry> = r_i_m
-            .iter()
-            .zip(&r_j_m)
-            .map(|(&r_i_m, &r_j_m)| PairGeometry { r_i_m, r_j_m, frequency_hz, moon_radius_m, response })
-            .collect();
-        let nside = self.config.sky.nside;
+        let pair = |k: usize| PairGeometry {
+            r_i_m: self.array.position_m(0, time_s + k as f64),
+            r_j_m: self.array.position_m(1, time_s + k as f64),
+            frequency_hz,
+            moon_radius_m: self.instrument.moon_radius_m,
+            response: self.instrument.response,
+        };
+        let pairs: Vec<PairGeometry> = (0..SAMPLES).map(pair).collect();
+        let nside = self.config.sky.nside.min(NSIDE_MEASURED);
         let directions = Directions::from(pixel_directions(nside).as_slice());
         let sky_k = vec![1.0_f32; directions.len()];
-        let few = &pairs[..SAMPLES.min(64)];
         let since = Instant::now();
-        let summed = sky_sums(few, &directions, &sky_k, pixel_area_sr(nside)).is_ok();
-        let simulated_per_s =
-            if summed { few.len() as f64 / since.elapsed().as_secs_f64() } else { f64::NAN };
-        let placed = PlacedVisibilities {
-            frequency_hz,
-            pair: Pair { i: 0, j: 1 },
-            time_s: (0..SAMPLES).map(at).collect(),
-            r_i_m,
-            r_j_m,
-            value_k_sr: vec![Complex64::ONE; SAMPLES],
-            weight: vec![1.0; SAMPLES],
-            ..PlacedVisibilities::default()
-        };
-        let setup = PixelSetup {
-            nside: measured_nside,
-            frequency_hz,
-            method: self.config.map.rows,
-            moon_radius_m,
-            response,
-            companion_seed: 0,
-        };
-        let rate = PixelEngine::new(setup).map_or(f64::NAN, |mut engine| {
-            // The first time makes tables and touches memory for the first time.
-            let warmed = engine.add(&placed).is_ok();
-            let since = Instant::now();
-            let added = warmed && engine.add(&placed).is_ok();
-            if added { SAMPLES as f64 / since.elapsed().as_secs_f64() } else { f64::NAN }
-        });
-        // The work of a visibility grows as the number of pixels squared.
-        let shrink = pixel_count(measured_nside) as f64 / pixel_count(self.config.map.nside) as f64;
-        let accumulated_per_s = rate * shrink * shrink;
-        Rates { simulated_per_s, accumulated_per_s }
+        let summed = sky_sums(&pairs, &directions, &sky_k, pixel_area_sr(nside)).is_ok();
+        let fringes = (pairs.len() * directions.len()) as f64;
+        if summed { fringes / since.elapsed().as_secs_f64() } else { f64::NAN }
     }
 }
 
@@ -178,19 +162,30 @@ impl fmt::Display for Cost {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "{:>12} {:>14} {:>14} {:>14} {:>16} {:>16}",
-            "channel", "visibilities", "in the map", "b max (m)", "fringes", "multiply-adds"
+            "{:>12} {:>14} {:>14} {:>14} {:>16}",
+            "channel", "visibilities", "in the map", "b max (m)", "multiply-adds"
         )?;
         for channel in &self.channels {
             writeln!(
                 f,
-                "{:>8.3} MHz {:>14.0} {:>14.0} {:>14.1} {:>16.2e} {:>16.2e}",
+                "{:>8.3} MHz {:>14.0} {:>14.0} {:>14.1} {:>16.2e}",
                 channel.frequency_hz / 1e6,
                 channel.visibilities_sent,
                 channel.visibilities_mapped,
                 channel.baseline_m_max,
-                channel.simulation_fringes,
                 channel.accumulation_multiply_adds + channel.solution_multiply_adds * self.solutions as f64
+            )?;
+        }
+        writeln!(f)?;
+        for channel in &self.channels {
+            let ModelPlan { kind, why, l_max, .. } = channel.simulation;
+            let [set_up_s, visibilities_s] = channel.simulation_harmonic_s;
+            writeln!(
+                f,
+                "{:>8.3} MHz simulated by {kind} ({why}): direct sums {:.3e} s, harmonics to l = {l_max} \
+                 {set_up_s:.0} s + {visibilities_s:.1} s",
+                channel.frequency_hz / 1e6,
+                channel.simulation_direct_s
             )?;
         }
         writeln!(f)?;

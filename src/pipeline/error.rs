@@ -24,6 +24,15 @@ pub enum PipelineError {
     /// The generated sky.
     #[error(transparent)]
     GeneratedSky(#[from] crate::sky::generated::GeneratedSkyError),
+    /// The sky's coefficients cannot be found.
+    #[error("the simulated sky's coefficients: {0}")]
+    Coefficients(#[from] crate::sky::harmonics::HarmonicsError),
+    /// A setting of the sky that does not fit its map.
+    #[error(transparent)]
+    SkyConfig(#[from] crate::sky::SkyConfigError),
+    /// A model of visibilities cannot be.
+    #[error(transparent)]
+    Model(#[from] crate::mother::ModelError),
     /// A map file.
     #[error(transparent)]
     Fits(#[from] FitsError),

@@ -11,7 +11,7 @@ use crate::downlink::{Reception, ReceptionCounters};
 use crate::products::{ChannelSummary, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Ledger, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
-use crate::solve::{Solver, SolverSetup};
+use crate::solve::{SolveWatch, Solver, SolverSetup, StoppingRule};
 
 /// What the ground segment leaves behind besides its files.
 #[derive(Clone, Debug, Default)]
@@ -25,7 +25,7 @@ pub struct GroundOutcome {
 }
 
 /// Adds the ground segment to `graph`. It takes the bytes of a downlink and nothing else from space;
-/// `truth`, if any, only serves to compare the maps with.
+/// `truth`, if any, only serves to compare the maps with; `watch` follows solutions.
 ///
 /// # Errors
 /// Calibration or prior maps that cannot be read.
@@ -34,7 +34,7 @@ pub fn add(
     bytes: Link<Vec<u8>>,
     config: &Config,
     out: &Path,
-    truth: Truth,
+    (truth, watch): (Truth, SolveWatch),
 ) -> Result<GroundOutcome, PipelineError> {
     let outcome = GroundOutcome::default();
     let capacity = config.runtime.queue_capacity;
@@ -42,6 +42,12 @@ pub fn add(
         epsilon: config.map.epsilon.clone(),
         prior_k: config.map.prior_k.clone(),
         prior_maps: prior_maps(config)?,
+        rule: StoppingRule {
+            residual_max: config.map.residual_max,
+            iterations_max: config.map.iterations_max,
+        },
+        trace_probes: config.map.trace_probes,
+        watch,
     };
     let calibration = config.calibration.build(Path::new(""))?;
     let publisher = Publisher::new(

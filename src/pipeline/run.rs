@@ -10,15 +10,33 @@ use super::ground::{self, GroundOutcome};
 use super::plan::Plan;
 use super::space;
 use super::summary::{Segment, Summary};
-use crate::downlink::{FileSource, Recorder};
+use crate::accumulation::EngineKind;
+use crate::downlink::link::LinkStage;
+use crate::downlink::{FileSource, Format, Recorder};
 use crate::products::{ProductsError, Truth};
-use crate::runtime::{Cancel, Graph, Metrics, Report, RuntimeConfig};
+use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig};
+use crate::solve::SolveWatch;
+
+/// What can be watched of a graph while it runs.
+#[derive(Clone, Debug)]
+pub struct Watched {
+    /// Counters and times of its stages.
+    pub metrics: Arc<Metrics>,
+    /// The solution that is being worked on.
+    pub solving: SolveWatch,
+}
 
 /// Whom to tell about a graph that is about to run.
-pub type Watcher<'a> = &'a mut dyn FnMut(Arc<Metrics>);
+pub type Watcher<'a> = &'a mut dyn FnMut(Watched);
 
-/// Name of the downlink file that `run` leaves among its products.
-pub const DOWNLINK_FILE: &str = "downlink.ccsds";
+/// Name of the downlink file that `run` leaves among its products, by its format.
+#[must_use]
+pub fn downlink_file(format: Format) -> &'static str {
+    match format {
+        Format::Packets => "downlink.ccsds",
+        Format::Cadu => "downlink.cadu",
+    }
+}
 
 /// The whole chain in one process: sky, spacecraft, downlink bytes, ground, products in `out`.
 ///
@@ -29,13 +47,20 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     let skies = space::skies(plan)?;
     let mut graph = Graph::new();
     let bytes = space::add(&mut graph, plan, &skies)?;
-    let recorder = Recorder::create(&out.join(DOWNLINK_FILE))?;
+    let file = out.join(downlink_file(plan.config.downlink.format));
+    let bytes = add_link(&mut graph, bytes, &plan.config, &file)?;
+    let recorder = Recorder::create(&file)?;
     let capacity = plan.config.runtime.queue_capacity;
     let bytes = graph.stage("record", capacity, bytes, recorder);
-    let truth = Truth::new(&skies, plan.config.map.nside)?;
+    let map = &plan.config.map;
+    let truth = match map.engine {
+        EngineKind::Harmonic => Truth::band_limited(&skies, map.nside, map.degree())?,
+        _ => Truth::new(&skies, map.nside)?,
+    };
     drop(skies);
-    let outcome = ground::add(&mut graph, bytes, &plan.config, out, truth)?;
-    let report = start(graph, &plan.config.runtime, cancel, watch)?;
+    let solving = SolveWatch::new(cancel.clone());
+    let outcome = ground::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()))?;
+    let report = start(graph, &plan.config.runtime, (cancel, solving), watch)?;
     conclude(Segment::Whole, &plan.config, Some(out), report, outcome)
 }
 
@@ -53,8 +78,9 @@ pub fn simulate(
     let mut graph = Graph::new();
     let bytes = space::add(&mut graph, plan, &skies)?;
     drop(skies);
+    let bytes = add_link(&mut graph, bytes, &plan.config, file)?;
     graph.sink("record", bytes, Recorder::create(file)?);
-    start(graph, &plan.config.runtime, cancel, watch)
+    start(graph, &plan.config.runtime, (cancel, SolveWatch::default()), watch)
 }
 
 /// The ground segment alone, from downlink files in the order given.
@@ -71,9 +97,23 @@ pub fn replay(
     make_folder(out)?;
     let mut graph = Graph::new();
     let bytes = graph.source("read", config.runtime.queue_capacity, FileSource::open(files)?);
-    let outcome = ground::add(&mut graph, bytes, config, out, Truth::unknown())?;
-    let report = start(graph, &config.runtime, cancel, watch)?;
+    let solving = SolveWatch::new(cancel.clone());
+    let outcome = ground::add(&mut graph, bytes, config, out, (Truth::unknown(), solving.clone()))?;
+    let report = start(graph, &config.runtime, (cancel, solving), watch)?;
     conclude(Segment::Ground, config, Some(out), report, outcome)
+}
+
+/// The link's faults, if any are asked for; the truth about them goes beside the downlink file.
+fn add_link(
+    graph: &mut Graph,
+    bytes: Link<Vec<u8>>,
+    config: &Config,
+    file: &Path,
+) -> Result<Link<Vec<u8>>, PipelineError> {
+    Ok(match LinkStage::new(&config.downlink, config.seed, file)? {
+        Some(link) => graph.stage("link", config.runtime.queue_capacity, bytes, link),
+        None => bytes,
+    })
 }
 
 /// Before anything is computed, so that a bad place is known at once.
@@ -85,10 +125,10 @@ fn make_folder(out: &Path) -> Result<(), PipelineError> {
 fn start(
     graph: Graph,
     config: &RuntimeConfig,
-    cancel: &Cancel,
+    (cancel, solving): (&Cancel, SolveWatch),
     watch: Watcher<'_>,
 ) -> Result<Report, PipelineError> {
-    watch(graph.metrics());
+    watch(Watched { metrics: graph.metrics(), solving });
     Ok(graph.run(cancel, Duration::from_secs_f64(config.shutdown_s))?)
 }
 

@@ -24,13 +24,13 @@ pub struct SampleCounts {
 #[must_use]
 pub fn sample_stages(
     plan: &Plan,
-    model: Arc<dyn VisibilityModel>,
+    models: Vec<Box<dyn VisibilityModel>>,
     counts: &SampleCounts,
 ) -> (Sampler, SampleLink, Correlator) {
     let Plan { config, array, instrument, schedules, windows } = plan;
     let scene = Scene {
         array: Arc::clone(array),
-        model,
+        models,
         channels: instrument.channels.clone(),
         receiver_noise_k_sr: config.spacecraft.receiver_noise_k_sr,
         seed: config.seed,
@@ -49,9 +49,13 @@ pub fn sample_stages(
 }
 
 /// Adds them to `graph`.
-pub(super) fn samples(graph: &mut Graph, plan: &Plan, model: Arc<dyn VisibilityModel>) -> Link<GroundFrame> {
+pub(super) fn samples(
+    graph: &mut Graph,
+    plan: &Plan,
+    models: Vec<Box<dyn VisibilityModel>>,
+) -> Link<GroundFrame> {
     let capacity = plan.config.runtime.queue_capacity;
-    let (sampler, link, correlator) = sample_stages(plan, model, &SampleCounts::default());
+    let (sampler, link, correlator) = sample_stages(plan, models, &SampleCounts::default());
     let sent = graph.source("sample", capacity, sampler);
     let received = graph.stage("link", capacity, sent, link);
     graph.stage("correlate", capacity, received, correlator)

@@ -7,7 +7,8 @@ use super::error::PipelineError;
 use super::plan::Plan;
 use super::sampling::samples;
 use crate::downlink::Transmitter;
-use crate::mother::{DirectSum, Fidelity, Integrator, NoiseModel, Observer, Store, VisibilityModel};
+use crate::frames::GroundFrame;
+use crate::mother::{Fidelity, Integrator, MeasurementOptions, NoiseModel, Observer, Store};
 use crate::runtime::{Graph, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::generated::generate;
@@ -53,27 +54,36 @@ pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
 /// Adds the space segment to `graph`; what comes out are the bytes of the downlink.
 ///
 /// # Errors
-/// A downlink configuration that cannot be.
+/// A model of the visibilities or a downlink configuration that cannot be.
 pub fn add(graph: &mut Graph, plan: &Plan, skies: &[SkyMap]) -> Result<Link<Vec<u8>>, PipelineError> {
     let Plan { config, array, instrument, schedules, windows } = plan;
     let capacity = config.runtime.queue_capacity;
-    let frequencies = &config.spacecraft.channels_hz;
-    let model: Arc<dyn VisibilityModel> =
-        Arc::new(DirectSum::new(skies, frequencies, array.moon_radius_m(), instrument.response));
+    let models = super::models::build(plan, skies)?;
+    if config.spacecraft.fidelity == Fidelity::Samples {
+        let frames = samples(graph, plan, models);
+        return transmit(graph, plan, frames);
+    }
     let noise = NoiseModel {
         seed: config.spacecraft.thermal_noise.then_some(config.seed),
         receiver_noise_k_sr: config.spacecraft.receiver_noise_k_sr,
     };
+    let options = MeasurementOptions { noise, smear_integrations: config.spacecraft.smear_integrations };
     let integrator =
-        Integrator::new(Arc::clone(array), Arc::clone(&model), instrument.clone(), schedules.clone(), noise);
-    let frames = match config.spacecraft.fidelity {
-        Fidelity::Visibilities => {
-            // A window waiting is nothing; a window's visibilities are.
-            let windows = graph.source("observe", 1, Observer::new(windows.clone()));
-            graph.stage(INTEGRATE, capacity, windows, integrator)
-        }
-        Fidelity::Samples => samples(graph, plan, model),
-    };
+        Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options);
+    // A window waiting is nothing; a window's visibilities are.
+    let windows = graph.source("observe", 1, Observer::new(windows.clone()));
+    let frames = graph.stage(INTEGRATE, capacity, windows, integrator);
+    transmit(graph, plan, frames)
+}
+
+/// What comes after the visibilities, however they were made.
+fn transmit(
+    graph: &mut Graph,
+    plan: &Plan,
+    frames: Link<GroundFrame>,
+) -> Result<Link<Vec<u8>>, PipelineError> {
+    let config = &plan.config;
+    let capacity = config.runtime.queue_capacity;
     let passes = graph.stage("store", capacity, frames, Store::new(config.spacecraft.store_bytes_max));
     Ok(graph.stage("transmit", capacity, passes, Transmitter::new(&config.downlink)?))
 }

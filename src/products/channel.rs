@@ -69,8 +69,10 @@ impl ChannelFolder {
     ) -> Result<(), ProductsError> {
         let map = SkyMap::new(Frame::Ecliptic, solution.map_k.clone())?;
         let noise = SkyMap::new(Frame::Ecliptic, solution.noise_k.clone())?;
+        // A map of harmonics has nothing beyond its own degrees.
+        let l_max = solution.diagnostics.l_max;
         let comparison =
-            self.truth.as_ref().map(|truth| compare(&map, truth, Some(&noise), None)).transpose()?;
+            self.truth.as_ref().map(|truth| compare(&map, truth, Some(&noise), l_max)).transpose()?;
         self.note(solution, comparison.as_ref());
         if self.config.snapshot_maps && !solution.is_final {
             self.write_map(&format!("snapshot-{:03}.fits", solution.number), &map, provenance, solution)?;

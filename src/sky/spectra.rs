@@ -3,6 +3,7 @@
 use std::f64::consts::LN_2;
 
 use super::error::MapError;
+use super::frame::Frame;
 use super::harmonics::{Alm, AnalysisOptions, Transform};
 use super::map::SkyMap;
 
@@ -67,6 +68,23 @@ impl SkyMap {
     pub fn harmonics(&self, l_max: usize, options: &AnalysisOptions) -> Result<Alm, MapError> {
         self.check_whole()?;
         Ok(Transform::new(self.nside(), l_max)?.analysis(self.values(), options)?.alm)
+    }
+
+    /// The map without the degrees beyond `l_max`, at the pixel centres of `nside`, in ecliptic coordinates.
+    ///
+    /// Averages over pixels, as [`SkyMap::resized`] takes them, also lower the degrees that they keep, and let those
+    /// beyond the new pixels' reach in: with point sources a tenth of the power at l = 2 nside.
+    ///
+    /// # Errors
+    /// [`MapError::BadPixels`]; [`MapError::Harmonics`] for an nside that is none.
+    pub fn band_limited(&self, nside: usize, l_max: usize) -> Result<Self, MapError> {
+        let l_max = l_max.min(3 * self.nside() - 1);
+        let alm = self.harmonics(l_max, &AnalysisOptions::default())?;
+        let alm = match self.frame() {
+            Frame::Ecliptic => alm,
+            frame => alm.rotated(&frame.to_ecliptic()),
+        };
+        Self::new(Frame::Ecliptic, Transform::new(nside, l_max)?.synthesis(&alm)?)
     }
 
     /// The map convolved with a Gaussian beam of a FWHM (rad), through harmonics up to l = 3 nside - 1, as

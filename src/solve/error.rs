@@ -2,6 +2,7 @@
 
 use thiserror::Error;
 
+use crate::sky::harmonics::HarmonicsError;
 use crate::units::ChannelId;
 
 /// Why there is no map.
@@ -25,6 +26,14 @@ pub enum SolveError {
         /// Pixels of the map.
         expected: usize,
     },
+    /// A pixel that is not on the map.
+    #[error("there is no pixel {pixel} on a map of {pixels}")]
+    NoPixel {
+        /// Pixel asked for.
+        pixel: usize,
+        /// Pixels of the map.
+        pixels: usize,
+    },
     /// The matrix has no Cholesky factor.
     #[error(
         "the regularised normal matrix is not positive definite at pixel {pixel}; expected it to be for \
@@ -36,6 +45,9 @@ pub enum SolveError {
         /// Regularisation.
         epsilon: f64,
     },
+    /// A map that has no harmonics, or harmonics that have no map.
+    #[error(transparent)]
+    Harmonics(#[from] HarmonicsError),
     /// An eigenvalue decomposition that did not converge.
     #[error("the eigenvalues of the normal matrix did not converge; expected finite numbers in it")]
     Eigenvalues,

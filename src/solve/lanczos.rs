@@ -5,9 +5,6 @@ use rand_distr::{Distribution, StandardNormal};
 use crate::accumulation::NormalSums;
 use crate::units::{StreamKind, random_stream};
 
-/// Relative change of the estimate, twice in a row, at which the iteration stops.
-const TOLERANCE: f64 = 1e-10;
-
 /// Most iterations; 20 to 40 are usual.
 const ITERATIONS_MAX: usize = 200;
 
@@ -22,46 +19,76 @@ pub struct LargestEigenvalue {
     pub change: f64,
 }
 
+/// Relative change at which W_max is as exact as f64 sums make it.
+pub const W_MAX_EXACT: f64 = 1e-10;
+
 /// W_max of `BtN^-1B`.
 ///
 /// Lanczos from a fixed random vector with full reorthogonalisation; the Ritz value rises towards W_max,
-/// and the iteration ends when it has twice risen by less than 1e-10 of itself. The error is then of the
-/// same order: it falls by a constant factor an iteration.
+/// and the iteration ends when it has twice risen by less than `tolerance` of itself. The error is then of the
+/// same order: it falls by a constant factor an iteration. `goes_on` is told the number of products and the last
+/// change, and ends the iteration early by `false`.
 #[must_use]
-pub fn largest_eigenvalue(sums: &dyn NormalSums) -> LargestEigenvalue {
+pub fn largest_eigenvalue(
+    sums: &dyn NormalSums,
+    tolerance: f64,
+    goes_on: &mut dyn FnMut(usize, f64) -> bool,
+) -> LargestEigenvalue {
     let order = sums.unknowns();
     let mut stream = random_stream(0, StreamKind::Probe, [order as u64, 0]);
     let start: Vec<f64> = (0..order).map(|_| StandardNormal.sample(&mut stream)).collect();
-    let mut basis = vec![normalised(start)];
-    let (mut alphas, mut betas) = (Vec::new(), Vec::new());
+    let mut krylov = Krylov::new(start);
     let mut found = LargestEigenvalue { value: 0.0, iterations: 0, change: f64::INFINITY };
     let mut calm = 0;
     while found.iterations < ITERATIONS_MAX.min(order) && calm < 2 {
-        let Some(last) = basis.last() else { break };
-        let mut next = vec![0.0; order];
+        let is_open = krylov.step(sums);
+        let value = largest_of_tridiagonal(&krylov.alphas, &krylov.betas);
+        found.iterations += 1;
+        found.change = ((value - found.value) / value).abs();
+        found.value = value;
+        calm = if found.change < tolerance { calm + 1 } else { 0 };
+        // An invariant subspace: the Ritz value is exact.
+        if !is_open || !goes_on(found.iterations, found.change) {
+            break;
+        }
+    }
+    found
+}
+
+/// An orthonormal basis of the space of `v, A v, A^2 v, ..`, in which A is tridiagonal.
+pub(super) struct Krylov {
+    pub(super) basis: Vec<Vec<f64>>,
+    pub(super) alphas: Vec<f64>,
+    pub(super) betas: Vec<f64>,
+}
+
+impl Krylov {
+    pub(super) fn new(start: Vec<f64>) -> Self {
+        Self { basis: vec![normalised(start)], alphas: Vec::new(), betas: Vec::new() }
+    }
+
+    /// One product with A; whether the space can grow further.
+    pub(super) fn step(&mut self, sums: &dyn NormalSums) -> bool {
+        let Some(last) = self.basis.last() else { return false };
+        let mut next = vec![0.0; last.len()];
         sums.apply(last, &mut next);
-        alphas.push(dot(last, &next));
+        self.alphas.push(dot(last, &next));
         // Twice, so that what rounding leaves of the first time goes too.
         for _ in 0..2 {
-            for vector in &basis {
+            for vector in &self.basis {
                 let part = dot(vector, &next);
                 next.iter_mut().zip(vector).for_each(|(x, v)| *x -= part * v);
             }
         }
-        let value = largest_of_tridiagonal(&alphas, &betas);
-        found.iterations += 1;
-        found.change = ((value - found.value) / value).abs();
-        found.value = value;
-        calm = if found.change < TOLERANCE { calm + 1 } else { 0 };
         let beta = dot(&next, &next).sqrt();
-        // An invariant subspace: the Ritz value is exact.
-        if beta.is_nan() || beta <= f64::EPSILON * value.abs() {
-            break;
+        let largest = self.alphas.iter().fold(0.0_f64, |a, b| a.max(b.abs()));
+        if beta.is_nan() || beta <= f64::EPSILON * largest {
+            return false;
         }
-        betas.push(beta);
-        basis.push(normalised(next));
+        self.betas.push(beta);
+        self.basis.push(normalised(next));
+        true
     }
-    found
 }
 
 fn dot(a: &[f64], b: &[f64]) -> f64 {

@@ -4,15 +4,23 @@
 //! Uses [`crate::accumulation`] and [`crate::sky`].
 
 mod cholesky;
+mod conjugate_gradients;
 mod diagnostics;
 mod error;
+mod harmonic;
 mod lanczos;
+mod probing;
 mod stage;
 mod tikhonov;
+mod watch;
 
 pub use cholesky::{Cholesky, NotPositive};
+pub use conjugate_gradients::{Convergence, StoppingRule};
 pub use diagnostics::{Spectrum, spectrum};
 pub use error::SolveError;
-pub use lanczos::{LargestEigenvalue, largest_eigenvalue};
+pub use harmonic::{HarmonicRequest, HarmonicSolution, solve_harmonics};
+pub use lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
+pub use probing::{Estimate, Traces, effective_beam, noise_variance, regularisation, traces};
 pub use stage::{Solution, Solver, SolverSetup};
 pub use tikhonov::{Diagnostics, PixelSolution, solve_pixels};
+pub use watch::{SolveWatch, Solving};

@@ -1,11 +1,14 @@
 //! The ground stage that turns sums into maps.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
-use super::{Diagnostics, SolveError, solve_pixels};
-use crate::accumulation::{NormalSums, Snapshot};
+use super::harmonic::{HarmonicRequest, solve_harmonics};
+use super::{Diagnostics, SolveError, SolveWatch, StoppingRule, solve_pixels};
+use crate::accumulation::{Snapshot, Sums};
 use crate::frames::Instrument;
 use crate::runtime::{Outlet, Stage, Units};
+use crate::sky::healpix::pixel_count;
 use crate::units::{ChannelId, PerChannel};
 
 /// A map of one channel and what goes with it.
@@ -41,19 +44,27 @@ pub struct SolverSetup {
     pub prior_k: PerChannel<f64>,
     /// Prior maps by channel, K, at the map's nside; empty for none.
     pub prior_maps: Vec<Vec<f64>>,
+    /// When the iteration for a harmonic map stops.
+    pub rule: StoppingRule,
+    /// Random vectors for the traces of a final harmonic map.
+    pub trace_probes: usize,
+    /// Who is told of progress, and may interrupt.
+    pub watch: SolveWatch,
 }
 
 /// Solves every snapshot that comes.
 pub struct Solver {
     setup: SolverSetup,
     solved: u64,
+    /// The last harmonic solution of each channel, from which the next starts.
+    last: HashMap<ChannelId, [Vec<f64>; 2]>,
 }
 
 impl Solver {
     /// A solving stage.
     #[must_use]
     pub fn new(setup: SolverSetup) -> Self {
-        Self { setup, solved: 0 }
+        Self { setup, solved: 0, last: HashMap::new() }
     }
 
     fn prior(&self, channel: usize, pixels: usize) -> Option<Vec<f64>> {
@@ -71,13 +82,30 @@ impl Stage for Solver {
     type Error = SolveError;
 
     fn step(&mut self, snapshot: Snapshot, out: &mut Outlet<Solution>) -> Result<(), SolveError> {
-        let Snapshot { instrument, channel, number, is_final, span_s, sums } = snapshot;
+        let Snapshot { instrument, channel, number, is_final, span_s, nside, sums } = snapshot;
         let index = usize::from(channel.0);
         let epsilon = self.setup.epsilon.get(index).ok_or(SolveError::NoEpsilon(channel))?;
-        let prior = self.prior(index, sums.unknowns());
-        let visibilities = sums.counts.visibilities;
-        let nside = sums.nside;
-        let solved = solve_pixels(sums, epsilon, prior.as_deref())?;
+        let prior = self.prior(index, pixel_count(nside));
+        let visibilities = sums.counts().visibilities;
+        let (map_k, noise_k, diagnostics) = match sums {
+            Sums::Pixel(sums) => {
+                let solved = solve_pixels(sums, epsilon, prior.as_deref())?;
+                (solved.map_k, solved.noise_k, solved.diagnostics)
+            }
+            Sums::Harmonic(sums) => {
+                let probes = if is_final { self.setup.trace_probes } else { 0 };
+                let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes };
+                let frequency_hz = instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
+                let name = format!("{:.3} MHz", frequency_hz / 1e6);
+                let start = self.last.remove(&channel);
+                let watch = (&self.setup.watch, name.as_str());
+                let solved = solve_harmonics(&sums, request, prior.as_deref(), start.as_ref(), watch)?;
+                if !is_final {
+                    self.last.insert(channel, solved.unknowns);
+                }
+                (solved.map_k, solved.noise_k, solved.diagnostics)
+            }
+        };
         self.solved += 1;
         out.push(Solution {
             instrument,
@@ -87,9 +115,9 @@ impl Stage for Solver {
             span_s,
             visibilities,
             nside,
-            map_k: solved.map_k,
-            noise_k: solved.noise_k,
-            diagnostics: solved.diagnostics,
+            map_k,
+            noise_k,
+            diagnostics,
         });
         Ok(())
     }

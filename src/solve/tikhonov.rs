@@ -3,11 +3,13 @@
 use serde::Serialize;
 
 use super::cholesky::{Cholesky, NotPositive};
+use super::conjugate_gradients::Convergence;
 use super::error::SolveError;
-use super::lanczos::{LargestEigenvalue, largest_eigenvalue};
+use super::lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
+use super::probing::Traces;
 use crate::accumulation::{NormalSums, PixelSums};
 
-/// How a map was found.
+/// How a map was found. Eigenvalues and traces are those of pixels, also for a map of harmonics.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Diagnostics {
     /// epsilon of `R = epsilon W_max I`.
@@ -16,6 +18,18 @@ pub struct Diagnostics {
     pub w_max: f64,
     /// Lanczos iterations for it.
     pub w_max_iterations: usize,
+    /// Greatest degree of a map of harmonics; absent for one of pixels.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub l_max: Option<usize>,
+    /// How the iteration for the map ended; absent after a factorisation.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub convergence: Option<Convergence>,
+    /// How the iteration for the noise-only map ended.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub noise_convergence: Option<Convergence>,
+    /// Traces of the covariances, if they were asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub traces: Option<Traces>,
 }
 
 /// A map and its noise-only companion.
@@ -48,7 +62,8 @@ pub fn solve_pixels(
     if epsilon.is_nan() || epsilon <= 0.0 {
         return Err(SolveError::Epsilon(epsilon));
     }
-    let LargestEigenvalue { value: w_max, iterations, .. } = largest_eigenvalue(&sums);
+    let LargestEigenvalue { value: w_max, iterations, .. } =
+        largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| true);
     let mut map_k = sums.right.clone();
     if let Some(prior_k) = prior_k {
         if prior_k.len() != pixels {
@@ -69,6 +84,14 @@ pub fn solve_pixels(
     Ok(PixelSolution {
         map_k,
         noise_k,
-        diagnostics: Diagnostics { epsilon, w_max, w_max_iterations: iterations },
+        diagnostics: Diagnostics {
+            epsilon,
+            w_max,
+            w_max_iterations: iterations,
+            l_max: None,
+            convergence: None,
+            noise_convergence: None,
+            traces: None,
+        },
     })
 }

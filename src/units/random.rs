@@ -21,6 +21,8 @@ pub enum StreamKind {
     Samples = 6,
     /// Phases of interference.
     Interference = 7,
+    /// Faults of a simulated link.
+    Link = 20,
 }
 
 /// The random stream of `seed`, `kind` and two words of identity (for a block of visibilities:

@@ -1,6 +1,8 @@
 //! Where tests find what is not in the repository.
 #![allow(dead_code)] // Each test file uses its part.
 
+pub mod downlink;
+
 use std::path::PathBuf;
 
 /// A file of the independent reference values and sky maps, below the folder that `LUNARRAY_SHARED`

@@ -6,17 +6,16 @@ use num_complex::{Complex32, Complex64};
 use rayon::prelude::*;
 
 use super::PairState;
+use super::blocked::{BLOCK_NODES, PATTERN_LANES};
 use super::chebyshev;
-use super::forward::{
-    ALPHAS_MAX, AlphaNode, Group, ORDER_LANES, OrderBlock, PATTERN_LANES, RunPlan, project,
-};
+use super::forward::{ALPHAS_MAX, AlphaPart, Group, ORDER_LANES, OrderBlock, RunPlan, project};
 use super::kernel::LANES;
 use super::model::{ALPHA_TOLERANCE, HarmonicModel, TERMS};
 use super::rotation::orders;
 use super::runs::Run;
 
 /// Alphas of the grid for which the sky is turned at once.
-pub(super) const ALPHA_BLOCK: usize = 48;
+pub(super) const ALPHA_BLOCK: usize = 64;
 /// Blocks of alphas that are kept, and most that a batch may use.
 pub(super) const BLOCKS_KEPT: usize = 4;
 /// Most runs of a batch; bounds its memory.
@@ -53,10 +52,14 @@ impl Batch {
             batch.blocks = needs;
             let mut group = group;
             for &run in &order[taken..taken + count] {
+                let plan = plan(model, &runs[run], stretch, group.alphas.len());
                 group.runs.push(batch.runs.len());
-                batch.plans.push(plan(model, &runs[run], stretch, group.alphas.len()));
+                group.blocks.extend(plan.first_block..plan.first_block + plan.blocks);
+                batch.plans.push(plan);
                 batch.runs.push(runs[run]);
             }
+            group.blocks.sort_unstable();
+            group.blocks.dedup();
             batch.groups.push(group);
             taken += count;
         }
@@ -74,19 +77,22 @@ impl Batch {
             .map(|t| {
                 let x = (0.5 * (stretch.high + stretch.low) + half * t).rem_euclid(TAU) * per_radian;
                 let (first, lanes) = model.alpha.kernel.spread(x);
-                let first = first.rem_euclid(model.alpha.count as i64) as usize;
-                let block = first / ALPHA_BLOCK;
-                if !needs.contains(&block) {
-                    needs.push(block);
+                let mut parts: Vec<AlphaPart> = Vec::new();
+                for (k, &weight) in (first..).zip(&lanes[..model.alpha.kernel.width()]) {
+                    let place = k.rem_euclid(model.alpha.count as i64) as usize;
+                    let (block, first) = (place / ALPHA_BLOCK, place % ALPHA_BLOCK);
+                    match parts.last_mut().filter(|part| part.block == block && first > 0) {
+                        Some(part) => part.weights.push(weight),
+                        None => parts.push(AlphaPart { block, first, weights: vec![weight] }),
+                    }
+                    if !needs.contains(&block) {
+                        needs.push(block);
+                    }
                 }
-                AlphaNode {
-                    block,
-                    first: first % ALPHA_BLOCK,
-                    weights: lanes[..model.alpha.kernel.width()].to_vec(),
-                }
+                parts
             })
             .collect();
-        (Group { alphas, runs: Vec::new() }, needs)
+        (Group { alphas, runs: Vec::new(), blocks: Vec::new() }, needs)
     }
 }
 
@@ -127,26 +133,35 @@ fn plan(model: &HarmonicModel, run: &Run, stretch: Stretch, alphas: usize) -> Ru
     let terms = chebyshev::terms_for(drift, tolerance).unwrap_or(TERMS).min(TERMS);
     let grid = model.patterns.grid;
     let node = |u: f64| (u - grid.first) / grid.step;
-    let lowest = node(run.u[0] - run.u[1].abs());
-    let first_node = (lowest - 0.5 * model.u_kernel.width() as f64).ceil().max(0.0);
+    let reach = 0.5 * model.u_kernel.width() as f64;
+    let first_node = (node(run.u[0] - run.u[1].abs()) - reach).ceil().max(0.0) as usize;
+    let last_node = (node(run.u[0] + run.u[1].abs()) + reach).floor().max(0.0) as usize;
+    let first_block = first_node / BLOCK_NODES;
+    let blocks = last_node.min(grid.count - 1) / BLOCK_NODES + 1 - first_block;
     let middle = 0.5 * (stretch.high + stretch.low);
     let half = (0.5 * (stretch.high - stretch.low)).max(1e-300);
     let run_middle = (run.node[0] - FRAC_PI_2).rem_euclid(TAU);
-    let mut weights = vec![[0.0_f64; PATTERN_LANES]; terms * alphas];
+    let mut weights = vec![[0.0_f64; PATTERN_LANES]; terms * blocks * alphas];
     let analysis = chebyshev::analysis(terms);
     for (k, tau) in chebyshev::points(terms).into_iter().enumerate() {
-        let u = node(run.u[0] + run.u[1] * tau) - first_node;
+        let u = node(run.u[0] + run.u[1] * tau) - (first_block * BLOCK_NODES) as f64;
+        let kernel: Vec<f64> =
+            (0..blocks * BLOCK_NODES).map(|n| model.u_kernel.value(n as f64 - u)).collect();
         let at = ((run_middle + run.node[1] * tau - middle) / half).clamp(-1.0, 1.0);
         for (a, lagrange) in chebyshev::lagrange(alphas, at).into_iter().enumerate() {
             for (n, row) in analysis.iter().enumerate() {
-                for (lane, weight) in weights[n * alphas + a].iter_mut().enumerate() {
-                    *weight += row[k] * lagrange * model.u_kernel.value((lane / 2) as f64 - u);
+                for (block, kernel) in kernel.chunks_exact(BLOCK_NODES).enumerate() {
+                    let factor = row[k] * lagrange;
+                    let weights = &mut weights[(n * blocks + block) * alphas + a];
+                    for (lane, weight) in weights.iter_mut().enumerate() {
+                        *weight += factor * kernel[lane / 2];
+                    }
                 }
             }
         }
     }
     let weights = weights.into_iter().map(|row| row.map(|w| w as f32)).collect();
-    RunPlan { first_node: first_node as usize, terms, weights }
+    RunPlan { first_block, blocks, terms, weights }
 }
 
 impl HarmonicModel {
@@ -186,7 +201,7 @@ impl HarmonicModel {
     /// A group with its blocks' places among the skies that are at hand.
     fn located(&self, group: &Group) -> Group {
         let mut group = group.clone();
-        for alpha in &mut group.alphas {
+        for alpha in group.alphas.iter_mut().flatten() {
             alpha.block = self.blocks.iter().position(|b| *b == alpha.block).unwrap_or_default();
         }
         group

@@ -61,6 +61,11 @@ impl FilteredPatterns {
         Self { grid, orders }
     }
 
+    /// The nodes, and the rows of every order mu as [`Self::order`] has them.
+    pub(crate) fn into_orders(self) -> (NodeGrid, Vec<Vec<f32>>) {
+        (self.grid, self.orders)
+    }
+
     /// Rows of order mu: `2 count` values for each l = mu, mu + 2, .., then padding.
     pub(crate) fn order(&self, mu: usize) -> &[f32] {
         &self.orders[mu]

@@ -3,38 +3,45 @@
 //! For each order mu: the sky turned to a group's alphas, its products with the patterns at a run's nodes,
 //! and their reduction to the run's Chebyshev terms.
 
-use super::filter::FilteredPatterns;
+use super::blocked::{BlockedPatterns, Lanes, PATTERN_LANES};
 use super::rotation::{RotatedSky, orders};
 
 /// Orders mu that one task takes: a vector of the rotated sky.
 pub(crate) const ORDER_LANES: usize = 16;
-/// A vector of patterns: eight nodes, both signs of mu.
-pub(crate) const PATTERN_LANES: usize = 16;
 /// Most alphas of a group.
 pub(crate) const ALPHAS_MAX: usize = 6;
 
-/// One alpha of a group: which rotated sky, from which of its alphas on, and the kernel there.
+/// A part of one alpha of a group: which rotated sky, from which of its alphas on, and the kernel there.
 #[derive(Clone, Debug)]
-pub(crate) struct AlphaNode {
+pub(crate) struct AlphaPart {
     pub(crate) block: usize,
     pub(crate) first: usize,
     pub(crate) weights: Vec<f32>,
 }
 
+/// Products at one block of nodes: the real and the imaginary part at each alpha.
+type Products = [[f32; PATTERN_LANES]; 2 * ALPHAS_MAX];
+
 /// Runs that share their alphas.
 #[derive(Clone, Debug)]
 pub(crate) struct Group {
-    pub(crate) alphas: Vec<AlphaNode>,
+    /// Each alpha in one or two parts.
+    pub(crate) alphas: Vec<Vec<AlphaPart>>,
     /// Places of its runs among those of the batch.
     pub(crate) runs: Vec<usize>,
+    /// The blocks of nodes that its runs need, in order.
+    pub(crate) blocks: Vec<usize>,
 }
 
 /// How a run's Chebyshev coefficients come from products at alphas and nodes.
 #[derive(Clone, Debug)]
 pub(crate) struct RunPlan {
-    pub(crate) first_node: usize,
+    /// The first of its blocks of nodes.
+    pub(crate) first_block: usize,
+    /// Their number.
+    pub(crate) blocks: usize,
     pub(crate) terms: usize,
-    /// `[term][alpha]`: a weight for each lane of the pattern vector.
+    /// `[term][block][alpha]`: a weight for each lane of the pattern vector.
     pub(crate) weights: Vec<[f32; PATTERN_LANES]>,
 }
 
@@ -57,37 +64,40 @@ impl OrderBlock {
 pub(crate) fn project(
     block: OrderBlock,
     l_max: usize,
-    (skies, patterns): (&[RotatedSky<f32>], &FilteredPatterns),
+    (skies, patterns): (&[RotatedSky<f32>], &BlockedPatterns),
     (groups, plans): (&[Group], &[RunPlan]),
     offsets: &[usize],
 ) -> Vec<f32> {
     let mut out = vec![0.0; 4 * ORDER_LANES * offsets[plans.len()]];
-    let count = 2 * patterns.grid.count;
     let rows = (l_max - block.order(0)) / 2 + 1;
     let turned: Vec<Vec<f32>> = groups.iter().map(|group| turn(block, l_max, skies, group)).collect();
+    let mut products: Vec<Products> = Vec::new();
     // Order by order: the patterns of one stay in the cache while all runs pass.
     for lane in 0..ORDER_LANES {
         let mu = block.order(lane);
         if mu > l_max {
             break;
         }
-        let pattern = patterns.order(mu);
         for (group, turned) in groups.iter().zip(&turned) {
             let alphas = group.alphas.len();
             let sky = &turned[(lane * rows + lane) * 2 * alphas..(lane + 1) * rows * 2 * alphas];
+            products.clear();
+            products.extend(group.blocks.iter().map(|&nodes| {
+                let pattern = patterns.block(mu, nodes);
+                match alphas {
+                    1 => multiply::<2, 0>(sky, pattern),
+                    2 => multiply::<4, 0>(sky, pattern),
+                    3 => multiply::<4, 2>(sky, pattern),
+                    4 => multiply::<4, 4>(sky, pattern),
+                    5 => multiply::<6, 4>(sky, pattern),
+                    _ => multiply::<6, 6>(sky, pattern),
+                }
+            }));
             for &run in &group.runs {
                 let plan = &plans[run];
-                let from = &pattern[2 * plan.first_node..];
-                let products = match alphas {
-                    1 => products::<2, 0>(sky, from, count),
-                    2 => products::<4, 0>(sky, from, count),
-                    3 => products::<4, 2>(sky, from, count),
-                    4 => products::<4, 4>(sky, from, count),
-                    5 => products::<6, 4>(sky, from, count),
-                    _ => products::<6, 6>(sky, from, count),
-                };
-                let place = 4 * (offsets[run] * ORDER_LANES + lane);
-                reduce(&products, alphas, plan, &mut out[place..]);
+                let place = group.blocks.partition_point(|nodes| *nodes < plan.first_block);
+                let products = &products[place..place + plan.blocks];
+                reduce(products, alphas, plan, &mut out[4 * (offsets[run] * ORDER_LANES + lane)..]);
             }
         }
     }
@@ -104,13 +114,14 @@ fn turn(block: OrderBlock, l_max: usize, skies: &[RotatedSky<f32>], group: &Grou
         let l = first_l + 2 * row;
         let stride = orders(l);
         let lanes = (stride - block.first).min(ORDER_LANES);
-        for (a, alpha) in group.alphas.iter().enumerate() {
+        let parts = group.alphas.iter().enumerate().flat_map(|(a, parts)| parts.iter().map(move |p| (a, p)));
+        for (a, alpha) in parts {
             let (re, im) = skies[alpha.block].degree(l);
             for (part, values) in [re, im].into_iter().enumerate() {
                 let start = alpha.first * stride + block.first;
                 let sums = combine(&values[start..], stride, lanes, &alpha.weights);
                 for (lane, sum) in sums.iter().enumerate().take(lanes) {
-                    out[(lane * rows + row) * width + 2 * a + part] = *sum;
+                    out[(lane * rows + row) * width + 2 * a + part] += *sum;
                 }
             }
         }
@@ -156,23 +167,15 @@ fn add_scaled(
 /// Two short arrays instead of a long one: loops over eight sums are turned into gathers and scatters
 /// instead of being unrolled.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
-fn products<const A: usize, const B: usize>(
-    sky: &[f32],
-    pattern: &[f32],
-    stride: usize,
-) -> [[f32; PATTERN_LANES]; 2 * ALPHAS_MAX] {
+fn multiply<const A: usize, const B: usize>(sky: &[f32], pattern: &[Lanes]) -> Products {
     let mut first = [[0.0_f32; PATTERN_LANES]; A];
     let mut second = [[0.0_f32; PATTERN_LANES]; B];
-    for (row, sky) in sky.chunks_exact(A + B).enumerate() {
-        let start = row * stride;
-        let Ok(values) = <&[f32; PATTERN_LANES]>::try_from(&pattern[start..start + PATTERN_LANES]) else {
-            continue;
-        };
+    for (sky, values) in sky.chunks_exact(A + B).zip(pattern) {
         for (sums, factor) in first.iter_mut().zip(sky) {
-            *sums = add_scaled(*sums, *factor, values);
+            *sums = add_scaled(*sums, *factor, &values.0);
         }
         for (sums, factor) in second.iter_mut().zip(&sky[A..]) {
-            *sums = add_scaled(*sums, *factor, values);
+            *sums = add_scaled(*sums, *factor, &values.0);
         }
     }
     let mut out = [[0.0; PATTERN_LANES]; 2 * ALPHAS_MAX];
@@ -183,13 +186,15 @@ fn products<const A: usize, const B: usize>(
 
 /// Sums the products into the run's terms; even lanes are +mu, odd ones -mu.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
-fn reduce(products: &[[f32; PATTERN_LANES]; 2 * ALPHAS_MAX], alphas: usize, plan: &RunPlan, out: &mut [f32]) {
-    for (term, weights) in plan.weights.chunks_exact(alphas).enumerate() {
+fn reduce(products: &[Products], alphas: usize, plan: &RunPlan, out: &mut [f32]) {
+    for (term, weights) in plan.weights.chunks_exact(alphas * products.len()).enumerate() {
         let mut sums = [[0.0_f32; PATTERN_LANES]; 2];
-        for (pair, weights) in products.chunks_exact(2).zip(weights) {
-            for part in 0..2 {
-                for lane in 0..PATTERN_LANES {
-                    sums[part][lane] = weights[lane].mul_add(pair[part][lane], sums[part][lane]);
+        for (products, weights) in products.iter().zip(weights.chunks_exact(alphas)) {
+            for (pair, weights) in products.chunks_exact(2).zip(weights) {
+                for part in 0..2 {
+                    for lane in 0..PATTERN_LANES {
+                        sums[part][lane] = weights[lane].mul_add(pair[part][lane], sums[part][lane]);
+                    }
                 }
             }
         }

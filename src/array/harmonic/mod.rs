@@ -1,23 +1,31 @@
-//! (to come)
+//! Spherical harmonics of what a pair on a circular orbit sees.
+//!
+//! Every visibility is the sky, turned into the orbit's plane, times a pattern that depends on the baseline's length
+//! alone: `V = sum_{m mu} exp(-i m alpha) exp(-i mu gamma) sum_l conj(T_lm) d^l_{m mu}(i) f_{l mu}(u)` with
+//! `alpha = Omega - pi/2`, `gamma = phi + pi/2`. [`PatternTable`] holds f, [`RotationTable`] d, and
+//! [`HarmonicModel`] makes visibilities of them; [`mod@crate::accumulation`] has the normal equations.
 
 mod batch;
+mod blocked;
 mod chebyshev;
 mod error;
-mod filter;
+pub(crate) mod filter;
 mod forward;
-mod kernel;
+mod geometry;
+pub(crate) mod kernel;
 mod legendre;
 mod model;
 mod pattern;
 mod quadrature;
-mod real;
+pub(crate) mod real;
 mod ring;
-mod rotation;
+pub(crate) mod rotation;
 mod runs;
-mod sizes;
+pub(crate) mod sizes;
 mod trigonometry;
 
 pub use error::HarmonicError;
+pub use geometry::{GeometryLimits, GeometryRefusal, NominalOrbit, NominalPair, PairOrientation};
 pub use model::{HarmonicModel, ModelSettings};
 pub use pattern::{NodeGrid, PatternGeometry, PatternTable, degrees};
 pub use real::Real;

@@ -7,8 +7,9 @@ use num_complex::Complex64;
 use rustfft::{Fft, FftPlanner};
 
 use super::batch::{ALPHA_BLOCK, BLOCKS_KEPT, Batch};
+use super::blocked::{BLOCK_NODES, BlockedPatterns};
 use super::filter::FilteredPatterns;
-use super::forward::{ALPHAS_MAX, PATTERN_LANES};
+use super::forward::ALPHAS_MAX;
 use super::kernel::{Kernel, LANES};
 use super::rotation::{RotatedSky, RotationTable};
 use super::runs::{RunLimits, split};
@@ -16,10 +17,8 @@ use super::sizes::fft_length;
 use super::{HarmonicError, NodeGrid, PairState, PatternGeometry, PatternTable, chebyshev};
 use crate::sky::harmonics::Alm;
 
-/// Nodes in u, a wavelength: 2.25 times what a band of |n_y| <= 1 asks for. Eight nodes then hold a kernel of six, and a stretch of u.
+/// Nodes in u, a wavelength: 2.25 times what a band of |n_y| <= 1 asks for; a kernel of six then suffices.
 const NODES_PER_WAVELENGTH: f64 = 4.5;
-/// Nodes that one pattern vector holds.
-const NODES: usize = PATTERN_LANES / 2;
 /// Chebyshev terms along a run.
 pub(super) const TERMS: usize = 8;
 
@@ -93,7 +92,7 @@ pub struct HarmonicModel {
     settings: ModelSettings,
     pub(super) sky: Alm,
     pub(super) rotation: Arc<RotationTable<f32>>,
-    pub(super) patterns: FilteredPatterns,
+    pub(super) patterns: BlockedPatterns,
     pub(super) u_kernel: Kernel,
     pub(super) alpha: PeriodicGrid,
     pub(super) gamma: PeriodicGrid,
@@ -158,7 +157,7 @@ impl HarmonicModel {
         let grid = NodeGrid {
             first: -(margin as f64) * step,
             step,
-            count: (settings.u_max / step).ceil() as usize + 2 * margin + NODES,
+            count: (settings.u_max / step).ceil() as usize + 2 * margin + BLOCK_NODES,
         };
         let table = PatternTable::new(settings.geometry, l_max, grid);
         // exp(-2 pi i u n_y): |f| = |n_y| / density; the kernel's transform is divided out, and the
@@ -173,7 +172,7 @@ impl HarmonicModel {
         Ok(Self {
             settings,
             rotation,
-            patterns,
+            patterns: BlockedPatterns::new(patterns, l_max),
             u_kernel,
             alpha: PeriodicGrid::new(l_max, settings.tolerance),
             fft: FftPlanner::new().plan_fft_forward(gamma.count),
@@ -248,7 +247,7 @@ impl HarmonicModel {
                 self.blocks.remove(oldest);
                 self.skies.remove(oldest);
             }
-            let alphas: Vec<f64> = (0..ALPHA_BLOCK + LANES)
+            let alphas: Vec<f64> = (0..ALPHA_BLOCK)
                 .map(|k| TAU * (block * ALPHA_BLOCK + k) as f64 / self.alpha.count as f64)
                 .collect();
             let sky = RotatedSky::new(&self.rotation, &self.sky, &self.alpha.correction, &alphas);
@@ -261,8 +260,8 @@ impl HarmonicModel {
         let tolerance = self.settings.tolerance;
         RunLimits {
             l_max: self.sky.l_max() as f64,
-            // Nodes within half a kernel of any u of the run fit the vector.
-            u_half: 0.5 * (NODES - self.u_kernel.width()).saturating_sub(1) as f64 / NODES_PER_WAVELENGTH,
+            // More nodes than a block would be read for a few visibilities.
+            u_half: 0.5 * BLOCK_NODES as f64 / NODES_PER_WAVELENGTH,
             drift_half: chebyshev::reach(TERMS, tolerance),
             node_half: chebyshev::reach(ALPHAS_MAX, ALPHA_TOLERANCE * tolerance)
                 / self.sky.l_max().max(1) as f64,

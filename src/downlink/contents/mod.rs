@@ -13,12 +13,15 @@ use std::path::Path;
 
 use serde::Serialize;
 
+use super::cadu::FrameCounters;
+use super::config::Format;
 use super::counters::ReceptionCounters;
 use super::decoder::Decoder;
 use super::error::DownlinkError;
 use super::file::{io_error, require_packets};
+use super::intake::Intake;
 use super::kind::Kind;
-use super::receiver::Receiver;
+use crate::frames::GroundFrame;
 
 pub use calendar::tai_text;
 
@@ -228,6 +231,8 @@ pub struct Contents {
     pub file: String,
     /// Its length.
     pub bytes: u64,
+    /// Plain packets, or packets in coded frames; the places below then count in what was recovered.
+    pub format: Format,
     /// From the first to the last integration.
     pub span: Option<Span>,
     /// The instrument description.
@@ -264,15 +269,27 @@ impl Contents {
     /// # Errors
     /// A file that cannot be read, is empty, or holds no packet at all; damage is told in the result.
     pub fn read(path: &Path) -> Result<Self, DownlinkError> {
-        Self::read_from(File::open(path).map_err(io_error(path, "open the file"))?, path)
+        Self::read_with(path, &mut |_| {})
     }
 
-    /// Looks through any source; `path` names it.
+    /// Looks through a file, and shows `see` every frame.
     ///
     /// # Errors
     /// Those of [`Contents::read`].
-    pub fn read_from(mut source: impl Read, path: &Path) -> Result<Self, DownlinkError> {
-        let mut receiver = Receiver::new();
+    pub fn read_with(path: &Path, see: &mut dyn FnMut(&GroundFrame)) -> Result<Self, DownlinkError> {
+        Self::read_from(File::open(path).map_err(io_error(path, "open the file"))?, path, see)
+    }
+
+    /// Looks through any source; `path` names it, `see` is shown every frame.
+    ///
+    /// # Errors
+    /// Those of [`Contents::read`].
+    pub fn read_from(
+        mut source: impl Read,
+        path: &Path,
+        see: &mut dyn FnMut(&GroundFrame),
+    ) -> Result<Self, DownlinkError> {
+        let mut receiver = Intake::new();
         let mut decoder = Decoder::new();
         let mut survey = survey::Survey::default();
         let mut at_end = false;
@@ -285,6 +302,7 @@ impl Contents {
                 survey.see_event(&event);
                 if let Some(frame) = decoder.accept(&event) {
                     survey.see_frame(&frame);
+                    see(&frame);
                 }
                 if let Some((offset, fault)) = decoder.take_fault() {
                     survey.faults.push(FaultEntry { offset, reason: fault.to_string() });
@@ -293,13 +311,16 @@ impl Contents {
         }
         decoder.finish();
         require_packets(path, receiver.bytes(), decoder.counters().packets())?;
-        Ok(survey.conclude(path, decoder.counters()))
+        let frames = receiver.frames();
+        let bytes = receiver.bytes();
+        Ok(survey.conclude(path, bytes, &ReceptionCounters { frames, ..decoder.counters().clone() }))
     }
 
     /// Whether nothing is missing or damaged.
     #[must_use]
     pub fn is_sound(&self) -> bool {
         let clean = self.gaps.count + self.bad_checksums.count + self.garbage.count + self.faults.count == 0;
-        clean && self.truncated_bytes == 0 && self.reception.instruments_contradictory == 0
+        let frames_sound = self.reception.frames.as_ref().is_none_or(FrameCounters::is_sound);
+        frames_sound && clean && self.truncated_bytes == 0 && self.reception.instruments_contradictory == 0
     }
 }

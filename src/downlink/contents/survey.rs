@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use super::super::config::Format;
 use super::super::counters::ReceptionCounters;
 use super::super::cuc::CucTime;
 use super::super::header::PacketHeader;
@@ -151,7 +152,7 @@ impl Survey {
     }
 
     /// What is in the file, now that all of it has been seen.
-    pub(super) fn conclude(self, path: &Path, reception: &ReceptionCounters) -> Contents {
+    pub(super) fn conclude(self, path: &Path, bytes: u64, reception: &ReceptionCounters) -> Contents {
         let epoch_tai_s = self.instrument.as_ref().map(|instrument| instrument.epoch_tai_s);
         let mission_s = |time: CucTime| epoch_tai_s.map(|epoch_tai_s| time.tai_s() - epoch_tai_s);
         let place_gap = |(gap, after, before): (GapEntry, Option<CucTime>, CucTime)| GapEntry {
@@ -179,7 +180,8 @@ impl Survey {
         };
         Contents {
             file: path.display().to_string(),
-            bytes: reception.bytes,
+            bytes,
+            format: if reception.frames.is_some() { Format::Cadu } else { Format::Packets },
             span: self.span.zip(epoch_tai_s).map(|(span, epoch_tai_s)| span_of(span, epoch_tai_s)),
             channels: self.channels(),
             instrument: self.instrument.as_ref().map(instrument_summary),

@@ -15,6 +15,9 @@ impl fmt::Display for Contents {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{}: {} bytes, {} packets", self.file, self.bytes, self.reception.packets())?;
         self.show_head(f)?;
+        if let Some(frames) = &self.reception.frames {
+            writeln!(f, "\n{frames}")?;
+        }
         self.show_packets(f)?;
         self.show_channels(f)?;
         self.show_baselines(f)?;

@@ -7,6 +7,7 @@ mod kernel;
 mod lanes;
 mod recurrence;
 mod rings;
+mod rotated;
 pub(crate) mod scaled;
 mod transform;
 mod wigner;

@@ -1,0 +1,105 @@
+//! How much of a downlink the harmonic engine covers, before anything is summed.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use serde::Serialize;
+
+use super::orbit_of;
+use crate::array::Ephemeris;
+use crate::array::harmonic::{GeometryLimits, GeometryRefusal, NominalOrbit, PairOrientation};
+use crate::frames::{GroundFrame, Instrument};
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+
+/// The circle that pairs are on, and those that are not.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct GeometryCoverage {
+    /// Inclination of the common circle, degrees.
+    pub inclination_deg: Option<f64>,
+    /// Radius of the common circle, m.
+    pub radius_m: Option<f64>,
+    /// Visibilities on it, within the limits.
+    pub covered: u64,
+    /// Visibilities that are refused, by reason.
+    pub refused: BTreeMap<String, u64>,
+    /// Good visibilities that no ephemeris covers.
+    pub without_ephemeris: u64,
+}
+
+/// Goes through what the ground receives.
+#[derive(Debug, Default)]
+pub struct GeometrySurvey {
+    instrument: Option<Instrument>,
+    ephemeris: Ephemeris,
+    orbit: Option<NominalOrbit>,
+    coverage: GeometryCoverage,
+    refused: BTreeMap<GeometryRefusal, u64>,
+    limits: GeometryLimits,
+}
+
+impl GeometrySurvey {
+    /// A survey with these limits.
+    #[must_use]
+    pub fn new(limits: GeometryLimits) -> Self {
+        Self { limits, ..Self::default() }
+    }
+
+    /// Looks at a frame.
+    pub fn see(&mut self, frame: &GroundFrame) {
+        match frame {
+            GroundFrame::Instrument(instrument) => {
+                self.instrument.get_or_insert_with(|| instrument.clone());
+            }
+            GroundFrame::Ephemeris(segment) => {
+                // What could not be used shows as visibilities without ephemeris.
+                self.ephemeris.insert(segment.clone());
+            }
+            GroundFrame::Visibilities(block) => {
+                let channel = usize::from(block.channel.0);
+                let Some(channel) = self.instrument.as_ref().and_then(|i| i.channels.get(channel)) else {
+                    return;
+                };
+                let wavelength_m = SPEED_OF_LIGHT_M_S / channel.frequency_hz;
+                let (placed, counts) = self.ephemeris.place(block, channel.frequency_hz);
+                self.coverage.without_ephemeris += counts.without_ephemeris;
+                if self.orbit.is_none() {
+                    self.orbit = orbit_of(&placed, self.limits);
+                }
+                for (&r_i_m, &r_j_m) in placed.r_i_m.iter().zip(&placed.r_j_m) {
+                    let orbit = self.orbit.ok_or(GeometryRefusal::Degenerate);
+                    let pair = orbit.and_then(|o| o.pair(&PairOrientation::of(r_i_m, r_j_m)?, wavelength_m));
+                    match pair {
+                        Ok(_) => self.coverage.covered += 1,
+                        Err(reason) => *self.refused.entry(reason).or_default() += 1,
+                    }
+                }
+            }
+            GroundFrame::Housekeeping(_) => {}
+        }
+    }
+
+    /// What was found.
+    #[must_use]
+    pub fn finish(self) -> GeometryCoverage {
+        GeometryCoverage {
+            inclination_deg: self.orbit.map(|orbit| orbit.inclination_rad.to_degrees()),
+            radius_m: self.orbit.map(|orbit| orbit.radius_m),
+            refused: self.refused.into_iter().map(|(reason, count)| (reason.to_string(), count)).collect(),
+            ..self.coverage
+        }
+    }
+}
+
+impl fmt::Display for GeometryCoverage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Geometry, for the harmonic engine")?;
+        if let (Some(inclination_deg), Some(radius_m)) = (self.inclination_deg, self.radius_m) {
+            write!(f, "\ncircle of {:.1} km, inclined by {inclination_deg:.2} deg", radius_m / 1e3)?;
+        }
+        write!(f, "\ncovered                            {:>12}", self.covered)?;
+        for (reason, count) in &self.refused {
+            write!(f, "\nrefused: {reason:<25} {count:>12}")?;
+        }
+        write!(f, "\nwithout ephemeris                  {:>12}", self.without_ephemeris)
+    }
+}

@@ -1,0 +1,125 @@
+//! What a harmonic engine is made for.
+
+use super::grid::Grids;
+use super::operator::Operator;
+use crate::accumulation::AccumulationError;
+use crate::array::harmonic::{GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry};
+use crate::frames::{AntennaResponse, PlacedVisibilities};
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+
+/// What distinguishes one harmonic engine from another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct HarmonicSetup {
+    /// Greatest degree of the map.
+    pub l_max: usize,
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Longest baseline that is taken, m.
+    pub baseline_m_max: f64,
+    /// Radius of the body that hides the sky, m.
+    pub moon_radius_m: f64,
+    /// Antenna response.
+    pub response: AntennaResponse,
+    /// The circle on which the satellites fly.
+    pub orbit: NominalOrbit,
+    /// Seed of the noise-only companion.
+    pub companion_seed: u64,
+}
+
+/// Greatest degree that is taken: its sums would hold 25 GB at 125 wavelengths.
+pub const L_MAX: usize = 383;
+/// Longest baseline that is taken, wavelengths.
+const U_MAX: f64 = 1000.0;
+
+/// Nominal inclinations are multiples of this, so that they do not depend on which data comes first.
+const INCLINATION_STEP_DEG: f64 = 0.05;
+/// Nominal radii likewise.
+const RADIUS_STEP_M: f64 = 100.0;
+
+/// The circle that the first pair with a known orientation is on; `None` if there is none.
+#[must_use]
+pub fn orbit_of(placed: &PlacedVisibilities, limits: GeometryLimits) -> Option<NominalOrbit> {
+    let mut pairs = placed.r_i_m.iter().zip(&placed.r_j_m);
+    let found = pairs.find_map(|(&r_i_m, &r_j_m)| PairOrientation::of(r_i_m, r_j_m).ok())?;
+    // A satellite j that leads turns the pair's plane upside down; orbits are taken as prograde.
+    let inclination_rad = found.inclination_rad.min(std::f64::consts::PI - found.inclination_rad);
+    let inclination_deg =
+        (inclination_rad.to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
+    Some(NominalOrbit {
+        inclination_rad: inclination_deg.to_radians(),
+        radius_m: (found.radius_m / RADIUS_STEP_M).round() * RADIUS_STEP_M,
+        limits,
+    })
+}
+
+impl HarmonicSetup {
+    /// Wavelength, m.
+    #[must_use]
+    pub fn wavelength_m(&self) -> f64 {
+        SPEED_OF_LIGHT_M_S / self.frequency_hz
+    }
+
+    pub(super) fn check(&self) -> Result<(), AccumulationError> {
+        let orbit = &self.orbit;
+        let u_max = self.baseline_m_max / self.wavelength_m();
+        for (name, value, good, expected) in [
+            ("l_max", self.l_max as f64, (1..=L_MAX).contains(&self.l_max), "1 to 383"),
+            ("frequency_hz", self.frequency_hz, self.frequency_hz > 0.0, "a positive number"),
+            ("moon_radius_m", self.moon_radius_m, self.moon_radius_m > 0.0, "a positive number"),
+            ("orbit radius_m", orbit.radius_m, orbit.radius_m > self.moon_radius_m, "more than the Moon's"),
+            (
+                "inclination_rad",
+                orbit.inclination_rad,
+                (0.0..=std::f64::consts::PI).contains(&orbit.inclination_rad),
+                "0 to pi",
+            ),
+            (
+                "baseline_m_max",
+                self.baseline_m_max,
+                self.baseline_m_max > 0.0 && self.baseline_m_max < orbit.radius_m && u_max <= U_MAX,
+                "above 0, at most 1000 wavelengths and less than the orbit's radius",
+            ),
+        ] {
+            if !(good && value.is_finite()) {
+                return Err(AccumulationError::Setup { name, value, expected });
+            }
+        }
+        Ok(())
+    }
+
+    pub(super) fn grids(&self) -> Grids {
+        Grids::new(self.l_max, self.baseline_m_max / self.wavelength_m())
+    }
+
+    pub(super) fn operator(&self, grids: &Grids) -> Operator {
+        let geometry = PatternGeometry {
+            orbit_radius_m: self.orbit.radius_m,
+            moon_radius_m: self.moon_radius_m,
+            wavelength_m: self.wavelength_m(),
+            response: self.response,
+        };
+        Operator::new(self.l_max, grids.clone(), (geometry, self.orbit.inclination_rad), 0.0)
+    }
+}
+
+/// Memory that an engine and a solution take, bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct HarmonicMemory {
+    /// The sums themselves, if baselines of all lengths occur.
+    pub sums: u64,
+    /// Patterns and rotations, shared by an engine and its snapshots.
+    pub tables: u64,
+    /// What threads work in during a solution.
+    pub workspace: u64,
+}
+
+/// Memory of an engine for maps up to `l_max` from baselines up to `u_max` wavelengths, solved by `threads` threads.
+#[must_use]
+pub fn memory(l_max: usize, u_max: f64, threads: usize) -> HarmonicMemory {
+    let grids = Grids::new(l_max, u_max);
+    HarmonicMemory {
+        sums: grids.nodes.count as u64 * grids.node_bytes(),
+        tables: Operator::table_bytes(l_max, &grids),
+        workspace: threads as u64 * Operator::workspace_bytes(l_max, &grids),
+    }
+}

@@ -1,0 +1,122 @@
+//! Normal equations over harmonic coefficients.
+
+use std::sync::{Arc, OnceLock};
+
+use super::HarmonicSetup;
+use super::blocks::OrderBlocks;
+use super::grid::{Grids, NODE_GROUP};
+use super::operator::Operator;
+use super::tori::Tori;
+use crate::accumulation::{NormalSums, SumCounts};
+use crate::sky::harmonics::Alm;
+
+/// Normal equations of one channel over the real orthonormal harmonics up to `l_max`.
+///
+/// A vector of unknowns holds, m after m: for m = 0 the `T_l0`, for m > 0 `sqrt(2) Re T_lm` and `sqrt(2) Im T_lm`
+/// of l = m, m + 1, ..: (l_max + 1)^2 numbers, in K sr^(1/2).
+#[derive(Clone, Debug)]
+pub struct HarmonicSums {
+    pub(super) setup: HarmonicSetup,
+    pub(super) grids: Arc<Grids>,
+    pub(super) tables: Arc<OnceLock<Operator>>,
+    pub(super) tori: Tori,
+    pub(super) counts: SumCounts,
+    pub(super) right: OnceLock<Vec<f64>>,
+    pub(super) noise: OnceLock<Vec<f64>>,
+}
+
+impl HarmonicSums {
+    /// What the sums were made for.
+    #[must_use]
+    pub fn setup(&self) -> &HarmonicSetup {
+        &self.setup
+    }
+
+    fn operator(&self) -> &Operator {
+        self.tables.get_or_init(|| self.setup.operator(&self.grids))
+    }
+
+    /// Floating-point operations of the matrix products in one [`NormalSums::apply`].
+    #[must_use]
+    pub fn matrix_product_flops(&self) -> f64 {
+        self.operator().matrix_product_flops(&self.tori)
+    }
+
+    /// About how much longer an application takes when all nodes and phases hold data and the map has degree `l_max`:
+    /// as the number of alphas and nodes, and of phases and their logarithm.
+    #[must_use]
+    pub fn share_of_whole(&self, l_max: usize) -> f64 {
+        let u_max = self.setup.baseline_m_max / self.setup.wavelength_m();
+        let whole = Grids::new(l_max, u_max);
+        let used = self.tori.alphas(self.grids.points, |node| &node.weights);
+        let alphas = used.iter().filter(|used| **used).count().max(1);
+        let nodes = self.tori.reached().len().next_multiple_of(NODE_GROUP).max(NODE_GROUP);
+        let line = |points: usize| points as f64 * (points as f64).log2();
+        (whole.points * whole.nodes.count) as f64 * line(whole.points)
+            / ((alphas * nodes) as f64 * line(self.grids.points))
+    }
+
+    /// The parts of BtN^-1B that do not change m, with weights that do not depend on the phase: what is left of
+    /// it when the orbit has swept all nodes and phases evenly.
+    #[must_use]
+    pub fn order_blocks(&self) -> OrderBlocks {
+        OrderBlocks::new(&self.operator().patterns, &self.grids, &self.tori, &self.setup)
+    }
+}
+
+impl NormalSums for HarmonicSums {
+    fn unknowns(&self) -> usize {
+        (self.setup.l_max + 1) * (self.setup.l_max + 1)
+    }
+
+    fn apply(&self, x: &[f64], y: &mut [f64]) {
+        let sky = coefficients(x, self.setup.l_max);
+        y.copy_from_slice(&unknowns_of_gradient(&self.operator().apply(&self.tori, &sky)));
+    }
+
+    fn right_hand_side(&self) -> &[f64] {
+        self.right.get_or_init(|| unknowns_of_gradient(&self.operator().project(&self.tori, 0)))
+    }
+
+    fn noise_side(&self) -> &[f64] {
+        self.noise.get_or_init(|| unknowns_of_gradient(&self.operator().project(&self.tori, 1)))
+    }
+
+    fn counts(&self) -> SumCounts {
+        self.counts
+    }
+}
+
+/// Coefficients from a vector of unknowns; those that it lacks are zero.
+#[must_use]
+pub fn coefficients(unknowns: &[f64], l_max: usize) -> Alm {
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    let mut alm = Alm::zeros(l_max);
+    let (zonal, rest) = unknowns.split_at(unknowns.len().min(l_max + 1));
+    let values = alm.values_mut();
+    for (value, x) in values.iter_mut().zip(zonal) {
+        value.re = *x;
+    }
+    for (value, x) in values[l_max + 1..].iter_mut().zip(rest.as_chunks::<2>().0) {
+        value.re = half * x[0];
+        value.im = half * x[1];
+    }
+    alm
+}
+
+/// The vector of unknowns of these coefficients.
+#[must_use]
+pub fn unknowns(alm: &Alm) -> Vec<f64> {
+    stretched(alm, std::f64::consts::SQRT_2)
+}
+
+/// A gradient with regard to `Re T_lm` and `Im T_lm` as one with regard to the unknowns.
+fn unknowns_of_gradient(gradient: &Alm) -> Vec<f64> {
+    stretched(gradient, std::f64::consts::FRAC_1_SQRT_2)
+}
+
+fn stretched(alm: &Alm, factor: f64) -> Vec<f64> {
+    let (zonal, rest) = alm.values().split_at(alm.l_max() + 1);
+    let rest = rest.iter().flat_map(|value| [factor * value.re, factor * value.im]);
+    zonal.iter().map(|value| value.re).chain(rest).collect()
+}

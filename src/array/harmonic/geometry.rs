@@ -1,0 +1,382 @@
+//! From two positions to the rotation that the harmonic basis needs.
+//!
+//! With `y = (r_i - r_j) / b`, x the direction of the mid-point, `z = x cross y`, the matrix of columns x, y, z is
+//!
+//! ```text
+//! R = Rz(Omega) Rx(i) Rz(phi):   x_z = sin i sin phi,  y_z = sin i cos phi,
+//!                                z = (sin i sin Omega, -sin i cos Omega, cos i)
+//! ```
+//!
+//! Two satellites at one distance from the Moon's centre are exact in it, whatever their orbits: any two
+//! directions have a plane. A pair off the track of the others has another plane than the orbit, with a node
+//! and an inclination of its own.
+//!
+//! The engine knows one inclination i0. Of all rotations with it, the nearest to R is the one with R's own
+//! Omega and phi: in unit quaternions the scalar product of two rotations is
+//!
+//! ```text
+//! cos(i/2) cos(i0/2) cos((dOmega + dphi)/2) + sin(i/2) sin(i0/2) cos((dOmega - dphi)/2)
+//! ```
+//!
+//! which is greatest, `cos((i - i0)/2)`, where both differences vanish. What is left is a turn by `i - i0`
+//! about the line of nodes. [`GeometryLimits`] bounds it and the altitude, and what is beyond is refused.
+//!
+//! What the limits let through is not exact. Rms error over rms visibility, for a diffuse sky with a monopole
+//! (tests/harmonic_departures.rs):
+//!
+//! | u = b / wavelength | 0.1 deg, l <= 64 | l <= 191 | 5 km, l <= 64 | l <= 191 |
+//! |---|---|---|---|---|
+//! | 3 | 0.4 % | 0.4 % | 9 % | 10 % |
+//! | 10 | 0.8 % | 0.9 % | 13 % | 14 % |
+//! | 30 | 1.1 % | 3.1 % | 34 % | 39 % |
+//! | 120 | 0.9 % | 2.1 % | 57 % | 68 % |
+//!
+//! A tilt of 0.1 deg stays within a few per cent. 5 km of altitude do not: they move the Moon's limb by
+//! 0.23 deg, and a sky without small scales is seen by long baselines at the limb alone. Errors are in
+//! proportion to the departure: the 150 m that are allowed unless told otherwise keep them below 2 %.
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use super::PairState;
+use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
+
+/// A pair's own frame as Euler angles, and its size.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PairOrientation {
+    /// Longitude Omega of the ascending node of the pair's plane, rad.
+    pub node_rad: f64,
+    /// Inclination of the pair's plane, rad; beyond pi/2 when satellite j leads on a prograde orbit.
+    pub inclination_rad: f64,
+    /// Phase phi of the mid-point in that plane, rad from the node.
+    pub phase_rad: f64,
+    /// Length of the baseline, m.
+    pub baseline_m: f64,
+    /// Mean distance of the two from the Moon's centre, m.
+    pub radius_m: f64,
+    /// Distance of i less that of j, m.
+    pub radius_difference_m: f64,
+}
+
+/// Departures from the orbit that an engine takes; all of them small angles and lengths.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GeometryLimits {
+    /// Greatest angle between a baseline and the plane of the orbit, degrees.
+    pub out_of_track_deg_max: f64,
+    /// Greatest difference of the orbit's inclination from its nominal value, degrees.
+    pub inclination_deg_max: f64,
+    /// Greatest difference of the altitude from its nominal value, m.
+    pub altitude_m_max: f64,
+    /// Greatest angle between a baseline and the horizontal of its mid-point, degrees: what unequal altitudes make.
+    pub radial_deg_max: f64,
+}
+
+impl GeometryLimits {
+    /// Keys and values.
+    #[must_use]
+    pub fn values(&self) -> [(&'static str, f64); 4] {
+        [
+            ("limits.out_of_track_deg_max", self.out_of_track_deg_max),
+            ("limits.inclination_deg_max", self.inclination_deg_max),
+            ("limits.altitude_m_max", self.altitude_m_max),
+            ("limits.radial_deg_max", self.radial_deg_max),
+        ]
+    }
+}
+
+impl Default for GeometryLimits {
+    /// 0.1 deg, 0.1 deg, 150 m, 0.1 deg: errors of a few per cent of a visibility at most.
+    fn default() -> Self {
+        Self {
+            out_of_track_deg_max: 0.1,
+            inclination_deg_max: 0.1,
+            altitude_m_max: 150.0,
+            radial_deg_max: 0.1,
+        }
+    }
+}
+
+/// The circle that an engine was made for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NominalOrbit {
+    /// Inclination, rad.
+    pub inclination_rad: f64,
+    /// Distance from the Moon's centre, m.
+    pub radius_m: f64,
+    /// What may depart from it.
+    pub limits: GeometryLimits,
+}
+
+/// A pair on the nominal circle.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NominalPair {
+    /// Its state, for an instant.
+    pub state: PairState,
+    /// Whether satellite j leads: V_ij is then the conjugate of what this state gives.
+    pub reversed: bool,
+}
+
+/// Why the harmonic basis does not cover a pair.
+#[derive(Clone, Copy, Debug, Error, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[non_exhaustive]
+pub enum GeometryRefusal {
+    /// A position that is not a number, or at the Moon's centre.
+    #[error("a position is not finite")]
+    NotFinite,
+    /// Both satellites in one place, or opposite each other.
+    #[error("the baseline has no direction")]
+    Degenerate,
+    /// The pair's plane is another one than the orbit's.
+    #[error("out of the orbit's plane")]
+    Inclination,
+    /// Too high or too low.
+    #[error("off the orbit's altitude")]
+    Altitude,
+    /// One satellite much higher than the other.
+    #[error("unequal altitudes of a pair")]
+    UnequalRadii,
+}
+
+impl GeometryRefusal {
+    /// All reasons, for tables of counts.
+    pub const ALL: [Self; 5] =
+        [Self::NotFinite, Self::Degenerate, Self::Inclination, Self::Altitude, Self::UnequalRadii];
+}
+
+/// Shortest baseline with a direction, m: rounding of positions turns a shorter one by more than 1e-6 rad.
+const BASELINE_M_MIN: f64 = 1e-3;
+
+impl PairOrientation {
+    /// Of a pair at these positions (m, Moon-centred, ecliptic axes).
+    ///
+    /// # Errors
+    /// [`GeometryRefusal::NotFinite`], [`GeometryRefusal::Degenerate`].
+    #[inline]
+    pub fn of(r_i_m: Vec3, r_j_m: Vec3) -> Result<Self, GeometryRefusal> {
+        let (difference, sum) = (sub(r_i_m, r_j_m), add(r_i_m, r_j_m));
+        let baseline_m = norm(difference);
+        let (radius_i_m, radius_j_m) = (norm(r_i_m), norm(r_j_m));
+        let all = baseline_m + radius_i_m + radius_j_m;
+        // Lengths are sums of squares: one that is not finite shows here.
+        if !(all.is_finite() && radius_i_m > 0.0 && radius_j_m > 0.0) {
+            return Err(GeometryRefusal::NotFinite);
+        }
+        let y = scale(1.0 / baseline_m, difference);
+        // Square to the baseline also where the distances differ.
+        let across = sub(sum, scale(dot(sum, y), y));
+        let across_m = norm(across);
+        if !(baseline_m > BASELINE_M_MIN && across_m > BASELINE_M_MIN) {
+            return Err(GeometryRefusal::Degenerate);
+        }
+        let x = scale(1.0 / across_m, across);
+        let z = cross(x, y);
+        let sin_inclination = z[0].hypot(z[1]);
+        // In the ecliptic the node is nowhere; any one will do with a phase counted from it.
+        let node = if sin_inclination > 0.0 {
+            [-z[1] / sin_inclination, z[0] / sin_inclination]
+        } else {
+            [1.0, 0.0]
+        };
+        Ok(Self {
+            node_rad: node[1].atan2(node[0]),
+            inclination_rad: sin_inclination.atan2(z[2]),
+            phase_rad: (-y[0] * node[0] - y[1] * node[1]).atan2(x[0] * node[0] + x[1] * node[1]),
+            baseline_m,
+            radius_m: 0.5 * (radius_i_m + radius_j_m),
+            radius_difference_m: radius_i_m - radius_j_m,
+        })
+    }
+}
+
+impl NominalOrbit {
+    /// A pair's state on this orbit: its own node, phase and baseline, with the orbit's inclination and radius.
+    ///
+    /// # Errors
+    /// What departs from the orbit by more than the limits.
+    #[inline]
+    pub fn pair(
+        &self,
+        orientation: &PairOrientation,
+        wavelength_m: f64,
+    ) -> Result<NominalPair, GeometryRefusal> {
+        use std::f64::consts::PI;
+        let limits = &self.limits;
+        let reversed = (orientation.inclination_rad - self.inclination_rad).abs()
+            > (PI - orientation.inclination_rad - self.inclination_rad).abs();
+        // Exchanging i and j turns y and z round: by pi about x.
+        let (node_rad, inclination_rad, phase_rad) = if reversed {
+            (orientation.node_rad + PI, PI - orientation.inclination_rad, PI - orientation.phase_rad)
+        } else {
+            (orientation.node_rad, orientation.inclination_rad, orientation.phase_rad)
+        };
+        // Two positions do not tell a tilted pair from a tilted orbit.
+        let tilt_rad_max = (limits.out_of_track_deg_max + limits.inclination_deg_max).to_radians();
+        if (inclination_rad - self.inclination_rad).abs() > tilt_rad_max {
+            return Err(GeometryRefusal::Inclination);
+        }
+        if (orientation.radius_m - self.radius_m).abs() > limits.altitude_m_max {
+            return Err(GeometryRefusal::Altitude);
+        }
+        if orientation.radius_difference_m.abs() > limits.radial_deg_max.to_radians() * orientation.baseline_m
+        {
+            return Err(GeometryRefusal::UnequalRadii);
+        }
+        let baseline_wavelengths = orientation.baseline_m / wavelength_m;
+        Ok(NominalPair {
+            state: PairState { node_rad, phase_rad, baseline_wavelengths, span_rad: 0.0 },
+            reversed,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::{PI, TAU};
+
+    use super::*;
+    use crate::array::harmonic::runs::wrap;
+    use crate::array::{Array, ArrayConfig};
+    use crate::units::all_pairs;
+
+    const RADIUS_M: f64 = 2_037_100.0;
+
+    type Matrix = [[f64; 3]; 3];
+
+    fn about_z(angle: f64) -> Matrix {
+        let (s, c) = angle.sin_cos();
+        [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+    }
+
+    fn about_x(angle: f64) -> Matrix {
+        let (s, c) = angle.sin_cos();
+        [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]
+    }
+
+    fn product(a: Matrix, b: Matrix) -> Matrix {
+        std::array::from_fn(|i| std::array::from_fn(|j| (0..3).map(|k| a[i][k] * b[k][j]).sum()))
+    }
+
+    fn rotation(node: f64, inclination: f64, phase: f64) -> Matrix {
+        product(product(about_z(node), about_x(inclination)), about_z(phase))
+    }
+
+    fn apply(r: Matrix, v: Vec3) -> Vec3 {
+        std::array::from_fn(|i| dot(r[i], v))
+    }
+
+    /// A pair at +-`half` of the body's x axis.
+    fn pair(r: Matrix, half: f64) -> [Vec3; 2] {
+        [half, -half].map(|at| apply(r, [RADIUS_M * at.cos(), RADIUS_M * at.sin(), 0.0]))
+    }
+
+    fn nominal(inclination_rad: f64) -> NominalOrbit {
+        let limits = GeometryLimits { altitude_m_max: 5e3, ..GeometryLimits::default() };
+        NominalOrbit { inclination_rad, radius_m: RADIUS_M, limits }
+    }
+
+    #[test]
+    fn angles_are_those_of_the_rotation() {
+        for k in 0..500 {
+            let k = f64::from(k);
+            let (node, phase) = ((0.731 * k).rem_euclid(TAU), (1.377 * k).rem_euclid(TAU));
+            let inclination = 0.01 + (0.0173 * k).rem_euclid(3.1);
+            let half = 2.5e-5 * 1.01_f64.powf(k);
+            let [r_i, r_j] = pair(rotation(node, inclination, phase), half);
+            let found = PairOrientation::of(r_i, r_j).unwrap();
+            // Positions of 2e6 m are rounded to 5e-10 m, which turns the shortest baseline, 100 m, by 5e-12.
+            // Towards the ecliptic the node is less and less well known.
+            let bound = 1e-10 / inclination.sin();
+            assert!(wrap(found.node_rad - node).abs() < bound, "{k}");
+            assert!(wrap(found.phase_rad - phase).abs() < bound, "{k}");
+            assert!((found.inclination_rad - inclination).abs() < 1e-10, "{k}");
+            assert!((found.baseline_m - 2.0 * RADIUS_M * half.sin()).abs() < 1e-8, "{k}");
+            assert!((found.radius_m - RADIUS_M).abs() < 1e-8 && found.radius_difference_m.abs() < 1e-8);
+        }
+    }
+
+    #[test]
+    fn the_array_s_own_pairs_are_on_its_orbit() {
+        let array = Array::new(&ArrayConfig::default()).unwrap();
+        let orbit = nominal(PI / 6.0);
+        for t_s in [0.0, 1e4, 3.3e5, 8.1e6, 4.09e7] {
+            for p in all_pairs(8) {
+                let [i, j] = [p.i, p.j].map(usize::from);
+                let found = PairOrientation::of(array.position_m(i, t_s), array.position_m(j, t_s)).unwrap();
+                assert!((found.inclination_rad - PI / 6.0).abs() < 1e-9, "{p} {t_s}");
+                let node = -TAU * t_s / (1.3 * 365.25 * 86_400.0);
+                assert!(wrap(found.node_rad - node).abs() < 1e-9, "{p} {t_s}");
+                let arcs = [i, j].map(|n| array.formation().arc_m(n, t_s).0 / RADIUS_M);
+                let phase = TAU * (t_s / 8_248.68).fract() - 0.5 * (arcs[0] + arcs[1]);
+                assert!(wrap(found.phase_rad - phase).abs() < 1e-9, "{p} {t_s}");
+                let placed = orbit.pair(&found, 30.0).unwrap();
+                let u = 2.0 * RADIUS_M * (0.5 * (arcs[1] - arcs[0])).sin() / 30.0;
+                // The last bit of an orbital phase is worth 7 um after 1.3 years.
+                assert!((placed.state.baseline_wavelengths - u).abs() < 1e-6 && !placed.reversed);
+            }
+        }
+    }
+
+    /// Exchanged satellites: the same rotation, and the flag that says to conjugate.
+    #[test]
+    fn a_pair_that_trails_is_turned_round() {
+        for (node, inclination, phase) in [(0.4, 0.5, 2.0), (5.0, 2.6, -1.0), (3.0, 0.01, 4.4)] {
+            let [r_i, r_j] = pair(rotation(node, inclination, phase), 0.01);
+            let orbit = nominal(inclination);
+            let forth = orbit.pair(&PairOrientation::of(r_i, r_j).unwrap(), 30.0).unwrap();
+            let back = orbit.pair(&PairOrientation::of(r_j, r_i).unwrap(), 30.0).unwrap();
+            assert!(!forth.reversed && back.reversed);
+            assert!(wrap(forth.state.node_rad - back.state.node_rad).abs() < 1e-9);
+            assert!(wrap(forth.state.phase_rad - back.state.phase_rad).abs() < 1e-9);
+        }
+    }
+
+    /// Of all rotations with the nominal inclination none is nearer than the one that is taken.
+    #[test]
+    fn the_nearest_rotation_keeps_node_and_phase() {
+        let (node, inclination, phase) = (1.1, 0.55, 2.2);
+        let trace = |a: Matrix, b: Matrix| (0..3).map(|k| dot(a[k], b[k])).sum::<f64>();
+        let real = rotation(node, inclination, phase);
+        let taken = trace(real, rotation(node, 0.5, phase));
+        for [a, b] in [[0.01, 0.0], [0.0, 0.01], [0.01, 0.01], [0.01, -0.01], [-0.01, 0.005]] {
+            assert!(trace(real, rotation(node + a, 0.5, phase + b)) < taken);
+        }
+        // trace = 1 + 2 cos(angle)
+        assert!((taken - 1.0 - 2.0 * 0.05_f64.cos()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn in_the_ecliptic_the_phase_counts_from_anywhere() {
+        let [r_i, r_j] = pair(rotation(0.0, 0.0, 2.5), 0.01);
+        let found = PairOrientation::of(r_i, r_j).unwrap();
+        assert!(wrap(found.node_rad + found.phase_rad - 2.5).abs() < 1e-9);
+        assert!(nominal(0.0).pair(&found, 30.0).is_ok());
+    }
+
+    #[test]
+    fn what_is_not_covered_is_refused() {
+        let r = rotation(1.0, 0.5, 2.0);
+        let [r_i, r_j] = pair(r, 0.001);
+        let orbit = nominal(0.5);
+        let ask = |r_i, r_j| PairOrientation::of(r_i, r_j).and_then(|found| orbit.pair(&found, 30.0));
+        let b = norm(sub(r_i, r_j));
+        let up = |metres: f64, r: Vec3| add(r, scale(metres / RADIUS_M, r));
+        assert!(ask(r_i, r_j).is_ok());
+        assert!(ask(up(4_900.0, r_i), up(4_900.0, r_j)).is_ok());
+        assert_eq!(ask(up(5_200.0, r_i), up(5_200.0, r_j)), Err(GeometryRefusal::Altitude));
+        assert!(ask(up(1e-3 * b, r_i), r_j).is_ok());
+        assert_eq!(ask(up(2e-3 * b, r_i), r_j), Err(GeometryRefusal::UnequalRadii));
+        // Turned about its mid-point; at the node that is an inclination.
+        for (tilt_deg, covered) in [(0.1, true), (-0.19, true), (0.21, false), (-1.0, false)] {
+            let tilted = product(rotation(1.0, 0.5, 0.0), about_x(f64::to_radians(tilt_deg)));
+            let [r_i, r_j] = pair(tilted, 0.001);
+            let expected = if covered { Ok(()) } else { Err(GeometryRefusal::Inclination) };
+            assert_eq!(ask(r_i, r_j).map(|_| ()), expected, "{tilt_deg}");
+        }
+        assert_eq!(ask(r_i, r_i), Err(GeometryRefusal::Degenerate));
+        assert_eq!(ask(r_i, scale(-1.0, r_i)), Err(GeometryRefusal::Degenerate));
+        assert_eq!(ask([f64::NAN, 0.0, 0.0], r_j), Err(GeometryRefusal::NotFinite));
+        assert_eq!(ask(r_i, [1e300, 1e300, 0.0]), Err(GeometryRefusal::NotFinite));
+        assert_eq!(ask(r_i, [0.0; 3]), Err(GeometryRefusal::NotFinite));
+    }
+}

@@ -1,0 +1,98 @@
+//! What the ground has made of a coded stream.
+
+use std::fmt;
+
+use serde::Serialize;
+
+/// Frames of one virtual channel.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct ChannelCounts {
+    /// Virtual channel.
+    pub channel: u8,
+    /// Good frames, duplicates left out.
+    pub frames: u64,
+    /// Gaps in the frame count.
+    pub gaps: u64,
+    /// Frames in those gaps.
+    pub missing: u64,
+    /// Frames that have filled a gap afterwards.
+    pub late: u64,
+    /// Frames that had been here before.
+    pub duplicates: u64,
+}
+
+/// The account of a coded stream.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct FrameCounters {
+    /// Bytes received.
+    pub bytes: u64,
+    /// Codewords interleaved in a block; 0 if no frame was found.
+    pub interleave: usize,
+    /// Good frames, idle ones and duplicates included.
+    pub frames: u64,
+    /// Good frames in which something had to be corrected.
+    pub frames_corrected: u64,
+    /// Bytes corrected in those.
+    pub bytes_corrected: u64,
+    /// Frames found that could not be corrected.
+    pub frames_uncorrectable: u64,
+    /// Good frames of another version or spacecraft, or of more virtual channels than are kept apart.
+    pub frames_foreign: u64,
+    /// Good frames with a pointer beyond their end.
+    pub frames_malformed: u64,
+    /// Good frames of idle data.
+    pub frames_idle: u64,
+    /// Times that the stream was lost and had to be searched for.
+    pub sync_losses: u64,
+    /// Bits passed over in searches.
+    pub bits_skipped: u64,
+    /// Times that the stream turned to its inverse or back.
+    pub inversions: u64,
+    /// Bytes of an unfinished frame at the end.
+    pub bytes_truncated: u64,
+    /// Bytes of idle packets.
+    pub bytes_idle_packets: u64,
+    /// Beginnings, middles and ends of packets that wait for their other frames, or waited in vain.
+    pub fragments: u64,
+    /// Bytes of those.
+    pub bytes_fragments: u64,
+    /// Virtual channels, idle frames left out.
+    pub channels: Vec<ChannelCounts>,
+}
+
+impl FrameCounters {
+    /// Whether nothing is missing and nothing had to be corrected.
+    #[must_use]
+    pub fn is_sound(&self) -> bool {
+        let faults =
+            self.frames_corrected + self.frames_uncorrectable + self.frames_malformed + self.sync_losses;
+        let gaps: u64 = self.channels.iter().map(|channel| channel.gaps).sum();
+        faults + gaps + self.bits_skipped + self.bytes_truncated + self.fragments == 0
+    }
+}
+
+impl fmt::Display for FrameCounters {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { frames, frames_corrected, bytes_corrected, frames_uncorrectable, .. } = self;
+        writeln!(
+            f,
+            "frames         {frames:>10} good of interleave {}, {frames_corrected} corrected ({bytes_corrected} \
+             bytes), {frames_uncorrectable} uncorrectable, {} idle, {} foreign",
+            self.interleave, self.frames_idle, self.frames_foreign
+        )?;
+        for counts in &self.channels {
+            let ChannelCounts { channel, frames, gaps, missing, late, duplicates } = counts;
+            writeln!(
+                f,
+                "  channel {channel:<4} {frames:>10} frames  {missing} missing in {gaps} gaps, {late} late, \
+                 {duplicates} duplicate"
+            )?;
+        }
+        write!(
+            f,
+            "  stream       {} times lost, {} bits passed over, {} inversions, {} bytes in a cut end, {} fragments \
+             of packets",
+            self.sync_losses, self.bits_skipped, self.inversions, self.bytes_truncated, self.fragments
+        )
+    }
+}

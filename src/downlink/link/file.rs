@@ -1,0 +1,130 @@
+//! The link as a stage, and between files; the truth beside what it damages.
+
+use std::fs::File;
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+use super::config::LinkConfig;
+use super::simulator::LinkSimulator;
+use super::truth::Truth;
+use crate::downlink::cadu::ReedSolomon;
+use crate::downlink::config::DownlinkConfig;
+use crate::downlink::error::DownlinkError;
+use crate::downlink::file::{io_error, require_packets};
+use crate::downlink::intake::Intake;
+use crate::files::{AtomicFile, Unfinished, write_atomically};
+use crate::runtime::{Outlet, Stage, Units};
+
+/// Bytes read at a time.
+const READ_BYTES: usize = 1 << 18;
+
+/// Where the truth about a damaged downlink stands: beside it, `.truth.json` behind its name.
+#[must_use]
+pub fn truth_path(downlink: &Path) -> PathBuf {
+    let mut name = downlink.as_os_str().to_owned();
+    name.push(".truth.json");
+    PathBuf::from(name)
+}
+
+fn write_truth(downlink: &Path, truth: &Truth) -> Result<(), DownlinkError> {
+    let path = truth_path(downlink);
+    let text = serde_json::to_vec(truth).map_err(std::io::Error::from);
+    text.and_then(|text| write_atomically(&path, &text)).map_err(io_error(&path, "write the truth"))
+}
+
+/// The link between spacecraft and ground, where a configuration asks for faults.
+#[derive(Debug)]
+pub struct LinkStage {
+    simulator: LinkSimulator,
+    downlink: PathBuf,
+    bytes: u64,
+}
+
+impl LinkStage {
+    /// A link whose truth goes beside the file `downlink`; `None` if it is to have no faults.
+    ///
+    /// # Errors
+    /// A bad configuration.
+    pub fn new(config: &DownlinkConfig, seed: u64, downlink: &Path) -> Result<Option<Self>, DownlinkError> {
+        if !config.link.is_on() {
+            return Ok(None);
+        }
+        let simulator = LinkSimulator::new(&config.link, seed, config.code())?;
+        Ok(Some(Self { simulator, downlink: downlink.to_owned(), bytes: 0 }))
+    }
+
+    fn pass_on(&mut self, bytes: Vec<u8>, out: &mut Outlet<Vec<u8>>) {
+        self.bytes += bytes.len() as u64;
+        if !bytes.is_empty() {
+            out.push(bytes);
+        }
+    }
+}
+
+impl Stage for LinkStage {
+    type In = Vec<u8>;
+    type Out = Vec<u8>;
+    type Error = DownlinkError;
+
+    fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
+        let mut arrived = Vec::new();
+        self.simulator.push(&bytes, &mut arrived)?;
+        self.pass_on(arrived, out);
+        Ok(())
+    }
+
+    fn finish(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
+        let mut arrived = Vec::new();
+        let truth = self.simulator.finish(&mut arrived)?;
+        write_truth(&self.downlink, truth)?;
+        self.pass_on(arrived, out);
+        Ok(())
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.bytes, "bytes")
+    }
+}
+
+/// Sends a sound file over a link, to another file; the truth goes beside it.
+///
+/// # Errors
+/// Files that cannot be read or written, a file that is no sound downlink, a bad configuration.
+pub fn corrupt(from: &Path, to: &Path, config: &LinkConfig, seed: u64) -> Result<Truth, DownlinkError> {
+    let mut simulator = LinkSimulator::new(config, seed, code_of(from)?)?;
+    let mut source = File::open(from).map_err(io_error(from, "open the file"))?;
+    let mut file = AtomicFile::create(to, Unfinished::Remove).map_err(io_error(to, "create the file"))?;
+    let (mut bytes, mut arrived) = (Vec::new(), Vec::new());
+    let at = |error: DownlinkError| error.at(from);
+    loop {
+        bytes.clear();
+        arrived.clear();
+        let read = Read::by_ref(&mut source).take(READ_BYTES as u64).read_to_end(&mut bytes);
+        if read.map_err(io_error(from, "read"))? == 0 {
+            break;
+        }
+        simulator.push(&bytes, &mut arrived).map_err(at)?;
+        file.write_all(&arrived).map_err(io_error(to, "write"))?;
+    }
+    let truth = simulator.finish(&mut arrived).map_err(at)?.clone();
+    file.write_all(&arrived).map_err(io_error(to, "write"))?;
+    file.finish().map_err(io_error(to, "finish the file"))?;
+    write_truth(to, &truth)?;
+    Ok(truth)
+}
+
+/// The code of a file's frames; `None` for plain packets.
+fn code_of(path: &Path) -> Result<Option<ReedSolomon>, DownlinkError> {
+    let mut file = File::open(path).map_err(io_error(path, "open the file"))?;
+    let mut intake = Intake::new();
+    while intake.format().is_none() {
+        if intake.fill_from(&mut file).map_err(io_error(path, "read"))? == 0 {
+            intake.finish();
+            break;
+        }
+    }
+    if intake.format().is_none() {
+        require_packets(path, intake.bytes(), 0)?;
+    }
+    Ok(intake.frames().and_then(|frames| ReedSolomon::new(frames.interleave)))
+}

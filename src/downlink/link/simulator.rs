@@ -1,0 +1,246 @@
+//! What a link makes of a downlink, and the truth about it.
+
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+
+use super::config::LinkConfig;
+use super::noise::Noise;
+use super::truth::{Fate, Truth, list_packet};
+use super::units::{Pass, Splitter};
+use super::writer::BitWriter;
+use crate::downlink::cadu::{ERRORS_MAX, ReedSolomon, SYNC_MARKER_BYTES};
+use crate::downlink::config::Format;
+use crate::downlink::error::DownlinkError;
+use crate::units::{StreamKind, random_stream};
+
+/// A unit on its way to the ground.
+#[derive(Clone, Copy, Debug)]
+struct Dispatch {
+    unit: usize,
+    /// Place in the order of arrival.
+    order: u64,
+    /// So many of its bytes arrive.
+    bytes: usize,
+    slips: bool,
+}
+
+/// What has become of a unit.
+#[derive(Clone, Copy, Debug, Default)]
+struct Outcome {
+    /// Copies that can be recovered.
+    good: u32,
+    /// The fate of the one that got furthest of the others.
+    fate: Option<Fate>,
+}
+
+/// Damages a downlink as a link would, pass by pass. Holds one pass, and another while it is swapped.
+///
+/// Faults of a pass depend on the seed and its number alone.
+#[derive(Debug)]
+pub struct LinkSimulator {
+    config: LinkConfig,
+    code: Option<ReedSolomon>,
+    splitter: Splitter,
+    /// A pass that arrives after the next.
+    held: Option<Vec<u8>>,
+    truth: Truth,
+}
+
+impl LinkSimulator {
+    /// A link for plain packets, or for frames of that code.
+    ///
+    /// # Errors
+    /// The first of [`LinkConfig::problems`].
+    pub fn new(config: &LinkConfig, seed: u64, code: Option<ReedSolomon>) -> Result<Self, DownlinkError> {
+        let format = if code.is_some() { Format::Cadu } else { Format::Packets };
+        if let Some(problem) = config.problems(format).into_iter().next() {
+            return Err(problem);
+        }
+        let truth = Truth { seed, link: config.clone(), format, ..Truth::default() };
+        Ok(Self { config: config.clone(), code, splitter: Splitter::new(code), held: None, truth })
+    }
+
+    /// Takes the next bytes of a sound downlink; appends what arrives to `out`.
+    ///
+    /// # Errors
+    /// Anything but a sound downlink.
+    pub fn push(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<(), DownlinkError> {
+        let mut passes = Vec::new();
+        self.splitter.push(bytes, |pass| passes.push(pass))?;
+        for pass in passes {
+            self.send(&pass, out);
+        }
+        Ok(())
+    }
+
+    /// Says that all has been sent; appends what has not arrived yet to `out`.
+    ///
+    /// # Errors
+    /// A downlink that ends within a frame or packet.
+    pub fn finish(&mut self, out: &mut Vec<u8>) -> Result<&Truth, DownlinkError> {
+        if let Some(pass) = self.splitter.finish()? {
+            self.send(&pass, out);
+        }
+        if let Some(held) = self.held.take() {
+            self.deliver(&held, out);
+        }
+        Ok(&self.truth)
+    }
+
+    /// The truth so far.
+    #[must_use]
+    pub fn truth(&self) -> &Truth {
+        &self.truth
+    }
+
+    fn deliver(&mut self, bytes: &[u8], out: &mut Vec<u8>) {
+        self.truth.bytes_delivered += bytes.len() as u64;
+        out.extend_from_slice(bytes);
+    }
+
+    fn send(&mut self, pass: &Pass, out: &mut Vec<u8>) {
+        let number = self.truth.passes;
+        self.truth.passes += 1;
+        let mut random = random_stream(self.truth.seed, StreamKind::Link, [number, 0]);
+        let lost = random.random_bool(self.config.pass_loss);
+        let swapped = random.random_bool(self.config.pass_swap);
+        let mut outcomes = vec![Outcome::default(); pass.units.len()];
+        let arrived = if lost {
+            self.truth.passes_lost += 1;
+            outcomes.fill(Outcome { good: 0, fate: Some(Fate::PassLost) });
+            Vec::new()
+        } else {
+            let copies = self.schedule(pass, &mut random, &mut outcomes);
+            self.carry(pass, &copies, &mut random, &mut outcomes)
+        };
+        self.settle(pass, &outcomes);
+        match self.held.take() {
+            None if swapped => {
+                self.truth.passes_swapped += 1;
+                self.held = Some(arrived);
+            }
+            earlier => {
+                self.deliver(&arrived, out);
+                if let Some(earlier) = earlier {
+                    self.deliver(&earlier, out);
+                }
+            }
+        }
+    }
+
+    /// The copies that set out and arrive, in the order in which they do.
+    fn schedule(&mut self, pass: &Pass, random: &mut ChaCha8Rng, outcomes: &mut [Outcome]) -> Vec<Dispatch> {
+        let count = pass.units.len();
+        let mut cut = (count, 0);
+        if random.random_bool(self.config.pass_cut) && count > 0 {
+            let unit = random.random_range(0..count);
+            // So much is missing that no code can make up for it.
+            cut = (unit, random.random_range(0..=pass.units[unit].bytes.len() / 2));
+            self.truth.passes_cut += 1;
+        }
+        let overlap = count.min(usize::try_from(self.config.second_station_frames).unwrap_or(count));
+        let first = (0..count).map(|unit| (unit, unit, true));
+        let second = (count - overlap..count).map(|unit| (unit, overlap + unit, false));
+        let mut copies = Vec::with_capacity(count + overlap);
+        for (unit, place, by_first) in first.chain(second) {
+            let again = random.random_bool(self.config.duplicate);
+            for _ in 0..=u32::from(again) {
+                let lost = random.random_bool(self.config.frame_loss);
+                let slips = random.random_bool(self.config.bit_slip);
+                let late = random.random_bool(self.config.reorder) && self.config.reorder_frames > 0;
+                let delay = if late { random.random_range(1..=self.config.reorder_frames) } else { 0 };
+                let whole = pass.units[unit].bytes.len();
+                let bytes = if by_first && unit == cut.0 { cut.1 } else { whole };
+                let fate = match (by_first && unit >= cut.0, lost) {
+                    (true, _) => Some(Fate::CutOff),
+                    (false, true) => Some(Fate::Lost),
+                    (false, false) => None,
+                };
+                outcomes[unit].fate = outcomes[unit].fate.max(fate);
+                if fate.is_none() || by_first && unit == cut.0 {
+                    self.truth.copies_delayed += u64::from(late);
+                    copies.push(Dispatch { unit, order: place as u64 + delay, bytes, slips });
+                }
+            }
+        }
+        copies.sort_by_key(|copy| copy.order);
+        copies
+    }
+
+    /// What arrives of the copies, wrong bits and all.
+    fn carry(
+        &mut self,
+        pass: &Pass,
+        copies: &[Dispatch],
+        random: &mut ChaCha8Rng,
+        outcomes: &mut [Outcome],
+    ) -> Vec<u8> {
+        let identity = [self.truth.passes, 1];
+        let mut noise = Noise::new(&self.config, random_stream(self.truth.seed, StreamKind::Link, identity));
+        let mut writer = BitWriter::default();
+        for copy in copies {
+            let sent = &pass.units[copy.unit].bytes;
+            let mut bytes = sent[..copy.bytes].to_vec();
+            let mut flips = Vec::new();
+            noise.spoil(&mut bytes, |bit| flips.push(bit));
+            self.truth.copies_delivered += 1;
+            self.truth.copies_damaged += u64::from(!flips.is_empty());
+            self.truth.bits_flipped += flips.len() as u64;
+            let outcome = &mut outcomes[copy.unit];
+            let fate = if copy.bytes < sent.len() {
+                Some(Fate::CutOff)
+            } else if copy.slips {
+                Some(Fate::Slipped)
+            } else {
+                is_spoilt(&flips, self.code).then_some(Fate::Spoilt)
+            };
+            outcome.good += u32::from(fate.is_none());
+            outcome.fate = outcome.fate.max(fate);
+            match self.code.filter(|_| copy.slips && copy.bytes == sent.len()) {
+                Some(code) => {
+                    self.truth.copies_slipped += 1;
+                    // So far from both ends that no code can make up for it.
+                    let margin = 8 * (SYNC_MARKER_BYTES + 64 * code.interleave());
+                    let bit = random.random_range(margin..8 * sent.len() - margin);
+                    let added = random.random::<bool>().then(|| random.random());
+                    writer.slip(&bytes, bit, added);
+                }
+                None => writer.push(&bytes),
+            }
+        }
+        writer.into_bytes()
+    }
+
+    /// Takes the outcomes of a pass into the account.
+    fn settle(&mut self, pass: &Pass, outcomes: &[Outcome]) {
+        for (unit, outcome) in pass.units.iter().zip(outcomes) {
+            self.truth.frames_sent += 1;
+            self.truth.frames_recoverable += u64::from(outcome.good > 0);
+            self.truth.copies_duplicate += u64::from(outcome.good.saturating_sub(1));
+            if let (0, Some(fate), Some((channel, count))) = (outcome.good, outcome.fate, unit.frame) {
+                self.truth.lose_frame(channel, count, fate);
+            }
+        }
+        for packet in &pass.packets {
+            self.truth.packets_sent += 1;
+            match packet.units.iter().map(|unit| outcomes[*unit].good).min().unwrap_or(0) {
+                0 => list_packet(&mut self.truth.packets_lost, packet.apid, packet.count),
+                1 => {}
+                _ => list_packet(&mut self.truth.packets_duplicate, packet.apid, packet.count),
+            }
+        }
+    }
+}
+
+/// Whether wrong bits cost a unit: more wrong bytes in a codeword than can be corrected, or any in a packet.
+fn is_spoilt(flips: &[usize], code: Option<ReedSolomon>) -> bool {
+    let Some(code) = code else { return !flips.is_empty() };
+    let mut wrong = [0; 8];
+    let mut last = None;
+    for byte in flips.iter().filter_map(|bit| (bit / 8).checked_sub(SYNC_MARKER_BYTES)) {
+        if last.replace(byte) != Some(byte) {
+            wrong[byte % code.interleave()] += 1;
+        }
+    }
+    wrong.iter().any(|wrong| *wrong > ERRORS_MAX)
+}

@@ -1,0 +1,92 @@
+//! Bytes behind one another at any bit.
+
+/// Puts bytes behind one another; those behind a lost or added bit no longer stand where bytes do.
+#[derive(Debug, Default)]
+pub(super) struct BitWriter {
+    bytes: Vec<u8>,
+    /// Bits of the last byte that are taken, 0 for all.
+    taken: u32,
+}
+
+impl BitWriter {
+    pub(super) fn push(&mut self, bytes: &[u8]) {
+        if self.taken == 0 {
+            self.bytes.extend_from_slice(bytes);
+            return;
+        }
+        for octet in bytes {
+            self.push_bits(*octet, 8);
+        }
+    }
+
+    /// Puts bytes of which one bit is lost (`None`), or before one of which another is added.
+    pub(super) fn slip(&mut self, bytes: &[u8], bit: usize, added: Option<bool>) {
+        let (before, rest) = bytes.split_at(bit / 8);
+        self.push(before);
+        let Some((octet, after)) = rest.split_first() else { return };
+        let upper = (bit % 8) as u32;
+        if upper > 0 {
+            self.push_bits(*octet, upper);
+        }
+        let lower = match added {
+            Some(added) => {
+                self.push_bits(u8::from(added) << 7, 1);
+                upper
+            }
+            None => upper + 1,
+        };
+        if lower < 8 {
+            self.push_bits(octet << lower, 8 - lower);
+        }
+        self.push(after);
+    }
+
+    /// All of it, the last byte filled up with zeros.
+    pub(super) fn into_bytes(self) -> Vec<u8> {
+        self.bytes
+    }
+
+    /// Puts the upper bits of a byte.
+    fn push_bits(&mut self, octet: u8, count: u32) {
+        let octet = octet & (0xFF00_u16 >> count) as u8;
+        match self.bytes.last_mut().filter(|_| self.taken > 0) {
+            Some(last) => {
+                *last |= octet >> self.taken;
+                if self.taken + count > 8 {
+                    self.bytes.push(octet << (8 - self.taken));
+                }
+            }
+            None => self.bytes.push(octet),
+        }
+        self.taken = (self.taken + count) % 8;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bits_are_lost_and_added_where_asked_for() {
+        let bits = |bytes: &[u8]| bytes.iter().map(|octet| format!("{octet:08b}")).collect::<String>();
+        let sent = [0b1011_0010, 0b0100_1101, 0b1110_0001];
+        for bit in 0..24 {
+            for slip in [None, Some(false), Some(true)] {
+                let mut writer = BitWriter::default();
+                writer.slip(&sent, bit, slip);
+                writer.push(&sent);
+                let mut expected = bits(&sent);
+                match slip {
+                    None => drop(expected.remove(bit)),
+                    Some(added) => expected.insert(bit, if added { '1' } else { '0' }),
+                }
+                expected += &bits(&sent);
+                let found = bits(&writer.into_bytes());
+                assert_eq!(found[..expected.len()], expected, "{bit}, {slip:?}");
+                assert!(
+                    found[expected.len()..].chars().all(|bit| bit == '0') && found.len() < expected.len() + 8
+                );
+            }
+        }
+    }
+}

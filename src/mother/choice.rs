@@ -1,0 +1,188 @@
+//! Which model predicts a channel's visibilities, and what each would cost.
+
+use std::f64::consts::TAU;
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+/// How visibilities are simulated, as a configuration says it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ModelChoice {
+    /// Direct sums while they take no longer than a minute or so, else whatever is cheaper.
+    #[default]
+    Auto,
+    /// Sums over the sky's pixels.
+    Direct,
+    /// Spherical harmonics.
+    Harmonic,
+}
+
+/// How visibilities are simulated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ModelKind {
+    /// Sums over the sky's pixels.
+    Direct,
+    /// Spherical harmonics.
+    Harmonic,
+}
+
+impl fmt::Display for ModelKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Direct => "direct",
+            Self::Harmonic => "harmonic",
+        })
+    }
+}
+
+/// What a channel's model has to do.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Load {
+    /// Visibilities.
+    pub visibilities: f64,
+    /// nside of the sky.
+    pub sky_nside: usize,
+    /// Longest baseline, wavelengths.
+    pub baseline_wavelengths_max: f64,
+    /// Greatest band limit; 0 for what the baselines ask for. A map that holds less has less.
+    pub l_max: usize,
+    /// Whether visibilities are averages over their integrations.
+    pub smeared: bool,
+}
+
+/// Which model, why, and what each would cost.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct ModelPlan {
+    /// The model.
+    pub kind: ModelKind,
+    /// Why this one.
+    pub why: &'static str,
+    /// Band limit of the harmonic model.
+    pub l_max: usize,
+    /// Longest baseline of the harmonic model, wavelengths.
+    pub baseline_wavelengths_max: f64,
+    /// Cost of direct sums in fringes: one a pixel and visibility.
+    pub direct_fringes: f64,
+    /// Cost of the harmonic model before the first visibility, in fringes that take as long.
+    pub set_up_fringes: f64,
+    /// Cost of one visibility of the harmonic model, likewise.
+    pub visibility_fringes: f64,
+    /// Memory of the chosen model, bytes.
+    pub bytes: f64,
+}
+
+/// Greatest band limit that is chosen by itself.
+const L_MAX: usize = 1024;
+/// Direct sums that need no reason: a minute or so on two cores. They have no band limit.
+const DIRECT_FRINGES_ALLOWED: f64 = 1.2e11;
+/// Most memory that a harmonic model takes without being asked for, bytes.
+const BYTES_ALLOWED: f64 = 8e9;
+
+/// Greatest degree that a map's analysis finds exactly, in units of nside, as a fraction.
+const DEGREES_OF_NSIDE: (usize, usize) = (9, 4);
+
+impl ModelPlan {
+    /// The model for `load`. Depends on nothing else, least of all on the machine: results do.
+    #[must_use]
+    pub fn new(choice: ModelChoice, load: Load) -> Self {
+        let u_max = load.baseline_wavelengths_max;
+        let l_max = match load.l_max {
+            0 => band_limit(u_max).min(held(load.sky_nside)),
+            // A little more can be asked for than is taken unasked.
+            most => {
+                if most > 5 * load.sky_nside / 2 {
+                    held(load.sky_nside)
+                } else {
+                    most
+                }
+            }
+        };
+        let pixels = 12.0 * (load.sky_nside as f64).powi(2);
+        let direct_fringes = pixels * load.visibilities;
+        let (l, nodes) = (l_max as f64, 4.5 * u_max + 40.0);
+        // Measured, in fringes of 0.45 ns (two cores): patterns and rotation; rotated sky, products, sampling.
+        let set_up_fringes = 2e8 + 40.0 * l * l * nodes + 6.0 * l * l * l;
+        let visibility_fringes = 500.0 + 8.0 * l;
+        let harmonic_fringes = set_up_fringes + visibility_fringes * load.visibilities;
+        // Patterns of both signs of mu; d+ and d-; rotated skies.
+        let harmonic_bytes = 2.2 * l * l * nodes + 4.0 / 3.0 * l * l * l + 600.0 * l * l;
+        let (kind, why) = match choice {
+            ModelChoice::Direct => (ModelKind::Direct, "as configured"),
+            ModelChoice::Harmonic => (ModelKind::Harmonic, "as configured"),
+            ModelChoice::Auto if load.smeared => (ModelKind::Harmonic, "averages over integrations"),
+            ModelChoice::Auto if direct_fringes <= DIRECT_FRINGES_ALLOWED => {
+                (ModelKind::Direct, "takes a minute at most")
+            }
+            ModelChoice::Auto if harmonic_bytes > BYTES_ALLOWED => {
+                (ModelKind::Direct, "harmonic needs more than 8 GB")
+            }
+            ModelChoice::Auto if harmonic_fringes < direct_fringes => (ModelKind::Harmonic, "cheaper"),
+            ModelChoice::Auto => (ModelKind::Direct, "cheaper"),
+        };
+        let bytes = match kind {
+            ModelKind::Direct => 28.0 * pixels,
+            ModelKind::Harmonic => harmonic_bytes,
+        };
+        Self {
+            kind,
+            why,
+            l_max,
+            baseline_wavelengths_max: u_max,
+            direct_fringes,
+            set_up_fringes,
+            visibility_fringes,
+            bytes,
+        }
+    }
+}
+
+/// Greatest degree to which fringes of `u_max` wavelengths reach: 2 pi u and the width of the Airy function's
+/// fall beyond it; no more than 1024.
+fn band_limit(u_max: f64) -> usize {
+    let turning = TAU * u_max;
+    let wanted = (turning + 6.0 * turning.cbrt()).ceil() as usize + 8;
+    wanted.min(L_MAX)
+}
+
+/// Greatest degree that a map of `nside` holds well.
+fn held(nside: usize) -> usize {
+    let (of, nsides) = DEGREES_OF_NSIDE;
+    of * nside / nsides
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(visibilities: f64, sky_nside: usize, u: f64) -> Load {
+        Load { visibilities, sky_nside, baseline_wavelengths_max: u, l_max: 0, smeared: false }
+    }
+
+    #[test]
+    fn small_jobs_are_summed_and_large_ones_are_not() {
+        let plan = |load| ModelPlan::new(ModelChoice::Auto, load);
+        assert_eq!(plan(load(5e4, 64, 31.3)).kind, ModelKind::Direct);
+        let paper = plan(load(2.6e7, 512, 125.2));
+        assert_eq!(paper.kind, ModelKind::Harmonic);
+        // 2 pi 125.2 = 787, and the fall beyond.
+        assert!((840..860).contains(&paper.l_max), "{}", paper.l_max);
+        assert_eq!(plan(load(2.6e7, 64, 125.2)).l_max, 144);
+        assert_eq!(plan(Load { l_max: 1024, ..load(2.6e7, 64, 125.2) }).l_max, 144);
+        assert_eq!(plan(Load { l_max: 1024, ..load(2.6e7, 512, 125.2) }).l_max, 1024);
+        // All pairs at 10 MHz ask for gigabytes of patterns.
+        assert_eq!(plan(load(1.9e9, 512, 3336.0)).kind, ModelKind::Direct);
+        assert_eq!(plan(Load { smeared: true, ..load(5e4, 64, 31.3) }).kind, ModelKind::Harmonic);
+    }
+
+    #[test]
+    fn what_is_asked_for_is_taken() {
+        for (choice, kind) in
+            [(ModelChoice::Direct, ModelKind::Direct), (ModelChoice::Harmonic, ModelKind::Harmonic)]
+        {
+            let plan = ModelPlan::new(choice, Load { l_max: 200, ..load(10.0, 512, 10.0) });
+            assert_eq!((plan.kind, plan.l_max), (kind, 200));
+        }
+    }
+}

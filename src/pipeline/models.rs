@@ -1,0 +1,121 @@
+//! The models that predict the channels' visibilities.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use super::error::PipelineError;
+use super::plan::Plan;
+use crate::array::Array;
+use crate::array::harmonic::RotationTable;
+use crate::mother::{
+    DirectSum, Fidelity, HarmonicSetup, HarmonicSum, Load, ModelChoice, ModelKind, ModelPlan, Schedule,
+    VisibilityModel,
+};
+use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
+use crate::sky::{Frame, SkyConfig, SkyConfigError, SkyMap};
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+
+impl Plan {
+    /// Which model each channel gets, for skies of these nsides, channel by channel.
+    #[must_use]
+    pub fn model_plans(&self, nsides: &[usize]) -> Vec<ModelPlan> {
+        let spacecraft = &self.config.spacecraft;
+        let plan = |((schedule, expected), &sky_nside): ((&Schedule, _), &usize)| {
+            let expected: super::Expected = expected;
+            let load = Load {
+                visibilities: expected.sent,
+                sky_nside,
+                baseline_wavelengths_max: longest_baseline_wavelengths(&self.array, schedule),
+                l_max: self.config.sky.l_max,
+                smeared: spacecraft.smear_integrations,
+            };
+            if spacecraft.fidelity == Fidelity::Samples {
+                // They ask for powers and for pairs stretched over the channel, beyond what is correlated: the
+                // harmonic model is laid out for neither.
+                let direct = ModelPlan::new(ModelChoice::Direct, load);
+                return ModelPlan { why: "samples take direct sums", ..direct };
+            }
+            ModelPlan::new(spacecraft.model, load)
+        };
+        self.schedules.iter().zip(self.visibilities()).zip(nsides).map(plan).collect()
+    }
+}
+
+impl Plan {
+    /// nside of each channel's simulated sky; a map file that cannot be read counts as a generated sky.
+    #[must_use]
+    pub fn sky_nsides(&self) -> Vec<usize> {
+        let sky = &self.config.sky;
+        let nside = |channel: usize| {
+            let path = sky.file.as_ref().and_then(|files| files.get(channel));
+            let map = path.and_then(|path| read_whole_map(&path, &ReadOptions::default()).ok());
+            map.map_or(sky.nside, |map| map.nside())
+        };
+        (0..self.schedules.len()).map(nside).collect()
+    }
+}
+
+/// The longest baseline that a schedule lets pass, wavelengths. The limit holds where an integration starts; until its
+/// middle a baseline moves by less than what the rule allows.
+fn longest_baseline_wavelengths(array: &Array, schedule: &Schedule) -> f64 {
+    let formation = array.formation();
+    // Arcs are greatest at the start of a period.
+    let arcs = (0..array.satellites()).map(|n| formation.arc_m(n, 0.0).0);
+    let arc_m = arcs.fold(0.0, f64::max);
+    let radius_m = array.orbit_radius_m();
+    let chord_m = 2.0 * radius_m * (0.5 * arc_m / radius_m).min(std::f64::consts::FRAC_PI_2).sin();
+    let longest = chord_m * schedule.frequency_hz / SPEED_OF_LIGHT_M_S * (1.0 + 1e-9);
+    match schedule.baseline_wavelengths_max {
+        0.0 => longest,
+        limit => longest.min(limit + schedule.rule.motion_wavelengths_max),
+    }
+}
+
+/// The model of each channel.
+///
+/// # Errors
+/// A sky whose coefficients cannot be found; a model that cannot be.
+pub(super) fn build(plan: &Plan, skies: &[SkyMap]) -> Result<Vec<Box<dyn VisibilityModel>>, PipelineError> {
+    let nsides: Vec<usize> = skies.iter().map(SkyMap::nside).collect();
+    let array = &plan.array;
+    let mut rotations: HashMap<usize, Arc<RotationTable<f32>>> = HashMap::new();
+    let mut models: Vec<Box<dyn VisibilityModel>> = Vec::new();
+    for ((model, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {
+        let (frequency_hz, response) = (schedule.frequency_hz, plan.instrument.response);
+        if model.kind == ModelKind::Direct {
+            models.push(Box::new(DirectSum::new(sky, frequency_hz, array.moon_radius_m(), response)));
+            continue;
+        }
+        let alm = coefficients(sky, model.l_max)?;
+        let setup = HarmonicSetup {
+            frequency_hz,
+            orbit_radius_m: array.orbit_radius_m(),
+            inclination_rad: array.inclination_rad(),
+            moon_radius_m: array.moon_radius_m(),
+            baseline_wavelengths_max: model.baseline_wavelengths_max,
+            response,
+        };
+        let table = || Arc::new(RotationTable::new(model.l_max, array.inclination_rad()));
+        let rotation = Arc::clone(rotations.entry(model.l_max).or_insert_with(table));
+        models.push(Box::new(HarmonicSum::new(alm, setup, rotation)?));
+    }
+    Ok(models)
+}
+
+/// Coefficients of a map in any frame on ecliptic axes, up to `l_max`.
+///
+/// # Errors
+/// More degrees than the map determines; a map with values that are not finite.
+fn coefficients(sky: &SkyMap, l_max: usize) -> Result<Alm, PipelineError> {
+    let most = SkyConfig::l_max_most(sky.nside());
+    if l_max > most {
+        return Err(SkyConfigError::BandLimit { l_max, most }.into());
+    }
+    let options = AnalysisOptions { method: Method::ACCURATE };
+    let alm = analysis(sky.values(), l_max, &options)?.alm;
+    Ok(match sky.frame() {
+        Frame::Ecliptic => alm,
+        frame => alm.rotated(&frame.to_ecliptic()),
+    })
+}

@@ -1,0 +1,75 @@
+//! A small mission and its downlink.
+
+use lunarray::downlink::{DownlinkConfig, Transmission};
+use lunarray::frames::{
+    AntennaResponse, Channel, EphemerisSegment, Flags, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
+};
+use lunarray::units::{ChannelId, MissionTime, Pair};
+use num_complex::Complex32;
+
+/// So many passes of two channels and two pairs, with so many visibilities a block.
+pub fn mission(passes: i64, visibilities: u32) -> Vec<GroundFrame> {
+    let channel = |frequency_hz| Channel { frequency_hz, width_hz: 8e3 };
+    let mut frames = vec![GroundFrame::Instrument(Instrument {
+        name: "test".to_owned(),
+        epoch_tai_s: 2_493_072_037.25,
+        moon_radius_m: 1_737_100.0,
+        satellites: 8,
+        channels: vec![channel(3e6), channel(1e7)],
+        response: AntennaResponse::Isotropic,
+        seed: 7,
+        configuration_hash: 1,
+    })];
+    for pass in 0..passes {
+        let start = MissionTime(9_000_000_000 * pass);
+        frames.push(GroundFrame::Ephemeris(EphemerisSegment {
+            start,
+            step_ticks: 60_000_000,
+            satellites: 8,
+            positions_m: (0..8 * 50).map(|k| [f64::from(k), -2e6, 0.5]).collect(),
+        }));
+        for (channel, j) in [(0, 1), (0, 7), (1, 1), (1, 7)] {
+            frames.push(GroundFrame::Visibilities(block(channel, j, start, visibilities)));
+        }
+        let sampled = 4 * u64::from(visibilities) * (pass as u64 + 1);
+        let time = start.plus_ticks(3_000_000_000);
+        frames.push(GroundFrame::Housekeeping(Housekeeping { time, sampled, dropped: 0 }));
+    }
+    frames
+}
+
+fn block(channel: u16, j: u8, start: MissionTime, count: u32) -> VisibilityBlock {
+    VisibilityBlock {
+        channel: ChannelId(channel),
+        pair: Pair { i: 0, j },
+        start,
+        offset_ticks: (0..count).map(|k| 50_000 * k).collect(),
+        duration_ticks: vec![50_000; count as usize],
+        value_k_sr: (0..count).map(|k| Complex32::new((k as f32).sin(), 0.37 * k as f32)).collect(),
+        weight: (0..count).map(|k| 1.0 / (1.0 + k as f32)).collect(),
+        flags: vec![Flags::GOOD; count as usize],
+    }
+}
+
+/// The bytes that frames become.
+pub fn transmit(frames: &[GroundFrame], config: &DownlinkConfig) -> Vec<u8> {
+    let mut transmission = Transmission::new(config).unwrap();
+    let mut bytes = Vec::new();
+    for frame in frames {
+        transmission.send(frame, &mut bytes).unwrap();
+    }
+    transmission.finish(&mut bytes);
+    bytes
+}
+
+/// Packets one after the other, by their length fields.
+pub fn packets_of(mut bytes: &[u8]) -> Vec<Vec<u8>> {
+    let mut packets = Vec::new();
+    while let [_, _, _, _, high, low, ..] = *bytes {
+        let (packet, rest) = bytes.split_at(7 + usize::from(u16::from_be_bytes([high, low])));
+        packets.push(packet.to_vec());
+        bytes = rest;
+    }
+    assert!(bytes.is_empty());
+    packets
+}
