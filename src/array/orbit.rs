@@ -146,7 +146,13 @@ impl Array {
 
     /// How deep the Earth stands behind the limb for daughter 1, m: positive when hidden.
     pub(super) fn earth_depth_m(&self, t_s: f64) -> f64 {
-        let position = self.position_m(0, t_s);
+        self.earth_depth_of_m(0, t_s)
+    }
+
+    /// How deep the Earth stands behind the limb for daughter `n` (from 0), m: positive when hidden.
+    #[must_use]
+    pub fn earth_depth_of_m(&self, n: usize, t_s: f64) -> f64 {
+        let position = self.position_m(n, t_s);
         hiding_depth_m(position, self.earth_hat(t_s), self.moon_radius_m)
     }
 }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{AntennaGains, Calibration, CalibrationError, Identity};
+use super::{AntennaGains, Calibration, CalibrationError, Identity, VanVleck};
 
 /// Which calibration is applied.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -26,19 +26,41 @@ pub struct CalibrationConfig {
     /// File of gains, for `antenna-gains`; relative to the folder that [`CalibrationConfig::build`] is given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gains_file: Option<PathBuf>,
+    /// Bits of the samples whose correlations are corrected: 1, 2 or 4; 0 for no correction.
+    pub quantiser_bits: u32,
 }
 
 impl CalibrationConfig {
     /// Everything that is wrong with the configuration; empty if it is good. Does not open the file.
     #[must_use]
     pub fn problems(&self) -> Vec<CalibrationError> {
+        let mut found = Vec::new();
+        if let Err(problem) = self.van_vleck() {
+            found.push(problem);
+        }
         let expected = match (self.hook, &self.gains_file) {
             (CalibrationHook::AntennaGains, None) => "the path of a file, for hook = \"antenna-gains\"",
             (CalibrationHook::Identity, Some(_)) => "no such key, or hook = \"antenna-gains\"",
-            _ => return Vec::new(),
+            _ => return found,
         };
         let value = self.gains_file.as_ref().map_or("(missing)".to_owned(), |path| format!("{path:?}"));
-        vec![CalibrationError::Parameter { key: "calibration.gains_file".to_owned(), value, expected }]
+        found.push(CalibrationError::Parameter { key: "calibration.gains_file".to_owned(), value, expected });
+        found
+    }
+
+    /// The correction of quantised correlations, if there is one.
+    ///
+    /// # Errors
+    /// A number of bits that none is made for.
+    pub fn van_vleck(&self) -> Result<Option<VanVleck>, CalibrationError> {
+        if self.quantiser_bits == 0 {
+            return Ok(None);
+        }
+        VanVleck::new(self.quantiser_bits).map(Some).map_err(|error| CalibrationError::Parameter {
+            key: "calibration.quantiser_bits".to_owned(),
+            value: error.0.to_string(),
+            expected: "0 for none, 1, 2 or 4",
+        })
     }
 
     /// The calibration; `folder` is where the configuration lies.

@@ -2,19 +2,22 @@
 //!
 //! A [`Calibration`] turns measured visibilities into what ideal antennas would have measured, and
 //! gives each the weight that is left to it. [`Identity`] does nothing; [`AntennaGains`] divides by
-//! complex gains from a file. [`CalibrationConfig`] chooses.
+//! complex gains from a file. [`CalibrationConfig`] chooses. Before either, [`VanVleck`] takes out what
+//! quantisers of few bits do to correlations.
 
 mod config;
 mod error;
 mod gains;
 mod gains_file;
 mod stage;
+mod van_vleck;
 
 pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 pub use gains::AntennaGains;
 pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation};
 pub use stage::{Calibrator, CalibratorState};
+pub use van_vleck::{QuantiserBitsError, VanVleck};
 
 use crate::frames::PlacedVisibilities;
 

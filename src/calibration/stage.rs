@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use super::{Calibration, CalibrationError};
+use super::{Calibration, CalibrationError, VanVleck};
 use crate::array::{Ephemeris, FlaggedCounts};
 use crate::frames::{EphemerisSegment, GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock};
 use crate::runtime::{Ledger, Outlet, Stage, Units};
@@ -28,6 +28,7 @@ pub struct CalibratorState {
 /// The ledger is closed against the spacecraft's own counts: sampled less dropped less received is
 /// what the link lost. Visibilities after the last housekeeping packet count as sampled when received.
 pub struct Calibrator {
+    van_vleck: Option<VanVleck>,
     calibration: Box<dyn Calibration>,
     ledger: Ledger,
     ephemeris: Ephemeris,
@@ -44,6 +45,7 @@ impl Calibrator {
     #[must_use]
     pub fn new(calibration: Box<dyn Calibration>, ledger: Ledger) -> Self {
         Self {
+            van_vleck: None,
             calibration,
             ledger,
             ephemeris: Ephemeris::default(),
@@ -79,9 +81,15 @@ impl Calibrator {
         Self { ephemeris, instrument, seen: seen.into_iter().collect(), received, reported, ..self }
     }
 
+    /// Takes out first what quantisers of few bits do.
+    #[must_use]
+    pub fn with_van_vleck(self, van_vleck: Option<VanVleck>) -> Self {
+        Self { van_vleck, ..self }
+    }
+
     fn visibilities(
         &mut self,
-        block: &VisibilityBlock,
+        mut block: VisibilityBlock,
         out: &mut Outlet<PlacedFrame>,
     ) -> Result<(), CalibrationError> {
         let count = block.len() as u64;
@@ -97,7 +105,10 @@ impl Calibrator {
             self.ledger.flagged("no instrument description", count);
             return Ok(());
         };
-        let (mut placed, placing) = self.ephemeris.place(block, channel.frequency_hz);
+        if let Some(van_vleck) = &self.van_vleck {
+            van_vleck.apply(&mut block, channel.width_hz);
+        }
+        let (mut placed, placing) = self.ephemeris.place(&block, channel.frequency_hz);
         self.ledger.flagged("no ephemeris", placing.without_ephemeris);
         self.post_flagged(&placing.flagged);
         let calibrated = self.calibration.apply(&mut placed)?;
@@ -139,7 +150,7 @@ impl Stage for Calibrator {
                 // Whatever becomes of it, visibilities without positions are counted one by one.
                 self.ephemeris.insert(segment);
             }
-            GroundFrame::Visibilities(block) => self.visibilities(&block, out)?,
+            GroundFrame::Visibilities(block) => self.visibilities(block, out)?,
             GroundFrame::Housekeeping(report) => {
                 if self.reported.is_none_or(|last| last.time <= report.time) {
                     self.reported = Some(report);

@@ -1,5 +1,6 @@
 //! The command line: arguments, progress, output for people and for programs.
 
+mod bench;
 mod check;
 mod compare;
 mod corrupt;
@@ -60,6 +61,7 @@ enum Command {
     Geometry(geometry::GeometryArgs),
     Predict(predict::PredictArgs),
     Check(check::CheckArgs),
+    Bench(bench::BenchArgs),
     Sky(sky::SkyArgs),
 }
 
@@ -123,6 +125,7 @@ pub fn main() -> ExitCode {
         Command::Geometry(args) => geometry::execute(&args),
         Command::Predict(args) => predict::execute(&args),
         Command::Check(args) => check::execute(&args),
+        Command::Bench(args) => bench::execute(&args),
         Command::Sky(args) => sky::execute(&args),
     };
     match result {

@@ -32,7 +32,7 @@ pub(super) fn execute(args: &RunArgs) -> CommandResult {
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
     let cancel = cancel_on_interrupt()?;
     let mut progress = None;
-    let windows = plan.windows.len() as u64;
+    let windows = plan.windows_watched();
     let summary = run(&plan, &out, &cancel, &mut |metrics| {
         progress = Some(Progress::watch(metrics, INTEGRATE, windows));
     })?;

@@ -30,7 +30,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     use_threads(&plan.config.runtime)?;
     let cancel = cancel_on_interrupt()?;
     let mut progress = None;
-    let windows = plan.windows.len() as u64;
+    let windows = plan.windows_watched();
     let report = simulate(&plan, &args.out, &cancel, &mut |metrics| {
         progress = Some(Progress::watch(metrics, INTEGRATE, windows));
     })?;

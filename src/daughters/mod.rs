@@ -1,4 +1,26 @@
-//! The daughters: sampling of 30 channels of 8 kHz, quantiser and clocks.
+//! The daughters: sampling of up to 30 channels, level control, quantisers, clocks, and the link to the mother.
 //!
-//! Empty for now: the chain starts at integrated visibilities, in [`crate::mother`]. Sample streams will
-//! come in here and be correlated there; everything downstream will not tell the difference.
+//! A channel of complex samples at its own width (8 kHz) is drawn for all daughters at once, with the
+//! covariance that a [`crate::mother::VisibilityModel`] gives over the channel as the array moves, and noise
+//! of the receivers: [`Covariances`], [`Synthesis`]. Each daughter then does to its samples what it does
+//! wrong ([`Disturbances`]), sets its level and quantises ([`Quantiser`]), and sends blocks over its link
+//! ([`SampleLink`]). All of it is noise with a seed: [`Sampler`] gives the same samples whatever the threads.
+
+mod colour;
+mod config;
+mod covariance;
+mod disturbances;
+mod link;
+mod normal;
+mod quantiser;
+mod sampler;
+mod synthesis;
+
+pub use colour::Repairs;
+pub use config::{DaughtersConfig, DaughtersError, Disturbances, DropPolicy, FLOAT_BITS};
+pub use covariance::{Covariances, Epochs, Request, Tables};
+pub use link::{LinkCounts, SampleLink};
+pub use quantiser::Quantiser;
+pub(crate) use sampler::sample_ticks;
+pub use sampler::{Sampler, SamplerCounts, Scene};
+pub use synthesis::{BINS, Draft, DrawKey, HOP, Response, Synthesis};

@@ -7,12 +7,14 @@ mod ephemeris;
 mod ground;
 mod housekeeping;
 mod instrument;
+mod samples;
 mod visibility;
 
 pub use ephemeris::EphemerisSegment;
 pub use ground::PlacedFrame;
 pub use housekeeping::Housekeeping;
 pub use instrument::{AntennaResponse, Channel, Instrument};
+pub use samples::{SampleBlock, Samples, SpaceFrame};
 pub use visibility::{Flags, PlacedVisibilities, VisibilityBlock};
 
 /// What the ground reads from a downlink, in the order in which it was sent.

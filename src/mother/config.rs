@@ -19,6 +19,8 @@ pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SpacecraftConfig {
+    /// What is simulated: integrated visibilities, or the samples that they are made of.
+    pub fidelity: Fidelity,
     /// Centre frequencies, Hz.
     pub channels_hz: Vec<f64>,
     /// Width of every channel, Hz.
@@ -27,6 +29,8 @@ pub struct SpacecraftConfig {
     pub duration_s: f64,
     /// Observe in every n-th window only.
     pub every_nth_window: u64,
+    /// Observe so long only in each window, from its start, s; 0 for all of it.
+    pub window_s_max: f64,
     /// Send down every n-th integration of a window only.
     pub every_nth_integration: PerChannel<u64>,
     /// Longest integration, s.
@@ -46,10 +50,23 @@ pub struct SpacecraftConfig {
     pub receiver_noise_k_sr: f64,
     /// Antenna response of the daughters.
     pub antenna: Antenna,
+    /// Numbers that a block of samples may be ahead of one that the mother waits for.
+    pub wait_blocks: u64,
     /// Capacity of the onboard store, bytes.
     pub store_bytes_max: u64,
     /// Mission epoch: TAI seconds since 1958-01-01.
     pub epoch_tai_s: f64,
+}
+
+/// How much of the spacecraft is simulated; what comes down looks the same.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Fidelity {
+    /// Integrated visibilities with thermal noise: for years of mission time.
+    #[default]
+    Visibilities,
+    /// Samples of every daughter, quantised, sent over links and correlated: for minutes to hours.
+    Samples,
 }
 
 /// Antenna response by name.
@@ -76,10 +93,12 @@ impl Default for SpacecraftConfig {
     fn default() -> Self {
         let rule = IntegrationRule::default();
         Self {
+            fidelity: Fidelity::default(),
             channels_hz: vec![10e6],
             channel_width_hz: 8_000.0,
             duration_s: 1.3 * YEAR_S,
             every_nth_window: 1,
+            window_s_max: 0.0,
             every_nth_integration: PerChannel::All(1),
             integration_s_max: rule.duration_s_max,
             motion_wavelengths_max: rule.motion_wavelengths_max,
@@ -89,6 +108,7 @@ impl Default for SpacecraftConfig {
             thermal_noise: true,
             receiver_noise_k_sr: 0.0,
             antenna: Antenna::default(),
+            wait_blocks: 16,
             store_bytes_max: 4 << 30,
             // 2027-01-01T00:00:00 TAI: 69 years of which 17 are leap years.
             epoch_tai_s: (69.0 * 365.0 + 17.0) * 86_400.0,
@@ -138,6 +158,12 @@ pub enum SpacecraftError {
          \"auto\" with it"
     )]
     Smearing,
+    /// Samples asked of a model that they do not have.
+    #[error(
+        "spacecraft.fidelity = \"samples\" takes direct sums of instants: expected spacecraft.model = \"auto\" or \
+         \"direct\", and spacecraft.smear_integrations = false"
+    )]
+    SamplesModel,
     /// A parameter outside its range.
     #[error("spacecraft.{key} = {value}: expected {expected}")]
     Parameter {
@@ -196,6 +222,10 @@ impl SpacecraftConfig {
                 found.push(SpacecraftError::PerChannel { key, channels });
             }
         }
+        let direct = self.model != ModelChoice::Harmonic && !self.smear_integrations;
+        if self.fidelity == Fidelity::Samples && !direct {
+            found.push(SpacecraftError::SamplesModel);
+        }
         if self.smear_integrations && self.model == ModelChoice::Direct {
             found.push(SpacecraftError::Smearing);
         }
@@ -206,6 +236,8 @@ impl SpacecraftConfig {
         };
         let seconds = self.duration_s;
         require("duration_s", seconds, seconds > 0.0 && seconds <= 1e9, "seconds, above 0 and at most 1e9");
+        let window = self.window_s_max;
+        require("window_s_max", window, window >= 0.0, "seconds, or 0 for all of a window");
         let width = self.channel_width_hz;
         require("channel_width_hz", width, width > 0.0 && width <= 1e6, "above 0 Hz and at most 1 MHz");
         let longest = self.integration_s_max;
@@ -214,6 +246,10 @@ impl SpacecraftConfig {
         require("motion_wavelengths_max", motion, (1e-3..=1.0).contains(&motion), "0.001 to 1");
         let store = self.store_bytes_max;
         require("store_bytes_max", store as f64, store >= 1 << 20, "at least 1 MiB (1048576)");
+        let wait = self.wait_blocks;
+        require("wait_blocks", wait as f64, (1..=1024).contains(&wait), "1 to 1024 blocks");
+        let noisy = self.thermal_noise || self.fidelity == Fidelity::Visibilities;
+        require("thermal_noise", 0.0, noisy, "true with fidelity = \"samples\": samples are noise");
         let noise = self.receiver_noise_k_sr;
         require("receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
         require("every_nth_window", self.every_nth_window as f64, self.every_nth_window >= 1, "at least 1");

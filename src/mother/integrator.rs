@@ -15,7 +15,7 @@ use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{ChannelId, Pair, StreamKind, TICKS_PER_SECOND, all_pairs, random_stream};
 
 /// Greatest distance of tabulated positions, s; interpolation is then good to micrometres.
-const EPHEMERIS_STEP_S: f64 = 60.0;
+pub(super) const EPHEMERIS_STEP_S: f64 = 60.0;
 
 /// Visibilities of all channels after which no model gets more at once; bounds memory to some 200 MB.
 const WAITING_VISIBILITIES_MAX: usize = 1_000_000;

@@ -1,11 +1,13 @@
 //! The mother: integration of visibilities while the Earth is hidden, and the store that holds them
 //! until it is in sight.
 //!
-//! This is the spacecraft at the level of integrated visibilities: what the correlator would put out
-//! for a given sky, with thermal noise. Uses [`crate::frames`], [`crate::array`], [`crate::sky`].
+//! There are two fidelities, which give the same frames: [`Integrator`] is the spacecraft at the level of
+//! integrated visibilities, what the correlator would put out for a given sky, with thermal noise;
+//! [`correlator`] makes them from the samples of [`crate::daughters`]. Uses [`crate::frames`], [`crate::array`], [`crate::sky`].
 
 mod choice;
 mod config;
+pub mod correlator;
 mod direct;
 mod harmonic;
 mod integrator;
@@ -15,7 +17,7 @@ mod schedule;
 mod store;
 
 pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
-pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, SpacecraftConfig, SpacecraftError};
+pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, SpacecraftError};
 pub use direct::DirectSum;
 pub use harmonic::{HarmonicSetup, HarmonicSum};
 pub use integrator::{Integrator, MeasurementOptions, NoiseModel};

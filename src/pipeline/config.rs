@@ -8,6 +8,7 @@ use thiserror::Error;
 use crate::accumulation::{MapConfig, MapConfigError};
 use crate::array::{Array, ArrayConfig};
 use crate::calibration::CalibrationConfig;
+use crate::daughters::DaughtersConfig;
 use crate::downlink::DownlinkConfig;
 use crate::mother::SpacecraftConfig;
 use crate::products::ProductsConfig;
@@ -32,6 +33,8 @@ pub struct Config {
     pub sky: SkyConfig,
     /// The array.
     pub array: ArrayConfig,
+    /// The daughters' samples.
+    pub daughters: DaughtersConfig,
     /// The spacecraft.
     pub spacecraft: SpacecraftConfig,
     /// The downlink.
@@ -210,6 +213,7 @@ impl Config {
             found.push(Box::new(problem));
         }
         found.extend(boxed(array));
+        found.extend(boxed(self.daughters.problems(self.array.satellites)));
         found.extend(boxed(self.spacecraft.problems()));
         found.extend(boxed(self.downlink.problems()));
         for key in self.map.misfits(channels) {
@@ -232,8 +236,8 @@ impl Config {
     /// A hash of the sections that shape the downlink, for provenance.
     #[must_use]
     pub fn space_hash(&self) -> u64 {
-        let Self { name, seed, sky, array, spacecraft, .. } = self;
-        hash(&(name, seed, sky, array, spacecraft))
+        let Self { name, seed, sky, array, daughters, spacecraft, .. } = self;
+        hash(&(name, seed, sky, array, daughters, spacecraft))
     }
 
     /// A hash of the sections that shape maps from a downlink, for provenance.

@@ -51,6 +51,9 @@ pub struct Cost {
     pub downlink_bytes: f64,
     /// Memory for sums, snapshots, solving and the simulated sky, bytes.
     pub memory_bytes: f64,
+    /// Rate that the daughters' samples need on their links to the mother, all together, bit/s; with
+    /// samples alone.
+    pub samples_bits_per_s: Option<f64>,
     /// Time on this machine, s, from a measurement of a fraction of a second.
     pub predicted_s: f64,
 }
@@ -117,6 +120,7 @@ impl Plan {
             downlink_bytes: self.config.downlink.expansion()
                 * (sent * VISIBILITY_BYTES as f64 + self.windows.len() as f64 * 10_000.0),
             memory_bytes,
+            samples_bits_per_s: self.samples_bits_per_s(),
             predicted_s,
         }
     }
@@ -189,6 +193,9 @@ impl fmt::Display for Cost {
         writeln!(f, "maps per channel {}", self.solutions)?;
         writeln!(f, "downlink         {:.1} MB", self.downlink_bytes / 1e6)?;
         writeln!(f, "memory           {:.2} GB", self.memory_bytes / 1e9)?;
+        if let Some(rate) = self.samples_bits_per_s {
+            writeln!(f, "samples          {:.3} Mbit/s from all daughters", rate / 1e6)?;
+        }
         write!(f, "predicted time   {:.0} s on this machine", self.predicted_s)
     }
 }

@@ -78,7 +78,8 @@ fn add_sums(
     let capacity = config.runtime.queue_capacity;
     let calibration = config.calibration.build(Path::new(""))?;
     let frames = graph.stage("receive", capacity, bytes, Reception::new(Arc::clone(&outcome.reception)));
-    let calibrator = Calibrator::new(calibration, outcome.ledger.clone());
+    let calibrator =
+        Calibrator::new(calibration, outcome.ledger.clone()).with_van_vleck(config.calibration.van_vleck()?);
     let placed = graph.stage("calibrate", capacity, frames, calibrator);
     let accumulator = Accumulator::new(config.map.clone(), outcome.ledger.clone());
     Ok(graph.stage("accumulate", 1, placed, accumulator))

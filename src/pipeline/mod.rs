@@ -2,6 +2,7 @@
 //!
 //! The only place where space and ground meet, and where concrete stages are wired.
 
+mod bench;
 mod config;
 mod cost;
 mod engine_cost;
@@ -10,14 +11,17 @@ mod ground;
 mod models;
 mod plan;
 mod run;
+mod sampling;
 mod space;
 pub mod state;
 mod summary;
 
+pub use bench::{BENCH_STAGES, Bench, BenchSettings, Machine, Rate, bench, bench_config};
 pub use config::{Config, ConfigError, ConfigSource, Problems, QUICKLOOK};
 pub use cost::{ChannelCost, Cost};
 pub use error::PipelineError;
 pub use plan::{Expected, Plan};
 pub use run::{Watched, Watcher, downlink_file, replay, run, simulate, use_threads};
+pub use sampling::{SampleCounts, sample_stages};
 pub use space::INTEGRATE;
 pub use summary::{Segment, Summary};

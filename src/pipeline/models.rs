@@ -8,7 +8,8 @@ use super::plan::Plan;
 use crate::array::Array;
 use crate::array::harmonic::RotationTable;
 use crate::mother::{
-    DirectSum, HarmonicSetup, HarmonicSum, Load, ModelKind, ModelPlan, Schedule, VisibilityModel,
+    DirectSum, Fidelity, HarmonicSetup, HarmonicSum, Load, ModelChoice, ModelKind, ModelPlan, Schedule,
+    VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
@@ -29,6 +30,12 @@ impl Plan {
                 l_max: self.config.sky.l_max,
                 smeared: spacecraft.smear_integrations,
             };
+            if spacecraft.fidelity == Fidelity::Samples {
+                // They ask for powers and for pairs stretched over the channel, beyond what is correlated: the
+                // harmonic model is laid out for neither.
+                let direct = ModelPlan::new(ModelChoice::Direct, load);
+                return ModelPlan { why: "samples take direct sums", ..direct };
+            }
             ModelPlan::new(spacecraft.model, load)
         };
         self.schedules.iter().zip(self.visibilities()).zip(nsides).map(plan).collect()

@@ -6,8 +6,8 @@ use super::config::{Config, Problems};
 use super::error::PipelineError;
 use crate::array::Array;
 use crate::frames::{Instrument, ObservingWindow};
-use crate::mother::{Observer, Schedule};
-use crate::units::all_pairs;
+use crate::mother::{Fidelity, Observer, Schedule};
+use crate::units::{MissionTime, all_pairs};
 
 /// A configuration that has been checked, with what follows from it.
 #[derive(Clone, Debug)]
@@ -51,7 +51,13 @@ impl Plan {
             every_nth_window: spacecraft.every_nth_window,
         };
         let schedules = spacecraft.channels_hz.iter().enumerate().map(schedule).collect();
-        let windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.every_nth_window);
+        let mut windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.every_nth_window);
+        if spacecraft.window_s_max > 0.0 {
+            for window in &mut windows {
+                let cut = MissionTime::from_seconds(window.start.seconds() + spacecraft.window_s_max);
+                window.end = window.end.min(cut);
+            }
+        }
         Ok(Self { config, array, instrument, schedules, windows })
     }
 
@@ -59,6 +65,24 @@ impl Plan {
     #[must_use]
     pub fn file_problems(&self) -> Problems {
         super::space::file_problems(self)
+    }
+
+    /// Rate that the daughters' samples need on their links, bit/s; `None` without samples.
+    #[must_use]
+    pub fn samples_bits_per_s(&self) -> Option<f64> {
+        let Config { spacecraft, daughters, .. } = &self.config;
+        let (count, channels) = (self.array.satellites(), spacecraft.channels_hz.len());
+        (spacecraft.fidelity == Fidelity::Samples)
+            .then(|| daughters.rate_bits_per_s(count, channels, spacecraft.channel_width_hz))
+    }
+
+    /// Windows by which progress is measured; 0 where stages are not paced by them.
+    #[must_use]
+    pub fn windows_watched(&self) -> u64 {
+        match self.config.spacecraft.fidelity {
+            Fidelity::Visibilities => self.windows.len() as u64,
+            Fidelity::Samples => 0,
+        }
     }
 
     /// About how many visibilities each channel will have, sent down and within the map's limit.

@@ -5,8 +5,10 @@ use std::sync::Arc;
 use super::config::Problems;
 use super::error::PipelineError;
 use super::plan::Plan;
+use super::sampling::samples;
 use crate::downlink::Transmitter;
-use crate::mother::{Integrator, MeasurementOptions, NoiseModel, Observer, Store};
+use crate::frames::GroundFrame;
+use crate::mother::{Fidelity, Integrator, MeasurementOptions, NoiseModel, Observer, Store};
 use crate::runtime::{Graph, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::generated::generate;
@@ -56,17 +58,32 @@ pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
 pub fn add(graph: &mut Graph, plan: &Plan, skies: &[SkyMap]) -> Result<Link<Vec<u8>>, PipelineError> {
     let Plan { config, array, instrument, schedules, windows } = plan;
     let capacity = config.runtime.queue_capacity;
+    let models = super::models::build(plan, skies)?;
+    if config.spacecraft.fidelity == Fidelity::Samples {
+        let frames = samples(graph, plan, models);
+        return transmit(graph, plan, frames);
+    }
     let noise = NoiseModel {
         seed: config.spacecraft.thermal_noise.then_some(config.seed),
         receiver_noise_k_sr: config.spacecraft.receiver_noise_k_sr,
     };
     let options = MeasurementOptions { noise, smear_integrations: config.spacecraft.smear_integrations };
-    let models = super::models::build(plan, skies)?;
     let integrator =
         Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options);
     // A window waiting is nothing; a window's visibilities are.
     let windows = graph.source("observe", 1, Observer::new(windows.clone()));
     let frames = graph.stage(INTEGRATE, capacity, windows, integrator);
+    transmit(graph, plan, frames)
+}
+
+/// What comes after the visibilities, however they were made.
+fn transmit(
+    graph: &mut Graph,
+    plan: &Plan,
+    frames: Link<GroundFrame>,
+) -> Result<Link<Vec<u8>>, PipelineError> {
+    let config = &plan.config;
+    let capacity = config.runtime.queue_capacity;
     let passes = graph.stage("store", capacity, frames, Store::new(config.spacecraft.store_bytes_max));
     Ok(graph.stage("transmit", capacity, passes, Transmitter::new(&config.downlink)?))
 }

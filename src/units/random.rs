@@ -17,6 +17,10 @@ pub enum StreamKind {
     SkySources = 4,
     /// Starting vectors of eigenvalue iterations and probing vectors.
     Probe = 5,
+    /// Samples of the daughters.
+    Samples = 6,
+    /// Phases of interference.
+    Interference = 7,
     /// Faults of a simulated link.
     Link = 20,
 }

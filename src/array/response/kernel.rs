@@ -46,7 +46,7 @@ impl Prepared {
 
 /// `a b + c`, fused where `FMA` says that the hardware does it.
 #[inline(always)]
-pub(super) fn fused<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
+pub(crate) fn fused<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
@@ -79,7 +79,7 @@ pub(super) fn fraction(turns: f64) -> f32 {
 
 /// A polynomial by Horner's rule, constant term first.
 #[inline(always)]
-pub(super) fn polynomial<const FMA: bool, const N: usize>(coefficients: &[f32; N], x: f32) -> f32 {
+pub(crate) fn polynomial<const FMA: bool, const N: usize>(coefficients: &[f32; N], x: f32) -> f32 {
     let mut sum = coefficients[N - 1];
     for k in (0..N - 1).rev() {
         sum = fused::<FMA>(sum, x, coefficients[k]);
@@ -92,7 +92,7 @@ pub(super) fn polynomial<const FMA: bool, const N: usize>(coefficients: &[f32; N
 /// From the half angle: sin(pi t)/t and cos(pi t) as polynomials in t^2, interpolated at Chebyshev
 /// points of 0 <= t^2 <= 1/4; then the formulas for the double angle.
 #[inline(always)]
-pub(super) fn cos_sin_turns<const FMA: bool>(turns: f32) -> (f32, f32) {
+pub(crate) fn cos_sin_turns<const FMA: bool>(turns: f32) -> (f32, f32) {
     const SIN: [f32; 5] = [std::f32::consts::PI, -5.167_710_3, 2.550_077_4, -0.598_291_3, 0.077_657_66];
     const COS: [f32; 6] = [1.0, -4.934_802, 4.058_709, -1.335_212, 0.234_937_2, -0.024_396_325];
     let square = turns * turns;

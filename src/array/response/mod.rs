@@ -13,7 +13,7 @@ mod blocks;
 mod directions;
 mod edge;
 pub mod exact;
-mod kernel;
+pub(crate) mod kernel;
 mod rows;
 mod sums;
 

@@ -1,0 +1,115 @@
+//! What is wrong with the daughters, and what is put in on purpose.
+
+use std::f64::consts::TAU;
+
+use num_complex::{Complex32, Complex64};
+use rand::Rng;
+
+use super::config::Disturbances;
+use super::synthesis::Response;
+use crate::array::Array;
+use crate::frames::Channel;
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+use crate::units::vector::dot;
+use crate::units::{StreamKind, random_stream};
+
+fn of(list: &[f64], daughter: usize) -> f64 {
+    list.get(daughter).copied().unwrap_or(0.0)
+}
+
+impl Disturbances {
+    /// How far a daughter's clock is off at `t_s`, s: it samples so much later than it believes.
+    #[must_use]
+    pub fn clock_offset_s(&self, daughter: usize, t_s: f64) -> f64 {
+        of(&self.clock_offset_s, daughter) + of(&self.clock_drift, daughter) * t_s
+    }
+
+    /// Whether gains, phases or clocks are other than ideal.
+    #[must_use]
+    pub fn changes_responses(&self) -> bool {
+        [
+            &self.gain_error,
+            &self.gain_drift_per_s,
+            &self.phase_rad,
+            &self.phase_drift_rad_per_s,
+            &self.clock_offset_s,
+            &self.clock_drift,
+        ]
+        .iter()
+        .any(|list| list.iter().any(|value| *value != 0.0))
+    }
+
+    /// What a daughter does to its signal at `t_s`.
+    #[must_use]
+    pub fn response(&self, daughter: usize, channel: Channel, t_s: f64) -> Response {
+        let amplitude = 1.0 + of(&self.gain_error, daughter) + of(&self.gain_drift_per_s, daughter) * t_s;
+        let phase_rad = of(&self.phase_rad, daughter) + of(&self.phase_drift_rad_per_s, daughter) * t_s;
+        let late_s = self.clock_offset_s(daughter, t_s);
+        // Signals turn as exp(-2 pi i nu t).
+        let gain = amplitude * Complex64::cis(phase_rad - TAU * (channel.frequency_hz * late_s).fract());
+        Response { gain, turns: -channel.width_hz * late_s }
+    }
+
+    /// Whether tones are added.
+    #[must_use]
+    pub fn has_tones(&self) -> bool {
+        self.interference_k_sr > 0.0 || self.calibration_k_sr > 0.0
+    }
+}
+
+/// A stretch of samples of one daughter to which tones are added.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Stretch<'a> {
+    pub disturbances: &'a Disturbances,
+    pub array: &'a Array,
+    pub daughter: usize,
+    pub channel: Channel,
+    /// Time of the window's first sample, s.
+    pub window_s: f64,
+    /// Number of the stretch's first sample in the window.
+    pub first: u64,
+    /// Seed of the interference's phase.
+    pub seed: u64,
+}
+
+impl Stretch<'_> {
+    /// Adds the calibration tone and the Earth's leak. Both pass the daughter's own gain.
+    pub(super) fn add_tones(&self, re: &mut [f32], im: &mut [f32]) {
+        let d = self.disturbances;
+        let t_s = self.window_s + self.first as f64 / self.channel.width_hz;
+        let gain = d.response(self.daughter, self.channel, t_s).gain;
+        if d.calibration_k_sr > 0.0 {
+            let start = Complex64::from_polar(d.calibration_k_sr.sqrt(), d.calibration_phase_rad);
+            self.add(gain * start, d.calibration_offset_hz, re, im);
+        }
+        if d.interference_k_sr > 0.0 {
+            let depth_m = self.array.earth_depth_of_m(self.daughter, t_s).max(0.0);
+            let power = d.interference_k_sr * (-depth_m / d.interference_depth_m).exp();
+            // One phase for all daughters, another for each window.
+            let identity = [self.channel.frequency_hz.to_bits(), self.window_s.to_bits()];
+            let mut rng = random_stream(self.seed, StreamKind::Interference, identity);
+            let turns = f64::from(rng.next_u32()) / 2.0_f64.powi(32);
+            let along_m = dot(self.array.earth_hat(t_s), self.array.position_m(self.daughter, t_s));
+            let frequency_hz = self.channel.frequency_hz + d.interference_offset_hz;
+            let fringe = (turns - frequency_hz / SPEED_OF_LIGHT_M_S * along_m).fract();
+            self.add(
+                gain * Complex64::from_polar(power.sqrt(), TAU * fringe),
+                d.interference_offset_hz,
+                re,
+                im,
+            );
+        }
+    }
+
+    fn add(&self, start: Complex64, offset_hz: f64, re: &mut [f32], im: &mut [f32]) {
+        let turns = offset_hz / self.channel.width_hz;
+        let from = Complex64::cis(-TAU * (turns * self.first as f64).fract());
+        let (mut value, step) = (start * from, Complex64::cis(-TAU * turns));
+        for (re, im) in re.iter_mut().zip(im) {
+            let tone = Complex32::new(value.re as f32, value.im as f32);
+            *re += tone.re;
+            *im += tone.im;
+            value *= step;
+        }
+    }
+}

@@ -1,0 +1,220 @@
+//! The link from each daughter to the mother.
+
+use std::collections::VecDeque;
+use std::convert::Infallible;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::config::{DaughtersConfig, DropPolicy};
+use crate::frames::{SampleBlock, SpaceFrame};
+use crate::runtime::{Outlet, Stage, Units};
+use crate::units::{MissionTime, TICKS_PER_SECOND};
+
+/// What the links have carried and dropped, all daughters together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct LinkCounts {
+    /// Blocks sent.
+    pub sent: u64,
+    /// Bits sent.
+    pub bits: u64,
+    /// Blocks dropped because a buffer was full.
+    pub dropped: u64,
+    /// Most bits that waited in one buffer.
+    pub waiting_bits_max: u64,
+}
+
+/// Sends blocks at a limited rate out of a bounded buffer, one of each a daughter. A block that does not fit
+/// is dropped by the policy and counted; a window's end waits until all buffers are empty.
+pub struct SampleLink {
+    rate_bits_per_s: f64,
+    capacity_bits: u64,
+    policy: DropPolicy,
+    buffers: Vec<Buffer>,
+    counts: Arc<Mutex<LinkCounts>>,
+}
+
+#[derive(Default)]
+struct Buffer {
+    waiting: VecDeque<SampleBlock>,
+    bits: u64,
+    /// Bits of the first block that have been sent.
+    sent_bits: f64,
+    /// Time up to which the link has worked.
+    now: Option<MissionTime>,
+}
+
+impl SampleLink {
+    /// The links of `daughters`; what they count can be read through `counts`.
+    #[must_use]
+    pub fn new(config: &DaughtersConfig, daughters: usize, counts: Arc<Mutex<LinkCounts>>) -> Self {
+        Self {
+            rate_bits_per_s: config.link_bits_per_s_max,
+            capacity_bits: config.link_buffer_bytes * 8,
+            policy: config.link_drop,
+            buffers: (0..daughters).map(|_| Buffer::default()).collect(),
+            counts,
+        }
+    }
+
+    fn take(&mut self, block: SampleBlock, out: &mut Outlet<SpaceFrame>) {
+        let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
+        let bits = block.samples.bits();
+        if self.rate_bits_per_s <= 0.0 {
+            counts.sent += 1;
+            counts.bits += bits;
+            drop(counts);
+            out.push(SpaceFrame::Samples(block));
+            return;
+        }
+        let Some(buffer) = self.buffers.get_mut(usize::from(block.daughter)) else {
+            counts.dropped += 1;
+            return;
+        };
+        for sent in buffer.work_until(block.time, self.rate_bits_per_s) {
+            counts.sent += 1;
+            counts.bits += sent.samples.bits();
+            out.push(SpaceFrame::Samples(sent));
+        }
+        if self.policy == DropPolicy::Oldest {
+            while buffer.bits + bits > self.capacity_bits && buffer.drop_oldest() {
+                counts.dropped += 1;
+            }
+        }
+        if buffer.bits + bits > self.capacity_bits {
+            counts.dropped += 1;
+        } else {
+            buffer.bits += bits;
+            buffer.waiting.push_back(block);
+        }
+        counts.waiting_bits_max = counts.waiting_bits_max.max(buffer.bits);
+    }
+}
+
+impl Buffer {
+    /// Blocks that leave by `time`.
+    fn work_until(&mut self, time: MissionTime, rate_bits_per_s: f64) -> Vec<SampleBlock> {
+        let since = self.now.replace(time).unwrap_or(time);
+        let ticks = (time.0 - since.0).max(0);
+        let mut budget = self.sent_bits + rate_bits_per_s * ticks as f64 / TICKS_PER_SECOND as f64;
+        let mut sent = Vec::new();
+        while let Some(first) = self.waiting.front() {
+            let bits = first.samples.bits();
+            if bits as f64 > budget {
+                break;
+            }
+            budget -= bits as f64;
+            self.bits -= bits;
+            sent.extend(self.waiting.pop_front());
+        }
+        // An idle link saves nothing up.
+        self.sent_bits = if self.waiting.is_empty() { 0.0 } else { budget };
+        sent
+    }
+
+    fn drop_oldest(&mut self) -> bool {
+        // The first is on its way already.
+        let Some(oldest) = self.waiting.remove(1) else { return false };
+        self.bits -= oldest.samples.bits();
+        true
+    }
+}
+
+impl Stage for SampleLink {
+    type In = SpaceFrame;
+    type Out = SpaceFrame;
+    type Error = Infallible;
+
+    fn step(&mut self, frame: SpaceFrame, out: &mut Outlet<SpaceFrame>) -> Result<(), Infallible> {
+        match frame {
+            SpaceFrame::Samples(block) => self.take(block, out),
+            SpaceFrame::WindowStart(_) => out.push(frame),
+            SpaceFrame::WindowEnd(_) => {
+                self.finish(out)?;
+                out.push(frame);
+            }
+        }
+        Ok(())
+    }
+
+    /// What waits is sent.
+    fn finish(&mut self, out: &mut Outlet<SpaceFrame>) -> Result<(), Infallible> {
+        let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
+        for buffer in &mut self.buffers {
+            for block in std::mem::take(buffer).waiting {
+                counts.sent += 1;
+                counts.bits += block.samples.bits();
+                out.push(SpaceFrame::Samples(block));
+            }
+        }
+        Ok(())
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.counts.lock().unwrap_or_else(PoisonError::into_inner).bits, "bits")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frames::Samples;
+    use crate::units::ChannelId;
+
+    /// 1000 samples of 2 x 8 bits, 16 kbit, every 0.1 s.
+    fn block(number: u64) -> SampleBlock {
+        SampleBlock {
+            channel: ChannelId(0),
+            daughter: 0,
+            number,
+            time: MissionTime(100_000 * number as i64),
+            clock_offset_s: 0.0,
+            saturated: 0,
+            samples: Samples::Codes { bits: 8, step: 1.0, re: vec![0; 1000], im: vec![0; 1000] },
+        }
+    }
+
+    fn numbers(rate: f64, buffer_bytes: u64, policy: DropPolicy) -> (Vec<u64>, LinkCounts) {
+        let config = DaughtersConfig {
+            link_bits_per_s_max: rate,
+            link_buffer_bytes: buffer_bytes,
+            link_drop: policy,
+            ..DaughtersConfig::default()
+        };
+        let counts = Arc::default();
+        let mut link = SampleLink::new(&config, 1, Arc::clone(&counts));
+        let mut out = Outlet::collect();
+        for number in 0..12 {
+            link.step(SpaceFrame::Samples(block(number)), &mut out).unwrap();
+        }
+        link.finish(&mut out).unwrap();
+        let number = |frame: &SpaceFrame| match frame {
+            SpaceFrame::Samples(block) => block.number,
+            other => panic!("{other:?}"),
+        };
+        let counts = *counts.lock().unwrap();
+        (out.items().iter().map(number).collect(), counts)
+    }
+
+    #[test]
+    fn a_link_that_is_fast_enough_drops_nothing() {
+        for rate in [0.0, 160e3, 1e9] {
+            let (sent, counts) = numbers(rate, 4096, DropPolicy::Newest);
+            assert_eq!(sent, (0..12).collect::<Vec<_>>());
+            assert_eq!((counts.sent, counts.bits, counts.dropped), (12, 12 * 16_000, 0));
+        }
+    }
+
+    #[test]
+    fn a_slow_link_drops_what_its_policy_says_and_counts_it() {
+        // One block leaves in 0.2 s, two fit the buffer.
+        for (policy, expected) in [
+            (DropPolicy::Newest, vec![0, 1, 2, 4, 6, 8, 10]),
+            (DropPolicy::Oldest, vec![0, 1, 3, 5, 7, 9, 11]),
+        ] {
+            let (sent, counts) = numbers(80e3, 4096, policy);
+            assert_eq!(counts.sent + counts.dropped, 12);
+            assert_eq!(counts.sent, sent.len() as u64);
+            assert!(counts.waiting_bits_max <= 4096 * 8);
+            assert_eq!(sent, expected, "{policy:?}");
+        }
+    }
+}

@@ -1,0 +1,236 @@
+//! The eight streams, side by side.
+
+use std::collections::BTreeMap;
+
+use crate::frames::{ObservingWindow, SampleBlock};
+
+/// What was wrong with the blocks that came.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct AlignerCounts {
+    /// Blocks that were used.
+    pub used: u64,
+    /// Blocks that did not come in time.
+    pub missing: u64,
+    /// Blocks that came when others had gone on without them.
+    pub late: u64,
+    /// Blocks that came again.
+    pub duplicate: u64,
+    /// Blocks with a number, time tag, length or origin that cannot be.
+    pub malformed: u64,
+}
+
+/// Blocks of one number: those that came, channel by channel, a daughter after another.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Row {
+    /// Number of the blocks.
+    pub number: u64,
+    /// Samples of each.
+    pub samples: usize,
+    /// The blocks.
+    pub blocks: Vec<Option<SampleBlock>>,
+}
+
+/// The shape of a window's streams.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Streams {
+    /// Number of daughters.
+    pub daughters: usize,
+    /// Number of channels.
+    pub channels: usize,
+    /// Samples of a block, but for the last.
+    pub block_samples: usize,
+    /// Width of a channel, Hz: the rate of samples.
+    pub width_hz: f64,
+    /// Numbers that a block may be ahead of one that is waited for.
+    pub wait_blocks: u64,
+}
+
+/// Brings blocks of the same number together, in the order of numbers. Waits for what is missing until blocks
+/// come that are `wait_blocks` ahead; memory is bounded by that.
+#[derive(Debug)]
+pub struct Aligner {
+    streams: Streams,
+    window: ObservingWindow,
+    /// Samples of the window.
+    samples: u64,
+    next: u64,
+    waiting: BTreeMap<u64, Waiting>,
+    counts: AlignerCounts,
+}
+
+#[derive(Debug)]
+struct Waiting {
+    row: Row,
+    present: usize,
+}
+
+impl Aligner {
+    /// An aligner of `window`.
+    #[must_use]
+    pub fn new(streams: Streams, window: ObservingWindow) -> Self {
+        let length_s = (window.end.0 - window.start.0) as f64 * 1e-6;
+        let samples = (length_s * streams.width_hz).round().max(0.0) as u64;
+        let (waiting, counts) = (BTreeMap::new(), AlignerCounts::default());
+        Self { streams, window, samples, next: 0, waiting, counts }
+    }
+
+    /// Samples of the window.
+    #[must_use]
+    pub fn samples(&self) -> u64 {
+        self.samples
+    }
+
+    /// What was wrong so far.
+    #[must_use]
+    pub fn counts(&self) -> AlignerCounts {
+        self.counts
+    }
+
+    /// Takes a block; gives the rows that are now complete or no longer waited for.
+    pub fn put(&mut self, block: SampleBlock) -> Vec<Row> {
+        let number = block.number;
+        let length = self.length(number);
+        if length == 0 || !self.is_well_formed(&block, length) {
+            self.counts.malformed += 1;
+            return Vec::new();
+        }
+        if number < self.next {
+            self.counts.late += 1;
+            return Vec::new();
+        }
+        let mut rows = Vec::new();
+        // Far ahead: what came before is not waited for any longer.
+        while number >= self.next + self.streams.wait_blocks {
+            rows.push(self.release());
+        }
+        let Streams { daughters, channels, .. } = self.streams;
+        let waiting =
+            self.waiting.entry(number).or_insert_with(|| Waiting::new(number, length, daughters * channels));
+        let slot =
+            &mut waiting.row.blocks[usize::from(block.channel.0) * daughters + usize::from(block.daughter)];
+        if slot.is_some() {
+            self.counts.duplicate += 1;
+            return rows;
+        }
+        *slot = Some(block);
+        waiting.present += 1;
+        while self.waiting.get(&self.next).is_some_and(|first| first.present == daughters * channels) {
+            rows.push(self.release());
+        }
+        rows
+    }
+
+    /// The rows up to `end_samples` of the window, after its last block.
+    pub fn finish(&mut self, end_samples: u64) -> Vec<Row> {
+        let mut rows = Vec::new();
+        while self.next * (self.streams.block_samples as u64) < end_samples.min(self.samples) {
+            rows.push(self.release());
+        }
+        rows
+    }
+
+    fn release(&mut self) -> Row {
+        let number = self.next;
+        self.next += 1;
+        let count = self.streams.daughters * self.streams.channels;
+        let length = self.length(number);
+        let waiting = self.waiting.remove(&number).unwrap_or_else(|| Waiting::new(number, length, count));
+        self.counts.used += waiting.present as u64;
+        self.counts.missing += (count - waiting.present) as u64;
+        waiting.row
+    }
+
+    /// Samples of a block; 0 beyond the window.
+    fn length(&self, number: u64) -> usize {
+        let whole = self.streams.block_samples as u64;
+        let first = number.saturating_mul(whole);
+        self.samples.saturating_sub(first).min(whole) as usize
+    }
+
+    fn is_well_formed(&self, block: &SampleBlock, length: usize) -> bool {
+        let first = block.number * self.streams.block_samples as u64;
+        let ticks = crate::daughters::sample_ticks(first, self.streams.width_hz);
+        block.samples.len() == length
+            && block.time == self.window.start.plus_ticks(ticks)
+            && usize::from(block.daughter) < self.streams.daughters
+            && usize::from(block.channel.0) < self.streams.channels
+    }
+}
+
+impl Waiting {
+    fn new(number: u64, samples: usize, count: usize) -> Self {
+        Self { row: Row { number, samples, blocks: vec![None; count] }, present: 0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frames::Samples;
+    use crate::units::{ChannelId, MissionTime};
+
+    const STREAMS: Streams =
+        Streams { daughters: 2, channels: 1, block_samples: 256, width_hz: 8e3, wait_blocks: 2 };
+
+    /// Two and a half blocks of 32 ms.
+    fn aligner() -> Aligner {
+        let window = ObservingWindow { index: 0, start: MissionTime(5_000), end: MissionTime(85_000) };
+        Aligner::new(STREAMS, window)
+    }
+
+    fn block(daughter: u8, number: u64) -> SampleBlock {
+        let length = if number == 2 { 128 } else { 256 };
+        SampleBlock {
+            channel: ChannelId(0),
+            daughter,
+            number,
+            time: MissionTime(5_000 + 32_000 * number as i64),
+            clock_offset_s: 0.0,
+            saturated: 0,
+            samples: Samples::Float { re: vec![0.0; length], im: vec![0.0; length] },
+        }
+    }
+
+    fn shape(rows: &[Row]) -> Vec<(u64, usize, Vec<bool>)> {
+        rows.iter()
+            .map(|row| (row.number, row.samples, row.blocks.iter().map(Option::is_some).collect()))
+            .collect()
+    }
+
+    #[test]
+    fn blocks_come_together_in_any_order() {
+        let mut aligner = aligner();
+        assert!(aligner.put(block(0, 0)).is_empty());
+        assert!(aligner.put(block(1, 1)).is_empty());
+        assert_eq!(shape(&aligner.put(block(1, 0))), [(0, 256, vec![true, true])]);
+        assert_eq!(shape(&aligner.put(block(0, 1))), [(1, 256, vec![true, true])]);
+        assert!(aligner.put(block(0, 2)).is_empty());
+        assert_eq!(shape(&aligner.put(block(1, 2))), [(2, 128, vec![true, true])]);
+        assert!(aligner.finish(u64::MAX).is_empty());
+        assert_eq!(aligner.counts(), AlignerCounts { used: 6, ..AlignerCounts::default() });
+    }
+
+    #[test]
+    fn what_is_missing_late_again_or_wrong_is_counted_and_not_guessed() {
+        let mut aligner = aligner();
+        assert!(aligner.put(block(0, 0)).is_empty());
+        assert!(aligner.put(block(0, 0)).is_empty());
+        let rows = aligner.put(block(0, 2));
+        assert_eq!(shape(&rows), [(0, 256, vec![true, false])]);
+        assert!(aligner.put(block(1, 0)).is_empty());
+        for wrong in [
+            SampleBlock { number: 3, ..block(0, 2) },
+            SampleBlock { number: u64::MAX, ..block(0, 2) },
+            SampleBlock { time: MissionTime(0), ..block(0, 1) },
+            SampleBlock { daughter: 2, ..block(0, 1) },
+            SampleBlock { channel: ChannelId(1), ..block(0, 1) },
+            SampleBlock { samples: block(0, 2).samples, ..block(0, 1) },
+        ] {
+            assert!(aligner.put(wrong).is_empty());
+        }
+        let rows = aligner.finish(u64::MAX);
+        assert_eq!(shape(&rows), [(1, 256, vec![false, false]), (2, 128, vec![true, false])]);
+        let expected = AlignerCounts { used: 2, missing: 4, late: 1, duplicate: 1, malformed: 6 };
+        assert_eq!(aligner.counts(), expected);
+    }
+}

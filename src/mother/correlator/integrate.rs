@@ -1,0 +1,239 @@
+//! From short dumps to integrations as long as each baseline allows.
+
+use num_complex::Complex32;
+
+use super::kernel::{LANES, Sums, product};
+use crate::array::{Array, integration_time_s};
+use crate::frames::{Flags, ObservingWindow, VisibilityBlock};
+use crate::mother::Schedule;
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+use crate::units::vector::{norm, sub};
+use crate::units::{ChannelId, Pair, TICKS_PER_SECOND, all_pairs};
+
+/// Visibilities of one pair and channel that are held before they are handed on.
+const HELD_MAX: usize = 2048;
+
+/// Weight of a visibility without samples, which is flagged: the downlink takes none that is not positive.
+const NO_WEIGHT: f32 = f32::MIN_POSITIVE;
+
+/// How dumps become integrations.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DumpRule {
+    /// Samples of a dump.
+    pub dump_samples: usize,
+    /// Width of a channel, Hz: the rate of samples.
+    pub width_hz: f64,
+    /// An integration with a smaller part of its samples is flagged as incomplete.
+    pub complete_min: f64,
+}
+
+impl DumpRule {
+    /// Whole dumps that fit into the integration time, at least one.
+    #[must_use]
+    pub fn dumps(&self, dt_s: f64) -> u64 {
+        ((dt_s * self.width_hz / self.dump_samples as f64) as u64).max(1)
+    }
+
+    fn ticks(&self, dumps: u64) -> u32 {
+        crate::daughters::sample_ticks(dumps * self.dump_samples as u64, self.width_hz) as u32
+    }
+}
+
+/// What the daughters of one group of channels sent in a block.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Presence {
+    /// By daughter and lane: whether samples are there.
+    pub there: Vec<[bool; LANES]>,
+    /// By daughter and lane: whether too many of them were out of range.
+    pub saturated: Vec<[bool; LANES]>,
+}
+
+/// The running integrations of up to `LANES` channels.
+pub struct GroupIntegrator {
+    first_channel: usize,
+    schedules: Vec<Schedule>,
+    rule: DumpRule,
+    window: ObservingWindow,
+    /// Dumps of the window.
+    dumps: u64,
+    now: u64,
+    pairs: Vec<PairLanes>,
+}
+
+/// One pair in all channels of a group.
+struct PairLanes {
+    pair: Pair,
+    re: [f64; LANES],
+    im: [f64; LANES],
+    used: [u32; LANES],
+    /// Dump in which the integration ends.
+    until: [u64; LANES],
+    /// The earliest of them.
+    due: u64,
+    from: [u64; LANES],
+    number: [u64; LANES],
+    keep: [bool; LANES],
+    saturated: [bool; LANES],
+    held: Vec<VisibilityBlock>,
+}
+
+impl GroupIntegrator {
+    /// Integrators of the channels from `first_channel` on, one a schedule, over `dumps` dumps of a window.
+    #[must_use]
+    pub fn new(
+        first_channel: usize,
+        schedules: &[Schedule],
+        rule: DumpRule,
+        array: &Array,
+        (window, dumps): (ObservingWindow, u64),
+    ) -> Self {
+        let pairs = all_pairs(array.satellites()).into_iter().map(PairLanes::new).collect();
+        let schedules = schedules[..schedules.len().min(LANES)].to_vec();
+        let mut own = Self { first_channel, schedules, rule, window, dumps, now: 0, pairs };
+        for at in 0..own.pairs.len() {
+            for lane in 0..own.schedules.len() {
+                own.pairs[at].number[lane] = window.index / own.schedules[lane].every_nth_window.max(1);
+                own.open(at, lane, array);
+            }
+        }
+        own
+    }
+
+    /// Adds a dump; `powers` are those of daughters by lane, K sr, by which products are weighted.
+    pub fn add(
+        &mut self,
+        sums: &Sums,
+        presence: &Presence,
+        powers: &[[f64; LANES]],
+        array: &Array,
+        out: &mut Vec<VisibilityBlock>,
+    ) {
+        self.now += 1;
+        let samples = self.rule.dump_samples as u32;
+        for at in 0..self.pairs.len() {
+            let pair = &mut self.pairs[at];
+            let (i, j) = (usize::from(pair.pair.i), usize::from(pair.pair.j));
+            let [re, im] = &sums[product(i, j)];
+            for lane in 0..LANES {
+                pair.re[lane] += f64::from(re[lane]);
+                pair.im[lane] += f64::from(im[lane]);
+                let both = presence.there[i][lane] & presence.there[j][lane];
+                pair.used[lane] += if both { samples } else { 0 };
+                pair.saturated[lane] |= presence.saturated[i][lane] | presence.saturated[j][lane];
+            }
+            if self.now >= pair.due {
+                for lane in 0..self.schedules.len() {
+                    if self.now >= self.pairs[at].until[lane] {
+                        self.close(at, lane, powers, out);
+                        self.open(at, lane, array);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Ends all integrations where they are, and hands on what is held.
+    pub fn finish(&mut self, powers: &[[f64; LANES]], out: &mut Vec<VisibilityBlock>) {
+        for lane in 0..self.schedules.len() {
+            for at in 0..self.pairs.len() {
+                if self.pairs[at].from[lane] < self.now {
+                    self.close(at, lane, powers, out);
+                }
+                let held = std::mem::take(&mut self.pairs[at].held[lane]);
+                if !held.is_empty() {
+                    out.push(held);
+                }
+            }
+        }
+    }
+
+    /// Begins an integration at the dump that comes.
+    fn open(&mut self, at: usize, lane: usize, array: &Array) {
+        let (now, schedule) = (self.now, self.schedules[lane]);
+        let t_s = self.window.start.plus_ticks(i64::from(self.rule.ticks(now))).seconds();
+        let own = &mut self.pairs[at];
+        let (i, j) = (array.state(own.pair.i.into(), t_s), array.state(own.pair.j.into(), t_s));
+        let dt_s = integration_time_s(schedule.rule, schedule.frequency_hz, i.velocity_m_s, j.velocity_m_s);
+        let longest_m = match schedule.baseline_wavelengths_max {
+            0.0 => f64::INFINITY,
+            limit => limit * SPEED_OF_LIGHT_M_S / schedule.frequency_hz,
+        };
+        let near_enough = norm(sub(i.position_m, j.position_m)) < longest_m;
+        own.keep[lane] = near_enough && own.number[lane].is_multiple_of(schedule.every_nth.max(1));
+        own.number[lane] += 1;
+        own.from[lane] = now;
+        own.until[lane] = (now + self.rule.dumps(dt_s)).min(self.dumps.max(now + 1));
+        (own.re[lane], own.im[lane], own.used[lane], own.saturated[lane]) = (0.0, 0.0, 0, false);
+        own.due = own.until[..self.schedules.len()].iter().copied().min().unwrap_or(u64::MAX);
+    }
+
+    fn close(&mut self, at: usize, lane: usize, powers: &[[f64; LANES]], out: &mut Vec<VisibilityBlock>) {
+        let (rule, own) = (self.rule, &mut self.pairs[at]);
+        if !own.keep[lane] {
+            return;
+        }
+        let (from, used) = (own.from[lane], f64::from(own.used[lane]));
+        let dumps = self.now - from;
+        let block = &mut own.held[lane];
+        block.channel = ChannelId((self.first_channel + lane) as u16);
+        block.pair = own.pair;
+        block.start = self.window.start;
+        let mut flags = Flags::GOOD;
+        if used < rule.complete_min * (dumps * rule.dump_samples as u64) as f64 {
+            flags.0 |= Flags::INCOMPLETE.0;
+        }
+        if own.saturated[lane] {
+            flags.0 |= Flags::SATURATED.0;
+        }
+        let power = powers[usize::from(own.pair.i)][lane] * powers[usize::from(own.pair.j)][lane];
+        // Variance of the mean of products of independent samples, in one part: P_i P_j / (2 n).
+        let weight = (2.0 * used / power) as f32;
+        let mean = |sum: f64| if used > 0.0 { (sum / used) as f32 } else { 0.0 };
+        block.offset_ticks.push(rule.ticks(from));
+        block.duration_ticks.push(rule.ticks(self.now) - rule.ticks(from));
+        block.value_k_sr.push(Complex32::new(mean(own.re[lane]), mean(own.im[lane])));
+        block.weight.push(if weight.is_finite() { weight.max(NO_WEIGHT) } else { NO_WEIGHT });
+        block.flags.push(flags);
+        if block.len() >= HELD_MAX {
+            out.push(std::mem::take(block));
+        }
+    }
+}
+
+impl PairLanes {
+    fn new(pair: Pair) -> Self {
+        Self {
+            pair,
+            re: [0.0; LANES],
+            im: [0.0; LANES],
+            used: [0; LANES],
+            until: [u64::MAX; LANES],
+            due: 0,
+            from: [0; LANES],
+            number: [0; LANES],
+            keep: [false; LANES],
+            saturated: [false; LANES],
+            held: vec![VisibilityBlock::default(); LANES],
+        }
+    }
+}
+
+/// Samples of a dump that is short against the shortest integration of any channel: an eighth of it or less,
+/// but no less than a slice, so that rounding to dumps shortens integrations by an eighth at most.
+#[must_use]
+pub fn dump_samples(array: &Array, schedules: &[Schedule], width_hz: f64) -> usize {
+    let last = array.satellites() - 1;
+    // Breathing changes lengths: the longest chord is that of a period's start.
+    let (first, last) = (array.state(0, 0.0), array.state(last, 0.0));
+    let shortest_s = schedules
+        .iter()
+        .map(|schedule| {
+            integration_time_s(schedule.rule, schedule.frequency_hz, first.velocity_m_s, last.velocity_m_s)
+        })
+        .fold(f64::INFINITY, f64::min);
+    let most = (shortest_s * width_hz / 8.0) as usize;
+    [64, 32].into_iter().find(|&samples| samples <= most).unwrap_or(super::kernel::SLICE)
+}
+
+/// Seconds of the longest time that offsets in ticks can tell apart in a window.
+pub(super) const WINDOW_S_MAX: f64 = u32::MAX as f64 / TICKS_PER_SECOND as f64;

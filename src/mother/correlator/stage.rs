@@ -1,0 +1,299 @@
+//! The mother's stage: blocks of samples in, what she sends to the ground out.
+
+use std::convert::Infallible;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use pulp::Arch;
+
+use super::align::{Aligner, AlignerCounts, Row, Streams};
+use super::integrate::{DumpRule, GroupIntegrator, Presence, WINDOW_S_MAX, dump_samples};
+use super::kernel::{LANES, Packed, SLICE, correlate, no_sums};
+use crate::array::{Array, segments_for};
+use crate::frames::{
+    GroundFrame, Housekeeping, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame, VisibilityBlock,
+};
+use crate::mother::Schedule;
+use crate::mother::integrator::EPHEMERIS_STEP_S;
+use crate::runtime::{Outlet, Stage, Units};
+use crate::units::MissionTime;
+
+/// Part of a block's values out of range at which its visibilities are flagged. Two bits lose 5 % by design.
+const SATURATED_MAX: f64 = 0.2;
+
+/// Part of an integration's samples without which it is flagged: its middle may then be off by a twentieth of its
+/// length, 2 degrees of fringe.
+const COMPLETE_MIN: f64 = 0.9;
+
+/// Time in which the power that weights are made of is averaged, s.
+const POWER_TIME_S: f64 = 10.0;
+
+/// What the mother's stage is made for.
+#[derive(Clone)]
+pub struct CorrelatorSetup {
+    /// Where the daughters are, by navigation.
+    pub array: Arc<Array>,
+    /// What she says of herself.
+    pub instrument: Instrument,
+    /// One schedule a channel.
+    pub schedules: Vec<Schedule>,
+    /// Samples of a block.
+    pub block_samples: usize,
+    /// Numbers that a block may be ahead of one that is waited for.
+    pub wait_blocks: u64,
+}
+
+/// What the correlator has counted, and the daughters' own powers.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct CorrelatorCounts {
+    /// What became of blocks.
+    pub blocks: AlignerCounts,
+    /// Blocks outside any window.
+    pub stray: u64,
+    /// Visibilities made.
+    pub visibilities: u64,
+    /// Sums of |x|^2 (K sr) and samples, by channel and daughter: the auto-correlations.
+    pub autos: Vec<Vec<(f64, u64)>>,
+}
+
+/// Aligns the daughters' streams, multiplies all pairs in all channels, and integrates each for as long as the
+/// baseline's motion allows.
+///
+/// Integrations are whole dumps, so they are up to an eighth shorter than the rule allows. A visibility is
+/// the mean over the samples that both daughters sent, its weight `2 n / (P_i P_j)` with their number n
+/// and the daughters' measured powers. It is flagged when less than 0.9 of its samples came.
+pub struct Correlator {
+    setup: CorrelatorSetup,
+    rule: DumpRule,
+    arch: Arch,
+    running: Option<Running>,
+    counts: Arc<Mutex<CorrelatorCounts>>,
+    sampled: u64,
+    samples: u64,
+}
+
+/// A window in work.
+struct Running {
+    window: ObservingWindow,
+    aligner: Aligner,
+    groups: Vec<Group>,
+}
+
+struct Group {
+    first: usize,
+    integrator: GroupIntegrator,
+    packed: Packed,
+    /// By daughter: power of each lane, K sr; 0 before the first block.
+    powers: Vec<[f64; LANES]>,
+}
+
+impl Correlator {
+    /// A correlator; what it counts can be read through `counts`.
+    #[must_use]
+    pub fn new(setup: CorrelatorSetup, counts: Arc<Mutex<CorrelatorCounts>>) -> Self {
+        let width_hz = setup.instrument.channels.first().map_or(1.0, |channel| channel.width_hz);
+        let rule = DumpRule {
+            dump_samples: dump_samples(&setup.array, &setup.schedules, width_hz),
+            width_hz,
+            complete_min: COMPLETE_MIN,
+        };
+        lock(&counts).autos = vec![vec![(0.0, 0); setup.array.satellites()]; setup.schedules.len()];
+        Self { setup, rule, arch: Arch::new(), running: None, counts, sampled: 0, samples: 0 }
+    }
+
+    fn begin(&mut self, mut window: ObservingWindow, out: &mut Outlet<GroundFrame>) {
+        let Self { setup, rule, .. } = self;
+        // A window is a third of an orbit; anything else is cut to what time tags can say.
+        let end = MissionTime::from_seconds(window.start.seconds() + WINDOW_S_MAX);
+        window.end = window.end.min(end);
+        out.push(GroundFrame::Instrument(setup.instrument.clone()));
+        for segment in segments_for(&setup.array, window.start, window.end, EPHEMERIS_STEP_S) {
+            out.push(GroundFrame::Ephemeris(segment));
+        }
+        let streams = Streams {
+            daughters: setup.array.satellites(),
+            channels: setup.schedules.len(),
+            block_samples: setup.block_samples,
+            width_hz: rule.width_hz,
+            wait_blocks: setup.wait_blocks,
+        };
+        let aligner = Aligner::new(streams, window);
+        let dumps = aligner.samples() / rule.dump_samples as u64;
+        let group = |(k, schedules): (usize, &[Schedule])| Group {
+            first: k * LANES,
+            integrator: GroupIntegrator::new(k * LANES, schedules, *rule, &setup.array, (window, dumps)),
+            packed: Packed::new(streams.daughters),
+            powers: vec![[0.0; LANES]; streams.daughters],
+        };
+        let groups = setup.schedules.chunks(LANES).enumerate().map(group).collect();
+        self.running = Some(Running { window, aligner, groups });
+    }
+
+    fn process(&mut self, running: &mut Running, row: &Row, out: &mut Outlet<GroundFrame>) {
+        let mut made = Vec::new();
+        for group in &mut running.groups {
+            self.process_group(group, row, &mut made);
+        }
+        self.samples += row.blocks.iter().flatten().map(|block| block.samples.len() as u64).sum::<u64>();
+        self.hand_on(made, out);
+    }
+
+    fn process_group(&self, group: &mut Group, row: &Row, made: &mut Vec<VisibilityBlock>) {
+        let daughters = self.setup.array.satellites();
+        let channels = LANES.min(self.setup.schedules.len() - group.first);
+        let block = |lane: usize, daughter: usize| -> Option<&SampleBlock> {
+            row.blocks.get((group.first + lane) * daughters + daughter)?.as_ref()
+        };
+        let mut presence =
+            Presence { there: vec![[false; LANES]; daughters], saturated: vec![[false; LANES]; daughters] };
+        let following = 1.0 - (-(row.samples as f64) / self.rule.width_hz / POWER_TIME_S).exp();
+        let mut autos = Vec::with_capacity(channels * daughters);
+        for lane in 0..channels {
+            for daughter in 0..daughters {
+                let Some(block) = block(lane, daughter) else {
+                    autos.push((0.0, 0));
+                    continue;
+                };
+                presence.there[daughter][lane] = true;
+                let parts = 2 * row.samples;
+                presence.saturated[daughter][lane] =
+                    f64::from(block.saturated) > SATURATED_MAX * parts as f64;
+                let sum = square(&block.samples);
+                autos.push((sum, row.samples as u64));
+                let power = &mut group.powers[daughter][lane];
+                let measured = sum / row.samples as f64;
+                *power = if *power > 0.0 { *power + following * (measured - *power) } else { measured };
+            }
+        }
+        self.count_autos(group.first, daughters, &autos);
+        for dump in 0..row.samples / self.rule.dump_samples {
+            let mut sums = no_sums(daughters);
+            for slice in 0..self.rule.dump_samples / SLICE {
+                let first = dump * self.rule.dump_samples + slice * SLICE;
+                for daughter in 0..daughters {
+                    let samples =
+                        |lane: usize| (lane < channels).then(|| block(lane, daughter))?.map(|b| &b.samples);
+                    group.packed.put_all(daughter, samples, first);
+                }
+                correlate(self.arch, &group.packed, &mut sums);
+            }
+            group.integrator.add(&sums, &presence, &group.powers, &self.setup.array, made);
+        }
+    }
+
+    fn count_autos(&self, first: usize, daughters: usize, sums: &[(f64, u64)]) {
+        let mut counts = lock(&self.counts);
+        for (own, sums) in counts.autos[first..].iter_mut().zip(sums.chunks_exact(daughters)) {
+            for (own, sum) in own.iter_mut().zip(sums) {
+                own.0 += sum.0;
+                own.1 += sum.1;
+            }
+        }
+    }
+
+    fn hand_on(&mut self, made: Vec<VisibilityBlock>, out: &mut Outlet<GroundFrame>) {
+        for block in made {
+            self.sampled += block.len() as u64;
+            out.push(GroundFrame::Visibilities(block));
+        }
+    }
+
+    /// Ends the running window at `end`.
+    fn end(&mut self, end: MissionTime, out: &mut Outlet<GroundFrame>) {
+        let Some(mut running) = self.running.take() else { return };
+        let seconds = (end.0 - running.window.start.0) as f64 * 1e-6;
+        for row in running.aligner.finish((seconds * self.rule.width_hz).round().max(0.0) as u64) {
+            self.process(&mut running, &row, out);
+        }
+        let mut made = Vec::new();
+        for group in &mut running.groups {
+            group.integrator.finish(&group.powers, &mut made);
+        }
+        self.hand_on(made, out);
+        let found = running.aligner.counts();
+        let mut counts = lock(&self.counts);
+        counts.blocks.used += found.used;
+        counts.blocks.missing += found.missing;
+        counts.blocks.late += found.late;
+        counts.blocks.duplicate += found.duplicate;
+        counts.blocks.malformed += found.malformed;
+        counts.visibilities = self.sampled;
+        drop(counts);
+        let (time, sampled) = (end, self.sampled);
+        out.push(GroundFrame::Housekeeping(Housekeeping { time, sampled, dropped: 0 }));
+    }
+}
+
+fn lock(counts: &Mutex<CorrelatorCounts>) -> std::sync::MutexGuard<'_, CorrelatorCounts> {
+    counts.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Sum of |x|^2, K sr.
+fn square(samples: &Samples) -> f64 {
+    match samples {
+        Samples::Float { re, im } => re.iter().zip(im).map(|(re, im)| f64::from(re * re + im * im)).sum(),
+        Samples::Codes { step, re, im, .. } => {
+            // (c + 1/2)^2 = c (c + 1) + 1/4, in whole numbers.
+            let whole: i64 =
+                re.chunks(CODES_AT_ONCE).chain(im.chunks(CODES_AT_ONCE)).map(whole_squares).sum();
+            f64::from(*step).powi(2) * (whole as f64 + 0.25 * (re.len() + im.len()) as f64)
+        }
+    }
+}
+
+/// Codes whose squares are summed in 32 bits: 2^14 each at most.
+const CODES_AT_ONCE: usize = 1 << 16;
+
+/// Sum of c (c + 1).
+#[multiversion::multiversion(targets(
+    "x86_64+avx512f+avx512vl+avx512bw+avx512dq",
+    "x86_64+avx2",
+    "aarch64+neon"
+))]
+fn whole_squares(codes: &[i8]) -> i64 {
+    let mut sum = 0_i32;
+    for &code in codes {
+        let code = i32::from(code);
+        sum += code * (code + 1);
+    }
+    i64::from(sum)
+}
+
+impl Stage for Correlator {
+    type In = SpaceFrame;
+    type Out = GroundFrame;
+    type Error = Infallible;
+
+    fn step(&mut self, frame: SpaceFrame, out: &mut Outlet<GroundFrame>) -> Result<(), Infallible> {
+        match frame {
+            SpaceFrame::WindowStart(window) => {
+                // A window whose end was lost ends where the next begins, at the latest.
+                self.finish(out)?;
+                self.begin(window, out);
+            }
+            SpaceFrame::Samples(block) => {
+                let Some(mut running) = self.running.take() else {
+                    lock(&self.counts).stray += 1;
+                    return Ok(());
+                };
+                for row in running.aligner.put(block) {
+                    self.process(&mut running, &row, out);
+                }
+                self.running = Some(running);
+            }
+            SpaceFrame::WindowEnd(window) => self.end(window.end, out),
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), Infallible> {
+        if let Some(running) = &self.running {
+            let end = running.window.end;
+            self.end(end, out);
+        }
+        Ok(())
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.samples, "samples")
+    }
+}
