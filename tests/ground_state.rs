@@ -59,7 +59,9 @@ impl Workplace {
     fn session(&self, state: &str, files: &[&str], more: &[&str]) -> Vec<String> {
         let (out, state) = (self.path(&format!("{state}.out")), self.path(state));
         let fixed = ["--map", &self.pipeline, "--out", &out, "--state", &state, "--json"];
-        let all = [&["replay"], files, &fixed, &["--wait-bytes", WAIT_BYTES], more].concat();
+        let wait = ["--wait-bytes", WAIT_BYTES];
+        let wait = if more.contains(&"--wait-bytes") { &[] } else { wait.as_slice() };
+        let all = [&["replay"], files, &fixed, wait, more].concat();
         all.into_iter().map(str::to_owned).collect()
     }
 
@@ -307,4 +309,48 @@ fn a_growing_file_is_followed_to_the_same_bits() {
     }
     assert!(child.wait().unwrap().success());
     assert!(place.bytes("followed") == place.bytes("once"));
+}
+
+#[test]
+fn states_of_different_passes_make_one() {
+    let place = Workplace::new();
+    let file = place.downlink();
+    let once = place.replay("once", &[&file], &[]);
+    // Two stations: either lacks what the other has heard, but for positions and what waits for company.
+    let states: [(&str, _, &[&str]); 4] = [
+        ("first", 41..1000, &[]),
+        ("second", 0..41, &[]),
+        ("all-first", 41..1000, &["--wait-bytes", "0"]),
+        ("all-both", 0..30, &["--wait-bytes", "0"]),
+    ];
+    for (name, lost, more) in states {
+        let path = place.path(&format!("{name}.ccsds"));
+        std::fs::write(&path, leave_out(&file, lost)).unwrap();
+        place.replay(name, &[&path], more);
+    }
+    let merge = |states: &[&str], out: &str| {
+        let states: Vec<String> = states.iter().map(|state| place.path(state)).collect();
+        let states: Vec<&str> = states.iter().map(String::as_str).collect();
+        run(&[&["merge"], states.as_slice(), &["--map", &place.pipeline, "--out", &place.path(out)]].concat())
+    };
+    let output = merge(&["first", "second"], "merged");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    // Nothing is missing, nothing new in the file; the ledger is that of the whole.
+    let merged = place.replay("merged", &[&file], &[]);
+    assert_eq!(merged["ledger"], once["ledger"]);
+    assert_eq!(gaps(&place.path("merged"))["gaps"].as_array().unwrap().len(), 0);
+    for (merged, once) in
+        merged["channels"].as_array().unwrap().iter().zip(once["channels"].as_array().unwrap())
+    {
+        // The same terms in another order.
+        let mean = |summary: &Value| summary["mean_k"].as_f64().unwrap();
+        assert!((mean(merged) / mean(once) - 1.0).abs() < 1e-9);
+    }
+    // The same packets twice, and a folder that is in use, are refused.
+    let said = |output: std::process::Output| {
+        assert!(!output.status.success());
+        String::from_utf8(output.stderr).unwrap()
+    };
+    assert!(said(merge(&["all-first", "all-both"], "more")).contains("count 30 is in the sums of both"));
+    assert!(said(merge(&["first", "second"], "once")).contains("holds a state already"));
 }

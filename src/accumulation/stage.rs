@@ -161,6 +161,39 @@ impl Accumulator {
         Ok(Self { instrument: instrument.map(Arc::new), channels, next_snapshot_s, accumulated, ..self })
     }
 
+    /// Adds what another holds, channel by channel.
+    ///
+    /// # Errors
+    /// Engines of different setups.
+    pub fn absorb(&mut self, other: Self) -> Result<(), AccumulationError> {
+        if self.instrument.is_none() {
+            self.instrument = other.instrument;
+        }
+        if self.channels.len() < other.channels.len() {
+            self.channels.resize_with(other.channels.len(), || None);
+        }
+        for (slot, theirs) in self.channels.iter_mut().zip(other.channels) {
+            match (slot.as_mut(), theirs) {
+                (_, None) => {}
+                (None, theirs) => *slot = theirs,
+                (Some(ours), Some(theirs)) => {
+                    match (&mut ours.engine, theirs.engine) {
+                        (Engine::Pixel(ours), Engine::Pixel(theirs)) => ours.merge(*theirs)?,
+                        (Engine::Harmonic(ours), Engine::Harmonic(theirs)) => ours.merge(*theirs)?,
+                        _ => return Err(AccumulationError::Mismatch { what: "kinds" }),
+                    }
+                    let ([first, last], [from, to]) = (ours.span_s, theirs.span_s);
+                    ours.span_s = [first.min(from), last.max(to)];
+                    ours.snapshots = ours.snapshots.max(theirs.snapshots);
+                }
+            }
+        }
+        let next_s = [self.next_snapshot_s, other.next_snapshot_s].into_iter().flatten();
+        self.next_snapshot_s = next_s.reduce(f64::max);
+        self.accumulated += other.accumulated;
+        Ok(())
+    }
+
     fn open(&mut self, instrument: Instrument) -> Result<(), AccumulationError> {
         let channels = instrument.channels.len();
         if let Some(&key) = self.config.misfits(channels).first() {

@@ -70,6 +70,21 @@ impl Calibrator {
         }
     }
 
+    /// Takes what another knows as well; of ephemeris segments that begin at the same time its own stay.
+    pub fn absorb(&mut self, state: CalibratorState) {
+        let CalibratorState { instrument, ephemeris, seen, received, reported } = state;
+        self.instrument = self.instrument.take().or(instrument);
+        for segment in ephemeris {
+            self.ephemeris.insert(segment);
+        }
+        self.seen.extend(seen);
+        for (start, count) in received {
+            *self.received.entry(start).or_default() += count;
+        }
+        let latest = [self.reported, reported].into_iter().flatten().max_by_key(|report| report.time);
+        self.reported = latest;
+    }
+
     /// Goes on with what another knew.
     #[must_use]
     pub fn resume(self, state: CalibratorState) -> Self {

@@ -7,6 +7,7 @@ mod corrupt;
 mod gaps;
 mod geometry;
 mod inspect;
+mod merge;
 mod predict;
 mod progress;
 mod replay;
@@ -57,6 +58,7 @@ enum Command {
     Inspect(inspect::InspectArgs),
     Corrupt(corrupt::CorruptArgs),
     Gaps(gaps::GapsArgs),
+    Merge(merge::MergeArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
     Predict(predict::PredictArgs),
@@ -121,6 +123,7 @@ pub fn main() -> ExitCode {
         Command::Inspect(args) => inspect::execute(&args),
         Command::Corrupt(args) => corrupt::execute(&args),
         Command::Gaps(args) => gaps::execute(&args),
+        Command::Merge(args) => merge::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
         Command::Predict(args) => predict::execute(&args),

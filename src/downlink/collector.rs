@@ -1,5 +1,6 @@
 //! Packets to frames, each once and in the order of sending, across files and sessions.
 
+use std::collections::VecDeque;
 use std::fs::File;
 use std::path::Path;
 
@@ -46,8 +47,8 @@ pub struct Collector {
     decoder: Decoder,
     /// Keeps the account of what is no new packet: of this session alone.
     link: Decoder,
-    /// A packet that came too late to wait.
-    late: Option<WaitingPacket>,
+    /// Packets that came too late to wait.
+    late: VecDeque<WaitingPacket>,
 }
 
 impl Collector {
@@ -60,7 +61,7 @@ impl Collector {
             waiting: Waiting::new(wait_bytes),
             decoder: Decoder::new(),
             link: Decoder::new(),
-            late: None,
+            late: VecDeque::new(),
         }
     }
 
@@ -81,6 +82,56 @@ impl Collector {
             waiting: self.waiting.clone(),
             decoder: self.decoder.state(),
         }
+    }
+
+    /// Takes all that another knows. Packets that wait in it come as frames as if they had just arrived.
+    ///
+    /// # Errors
+    /// Another instrument; visibilities that have been decoded by both; packet counts that have begun anew.
+    pub fn absorb(&mut self, other: CollectorState) -> Result<(), DownlinkError> {
+        let CollectorState { taken: mut theirs, waiting: mut their_waiting, mut decoder } = other;
+        theirs.resize(Kind::ALL.len(), Taken::default());
+        // A payload that is half put together there is gone on with here, unless it is known here.
+        let mut unfinished = decoder.take_partials();
+        unfinished.retain(|packet| {
+            let WaitingPacket { header, .. } = packet;
+            !self.taken[header.kind.index()].contains(header.count, header.time)
+                || self.waiting.headers().any(|ours| (ours.kind, ours.count) == (header.kind, header.count))
+        });
+        // What one has decoded need not wait in the other.
+        for header in their_waiting.headers().collect::<Vec<_>>() {
+            if self.taken[header.kind.index()].contains(header.count, header.time) {
+                their_waiting.drop_packet(&header);
+                theirs[header.kind.index()].forget(header.count, header.time);
+            }
+        }
+        for header in self.waiting.headers().collect::<Vec<_>>() {
+            if theirs[header.kind.index()].contains(header.count, header.time) {
+                self.waiting.drop_packet(&header);
+                self.taken[header.kind.index()].forget(header.count, header.time);
+            }
+        }
+        for kind in Kind::ALL {
+            let (ours, theirs) = (&mut self.taken[kind.index()], &theirs[kind.index()]);
+            if kind == Kind::Visibilities
+                && let Some(count) = ours.common(theirs)
+            {
+                return Err(DownlinkError::TakenTwice { apid: kind.apid(), count });
+            }
+            if !ours.absorb(theirs) {
+                return Err(DownlinkError::Restarted { kind });
+            }
+        }
+        if !self.decoder.absorb(decoder) {
+            return Err(DownlinkError::OtherInstrument { offset: 0 });
+        }
+        for packet in unfinished {
+            self.late.extend(self.waiting.put(packet));
+        }
+        while let Some(packet) = their_waiting.next_waiting() {
+            self.late.extend(self.waiting.put(packet));
+        }
+        Ok(())
     }
 
     /// Takes the next bytes of the stream.
@@ -105,7 +156,7 @@ impl Collector {
     /// [`DownlinkError::OtherInstrument`].
     pub fn next_frame(&mut self) -> Result<Option<(PacketHeader, GroundFrame)>, DownlinkError> {
         loop {
-            let found = match self.late.take() {
+            let found = match self.late.pop_front() {
                 Some(packet) => self.decode(&packet),
                 None => match self.next_due() {
                     Some(packet) => self.decode(&packet),
@@ -225,7 +276,7 @@ impl Collector {
             // Everything waits for it.
             return Ok(Some(self.decode(&packet)));
         }
-        self.late = self.waiting.put(packet);
+        self.late.extend(self.waiting.put(packet));
         Ok(Some(None))
     }
 }

@@ -135,6 +135,31 @@ impl ReceptionCounters {
         }
     }
 
+    /// Adds the account of packets and payloads of another decoder; not that of bytes between them.
+    pub(super) fn add(&mut self, other: &Self) {
+        self.bytes += other.bytes;
+        for kind in Kind::ALL {
+            let (ours, theirs) = (self.kind_mut(kind), other.kind(kind));
+            ours.packets += theirs.packets;
+            ours.bytes += theirs.bytes;
+            ours.orphans += theirs.orphans;
+        }
+        let FaultCounts { version, record, length, value, order } = other.faults;
+        self.faults.version += version;
+        self.faults.record += record;
+        self.faults.length += length;
+        self.faults.value += value;
+        self.faults.order += order;
+        self.instruments_contradictory += other.instruments_contradictory;
+        self.payloads_foreign += other.payloads_foreign;
+        self.payloads_before_instrument += other.payloads_before_instrument;
+        self.visibilities_decoded += other.visibilities_decoded;
+        self.visibilities_bad_value += other.visibilities_bad_value;
+        self.visibilities_refused += other.visibilities_refused;
+        self.visibilities_before_instrument += other.visibilities_before_instrument;
+        self.visibilities_foreign += other.visibilities_foreign;
+    }
+
     /// Good packets of all kinds.
     #[must_use]
     pub fn packets(&self) -> u64 {

@@ -2,13 +2,14 @@
 
 use super::counters::ReceptionCounters;
 use super::cuc::CucTime;
-use super::header::{FORMAT_VERSION, PacketHeader, Segment};
+use super::header::{FORMAT_VERSION, HEADER_BYTES, PacketHeader, Segment, TRAILER_BYTES};
 use super::kind::Kind;
 use super::payload::{
     PayloadFault, count_visibilities, decode_ephemeris, decode_housekeeping, decode_instrument,
     decode_visibilities,
 };
 use super::receiver::{Event, Packet};
+use super::waiting::WaitingPacket;
 use crate::frames::{GroundFrame, Instrument};
 
 /// Greatest payload that is put together from segments; a window's ephemeris is a thousandth of it.
@@ -46,6 +47,26 @@ impl DecoderState {
     #[must_use]
     pub fn counters(&self) -> &ReceptionCounters {
         &self.counters
+    }
+}
+
+impl DecoderState {
+    /// Takes out the payloads of which segments are lacking: as packets that hold all their segments so far, not in
+    /// the account any more.
+    pub(super) fn take_partials(&mut self) -> Vec<WaitingPacket> {
+        let mut packets = Vec::new();
+        for (kind, slot) in Kind::ALL.into_iter().zip(&mut self.partial) {
+            let Some(Partial { next, time, bytes: payload }) = slot.take() else { continue };
+            let bytes = HEADER_BYTES + payload.len() + TRAILER_BYTES;
+            let (segment, count) = (Segment::First, next.saturating_sub(1));
+            let header = PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes };
+            let counts = self.counters.kind_mut(kind);
+            counts.packets = counts.packets.saturating_sub(1);
+            counts.bytes = counts.bytes.saturating_sub(bytes as u64);
+            self.counters.bytes = self.counters.bytes.saturating_sub(bytes as u64);
+            packets.push(WaitingPacket { header, payload });
+        }
+        packets
     }
 }
 
@@ -88,6 +109,19 @@ impl Decoder {
         partial.resize(Kind::ALL.len(), None);
         let partial = partial.try_into().unwrap_or_default();
         Self { instrument, standing, partial, counters, fault: None }
+    }
+
+    /// Takes what another has learnt and counted; unfinished payloads left out. Whether both
+    /// are of one instrument; if not, nothing changes.
+    pub fn absorb(&mut self, other: DecoderState) -> bool {
+        let DecoderState { instrument, standing, counters, .. } = other;
+        match (&self.instrument, instrument) {
+            (Some(ours), Some(theirs)) if *ours != theirs => return false,
+            (None, Some(theirs)) => (self.instrument, self.standing) = (Some(theirs), standing),
+            _ => {}
+        }
+        self.counters.add(&counters);
+        true
     }
 
     /// Whether this is the payload of another instrument's description than the one that holds.

@@ -73,6 +73,25 @@ pub enum DownlinkError {
         /// Place in the stream.
         offset: u64,
     },
+    /// States that hold the same visibilities.
+    #[error(
+        "the packet of APID {apid:#x} and count {count} is in the sums of both; expected states of different packets: \
+         replay the files of one into the other"
+    )]
+    TakenTwice {
+        /// Application process identifier.
+        apid: u16,
+        /// Packet count.
+        count: u64,
+    },
+    /// States across a restart of the spacecraft's counts.
+    #[error(
+        "packets of {kind} have been counted anew on the way; expected states of one count: replay the files of one into the other"
+    )]
+    Restarted {
+        /// Kind.
+        kind: super::kind::Kind,
+    },
     /// A downlink that was to be damaged and already is.
     #[error(
         "at byte {offset}: no sound frame or packet; expected a whole downlink, as `lunarray simulate` writes it"

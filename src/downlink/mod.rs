@@ -8,6 +8,7 @@
 //! | space packet, time code | CCSDS 133.0-B, 301.0-B | [`Packetizer`], [`Receiver`] |
 //! | transfer frame, Reed-Solomon, randomizer, sync marker | CCSDS 732.0-B, 131.0-B | [`cadu`] |
 //! | either of the two | | [`Intake`] |
+//! | every packet once, in order, across files and sessions | | [`Collector`] |
 //! | file | | [`DownlinkWriter`], [`DownlinkReader`], [`Contents`] |
 //!
 //! The frame layer takes the bytes that [`Packetizer::encode`] appends and hands what it recovers to

@@ -32,6 +32,22 @@ impl Era {
         true
     }
 
+    fn contains(&self, count: u64) -> bool {
+        self.stretches.range(..=count).next_back().is_some_and(|(_, &end)| end > count)
+    }
+
+    /// Adds a stretch, joined with those that it meets.
+    fn insert(&mut self, mut start: u64, mut end: u64) {
+        while let Some((&from, &to)) = self.stretches.range(..=end).next_back() {
+            if to < start {
+                break;
+            }
+            self.stretches.remove(&from);
+            (start, end) = (start.min(from), end.max(to));
+        }
+        self.stretches.insert(start, end);
+    }
+
     fn forget(&mut self, count: u64) {
         let Some((&start, &end)) = self.stretches.range(..=count).next_back() else { return };
         if end <= count {
@@ -69,6 +85,44 @@ impl Taken {
         if let Some(era) = self.eras.iter_mut().rev().find(|era| era.from <= time) {
             era.forget(count);
         }
+    }
+
+    /// Whether a packet is among them.
+    #[must_use]
+    pub fn contains(&self, count: u64, time: CucTime) -> bool {
+        let era = self.eras.iter().rev().find(|era| era.from <= time);
+        era.is_some_and(|era| era.contains(count))
+    }
+
+    /// Takes what another set has too, if both know one era at most; says whether they do.
+    pub fn absorb(&mut self, other: &Self) -> bool {
+        let (Some(theirs), []) = (other.eras.first(), other.eras.get(1..).unwrap_or_default()) else {
+            return other.eras.is_empty();
+        };
+        match self.eras.as_mut_slice() {
+            [] => self.eras.push(theirs.clone()),
+            [era] => {
+                era.from = era.from.min(theirs.from);
+                era.newest = era.newest.max(theirs.newest);
+                for (&start, &end) in &theirs.stretches {
+                    era.insert(start, end);
+                }
+            }
+            _ => return false,
+        }
+        true
+    }
+
+    /// The first count that both have, where both know one era at most.
+    #[must_use]
+    pub fn common(&self, other: &Self) -> Option<u64> {
+        let (ours, theirs) = (self.eras.first()?, other.eras.first()?);
+        let meets = |(&start, &end): (&u64, &u64)| {
+            let from = ours.stretches.range(..=start).next_back().map_or(start, |(&start, _)| start);
+            let common = ours.stretches.range(from..end).find(|(_, stretch)| **stretch > start);
+            common.map(|(&first, _)| first.max(start))
+        };
+        theirs.stretches.iter().find_map(meets)
     }
 
     /// Number of packets.
@@ -157,6 +211,28 @@ mod tests {
         }
     }
 
+    proptest! {
+        #[test]
+        fn two_sets_make_one(both in proptest::collection::vec((0..60_u64, 0..3_u8), 0..80)) {
+            let mut sets = [Taken::default(), Taken::default(), Taken::default()];
+            let mut counts = [BTreeSet::new(), BTreeSet::new()];
+            for (count, whose) in both {
+                for (k, counts) in counts.iter_mut().enumerate() {
+                    if whose == 2 || usize::from(whose) == k {
+                        sets[k].take(count, at(count));
+                        counts.insert(count);
+                    }
+                }
+                sets[2].take(count, at(count));
+            }
+            let [mut ours, theirs, together] = sets;
+            prop_assert_eq!(ours.common(&theirs), counts[0].intersection(&counts[1]).next().copied());
+            prop_assert!(theirs.is_empty() || theirs.contains(*counts[1].first().unwrap(), at(60)));
+            prop_assert!(ours.absorb(&theirs));
+            prop_assert_eq!(ours, together);
+        }
+    }
+
     #[test]
     fn a_restart_begins_another_era() {
         let mut taken = Taken::default();
@@ -165,6 +241,8 @@ mod tests {
         assert!(taken.take(1, at(7)) && taken.take(4, at(8)));
         assert!(!taken.take(3, at(8)) && !taken.take(9, at(5)) && !taken.take(1, at(7)));
         assert!(taken.take(8, at(5)), "late, of the first era");
-        assert_eq!(taken.missing(), [vec![1..8], vec![0..1, 2..3]]);
+        let missing: Vec<Vec<u64>> =
+            taken.missing().into_iter().map(|era| era.into_iter().flatten().collect()).collect();
+        assert_eq!(missing, [(1..8).collect(), vec![0, 2]]);
     }
 }

@@ -69,6 +69,19 @@ impl Waiting {
         None
     }
 
+    /// Headers of all packets, in order.
+    pub fn headers(&self) -> impl Iterator<Item = PacketHeader> {
+        self.packets.values().map(|packet| packet.header)
+    }
+
+    /// Lets go of a packet as if it had never come.
+    pub fn drop_packet(&mut self, header: &PacketHeader) {
+        let key = (header.time, header.kind as u8, header.count);
+        if let Some(packet) = self.packets.remove(&key) {
+            self.bytes -= packet.header.bytes as u64;
+        }
+    }
+
     /// The first of the packets, if so many times more wait than may; call it until it gives none.
     pub fn next_due(&mut self, times: u64) -> Option<WaitingPacket> {
         if self.bytes > self.bytes_max.saturating_mul(times) { self.next_waiting() } else { None }

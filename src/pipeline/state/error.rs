@@ -64,6 +64,12 @@ pub enum StateError {
         /// Its value now.
         expected: String,
     },
+    /// A new state where there is one.
+    #[error("{}: holds a state already; expected a new folder", path.display())]
+    Occupied {
+        /// The folder.
+        path: PathBuf,
+    },
     /// Received bytes.
     #[error(transparent)]
     Downlink(#[from] crate::downlink::DownlinkError),
@@ -76,6 +82,15 @@ pub enum StateError {
 }
 
 impl StateError {
+    /// A folder that is no state's.
+    pub(super) fn without_checkpoint(path: &std::path::Path) -> Self {
+        Self::Damaged {
+            path: path.to_owned(),
+            found: "no checkpoint".into(),
+            expected: "a folder that `lunarray replay --state` has made",
+        }
+    }
+
     /// Names what was tried when the operating system refused.
     pub(super) fn io(
         path: &std::path::Path,

@@ -214,15 +214,22 @@ impl Schedule {
         let mut filled = BTreeMap::new();
         let before = next.checked_sub(1).map(|at| self.entries[at]);
         let after = self.entries.get(next);
-        let (mut at, mut sent) = (0, 0);
+        let (mut at, mut sent, mut step) = (0, 0, 1);
+        let place = |stream: Stream| self.order.iter().position(|known| *known == stream).unwrap_or(0);
         if let Some(before) = before {
             let stream = (before.channel, before.pair);
             if after.is_some_and(|after| same_pass(&before, after)) {
                 filled.insert(stream, missing);
                 return filled;
             }
-            at = self.order.iter().position(|known| *known == stream).unwrap_or(0);
+            at = place(stream);
             let of_pass = self.entries[..next].iter().rev();
+            sent = of_pass.take_while(|entry| (entry.channel, entry.pair) == stream).count() as u64;
+        } else if let Some(after) = after {
+            // Nothing came before: backwards from what came first.
+            let stream = (after.channel, after.pair);
+            (at, step) = (place(stream), self.order.len() - 1);
+            let of_pass = self.entries[next..].iter();
             sent = of_pass.take_while(|entry| (entry.channel, entry.pair) == stream).count() as u64;
         }
         let mut left = missing;
@@ -235,7 +242,7 @@ impl Schedule {
             }
             left -= packets;
             sent = 0;
-            at = (at + 1) % self.order.len();
+            at = (at + step) % self.order.len();
         }
         filled
     }

@@ -1,11 +1,11 @@
 //! The ground stage from bytes to sums that remembers what it has done.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::PoisonError;
 
 use super::error::StateError;
 use super::file::{self, Head};
-use super::folder::StateFolder;
+use super::folder::{StateFolder, checkpoints};
 use super::journal::JournalEntry;
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::Calibrator;
@@ -82,6 +82,49 @@ impl Keeper {
             checkpoint_every: checkpoint_every.max(1),
             since_checkpoint: 0,
         })
+    }
+
+    /// Puts states together into a new one, in the folder `into`; those of `parts` stay as they are.
+    ///
+    /// # Errors
+    /// A folder that holds a state already; states of different instruments or settings, or that hold the same
+    /// visibilities.
+    pub fn merge(into: &Path, parts: &[PathBuf], config: &Config) -> Result<Self, StateError> {
+        let mut whole: Option<Self> = None;
+        for path in parts {
+            if checkpoints(path)?.is_empty() {
+                return Err(StateError::without_checkpoint(path));
+            }
+            let part = Self::open(path, config, 0, u64::MAX)?;
+            match &mut whole {
+                None => whole = Some(part),
+                Some(whole) => whole.absorb(part)?,
+            }
+        }
+        let mut whole = whole.ok_or_else(|| StateError::without_checkpoint(into))?;
+        whole.folder = StateFolder::open(into)?;
+        if !checkpoints(into)?.is_empty() {
+            return Err(StateError::Occupied { path: into.to_owned() });
+        }
+        whole.advance(&mut Outlet::collect())?;
+        whole.checkpoint()?;
+        Ok(whole)
+    }
+
+    fn absorb(&mut self, part: Self) -> Result<(), StateError> {
+        self.collector.absorb(part.collector.state())?;
+        self.calibrator.absorb(part.calibrator.state());
+        self.accumulator.absorb(part.accumulator)?;
+        self.outcome.ledger.post_report(&part.outcome.ledger.report());
+        self.journal.extend(part.journal);
+        self.notes.extend(part.notes);
+        Ok(())
+    }
+
+    /// Packets of visibilities in its sums.
+    #[must_use]
+    pub fn packets(&self) -> usize {
+        self.journal.len()
     }
 
     /// What is to be said of checkpoints that do not hold.

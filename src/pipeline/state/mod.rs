@@ -12,6 +12,9 @@
 //! then hold the same terms in another order, which shows in their last bits. Visibilities whose ephemeris comes
 //! later than that are flagged, as without a state.
 //!
+//! States that are merged add up in the order in which they are named. Of two, packets that one has decoded and
+//! that still wait in the other are taken once; visibilities that both have summed are refused.
+//!
 //! # A checkpoint
 //! Magic `LNRSTA01`; length of the head (u64 LE); head (bincode); the channels' engines as they write
 //! themselves; CRC-64/NVME of all that (u64 LE). It is written under another name, put on the disk and renamed; the

@@ -65,11 +65,7 @@ impl Survey {
                 checkpoints: files.len(),
                 newest: Box::new(newest),
             }),
-            None => Err(StateError::Damaged {
-                path: path.to_owned(),
-                found: "no checkpoint".into(),
-                expected: "a folder that `lunarray replay --state` has made",
-            }),
+            None => Err(StateError::without_checkpoint(path)),
         }
     }
 

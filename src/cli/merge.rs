@@ -1,0 +1,44 @@
+//! `lunarray merge`: several states to one.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::{CommandResult, Outcome, print_text};
+use crate::pipeline::state::Keeper;
+use crate::pipeline::{ConfigSource, use_threads};
+
+/// Put the states of several grounds together.
+///
+/// Takes folders of `lunarray replay --state` that were summed with the same settings and hold different packets, such
+/// as those of passes received at different stations, and leaves a state in a new folder, to be gone on with. States
+/// that hold the same visibilities are refused: replay the files of one into the other, which takes
+/// every packet once. Sums of states put together in another order differ in their last bits.
+#[derive(Debug, Args)]
+pub(super) struct MergeArgs {
+    /// States.
+    #[arg(required = true, num_args = 1.., value_name = "STATE")]
+    states: Vec<PathBuf>,
+    /// Folder for the new state.
+    #[arg(short, long, value_name = "STATE")]
+    out: PathBuf,
+    /// The map file that the states were made with; the embedded quicklook's settings if not given.
+    #[arg(long, value_name = "MAP.toml")]
+    map: Option<PathBuf>,
+    /// Replace one setting, for example --set map.nside=8; may be given again.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+}
+
+pub(super) fn execute(args: &MergeArgs) -> CommandResult {
+    let source = ConfigSource { file: args.map.clone(), overrides: args.overrides.clone(), seed: None };
+    let config = source.load_ground()?;
+    use_threads(&config.runtime)?;
+    let whole = Keeper::merge(&args.out, &args.states, &config)?;
+    for note in whole.notes() {
+        eprintln!("note: {note}");
+    }
+    let (states, packets, out) = (args.states.len(), whole.packets(), args.out.display());
+    print_text(&format!("{states} states with {packets} packets of visibilities are together in {out}"))?;
+    Ok(Outcome::Done)
+}
