@@ -32,8 +32,8 @@
 //! | 120 | 0.9 % | 2.1 % | 57 % | 68 % |
 //!
 //! A tilt of 0.1 deg stays within a few per cent. 5 km of altitude do not: they move the Moon's limb by
-//! 0.23 deg, and a sky without small scales is seen by long baselines at the limb alone. Errors are in
-//! proportion to the departure: the 150 m that are allowed unless told otherwise keep them below 2 %.
+//! 0.23 deg, and a sky without small scales is seen by long baselines at the limb alone. The 150 m that are
+//! allowed unless told otherwise keep errors below 2 % at all of these u.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
