@@ -12,8 +12,8 @@ pub enum AccumulationError {
     /// Rows of B cannot be made.
     #[error(transparent)]
     Response(#[from] ResponseError),
-    /// A harmonic engine that cannot be.
-    #[error("harmonic engine: {name} = {value}: expected {expected}")]
+    /// An engine that cannot be.
+    #[error("engine of a map: {name} = {value}: expected {expected}")]
     Setup {
         /// Quantity.
         name: &'static str,
@@ -50,6 +50,12 @@ pub enum AccumulationError {
         /// What differs.
         what: &'static str,
     },
+    /// Engines whose sums together would be greater than there is room for, or less than nothing.
+    #[error(
+        "merged sums would leave the range of an engine: expected more in the first than is taken out, and room for \
+         both at this map.weight_max"
+    )]
+    Range,
     /// A checkpoint that cannot be read or written.
     #[error("checkpoint: {0}")]
     Io(#[from] std::io::Error),

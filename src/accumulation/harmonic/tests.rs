@@ -26,6 +26,7 @@ fn setup() -> HarmonicSetup {
             limits: GeometryLimits::default(),
         },
         companion_seed: 7,
+        weight_max: 1024.0,
     }
 }
 
