@@ -166,7 +166,7 @@ fn to_values(tile: Vec<i64>, unit: f64) -> Vec<f64> {
 /// Adds the products of two strips of panels to a tile, of a diagonal one those that reach its lower triangle.
 ///
 /// Without fused multiply-add in hardware this is slow, and right.
-#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+#[multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn multiply_panels(
     (left, right): (&[[f64; LEFT]], &[[f64; RIGHT]]),
     columns: usize,

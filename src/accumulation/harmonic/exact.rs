@@ -75,7 +75,7 @@ pub(super) struct Row {
 impl Row {
     /// Makes room for terms of together at most `most` quanta in each of `len` sums.
     #[inline(always)]
-    pub(super) fn expect(&mut self, most: u64, direction: Direction, len: usize) {
+    pub(super) fn make_room(&mut self, most: u64, direction: Direction, len: usize) {
         let before = self.bound;
         self.bound = match direction {
             Direction::In => before.wrapping_add(most),
@@ -108,7 +108,7 @@ impl Row {
             Integers::Narrow(sums) => sums.len(),
             Integers::Wide(sums) => sums.len(),
         };
-        self.expect(other.bound, direction, len);
+        self.make_room(other.bound, direction, len);
         let sign = if direction == Direction::In { 1 } else { -1 };
         match (&mut self.integers, &other.integers) {
             (Integers::Narrow(sums), Integers::Narrow(terms)) => {
@@ -191,7 +191,7 @@ impl Row {
         let width = if bound < NARROW { 4 } else { 8 };
         let mut bytes = vec![0; width * points * parts];
         from(&mut bytes)?;
-        row.expect(bound, Direction::In, stride * parts);
+        row.make_room(bound, Direction::In, stride * parts);
         let places = (0..parts).flat_map(|part| part * stride..part * stride + points);
         match &mut row.integers {
             Integers::None => {}

@@ -209,7 +209,7 @@ fn spread_rows<const K: usize>(rows: Rows<'_, K>, terms: &[Term<'_, K>]) {
             most += (greatest * term.alphas[lane].abs()) as u64 + step;
         }
         let Some(row) = rows.rows.get_mut(alpha) else { return };
-        row.expect(most, rows.direction, K * rows.stride);
+        row.make_room(most, rows.direction, K * rows.stride);
         for (k, shift) in rows.shifts.iter().enumerate().take(rows.used) {
             let start = k * rows.stride + gamma;
             let mut multiples = [0_i32; LANES];
