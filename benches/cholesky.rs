@@ -31,6 +31,7 @@ fn normal_matrix(nside: usize) -> SymmetricTiles {
         moon_radius_m: array.moon_radius_m(),
         response: AntennaResponse::Isotropic,
         companion_seed: 1,
+        weight_max: 1e-6,
     })
     .unwrap();
     let time_s: Vec<f64> = (0..512).map(|k| 3.1e4 * f64::from(k)).collect();

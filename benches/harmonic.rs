@@ -181,6 +181,8 @@ fn engine(array: &Array, l_max: usize) {
             limits: GeometryLimits::default(),
         },
         companion_seed: 1,
+        // A thousand times that of the data, as for a thermal sky.
+        weight_max: 1024.0,
     })
     .expect("settings in range");
     let memory = memory(l_max, 125.0, rayon::current_num_threads());

@@ -93,6 +93,7 @@ fn main() {
                 moon_radius_m: array.moon_radius_m(),
                 response: AntennaResponse::Isotropic,
                 companion_seed: 1,
+                weight_max: 1e-6,
             })
             .unwrap();
             let longest_m = MapConfig { nside, ..MapConfig::default() }.baseline_m_max(FREQUENCY_HZ);

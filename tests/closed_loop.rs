@@ -8,7 +8,7 @@
 
 mod common;
 
-use lunarray::accumulation::{MapConfig, NormalEngine, PixelEngine, PixelSetup};
+use lunarray::accumulation::{MapConfig, NormalEngine, PixelEngine, PixelSetup, automatic_weight_max};
 use lunarray::array::response::{Directions, PairGeometry, PixelMethod, sky_sums};
 use lunarray::array::{Array, ArrayConfig, IntegrationRule, ObservingWindows, integration_time_s};
 use lunarray::frames::{AntennaResponse, ObservingWindow, PlacedVisibilities};
@@ -100,6 +100,7 @@ fn map(
         moon_radius_m: array.moon_radius_m(),
         response: AntennaResponse::Isotropic,
         companion_seed: 1,
+        weight_max: automatic_weight_max(frequency_hz, CHANNEL_WIDTH_HZ),
     })
     .unwrap();
     for (observation, value, weight) in observed {

@@ -85,6 +85,7 @@ fn harmonic_sums(blocks: &[PlacedVisibilities], l_max: usize, baseline_m_max: f6
         response: AntennaResponse::Isotropic,
         orbit: orbit_of(&blocks[0], GeometryLimits::default()).unwrap(),
         companion_seed: 1,
+        weight_max: 1e-5,
     };
     add_all(HarmonicEngine::new(setup).unwrap(), blocks)
 }
@@ -97,6 +98,7 @@ fn pixel_sums(blocks: &[PlacedVisibilities], nside: usize) -> lunarray::accumula
         moon_radius_m: ArrayConfig::default().moon_radius_m,
         response: AntennaResponse::Isotropic,
         companion_seed: 1,
+        weight_max: 1e-5,
     };
     add_all(PixelEngine::new(setup).unwrap(), blocks)
 }

@@ -3,7 +3,9 @@
 
 mod common;
 
-use lunarray::accumulation::{NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums};
+use lunarray::accumulation::{
+    NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums, automatic_weight_max,
+};
 use lunarray::array::response::PixelMethod;
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
@@ -41,6 +43,7 @@ fn sums(reference: &Value) -> PixelSums {
         moon_radius_m: array.moon_radius_m(),
         response: AntennaResponse::Isotropic,
         companion_seed: 1,
+        weight_max: automatic_weight_max(frequency_hz, 8e3),
     })
     .unwrap();
     for data in reference["data"].as_array().unwrap() {

@@ -49,14 +49,14 @@ impl<'a> Summed<'a> {
         Ok(self.write(&head)?)
     }
 
-    pub(super) fn numbers(&mut self, values: &[f64]) -> std::io::Result<()> {
-        let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
-        self.write(&bytes)
-    }
-
-    pub(super) fn singles(&mut self, values: &[f32]) -> std::io::Result<()> {
+    /// Integers, little-endian.
+    pub(super) fn integers<T: Copy, const N: usize>(
+        &mut self,
+        values: &[T],
+        to_bytes: impl Fn(T) -> [u8; N],
+    ) -> std::io::Result<()> {
         for values in values.chunks(1 << 16) {
-            let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+            let bytes: Vec<u8> = values.iter().flat_map(|value| to_bytes(*value)).collect();
             self.write(&bytes)?;
         }
         Ok(())
@@ -102,21 +102,17 @@ impl<'a> Checked<'a> {
         }
     }
 
-    pub(super) fn numbers(&mut self, values: &mut [f64]) -> std::io::Result<()> {
-        let mut bytes = vec![0; size_of_val(values)];
-        self.read(&mut bytes)?;
-        for (value, bytes) in values.iter_mut().zip(bytes.as_chunks::<8>().0) {
-            *value = f64::from_le_bytes(*bytes);
-        }
-        Ok(())
-    }
-
-    pub(super) fn singles(&mut self, values: &mut [f32]) -> std::io::Result<()> {
+    /// Integers, little-endian.
+    pub(super) fn integers<T, const N: usize>(
+        &mut self,
+        values: &mut [T],
+        of_bytes: impl Fn([u8; N]) -> T,
+    ) -> std::io::Result<()> {
         for values in values.chunks_mut(1 << 16) {
-            let mut bytes = vec![0; size_of_val(values)];
+            let mut bytes = vec![0; N * values.len()];
             self.read(&mut bytes)?;
-            for (value, bytes) in values.iter_mut().zip(bytes.as_chunks::<4>().0) {
-                *value = f32::from_le_bytes(*bytes);
+            for (value, bytes) in values.iter_mut().zip(bytes.as_chunks::<N>().0) {
+                *value = of_bytes(*bytes);
             }
         }
         Ok(())

@@ -1,29 +1,24 @@
 //! Checkpoints of the pixel engine: versioned, bounded, with a checksum over everything.
 //!
-//! Layout: magic, length of the head (u32 LE), head (bincode), raw little-endian f64: the matrix's tiles
-//! column by column, both right-hand sides, the waiting visibilities; CRC-32C of all that (u32 LE).
+//! Layout: magic, length of the head (u32 LE), head (bincode), raw little-endian integers: the matrix's tiles
+//! column by column (i64), both right-hand sides (i128); CRC-32C of all that (u32 LE). Nothing in it depends on how
+//! the data came.
 
 use std::io::{Read, Write};
 
-use num_complex::Complex64;
-
-use super::SumCounts;
 use super::checked::{Checked, RESPONSES, Summed, number_of, refused};
 use super::error::AccumulationError;
-use super::pixel::{Pending, PixelEngine, PixelSetup, PixelSums};
+use super::pixel::{PixelEngine, PixelSetup};
+use super::scale::Totals;
 use crate::array::response::PixelMethod;
 use crate::sky::healpix::is_valid_nside;
 
-const MAGIC: &[u8; 8] = b"LNRPIX01";
-
-/// Greatest number of waiting visibilities that is believed.
-const PENDING_MAX: u32 = 65_536;
+const MAGIC: &[u8; 8] = b"LNRPIX02";
+const VERSION: &str =
+    "a pixel engine's checkpoint, version 02; sums of version 01 were not exact: sum the data anew";
 
 /// Greatest nside that is believed.
 const NSIDE_MAX: u32 = 64;
-
-/// Numbers that a waiting visibility takes.
-const PENDING_NUMBERS: usize = 11;
 
 #[derive(bincode::Encode, bincode::Decode)]
 struct Head {
@@ -33,15 +28,8 @@ struct Head {
     moon_radius_m: f64,
     response: u8,
     companion_seed: u64,
-    counts: SumCounts,
-    pending: u32,
-}
-
-/// What a checkpoint holds.
-pub(super) struct Restored {
-    pub(super) setup: PixelSetup,
-    pub(super) sums: PixelSums,
-    pub(super) pending: Vec<Pending>,
+    weight_max: f64,
+    totals: Totals,
 }
 
 /// Numbers of variants on disk: never to be renumbered.
@@ -57,65 +45,43 @@ pub(super) fn write(engine: &PixelEngine, out: &mut dyn Write) -> Result<(), Acc
         moon_radius_m: setup.moon_radius_m,
         response: number_of(&RESPONSES, &setup.response),
         companion_seed: setup.companion_seed,
-        counts: engine.sums.counts,
-        pending: engine.pending.len() as u32,
+        weight_max: setup.weight_max,
+        totals: engine.totals,
     };
     out.write(MAGIC)?;
     out.head(head)?;
     for column in engine.sums.normal.columns() {
-        out.numbers(column)?;
+        out.integers(column, i64::to_le_bytes)?;
     }
-    out.numbers(&engine.sums.right)?;
-    out.numbers(&engine.sums.noise)?;
-    for p in &engine.pending {
-        let ([a, b, c], [d, e, f]) = (p.r_i_m, p.r_j_m);
-        let (v, n) = (p.value_k_sr, p.noise);
-        out.numbers(&[a, b, c, d, e, f, v.re, v.im, p.weight, n.re, n.im])?;
-    }
+    out.integers(&engine.sums.right, i128::to_le_bytes)?;
+    out.integers(&engine.sums.noise, i128::to_le_bytes)?;
     out.finish()?;
     Ok(())
 }
 
-pub(super) fn read(from: &mut dyn Read) -> Result<Restored, AccumulationError> {
+pub(super) fn read(from: &mut dyn Read) -> Result<PixelEngine, AccumulationError> {
     let mut from = Checked::new(from);
     let mut magic = [0; 8];
     from.read(&mut magic)?;
     if &magic != MAGIC {
-        return Err(refused(format!("{magic:02x?}"), "a pixel engine's checkpoint, version 01"));
+        return Err(refused(format!("{magic:02x?}"), VERSION));
     }
     let head: Head = from.head()?;
-    let setup = setup_of(&head)?;
-    let mut sums = PixelSums::zeros(setup.nside);
-    for column in sums.normal.columns_mut() {
-        from.numbers(column)?;
+    let mut engine = PixelEngine::new(setup_of(&head)?)?;
+    for column in engine.sums.normal.columns_mut() {
+        from.integers(column, i64::from_le_bytes)?;
     }
-    from.numbers(&mut sums.right)?;
-    from.numbers(&mut sums.noise)?;
-    sums.counts = head.counts;
-    let mut pending = Vec::new();
-    for _ in 0..head.pending {
-        let mut numbers = [0.0; PENDING_NUMBERS];
-        from.numbers(&mut numbers)?;
-        let [a, b, c, d, e, f, re, im, weight, noise_re, noise_im] = numbers;
-        pending.push(Pending {
-            r_i_m: [a, b, c],
-            r_j_m: [d, e, f],
-            value_k_sr: Complex64::new(re, im),
-            weight,
-            noise: Complex64::new(noise_re, noise_im),
-        });
-    }
+    from.integers(&mut engine.sums.right, i128::from_le_bytes)?;
+    from.integers(&mut engine.sums.noise, i128::from_le_bytes)?;
+    engine.totals = head.totals;
     from.finish()?;
-    Ok(Restored { setup, sums, pending })
+    Ok(engine)
 }
 
 fn setup_of(head: &Head) -> Result<PixelSetup, AccumulationError> {
     let nside = head.nside as usize;
     if !is_valid_nside(nside) || head.nside > NSIDE_MAX {
         return Err(refused(format!("nside {nside}"), "a power of two up to 64"));
-    }
-    if head.pending > PENDING_MAX {
-        return Err(refused(format!("{} waiting visibilities", head.pending), "at most 65536"));
     }
     let method = METHODS.get(usize::from(head.method)).copied();
     let response = RESPONSES.get(usize::from(head.response)).copied();
@@ -126,11 +92,14 @@ fn setup_of(head: &Head) -> Result<PixelSetup, AccumulationError> {
         moon_radius_m: head.moon_radius_m,
         response: response.ok_or_else(|| refused(format!("response {}", head.response), "a known one"))?,
         companion_seed: head.companion_seed,
+        weight_max: head.weight_max,
     })
 }
 
 #[cfg(test)]
 mod tests {
+    use num_complex::Complex64;
+
     use super::super::{NormalEngine, NormalSums};
     use super::*;
     use crate::array::{Array, ArrayConfig};
@@ -145,6 +114,7 @@ mod tests {
             moon_radius_m: crate::units::constants::MOON_RADIUS_M,
             response: AntennaResponse::Isotropic,
             companion_seed: 3,
+            weight_max: 10.0,
         }
     }
 
@@ -166,7 +136,7 @@ mod tests {
         placed
     }
 
-    fn checkpoint(engine: &PixelEngine) -> Vec<u8> {
+    fn checkpoint(engine: &mut PixelEngine) -> Vec<u8> {
         let mut bytes = Vec::new();
         engine.checkpoint(&mut bytes).unwrap();
         bytes
@@ -180,7 +150,7 @@ mod tests {
         let _ = whole.add(&first).unwrap();
         let _ = whole.add(&second).unwrap();
         let _ = stopped.add(&first).unwrap();
-        let mut resumed = PixelEngine::restore(&mut checkpoint(&stopped).as_slice()).unwrap();
+        let mut resumed = PixelEngine::restore(&mut checkpoint(&mut stopped).as_slice()).unwrap();
         let _ = resumed.add(&second).unwrap();
         assert!(whole.into_sums() == resumed.into_sums());
     }
@@ -233,7 +203,7 @@ mod tests {
     fn damage_is_found_wherever_it_is() {
         let mut engine = PixelEngine::new(setup()).unwrap();
         let _ = engine.add(&visibilities(0.0, 140)).unwrap();
-        let good = checkpoint(&engine);
+        let good = checkpoint(&mut engine);
         assert!(PixelEngine::restore(&mut good.as_slice()).is_ok());
         for place in [0, 7, 8, 11, 12, 16, 24, 40, 60, 80, good.len() / 2, good.len() - 5, good.len() - 1] {
             let mut bad = good.clone();

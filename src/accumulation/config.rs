@@ -57,6 +57,9 @@ pub struct MapConfig {
     pub prior_fwhm_deg: f64,
     /// Mission time between snapshot maps, s; 0 for a final map alone.
     pub snapshot_every_s: f64,
+    /// Greatest weight of a visibility that is taken, (K sr)^-2; it sets the resolution of the sums. 0 for 1024 times
+    /// that of 25 s under the mean sky of the channel's frequency.
+    pub weight_max: f64,
     /// Seed of the noise-only companion map.
     pub companion_seed: u64,
     /// Residual at which the harmonic solution ends, relative to the right-hand side, in the preconditioner's norm.
@@ -82,6 +85,7 @@ impl Default for MapConfig {
             prior_files: Vec::new(),
             prior_fwhm_deg: 5.0,
             snapshot_every_s: 0.0,
+            weight_max: 0.0,
             companion_seed: 1,
             residual_max: 1e-4,
             iterations_max: 300,
@@ -164,6 +168,13 @@ impl MapConfig {
         for (key, value) in self.limits.values() {
             require(key, value, value >= 0.0, "not negative");
         }
+        let weight = self.weight_max;
+        require(
+            "weight_max",
+            weight,
+            weight == 0.0 || (1e-60..=1e60).contains(&weight),
+            "0, or 1e-60 to 1e60",
+        );
         let every = self.snapshot_every_s;
         require("snapshot_every_s", every, every >= 0.0, "seconds, or 0 for a final map alone");
         if !self.prior_files.is_empty() && self.prior_k.values().iter().any(|&k| k != 0.0) {
@@ -181,12 +192,13 @@ impl MapConfig {
     /// The settings that shape sums, by key; the others only shape what is made of them.
     #[must_use]
     pub fn of_sums(&self) -> Vec<(&'static str, String)> {
-        let Self { nside, engine, rows, baseline_bp_max, companion_seed, limits, .. } = self;
+        let Self { nside, engine, rows, baseline_bp_max, companion_seed, limits, weight_max, .. } = self;
         let mut settings = vec![
             ("map.nside", nside.to_string()),
             ("map.engine", format!("{engine:?}")),
             ("map.baseline_bp_max", format!("{baseline_bp_max:?}")),
             ("map.companion_seed", companion_seed.to_string()),
+            ("map.weight_max", format!("{weight_max:?}")),
         ];
         match engine {
             EngineKind::Pixel => settings.push(("map.rows", format!("{rows:?}"))),

@@ -12,8 +12,8 @@ pub enum AccumulationError {
     /// Rows of B cannot be made.
     #[error(transparent)]
     Response(#[from] ResponseError),
-    /// A harmonic engine that cannot be.
-    #[error("harmonic engine: {name} = {value}: expected {expected}")]
+    /// An engine that cannot be.
+    #[error("engine of a map: {name} = {value}: expected {expected}")]
     Setup {
         /// Quantity.
         name: &'static str,
@@ -25,6 +25,9 @@ pub enum AccumulationError {
     /// Data of a channel that the instrument description does not have.
     #[error("visibilities of channel {0} arrived, which the instrument description does not have")]
     UnknownChannel(ChannelId),
+    /// Data to be taken out of sums that are not there.
+    #[error("visibilities of channel {0} are to be taken out, but nothing of it was ever put in")]
+    NothingHeld(ChannelId),
     /// Data of another frequency.
     #[error("a block at {found_hz} Hz was given to an engine for {expected_hz} Hz")]
     Frequency {
@@ -47,6 +50,12 @@ pub enum AccumulationError {
         /// What differs.
         what: &'static str,
     },
+    /// Engines whose sums together would be greater than there is room for, or less than nothing.
+    #[error(
+        "merged sums would leave the range of an engine: expected more in the first than is taken out, and room for \
+         both at this map.weight_max"
+    )]
+    Range,
     /// A checkpoint that cannot be read or written.
     #[error("checkpoint: {0}")]
     Io(#[from] std::io::Error),

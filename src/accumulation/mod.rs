@@ -9,15 +9,18 @@ mod checked;
 mod checkpoint;
 mod config;
 mod error;
+mod exact;
 pub mod harmonic;
 mod noise;
 mod pixel;
+mod scale;
 mod stage;
 mod tiles;
 
 pub use config::{EngineKind, MapConfig, MapConfigError};
 pub use error::AccumulationError;
 pub use pixel::{PixelEngine, PixelSetup, PixelSums};
+pub use scale::automatic_weight_max;
 pub use stage::{Accumulator, AccumulatorState, Snapshot, Sums};
 pub use tiles::{Columns, SymmetricTiles, TILE};
 
@@ -51,6 +54,12 @@ pub enum Refusal {
     /// Its value or weight is no number that can be summed.
     #[error("value or weight not finite, or weight not positive")]
     NotFinite,
+    /// Its weight, or its value in units of its noise, is more than the sums have room for.
+    #[error("weight or value beyond the range of the sums")]
+    OutOfRange,
+    /// The sums have no room for more weight.
+    #[error("the sums are full")]
+    Full,
 }
 
 impl Refusal {
@@ -69,6 +78,10 @@ impl Refusal {
             }
             Self::TooLong => "refused by the engine: baseline beyond its limit",
             Self::NotFinite => "refused by the engine: value or weight not finite, or weight not positive",
+            Self::OutOfRange => {
+                "refused by the engine: weight above map.weight_max, or value far above its noise"
+            }
+            Self::Full => "refused by the engine: sums full at this map.weight_max",
         }
     }
 }
@@ -89,10 +102,28 @@ impl Added {
     }
 }
 
+/// Whether visibilities are put in or taken out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Direction {
+    In,
+    Out,
+}
+
+impl Direction {
+    fn sign(self) -> f64 {
+        match self {
+            Self::In => 1.0,
+            Self::Out => -1.0,
+        }
+    }
+}
+
 /// Takes visibilities of one channel, one block after another.
 ///
-/// The sums depend on the order of the visibilities, in their last bits, but neither on how they come in
-/// blocks nor on threads, nor on whether [`NormalEngine::sums`] was called on the way.
+/// Sums are exact: each term is rounded once, by a rule that looks at its own visibility alone, to a multiple of a
+/// quantum that the setup fixes, and the multiples are added as integers. So the sums, and the bytes of a checkpoint,
+/// depend on which visibilities are in them and on nothing else: not on their order, blocks or threads, not on how
+/// engines were merged, nor on what was put in and taken out again.
 pub trait NormalEngine: Send {
     /// The form of the sums.
     type Sums: NormalSums;
@@ -103,6 +134,15 @@ pub trait NormalEngine: Send {
     /// A block that is none of this engine's channel. Geometry that the engine does not cover is
     /// counted as refused instead.
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
+
+    /// Takes out visibilities that were added: the exact inverse of [`NormalEngine::add`].
+    ///
+    /// What the engine would refuse to add is refused here too, and counted; that the others were ever added is
+    /// for the caller to know.
+    ///
+    /// # Errors
+    /// As [`NormalEngine::add`]; or more is to be taken out than there is.
+    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 
     /// Adds what waits for company, if anything does; changes no bit of the sums.
     fn settle(&mut self) {}
@@ -115,11 +155,19 @@ pub trait NormalEngine: Send {
     where
         Self: Sized;
 
+    /// Takes out what another engine of the same setup holds: the exact inverse of [`NormalEngine::merge`].
+    ///
+    /// # Errors
+    /// [`AccumulationError::Mismatch`] if the setups differ; or more is to be taken out than there is.
+    fn subtract(&mut self, other: Self) -> Result<(), AccumulationError>
+    where
+        Self: Sized;
+
     /// What is in the engine.
     fn counts(&self) -> SumCounts;
 
     /// A copy of the sums of all visibilities so far.
-    fn sums(&self) -> Self::Sums;
+    fn sums(&mut self) -> Self::Sums;
 
     /// The sums of all visibilities, without a copy.
     fn into_sums(self) -> Self::Sums
@@ -130,7 +178,7 @@ pub trait NormalEngine: Send {
     ///
     /// # Errors
     /// What the writer says.
-    fn checkpoint(&self, out: &mut dyn std::io::Write) -> Result<(), AccumulationError>;
+    fn checkpoint(&mut self, out: &mut dyn std::io::Write) -> Result<(), AccumulationError>;
 
     /// An engine as [`NormalEngine::checkpoint`] wrote it; it goes on to the same bits.
     ///

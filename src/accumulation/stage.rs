@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::harmonic::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
 use super::{
     AccumulationError, Added, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine, PixelSetup,
-    PixelSums, Refusal, SumCounts,
+    PixelSums, Refusal, SumCounts, automatic_weight_max,
 };
 use crate::array::harmonic::GeometryRefusal;
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities};
@@ -65,7 +65,14 @@ impl Engine {
         }
     }
 
-    fn sums(&self) -> Sums {
+    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        match self {
+            Self::Pixel(engine) => engine.remove(placed),
+            Self::Harmonic(engine) => engine.remove(placed),
+        }
+    }
+
+    fn sums(&mut self) -> Sums {
         match self {
             Self::Pixel(engine) => Sums::Pixel(engine.sums()),
             Self::Harmonic(engine) => Sums::Harmonic(Box::new(engine.sums())),
@@ -130,9 +137,9 @@ impl Accumulator {
     ///
     /// # Errors
     /// What the writer says.
-    pub fn write_engines(&self, out: &mut dyn Write) -> Result<(), AccumulationError> {
-        for sums in self.channels.iter().flatten() {
-            match &sums.engine {
+    pub fn write_engines(&mut self, out: &mut dyn Write) -> Result<(), AccumulationError> {
+        for sums in self.channels.iter_mut().flatten() {
+            match &mut sums.engine {
                 Engine::Pixel(engine) => engine.checkpoint(out)?,
                 Engine::Harmonic(engine) => engine.checkpoint(out)?,
             }
@@ -192,6 +199,24 @@ impl Accumulator {
         self.next_snapshot_s = next_s.reduce(f64::max);
         self.accumulated += other.accumulated;
         Ok(())
+    }
+
+    /// Takes visibilities out of the sums of their channel again; the ledger is the caller's affair.
+    ///
+    /// Those beyond the map's longest baseline never were in the sums: they are neither taken out nor refused.
+    ///
+    /// # Errors
+    /// A channel that holds nothing, or as [`NormalEngine::remove`].
+    pub fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
+        if near.is_empty() {
+            return Ok(Added::default());
+        }
+        let slot = self.channels.get_mut(usize::from(placed.channel.0)).and_then(Option::as_mut);
+        let sums = slot.ok_or(AccumulationError::NothingHeld(placed.channel))?;
+        let removed = sums.engine.remove(&near)?;
+        self.accumulated = self.accumulated.saturating_sub(removed.visibilities);
+        Ok(removed)
     }
 
     fn open(&mut self, instrument: Instrument) -> Result<(), AccumulationError> {
@@ -285,10 +310,15 @@ fn engine(
     instrument: &Instrument,
     placed: &PlacedVisibilities,
 ) -> Result<Option<Engine>, AccumulationError> {
-    let Some(&Channel { frequency_hz, .. }) = instrument.channels.get(usize::from(placed.channel.0)) else {
+    let Some(&Channel { frequency_hz, width_hz }) = instrument.channels.get(usize::from(placed.channel.0))
+    else {
         return Err(AccumulationError::UnknownChannel(placed.channel));
     };
     let (moon_radius_m, response) = (instrument.moon_radius_m, instrument.response);
+    let weight_max = match config.weight_max {
+        0.0 => automatic_weight_max(frequency_hz, width_hz),
+        weight_max => weight_max,
+    };
     Ok(match config.engine {
         EngineKind::Pixel => Some(Engine::Pixel(Box::new(PixelEngine::new(PixelSetup {
             nside: config.nside,
@@ -297,6 +327,7 @@ fn engine(
             moon_radius_m,
             response,
             companion_seed: config.companion_seed,
+            weight_max,
         })?))),
         EngineKind::Harmonic => match orbit_of(placed, config.limits) {
             Some(orbit) => Some(Engine::Harmonic(Box::new(HarmonicEngine::new(HarmonicSetup {
@@ -307,6 +338,7 @@ fn engine(
                 response,
                 orbit,
                 companion_seed: config.companion_seed,
+                weight_max,
             })?))),
             None => None,
         },

@@ -12,7 +12,7 @@ pub const TILE: usize = 512;
 
 /// Elements between the columns of a tile: not a power of two, which would map all columns to few cache
 /// sets (155 instead of 229 Gflop/s where it was measured).
-const STRIDE: usize = TILE + 16;
+pub(super) const STRIDE: usize = TILE + 16;
 
 /// Lower triangle of a symmetric matrix, f64, as tiles.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,12 +35,12 @@ pub struct Columns<'a, T> {
 }
 
 /// Number of tiles along the side of a matrix.
-fn tiles_along(order: usize) -> usize {
+pub(super) fn tiles_along(order: usize) -> usize {
     order.div_ceil(TILE)
 }
 
 /// Place of tile (i, j) and back: tiles are stored row by row.
-fn place(index: usize) -> (usize, usize) {
+pub(super) fn place(index: usize) -> (usize, usize) {
     let mut i = ((((8 * index + 1) as f64).sqrt() - 1.0) / 2.0) as usize;
     // The root may be off by one rounding.
     while i * (i + 1) / 2 > index {
@@ -63,6 +63,11 @@ impl SymmetricTiles {
                 vec![0.0; STRIDE * extent(order, j)]
             })
             .collect();
+        Self { order, tiles }
+    }
+
+    /// Of tiles in their order.
+    pub(super) fn of(order: usize, tiles: Vec<Vec<f64>>) -> Self {
         Self { order, tiles }
     }
 
@@ -115,49 +120,15 @@ impl SymmetricTiles {
         MatMut::from_column_major_slice_with_stride_mut(values, rows, columns, STRIDE)
     }
 
-    /// Adds A A^T, by products in f64.
+    /// Adds A A^T by the library's products: faster to write than [`super::exact`], but of no fixed rounding.
     pub fn add_products_f64(&mut self, a: Columns<'_, f64>) {
         let order = self.order;
         self.tiles.par_iter_mut().enumerate().for_each(|(index, tile)| {
             let (i, j) = place(index);
             let (left, right) = (strip(a, order, i), strip(a, order, j));
             let tile = Self::view_mut(tile, left.nrows(), right.nrows());
-            product(tile, Accum::Add, left, right, i == j);
+            add_product(tile, left, right, i == j);
         });
-    }
-
-    /// Adds A A^T, by products in f32 over the columns given, added up in f64.
-    ///
-    /// A product of 256 columns errs by about 1e-6 of its largest terms; sums of them do not drift.
-    pub fn add_products_f32(&mut self, a: Columns<'_, f32>) {
-        let order = self.order;
-        self.tiles.par_iter_mut().enumerate().for_each_init(
-            || vec![0.0_f32; STRIDE * TILE],
-            |scratch, (index, tile)| {
-                let (i, j) = place(index);
-                let (left, right) = (strip(a, order, i), strip(a, order, j));
-                let (rows, columns) = (left.nrows(), right.nrows());
-                let scratch = &mut scratch[..STRIDE * columns];
-                let view = MatMut::from_column_major_slice_with_stride_mut(scratch, rows, columns, STRIDE);
-                product(view, Accum::Replace, left, right, i == j);
-                for (tile, scratch) in tile.chunks_exact_mut(STRIDE).zip(scratch.chunks_exact(STRIDE)) {
-                    for (sum, &term) in tile[..rows].iter_mut().zip(scratch) {
-                        *sum += f64::from(term);
-                    }
-                }
-            },
-        );
-    }
-
-    /// Adds another matrix of the same order; nothing if it has another order.
-    pub fn add(&mut self, other: &Self) {
-        if self.order == other.order {
-            self.tiles.par_iter_mut().zip(&other.tiles).for_each(|(tile, other)| {
-                for (sum, &term) in tile.iter_mut().zip(other) {
-                    *sum += term;
-                }
-            });
-        }
     }
 
     /// Adds `shift` to the diagonal.
@@ -207,27 +178,10 @@ impl SymmetricTiles {
             }
         }
     }
-
-    /// The numbers in use, tile by tile and column by column, for a checkpoint.
-    pub(crate) fn columns(&self) -> impl Iterator<Item = &[f64]> {
-        self.tiles.iter().enumerate().flat_map(move |(index, tile)| {
-            let rows = extent(self.order, place(index).0);
-            tile.chunks_exact(STRIDE).map(move |column| &column[..rows])
-        })
-    }
-
-    /// As [`Self::columns`], to be filled.
-    pub(crate) fn columns_mut(&mut self) -> impl Iterator<Item = &mut [f64]> {
-        let order = self.order;
-        self.tiles.iter_mut().enumerate().flat_map(move |(index, tile)| {
-            let rows = extent(order, place(index).0);
-            tile.chunks_exact_mut(STRIDE).map(move |column| &mut column[..rows])
-        })
-    }
 }
 
 /// Rows of tile row `i`.
-fn extent(order: usize, i: usize) -> usize {
+pub(super) fn extent(order: usize, i: usize) -> usize {
     (order - i * TILE).min(TILE)
 }
 
@@ -237,21 +191,15 @@ fn strip<T>(a: Columns<'_, T>, order: usize, i: usize) -> MatRef<'_, T> {
         .subrows(i * TILE, extent(order, i))
 }
 
-/// `to (+)= left right^T`, of a diagonal tile the lower triangle.
-fn product<T: faer::traits::ComplexField>(
-    to: MatMut<'_, T>,
-    accum: Accum,
-    left: MatRef<'_, T>,
-    right: MatRef<'_, T>,
-    diagonal: bool,
-) {
-    let one = T::one_impl();
+/// `to += left right^T`, of a diagonal tile the lower triangle.
+fn add_product(to: MatMut<'_, f64>, left: MatRef<'_, f64>, right: MatRef<'_, f64>, diagonal: bool) {
     if diagonal {
         use triangular::BlockStructure::{Rectangular, TriangularLower};
         let right = right.transpose();
-        triangular::matmul(to, TriangularLower, accum, left, Rectangular, right, Rectangular, one, Par::Seq);
+        let accum = Accum::Add;
+        triangular::matmul(to, TriangularLower, accum, left, Rectangular, right, Rectangular, 1.0, Par::Seq);
     } else {
-        matmul(to, accum, left, right.transpose(), one, Par::Seq);
+        matmul(to, Accum::Add, left, right.transpose(), 1.0, Par::Seq);
     }
 }
 
@@ -319,16 +267,12 @@ mod tests {
             let a = random(stride * columns, 1);
             let mut exact = SymmetricTiles::zeros(order);
             exact.add_products_f64(Columns { values: &a, columns, stride });
-            let single: Vec<f32> = a.iter().map(|&x| x as f32).collect();
-            let mut rough = SymmetricTiles::zeros(order);
-            rough.add_products_f32(Columns { values: &single, columns, stride });
             let plain = |r: usize, c: usize| -> f64 {
                 (0..columns).map(|k| a[k * stride + r] * a[k * stride + c]).sum()
             };
             for (r, c) in [(0, 0), (order - 1, 0), (order / 2, order - 1), (order - 1, order - 1)] {
-                // Six terms below one: roundings of 1e-16, of 6e-8 each for single precision.
+                // Six terms below one: roundings of 1e-16.
                 assert!((exact.get(r, c) - plain(r, c)).abs() < 1e-14);
-                assert!((rough.get(r, c) - plain(r, c)).abs() < 2e-6);
             }
             let x = random(order, 2);
             let mut y = vec![0.0; order];

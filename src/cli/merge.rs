@@ -13,7 +13,7 @@ use crate::pipeline::{ConfigSource, use_threads};
 /// Takes folders of `lunarray replay --state` that were summed with the same settings and hold different packets, such
 /// as those of passes received at different stations, and leaves a state in a new folder, to be gone on with. States
 /// that hold the same visibilities are refused: replay the files of one into the other, which takes
-/// every packet once. Sums of states put together in another order differ in their last bits.
+/// every packet once. Sums are exact: they are the same in whatever order states are put together.
 #[derive(Debug, Args)]
 pub(super) struct MergeArgs {
     /// States.

@@ -81,6 +81,7 @@ impl Plan {
             moon_radius_m: self.instrument.moon_radius_m,
             response: self.instrument.response,
             companion_seed: 0,
+            weight_max: 1.0,
         };
         let placed = self.samples(frequency_hz);
         let measured_s = PixelEngine::new(setup).map_or(f64::NAN, |mut engine| time_of(&mut engine, &placed));
@@ -116,6 +117,7 @@ impl Plan {
                 response: self.instrument.response,
                 orbit,
                 companion_seed: 0,
+                weight_max: 1.0,
             };
             HarmonicEngine::new(setup).ok()
         });

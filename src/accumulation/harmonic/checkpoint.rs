@@ -1,21 +1,24 @@
 //! Checkpoints of the harmonic engine: versioned, bounded, with a checksum over everything.
 //!
-//! Layout: magic, length of the head (u32 LE), head (bincode), a byte for every node (1 if it holds something), the
-//! sums of those nodes (raw little-endian f32), the waiting visibilities (f64); CRC-32C of all that (u32 LE).
+//! Layout: magic, length of the head (u32 LE), head (bincode), a byte for every node (1 if it holds something); of
+//! those nodes every row of weights and of sides: its bound (u64 LE, 0 for an empty row, of which nothing follows) and
+//! its sums, i32 LE for bounds below 2^31, else i64; CRC-32C of all that (u32 LE). Nothing in it depends on how the
+//! data came.
 
 use std::io::{Read, Write};
 
-use super::spread::Pending;
-use super::tori::Node;
-use super::{BATCH, HarmonicEngine, HarmonicSetup};
+use super::exact::{ExactNode, Row};
+use super::grid::{Grids, NODES};
+use super::{HarmonicEngine, HarmonicSetup};
+use crate::accumulation::AccumulationError;
 use crate::accumulation::checked::{Checked, RESPONSES, Summed, number_of, refused};
-use crate::accumulation::{AccumulationError, SumCounts};
+use crate::accumulation::scale::Totals;
 use crate::array::harmonic::{GeometryLimits, NominalOrbit};
 
-const MAGIC: &[u8; 8] = b"LNRHRM01";
+const MAGIC: &[u8; 8] = b"LNRHRM02";
 
-/// Numbers that a waiting visibility takes.
-const PENDING_NUMBERS: usize = 8;
+const VERSION: &str =
+    "a harmonic engine's checkpoint, version 02; sums of version 01 were not exact: sum the data anew";
 
 #[derive(bincode::Encode, bincode::Decode)]
 struct Head {
@@ -28,14 +31,22 @@ struct Head {
     orbit_radius_m: f64,
     limits: [f64; 4],
     companion_seed: u64,
-    counts: SumCounts,
-    pending: u32,
+    weight_max: f64,
+    totals: Totals,
 }
 
 pub(super) fn write(engine: &HarmonicEngine, out: &mut dyn Write) -> Result<(), AccumulationError> {
     let mut out = Summed::new(out);
-    let HarmonicSetup { l_max, frequency_hz, baseline_m_max, moon_radius_m, response, orbit, companion_seed } =
-        engine.sums.setup;
+    let HarmonicSetup {
+        l_max,
+        frequency_hz,
+        baseline_m_max,
+        moon_radius_m,
+        response,
+        orbit,
+        companion_seed,
+        weight_max,
+    } = engine.setup;
     let limits = orbit.limits;
     out.write(MAGIC)?;
     out.head(Head {
@@ -53,19 +64,17 @@ pub(super) fn write(engine: &HarmonicEngine, out: &mut dyn Write) -> Result<(), 
             limits.radial_deg_max,
         ],
         companion_seed,
-        counts: engine.sums.counts,
-        pending: engine.pending.len() as u32,
+        weight_max,
+        totals: engine.totals,
     })?;
-    let nodes = &engine.sums.tori.nodes;
-    let held: Vec<u8> = nodes.iter().map(|node| u8::from(node.is_some())).collect();
+    let filled = |node: &Option<ExactNode>| node.as_ref().is_some_and(|node| !node.is_empty());
+    let nodes = &engine.tori.nodes;
+    let held: Vec<u8> = nodes.iter().map(|node| u8::from(filled(node))).collect();
     out.write(&held)?;
-    for node in nodes.iter().flatten() {
-        out.singles(&node.weights)?;
-        out.singles(&node.sides)?;
-    }
-    for p in &engine.pending {
-        let [a, b, c, d] = p.sides;
-        out.numbers(&[p.alpha_rad, p.gamma_rad, p.u, p.weight, a, b, c, d])?;
+    let [weights, sides] = layouts(&engine.grids);
+    for node in nodes.iter().flatten().filter(|node| !node.is_empty()) {
+        node.weights.iter().try_for_each(|row| row.write(weights, |bytes| out.write(bytes)))?;
+        node.sides.iter().try_for_each(|row| row.write(sides, |bytes| out.write(bytes)))?;
     }
     out.finish()?;
     Ok(())
@@ -76,42 +85,37 @@ pub(super) fn read(from: &mut dyn Read) -> Result<HarmonicEngine, AccumulationEr
     let mut magic = [0; 8];
     from.read(&mut magic)?;
     if &magic != MAGIC {
-        return Err(refused(format!("{magic:02x?}"), "a harmonic engine's checkpoint, version 01"));
+        return Err(refused(format!("{magic:02x?}"), VERSION));
     }
     let head: Head = from.head()?;
     let mut engine = HarmonicEngine::new(setup_of(&head)?)?;
-    if head.pending as usize > BATCH {
-        return Err(refused(format!("{} waiting visibilities", head.pending), "at most 16384"));
-    }
-    engine.sums.counts = head.counts;
-    let mut held = vec![0; engine.sums.tori.nodes.len()];
+    engine.totals = head.totals;
+    let mut held = vec![0; engine.tori.nodes.len()];
     from.read(&mut held)?;
-    for (node, held) in engine.sums.tori.nodes.iter_mut().zip(held) {
+    let [weights, sides] = layouts(&engine.grids);
+    for (node, held) in engine.tori.nodes.iter_mut().zip(held) {
         if held > 1 {
             return Err(refused(format!("{held} for a node"), "0 or 1"));
         }
         if held == 1 {
-            // Memory follows the data that is there: a forged head ends at the first node that is not.
-            let mut read = Node::zeros(&engine.sums.grids);
-            from.singles(&mut read.weights)?;
-            from.singles(&mut read.sides)?;
+            // Memory follows the data that is there: a forged head ends at the first row that is not.
+            let mut read = ExactNode::zeros(&engine.grids);
+            for row in &mut read.weights {
+                *row = Row::read(weights, |bytes| from.read(bytes))?;
+            }
+            for row in &mut read.sides {
+                *row = Row::read(sides, |bytes| from.read(bytes))?;
+            }
             *node = Some(read);
         }
     }
-    let grids = &engine.sums.grids;
-    for _ in 0..head.pending {
-        let mut numbers = [0.0; PENDING_NUMBERS];
-        from.numbers(&mut numbers)?;
-        let [alpha_rad, gamma_rad, u, weight, sides @ ..] = numbers;
-        let in_range =
-            (0.0..=engine.sums.setup.baseline_m_max / engine.sums.setup.wavelength_m()).contains(&u);
-        if !in_range || numbers.iter().any(|x| !x.is_finite()) || grids.nodes.count == 0 {
-            return Err(refused(format!("a baseline of {u} wavelengths"), "one within the engine's limit"));
-        }
-        engine.pending.push(Pending { alpha_rad, gamma_rad, u, weight, sides });
-    }
     from.finish()?;
     Ok(engine)
+}
+
+/// Length and number of the parts of a row of weights and of one of sides.
+fn layouts(grids: &Grids) -> [(usize, usize); 2] {
+    [(grids.weight_stride(), NODES), (grids.data_stride(), 4)]
 }
 
 fn setup_of(head: &Head) -> Result<HarmonicSetup, AccumulationError> {
@@ -134,5 +138,6 @@ fn setup_of(head: &Head) -> Result<HarmonicSetup, AccumulationError> {
             },
         },
         companion_seed: head.companion_seed,
+        weight_max: head.weight_max,
     })
 }

@@ -12,11 +12,14 @@
 //! summed. On the torus it multiplies pointwise. Its grid is fine enough for the products of two
 //! functions of degree `l_max`, so the weights are spread by kernels whose spectra are flat over their band.
 //!
-//! The sums are additive: they can be merged and subtracted, and their size does not grow with the data.
+//! The sums are additive: they can be merged and subtracted, and their size does not grow with the data. They are
+//! exact: with M the power of four not below `weight_max`, weights are rounded to `2^-30 M` and data to
+//! `2^-19 sqrt(M)`, those above 2^21 of these to 21 bits; see the module `exact`.
 
 mod blocks;
 mod checkpoint;
 mod coverage;
+mod exact;
 mod grid;
 mod operator;
 mod setup;
@@ -36,10 +39,13 @@ pub use grid::SPREAD_MULTIPLY_ADDS;
 pub use setup::{ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, application_size, memory, orbit_of};
 pub use sums::{HarmonicSums, coefficients, unknowns};
 
+use self::exact::{ExactTori, Quanta};
+use self::grid::Grids;
+use self::operator::Operator;
 use self::spread::Pending;
-use self::tori::Tori;
 use super::noise::companion_noise;
-use super::{AccumulationError, Added, NormalEngine, Refusal, SumCounts};
+use super::scale::{Scale, Totals};
+use super::{AccumulationError, Added, Direction, NormalEngine, Refusal, SumCounts};
 use crate::array::harmonic::PairOrientation;
 use crate::frames::PlacedVisibilities;
 
@@ -49,8 +55,16 @@ const BATCH: usize = 16_384;
 /// Sums weights and data on tori; each visibility costs some thousand multiply-adds, whatever the map's size.
 #[derive(Debug)]
 pub struct HarmonicEngine {
-    sums: HarmonicSums,
+    setup: HarmonicSetup,
+    scale: Scale,
+    grids: Arc<Grids>,
+    tables: Arc<OnceLock<Operator>>,
+    tori: ExactTori,
+    /// All that were put in, also those that wait.
+    totals: Totals,
     pending: Vec<Pending>,
+    /// What is to become of those that wait.
+    direction: Direction,
 }
 
 impl HarmonicEngine {
@@ -61,39 +75,34 @@ impl HarmonicEngine {
     pub fn new(setup: HarmonicSetup) -> Result<Self, AccumulationError> {
         setup.check()?;
         let grids = Arc::new(setup.grids());
-        Ok(Self::with(HarmonicSums {
-            setup,
+        Ok(Self {
+            scale: Scale::new(setup.weight_max)?,
             tables: Arc::new(OnceLock::new()),
-            tori: Tori::zeros(&grids),
+            tori: ExactTori::zeros(&grids),
             grids,
-            counts: SumCounts::default(),
-            right: OnceLock::new(),
-            noise: OnceLock::new(),
-        }))
-    }
-
-    fn with(sums: HarmonicSums) -> Self {
-        Self { sums, pending: Vec::with_capacity(BATCH) }
+            totals: Totals::default(),
+            pending: Vec::with_capacity(BATCH),
+            direction: Direction::In,
+            setup,
+        })
     }
 
     /// Setup.
     #[must_use]
     pub fn setup(&self) -> &HarmonicSetup {
-        &self.sums.setup
+        &self.setup
     }
 
     /// Where a visibility goes, or why it cannot.
     fn place(&self, placed: &PlacedVisibilities, k: usize) -> Result<Pending, Refusal> {
-        let setup = &self.sums.setup;
+        let setup = &self.setup;
         let orientation = PairOrientation::of(placed.r_i_m[k], placed.r_j_m[k])?;
         let pair = setup.orbit.pair(&orientation, setup.wavelength_m())?;
         if orientation.baseline_m > setup.baseline_m_max {
             return Err(Refusal::TooLong);
         }
         let (weight, mut value) = (placed.weight[k], placed.value_k_sr[k]);
-        if !(value.re.is_finite() && value.im.is_finite() && weight > 0.0 && weight.is_finite()) {
-            return Err(Refusal::NotFinite);
-        }
+        self.scale.check(value, weight, setup.weight_max)?;
         if pair.reversed {
             value = value.conj();
         }
@@ -107,52 +116,37 @@ impl HarmonicEngine {
         })
     }
 
-    /// Takes out what another engine of the same setup holds: the inverse of [`NormalEngine::merge`], to rounding.
-    ///
-    /// # Errors
-    /// [`AccumulationError::Mismatch`] if the setups differ.
-    pub fn subtract(&mut self, other: Self) -> Result<(), AccumulationError> {
-        self.combine(other, -1.0)
+    fn quanta(&self) -> Quanta {
+        Quanta::new(self.scale)
     }
 
-    fn combine(&mut self, mut other: Self, sign: f64) -> Result<(), AccumulationError> {
-        if self.sums.setup != other.sums.setup {
-            return Err(AccumulationError::Mismatch {
-                what: "degrees, frequencies, baselines, orbits or seeds",
-            });
-        }
-        self.settle();
-        other.settle();
-        self.sums.tori.merge(&self.sums.grids, &other.sums.tori, sign as f32);
-        let (counts, others) = (&mut self.sums.counts, other.sums.counts);
-        counts.weight += sign * others.weight;
-        counts.visibilities = if sign < 0.0 {
-            counts.visibilities.saturating_sub(others.visibilities)
-        } else {
-            counts.visibilities + others.visibilities
-        };
-        Ok(())
-    }
-}
-
-impl NormalEngine for HarmonicEngine {
-    type Sums = HarmonicSums;
-
-    fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        let setup = &self.sums.setup;
-        if placed.frequency_hz != setup.frequency_hz {
-            let (expected_hz, found_hz) = (setup.frequency_hz, placed.frequency_hz);
+    /// Puts visibilities in or takes them out.
+    fn take(
+        &mut self,
+        placed: &PlacedVisibilities,
+        direction: Direction,
+    ) -> Result<Added, AccumulationError> {
+        let (expected_hz, found_hz) = (self.setup.frequency_hz, placed.frequency_hz);
+        if found_hz != expected_hz {
             return Err(AccumulationError::Frequency { expected_hz, found_hz });
         }
-        let mut added = Added::default();
         let found: Vec<_> = (0..placed.len()).into_par_iter().map(|k| self.place(placed, k)).collect();
+        let one = |pending: &Pending| Totals::one(self.scale, pending.weight);
+        let totals = found
+            .iter()
+            .flatten()
+            .try_fold(self.totals, |totals, pending| totals.and(one(pending), direction));
+        self.totals = totals.ok_or(AccumulationError::NothingHeld(placed.channel))?;
+        if self.direction != direction {
+            self.settle();
+            self.direction = direction;
+        }
+        let mut added = Added::default();
         for found in found {
             match found {
                 Ok(pending) => {
                     added.visibilities += 1;
-                    self.sums.counts.visibilities += 1;
-                    self.sums.counts.weight += pending.weight;
-                    self.pending.push(pending);
+                    self.pending.push(pending.times(direction.sign()));
                 }
                 Err(reason) => added.refuse(reason),
             }
@@ -163,35 +157,76 @@ impl NormalEngine for HarmonicEngine {
         Ok(added)
     }
 
+    fn combine(&mut self, mut other: Self, direction: Direction) -> Result<(), AccumulationError> {
+        if self.setup != other.setup {
+            return Err(AccumulationError::Mismatch {
+                what: "degrees, frequencies, baselines, orbits, seeds or greatest weights",
+            });
+        }
+        self.totals = self.totals.and(other.totals, direction).ok_or(AccumulationError::Range)?;
+        self.settle();
+        other.settle();
+        self.tori.combine(&self.grids, &other.tori, direction);
+        Ok(())
+    }
+
+    fn with(&self, tori: tori::Tori) -> HarmonicSums {
+        HarmonicSums {
+            setup: self.setup,
+            grids: Arc::clone(&self.grids),
+            tables: Arc::clone(&self.tables),
+            tori,
+            counts: self.totals.counts(self.scale),
+            right: OnceLock::new(),
+            noise: OnceLock::new(),
+        }
+    }
+}
+
+impl NormalEngine for HarmonicEngine {
+    type Sums = HarmonicSums;
+
+    fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        self.take(placed, Direction::In)
+    }
+
+    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        self.take(placed, Direction::Out)
+    }
+
     fn settle(&mut self) {
         if !self.pending.is_empty() {
-            self.sums.tori.add(&self.sums.grids, &self.pending);
+            let quanta = self.quanta();
+            self.tori.add((&self.grids, quanta), &self.pending, self.direction);
             self.pending.clear();
         }
     }
 
     fn merge(&mut self, other: Self) -> Result<(), AccumulationError> {
-        self.combine(other, 1.0)
+        self.combine(other, Direction::In)
+    }
+
+    fn subtract(&mut self, other: Self) -> Result<(), AccumulationError> {
+        self.combine(other, Direction::Out)
     }
 
     fn counts(&self) -> SumCounts {
-        self.sums.counts
+        self.totals.counts(self.scale)
     }
 
-    fn sums(&self) -> HarmonicSums {
-        let mut sums = self.sums.clone();
-        sums.tori.add(&sums.grids, &self.pending);
-        sums.tori.fold(&sums.grids);
-        sums
+    fn sums(&mut self) -> HarmonicSums {
+        self.settle();
+        self.with(self.tori.values(&self.grids, self.quanta()))
     }
 
     fn into_sums(mut self) -> HarmonicSums {
         self.settle();
-        self.sums.tori.fold(&self.sums.grids);
-        self.sums
+        let tori = std::mem::take(&mut self.tori);
+        self.with(tori.into_values(&self.grids, self.quanta()))
     }
 
-    fn checkpoint(&self, out: &mut dyn std::io::Write) -> Result<(), AccumulationError> {
+    fn checkpoint(&mut self, out: &mut dyn std::io::Write) -> Result<(), AccumulationError> {
+        self.settle();
         checkpoint::write(self, out)
     }
 

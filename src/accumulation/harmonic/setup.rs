@@ -24,6 +24,8 @@ pub struct HarmonicSetup {
     pub orbit: NominalOrbit,
     /// Seed of the noise-only companion.
     pub companion_seed: u64,
+    /// Greatest weight that is taken, (K sr)^-2; it sets the resolution of the sums.
+    pub weight_max: f64,
 }
 
 /// Greatest degree that is taken: its sums would hold 25 GB at 125 wavelengths.

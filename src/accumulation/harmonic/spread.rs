@@ -1,10 +1,11 @@
 //! Spreading visibilities onto the sums at the nodes.
 
+use super::exact::{ExactNode, Integers, Quanta, Row, TERM_MAX, biased_multiple, biases};
 use super::grid::{Grids, NODES};
-use super::tori::Node;
+use crate::accumulation::Direction;
 use crate::array::harmonic::kernel::LANES;
 
-/// A visibility as it waits to be spread.
+/// A visibility as it waits to be spread; one that is to be taken out has a negative weight and negative sides.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Pending {
     /// Omega - pi/2, rad.
@@ -19,7 +20,14 @@ pub(super) struct Pending {
     pub(super) sides: [f64; 4],
 }
 
-/// A visibility's place on every grid.
+impl Pending {
+    /// As it is to count, 1 or -1 times.
+    pub(super) fn times(self, sign: f64) -> Self {
+        Self { weight: sign * self.weight, sides: self.sides.map(|side| sign * side), ..self }
+    }
+}
+
+/// A visibility's place on every grid, and its numbers in quanta.
 #[derive(Clone, Debug)]
 pub(super) struct Located {
     pub(super) first_node: usize,
@@ -30,19 +38,38 @@ pub(super) struct Located {
     data_first: [u32; 2],
     data_alpha: [f32; LANES],
     data_gamma: [f32; LANES],
+    /// In 2^shift quanta.
     weight: f32,
+    weight_shift: u32,
+    /// Likewise.
     sides: [f32; 4],
+    side_shifts: [u32; 4],
+}
+
+/// Numbers of quanta as multiples of a power of two that leaves the greatest no more than [`TERM_MAX`].
+fn shifted<const N: usize>(quanta: [f64; N]) -> ([f32; N], u32) {
+    let greatest = quanta.iter().fold(0.0_f64, |most, x| most.max(x.abs()));
+    let (mut shift, mut step) = (0, 1.0);
+    while greatest * step > TERM_MAX {
+        shift += 1;
+        step *= 0.5;
+    }
+    (quanta.map(|x| (x * step) as f32), shift)
 }
 
 impl Located {
     /// `u` must lie within the grid.
-    pub(super) fn new(grids: &Grids, pending: &Pending) -> Self {
+    pub(super) fn new(grids: &Grids, quanta: Quanta, pending: &Pending) -> Self {
         let (first_node, u) = grids.u.spread((pending.u - grids.nodes.first) / grids.nodes.step);
         let (points, data_points) = (grids.points, grids.data_points());
         let (a, weight_alpha) = Grids::on_circle(&grids.weight_alpha, points, pending.alpha_rad);
         let (g, weight_gamma) = Grids::on_circle(&grids.weight_gamma, points, pending.gamma_rad);
         let (da, data_alpha) = Grids::on_circle(&grids.data, data_points, pending.alpha_rad);
         let (dg, data_gamma) = Grids::on_circle(&grids.data, data_points, pending.gamma_rad);
+        let ([weight], weight_shift) = shifted([pending.weight / quanta.weight]);
+        let [a_re, a_im, n_re, n_im] = pending.sides.map(|side| side / quanta.side);
+        let (([d_re, d_im], data_shift), ([n_re, n_im], noise_shift)) =
+            (shifted([a_re, a_im]), shifted([n_re, n_im]));
         Self {
             first_node: first_node.max(0) as usize,
             u,
@@ -52,8 +79,10 @@ impl Located {
             data_first: [da, dg],
             data_alpha,
             data_gamma,
-            weight: pending.weight as f32,
-            sides: pending.sides.map(|x| x as f32),
+            weight,
+            weight_shift,
+            sides: [d_re, d_im, n_re, n_im],
+            side_shifts: [data_shift, data_shift, noise_shift, noise_shift],
         }
     }
 
@@ -67,22 +96,28 @@ impl Located {
     }
 }
 
-/// Adds visibilities, in their order, to the sums at node `index`, which all of them reach.
+/// Adds visibilities to the sums at node `index`, which all of them reach.
 ///
-/// Consecutive ones in one cell of the grid are added together in registers; that changes no bit.
-pub(super) fn spread(grids: &Grids, index: usize, located: &[Located], reaching: &[u32], node: &mut Node) {
+/// Consecutive ones in one cell of the grid, of one power of two, are added together in registers.
+pub(super) fn spread(
+    (grids, direction): (&Grids, Direction),
+    index: usize,
+    (located, reaching): (&[Located], &[u32]),
+    node: &mut ExactNode,
+) {
     let of = |k: &u32| &located[*k as usize];
-    let cell = |k: &u32| (of(k).first_node, of(k).weight_first);
+    let cell = |k: &u32| (of(k).first_node, of(k).weight_first, of(k).weight_shift);
     for run in reaching.chunk_by(|a, b| cell(a) == cell(b)) {
         for group in run.chunks(GROUP) {
             let at = index - of(&group[0]).first_node;
             let rows = Rows {
-                sums: &mut node.weights,
+                rows: &mut node.weights,
                 stride: grids.weight_stride(),
                 first: of(&group[0]).weight_first,
-                points: grids.points,
                 alphas: grids.weight_alpha.width(),
                 used: NODES - at,
+                shifts: [of(&group[0]).weight_shift; NODES],
+                direction,
             };
             let mut terms = [Term::EMPTY; GROUP];
             for (term, k) in terms.iter_mut().zip(group) {
@@ -93,17 +128,18 @@ pub(super) fn spread(grids: &Grids, index: usize, located: &[Located], reaching:
             spread_rows(rows, &terms[..group.len()]);
         }
     }
-    let cell = |k: &u32| (of(k).first_node, of(k).data_first);
+    let cell = |k: &u32| (of(k).first_node, of(k).data_first, of(k).side_shifts);
     for run in reaching.chunk_by(|a, b| cell(a) == cell(b)) {
         for group in run.chunks(GROUP) {
             let at = index - of(&group[0]).first_node;
             let rows = Rows {
-                sums: &mut node.sides,
+                rows: &mut node.sides,
                 stride: grids.data_stride(),
                 first: of(&group[0]).data_first,
-                points: grids.data_points(),
                 alphas: grids.data.width(),
                 used: 4,
+                shifts: of(&group[0]).side_shifts,
+                direction,
             };
             let mut terms = [Term::EMPTY; GROUP];
             for (term, k) in terms.iter_mut().zip(group) {
@@ -116,19 +152,21 @@ pub(super) fn spread(grids: &Grids, index: usize, located: &[Located], reaching:
     }
 }
 
-/// Most visibilities that are added at once.
+/// Most visibilities that are added at once: their terms of up to 2^22 sum within 32 bits.
 const GROUP: usize = 8;
 
-/// Sums `[alpha][K][gamma]`, and the first point in alpha and gamma to add to.
-struct Rows<'a> {
-    sums: &'a mut [f32],
+/// By alpha `[K][gamma]`, and the first point in alpha and gamma to add to.
+struct Rows<'a, const K: usize> {
+    rows: &'a mut [Row],
     stride: usize,
     first: [u32; 2],
-    points: usize,
     /// Alphas that are reached.
     alphas: usize,
     /// Of K.
     used: usize,
+    /// Powers of two, in quanta, that values of each of K are multiples of.
+    shifts: [u32; K],
+    direction: Direction,
 }
 
 /// One visibility's factors.
@@ -141,26 +179,63 @@ struct Term<'a, const K: usize> {
 
 impl<const K: usize> Term<'_, K> {
     const EMPTY: Self = Self { values: [0.0; K], alphas: &[0.0; LANES], gammas: &[0.0; LANES] };
+
+    /// Bound of its values, in quanta: kernels are at most one, up to rounding.
+    #[inline(always)]
+    fn greatest(&self, shifts: &[u32; K]) -> f32 {
+        let mut greatest = 0.0_f32;
+        for (value, shift) in self.values.iter().zip(shifts) {
+            greatest = greatest.max(value.abs() * (1_u64 << shift) as f32);
+        }
+        1.0625 * greatest
+    }
 }
 
-/// Adds the outer products of values, alphas and gammas.
+/// Adds the outer products of values, alphas and gammas, each term rounded to a whole number.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
-fn spread_rows<const K: usize>(rows: Rows<'_>, terms: &[Term<'_, K>]) {
+fn spread_rows<const K: usize>(rows: Rows<'_, K>, terms: &[Term<'_, K>]) {
     let [first, gamma] = rows.first.map(|x| x as usize);
+    let mut greatest = [0.0; GROUP];
+    for (greatest, term) in greatest.iter_mut().zip(terms) {
+        *greatest = term.greatest(&rows.shifts);
+    }
+    // A term may be rounded up by half its power of two.
+    let step = 1_u64 << rows.shifts.iter().fold(0, |most, shift| *shift.max(&most));
+    let points = rows.rows.len();
     let mut alpha = first;
     for lane in 0..rows.alphas {
-        for k in 0..rows.used {
-            let start = (alpha * K + k) * rows.stride + gamma;
-            let Some(sums) = rows.sums[start..].first_chunk_mut::<LANES>() else { return };
-            let mut sum = *sums;
+        let mut most = 0;
+        for (greatest, term) in greatest.iter().zip(terms) {
+            most += (greatest * term.alphas[lane].abs()) as u64 + step;
+        }
+        let Some(row) = rows.rows.get_mut(alpha) else { return };
+        row.make_room(most, rows.direction, K * rows.stride);
+        for (k, shift) in rows.shifts.iter().enumerate().take(rows.used) {
+            let start = k * rows.stride + gamma;
+            let mut multiples = [0_i32; LANES];
             for term in terms {
                 let factor = term.values[k] * term.alphas[lane];
-                for (sum, gamma) in sum.iter_mut().zip(term.gammas) {
-                    *sum += factor * gamma;
+                for (multiple, gamma) in multiples.iter_mut().zip(term.gammas) {
+                    *multiple = multiple.wrapping_add(biased_multiple(factor * gamma));
                 }
             }
-            *sums = sum;
+            let excess = biases(terms.len());
+            match &mut row.integers {
+                Integers::Narrow(sums) => {
+                    let Some(sums) = sums[start..].first_chunk_mut::<LANES>() else { return };
+                    for (sum, multiple) in sums.iter_mut().zip(multiples) {
+                        *sum = sum.wrapping_add(multiple.wrapping_sub(excess) << shift);
+                    }
+                }
+                Integers::Wide(sums) => {
+                    let Some(sums) = sums[start..].first_chunk_mut::<LANES>() else { return };
+                    for (sum, multiple) in sums.iter_mut().zip(multiples) {
+                        *sum = sum.wrapping_add(i64::from(multiple.wrapping_sub(excess)) << shift);
+                    }
+                }
+                Integers::None => {}
+            }
         }
-        alpha = if alpha + 1 == rows.points { 0 } else { alpha + 1 };
+        alpha = if alpha + 1 == points { 0 } else { alpha + 1 };
     }
 }

@@ -26,6 +26,7 @@ fn setup() -> HarmonicSetup {
             limits: GeometryLimits::default(),
         },
         companion_seed: 7,
+        weight_max: 1024.0,
     }
 }
 
@@ -405,4 +406,74 @@ fn blocks_of_orders_are_symmetric_and_solved() {
     let quotient = block.diagonal(0) / whole[0];
     // What depends on the phase is not in the block; for the monopole nothing does.
     assert!((quotient - 1.0).abs() < 1e-3, "{quotient}");
+}
+
+/// Every sum against a plain one in f64 of the same kernels, at weights a thousand times below the greatest: each term
+/// is off by at most half a quantum and the roundings of its f32 product, and the errors do not add up.
+#[test]
+fn sums_are_within_their_resolution_of_plain_ones() {
+    let blocks = blocks(0, 20);
+    let mut engine = engine(&blocks);
+    let (tori, quanta) = (engine.sums().tori, engine.quanta());
+    let grids = Arc::clone(&engine.grids);
+    let mut sums = [vec![Cell::default(); tori.nodes.len() * grids.weights_len()], Vec::new()];
+    sums[1] = vec![Cell::default(); tori.nodes.len() * grids.sides_len()];
+    for pending in blocks.iter().flat_map(|block| (0..block.len()).map(|k| engine.place(block, k).unwrap())) {
+        let (first_node, u) = grids.u.spread((pending.u - grids.nodes.first) / grids.nodes.step);
+        let circles = [
+            (&grids.weight_alpha, &grids.weight_gamma, grids.points, grids.weight_stride(), quanta.weight),
+            (&grids.data, &grids.data, grids.data_points(), grids.data_stride(), quanta.side),
+        ];
+        for (which, (by_alpha, by_gamma, points, stride, quantum)) in circles.into_iter().enumerate() {
+            let (alpha, alphas) = Grids::on_circle(by_alpha, points, pending.alpha_rad);
+            let (gamma, gammas) = Grids::on_circle(by_gamma, points, pending.gamma_rad);
+            for at in 0..grid::NODES {
+                let values: Vec<f64> = if which == 0 {
+                    (at..grid::NODES).map(|above| pending.weight * f64::from(u[at] * u[above])).collect()
+                } else {
+                    pending.sides.iter().map(|side| side * f64::from(u[at])).collect()
+                };
+                let parts = [grid::NODES, 4][which];
+                let node = (first_node as usize + at) * points * parts * stride;
+                for (i, part, j) in (0..by_alpha.width())
+                    .flat_map(|i| (0..values.len()).flat_map(move |part| (0..16).map(move |j| (i, part, j))))
+                {
+                    let row = (alpha as usize + i) % points * parts + part;
+                    let cell = &mut sums[which][node + row * stride + (gamma as usize + j) % points];
+                    let term = values[part] * f64::from(alphas[i]) * f64::from(gammas[j]);
+                    cell.sum += term;
+                    // Four roundings of factors and products, and the sum read in f32.
+                    cell.error_max += 0.5 * quantum + 5.0 * 6e-8 * term.abs();
+                }
+            }
+        }
+    }
+    for (which, sums) in sums.iter().enumerate() {
+        let (mut error, mut total, mut count) = (0.0, 0.0, 0);
+        for (node, sums) in tori.nodes.iter().zip(sums.chunks_exact(sums.len() / tori.nodes.len())) {
+            let Some(node) = node else {
+                assert!(sums.iter().all(|cell| cell.error_max == 0.0));
+                continue;
+            };
+            let found = if which == 0 { &node.weights } else { &node.sides };
+            for (found, cell) in found.iter().zip(sums) {
+                let off = f64::from(*found) - cell.sum;
+                assert!(off.abs() <= cell.error_max, "{found} {} {:e}", cell.sum, cell.error_max);
+                error += off * off;
+                total += cell.sum * cell.sum;
+                count += usize::from(cell.sum != 0.0);
+            }
+        }
+        // Rounding of 0.3 quanta, 2^-20 of a weight and 2^-14 of a standard deviation, against terms of kernels in
+        // three dimensions, whose root mean squares are some 1e-2 and 1e-1; far below the kernels' own 1e-4 and the noise.
+        let relative = (error / total).sqrt();
+        assert!(count > 100_000 && relative < [5e-5, 4e-4][which], "{count} {relative:e}");
+    }
+}
+
+/// A plain sum, and how far the exact one may be from it.
+#[derive(Clone, Copy, Default)]
+struct Cell {
+    sum: f64,
+    error_max: f64,
 }

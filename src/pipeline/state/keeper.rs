@@ -177,7 +177,7 @@ impl Keeper {
             ledger: self.outcome.ledger.report(),
             journal: self.journal.clone(),
         };
-        let accumulator = &self.accumulator;
+        let accumulator = &mut self.accumulator;
         self.folder.save(|out, path| {
             file::write(out, path, &head, |out| accumulator.write_engines(out).map_err(StateError::from))
         })

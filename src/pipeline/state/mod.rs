@@ -9,10 +9,10 @@
 //! Every packet is applied once, in the order of sending as long as it comes before others of `wait_bytes` that
 //! were sent later. Within that reach, doubles and disorder leave no trace: what a session leaves is the same, bit
 //! for bit, as if all had come in order and once. A packet that comes later still is applied when it comes: the sums
-//! then hold the same terms in another order, which shows in their last bits. Visibilities whose ephemeris comes
+//! are exact and do not tell. Visibilities whose ephemeris comes
 //! later than that are flagged, as without a state.
 //!
-//! States that are merged add up in the order in which they are named. Of two, packets that one has decoded and
+//! States that are merged add up to the same sums in any order. Of two, packets that one has decoded and
 //! that still wait in the other are taken once; visibilities that both have summed are refused.
 //!
 //! # A checkpoint

@@ -1,0 +1,136 @@
+//! The scale of exact sums, and what they hold.
+//!
+//! Sums are integers: every term is rounded to a multiple of a quantum that was fixed before any data came, and
+//! integers add up to the same bits in any order, batch, number of threads or tree of merges; what was added can be
+//! taken out again without a trace. The quantum follows from the greatest weight that is taken, `weight_max`.
+
+use super::error::AccumulationError;
+use super::{Direction, SumCounts};
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+
+/// Boltzmann's constant, J/K.
+const BOLTZMANN_J_K: f64 = 1.380_649e-23;
+/// What a satellite at 300 km sees of the sky, sr.
+const SEEN_SR: f64 = 9.6;
+/// The longest integration of the paper's array, s.
+const INTEGRATION_S: f64 = 25.0;
+/// Room above the weight expected of a sky of Cane's brightness: for longer integrations, fainter skies and gains.
+const HEAD_ROOM: f64 = 1024.0;
+/// Greatest signal-to-noise ratio of one visibility; thermal noise of the sky itself allows 600.
+pub(super) const SIGNAL_TO_NOISE_MAX: f64 = 524_288.0;
+/// Weights are counted in this part of the scale.
+const WEIGHT_STEPS: f64 = 18_446_744_073_709_551_616.0; // 2^64
+
+/// The greatest weight of a thermal visibility at a frequency in a channel of a width, (K sr)^-2, with room above it.
+///
+/// `2 dnu dt / T_sys^2` of 25 s under the mean sky of Cane (1979, MNRAS 189, 465), times 1024. It depends on nothing
+/// that the data says, so that engines of one channel always agree.
+#[must_use]
+pub fn automatic_weight_max(frequency_hz: f64, width_hz: f64) -> f64 {
+    let mhz = frequency_hz / 1e6;
+    let depth = 5.0 * mhz.powf(-2.1);
+    let galaxy = 2.48e-20 * mhz.powf(-0.52) * -(-depth).exp_m1() / depth;
+    let brightness = galaxy + 1.06e-20 * mhz.powf(-0.8) * (-depth).exp();
+    let sky_k = brightness * (SPEED_OF_LIGHT_M_S / frequency_hz).powi(2) / (2.0 * BOLTZMANN_J_K);
+    HEAD_ROOM * 2.0 * width_hz * INTEGRATION_S / (sky_k * SEEN_SR).powi(2)
+}
+
+/// The scale: the least even power of two that `weight_max` does not exceed, so that its root is one too.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Scale {
+    /// Greatest weight that is taken, (K sr)^-2.
+    pub(super) weight: f64,
+    /// Its root, (K sr)^-1.
+    pub(super) root: f64,
+}
+
+impl Scale {
+    pub(super) fn new(weight_max: f64) -> Result<Self, AccumulationError> {
+        if !(1e-60..=1e60).contains(&weight_max) {
+            let expected = "1e-60 to 1e60 (K sr)^-2";
+            return Err(AccumulationError::Setup { name: "weight_max", value: weight_max, expected });
+        }
+        let half = (0.5 * weight_max.log2()).ceil() as i32;
+        // The logarithm may be off by one rounding.
+        let half = if 4_f64.powi(half) < weight_max { half + 1 } else { half };
+        Ok(Self { weight: 4_f64.powi(half), root: 2_f64.powi(half) })
+    }
+
+    /// Whether a value (K sr) of this weight can be summed, or why not.
+    pub(super) fn check(
+        self,
+        value: num_complex::Complex64,
+        weight: f64,
+        weight_max: f64,
+    ) -> Result<(), super::Refusal> {
+        if !(value.re.is_finite() && value.im.is_finite() && weight > 0.0 && weight.is_finite()) {
+            return Err(super::Refusal::NotFinite);
+        }
+        let signal = value.re.abs().max(value.im.abs()) * weight.sqrt();
+        if weight > weight_max || signal > SIGNAL_TO_NOISE_MAX {
+            return Err(super::Refusal::OutOfRange);
+        }
+        Ok(())
+    }
+}
+
+/// How many visibilities are in sums, and their weight in 2^-64 of the scale: exact as the sums are.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
+pub(super) struct Totals {
+    visibilities: u64,
+    weight: u128,
+}
+
+impl Totals {
+    pub(super) fn one(scale: Scale, weight: f64) -> Self {
+        Self { visibilities: 1, weight: (weight / scale.weight * WEIGHT_STEPS).round() as u128 }
+    }
+
+    /// `None` if more would be taken out than is there.
+    pub(super) fn and(self, other: Self, direction: Direction) -> Option<Self> {
+        let (count, weight): (fn(u64, u64) -> Option<u64>, fn(u128, u128) -> Option<u128>) = match direction {
+            Direction::In => (u64::checked_add, u128::checked_add),
+            Direction::Out => (u64::checked_sub, u128::checked_sub),
+        };
+        Some(Self {
+            visibilities: count(self.visibilities, other.visibilities)?,
+            weight: weight(self.weight, other.weight)?,
+        })
+    }
+
+    /// The weight in units of the scale, rounded.
+    pub(super) fn scales(self) -> f64 {
+        self.weight as f64 / WEIGHT_STEPS
+    }
+
+    pub(super) fn counts(self, scale: Scale) -> SumCounts {
+        SumCounts { visibilities: self.visibilities, weight: self.scales() * scale.weight }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scales_are_even_powers_of_two_that_hold_their_weight() {
+        for (weight_max, weight, root) in
+            [(1.0, 1.0, 1.0), (1.01, 4.0, 2.0), (4.0, 4.0, 2.0), (0.2, 0.25, 0.5)]
+        {
+            assert_eq!(Scale::new(weight_max).unwrap(), Scale { weight, root });
+        }
+        for weight_max in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e-70, 1e70] {
+            assert!(Scale::new(weight_max).is_err());
+        }
+    }
+
+    /// Cane's 4.96e6, 2.92e5 and 1.78e4 K at 3, 10 and 30 MHz, as tabulated to three digits.
+    #[test]
+    fn the_automatic_limit_follows_the_sky() {
+        for (mhz, sky_k) in [(3.0, 4.96e6), (10.0, 2.92e5), (30.0, 1.78e4)] {
+            let expected = 1024.0 * 2.0 * 8e3 * 25.0 / (9.6_f64 * sky_k).powi(2);
+            let found = automatic_weight_max(mhz * 1e6, 8e3);
+            assert!((found / expected - 1.0).abs() < 0.01, "{mhz} MHz: {found:e} {expected:e}");
+        }
+    }
+}
