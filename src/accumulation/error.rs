@@ -25,6 +25,9 @@ pub enum AccumulationError {
     /// Data of a channel that the instrument description does not have.
     #[error("visibilities of channel {0} arrived, which the instrument description does not have")]
     UnknownChannel(ChannelId),
+    /// Data to be taken out of sums that are not there.
+    #[error("visibilities of channel {0} are to be taken out, but nothing of it was ever put in")]
+    NothingHeld(ChannelId),
     /// Data of another frequency.
     #[error("a block at {found_hz} Hz was given to an engine for {expected_hz} Hz")]
     Frequency {

@@ -104,6 +104,15 @@ pub trait NormalEngine: Send {
     /// counted as refused instead.
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 
+    /// Takes out visibilities that were added: the inverse of [`NormalEngine::add`].
+    ///
+    /// What the engine would refuse to add is refused here too, and counted; that the others were ever added is
+    /// for the caller to know.
+    ///
+    /// # Errors
+    /// As [`NormalEngine::add`].
+    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
+
     /// Adds what waits for company, if anything does; changes no bit of the sums.
     fn settle(&mut self) {}
 

@@ -89,8 +89,8 @@ impl PixelSums {
         }
     }
 
-    /// Adds a block of visibilities, their rows made by `rows`.
-    fn add_block(&mut self, setup: &PixelSetup, rows: &RowMaker, block: &[Pending]) {
+    /// Adds a block of visibilities `sign` times, their rows made by `rows`.
+    fn add_block(&mut self, setup: &PixelSetup, rows: &RowMaker, block: &[Pending], sign: f64) {
         if block.is_empty() {
             return;
         }
@@ -113,26 +113,31 @@ impl PixelSums {
             let (re, im) = rows.split_at_mut(stride);
             fill(visibility, &mut re[..pixels], &mut im[..pixels]);
         });
-        self.add_sides(&a, stride, block);
+        self.add_sides(&a, stride, block, sign);
         let columns = 2 * block.len();
-        if setup.nside <= NSIDE_MAX_F64 {
-            self.normal.add_products_f64(Columns { values: &a, columns, stride });
+        if setup.nside <= NSIDE_MAX_F64 || sign < 0.0 {
+            self.normal.add_products_times(Columns { values: &a, columns, stride }, sign);
         } else {
             let single: Vec<f32> = a.par_iter().map(|&x| x as f32).collect();
             self.normal.add_products_f32(Columns { values: &single, columns, stride });
         }
-        self.counts.visibilities += block.len() as u64;
-        self.counts.weight += block.iter().map(|visibility| visibility.weight).sum::<f64>();
+        self.counts.visibilities = if sign < 0.0 {
+            self.counts.visibilities.saturating_sub(block.len() as u64)
+        } else {
+            self.counts.visibilities + block.len() as u64
+        };
+        self.counts.weight += sign * block.iter().map(|visibility| visibility.weight).sum::<f64>();
     }
 
     /// Adds rows times whitened data, and rows times whitened noise, to the two right-hand sides.
-    fn add_sides(&mut self, a: &[f64], stride: usize, block: &[Pending]) {
+    fn add_sides(&mut self, a: &[f64], stride: usize, block: &[Pending], sign: f64) {
         const STRETCH: usize = 512;
         let sides = self.right.par_chunks_mut(STRETCH).zip(self.noise.par_chunks_mut(STRETCH));
         sides.enumerate().for_each(|(stretch, (right, noise))| {
             for (k, visibility) in block.iter().enumerate() {
-                let whitened = visibility.value_k_sr * visibility.weight.sqrt();
-                let parts = [(whitened.re, visibility.noise.re), (whitened.im, visibility.noise.im)];
+                let whitened = sign * visibility.value_k_sr * visibility.weight.sqrt();
+                let noise_of = sign * visibility.noise;
+                let parts = [(whitened.re, noise_of.re), (whitened.im, noise_of.im)];
                 for (part, (data, draw)) in parts.into_iter().enumerate() {
                     let row = &a[(2 * k + part) * stride + stretch * STRETCH..];
                     for ((right, noise), &row) in right.iter_mut().zip(noise.iter_mut()).zip(row) {
@@ -168,10 +173,29 @@ impl PixelEngine {
         &self.setup
     }
 
+    fn check(&self, placed: &PlacedVisibilities) -> Result<(), AccumulationError> {
+        let (expected_hz, found_hz) = (self.setup.frequency_hz, placed.frequency_hz);
+        if found_hz == expected_hz {
+            Ok(())
+        } else {
+            Err(AccumulationError::Frequency { expected_hz, found_hz })
+        }
+    }
+
+    fn pending(&self, placed: &PlacedVisibilities, k: usize) -> Pending {
+        Pending {
+            r_i_m: placed.r_i_m[k],
+            r_j_m: placed.r_j_m[k],
+            value_k_sr: placed.value_k_sr[k],
+            weight: placed.weight[k],
+            noise: companion_noise(self.setup.companion_seed, placed, k),
+        }
+    }
+
     /// Adds what waits, full block or not.
     fn settle(&mut self) {
         let pending = std::mem::take(&mut self.pending);
-        self.sums.add_block(&self.setup, &self.rows, &pending);
+        self.sums.add_block(&self.setup, &self.rows, &pending, 1.0);
     }
 }
 
@@ -179,23 +203,22 @@ impl NormalEngine for PixelEngine {
     type Sums = PixelSums;
 
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        if placed.frequency_hz != self.setup.frequency_hz {
-            return Err(AccumulationError::Frequency {
-                expected_hz: self.setup.frequency_hz,
-                found_hz: placed.frequency_hz,
-            });
-        }
+        self.check(placed)?;
         for k in 0..placed.len() {
-            self.pending.push(Pending {
-                r_i_m: placed.r_i_m[k],
-                r_j_m: placed.r_j_m[k],
-                value_k_sr: placed.value_k_sr[k],
-                weight: placed.weight[k],
-                noise: companion_noise(self.setup.companion_seed, placed, k),
-            });
+            self.pending.push(self.pending(placed, k));
             if self.pending.len() == BLOCK {
                 self.settle();
             }
+        }
+        Ok(Added { visibilities: placed.len() as u64, ..Added::default() })
+    }
+
+    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        self.check(placed)?;
+        self.settle();
+        let taken: Vec<Pending> = (0..placed.len()).map(|k| self.pending(placed, k)).collect();
+        for block in taken.chunks(BLOCK) {
+            self.sums.add_block(&self.setup, &self.rows, block, -1.0);
         }
         Ok(Added { visibilities: placed.len() as u64, ..Added::default() })
     }
@@ -227,7 +250,7 @@ impl NormalEngine for PixelEngine {
 
     fn sums(&self) -> PixelSums {
         let mut sums = self.sums.clone();
-        sums.add_block(&self.setup, &self.rows, &self.pending);
+        sums.add_block(&self.setup, &self.rows, &self.pending, 1.0);
         sums
     }
 

@@ -65,6 +65,13 @@ impl Engine {
         }
     }
 
+    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        match self {
+            Self::Pixel(engine) => engine.remove(placed),
+            Self::Harmonic(engine) => engine.remove(placed),
+        }
+    }
+
     fn sums(&self) -> Sums {
         match self {
             Self::Pixel(engine) => Sums::Pixel(engine.sums()),
@@ -192,6 +199,24 @@ impl Accumulator {
         self.next_snapshot_s = next_s.reduce(f64::max);
         self.accumulated += other.accumulated;
         Ok(())
+    }
+
+    /// Takes visibilities out of the sums of their channel again; the ledger is the caller's affair.
+    ///
+    /// Those beyond the map's longest baseline never were in the sums: they are neither taken out nor refused.
+    ///
+    /// # Errors
+    /// A channel that holds nothing, or as [`NormalEngine::remove`].
+    pub fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
+        if near.is_empty() {
+            return Ok(Added::default());
+        }
+        let slot = self.channels.get_mut(usize::from(placed.channel.0)).and_then(Option::as_mut);
+        let sums = slot.ok_or(AccumulationError::NothingHeld(placed.channel))?;
+        let removed = sums.engine.remove(&near)?;
+        self.accumulated = self.accumulated.saturating_sub(removed.visibilities);
+        Ok(removed)
     }
 
     fn open(&mut self, instrument: Instrument) -> Result<(), AccumulationError> {

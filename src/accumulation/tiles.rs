@@ -117,12 +117,17 @@ impl SymmetricTiles {
 
     /// Adds A A^T, by products in f64.
     pub fn add_products_f64(&mut self, a: Columns<'_, f64>) {
+        self.add_products_times(a, 1.0);
+    }
+
+    /// Adds `factor` A A^T, by products in f64.
+    pub(crate) fn add_products_times(&mut self, a: Columns<'_, f64>, factor: f64) {
         let order = self.order;
         self.tiles.par_iter_mut().enumerate().for_each(|(index, tile)| {
             let (i, j) = place(index);
             let (left, right) = (strip(a, order, i), strip(a, order, j));
             let tile = Self::view_mut(tile, left.nrows(), right.nrows());
-            product(tile, Accum::Add, left, right, i == j);
+            product(tile, Accum::Add, (left, right), factor, i == j);
         });
     }
 
@@ -139,7 +144,7 @@ impl SymmetricTiles {
                 let (rows, columns) = (left.nrows(), right.nrows());
                 let scratch = &mut scratch[..STRIDE * columns];
                 let view = MatMut::from_column_major_slice_with_stride_mut(scratch, rows, columns, STRIDE);
-                product(view, Accum::Replace, left, right, i == j);
+                product(view, Accum::Replace, (left, right), 1.0, i == j);
                 for (tile, scratch) in tile.chunks_exact_mut(STRIDE).zip(scratch.chunks_exact(STRIDE)) {
                     for (sum, &term) in tile[..rows].iter_mut().zip(scratch) {
                         *sum += f64::from(term);
@@ -237,21 +242,30 @@ fn strip<T>(a: Columns<'_, T>, order: usize, i: usize) -> MatRef<'_, T> {
         .subrows(i * TILE, extent(order, i))
 }
 
-/// `to (+)= left right^T`, of a diagonal tile the lower triangle.
+/// `to (+)= factor left right^T`, of a diagonal tile the lower triangle.
 fn product<T: faer::traits::ComplexField>(
     to: MatMut<'_, T>,
     accum: Accum,
-    left: MatRef<'_, T>,
-    right: MatRef<'_, T>,
+    (left, right): (MatRef<'_, T>, MatRef<'_, T>),
+    factor: T,
     diagonal: bool,
 ) {
-    let one = T::one_impl();
     if diagonal {
         use triangular::BlockStructure::{Rectangular, TriangularLower};
         let right = right.transpose();
-        triangular::matmul(to, TriangularLower, accum, left, Rectangular, right, Rectangular, one, Par::Seq);
+        triangular::matmul(
+            to,
+            TriangularLower,
+            accum,
+            left,
+            Rectangular,
+            right,
+            Rectangular,
+            factor,
+            Par::Seq,
+        );
     } else {
-        matmul(to, accum, left, right.transpose(), one, Par::Seq);
+        matmul(to, accum, left, right.transpose(), factor, Par::Seq);
     }
 }
 

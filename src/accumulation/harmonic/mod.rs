@@ -46,6 +46,13 @@ use crate::frames::PlacedVisibilities;
 /// Visibilities that are spread together: enough to keep all cores busy over the nodes, little memory.
 const BATCH: usize = 16_384;
 
+/// Whether visibilities are put in or taken out.
+#[derive(Clone, Copy)]
+enum Direction {
+    In,
+    Out,
+}
+
 /// Sums weights and data on tori; each visibility costs some thousand multiply-adds, whatever the map's size.
 #[derive(Debug)]
 pub struct HarmonicEngine {
@@ -133,12 +140,12 @@ impl HarmonicEngine {
         };
         Ok(())
     }
-}
 
-impl NormalEngine for HarmonicEngine {
-    type Sums = HarmonicSums;
-
-    fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+    fn take(
+        &mut self,
+        placed: &PlacedVisibilities,
+        direction: Direction,
+    ) -> Result<Added, AccumulationError> {
         let setup = &self.sums.setup;
         if placed.frequency_hz != setup.frequency_hz {
             let (expected_hz, found_hz) = (setup.frequency_hz, placed.frequency_hz);
@@ -148,9 +155,17 @@ impl NormalEngine for HarmonicEngine {
         let found: Vec<_> = (0..placed.len()).into_par_iter().map(|k| self.place(placed, k)).collect();
         for found in found {
             match found {
-                Ok(pending) => {
+                Ok(mut pending) => {
+                    let counts = &mut self.sums.counts;
                     added.visibilities += 1;
-                    self.sums.counts.visibilities += 1;
+                    match direction {
+                        Direction::In => counts.visibilities += 1,
+                        Direction::Out => {
+                            counts.visibilities = counts.visibilities.saturating_sub(1);
+                            pending.weight = -pending.weight;
+                            pending.sides = pending.sides.map(|side| -side);
+                        }
+                    }
                     self.sums.counts.weight += pending.weight;
                     self.pending.push(pending);
                 }
@@ -161,6 +176,18 @@ impl NormalEngine for HarmonicEngine {
             }
         }
         Ok(added)
+    }
+}
+
+impl NormalEngine for HarmonicEngine {
+    type Sums = HarmonicSums;
+
+    fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        self.take(placed, Direction::In)
+    }
+
+    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        self.take(placed, Direction::Out)
     }
 
     fn settle(&mut self) {
