@@ -30,7 +30,7 @@ fn states_make_one_whatever_their_order() {
         for station in 0..3 {
             let hears = |packet: &Vec<u8>| {
                 let (apid, count) = identity(packet);
-                apid != VISIBILITIES || count.wrapping_mul(2_654_435_761) >> 7 % 3 == station
+                apid != VISIBILITIES || (count.wrapping_mul(2_654_435_761) >> 7) % 3 == station
             };
             let heard: Vec<Vec<u8>> = packets(&file).into_iter().filter(hears).collect();
             let heard = place.file(&format!("{station}.ccsds"), &heard.concat());
