@@ -2,11 +2,13 @@
 //! nothing but the seed and the configuration changes a byte.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
+mod common;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use assert_cmd::Command;
+use common::workplace::{Workplace, files, succeed};
 use serde_json::Value;
 
 /// A mission of a few minutes of work at most: real geometry, small maps.
@@ -26,57 +28,10 @@ epsilon = [1e-6, 1e-4]
 snapshot_every_s = 1.5e7
 "#;
 
-fn lunarray(args: &[&str]) -> std::process::Output {
-    Command::cargo_bin("lunarray").unwrap().args(args).output().unwrap()
-}
-
-fn succeed(args: &[&str]) -> String {
-    let output = lunarray(args);
-    let text = String::from_utf8(output.stderr).unwrap();
-    assert!(output.status.success(), "{args:?}: {text}");
-    String::from_utf8(output.stdout).unwrap()
-}
-
-struct Workplace {
-    folder: tempfile::TempDir,
-    pipeline: String,
-}
-
-impl Workplace {
-    fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("small.toml");
-        std::fs::write(&path, SMALL).unwrap();
-        Self { pipeline: path.to_str().unwrap().to_owned(), folder }
-    }
-
-    fn path(&self, name: &str) -> String {
-        self.folder.path().join(name).to_str().unwrap().to_owned()
-    }
-
-    fn run(&self, out: &str, more: &[&str]) -> BTreeMap<PathBuf, Vec<u8>> {
-        let out = self.path(out);
-        succeed(&[&["run", self.pipeline.as_str(), "--out", &out], more].concat());
-        files(Path::new(&out))
-    }
-}
-
-/// All files below a folder but the summary, which holds times.
-fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut found = BTreeMap::new();
-    let mut folders = vec![folder.to_owned()];
-    while let Some(next) = folders.pop() {
-        for entry in std::fs::read_dir(next).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-            } else if path.file_name().unwrap() != "summary.json" {
-                found.insert(path.strip_prefix(folder).unwrap().to_owned(), std::fs::read(path).unwrap());
-            }
-        }
-    }
-    assert!(!found.is_empty());
-    found
+fn run(place: &Workplace, out: &str, more: &[&str]) -> BTreeMap<PathBuf, Vec<u8>> {
+    let out = place.path(out);
+    succeed(&[&["run", place.pipeline.as_str(), "--out", &out], more].concat());
+    files(Path::new(&out))
 }
 
 fn assert_same(one: &BTreeMap<PathBuf, Vec<u8>>, other: &BTreeMap<PathBuf, Vec<u8>>) {
@@ -88,10 +43,9 @@ fn assert_same(one: &BTreeMap<PathBuf, Vec<u8>>, other: &BTreeMap<PathBuf, Vec<u
 
 #[test]
 fn space_and_ground_apart_give_what_they_give_together() {
-    let place = Workplace::new();
-    let whole = place.run("whole", &[]);
-    let downlink = place.path("small.ccsds");
-    succeed(&["simulate", &place.pipeline, "--out", &downlink]);
+    let place = Workplace::new(SMALL);
+    let whole = run(&place, "whole", &[]);
+    let downlink = place.simulate("small.ccsds", &[]);
     assert!(std::fs::read(&downlink).unwrap() == whole[Path::new("downlink.ccsds")]);
     let out = place.path("ground");
     succeed(&["replay", &downlink, "--map", &place.pipeline, "--out", &out]);
@@ -110,27 +64,27 @@ fn space_and_ground_apart_give_what_they_give_together() {
 
 #[test]
 fn capacities_and_threads_do_not_change_a_byte() {
-    let place = Workplace::new();
-    let reference = place.run("reference", &[]);
+    let place = Workplace::new(SMALL);
+    let reference = run(&place, "reference", &[]);
     for (name, capacity, threads) in [("one", "1", "1"), ("three", "3", "3"), ("many", "999", "2")] {
         let capacity = format!("runtime.queue_capacity={capacity}");
         let threads = format!("runtime.threads={threads}");
-        let other = place.run(name, &["--set", &capacity, "--set", &threads]);
+        let other = run(&place, name, &["--set", &capacity, "--set", &threads]);
         assert_same(&reference, &other);
     }
 }
 
 #[test]
 fn the_seed_changes_the_noise() {
-    let place = Workplace::new();
-    let one = place.run("one", &["--set", "products.pictures=false"]);
-    let other = place.run("other", &["--set", "products.pictures=false", "--seed", "8"]);
+    let place = Workplace::new(SMALL);
+    let one = run(&place, "one", &["--set", "products.pictures=false"]);
+    let other = run(&place, "other", &["--set", "products.pictures=false", "--seed", "8"]);
     assert!(one[Path::new("downlink.ccsds")] != other[Path::new("downlink.ccsds")]);
 }
 
 #[test]
 fn the_ledger_closes_and_the_summary_tells() {
-    let place = Workplace::new();
+    let place = Workplace::new(SMALL);
     let out = place.path("out");
     let text = succeed(&["run", &place.pipeline, "--out", &out, "--json"]);
     let printed: Value = serde_json::from_str(&text).unwrap();
@@ -152,9 +106,8 @@ fn the_ledger_closes_and_the_summary_tells() {
 
 #[test]
 fn a_lost_stretch_is_counted_and_the_rest_is_used() {
-    let place = Workplace::new();
-    let downlink = place.path("small.ccsds");
-    succeed(&["simulate", &place.pipeline, "--out", &downlink]);
+    let place = Workplace::new(SMALL);
+    let downlink = place.simulate("small.ccsds", &[]);
     let mut bytes = std::fs::read(&downlink).unwrap();
     let middle = bytes.len() / 2;
     bytes.drain(middle..middle + bytes.len() / 20);
@@ -170,7 +123,7 @@ fn a_lost_stretch_is_counted_and_the_rest_is_used() {
 
 #[test]
 fn a_channel_without_usable_data_leaves_the_others_alone() {
-    let place = Workplace::new();
+    let place = Workplace::new(SMALL);
     let out = place.path("out");
     // At nside 1, 10 MHz, no baseline is short enough.
     let sets = ["--set", "map.nside=1", "--set", "map.epsilon=1e-4", "--set", "products.pictures=false"];
@@ -183,9 +136,8 @@ fn a_channel_without_usable_data_leaves_the_others_alone() {
 
 #[test]
 fn files_out_of_order_lose_nothing_but_the_cut_packet() {
-    let place = Workplace::new();
-    let downlink = place.path("small.ccsds");
-    succeed(&["simulate", &place.pipeline, "--out", &downlink]);
+    let place = Workplace::new(SMALL);
+    let downlink = place.simulate("small.ccsds", &[]);
     let bytes = std::fs::read(&downlink).unwrap();
     let (first, second) = bytes.split_at(bytes.len() / 2);
     let (one, two) = (place.path("one"), place.path("two"));
@@ -208,9 +160,8 @@ fn files_out_of_order_lose_nothing_but_the_cut_packet() {
 
 #[test]
 fn a_file_given_twice_counts_once() {
-    let place = Workplace::new();
-    let downlink = place.path("small.ccsds");
-    succeed(&["simulate", &place.pipeline, "--out", &downlink]);
+    let place = Workplace::new(SMALL);
+    let downlink = place.simulate("small.ccsds", &[]);
     let replay = |out: &str, files: &[&str]| {
         let out = place.path(out);
         let args = ["--map", &place.pipeline, "--out", &out, "--json"];
@@ -232,7 +183,7 @@ fn files_of_maps(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 #[cfg(unix)]
 #[test]
 fn an_interrupt_leaves_maps_of_the_data_so_far() {
-    let place = Workplace::new();
+    let place = Workplace::new(SMALL);
     let out = place.path("out");
     let binary = assert_cmd::cargo::cargo_bin("lunarray");
     let mut child = std::process::Command::new(binary)

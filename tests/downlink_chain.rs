@@ -1,9 +1,12 @@
 //! Coded downlinks through the commands: the same maps, and ledgers that close whatever the link did.
 #![allow(clippy::unwrap_used)] // Also in the helpers.
 
+mod common;
+
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use assert_cmd::Command;
+use common::workplace::{Workplace, fail, json, maps, succeed};
 use serde_json::Value;
 
 /// Real geometry, one channel, few visibilities.
@@ -24,54 +27,11 @@ epsilon = 1e-4
 pictures = false
 "#;
 
-fn succeed(args: &[&str]) -> String {
-    let output = Command::cargo_bin("lunarray").unwrap().args(args).output().unwrap();
-    assert!(output.status.success(), "{args:?}: {}", String::from_utf8(output.stderr).unwrap());
-    String::from_utf8(output.stdout).unwrap()
-}
-
-fn json(args: &[&str]) -> Value {
-    serde_json::from_str(&succeed(&[args, &["--json"]].concat())).unwrap()
-}
-
-struct Workplace {
-    folder: tempfile::TempDir,
-    pipeline: String,
-}
-
-impl Workplace {
-    fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("small.toml");
-        std::fs::write(&path, SMALL).unwrap();
-        Self { pipeline: path.to_str().unwrap().to_owned(), folder }
-    }
-
-    fn path(&self, name: &str) -> String {
-        self.folder.path().join(name).to_str().unwrap().to_owned()
-    }
-
-    /// The summary of a replay and its maps.
-    fn replay(&self, downlink: &str) -> (Value, Vec<(PathBuf, Vec<u8>)>) {
-        let out = format!("{downlink}.out");
-        let summary = json(&["replay", downlink, "--map", &self.pipeline, "--out", &out]);
-        let mut maps = Vec::new();
-        let mut folders = vec![PathBuf::from(&out)];
-        while let Some(folder) = folders.pop() {
-            for entry in std::fs::read_dir(folder).unwrap() {
-                let path = entry.unwrap().path();
-                if path.is_dir() {
-                    folders.push(path);
-                } else if path.extension().is_some_and(|ending| ending == "fits") {
-                    let name = path.strip_prefix(&out).unwrap().to_owned();
-                    maps.push((name, std::fs::read(&path).unwrap()));
-                }
-            }
-        }
-        maps.sort();
-        assert!(!maps.is_empty());
-        (summary, maps)
-    }
+/// The summary of a replay and its maps.
+fn replay(place: &Workplace, downlink: &str) -> (Value, BTreeMap<PathBuf, Vec<u8>>) {
+    let out = format!("{downlink}.out");
+    let summary = json(&["replay", downlink, "--map", &place.pipeline, "--out", &out]);
+    (summary, maps(&out))
 }
 
 fn lost(summary: &Value) -> u64 {
@@ -81,12 +41,11 @@ fn lost(summary: &Value) -> u64 {
 
 #[test]
 fn coded_frames_give_the_maps_that_packets_give() {
-    let place = Workplace::new();
-    let (plain, coded) = (place.path("plain.ccsds"), place.path("coded.cadu"));
-    succeed(&["simulate", &place.pipeline, "--out", &plain]);
-    succeed(&["simulate", &place.pipeline, "--out", &coded, "--format", "cadu"]);
-    let (of_plain, maps) = place.replay(&plain);
-    let (of_coded, same) = place.replay(&coded);
+    let place = Workplace::new(SMALL);
+    let plain = place.simulate("plain.ccsds", &[]);
+    let coded = place.simulate("coded.cadu", &["--format", "cadu"]);
+    let (of_plain, maps) = replay(&place, &plain);
+    let (of_coded, same) = replay(&place, &coded);
     assert!(maps == same);
     assert_eq!(of_plain["ledger"], of_coded["ledger"]);
     assert!(of_plain["reception"]["frames"].is_null());
@@ -104,18 +63,15 @@ fn coded_frames_give_the_maps_that_packets_give() {
     // One wrong bit in ten thousand: not a byte of the maps differs.
     let noisy = place.path("noisy.cadu");
     succeed(&["corrupt", &coded, "--out", &noisy, "--bit-error-rate", "1e-4"]);
-    assert!(maps == place.replay(&noisy).1);
+    assert!(maps == replay(&place, &noisy).1);
     assert!(json(&["inspect", &noisy])["reception"]["frames"]["bytes_corrected"].as_u64().unwrap() > 100);
 
-    let refused = Command::cargo_bin("lunarray").unwrap();
-    let output = { refused }.args(["replay", &plain, &coded, "--out", &place.path("both")]).output().unwrap();
-    assert!(!output.status.success());
-    assert!(String::from_utf8(output.stderr).unwrap().contains("different formats"));
+    assert!(fail(&["replay", &plain, &coded, "--out", &place.path("both")]).contains("different formats"));
 }
 
 #[test]
 fn a_bad_link_is_accounted_for() {
-    let place = Workplace::new();
+    let place = Workplace::new(SMALL);
     for format in ["packets", "cadu"] {
         let sound = place.path(&format!("sound.{format}"));
         let bad = place.path(&format!("bad.{format}"));
@@ -138,8 +94,8 @@ fn a_bad_link_is_accounted_for() {
         assert!(!Path::new(&format!("{sound}.truth.json")).exists());
 
         // What does not arrive is lost in the ledger, which closes or the command fails.
-        let (of_sound, _) = place.replay(&sound);
-        let (of_bad, _) = place.replay(&bad);
+        let (of_sound, _) = replay(&place, &sound);
+        let (of_bad, _) = replay(&place, &bad);
         let total = |summary: &Value, key: &str| summary["ledger"][key].as_u64().unwrap();
         assert_eq!(lost(&of_sound), 0);
         assert!(lost(&of_bad) > 0 && total(&of_bad, "accumulated") > 0);

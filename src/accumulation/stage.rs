@@ -112,13 +112,23 @@ pub struct Accumulator {
     channels: Vec<Option<ChannelSums>>,
     next_snapshot_s: Option<f64>,
     accumulated: u64,
+    /// First and last time of what was added last; `None` if nothing was.
+    latest_s: Option<[f64; 2]>,
 }
 
 impl Accumulator {
     /// A stage that posts to `ledger`.
     #[must_use]
     pub fn new(config: MapConfig, ledger: Ledger) -> Self {
-        Self { config, ledger, instrument: None, channels: Vec::new(), next_snapshot_s: None, accumulated: 0 }
+        Self {
+            config,
+            ledger,
+            instrument: None,
+            channels: Vec::new(),
+            next_snapshot_s: None,
+            accumulated: 0,
+            latest_s: None,
+        }
     }
 
     /// What it holds besides its engines.
@@ -219,6 +229,20 @@ impl Accumulator {
         Ok(removed)
     }
 
+    /// First and last mission time, s, of what has been added since this was asked last; of the last block.
+    pub fn take_latest_s(&mut self) -> Option<[f64; 2]> {
+        self.latest_s.take()
+    }
+
+    /// Says what a channel spans after visibilities have been taken out; nothing is left of a channel without.
+    pub fn set_span(&mut self, channel: ChannelId, span_s: Option<[f64; 2]>) {
+        let Some(slot) = self.channels.get_mut(usize::from(channel.0)) else { return };
+        match (slot.as_mut(), span_s) {
+            (Some(sums), Some(span_s)) => sums.span_s = span_s,
+            _ => *slot = None,
+        }
+    }
+
     fn open(&mut self, instrument: Instrument) -> Result<(), AccumulationError> {
         let channels = instrument.channels.len();
         if let Some(&key) = self.config.misfits(channels).first() {
@@ -259,6 +283,7 @@ impl Accumulator {
         let Added { visibilities, refused } = sums.engine.add(&near)?;
         if let (Some(first), Some(last)) = (near.time_s.first(), near.time_s.last()) {
             sums.span_s = [sums.span_s[0].min(*first), sums.span_s[1].max(*last)];
+            self.latest_s = Some([*first, *last]);
         }
         self.accumulated += visibilities;
         self.ledger.accumulated(visibilities);

@@ -148,6 +148,28 @@ impl Ephemeris {
         Insertion::New
     }
 
+    /// The segment that begins at a time.
+    #[must_use]
+    pub fn segment(&self, start: MissionTime) -> Option<&EphemerisSegment> {
+        self.segments.get(&start)
+    }
+
+    /// Takes the segment that begins at a time out again.
+    pub fn remove(&mut self, start: MissionTime) -> Option<EphemerisSegment> {
+        self.segments.remove(&start)
+    }
+
+    /// Whether segments cover all of a stretch of time, both ends included.
+    #[must_use]
+    pub fn covers(&self, [from, to]: [MissionTime; 2]) -> bool {
+        let mut time = from;
+        while time <= to {
+            let Some(segment) = self.stretch_at(time).segment else { return false };
+            time = segment.end().plus_ticks(1);
+        }
+        true
+    }
+
     /// Position of a satellite (from 0), m; `None` where no segment covers the time or knows the satellite.
     #[must_use]
     pub fn position_at(&self, time_s: f64, satellite: usize) -> Option<Vec3> {
@@ -313,6 +335,22 @@ mod tests {
         assert!(worst_m < 1e-2, "{worst_m}");
         let segments = segments_for(&array, MissionTime(0), MissionTime(2_750_000_000), 60.0);
         assert_eq!(segments.len(), 8);
+    }
+
+    #[test]
+    fn a_stretch_is_covered_without_a_hole() {
+        let array = Array::new(&ArrayConfig::default()).unwrap();
+        // Parted at the turnaround.
+        let turnaround_s = 7.0 * DAY_S;
+        let mut table = table(&array, turnaround_s - 1000.0, turnaround_s + 1000.0);
+        let covers = |table: &Ephemeris, from_s: f64, to_s: f64| {
+            table.covers([from_s, to_s].map(|s| MissionTime::from_seconds(turnaround_s + s)))
+        };
+        assert!(covers(&table, -999.0, 999.0) && covers(&table, 5.0, 5.0));
+        assert!(!covers(&table, -1100.0, 0.0) && !covers(&table, 0.0, 1100.0));
+        let second = table.segments().last().map(|segment| segment.start).unwrap();
+        assert!(table.remove(second).is_some() && table.segment(second).is_none());
+        assert!(covers(&table, -999.0, -1.0) && !covers(&table, -999.0, 1.0));
     }
 
     #[test]

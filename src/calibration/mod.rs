@@ -16,7 +16,7 @@ pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 pub use gains::AntennaGains;
 pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation};
-pub use stage::{Calibrator, CalibratorState};
+pub use stage::{Calibrator, CalibratorState, DUPLICATE};
 pub use van_vleck::{QuantiserBitsError, VanVleck};
 
 use crate::frames::PlacedVisibilities;

@@ -4,22 +4,30 @@ use std::collections::{BTreeMap, HashSet};
 
 use super::{Calibration, CalibrationError, VanVleck};
 use crate::array::{Ephemeris, FlaggedCounts};
-use crate::frames::{EphemerisSegment, GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock};
+use crate::frames::{
+    EphemerisSegment, GroundFrame, Housekeeping, Instrument, PlacedFrame, PlacedVisibilities, VisibilityBlock,
+};
 use crate::runtime::{Ledger, Outlet, Stage, Units};
-use crate::units::{ChannelId, Pair};
+use crate::units::{ChannelId, MissionTime, Pair};
 
-/// Identity of a block of visibilities: every one is used once, however often it arrives.
-type BlockKey = (ChannelId, Pair, i64, u32);
+/// Identity of a block of visibilities, the beginning of its first integration in it: every one is used once,
+/// however often it arrives.
+type BlockKey = (ChannelId, Pair, MissionTime);
 
-/// What a calibrator has learnt and counted, for another to go on with; its ledger is apart.
+/// Reason under which a block that has been used already is flagged.
+pub const DUPLICATE: &str = "duplicate";
+
+/// Greatest number of the spacecraft's reports that are kept.
+const REPORTS_MAX: usize = 1 << 16;
+
+/// What a calibrator has learnt and counted, for another to go on with; its ledger and the blocks that it has used
+/// are apart.
 #[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct CalibratorState {
     instrument: Option<Instrument>,
     ephemeris: Vec<EphemerisSegment>,
-    /// Sorted.
-    seen: Vec<BlockKey>,
     received: BTreeMap<i64, u64>,
-    reported: Option<Housekeeping>,
+    reports: BTreeMap<MissionTime, Housekeeping>,
 }
 
 /// Gives each visibility the positions of its satellites, from the ephemeris packets alone, and hands
@@ -36,8 +44,8 @@ pub struct Calibrator {
     seen: HashSet<BlockKey>,
     /// Visibilities received, by the start of their window (ticks).
     received: BTreeMap<i64, u64>,
-    /// The spacecraft's latest counts.
-    reported: Option<Housekeeping>,
+    /// The spacecraft's counts, by the time up to which they hold.
+    reports: BTreeMap<MissionTime, Housekeeping>,
 }
 
 impl Calibrator {
@@ -52,48 +60,95 @@ impl Calibrator {
             instrument: None,
             seen: HashSet::new(),
             received: BTreeMap::new(),
-            reported: None,
+            reports: BTreeMap::new(),
         }
     }
 
     /// What it knows.
     #[must_use]
     pub fn state(&self) -> CalibratorState {
-        let mut seen: Vec<BlockKey> = self.seen.iter().copied().collect();
-        seen.sort_unstable();
         CalibratorState {
             instrument: self.instrument.clone(),
             ephemeris: self.ephemeris.segments().cloned().collect(),
-            seen,
             received: self.received.clone(),
-            reported: self.reported,
+            reports: self.reports.clone(),
         }
     }
 
-    /// Takes what another knows as well; of ephemeris segments that begin at the same time its own stay.
+    /// Takes what another knows as well; of ephemeris segments that begin at the same time its own stay. Blocks that
+    /// the other has used are to be told by [`Calibrator::has_used`].
     pub fn absorb(&mut self, state: CalibratorState) {
-        let CalibratorState { instrument, ephemeris, seen, received, reported } = state;
+        let CalibratorState { instrument, ephemeris, received, reports } = state;
         self.instrument = self.instrument.take().or(instrument);
         for segment in ephemeris {
             self.ephemeris.insert(segment);
         }
-        self.seen.extend(seen);
         for (start, count) in received {
             *self.received.entry(start).or_default() += count;
         }
-        let latest = [self.reported, reported].into_iter().flatten().max_by_key(|report| report.time);
-        self.reported = latest;
+        self.reports.extend(reports);
     }
 
-    /// Goes on with what another knew.
+    /// Goes on with what another knew; blocks that it has used are to be told by [`Calibrator::has_used`].
     #[must_use]
-    pub fn resume(self, state: CalibratorState) -> Self {
-        let CalibratorState { instrument, ephemeris: segments, seen, received, reported } = state;
-        let mut ephemeris = Ephemeris::default();
-        for segment in segments {
-            ephemeris.insert(segment);
+    pub fn resume(mut self, state: CalibratorState) -> Self {
+        let CalibratorState { instrument, ephemeris, received, reports } = state;
+        for segment in ephemeris {
+            self.ephemeris.insert(segment);
         }
-        Self { ephemeris, instrument, seen: seen.into_iter().collect(), received, reported, ..self }
+        Self { instrument, received, reports, ..self }
+    }
+
+    /// Keeps positions of so many segments.
+    #[must_use]
+    pub fn with_segments(self, segments_max: usize) -> Self {
+        Self { ephemeris: Ephemeris::new(segments_max), ..self }
+    }
+
+    /// Says that a block, of which this is the beginning of the first integration, has been used.
+    pub fn has_used(&mut self, channel: ChannelId, pair: Pair, first: MissionTime) {
+        self.seen.insert((channel, pair, first));
+    }
+
+    /// Positions.
+    #[must_use]
+    pub fn ephemeris(&self) -> &Ephemeris {
+        &self.ephemeris
+    }
+
+    /// Forgets positions from a time on, as if they had never come.
+    pub fn forget_segment(&mut self, start: MissionTime) {
+        self.ephemeris.remove(start);
+    }
+
+    /// Forgets what the spacecraft has said of its counts.
+    pub fn forget_report(&mut self, report: &Housekeeping) {
+        self.reports.retain(|_, known| known != report);
+    }
+
+    /// Calibrated visibilities of a block that was used, as they were handed on if the positions are the same;
+    /// nothing changes.
+    ///
+    /// # Errors
+    /// As [`Calibrator::step`].
+    pub fn place_again(&mut self, block: VisibilityBlock) -> Result<PlacedVisibilities, CalibrationError> {
+        let aside = std::mem::replace(&mut self.ledger, Ledger::new());
+        let placed = self.place(block);
+        self.ledger = aside;
+        Ok(placed?.unwrap_or_default())
+    }
+
+    /// Forgets a block that was used; the ledger is the caller's affair.
+    pub fn forget_block(&mut self, block: &VisibilityBlock) {
+        if let Some(key) = key_of(block) {
+            self.seen.remove(&key);
+        }
+        if let Some(count) = self.received.get_mut(&block.start.0) {
+            *count = count.saturating_sub(block.len() as u64);
+            if *count == 0 {
+                self.received.remove(&block.start.0);
+            }
+        }
     }
 
     /// Takes out first what quantisers of few bits do.
@@ -104,21 +159,30 @@ impl Calibrator {
 
     fn visibilities(
         &mut self,
-        mut block: VisibilityBlock,
+        block: VisibilityBlock,
         out: &mut Outlet<PlacedFrame>,
     ) -> Result<(), CalibrationError> {
         let count = block.len() as u64;
-        let Some(&first) = block.offset_ticks.first() else { return Ok(()) };
-        if !self.seen.insert((block.channel, block.pair, block.start.0, first)) {
+        let Some(key) = key_of(&block) else { return Ok(()) };
+        if !self.seen.insert(key) {
             self.ledger.sampled(count);
-            self.ledger.flagged("duplicate", count);
+            self.ledger.flagged(DUPLICATE, count);
             return Ok(());
         }
         *self.received.entry(block.start.0).or_default() += count;
+        if let Some(placed) = self.place(block)?.filter(|placed| !placed.is_empty()) {
+            out.push(PlacedFrame::Visibilities(placed));
+        }
+        Ok(())
+    }
+
+    /// Places and calibrates a block; `None` for want of an instrument.
+    fn place(&mut self, mut block: VisibilityBlock) -> Result<Option<PlacedVisibilities>, CalibrationError> {
+        let count = block.len() as u64;
         let channel = self.instrument.as_ref().and_then(|i| i.channels.get(usize::from(block.channel.0)));
         let Some(channel) = channel else {
             self.ledger.flagged("no instrument description", count);
-            return Ok(());
+            return Ok(None);
         };
         if let Some(van_vleck) = &self.van_vleck {
             van_vleck.apply(&mut block, channel.width_hz);
@@ -130,14 +194,9 @@ impl Calibrator {
         for (reason, count) in calibrated.removed() {
             self.ledger.flagged(reason, count as u64);
         }
-        if !placed.is_empty() {
-            out.push(PlacedFrame::Visibilities(placed));
-        }
-        Ok(())
+        Ok(Some(placed))
     }
-}
 
-impl Calibrator {
     fn post_flagged(&self, flagged: &FlaggedCounts) {
         self.ledger.flagged("interference", flagged.interference);
         self.ledger.flagged("incomplete integration", flagged.incomplete);
@@ -145,6 +204,11 @@ impl Calibrator {
         self.ledger.flagged("uncalibrated", flagged.uncalibrated);
         self.ledger.flagged("unknown flag", flagged.other);
     }
+}
+
+fn key_of(block: &VisibilityBlock) -> Option<BlockKey> {
+    let &first = block.offset_ticks.first()?;
+    Some((block.channel, block.pair, block.start.plus_ticks(i64::from(first))))
 }
 
 impl Stage for Calibrator {
@@ -167,8 +231,9 @@ impl Stage for Calibrator {
             }
             GroundFrame::Visibilities(block) => self.visibilities(block, out)?,
             GroundFrame::Housekeeping(report) => {
-                if self.reported.is_none_or(|last| last.time <= report.time) {
-                    self.reported = Some(report);
+                self.reports.insert(report.time, report);
+                if self.reports.len() > REPORTS_MAX {
+                    self.reports.pop_first();
                 }
                 out.push(PlacedFrame::Housekeeping(report));
             }
@@ -178,7 +243,7 @@ impl Stage for Calibrator {
 
     fn finish(&mut self, _: &mut Outlet<PlacedFrame>) -> Result<(), CalibrationError> {
         let all: u64 = self.received.values().sum();
-        let Some(report) = self.reported else {
+        let Some((_, report)) = self.reports.last_key_value() else {
             self.ledger.sampled(all);
             return Ok(());
         };

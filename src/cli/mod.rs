@@ -11,6 +11,7 @@ mod merge;
 mod predict;
 mod progress;
 mod replay;
+mod retract;
 mod run;
 mod simulate;
 mod sky;
@@ -59,6 +60,7 @@ enum Command {
     Corrupt(corrupt::CorruptArgs),
     Gaps(gaps::GapsArgs),
     Merge(merge::MergeArgs),
+    Retract(retract::RetractArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
     Predict(predict::PredictArgs),
@@ -124,6 +126,7 @@ pub fn main() -> ExitCode {
         Command::Corrupt(args) => corrupt::execute(&args),
         Command::Gaps(args) => gaps::execute(&args),
         Command::Merge(args) => merge::execute(&args),
+        Command::Retract(args) => retract::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
         Command::Predict(args) => predict::execute(&args),

@@ -7,7 +7,7 @@ use clap::Args;
 use super::progress::{Progress, cancel_on_interrupt};
 use super::{CommandError, CommandResult, Outcome, print_json_line, print_text};
 use crate::downlink::FileSource;
-use crate::pipeline::state::Keeper;
+use crate::pipeline::state::{Keeper, WAIT_BYTES};
 use crate::pipeline::{ConfigSource, replay, use_threads};
 use crate::units::constants::DAY_S;
 
@@ -35,9 +35,9 @@ pub(super) struct ReplayArgs {
     /// Visibilities between two checkpoints of the state; there is one at the end in any case.
     #[arg(long, value_name = "NUMBER", default_value_t = 1_000_000, requires = "state")]
     checkpoint_every: u64,
-    /// Bytes of later packets that a packet may come after and still be applied in its order; of a new state,
-    /// an old one keeps its own.
-    #[arg(long, value_name = "BYTES", default_value_t = 1 << 24, requires = "state")]
+    /// Bytes of packets that may wait for missing ones sent before them, or for positions, to be applied in order;
+    /// of a new state, an old one keeps its own.
+    #[arg(long, value_name = "BYTES", default_value_t = WAIT_BYTES, requires = "state")]
     wait_bytes: u64,
     /// Read on in the last FILE as it grows, until Ctrl-C, which leaves maps of the data so far.
     #[arg(long, requires = "files")]

@@ -7,19 +7,18 @@ use std::path::Path;
 use bincode::{Decode, Encode};
 
 use super::counters::ReceptionCounters;
+use super::cuc::CucTime;
 use super::decoder::{Decoder, DecoderState};
 use super::error::DownlinkError;
 use super::file::{io_error, require_packets};
 use super::header::{PacketHeader, Segment};
 use super::intake::Intake;
 use super::kind::Kind;
-use super::receiver::{Event, Packet};
+use super::receiver::Event;
 use super::taken::Taken;
 use super::waiting::{Waiting, WaitingPacket};
-use crate::frames::GroundFrame;
-
-/// Packets wait for an instrument description until there are so many times the bytes that wait otherwise.
-const PATIENCE: u64 = 4;
+use crate::frames::{GroundFrame, VisibilityBlock};
+use crate::units::MissionTime;
 
 /// What a collector knows, for another to go on with.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
@@ -29,16 +28,44 @@ pub struct CollectorState {
     decoder: DecoderState,
 }
 
+/// What a collector knows, to be written as a [`CollectorState`] is, without a copy of what waits.
+#[derive(Clone, Debug, PartialEq, Encode)]
+pub struct CollectorView<'a> {
+    taken: Vec<Taken>,
+    waiting: &'a Waiting,
+    decoder: DecoderState,
+}
+
 impl CollectorState {
     /// The packets of a kind that have been taken.
     #[must_use]
     pub fn taken(&self, kind: Kind) -> Option<&Taken> {
         self.taken.get(kind.index())
     }
+
+    /// Packets that wait.
+    #[must_use]
+    pub fn waiting(&self) -> &Waiting {
+        &self.waiting
+    }
 }
 
-/// Takes bytes of a downlink as they come, and gives every frame once, in the order in which it was sent as far as
-/// [`Waiting`] reaches; packets that come later than that are given as they come.
+/// Packets that have been read, and what they say.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Delivery {
+    /// Headers and check of each: one, or all those of a payload in segments.
+    pub packets: Vec<(PacketHeader, u32)>,
+    /// `None` if they say nothing new, or nothing that can be understood.
+    pub frame: Option<GroundFrame>,
+}
+
+/// Whether positions are known over a stretch of time.
+pub type Placed<'a> = &'a dyn Fn([MissionTime; 2]) -> bool;
+
+/// Takes bytes of a downlink as they come, and gives what every packet says once: visibilities in the order in which
+/// they were sent as far as [`Waiting`] reaches, everything else as soon as it is there.
+///
+/// Until the description of the instrument has come, nobody can read anything, and all packets wait.
 #[derive(Debug)]
 pub struct Collector {
     intake: Intake,
@@ -47,12 +74,12 @@ pub struct Collector {
     decoder: Decoder,
     /// Keeps the account of what is no new packet: of this session alone.
     link: Decoder,
-    /// Packets that came too late to wait.
-    late: VecDeque<WaitingPacket>,
+    /// Packets that may wait although nothing keeps them from being read.
+    again: VecDeque<PacketHeader>,
 }
 
 impl Collector {
-    /// A collector that knows nothing; packets wait for those before them until others of `wait_bytes` have come.
+    /// A collector that knows nothing; visibilities wait for those before them until so many bytes do.
     #[must_use]
     pub fn new(wait_bytes: u64) -> Self {
         Self {
@@ -61,7 +88,7 @@ impl Collector {
             waiting: Waiting::new(wait_bytes),
             decoder: Decoder::new(),
             link: Decoder::new(),
-            late: VecDeque::new(),
+            again: VecDeque::new(),
         }
     }
 
@@ -71,66 +98,55 @@ impl Collector {
         let CollectorState { mut taken, waiting, decoder } = state;
         taken.resize(Kind::ALL.len(), Taken::default());
         let taken = taken.try_into().unwrap_or_default();
-        Self { taken, waiting, decoder: Decoder::resume(decoder), ..Self::new(0) }
+        let decoder = Decoder::resume(decoder);
+        let again = headers(&waiting);
+        Self { taken, waiting, decoder, again, ..Self::new(0) }
     }
 
     /// What it knows; the bytes of an unfinished packet left out, which are no packet yet.
     #[must_use]
-    pub fn state(&self) -> CollectorState {
-        CollectorState {
-            taken: self.taken.to_vec(),
-            waiting: self.waiting.clone(),
-            decoder: self.decoder.state(),
-        }
+    pub fn view(&self) -> CollectorView<'_> {
+        CollectorView { taken: self.taken.to_vec(), waiting: &self.waiting, decoder: self.decoder.state() }
     }
 
-    /// Takes all that another knows. Packets that wait in it come as frames as if they had just arrived.
+    /// What it knows, as [`Collector::view`].
+    #[must_use]
+    pub fn into_state(self) -> CollectorState {
+        CollectorState { taken: self.taken.to_vec(), waiting: self.waiting, decoder: self.decoder.state() }
+    }
+
+    /// Takes all that another knows, of which no visibilities have been read by both.
     ///
     /// # Errors
-    /// Another instrument; visibilities that have been decoded by both; packet counts that have begun anew.
+    /// Another instrument; packet counts that have begun anew where one knows and the other does not.
     pub fn absorb(&mut self, other: CollectorState) -> Result<(), DownlinkError> {
-        let CollectorState { taken: mut theirs, waiting: mut their_waiting, mut decoder } = other;
+        let CollectorState { taken: mut theirs, waiting: mut their_waiting, decoder } = other;
         theirs.resize(Kind::ALL.len(), Taken::default());
-        // A payload that is half put together there is gone on with here, unless it is known here.
-        let mut unfinished = decoder.take_partials();
-        unfinished.retain(|packet| {
-            let WaitingPacket { header, .. } = packet;
-            !self.taken[header.kind.index()].contains(header.count, header.time)
-                || self.waiting.headers().any(|ours| (ours.kind, ours.count) == (header.kind, header.count))
-        });
-        // What one has decoded need not wait in the other.
-        for header in their_waiting.headers().collect::<Vec<_>>() {
-            if self.taken[header.kind.index()].contains(header.count, header.time) {
-                their_waiting.drop_packet(&header);
-                theirs[header.kind.index()].forget(header.count, header.time);
+        // What one has read need not wait in the other; what waits in both does so once.
+        for header in headers(&self.waiting) {
+            let has_come = theirs[header.kind.index()].contains(header.count, header.time);
+            if has_come && their_waiting.get(&header).is_none() {
+                self.waiting.take_out(&header);
             }
         }
-        for header in self.waiting.headers().collect::<Vec<_>>() {
-            if theirs[header.kind.index()].contains(header.count, header.time) {
-                self.waiting.drop_packet(&header);
-                self.taken[header.kind.index()].forget(header.count, header.time);
+        for header in headers(&their_waiting) {
+            if self.has_taken(&header) {
+                their_waiting.take_out(&header);
             }
         }
         for kind in Kind::ALL {
-            let (ours, theirs) = (&mut self.taken[kind.index()], &theirs[kind.index()]);
-            if kind == Kind::Visibilities
-                && let Some(count) = ours.common(theirs)
-            {
-                return Err(DownlinkError::TakenTwice { apid: kind.apid(), count });
-            }
-            if !ours.absorb(theirs) {
+            if !self.taken[kind.index()].absorb(&theirs[kind.index()]) {
                 return Err(DownlinkError::Restarted { kind });
             }
         }
         if !self.decoder.absorb(decoder) {
             return Err(DownlinkError::OtherInstrument { offset: 0 });
         }
-        for packet in unfinished {
-            self.late.extend(self.waiting.put(packet));
+        self.waiting.absorb_gone(&their_waiting);
+        for packet in their_waiting.packets() {
+            self.waiting.put(packet.clone());
         }
-        while let Some(packet) = their_waiting.next_waiting() {
-            self.late.extend(self.waiting.put(packet));
-        }
+        self.again = headers(&self.waiting);
         Ok(())
     }
 
@@ -150,68 +166,131 @@ impl Collector {
         self.intake.bytes()
     }
 
-    /// The next frame and the headers of the packet that completed it; `None` until more bytes come.
+    /// What is to be read next; `None` until more bytes come.
     ///
     /// # Errors
     /// [`DownlinkError::OtherInstrument`].
-    pub fn next_frame(&mut self) -> Result<Option<(PacketHeader, GroundFrame)>, DownlinkError> {
+    pub fn next_delivery(&mut self, placed: Placed<'_>) -> Result<Option<Delivery>, DownlinkError> {
         loop {
-            let found = match self.late.pop_front() {
-                Some(packet) => self.decode(&packet),
-                None => match self.next_due() {
-                    Some(packet) => self.decode(&packet),
-                    None => match self.take_event()? {
-                        Some(found) => found,
-                        None => return Ok(None),
-                    },
-                },
-            };
-            if found.is_some() {
-                return Ok(found);
+            if self.knows_instrument() {
+                if let Some(found) = self.next_due(placed) {
+                    return Ok(Some(found));
+                }
+            } else {
+                self.set_aside_unread();
+            }
+            match self.take_event()? {
+                Taking::Nothing => return Ok(None),
+                Taking::Event => {}
+                Taking::Delivery(found) => return Ok(Some(found)),
             }
         }
     }
 
-    /// The next frame of those that still wait; not to be followed by a [`Collector::state`] that is kept.
-    pub fn next_waiting(&mut self) -> Option<(PacketHeader, GroundFrame)> {
-        while let Some(packet) = self.waiting.next_waiting() {
-            let found = self.decode(&packet);
-            if found.is_some() {
-                return found;
-            }
+    /// The next of what still waits; not to be followed by a [`Collector::view`] that is kept.
+    pub fn next_waiting(&mut self) -> Option<Delivery> {
+        if let Some(packet) = self.waiting.first_visibilities() {
+            return Some(self.read(&[packet]));
         }
-        None
+        let packet = self.waiting.first_other()?;
+        Some(self.give_up(packet))
     }
 
-    /// Takes all of a file and gives every frame to `take`, those that wait at its end too.
+    /// Takes all of a file and gives everything to `take`, what waits at its end too.
     ///
     /// # Errors
     /// A file that cannot be read, is empty, or does not hold a packet of ours.
-    pub fn read_file(
-        &mut self,
-        path: &Path,
-        take: &mut dyn FnMut(PacketHeader, &GroundFrame),
-    ) -> Result<(), DownlinkError> {
+    pub fn read_file(&mut self, path: &Path, take: &mut dyn FnMut(Delivery)) -> Result<(), DownlinkError> {
         let mut file = File::open(path).map_err(io_error(path, "open the file"))?;
         loop {
             let read = self.intake.fill_from(&mut file).map_err(io_error(path, "read"))?;
             if read == 0 {
                 self.finish();
             }
-            while let Some((header, frame)) = self.next_frame()? {
-                take(header, &frame);
+            while let Some(found) = self.next_delivery(&|_| true)? {
+                take(found);
             }
             if read == 0 {
                 break;
             }
         }
-        while let Some((header, frame)) = self.next_waiting() {
-            take(header, &frame);
+        while let Some(found) = self.next_waiting() {
+            take(found);
         }
         require_packets(path, self.bytes(), self.taken.iter().map(Taken::len).sum())
     }
 
-    /// The account: of packets that were decoded at any time, of gaps in all that was taken, and of what else was in
+    /// Whether a packet has come, be it read or waiting.
+    #[must_use]
+    pub fn has_taken(&self, header: &PacketHeader) -> bool {
+        self.taken[header.kind.index()].contains(header.count, header.time)
+    }
+
+    /// Packets that wait.
+    #[must_use]
+    pub fn waiting(&self) -> &Waiting {
+        &self.waiting
+    }
+
+    /// Lets go of a packet that waits.
+    pub fn take_out(&mut self, header: &PacketHeader) -> Option<WaitingPacket> {
+        self.waiting.take_out(header)
+    }
+
+    /// The visibilities of a packet, of no account.
+    #[must_use]
+    pub fn read_again(&self, packet: &WaitingPacket) -> Option<VisibilityBlock> {
+        match self.decoder.uncounted().accept(&packet.event()) {
+            Some(GroundFrame::Visibilities(block)) if !block.is_empty() => Some(block),
+            _ => None,
+        }
+    }
+
+    /// Takes packets that were read together off the account; what they said. To be concluded by [`Collector::retake`].
+    pub fn take_back(&mut self, packets: &[WaitingPacket]) -> Option<GroundFrame> {
+        let mut reader = self.decoder.uncounted();
+        let mut frame = None;
+        for packet in packets {
+            frame = reader.accept(&packet.event()).or(frame);
+        }
+        reader.finish();
+        self.decoder.uncount(reader.counters());
+        frame
+    }
+
+    /// Takes packets that another collector has read as well, and counted, off the account.
+    pub fn uncount(&mut self, kind: Kind, packets: u64, bytes: u64) {
+        let mut counters = ReceptionCounters { bytes, ..ReceptionCounters::default() };
+        (counters.kind_mut(kind).packets, counters.kind_mut(kind).bytes) = (packets, bytes);
+        self.decoder.uncount(&counters);
+    }
+
+    /// Says anew which packets of a kind have been read, in the order of sending; those that wait have come too.
+    pub fn retake(&mut self, kind: Kind, read: impl Iterator<Item = (CucTime, u64)>) {
+        let mut all: Vec<(CucTime, u64)> = read.collect();
+        if kind == Kind::Visibilities {
+            self.waiting.set_gone(all.last().copied());
+        }
+        let waiting = self.waiting.packets().map(|packet| packet.header).filter(|header| header.kind == kind);
+        all.extend(waiting.map(|header| (header.time, header.count)));
+        all.sort_unstable();
+        let mut taken = Taken::default();
+        for (time, count) in all {
+            taken.take(count, time);
+        }
+        self.taken[kind.index()] = taken;
+    }
+
+    /// Forgets the instrument and everything else if no packet is left.
+    pub fn begin_anew_if_empty(&mut self) -> bool {
+        let is_empty = self.taken.iter().all(Taken::is_empty);
+        if is_empty {
+            self.decoder = Decoder::new();
+        }
+        is_empty
+    }
+
+    /// The account: of packets that were read at any time, of gaps in all that was taken, and of what else was in
     /// the streams of this session.
     #[must_use]
     pub fn counters(&self) -> ReceptionCounters {
@@ -241,42 +320,91 @@ impl Collector {
         self.decoder.instrument().is_some()
     }
 
-    fn next_due(&mut self) -> Option<WaitingPacket> {
-        let patience = if self.knows_instrument() { 1 } else { PATIENCE };
-        self.waiting.next_due(patience)
-    }
-
-    fn decode(&mut self, packet: &WaitingPacket) -> Option<(PacketHeader, GroundFrame)> {
-        let header = packet.header;
-        if !self.knows_instrument() && header.kind != Kind::Instrument {
-            // Nobody can read it; it may come again when somebody can.
-            self.taken[header.kind.index()].forget(header.count, header.time);
+    /// What waits and need not, once the instrument is known.
+    fn next_due(&mut self, placed: Placed<'_>) -> Option<Delivery> {
+        while let Some(header) = self.again.pop_front() {
+            if header.kind != Kind::Visibilities
+                && let Some(payload) = self.waiting.payload_of(&header)
+            {
+                return Some(self.read(&payload));
+            }
         }
-        self.decoder.accept(&packet.event()).map(|frame| (header, frame))
+        let taken = &self.taken[Kind::Visibilities.index()];
+        if let Some(packet) = self.waiting.next_visibilities(taken, placed) {
+            return Some(self.read(&[packet]));
+        }
+        let packet = self.waiting.next_given_up()?;
+        Some(self.give_up(packet))
     }
 
-    /// Takes one event of the stream; `None` if there is none, else what it completes.
-    #[allow(clippy::type_complexity)] // Nothing to take, and nothing made of it, are not the same.
-    fn take_event(&mut self) -> Result<Option<Option<(PacketHeader, GroundFrame)>>, DownlinkError> {
-        let Some(event) = self.intake.next_event() else { return Ok(None) };
-        let Event::Packet(Packet { offset, header, payload, .. }) = event else {
+    /// Nobody can read what has waited too long for a description; it may come again when somebody can.
+    fn set_aside_unread(&mut self) {
+        while let Some(packet) = self.waiting.next_unread() {
+            let header = packet.header;
+            self.taken[header.kind.index()].forget(header.count, header.time);
+            self.decoder.accept(&packet.event());
+        }
+    }
+
+    fn read(&mut self, packets: &[WaitingPacket]) -> Delivery {
+        let mut frame = None;
+        for packet in packets {
+            frame = self.decoder.accept(&packet.event()).or(frame);
+        }
+        Delivery { packets: packets.iter().map(|packet| (packet.header, packet.check)).collect(), frame }
+    }
+
+    /// Reads a segment without those that it needs.
+    fn give_up(&mut self, packet: WaitingPacket) -> Delivery {
+        let found = self.read(&[packet]);
+        self.decoder.finish();
+        found
+    }
+
+    /// Takes one event of the stream.
+    fn take_event(&mut self) -> Result<Taking, DownlinkError> {
+        let Some(event) = self.intake.next_event() else { return Ok(Taking::Nothing) };
+        let Event::Packet(packet) = event else {
             self.link.accept(&event);
-            return Ok(Some(None));
+            return Ok(Taking::Event);
         };
-        let describes = header.kind == Kind::Instrument && header.segment == Segment::Whole;
-        if describes && self.decoder.contradicts(payload) {
+        let (offset, header) = (packet.offset, packet.header);
+        let describes = header.kind == Kind::Instrument;
+        if describes && header.segment == Segment::Whole && self.decoder.contradicts(packet.payload) {
             return Err(DownlinkError::OtherInstrument { offset });
         }
         if !self.taken[header.kind.index()].take(header.count, header.time) {
             self.link.accept(&Event::Duplicate { offset, header });
-            return Ok(Some(None));
+            return Ok(Taking::Event);
         }
-        let packet = WaitingPacket { header, payload: payload.to_vec() };
+        self.waiting.put(WaitingPacket::of(&packet));
+        if header.kind == Kind::Visibilities || !describes && !self.knows_instrument() {
+            return Ok(Taking::Event);
+        }
+        let Some(payload) = self.waiting.payload_of(&header) else { return Ok(Taking::Event) };
         if describes {
-            // Everything waits for it.
-            return Ok(Some(self.decode(&packet)));
+            let whole: Vec<u8> = payload.iter().flat_map(|packet| packet.payload.iter().copied()).collect();
+            if self.decoder.contradicts(&whole) {
+                return Err(DownlinkError::OtherInstrument { offset });
+            }
         }
-        self.late.extend(self.waiting.put(packet));
-        Ok(Some(None))
+        if !self.knows_instrument() {
+            // Everything else has waited for it.
+            self.again = headers(&self.waiting);
+        }
+        Ok(Taking::Delivery(self.read(&payload)))
     }
+}
+
+/// What an event of a stream comes to.
+enum Taking {
+    /// There is none.
+    Nothing,
+    /// Nothing to be read yet.
+    Event,
+    Delivery(Delivery),
+}
+
+fn headers(waiting: &Waiting) -> VecDeque<PacketHeader> {
+    waiting.packets().map(|packet| packet.header).collect()
 }

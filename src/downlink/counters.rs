@@ -137,27 +137,37 @@ impl ReceptionCounters {
 
     /// Adds the account of packets and payloads of another decoder; not that of bytes between them.
     pub(super) fn add(&mut self, other: &Self) {
-        self.bytes += other.bytes;
+        self.combine(other, u64::saturating_add);
+    }
+
+    /// The inverse of [`ReceptionCounters::add`].
+    pub(super) fn subtract(&mut self, other: &Self) {
+        self.combine(other, u64::saturating_sub);
+    }
+
+    fn combine(&mut self, other: &Self, with: fn(u64, u64) -> u64) {
+        let combine = |ours: &mut u64, theirs: u64| *ours = with(*ours, theirs);
+        combine(&mut self.bytes, other.bytes);
         for kind in Kind::ALL {
             let (ours, theirs) = (self.kind_mut(kind), other.kind(kind));
-            ours.packets += theirs.packets;
-            ours.bytes += theirs.bytes;
-            ours.orphans += theirs.orphans;
+            combine(&mut ours.packets, theirs.packets);
+            combine(&mut ours.bytes, theirs.bytes);
+            combine(&mut ours.orphans, theirs.orphans);
         }
         let FaultCounts { version, record, length, value, order } = other.faults;
-        self.faults.version += version;
-        self.faults.record += record;
-        self.faults.length += length;
-        self.faults.value += value;
-        self.faults.order += order;
-        self.instruments_contradictory += other.instruments_contradictory;
-        self.payloads_foreign += other.payloads_foreign;
-        self.payloads_before_instrument += other.payloads_before_instrument;
-        self.visibilities_decoded += other.visibilities_decoded;
-        self.visibilities_bad_value += other.visibilities_bad_value;
-        self.visibilities_refused += other.visibilities_refused;
-        self.visibilities_before_instrument += other.visibilities_before_instrument;
-        self.visibilities_foreign += other.visibilities_foreign;
+        combine(&mut self.faults.version, version);
+        combine(&mut self.faults.record, record);
+        combine(&mut self.faults.length, length);
+        combine(&mut self.faults.value, value);
+        combine(&mut self.faults.order, order);
+        combine(&mut self.instruments_contradictory, other.instruments_contradictory);
+        combine(&mut self.payloads_foreign, other.payloads_foreign);
+        combine(&mut self.payloads_before_instrument, other.payloads_before_instrument);
+        combine(&mut self.visibilities_decoded, other.visibilities_decoded);
+        combine(&mut self.visibilities_bad_value, other.visibilities_bad_value);
+        combine(&mut self.visibilities_refused, other.visibilities_refused);
+        combine(&mut self.visibilities_before_instrument, other.visibilities_before_instrument);
+        combine(&mut self.visibilities_foreign, other.visibilities_foreign);
     }
 
     /// Good packets of all kinds.

@@ -2,21 +2,20 @@
 
 use super::counters::ReceptionCounters;
 use super::cuc::CucTime;
-use super::header::{FORMAT_VERSION, HEADER_BYTES, PacketHeader, Segment, TRAILER_BYTES};
+use super::header::{FORMAT_VERSION, PacketHeader, Segment};
 use super::kind::Kind;
 use super::payload::{
     PayloadFault, count_visibilities, decode_ephemeris, decode_housekeeping, decode_instrument,
     decode_visibilities,
 };
 use super::receiver::{Event, Packet};
-use super::waiting::WaitingPacket;
 use crate::frames::{GroundFrame, Instrument};
 
 /// Greatest payload that is put together from segments; a window's ephemeris is a thousandth of it.
 const PAYLOAD_BYTES_MAX: usize = 1 << 24;
 
 /// A payload of which not all segments have come.
-#[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
+#[derive(Clone, Debug)]
 struct Partial {
     next: u64,
     time: CucTime,
@@ -33,12 +32,11 @@ enum Standing {
     Contradicted,
 }
 
-/// What a decoder has learnt and counted, for another to go on with.
+/// What a decoder has learnt and counted, for another to go on with; segments of unfinished payloads left out.
 #[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct DecoderState {
     instrument: Option<Instrument>,
     standing: Standing,
-    partial: Vec<Option<Partial>>,
     counters: ReceptionCounters,
 }
 
@@ -47,26 +45,6 @@ impl DecoderState {
     #[must_use]
     pub fn counters(&self) -> &ReceptionCounters {
         &self.counters
-    }
-}
-
-impl DecoderState {
-    /// Takes out the payloads of which segments are lacking: as packets that hold all their segments so far, not in
-    /// the account any more.
-    pub(super) fn take_partials(&mut self) -> Vec<WaitingPacket> {
-        let mut packets = Vec::new();
-        for (kind, slot) in Kind::ALL.into_iter().zip(&mut self.partial) {
-            let Some(Partial { next, time, bytes: payload }) = slot.take() else { continue };
-            let bytes = HEADER_BYTES + payload.len() + TRAILER_BYTES;
-            let (segment, count) = (Segment::First, next.saturating_sub(1));
-            let header = PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes };
-            let counts = self.counters.kind_mut(kind);
-            counts.packets = counts.packets.saturating_sub(1);
-            counts.bytes = counts.bytes.saturating_sub(bytes as u64);
-            self.counters.bytes = self.counters.bytes.saturating_sub(bytes as u64);
-            packets.push(WaitingPacket { header, payload });
-        }
-        packets
     }
 }
 
@@ -93,26 +71,28 @@ impl Decoder {
     /// What it knows.
     #[must_use]
     pub fn state(&self) -> DecoderState {
-        let Self { instrument, standing, partial, counters, .. } = self;
-        DecoderState {
-            instrument: instrument.clone(),
-            standing: *standing,
-            partial: partial.to_vec(),
-            counters: counters.clone(),
-        }
+        let Self { instrument, standing, counters, .. } = self;
+        DecoderState { instrument: instrument.clone(), standing: *standing, counters: counters.clone() }
     }
 
     /// A decoder that knows what another knew.
     #[must_use]
     pub fn resume(state: DecoderState) -> Self {
-        let DecoderState { instrument, standing, mut partial, counters } = state;
-        partial.resize(Kind::ALL.len(), None);
-        let partial = partial.try_into().unwrap_or_default();
-        Self { instrument, standing, partial, counters, fault: None }
+        let DecoderState { instrument, standing, counters } = state;
+        Self { instrument, standing, counters, ..Self::new() }
     }
 
-    /// Takes what another has learnt and counted; unfinished payloads left out. Whether both
-    /// are of one instrument; if not, nothing changes.
+    /// A decoder that knows the same and has counted nothing.
+    pub(super) fn uncounted(&self) -> Self {
+        Self { instrument: self.instrument.clone(), standing: self.standing, ..Self::new() }
+    }
+
+    /// Takes what another has counted off its account.
+    pub(super) fn uncount(&mut self, counters: &ReceptionCounters) {
+        self.counters.subtract(counters);
+    }
+
+    /// Takes what another has learnt and counted. Whether both are of one instrument; if not, nothing changes.
     pub fn absorb(&mut self, other: DecoderState) -> bool {
         let DecoderState { instrument, standing, counters, .. } = other;
         match (&self.instrument, instrument) {

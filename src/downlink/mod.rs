@@ -63,7 +63,7 @@ mod taken;
 mod transmission;
 mod waiting;
 
-pub use collector::{Collector, CollectorState};
+pub use collector::{Collector, CollectorState, CollectorView, Delivery, Placed};
 pub use config::{DownlinkConfig, Format};
 pub use contents::Contents;
 pub use counters::{FaultCounts, KindCounts, ReceptionCounters};

@@ -19,6 +19,8 @@ pub struct Packet<'a> {
     pub header: PacketHeader,
     /// What it carries, without headers and check.
     pub payload: &'a [u8],
+    /// Its check, over headers and payload.
+    pub check: u32,
     /// Whether it fills a gap that has been reported.
     pub late: bool,
 }
@@ -209,7 +211,8 @@ impl Receiver {
                 let packet = &self.buffer[self.begin..self.begin + header.bytes];
                 self.begin += header.bytes;
                 let payload = &packet[HEADER_BYTES..packet.len() - TRAILER_BYTES];
-                Event::Packet(Packet { offset, header, payload, late })
+                let check = packet.last_chunk().map_or(0, |check| u32::from_be_bytes(*check));
+                Event::Packet(Packet { offset, header, payload, check, late })
             }
             Step::Duplicate(header) => {
                 self.begin += header.bytes;

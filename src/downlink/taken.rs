@@ -94,35 +94,48 @@ impl Taken {
         era.is_some_and(|era| era.contains(count))
     }
 
-    /// Takes what another set has too, if both know one era at most; says whether they do.
-    pub fn absorb(&mut self, other: &Self) -> bool {
-        let (Some(theirs), []) = (other.eras.first(), other.eras.get(1..).unwrap_or_default()) else {
-            return other.eras.is_empty();
-        };
-        match self.eras.as_mut_slice() {
-            [] => self.eras.push(theirs.clone()),
-            [era] => {
-                era.from = era.from.min(theirs.from);
-                era.newest = era.newest.max(theirs.newest);
-                for (&start, &end) in &theirs.stretches {
-                    era.insert(start, end);
-                }
-            }
-            _ => return false,
-        }
-        true
+    /// Whether every packet of the same era from the count `from` up to this one, which is one of them, has come.
+    #[must_use]
+    pub fn is_whole(&self, from: u64, count: u64, time: CucTime) -> bool {
+        let Some(era) = self.eras.iter().rev().find(|era| era.from <= time) else { return false };
+        let stretch = era.stretches.range(..=count).next_back();
+        stretch.is_some_and(|(&start, &end)| start <= from.min(count) && end > count)
     }
 
-    /// The first count that both have, where both know one era at most.
+    /// Whether two packets, of which the times are given, are of one era.
     #[must_use]
-    pub fn common(&self, other: &Self) -> Option<u64> {
-        let (ours, theirs) = (self.eras.first()?, other.eras.first()?);
-        let meets = |(&start, &end): (&u64, &u64)| {
-            let from = ours.stretches.range(..=start).next_back().map_or(start, |(&start, _)| start);
-            let common = ours.stretches.range(from..end).find(|(_, stretch)| **stretch > start);
-            common.map(|(&first, _)| first.max(start))
-        };
-        theirs.stretches.iter().find_map(meets)
+    pub fn are_of_one_era(&self, a: CucTime, b: CucTime) -> bool {
+        let of = |time: CucTime| self.eras.iter().rposition(|era| era.from <= time);
+        of(a) == of(b)
+    }
+
+    /// Takes what another set has too. Eras of the two are one if their times overlap, or if the counts of the later
+    /// go on above those of the earlier; false, with nothing taken, if that would make one of two that are known apart.
+    pub fn absorb(&mut self, other: &Self) -> bool {
+        let ours = self.eras.iter().map(|era| (era, 0));
+        let mut all: Vec<(&Era, usize)> = ours.chain(other.eras.iter().map(|era| (era, 1))).collect();
+        all.retain(|(era, _)| !era.stretches.is_empty());
+        all.sort_by_key(|(era, _)| era.from);
+        // How many eras of either set are in each.
+        let mut joined: Vec<(Era, [usize; 2])> = Vec::new();
+        for (era, whose) in all {
+            let first = era.stretches.keys().next().copied().unwrap_or_default();
+            match joined.last_mut() {
+                Some((last, of))
+                    if era.from <= last.newest.1 || (of[whose] == 0 && first > last.newest.0) =>
+                {
+                    last.newest = last.newest.max(era.newest);
+                    era.stretches.iter().for_each(|(&start, &end)| last.insert(start, end));
+                    of[whose] += 1;
+                }
+                _ => joined.push((era.clone(), [1 - whose, whose])),
+            }
+        }
+        let sound = joined.iter().all(|(_, of)| of.iter().all(|eras| *eras <= 1));
+        if sound {
+            self.eras = joined.into_iter().map(|(era, _)| era).collect();
+        }
+        sound
     }
 
     /// Number of packets.
@@ -226,11 +239,57 @@ mod tests {
                 sets[2].take(count, at(count));
             }
             let [mut ours, theirs, together] = sets;
-            prop_assert_eq!(ours.common(&theirs), counts[0].intersection(&counts[1]).next().copied());
             prop_assert!(theirs.is_empty() || theirs.contains(*counts[1].first().unwrap(), at(60)));
             prop_assert!(ours.absorb(&theirs));
             prop_assert_eq!(ours, together);
         }
+    }
+
+    #[test]
+    fn eras_are_put_together_by_their_times() {
+        // Counts 0..10 at 0..10 s; then anew, 0..8 at 20..28 s; each has heard some of them.
+        let all: Vec<(u64, CucTime)> =
+            (0..10).map(|k| (k, at(k))).chain((0..8).map(|k| (k, at(20 + k)))).collect();
+        for heard in 0..1_u64 << 8 {
+            let mut sets = [Taken::default(), Taken::default(), Taken::default()];
+            for (k, &(count, time)) in all.iter().enumerate() {
+                // A fixed pattern of who has heard what, another one each time; nobody misses the first two.
+                let whose = if k < 2 || (10..12).contains(&k) { k as u64 } else { heard >> (k % 8) };
+                sets[(whose % 2) as usize].take(count, time);
+                sets[2].take(count, time);
+            }
+            let [ours, theirs, together] = sets;
+            for (mut one, other) in [(ours.clone(), &theirs), (theirs.clone(), &ours)] {
+                assert!(one.absorb(other), "{heard:b}");
+                assert_eq!(one, together, "{heard:b}");
+            }
+        }
+    }
+
+    #[test]
+    fn eras_that_one_knows_apart_are_not_made_one() {
+        let (mut two, mut one) = (Taken::default(), Taken::default());
+        for (count, s) in [(5, 1), (6, 2), (3, 8), (9, 9)] {
+            two.take(count, at(s));
+        }
+        // Counted on, as far as this one knows, across the restart.
+        one.take(7, at(3));
+        one.take(8, at(9));
+        let before = two.clone();
+        assert!(!two.absorb(&one));
+        assert_eq!(two, before);
+    }
+
+    #[test]
+    fn packets_in_a_row_are_told_from_those_behind_a_gap() {
+        let mut taken = Taken::default();
+        for count in [0, 1, 2, 5, 6] {
+            taken.take(count, at(count));
+        }
+        assert!(taken.is_whole(0, 2, at(2)) && taken.is_whole(1, 2, at(2)) && taken.is_whole(6, 6, at(6)));
+        assert!(!taken.is_whole(0, 5, at(5)) && !taken.is_whole(3, 5, at(5)) && !taken.is_whole(0, 3, at(3)));
+        taken.take(0, at(9));
+        assert!(taken.is_whole(0, 0, at(9)) && !taken.are_of_one_era(at(6), at(9)));
     }
 
     #[test]

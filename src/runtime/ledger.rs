@@ -43,6 +43,34 @@ impl Ledger {
         }
     }
 
+    /// Takes all that another account reports off this one, where it stands; empty accounts go.
+    pub fn withdraw(&self, report: &LedgerReport) {
+        let mut accounts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let Accounts { sampled, accumulated, flagged, lost } = &mut *accounts;
+        *sampled = sampled.saturating_sub(report.sampled);
+        *accumulated = accumulated.saturating_sub(report.accumulated);
+        for (reason, &count) in &report.flagged {
+            if let Some(account) = flagged.get_mut(reason.as_str()) {
+                *account = account.saturating_sub(count);
+            }
+        }
+        for Loss { stage, reason, count } in &report.lost {
+            if let Some(account) = lost.get_mut(&(stage.clone().into(), reason.clone().into())) {
+                *account = account.saturating_sub(*count);
+            }
+        }
+        flagged.retain(|_, count| *count > 0);
+        lost.retain(|_, count| *count > 0);
+    }
+
+    /// The accounts as they stand, which begin anew.
+    #[must_use]
+    pub fn take(&self) -> LedgerReport {
+        let report = self.report();
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Accounts::default();
+        report
+    }
+
     /// Posts `count` samples that came into being.
     pub fn sampled(&self, count: u64) {
         self.post(|accounts| &mut accounts.sampled, count);
@@ -260,6 +288,21 @@ mod tests {
                 }
             });
             prop_assert_eq!(forward.report(), together.report());
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_withdrawn_was_never_there(first in fates(), second in fates()) {
+            let (ledger, alone, part) = (Ledger::new(), Ledger::new(), Ledger::new());
+            for (fates, to) in [(&first, [&ledger, &alone]), (&second, [&ledger, &part])] {
+                for &(fate, count) in fates {
+                    to.iter().for_each(|ledger| post(ledger, fate, count));
+                }
+            }
+            ledger.withdraw(&part.take());
+            prop_assert_eq!(ledger.report(), alone.report());
+            prop_assert_eq!(part.report(), LedgerReport::default());
         }
     }
 

@@ -22,7 +22,7 @@ pub(super) use housekeeping::{decode as decode_housekeeping, encode as encode_ho
 pub(super) use instrument::{decode as decode_instrument, encode as encode_instrument};
 pub(super) use visibilities::{
     capacity as visibilities_in, check as check_visibilities, count as count_visibilities,
-    decode as decode_visibilities, encode as encode_visibilities,
+    decode as decode_visibilities, encode as encode_visibilities, span as visibilities_span,
 };
 
 /// Bytes that any record may take; bincode refuses to allocate more whatever a length field says.

@@ -86,6 +86,18 @@ pub(in crate::downlink) fn count(bytes: &[u8]) -> u64 {
         .map_or(0, |(record, rest)| u64::from(record.count).min((rest.len() / VISIBILITY_BYTES) as u64))
 }
 
+/// First and last instant of the visibilities that a payload says it has, as far as it can be read.
+pub(in crate::downlink) fn span(bytes: &[u8]) -> Option<[MissionTime; 2]> {
+    let (record, rest) = take_record::<Record>("visibility", bytes).ok()?;
+    let count = record.count as usize;
+    require_length("visibility arrays", count.saturating_mul(VISIBILITY_BYTES), rest.len()).ok()?;
+    let mut arrays = Arrays(rest);
+    let (offsets, durations) = (arrays.u32(count), arrays.u32(count));
+    let start = MissionTime(record.start_ticks);
+    let end = i64::from(*offsets.last()?) + i64::from(*durations.last()?);
+    Some([start.plus_ticks(i64::from(*offsets.first()?)), start.plus_ticks(end)])
+}
+
 /// What holds of a block as a whole.
 pub(in crate::downlink) fn check(
     block: &VisibilityBlock,

@@ -64,6 +64,19 @@ pub enum StateError {
         /// Its value now.
         expected: String,
     },
+    /// Sums that do not hold what the journal says.
+    #[error(
+        "the packet of visibilities with count {count}: {found} of its visibilities could be taken out of the sums; \
+         expected {expected}, as the journal says: nothing has been changed"
+    )]
+    NotInSums {
+        /// Packet count.
+        count: u64,
+        /// Visibilities that the sums would give.
+        found: u64,
+        /// Visibilities that the journal has.
+        expected: u32,
+    },
     /// A new state where there is one.
     #[error("{}: holds a state already; expected a new folder", path.display())]
     Occupied {

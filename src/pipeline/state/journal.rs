@@ -1,13 +1,19 @@
-//! A line on every block of visibilities that has been received.
+//! A line on every packet that has been read, and what became of it.
 
+use std::collections::{BTreeMap, BTreeSet};
+
+use bincode::de::Decoder;
+use bincode::enc::Encoder;
+use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 
-use crate::downlink::{CucTime, PacketHeader};
-use crate::frames::VisibilityBlock;
+use crate::downlink::{CucTime, Kind, PacketHeader};
+use crate::frames::{PlacedVisibilities, VisibilityBlock};
+use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime, Pair};
 
 /// What one packet of visibilities held, as it was received.
-#[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Encode, Decode)]
 pub struct JournalEntry {
     /// Count of the packet.
     pub count: u64,
@@ -30,15 +36,16 @@ pub struct JournalEntry {
 }
 
 impl JournalEntry {
-    /// The line on a block; `None` if it is empty.
-    pub(super) fn of(header: PacketHeader, block: &VisibilityBlock) -> Option<Self> {
-        let last = block.len().checked_sub(1)?;
+    /// The line on a packet: of none, if it holds no visibilities or has been refused.
+    pub(super) fn of(header: PacketHeader, block: Option<&VisibilityBlock>) -> Self {
+        let none = Self { count: header.count, made: header.time, ..Self::default() };
+        let Some((block, last)) = block.and_then(|block| Some((block, block.len().checked_sub(1)?))) else {
+            return none;
+        };
         let end = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);
         let ticks: u64 = block.duration_ticks.iter().map(|&ticks| u64::from(ticks)).sum();
         let good = block.weight.iter().zip(&block.flags).filter(|(_, flags)| flags.is_good());
-        Some(Self {
-            count: header.count,
-            made: header.time,
+        Self {
             channel: block.channel,
             pair: block.pair,
             start: block.start.plus_ticks(i64::from(block.offset_ticks[0])),
@@ -46,6 +53,242 @@ impl JournalEntry {
             visibilities: block.len() as u32,
             integration_s: ticks as f64 * 1e-6,
             weight: good.map(|(&weight, _)| f64::from(weight)).sum(),
-        })
+            ..none
+        }
+    }
+}
+
+/// Order of sending within a kind.
+pub(super) type Sent = (CucTime, u64);
+
+/// A packet of visibilities, and what became of them.
+#[derive(Clone, Debug, PartialEq, Encode, Decode)]
+pub(super) struct Line {
+    pub(super) entry: JournalEntry,
+    /// The packet's check.
+    pub(super) check: u32,
+    /// Of what was handed to the sums: places, values, weights.
+    pub(super) digest: u32,
+    /// Visibilities in the sums.
+    pub(super) accumulated: u32,
+    /// Visibilities left out, by number of the reason in [`Journal`].
+    pub(super) flagged: Vec<(u16, u32)>,
+    /// First and last mission time, s, of those that were offered to the sums.
+    pub(super) used_s: Option<[f64; 2]>,
+}
+
+/// A packet of another kind.
+#[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
+pub(super) struct OtherLine {
+    /// The packet's check.
+    pub(super) check: u32,
+    pub(super) bytes: u32,
+    /// First and last count of the packets of its payload.
+    pub(super) payload: [u64; 2],
+    /// Beginning of the positions in it, if they are those that hold.
+    pub(super) segment: Option<MissionTime>,
+}
+
+/// All packets that have been read, in the order of sending.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Journal {
+    pub(super) visibilities: BTreeMap<Sent, Line>,
+    pub(super) others: BTreeMap<(Kind, Sent), OtherLine>,
+    /// Why visibilities were left out, as the ledger has it.
+    reasons: Vec<String>,
+}
+
+impl Journal {
+    /// Lines on packets with visibilities.
+    pub(super) fn entries(&self) -> impl Iterator<Item = &JournalEntry> {
+        self.visibilities.values().map(|line| &line.entry).filter(|entry| entry.visibilities > 0)
+    }
+
+    /// Keeps a line on a packet of visibilities that became what `account` says.
+    pub(super) fn keep(
+        &mut self,
+        header: PacketHeader,
+        check: u32,
+        block: Option<&VisibilityBlock>,
+        (digest, used_s): (u32, Option<[f64; 2]>),
+        account: &LedgerReport,
+    ) {
+        let mut flagged = Vec::new();
+        for (reason, &count) in &account.flagged {
+            flagged.push((self.number_of(reason), count as u32));
+        }
+        let (entry, accumulated) = (JournalEntry::of(header, block), account.accumulated as u32);
+        let line = Line { entry, check, digest, accumulated, flagged, used_s };
+        self.visibilities.insert((header.time, header.count), line);
+    }
+
+    fn number_of(&mut self, reason: &str) -> u16 {
+        let known = self.reasons.iter().position(|known| known == reason);
+        let number = known.unwrap_or_else(|| {
+            self.reasons.push(reason.to_owned());
+            self.reasons.len() - 1
+        });
+        number as u16
+    }
+
+    /// Numbers the reasons that occur in the order of their names, so that lines do not tell in which order they came.
+    pub(super) fn renumber(&mut self) {
+        let used = self.visibilities.values().flat_map(|line| line.flagged.iter().map(|(number, _)| *number));
+        let used: BTreeSet<u16> = used.collect();
+        let mut names: Vec<(String, u16)> = Vec::new();
+        for number in used {
+            names.extend(self.reasons.get(usize::from(number)).map(|name| (name.clone(), number)));
+        }
+        names.sort();
+        let unchanged =
+            names.len() == self.reasons.len() && names.iter().zip(0..).all(|((_, old), new)| *old == new);
+        if unchanged {
+            return;
+        }
+        let new: BTreeMap<u16, u16> = names.iter().zip(0..).map(|((_, old), new)| (*old, new)).collect();
+        for line in self.visibilities.values_mut() {
+            for (number, _) in &mut line.flagged {
+                *number = new.get(number).copied().unwrap_or(u16::MAX);
+            }
+            line.flagged.sort_unstable();
+        }
+        self.reasons = names.into_iter().map(|(name, _)| name).collect();
+    }
+
+    /// Visibilities of a line that were left out, by reason.
+    pub(super) fn flagged<'a>(&'a self, line: &'a Line) -> impl Iterator<Item = (&'a str, u64)> {
+        let reason = |number: u16| self.reasons.get(usize::from(number)).map_or("", String::as_str);
+        line.flagged.iter().map(move |&(number, count)| (reason(number), u64::from(count)))
+    }
+
+    /// Takes all lines of another journal; the first packet of visibilities that is in both is refused, and gives
+    /// packets of other kinds that are in both.
+    pub(super) fn absorb(&mut self, other: Self) -> Result<Vec<(Kind, OtherLine)>, u64> {
+        let Self { visibilities, others, reasons } = other;
+        if let Some((_, count)) = visibilities.keys().find(|sent| self.visibilities.contains_key(sent)) {
+            return Err(*count);
+        }
+        for (sent, mut line) in visibilities {
+            for (number, _) in &mut line.flagged {
+                *number = self.number_of(reasons.get(usize::from(*number)).map_or("", String::as_str));
+            }
+            self.visibilities.insert(sent, line);
+        }
+        let mut both = Vec::new();
+        for (key, line) in others {
+            if let Some(ours) = self.others.get_mut(&key) {
+                both.push((key.0, line));
+                ours.segment = ours.segment.or(line.segment);
+            } else {
+                self.others.insert(key, line);
+            }
+        }
+        Ok(both)
+    }
+
+    /// First and last mission time, s, of what is in the sums of each channel.
+    pub(super) fn spans_s(&self) -> BTreeMap<ChannelId, [f64; 2]> {
+        let mut spans: BTreeMap<ChannelId, [f64; 2]> = BTreeMap::new();
+        for line in self.visibilities.values() {
+            let Some([first, last]) = line.used_s else { continue };
+            let span = spans.entry(line.entry.channel).or_insert([first, last]);
+            *span = [span[0].min(first), span[1].max(last)];
+        }
+        spans
+    }
+
+    /// Whether visibilities with positions of a stretch of time are in the sums.
+    pub(super) fn uses(&self, [from, to]: [MissionTime; 2]) -> bool {
+        let within = |line: &Line| line.accumulated > 0 && line.entry.start <= to && line.entry.end >= from;
+        self.visibilities.values().any(within)
+    }
+}
+
+/// As a list of lines: a line names its packet itself.
+impl Encode for Journal {
+    fn encode<E: Encoder>(&self, encoder: &mut E) -> Result<(), EncodeError> {
+        (self.visibilities.len() as u64).encode(encoder)?;
+        for line in self.visibilities.values() {
+            line.encode(encoder)?;
+        }
+        self.others.encode(encoder)?;
+        self.reasons.encode(encoder)
+    }
+}
+
+impl<Context> Decode<Context> for Journal {
+    fn decode<D: Decoder<Context = Context>>(decoder: &mut D) -> Result<Self, DecodeError> {
+        let lines = Vec::<Line>::decode(decoder)?;
+        let sent = |line: &Line| (line.entry.made, line.entry.count);
+        let visibilities = lines.into_iter().map(|line| (sent(&line), line)).collect();
+        Ok(Self { visibilities, others: Decode::decode(decoder)?, reasons: Decode::decode(decoder)? })
+    }
+}
+
+bincode::impl_borrow_decode!(Journal);
+
+/// A checksum over everything that sums are made of.
+pub(super) fn digest(placed: &PlacedVisibilities) -> u32 {
+    let mut crc = crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi);
+    let mut bytes = Vec::with_capacity(80 * placed.len());
+    for k in 0..placed.len() {
+        let ([a, b, c], [d, e, f], v) = (placed.r_i_m[k], placed.r_j_m[k], placed.value_k_sr[k]);
+        for number in [placed.time_s[k], a, b, c, d, e, f, v.re, v.im, placed.weight[k]] {
+            bytes.extend_from_slice(&number.to_le_bytes());
+        }
+    }
+    crc.update(&bytes);
+    crc.finalize() as u32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::downlink::{FORMAT_VERSION, Segment};
+
+    fn header(count: u64) -> PacketHeader {
+        let (kind, segment, time) = (Kind::Visibilities, Segment::Whole, CucTime(7 * count));
+        PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 }
+    }
+
+    fn account(reasons: &[(&str, u64)]) -> LedgerReport {
+        let flagged = reasons.iter().map(|(reason, count)| ((*reason).to_owned(), *count)).collect();
+        LedgerReport { accumulated: 5, flagged, ..LedgerReport::default() }
+    }
+
+    fn told(journal: &Journal) -> Vec<(u64, Vec<(String, u64)>)> {
+        let flagged =
+            |line: &Line| journal.flagged(line).map(|(reason, count)| (reason.to_owned(), count)).collect();
+        journal.visibilities.values().map(|line| (line.entry.count, flagged(line))).collect()
+    }
+
+    #[test]
+    fn reasons_are_told_again_whatever_was_merged_and_kept() {
+        let (mut ours, mut theirs) = (Journal::default(), Journal::default());
+        ours.keep(header(1), 11, None, (0, None), &account(&[("far", 2)]));
+        theirs.keep(header(2), 12, None, (0, None), &account(&[("bright", 3), ("far", 4)]));
+        theirs.keep(header(0), 13, None, (0, None), &account(&[]));
+        assert_eq!(ours.absorb(theirs.clone()), Ok(vec![]));
+        let far = |count| ("far".to_owned(), count);
+        let expected = vec![(0, vec![]), (1, vec![far(2)]), (2, vec![("bright".to_owned(), 3), far(4)])];
+        assert_eq!(told(&ours), expected);
+        ours.renumber();
+        assert_eq!(told(&ours), expected);
+        let bytes = bincode::encode_to_vec(&ours, bincode::config::standard()).unwrap();
+        let (kept, used) =
+            bincode::decode_from_slice::<Journal, _>(&bytes, bincode::config::standard()).unwrap();
+        assert_eq!((&kept, used), (&ours, bytes.len()));
+        // The other way round the same is told.
+        let mut first = Journal::default();
+        first.keep(header(1), 11, None, (0, None), &account(&[("far", 2)]));
+        assert_eq!(theirs.absorb(first.clone()), Ok(vec![]));
+        theirs.renumber();
+        assert_eq!((told(&theirs), &theirs), (expected, &ours));
+        // What no line needs any more is forgotten.
+        let mut without = theirs.clone();
+        without.visibilities.retain(|(_, count), _| *count == 1);
+        without.renumber();
+        assert_eq!(without.reasons, ["far"]);
+        assert_eq!(theirs.absorb(first), Err(1));
     }
 }

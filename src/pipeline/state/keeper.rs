@@ -4,27 +4,36 @@ use std::path::{Path, PathBuf};
 use std::sync::PoisonError;
 
 use super::error::StateError;
-use super::file::{self, Head};
+use super::file::{self, HeadView};
 use super::folder::{StateFolder, checkpoints};
-use super::journal::JournalEntry;
+use super::journal::{Journal, OtherLine, digest};
+use super::settings::{compare, settings_of};
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::Calibrator;
-use crate::downlink::{Collector, PacketHeader};
-use crate::frames::GroundFrame;
+use crate::downlink::{Collector, Delivery, DownlinkError, Kind, PacketHeader};
+use crate::frames::{GroundFrame, PlacedFrame, PlacedVisibilities, VisibilityBlock};
 use crate::pipeline::config::Config;
 use crate::pipeline::ground::GroundOutcome;
-use crate::runtime::{Outlet, Stage, Units};
+use crate::runtime::{Ledger, LedgerReport, Outlet, Stage, Units};
+
+/// Bytes that visibilities wait for those before them, if nothing else is said: a week of thirty channels.
+pub const WAIT_BYTES: u64 = 1 << 28;
+
+/// Windows whose positions are kept: more than two years of them.
+const SEGMENTS_MAX: usize = 8192;
 
 /// Takes the bytes of a downlink and emits sums; everything in between is in its checkpoints.
 pub struct Keeper {
     folder: StateFolder,
     notes: Vec<String>,
     settings: Vec<(String, String)>,
-    collector: Collector,
-    calibrator: Calibrator,
-    accumulator: Accumulator,
-    journal: Vec<JournalEntry>,
-    outcome: GroundOutcome,
+    pub(super) collector: Collector,
+    pub(super) calibrator: Calibrator,
+    pub(super) accumulator: Accumulator,
+    pub(super) journal: Journal,
+    pub(super) outcome: GroundOutcome,
+    /// What becomes of the packet that is being applied.
+    tally: Ledger,
     checkpoint_every: u64,
     since_checkpoint: u64,
 }
@@ -33,7 +42,7 @@ impl Keeper {
     /// A keeper that goes on from the newest checkpoint in `folder`, or from nothing if there is none.
     ///
     /// A checkpoint is written whenever `checkpoint_every` visibilities have been taken, and at the end. A new state
-    /// lets packets wait for those before them until others of `wait_bytes` have come.
+    /// lets packets wait for those before them until `wait_bytes` of them do.
     ///
     /// # Errors
     /// A folder that cannot be used or is in use; a state that was summed with other settings, or of which no
@@ -49,27 +58,29 @@ impl Keeper {
         let read = |path: &Path| {
             file::read(path, |head, engines| {
                 compare(path, &head.settings, &settings)?;
-                let outcome = GroundOutcome::default();
-                outcome.ledger.post_report(&head.ledger);
-                let accumulator = Accumulator::new(config.map.clone(), outcome.ledger.clone());
-                let calibration = config.calibration.build(Path::new(""))?;
-                let calibrator = Calibrator::new(calibration, outcome.ledger.clone());
+                let tally = Ledger::new();
+                let (calibrator, accumulator) = stages(config, &tally)?;
                 let accumulator = accumulator.resume(head.accumulator, engines)?;
-                let calibrator = calibrator.resume(head.calibrator);
-                Ok((Collector::resume(head.collector), calibrator, accumulator, head.journal, outcome))
+                let mut calibrator = calibrator.resume(head.calibrator);
+                for entry in head.journal.entries() {
+                    calibrator.has_used(entry.channel, entry.pair, entry.start);
+                }
+                let collector = Collector::resume(head.collector);
+                Ok((collector, calibrator, accumulator, head.journal, head.ledger, tally))
             })
         };
         let (found, notes) = folder.load(read)?;
-        let (collector, calibrator, accumulator, journal, outcome) = match found {
+        let (collector, calibrator, accumulator, journal, ledger, tally) = match found {
             Some(found) => found,
             None => {
-                let outcome = GroundOutcome::default();
-                let calibration = config.calibration.build(Path::new(""))?;
-                let calibrator = Calibrator::new(calibration, outcome.ledger.clone());
-                let accumulator = Accumulator::new(config.map.clone(), outcome.ledger.clone());
-                (Collector::new(wait_bytes), calibrator, accumulator, Vec::new(), outcome)
+                let tally = Ledger::new();
+                let (calibrator, accumulator) = stages(config, &tally)?;
+                let collector = Collector::new(wait_bytes);
+                (collector, calibrator, accumulator, Journal::default(), LedgerReport::default(), tally)
             }
         };
+        let outcome = GroundOutcome::default();
+        outcome.ledger.post_report(&ledger);
         Ok(Self {
             folder,
             notes,
@@ -79,6 +90,7 @@ impl Keeper {
             accumulator,
             journal,
             outcome,
+            tally,
             checkpoint_every: checkpoint_every.max(1),
             since_checkpoint: 0,
         })
@@ -112,11 +124,19 @@ impl Keeper {
     }
 
     fn absorb(&mut self, part: Self) -> Result<(), StateError> {
-        self.collector.absorb(part.collector.state())?;
+        for entry in part.journal.entries() {
+            self.calibrator.has_used(entry.channel, entry.pair, entry.start);
+        }
+        let both = self.journal.absorb(part.journal);
+        let both =
+            both.map_err(|count| DownlinkError::TakenTwice { apid: Kind::Visibilities.apid(), count })?;
+        self.collector.absorb(part.collector.into_state())?;
+        for (kind, line) in both {
+            self.collector.uncount(kind, 1, u64::from(line.bytes));
+        }
         self.calibrator.absorb(part.calibrator.state());
         self.accumulator.absorb(part.accumulator)?;
         self.outcome.ledger.post_report(&part.outcome.ledger.report());
-        self.journal.extend(part.journal);
         self.notes.extend(part.notes);
         Ok(())
     }
@@ -124,7 +144,7 @@ impl Keeper {
     /// Packets of visibilities in its sums.
     #[must_use]
     pub fn packets(&self) -> usize {
-        self.journal.len()
+        self.journal.entries().count()
     }
 
     /// What is to be said of checkpoints that do not hold.
@@ -138,50 +158,110 @@ impl Keeper {
         self.outcome.clone()
     }
 
-    /// Takes a frame through calibration into the sums.
-    fn apply(
-        &mut self,
-        (header, frame): (PacketHeader, GroundFrame),
-        out: &mut Outlet<Snapshot>,
-    ) -> Result<(), StateError> {
-        if let GroundFrame::Visibilities(block) = &frame {
-            self.journal.extend(JournalEntry::of(header, block));
-            self.since_checkpoint += block.len() as u64;
-        }
+    /// Takes what has been read through calibration into the sums.
+    fn apply(&mut self, found: Delivery, out: &mut Outlet<Snapshot>) -> Result<(), StateError> {
+        let Delivery { packets, frame } = found;
+        let visibilities = packets.first().filter(|(header, _)| header.kind == Kind::Visibilities).copied();
+        let Some((header, check)) = visibilities else {
+            return self.apply_other(&packets, frame);
+        };
+        let block: Option<VisibilityBlock> = match &frame {
+            Some(GroundFrame::Visibilities(block)) => Some(block.clone()),
+            _ => None,
+        };
+        let mut summed = digest(&PlacedVisibilities::default());
         let mut placed = Outlet::collect();
-        self.calibrator.step(frame, &mut placed)?;
+        if let Some(frame) = frame {
+            self.since_checkpoint += block.as_ref().map_or(0, |block| block.len() as u64);
+            self.calibrator.step(frame, &mut placed)?;
+        }
         for frame in placed.into_vec() {
+            if let PlacedFrame::Visibilities(placed) = &frame {
+                summed = digest(placed);
+            }
             self.accumulator.step(frame, out)?;
+        }
+        let used_s = self.accumulator.take_latest_s();
+        let account = self.tally.take();
+        self.outcome.ledger.post_report(&account);
+        self.journal.keep(header, check, block.as_ref(), (summed, used_s), &account);
+        Ok(())
+    }
+
+    /// Takes a payload other than visibilities, or a part of one that has been given up.
+    fn apply_other(
+        &mut self,
+        packets: &[(PacketHeader, u32)],
+        frame: Option<GroundFrame>,
+    ) -> Result<(), StateError> {
+        let positions = match &frame {
+            Some(GroundFrame::Ephemeris(segment)) => Some(segment.clone()),
+            _ => None,
+        };
+        let mut placed = Outlet::collect();
+        if let Some(frame) = frame {
+            self.calibrator.step(frame, &mut placed)?;
+        }
+        for frame in placed.into_vec() {
+            self.accumulator.step(frame, &mut Outlet::collect())?;
+        }
+        let holds =
+            positions.filter(|segment| self.calibrator.ephemeris().segment(segment.start) == Some(segment));
+        let (Some((first, _)), Some((last, _))) = (packets.first(), packets.last()) else { return Ok(()) };
+        let payload = [first.count, last.count];
+        for (header, check) in packets {
+            let segment = holds.as_ref().map(|segment| segment.start);
+            let line = OtherLine { check: *check, bytes: header.bytes as u32, payload, segment };
+            self.journal.others.insert((header.kind, (header.time, header.count)), line);
         }
         Ok(())
     }
 
-    /// Applies what has come and is in order.
+    /// Applies what has come and need not wait.
     fn advance(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), StateError> {
-        while let Some(found) = self.collector.next_frame()? {
+        loop {
+            let ephemeris = self.calibrator.ephemeris();
+            let Some(found) = self.collector.next_delivery(&|stretch| ephemeris.covers(stretch))? else {
+                return Ok(());
+            };
             self.apply(found, out)?;
             if self.since_checkpoint >= self.checkpoint_every {
                 self.checkpoint()?;
             }
         }
+    }
+
+    /// Forgets all that is not in packets.
+    pub(super) fn begin_anew(&mut self, config: &Config) -> Result<(), StateError> {
+        (self.calibrator, self.accumulator) = stages(config, &self.tally)?;
+        let _ = self.outcome.ledger.take();
+        self.journal = Journal::default();
         Ok(())
     }
 
-    fn checkpoint(&mut self) -> Result<(), StateError> {
+    pub(super) fn checkpoint(&mut self) -> Result<(), StateError> {
         self.since_checkpoint = 0;
-        let head = Head {
-            settings: self.settings.clone(),
-            collector: self.collector.state(),
+        self.journal.renumber();
+        let head = HeadView {
+            settings: &self.settings,
+            collector: self.collector.view(),
             calibrator: self.calibrator.state(),
             accumulator: self.accumulator.state(),
             ledger: self.outcome.ledger.report(),
-            journal: self.journal.clone(),
+            journal: &self.journal,
         };
         let accumulator = &mut self.accumulator;
         self.folder.save(|out, path| {
             file::write(out, path, &head, |out| accumulator.write_engines(out).map_err(StateError::from))
         })
     }
+}
+
+/// Calibration and sums that know nothing yet.
+fn stages(config: &Config, ledger: &Ledger) -> Result<(Calibrator, Accumulator), StateError> {
+    let calibration = config.calibration.build(Path::new(""))?;
+    let calibrator = Calibrator::new(calibration, ledger.clone()).with_segments(SEGMENTS_MAX);
+    Ok((calibrator, Accumulator::new(config.map.clone(), ledger.clone())))
 }
 
 impl Stage for Keeper {
@@ -203,6 +283,7 @@ impl Stage for Keeper {
             self.apply(found, out)?;
         }
         self.calibrator.finish(&mut Outlet::collect())?;
+        self.outcome.ledger.post_report(&self.tally.take());
         *self.outcome.reception.lock().unwrap_or_else(PoisonError::into_inner) = self.collector.counters();
         Ok(self.accumulator.finish(out)?)
     }
@@ -210,31 +291,4 @@ impl Stage for Keeper {
     fn units(&self) -> Units {
         Units::of(self.collector.bytes(), "bytes")
     }
-}
-
-/// The settings that shape sums, the contents of the gains file among them.
-fn settings_of(config: &Config) -> Result<Vec<(String, String)>, StateError> {
-    let mut settings: Vec<(String, String)> =
-        config.map.of_sums().into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
-    settings.push(("calibration.hook".to_owned(), format!("{:?}", config.calibration.hook)));
-    if let Some(path) = &config.calibration.gains_file {
-        let bytes = std::fs::read(path).map_err(StateError::io(path, "read"))?;
-        let sum = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes);
-        settings.push(("calibration.gains_file".to_owned(), format!("a file of checksum {sum:016x}")));
-    }
-    Ok(settings)
-}
-
-/// Refuses a state of other settings.
-fn compare(path: &Path, found: &[(String, String)], expected: &[(String, String)]) -> Result<(), StateError> {
-    let of = |settings: &[(String, String)], key: &str| {
-        settings.iter().find(|(k, _)| k == key).map_or("(nothing)".to_owned(), |(_, value)| value.clone())
-    };
-    for (key, _) in expected.iter().chain(found) {
-        let (found, expected) = (of(found, key), of(expected, key));
-        if found != expected {
-            return Err(StateError::Settings { path: path.to_owned(), key: key.clone(), found, expected });
-        }
-    }
-    Ok(())
 }

@@ -7,7 +7,7 @@ use super::file::{self, Head};
 use super::folder::checkpoints;
 use super::gaps::{Gaps, find_gaps};
 use super::journal::JournalEntry;
-use crate::downlink::{Collector, Kind, Taken};
+use crate::downlink::{Collector, Delivery, Kind, Taken};
 use crate::frames::GroundFrame;
 use crate::products::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
 use crate::units::constants::DAY_S;
@@ -41,12 +41,8 @@ impl Survey {
         }
         let mut journal = Vec::new();
         let mut collector = Collector::new(WAIT_BYTES);
-        collector.read_file(path, &mut |header, frame| {
-            if let GroundFrame::Visibilities(block) = frame {
-                journal.extend(JournalEntry::of(header, block));
-            }
-        })?;
-        let state = collector.state();
+        collector.read_file(path, &mut |found| journal.extend(entry_of(&found)))?;
+        let state = collector.into_state();
         Ok(Self { journal, taken: taken(|kind| state.taken(kind).cloned()) })
     }
 
@@ -74,15 +70,14 @@ impl Survey {
             std::io::copy(engines, &mut std::io::sink()).map_err(StateError::io(path, "read"))?;
             Ok(head)
         })?;
-        let mut journal = head.journal;
+        let mut journal: Vec<JournalEntry> = head.journal.entries().copied().collect();
         // Packets that wait have come too, and are in no journal yet.
-        let mut collector = Collector::resume(head.collector.clone());
-        while let Some((header, frame)) = collector.next_waiting() {
-            if let GroundFrame::Visibilities(block) = frame {
-                journal.extend(JournalEntry::of(header, &block));
-            }
+        let taken = taken(|kind| head.collector.taken(kind).cloned());
+        let mut collector = Collector::resume(head.collector);
+        while let Some(found) = collector.next_waiting() {
+            journal.extend(entry_of(&found));
         }
-        Ok(Self { journal, taken: taken(|kind| head.collector.taken(kind).cloned()) })
+        Ok(Self { journal, taken })
     }
 
     /// What is missing.
@@ -142,6 +137,15 @@ impl Survey {
             })
             .collect();
         draw_plots("Integration time received", &plots, 1 + usize::from(plots.len() > 3))
+    }
+}
+
+fn entry_of(found: &Delivery) -> Option<JournalEntry> {
+    match (found.packets.first(), &found.frame) {
+        (Some((header, _)), Some(GroundFrame::Visibilities(block))) if !block.is_empty() => {
+            Some(JournalEntry::of(*header, Some(block)))
+        }
+        _ => None,
     }
 }
 

@@ -1,0 +1,37 @@
+//! The settings that a state is bound to.
+
+use std::path::Path;
+
+use super::error::StateError;
+use crate::pipeline::config::Config;
+
+/// The settings that shape sums, the contents of the gains file among them.
+pub(super) fn settings_of(config: &Config) -> Result<Vec<(String, String)>, StateError> {
+    let mut settings: Vec<(String, String)> =
+        config.map.of_sums().into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
+    settings.push(("calibration.hook".to_owned(), format!("{:?}", config.calibration.hook)));
+    if let Some(path) = &config.calibration.gains_file {
+        let bytes = std::fs::read(path).map_err(StateError::io(path, "read"))?;
+        let sum = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes);
+        settings.push(("calibration.gains_file".to_owned(), format!("a file of checksum {sum:016x}")));
+    }
+    Ok(settings)
+}
+
+/// Refuses a state of other settings.
+pub(super) fn compare(
+    path: &Path,
+    found: &[(String, String)],
+    expected: &[(String, String)],
+) -> Result<(), StateError> {
+    let of = |settings: &[(String, String)], key: &str| {
+        settings.iter().find(|(k, _)| k == key).map_or("(nothing)".to_owned(), |(_, value)| value.clone())
+    };
+    for (key, _) in expected.iter().chain(found) {
+        let (found, expected) = (of(found, key), of(expected, key));
+        if found != expected {
+            return Err(StateError::Settings { path: path.to_owned(), key: key.clone(), found, expected });
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,53 @@
+//! Checkpoints that do not hold.
+
+use super::{ENGINES, Ground, checkpoints};
+
+use std::path::Path;
+
+#[test]
+fn a_damaged_checkpoint_is_told_and_the_one_before_used() {
+    for (engine, more) in ENGINES {
+        let place = Ground::with(more);
+        let file = place.downlink();
+        let every = ["--checkpoint-every", "2000"];
+        place.replay("state", &[&file], &every);
+        let good = place.bytes("state");
+        let head = 16 + place.head("state").len();
+        // Magic, length, all over the head and the engines, checksum; and files cut short.
+        let spread = |from: usize, to: usize| (0..4).map(move |k| from + (to - from) * (2 * k + 1) / 8);
+        let places = [0, 9, 16].into_iter().chain(spread(16, head)).chain(spread(head, good.len() - 8));
+        let places: Vec<usize> = places.chain([good.len() - 9, good.len() - 1]).collect();
+        let flipped = places.iter().map(|&at| {
+            let mut bad = good.clone();
+            bad[at] ^= 0x20;
+            (at, bad)
+        });
+        let cut = [0, 7, 23, head, good.len() - 1].map(|at| (at, good[..at].to_vec()));
+        for (at, bad) in flipped.chain(cut) {
+            let path = place.newest("state");
+            std::fs::write(&path, bad).unwrap();
+            let output = place.output("state", &[&file], &every);
+            let said = String::from_utf8(output.stderr).unwrap();
+            assert!(output.status.success(), "{engine}, byte {at}: {said}");
+            let name = path.file_name().unwrap().to_str().unwrap();
+            let told = said.contains(name) && said.contains("going on from the one before");
+            assert!(told, "{engine}, byte {at}: {said}");
+            assert!(place.bytes("state") == good, "{engine}, byte {at}");
+        }
+        // Of two generations: damage of the older one changes nothing while the newer one holds.
+        let folder = place.path("state");
+        let [older, _] = checkpoints(Path::new(&folder)).try_into().unwrap();
+        std::fs::write(&older, b"nothing").unwrap();
+        let output = place.output("state", &[&file], &every);
+        assert!(output.status.success() && !String::from_utf8(output.stderr).unwrap().contains("note:"));
+        assert!(place.bytes("state") == good, "{engine}");
+        // With none that holds, it does not silently begin anew, and leaves what there is.
+        for path in checkpoints(Path::new(&folder)) {
+            std::fs::write(path, b"nothing").unwrap();
+        }
+        let output = place.output("state", &[&file], &every);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(!output.status.success() && said.contains("none of its 2 checkpoints holds"), "{said}");
+        assert_eq!(checkpoints(Path::new(&folder)).len(), 2);
+    }
+}

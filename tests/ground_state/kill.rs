@@ -1,0 +1,108 @@
+//! Ended by force at any moment.
+
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use super::{ENGINES, Ground, checkpoints};
+
+/// Kills for each engine.
+fn kills() -> u32 {
+    std::env::var("LUNARRAY_KILLS").map_or(10, |text| text.parse().unwrap())
+}
+
+fn start(args: &[String]) -> Child {
+    let mut command = Command::new(assert_cmd::cargo::cargo_bin("lunarray"));
+    command.args(args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap()
+}
+
+/// Starts `begin` again and again and kills it, at moments spread evenly over `length` in golden steps; `ended` is
+/// told each time whether it had come to its end before.
+fn kill(kills: u32, length: Duration, begin: impl Fn() -> Child, mut ended: impl FnMut(bool)) {
+    let mut share: f64 = 0.1;
+    let mut killed = 0;
+    while killed < kills {
+        let mut child = begin();
+        share = (share + 0.618_034) % 1.0;
+        std::thread::sleep(length.mul_f64(share));
+        let is_over = child.try_wait().unwrap().is_some();
+        child.kill().unwrap();
+        child.wait().unwrap();
+        killed += u32::from(!is_over);
+        ended(is_over);
+    }
+}
+
+#[test]
+fn killed_at_any_moment_it_goes_on_to_the_same_bits() {
+    for (engine, more) in ENGINES {
+        let place = Ground::with(more);
+        let file = place.simulate("longer.ccsds", &["--set", "spacecraft.every_nth_window=100"]);
+        let every = ["--checkpoint-every", "300"];
+        let since = Instant::now();
+        place.replay("whole", &[&file], &every);
+        let session = since.elapsed();
+        let whole = place.bytes("whole");
+        let args = place.session("killed", &[&file], &every);
+        let mut resumed = 0;
+        kill(
+            kills(),
+            session,
+            || start(&args),
+            |is_over| {
+                resumed += u32::from(!checkpoints(Path::new(&place.path("killed"))).is_empty());
+                if is_over {
+                    // It came to its end: that has to be right too; then from the beginning.
+                    assert!(place.bytes("killed") == whole, "{engine}");
+                    std::fs::remove_dir_all(place.path("killed")).unwrap();
+                }
+            },
+        );
+        place.replay("killed", &[&file], &every);
+        assert!(place.bytes("killed") == whole, "{engine}: {resumed} sessions with a checkpoint");
+        assert!(place.maps("killed") == place.maps("whole"), "{engine}");
+        eprintln!("{engine}: {} kills, none differs; {resumed} sessions left or found a checkpoint", kills());
+    }
+}
+
+#[test]
+fn killed_while_taking_out_it_leaves_the_old_state_or_the_new_one() {
+    let place = Ground::new();
+    let file = place.downlink();
+    place.replay("whole", &[&file], &[]);
+    let packets = super::packets(&file);
+    let part = place.file("part", &packets[packets.len() / 2..].concat());
+    let copy = |name: &str| {
+        let (from, to) = (place.path("whole"), place.path(name));
+        let _ = std::fs::remove_dir_all(&to);
+        std::fs::create_dir(&to).unwrap();
+        for path in checkpoints(Path::new(&from)) {
+            std::fs::copy(&path, Path::new(&to).join(path.file_name().unwrap())).unwrap();
+        }
+    };
+    let args = |state: &str| -> Vec<String> {
+        let args = ["retract", &part, "--state", &place.path(state), "--map", &place.pipeline];
+        args.map(str::to_owned).to_vec()
+    };
+    copy("without");
+    let since = Instant::now();
+    assert!(start(&args("without")).wait().unwrap().success());
+    let length = since.elapsed();
+    let (old, new) = (place.bytes("whole"), place.bytes("without"));
+    assert!(old != new);
+    copy("killed");
+    let (mut olds, mut news) = (0, 0);
+    kill(
+        kills(),
+        length,
+        || start(&args("killed")),
+        |_| {
+            let found = place.bytes("killed");
+            assert!(found == old || found == new);
+            olds += u32::from(found == old);
+            news += u32::from(found == new);
+            copy("killed");
+        },
+    );
+    eprintln!("{olds} left the old state, {news} the new one");
+}

@@ -1,0 +1,148 @@
+//! A ground that remembers: every packet once, whatever comes twice, late, or is ended by force.
+#![allow(clippy::unwrap_used)] // Also in the helpers.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod damage;
+mod gaps;
+mod kill;
+mod merge;
+mod order;
+mod retract;
+mod sums;
+
+use std::path::{Path, PathBuf};
+
+use common::workplace::{Workplace, json};
+use serde_json::Value;
+
+/// Real geometry, two channels, few visibilities.
+const SMALL: &str = r#"
+name = "small"
+seed = 7
+[sky]
+nside = 8
+[spacecraft]
+channels_hz = [3.0e6, 10.0e6]
+every_nth_window = 300
+every_nth_integration = 2
+baseline_wavelengths_max = 16.0
+[downlink]
+packet_bytes_max = 2048
+[map]
+nside = 4
+epsilon = 1e-4
+[products]
+pictures = false
+"#;
+
+/// The two engines, each with what is to be added to the pipeline.
+const ENGINES: [(&str, &str); 2] = [("pixel", ""), ("harmonic", "[map]\nengine = \"harmonic\"")];
+
+/// Less than the downlink holds, so that not all that follows a gap waits to the end.
+const WAIT_BYTES: &str = "100000";
+
+/// A ground in a folder of its own.
+struct Ground(Workplace);
+
+impl std::ops::Deref for Ground {
+    type Target = Workplace;
+
+    fn deref(&self) -> &Workplace {
+        &self.0
+    }
+}
+
+impl Ground {
+    fn new() -> Self {
+        Self::with("")
+    }
+
+    /// With one more line for the section `[map]`.
+    fn with(engine: &str) -> Self {
+        Self(Workplace::new(&SMALL.replace("[map]", if engine.is_empty() { "[map]" } else { engine })))
+    }
+
+    fn downlink(&self) -> String {
+        self.simulate("small.ccsds", &[])
+    }
+
+    /// Arguments of a session.
+    fn session(&self, state: &str, files: &[&str], more: &[&str]) -> Vec<String> {
+        let (out, state) = (self.path(&format!("{state}.out")), self.path(state));
+        let fixed = ["--map", &self.pipeline, "--out", &out, "--state", &state, "--json"];
+        let wait = ["--wait-bytes", WAIT_BYTES];
+        let wait = if more.contains(&"--wait-bytes") { &[] } else { wait.as_slice() };
+        let all = [&["replay"], files, &fixed, wait, more].concat();
+        all.into_iter().map(str::to_owned).collect()
+    }
+
+    fn output(&self, state: &str, files: &[&str], more: &[&str]) -> std::process::Output {
+        let args = self.session(state, files, more);
+        common::workplace::lunarray(&args.iter().map(String::as_str).collect::<Vec<_>>())
+    }
+
+    fn replay(&self, state: &str, files: &[&str], more: &[&str]) -> Value {
+        let output = self.output(state, files, more);
+        assert!(output.status.success(), "{}", String::from_utf8(output.stderr).unwrap());
+        serde_json::from_slice(&output.stdout).unwrap()
+    }
+
+    fn gaps(&self, state: &str) -> Value {
+        json(&["gaps", &self.path(state)])
+    }
+
+    /// The newest checkpoint of a state.
+    fn newest(&self, state: &str) -> PathBuf {
+        checkpoints(Path::new(&self.path(state))).pop().unwrap()
+    }
+
+    fn bytes(&self, state: &str) -> Vec<u8> {
+        std::fs::read(self.newest(state)).unwrap()
+    }
+
+    /// All of the newest checkpoint but the engines: packets, journal, accounts, positions.
+    fn head(&self, state: &str) -> Vec<u8> {
+        let bytes = self.bytes(state);
+        let length = u64::from_le_bytes(*bytes[8..].first_chunk().unwrap());
+        bytes[16..16 + length as usize].to_vec()
+    }
+
+    fn maps(&self, state: &str) -> Vec<Vec<u8>> {
+        let maps = common::workplace::maps(&self.path(&format!("{state}.out")));
+        maps.into_iter().filter(|(path, _)| path.ends_with("map.fits")).map(|(_, bytes)| bytes).collect()
+    }
+}
+
+/// The checkpoints in a folder, oldest first.
+fn checkpoints(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten();
+    let mut found: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
+    found.retain(|path| path.extension().is_some_and(|extension| extension == "lunarray"));
+    found.sort();
+    found
+}
+
+/// Number and kind of a packet: its sequence count and application process identifier.
+fn identity(packet: &[u8]) -> (u16, u64) {
+    let word = |at: usize| u16::from_be_bytes([packet[at], packet[at + 1]]);
+    (word(0) & 0x7FF, u64::from(word(2) & 0x3FFF))
+}
+
+/// Identifier of packets of visibilities.
+const VISIBILITIES: u16 = 0x103;
+
+/// The packets of a downlink file.
+fn packets(file: &str) -> Vec<Vec<u8>> {
+    common::downlink::packets_of(&std::fs::read(file).unwrap())
+}
+
+/// A file without the visibility packets of these counts.
+fn leave_out(file: &str, counts: std::ops::Range<u64>) -> Vec<u8> {
+    let is_kept = |packet: &Vec<u8>| {
+        let (apid, count) = identity(packet);
+        apid != VISIBILITIES || !counts.contains(&count)
+    };
+    packets(file).into_iter().filter(is_kept).collect::<Vec<_>>().concat()
+}

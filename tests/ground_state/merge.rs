@@ -1,0 +1,75 @@
+//! States put together.
+
+use super::common::workplace::{fail, succeed};
+use super::sums::assert_same_maps;
+use super::{ENGINES, Ground, VISIBILITIES, identity, leave_out, packets};
+
+/// Merges states and takes nothing more.
+fn merge(place: &Ground, states: &[&str], out: &str) -> Vec<String> {
+    let states: Vec<String> = states.iter().map(|state| place.path(state)).collect();
+    let mut args = vec!["merge".to_owned()];
+    args.extend(states);
+    args.extend(["--map", &place.pipeline, "--out", &place.path(out)].map(str::to_owned));
+    args
+}
+
+fn strs(args: &[String]) -> Vec<&str> {
+    args.iter().map(String::as_str).collect()
+}
+
+#[test]
+fn states_make_one_whatever_their_order() {
+    for (engine, more) in ENGINES {
+        let place = Ground::with(more);
+        let file = place.downlink();
+        let reach = ["--wait-bytes", "10000000"];
+        let once = place.replay("once", &[&file], &reach);
+        let at_once = place.replay("at-once", &[&file], &["--wait-bytes", "0"]);
+        assert_eq!(at_once["ledger"], once["ledger"]);
+        // Three stations: of visibilities each hears a third, here and there; of the rest all of it.
+        for station in 0..3 {
+            let hears = |packet: &Vec<u8>| {
+                let (apid, count) = identity(packet);
+                apid != VISIBILITIES || (count.wrapping_mul(2_654_435_761) >> 7) % 3 == station
+            };
+            let heard: Vec<Vec<u8>> = packets(&file).into_iter().filter(hears).collect();
+            let heard = place.file(&format!("{station}.ccsds"), &heard.concat());
+            place.replay(&format!("{station}"), &[&heard], &reach);
+            place.replay(&format!("{station} at once"), &[&heard], &["--wait-bytes", "0"]);
+        }
+        let orders = [["0", "1", "2"], ["2", "0", "1"], ["1", "2", "0"]];
+        for (k, order) in orders.iter().enumerate() {
+            // What waits for what others have heard goes on in its order: the bits of one ground that heard all.
+            let out = format!("merged {k}");
+            succeed(&strs(&merge(&place, order, &out)));
+            assert!(place.bytes(&out) == place.bytes("once"), "{engine}, {order:?}");
+            // Of states that do not wait the sums are added: all else is the same.
+            let out = format!("merged at once {k}");
+            let states = order.map(|station| format!("{station} at once"));
+            succeed(&strs(&merge(&place, &states.each_ref().map(String::as_str), &out)));
+            assert!(place.head(&out) == place.head("at-once"), "{engine}, {order:?}");
+            place.replay(&out, &[&file], &[]);
+            assert_same_maps(&place, engine, &out, "once");
+        }
+    }
+}
+
+#[test]
+fn states_of_the_same_visibilities_are_refused() {
+    let place = Ground::new();
+    let file = place.downlink();
+    let states = [("first", 41..1000, "0"), ("second", 0..30, "0")];
+    for (name, lost, wait) in states {
+        let path = place.file(&format!("{name}.ccsds"), &leave_out(&file, lost));
+        place.replay(name, &[&path], &["--wait-bytes", wait]);
+    }
+    let said = fail(&strs(&merge(&place, &["first", "second"], "more")));
+    assert!(said.contains("count 30 is in the sums of both"), "{said}");
+    let said = fail(&strs(&merge(&place, &["first", "second"], "first")));
+    assert!(said.contains("is in the sums of both") || said.contains("holds a state already"), "{said}");
+    // What one has read and the other lets wait is taken once.
+    let path = place.file("third.ccsds", &leave_out(&file, 0..30));
+    place.replay("third", &[&path], &["--wait-bytes", "10000000"]);
+    succeed(&strs(&merge(&place, &["first", "third"], "both")));
+    assert_eq!(place.gaps("both")["gaps"].as_array().unwrap().len(), 0);
+}
