@@ -16,7 +16,7 @@ use super::kind::Kind;
 use super::receiver::{Event, Packet};
 use super::taken::Taken;
 use super::waiting::{Waiting, WaitingPacket};
-use crate::frames::GroundFrame;
+use crate::frames::{GroundFrame, Instrument};
 
 /// Packets wait for an instrument description until there are so many times the bytes that wait otherwise.
 const PATIENCE: u64 = 4;
@@ -235,6 +235,12 @@ impl Collector {
                 gaps.fold((0, 0), |(n, sum), gap| (n + 1, sum + gap.end - gap.start));
         }
         counters
+    }
+
+    /// The instrument that it knows.
+    #[must_use]
+    pub fn instrument(&self) -> Option<&Instrument> {
+        self.decoder.instrument()
     }
 
     fn knows_instrument(&self) -> bool {

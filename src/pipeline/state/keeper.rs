@@ -10,7 +10,7 @@ use super::journal::JournalEntry;
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::Calibrator;
 use crate::downlink::{Collector, PacketHeader};
-use crate::frames::GroundFrame;
+use crate::frames::{GroundFrame, Instrument};
 use crate::pipeline::config::Config;
 use crate::pipeline::ground::GroundOutcome;
 use crate::runtime::{Outlet, Stage, Units};
@@ -119,6 +119,12 @@ impl Keeper {
         self.journal.extend(part.journal);
         self.notes.extend(part.notes);
         Ok(())
+    }
+
+    /// The instrument that it knows.
+    #[must_use]
+    pub fn instrument(&self) -> Option<&Instrument> {
+        self.collector.instrument()
     }
 
     /// Packets of visibilities in its sums.
