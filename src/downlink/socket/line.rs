@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::account::Ended;
+use crate::downlink::cadu::FrameCounters;
 use crate::downlink::config::Format;
 use crate::downlink::counters::ReceptionCounters;
 use crate::downlink::decoder::Decoder;
@@ -90,7 +91,9 @@ impl Line {
 
     /// Whether a sound packet or frame has come since the last look.
     fn look_for_signs(&mut self) -> bool {
-        let frames = self.intake.frames().map_or(0, |frames| frames.frames);
+        // A block of equal octets is a codeword too, and so is a stream of nothing but markers: it has to be a frame.
+        let ours = |frames: FrameCounters| frames.frames - frames.frames_foreign - frames.frames_malformed;
+        let frames = self.intake.frames().map_or(0, ours);
         let signs = self.packets + self.grouped + self.packets_refused + frames;
         let alive = signs > self.signs;
         if alive {
