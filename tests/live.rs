@@ -602,9 +602,10 @@ fn steps_are_passes_or_times() {
     for (name, file) in [("plain", &plain), ("coded", &coded)] {
         step(&place, name, file, "pass", passes);
         assert!(place.maps(name) == place.maps("read"), "{name}");
-        let said = step(&place, name, file, "pass", 2);
+        let begun = format!("{name}.three");
+        let said = step(&place, &begun, file, "pass", 2);
         assert_eq!(said.matches("Enter goes on").count(), 3, "{said}");
-        assert!(place.maps(name) == place.maps("three.out"), "{name}");
+        assert!(place.maps(&begun) == place.maps("three.out"), "{name}");
     }
     // Steps of a tenth of the time, and a little more: nine marks on the way.
     let times = times(&plain);
