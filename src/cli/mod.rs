@@ -165,6 +165,14 @@ fn report(error: &(dyn std::error::Error + 'static)) {
     }
 }
 
+/// A time that may be given: seconds, not negative and not beyond 30 years.
+fn not_negative_s(text: &str) -> Result<f64, String> {
+    match text.trim().parse::<f64>() {
+        Ok(value) if (0.0..=1e9).contains(&value) => Ok(value),
+        _ => Err("expected seconds from 0 to 1e9".into()),
+    }
+}
+
 /// Prints one JSON object on a line of its own.
 fn print_json_line(value: &impl serde::Serialize) -> Result<(), CommandError> {
     let mut out = std::io::stdout().lock();

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::CommandError;
+use crate::downlink::socket::ListenStatus;
 use crate::pipeline::Watched;
 use crate::runtime::Cancel;
 use crate::solve::Solving;
@@ -68,6 +69,8 @@ impl Drop for Progress {
 struct Shown {
     bar: Option<ProgressBar>,
     total: u64,
+    /// Bytes of all senders at the last look, and when that was.
+    received: (u64, Instant),
     since: Instant,
     /// The solution on view: its number, when it was first seen, and its residual then.
     solution: Option<(u64, Instant, f64)>,
@@ -84,7 +87,8 @@ impl Shown {
             let style = ProgressStyle::with_template(template);
             ProgressBar::new(total).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
         });
-        Self { bar, total, since: Instant::now(), solution: None }
+        let now = Instant::now();
+        Self { bar, total, received: (0, now), since: now, solution: None }
     }
 
     /// What is being solved, and how long it will take if the residual goes on falling as it has.
@@ -104,6 +108,19 @@ impl Shown {
         format!("{what}: step {iteration}, residual {residual:.1e} of {target:.0e}{left}")
     }
 
+    /// Who sends, how fast, and what waits.
+    fn senders(&mut self, status: &ListenStatus) -> String {
+        let ((before, since), bytes) = (self.received, status.bytes());
+        self.received = (bytes, Instant::now());
+        let rate = (bytes - before) as f64 / since.elapsed().as_secs_f64().max(1e-3);
+        format!(
+            "{} senders, {:.2} MB/s, {:.2} MB waiting",
+            status.open(),
+            1e-6 * rate,
+            1e-6 * status.backlog_bytes() as f64
+        )
+    }
+
     fn show(&mut self, watched: &Watched, stage: &str) {
         let stages = watched.metrics.snapshot();
         let done = stages.iter().find(|s| s.name == stage).map_or(0, |s| s.items_in.saturating_sub(1));
@@ -112,6 +129,9 @@ impl Shown {
             .filter(|s| !s.units.name.is_empty() && s.units.count > 0)
             .map(|s| format!("{} {} {}", s.name, s.units.count, s.units.name))
             .collect();
+        if let Some(listening) = &watched.listening {
+            message.insert(0, self.senders(&listening.status));
+        }
         if let Some(solving) = watched.solving.now() {
             message.push(self.solution(&solving));
         }

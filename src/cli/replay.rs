@@ -2,25 +2,36 @@
 
 use std::path::PathBuf;
 
-use clap::Args;
+use clap::{ArgGroup, Args};
+use crossbeam_channel::{Receiver, bounded};
 
 use super::progress::{Progress, cancel_on_interrupt};
-use super::{CommandError, CommandResult, Outcome, print_json_line, print_text};
-use crate::downlink::FileSource;
+use super::{CommandError, CommandResult, Outcome, not_negative_s, print_json_line, print_text};
+use crate::downlink::socket::{SocketError, SocketSource, TcpUrl, Until};
+use crate::downlink::{FileSource, Pace, Paced, Steps};
 use crate::pipeline::state::{Keeper, WAIT_BYTES};
-use crate::pipeline::{ConfigSource, replay, use_threads};
+use crate::pipeline::{
+    Config, ConfigSource, GroundSource, PipelineError, READ, Receiving, Summary, replay, use_threads,
+};
+use crate::runtime::Cancel;
 use crate::units::constants::DAY_S;
 
-/// Make maps from downlink files alone.
+/// Bytes that packets wait for those before them where several senders are listened to and nothing is kept.
+const WAIT_BYTES_LIVE: u64 = 1 << 20;
+
+/// Make maps from downlink files, or from stations that send, alone.
 ///
-/// Takes everything from the files: instrument, positions, visibilities. Lost, damaged and unusable
+/// Takes everything from the downlink: instrument, positions, visibilities. Lost, damaged and unusable
 /// data is counted in the ledger. A map file is a pipeline file of which only the sections calibration,
-/// map, products and runtime are used, so the file that made a simulation serves as it is; replaying it
-/// gives, bit for bit, the maps that `lunarray run` gives.
+/// map, products, runtime and downlink.listen are used, so the file that made a simulation serves as it is;
+/// replaying it gives, bit for bit, the maps that `lunarray run` gives.
 #[derive(Debug, Args)]
+#[command(group(ArgGroup::new("ordered").args(["state", "listen"]).multiple(true)))]
+#[command(group(ArgGroup::new("live").args(["follow", "listen"])))]
+#[command(group(ArgGroup::new("pace").args(["speed", "step"])))]
 pub(super) struct ReplayArgs {
     /// Downlink files, in the order of time.
-    #[arg(required_unless_present = "state", value_name = "FILE")]
+    #[arg(required_unless_present_any = ["state", "listen"], value_name = "FILE")]
     files: Vec<PathBuf>,
     /// How to make the maps; the embedded quicklook's settings if not given.
     #[arg(long, value_name = "MAP.toml")]
@@ -35,16 +46,34 @@ pub(super) struct ReplayArgs {
     /// Visibilities between two checkpoints of the state; there is one at the end in any case.
     #[arg(long, value_name = "NUMBER", default_value_t = 1_000_000, requires = "state")]
     checkpoint_every: u64,
-    /// Bytes of packets that may wait for missing ones sent before them, or for positions, to be applied in order;
-    /// of a new state, an old one keeps its own.
-    #[arg(long, value_name = "BYTES", default_value_t = WAIT_BYTES, requires = "state")]
-    wait_bytes: u64,
+    /// Bytes of packets that may wait for missing ones sent before them, or for positions, to be applied in order:
+    /// 256 MiB of a new state, an old one keeps its own; 1 MiB when listening without a state.
+    #[arg(long, value_name = "BYTES", requires = "ordered")]
+    wait_bytes: Option<u64>,
     /// Read on in the last FILE as it grows, until Ctrl-C, which leaves maps of the data so far.
     #[arg(long, requires = "files")]
     follow: bool,
-    /// Seconds without growth after which a followed file is taken to be whole; 0 for never.
-    #[arg(long, value_name = "SECONDS", default_value_t = 0.0, requires = "follow")]
+    /// Take the downlink from senders that connect here, instead of files, until Ctrl-C; port 0 chooses one.
+    /// Standard error says `listening on tcp://HOST:PORT`.
+    #[arg(long, value_name = "tcp://HOST:PORT", conflicts_with_all = ["files", "pace"])]
+    listen: Option<TcpUrl>,
+    /// Listen on an address that other machines can reach. Whoever connects can add to the maps.
+    #[arg(long, requires = "listen")]
+    allow_remote: bool,
+    /// End after so many connections that gave packets have been closed; 0 for never.
+    #[arg(long, value_name = "NUMBER", default_value_t = 0, requires = "listen")]
+    connections: u64,
+    /// Seconds without growth after which a followed file is taken to be whole, or without a sound packet from anyone
+    /// after which listening ends; 0 for never.
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.0, requires = "live", value_parser = not_negative_s)]
     idle_s: f64,
+    /// How many times as fast as it was sent a FILE is replayed, by the times of its packets: a number, or max.
+    #[arg(long, value_name = "max|NUMBER", default_value = "max", value_parser = speed)]
+    speed: Speed,
+    /// Replay step by step, a pass or so much mission time each (a number with s, h or d): each line of standard
+    /// input is a step, its end ends the replay.
+    #[arg(long, value_name = "pass|TIME", value_parser = step)]
+    step: Option<Step>,
     /// Mission time between snapshot maps: a number with s, h or d, such as 7d; 0 for a final map alone.
     #[arg(long, value_name = "TIME", value_parser = seconds)]
     snapshot_every: Option<f64>,
@@ -54,6 +83,32 @@ pub(super) struct ReplayArgs {
     /// Print the summary as one JSON object instead of tables.
     #[arg(long)]
     json: bool,
+}
+
+/// How fast to replay; `None` for as fast as possible.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Speed(Option<f64>);
+
+/// Mission time of a step, s; `None` for a pass.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Step(Option<f64>);
+
+fn speed(text: &str) -> Result<Speed, String> {
+    match (text.trim(), text.trim().parse::<f64>()) {
+        ("max", _) => Ok(Speed(None)),
+        (_, Ok(times)) if (1e-3..=1e12).contains(&times) => Ok(Speed(Some(times))),
+        _ => Err("expected max, or a number of times real time from 0.001 to 1e12".into()),
+    }
+}
+
+fn step(text: &str) -> Result<Step, String> {
+    match text.trim() {
+        "pass" => Ok(Step(None)),
+        text => match seconds(text) {
+            Ok(every_s) if every_s > 0.0 => Ok(Step(Some(every_s))),
+            _ => Err("expected pass, or a number above 0 with s, h or d, such as 1d".into()),
+        },
+    }
 }
 
 /// Seconds from a text such as `7d`, `12h`, `90s` or `90`.
@@ -79,27 +134,24 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     let config = ConfigSource { file: args.map.clone(), overrides, seed: None }.load_ground()?;
     use_threads(&config.runtime)?;
     let keeper = match &args.state {
-        Some(folder) => Some(Keeper::open(folder, &config, args.wait_bytes, args.checkpoint_every)?),
+        Some(folder) => {
+            let wait_bytes = args.wait_bytes.unwrap_or(WAIT_BYTES);
+            Some(Keeper::open(folder, &config, wait_bytes, args.checkpoint_every)?)
+        }
         None => None,
     };
     for note in keeper.iter().flat_map(Keeper::notes) {
         eprintln!("note: {note}");
     }
-    let files = match args.follow {
-        true => FileSource::follow(&args.files, args.idle_s)?,
-        false => FileSource::open(&args.files)?,
+    let summary = match &args.listen {
+        Some(url) => from_senders(args, url, &config, keeper)?,
+        None => from_files(args, &config, keeper)?,
     };
-    let cancel = cancel_on_interrupt()?;
-    let mut progress = None;
-    let summary = replay(files, &config, keeper, &args.out, &cancel, &mut |metrics| {
-        progress = Some(Progress::watch(metrics, "read", 0));
-    })?;
-    drop(progress);
     if summary.channels.is_empty() && !summary.cancelled {
         let files: Vec<String> = args.files.iter().map(|file| file.display().to_string()).collect();
+        let from = summary.listening.as_ref().map_or(files.join(", "), |listening| listening.address.clone());
         let error = format!(
-            "{}: no visibility could be used; see the ledger in {} and `lunarray inspect`\n{}",
-            files.join(", "),
+            "{from}: no visibility could be used; see the ledger in {} and `lunarray inspect`\n{}",
             args.out.join("summary.json").display(),
             summary.ledger
         );
@@ -113,9 +165,78 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     Ok(if summary.cancelled { Outcome::Interrupted } else { Outcome::Done })
 }
 
+fn from_senders(
+    args: &ReplayArgs,
+    url: &TcpUrl,
+    config: &Config,
+    keeper: Option<Keeper>,
+) -> Result<Summary, CommandError> {
+    let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
+    let until = Until { idle_s: args.idle_s, connections: args.connections };
+    let source = SocketSource::bind(&addresses, &config.downlink.listen, until)
+        .map_err(|error| match error {
+            SocketError::Listen { source, .. } => SocketError::Listen { url: url.clone(), source },
+            other => other,
+        })?
+        .knowing(keeper.as_ref().and_then(Keeper::instrument).cloned())
+        .telling(Box::new(|note| eprintln!("note: {note}")));
+    let cancel = cancel_on_interrupt()?;
+    eprintln!("listening on {}", source.url());
+    let receiving = match keeper {
+        Some(keeper) => Receiving::Kept(Box::new(keeper)),
+        None => Receiving::InOrder { wait_bytes: args.wait_bytes.unwrap_or(WAIT_BYTES_LIVE) },
+    };
+    Ok(watched(source, args, config, receiving, &cancel)?)
+}
+
+fn from_files(args: &ReplayArgs, config: &Config, keeper: Option<Keeper>) -> Result<Summary, CommandError> {
+    let files = match args.follow {
+        true => FileSource::follow(&args.files, args.idle_s)?,
+        false => FileSource::open(&args.files)?,
+    };
+    let cancel = cancel_on_interrupt()?;
+    let receiving = keeper.map_or(Receiving::AsTheyCome, |keeper| Receiving::Kept(Box::new(keeper)));
+    let pace = match (args.step, args.speed) {
+        (Some(Step(every_s)), _) => {
+            let tell = Box::new(|note: &str| eprintln!("{note}"));
+            Pace::Steps(Steps { every_s, go: lines_of_input(), tell })
+        }
+        (None, Speed(Some(times))) => Pace::Speed(times),
+        (None, Speed(None)) => return Ok(watched(files, args, config, receiving, &cancel)?),
+    };
+    Ok(watched(Paced::new(files, pace), args, config, receiving, &cancel)?)
+}
+
+fn watched<S: GroundSource + 'static>(
+    source: S,
+    args: &ReplayArgs,
+    config: &Config,
+    receiving: Receiving,
+    cancel: &Cancel,
+) -> Result<Summary, PipelineError> {
+    let mut progress = None;
+    replay(source, config, receiving, &args.out, cancel, &mut |watched| {
+        progress = Some(Progress::watch(watched, READ, 0));
+    })
+}
+
+/// A message for each line of standard input, until its end.
+fn lines_of_input() -> Receiver<()> {
+    let (say, go) = bounded(0);
+    // The thread ends with the input or the process: nothing else can end its reading.
+    std::thread::spawn(move || {
+        for line in std::io::stdin().lines() {
+            if line.is_err() || say.send(()).is_err() {
+                return;
+            }
+        }
+    });
+    go
+}
+
 #[cfg(test)]
 mod tests {
-    use super::seconds;
+    use super::*;
 
     #[test]
     fn times_have_units() {
@@ -126,5 +247,15 @@ mod tests {
         for text in ["", "d", "-1d", "infd", "7w", "NaN"] {
             assert!(seconds(text).is_err(), "{text}");
         }
+    }
+
+    #[test]
+    fn paces_are_read() {
+        assert_eq!(speed("max"), Ok(Speed(None)));
+        assert_eq!(speed("1000"), Ok(Speed(Some(1000.0))));
+        assert_eq!(step("pass"), Ok(Step(None)));
+        assert_eq!(step("1d"), Ok(Step(Some(DAY_S))));
+        assert!(["0", "-1", "inf", "NaN", "fast"].iter().all(|text| speed(text).is_err()));
+        assert!(["0", "-1d", "file.ccsds", ""].iter().all(|text| step(text).is_err()));
     }
 }

@@ -17,7 +17,7 @@ use super::kind::Kind;
 use super::receiver::Event;
 use super::taken::Taken;
 use super::waiting::{Waiting, WaitingPacket};
-use crate::frames::{GroundFrame, VisibilityBlock};
+use crate::frames::{GroundFrame, Instrument, VisibilityBlock};
 use crate::units::MissionTime;
 
 /// What a collector knows, for another to go on with.
@@ -314,6 +314,12 @@ impl Collector {
                 gaps.fold((0, 0), |(n, sum), gap| (n + 1, sum + gap.end - gap.start));
         }
         counters
+    }
+
+    /// The instrument that it knows.
+    #[must_use]
+    pub fn instrument(&self) -> Option<&Instrument> {
+        self.decoder.instrument()
     }
 
     fn knows_instrument(&self) -> bool {

@@ -6,6 +6,7 @@ use super::cadu::{CaduEncoder, INTERLEAVES, ReedSolomon};
 use super::error::DownlinkError;
 use super::header::PACKET_BYTES_MAX;
 use super::link::LinkConfig;
+use super::socket::ListenConfig;
 
 /// Least packet that holds headers and more than one record of any kind.
 const PACKET_BYTES_MIN: usize = 256;
@@ -43,6 +44,8 @@ pub struct DownlinkConfig {
     pub idle_frames: u32,
     /// Faults of the link; none unless asked for.
     pub link: LinkConfig,
+    /// Limits of a ground that listens.
+    pub listen: ListenConfig,
 }
 
 impl Default for DownlinkConfig {
@@ -56,6 +59,7 @@ impl Default for DownlinkConfig {
             spacecraft_id: 0x4C,
             idle_frames: 2,
             link: LinkConfig::default(),
+            listen: ListenConfig::default(),
         }
     }
 }

@@ -170,6 +170,21 @@ impl ReceptionCounters {
         combine(&mut self.visibilities_foreign, other.visibilities_foreign);
     }
 
+    /// Adds what a stream held besides sound packets: garbage, damage, a cut end, and the account of its frames.
+    pub(super) fn add_stream(&mut self, other: &Self) {
+        self.bytes += other.bytes_garbage + other.bytes_truncated + other.bytes_damaged;
+        self.bytes_garbage += other.bytes_garbage;
+        self.garbage_stretches += other.garbage_stretches;
+        self.bytes_truncated += other.bytes_truncated;
+        self.bytes_damaged += other.bytes_damaged;
+        for kind in Kind::ALL {
+            self.kind_mut(kind).damaged += other.kind(kind).damaged;
+        }
+        if let Some(frames) = &other.frames {
+            self.frames.get_or_insert_default().add(frames);
+        }
+    }
+
     /// Good packets of all kinds.
     #[must_use]
     pub fn packets(&self) -> u64 {

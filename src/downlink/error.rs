@@ -92,6 +92,9 @@ pub enum DownlinkError {
         /// Kind.
         kind: super::kind::Kind,
     },
+    /// A socket.
+    #[error(transparent)]
+    Socket(#[from] super::socket::SocketError),
     /// A downlink that was to be damaged and already is.
     #[error(
         "at byte {offset}: no sound frame or packet; expected a whole downlink, as `lunarray simulate` writes it"

@@ -105,6 +105,13 @@ impl Intake {
         self.bytes
     }
 
+    /// Memory taken for the stream, bytes.
+    #[must_use]
+    pub fn held_bytes(&self) -> usize {
+        let chunks = self.chunk.capacity() + self.recovered.capacity();
+        self.packets.held_bytes() + self.frames.held_bytes() + chunks
+    }
+
     /// The format, once it is known.
     #[must_use]
     pub fn format(&self) -> Option<Format> {

@@ -10,6 +10,7 @@
 //! | either of the two | | [`Intake`] |
 //! | every packet once, in order, across files and sessions | | [`Collector`] |
 //! | file | | [`DownlinkWriter`], [`DownlinkReader`], [`Contents`] |
+//! | socket | | [`socket`] |
 //!
 //! The frame layer takes the bytes that [`Packetizer::encode`] appends and hands what it recovers to
 //! [`Receiver::push`]. Idle packets are its own affair and never reach the receiver.
@@ -54,10 +55,12 @@ mod header;
 mod intake;
 mod kind;
 pub mod link;
+mod pace;
 mod packetizer;
 mod payload;
 mod receiver;
 mod sequence;
+pub mod socket;
 mod stages;
 mod taken;
 mod transmission;
@@ -74,6 +77,7 @@ pub use file::{DownlinkReader, DownlinkWriter};
 pub use header::{FORMAT_VERSION, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, Segment, TRAILER_BYTES};
 pub use intake::Intake;
 pub use kind::{APID_BASE, Kind};
+pub use pace::{Pace, Paced, Steps};
 pub use packetizer::Packetizer;
 pub use payload::{NODES_MIN, PayloadFault};
 pub use receiver::{Event, Packet, Receiver};

@@ -199,6 +199,12 @@ impl Receiver {
         self.offset + self.end as u64
     }
 
+    /// Memory taken for bytes of the stream.
+    #[must_use]
+    pub fn held_bytes(&self) -> usize {
+        self.buffer.capacity()
+    }
+
     /// The next event; `None` until more bytes come, or when all is said.
     pub fn next_event(&mut self) -> Option<Event<'_>> {
         if self.steps.is_empty() {

@@ -21,7 +21,7 @@ pub const QUICKLOOK: &str = include_str!("../../pipelines/quicklook.toml");
 /// A whole pipeline: what is in the sky, what flies, and what the ground makes of it.
 ///
 /// Sections stand in the order in which data passes. A ground segment reads `calibration`, `map`,
-/// `products` and `runtime` only.
+/// `products` and `runtime` only, and `downlink.listen` where it listens.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
@@ -226,7 +226,8 @@ impl Config {
     /// Everything that is wrong with the ground segment's sections; empty if they are good.
     #[must_use]
     pub fn ground_problems(&self) -> Problems {
-        let mut found = boxed(self.calibration.problems());
+        let mut found = boxed(self.downlink.listen.problems());
+        found.extend(boxed(self.calibration.problems()));
         found.extend(boxed(self.map.problems()));
         found.extend(boxed(self.products.problems()));
         found.extend(boxed(self.runtime.problems()));

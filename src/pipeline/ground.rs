@@ -8,11 +8,26 @@ use super::error::PipelineError;
 use super::state::Keeper;
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::Calibrator;
+use super::gathering::Gathering;
 use crate::downlink::{Reception, ReceptionCounters};
+use crate::frames::GroundFrame;
 use crate::products::{ChannelSummary, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Ledger, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::solve::{SolveWatch, Solver, SolverSetup, StoppingRule};
+
+/// How packets are taken.
+pub enum Receiving {
+    /// From one stream, as they come.
+    AsTheyCome,
+    /// From any number of senders: every packet once, and in the order of sending among so many bytes of later ones.
+    InOrder {
+        /// Bytes that packets wait for those before them.
+        wait_bytes: u64,
+    },
+    /// As [`Receiving::InOrder`], and kept for later sessions.
+    Kept(Box<Keeper>),
+}
 
 /// What the ground segment leaves behind besides its files.
 #[derive(Clone, Debug, Default)]
@@ -27,7 +42,6 @@ pub struct GroundOutcome {
 
 /// Adds the ground segment to `graph`. It takes the bytes of a downlink and nothing else from space;
 /// `truth`, if any, only serves to compare the maps with; `watch` follows solutions.
-/// With a `keeper`, what has been received is kept for later sessions.
 ///
 /// # Errors
 /// Calibration or prior maps that cannot be read.
@@ -37,9 +51,12 @@ pub fn add(
     config: &Config,
     out: &Path,
     (truth, watch): (Truth, SolveWatch),
-    keeper: Option<Keeper>,
+    receiving: Receiving,
 ) -> Result<GroundOutcome, PipelineError> {
-    let outcome = keeper.as_ref().map(Keeper::outcome).unwrap_or_default();
+    let outcome = match &receiving {
+        Receiving::Kept(keeper) => keeper.outcome(),
+        _ => GroundOutcome::default(),
+    };
     let setup = SolverSetup {
         epsilon: config.map.epsilon.clone(),
         prior_k: config.map.prior_k.clone(),
@@ -59,25 +76,33 @@ pub fn add(
         Arc::clone(&outcome.channels),
     )?;
     // Sums are large: one waits while another is solved.
-    let sums = match keeper {
-        Some(keeper) => graph.stage("keep", 1, bytes, keeper),
-        None => add_sums(graph, bytes, config, &outcome)?,
+    let capacity = config.runtime.queue_capacity;
+    let account = Arc::clone(&outcome.reception);
+    let sums = match receiving {
+        Receiving::Kept(keeper) => graph.stage("keep", 1, bytes, *keeper),
+        Receiving::AsTheyCome => {
+            let frames = graph.stage("receive", capacity, bytes, Reception::new(account));
+            add_sums(graph, frames, config, &outcome)?
+        }
+        Receiving::InOrder { wait_bytes } => {
+            let frames = graph.stage("receive", capacity, bytes, Gathering::new(wait_bytes, account));
+            add_sums(graph, frames, config, &outcome)?
+        }
     };
     let maps = graph.stage("solve", 1, sums, Solver::new(setup));
     graph.sink("publish", maps, publisher);
     Ok(outcome)
 }
 
-/// The stages from bytes to sums, when nothing is kept.
+/// The stages from frames to sums, when nothing is kept.
 fn add_sums(
     graph: &mut Graph,
-    bytes: Link<Vec<u8>>,
+    frames: Link<GroundFrame>,
     config: &Config,
     outcome: &GroundOutcome,
 ) -> Result<Link<Snapshot>, PipelineError> {
     let capacity = config.runtime.queue_capacity;
     let calibration = config.calibration.build(Path::new(""))?;
-    let frames = graph.stage("receive", capacity, bytes, Reception::new(Arc::clone(&outcome.reception)));
     let calibrator =
         Calibrator::new(calibration, outcome.ledger.clone()).with_van_vleck(config.calibration.van_vleck()?);
     let placed = graph.stage("calibrate", capacity, frames, calibrator);

@@ -7,6 +7,7 @@ mod config;
 mod cost;
 mod engine_cost;
 mod error;
+mod gathering;
 mod ground;
 mod models;
 mod plan;
@@ -20,8 +21,11 @@ pub use bench::{BENCH_STAGES, Bench, BenchSettings, Machine, Rate, bench, bench_
 pub use config::{Config, ConfigError, ConfigSource, Problems, QUICKLOOK};
 pub use cost::{ChannelCost, Cost};
 pub use error::PipelineError;
+pub use ground::Receiving;
 pub use plan::{Expected, Plan};
-pub use run::{Watched, Watcher, downlink_file, replay, run, simulate, use_threads};
+pub use run::{
+    Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, simulate, use_threads,
+};
 pub use sampling::{SampleCounts, sample_stages};
 pub use space::INTEGRATE;
 pub use summary::{Segment, Summary};

@@ -1,21 +1,21 @@
 //! Running pipelines: the whole chain, the space segment alone, the ground segment alone.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
 use super::config::Config;
 use super::error::PipelineError;
-use super::ground::{self, GroundOutcome};
+use super::ground::{self, GroundOutcome, Receiving};
 use super::plan::Plan;
 use super::space;
-use super::state::Keeper;
 use super::summary::{Segment, Summary};
 use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
-use crate::downlink::{FileSource, Format, Recorder};
+use crate::downlink::socket::{Listening, SocketError, SocketSink, SocketSource};
+use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
 use crate::products::{ProductsError, Truth};
-use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig};
+use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::solve::SolveWatch;
 
 /// What can be watched of a graph while it runs.
@@ -25,10 +25,52 @@ pub struct Watched {
     pub metrics: Arc<Metrics>,
     /// The solution that is being worked on.
     pub solving: SolveWatch,
+    /// The senders, if the ground listens.
+    pub listening: Option<Listening>,
+}
+
+/// Where a ground takes its downlink from.
+pub trait GroundSource: Source<Out = Vec<u8>, Error = DownlinkError> {
+    /// What can be seen of its senders, if it listens.
+    fn listening(&self) -> Option<Listening> {
+        None
+    }
+}
+
+impl GroundSource for FileSource {}
+
+impl<S: GroundSource> GroundSource for Paced<S> {
+    fn listening(&self) -> Option<Listening> {
+        self.source().listening()
+    }
+}
+
+impl GroundSource for SocketSource {
+    fn listening(&self) -> Option<Listening> {
+        Some(SocketSource::listening(self))
+    }
+}
+
+/// Where a spacecraft's downlink goes.
+#[derive(Debug, Default)]
+pub struct Destination {
+    /// A file.
+    pub file: Option<PathBuf>,
+    /// A ground that listens.
+    pub socket: Option<SocketSink>,
+}
+
+impl<P: AsRef<Path>> From<&P> for Destination {
+    fn from(file: &P) -> Self {
+        Self { file: Some(file.as_ref().to_owned()), socket: None }
+    }
 }
 
 /// Whom to tell about a graph that is about to run.
 pub type Watcher<'a> = &'a mut dyn FnMut(Watched);
+
+/// Name of the stage that takes the downlink in.
+pub const READ: &str = "read";
 
 /// Name of the downlink file that `run` leaves among its products, by its format.
 #[must_use]
@@ -60,49 +102,71 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     };
     drop(skies);
     let solving = SolveWatch::new(cancel.clone());
-    let outcome = ground::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()), None)?;
-    let report = start(graph, &plan.config.runtime, (cancel, solving), watch)?;
-    conclude(Segment::Whole, &plan.config, Some(out), report, outcome)
+    let receiving = Receiving::AsTheyCome;
+    let outcome = ground::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()), receiving)?;
+    let watched = Watched { metrics: graph.metrics(), solving, listening: None };
+    let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
+    conclude(Segment::Whole, &plan.config, out, report, (outcome, None))
 }
 
-/// The space segment alone, to a downlink file.
+/// The space segment alone, to a downlink file, a ground that listens, or both.
 ///
 /// # Errors
-/// The first failure of any stage.
+/// The first failure of any stage; a link with faults and no file.
 pub fn simulate(
     plan: &Plan,
-    file: &Path,
+    to: impl Into<Destination>,
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<Report, PipelineError> {
+    let Destination { file, socket } = to.into();
+    if plan.config.downlink.link.is_on() && file.is_none() {
+        return Err(DownlinkError::from(SocketError::TruthNowhere).into());
+    }
     let skies = space::skies(plan)?;
     let mut graph = Graph::new();
-    let bytes = space::add(&mut graph, plan, &skies)?;
+    let mut bytes = space::add(&mut graph, plan, &skies)?;
     drop(skies);
-    let bytes = add_link(&mut graph, bytes, &plan.config, file)?;
-    graph.sink("record", bytes, Recorder::create(file)?);
-    start(graph, &plan.config.runtime, (cancel, SolveWatch::default()), watch)
+    if let Some(file) = &file {
+        bytes = add_link(&mut graph, bytes, &plan.config, file)?;
+    }
+    let recorder = file.as_deref().map(Recorder::create).transpose()?;
+    match (recorder, socket) {
+        (Some(recorder), Some(socket)) => {
+            let bytes = graph.stage("record", plan.config.runtime.queue_capacity, bytes, recorder);
+            graph.sink("send", bytes, socket);
+        }
+        (Some(recorder), None) => graph.sink("record", bytes, recorder),
+        (None, Some(socket)) => graph.sink("send", bytes, socket),
+        // The graph says that its end is open.
+        (None, None) => drop(bytes),
+    }
+    let watched = Watched { metrics: graph.metrics(), solving: SolveWatch::default(), listening: None };
+    start(graph, &plan.config.runtime, cancel, (watched, watch))
 }
 
-/// The ground segment alone, from downlink files; with a `keeper`, on top of what it holds.
+/// The ground segment alone, from downlink files or senders.
 ///
 /// # Errors
 /// A file that cannot be read; the first failure of any stage.
-pub fn replay(
-    files: FileSource,
+pub fn replay<S: GroundSource + 'static>(
+    source: S,
     config: &Config,
-    keeper: Option<Keeper>,
+    receiving: Receiving,
     out: &Path,
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<Summary, PipelineError> {
     make_folder(out)?;
     let mut graph = Graph::new();
-    let bytes = graph.source("read", config.runtime.queue_capacity, files);
+    let listening = source.listening();
+    let bytes = graph.source(READ, config.runtime.queue_capacity, source);
     let solving = SolveWatch::new(cancel.clone());
-    let outcome = ground::add(&mut graph, bytes, config, out, (Truth::unknown(), solving.clone()), keeper)?;
-    let report = start(graph, &config.runtime, (cancel, solving), watch)?;
-    conclude(Segment::Ground, config, Some(out), report, outcome)
+    let watching = (Truth::unknown(), solving.clone());
+    let outcome = ground::add(&mut graph, bytes, config, out, watching, receiving)?;
+    let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone() };
+    let report = start(graph, &config.runtime, cancel, (watched, watch))?;
+    conclude(Segment::Ground, config, out, report, (outcome, listening))
 }
 
 /// The link's faults, if any are asked for; the truth about them goes beside the downlink file.
@@ -127,27 +191,30 @@ fn make_folder(out: &Path) -> Result<(), PipelineError> {
 fn start(
     graph: Graph,
     config: &RuntimeConfig,
-    (cancel, solving): (&Cancel, SolveWatch),
-    watch: Watcher<'_>,
+    cancel: &Cancel,
+    (watched, watch): (Watched, Watcher<'_>),
 ) -> Result<Report, PipelineError> {
-    watch(Watched { metrics: graph.metrics(), solving });
+    watch(watched);
     Ok(graph.run(cancel, Duration::from_secs_f64(config.shutdown_s))?)
 }
 
 fn conclude(
     segment: Segment,
     config: &Config,
-    out: Option<&Path>,
+    out: &Path,
     report: Report,
-    outcome: GroundOutcome,
+    (outcome, listening): (GroundOutcome, Option<Listening>),
 ) -> Result<Summary, PipelineError> {
-    let reception = outcome.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let mut reception = outcome.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = outcome.channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let ledger = outcome.ledger.close()?;
-    let summary = Summary::new(segment, config, report, ledger, reception, channels);
-    if let Some(out) = out {
-        summary.write(out)?;
+    let listening = listening.map(|listening| listening.account());
+    if let Some(account) = &listening {
+        account.complete(&mut reception);
     }
+    let mut summary = Summary::new(segment, config, report, ledger, reception, channels);
+    summary.listening = listening;
+    summary.write(out)?;
     Ok(summary)
 }
 

@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::config::Config;
 use crate::downlink::ReceptionCounters;
+use crate::downlink::socket::ListenAccount;
 use crate::files::write_atomically;
 use crate::products::{ChannelSummary, ProductsError};
 use crate::runtime::{LedgerReport, Report};
@@ -44,6 +45,9 @@ pub struct Summary {
     pub ledger: LedgerReport,
     /// What was received, and what was wrong with it.
     pub reception: ReceptionCounters,
+    /// The senders, if the ground listened.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub listening: Option<ListenAccount>,
     /// Stages: throughput, times, queues.
     pub report: Report,
 }
@@ -70,6 +74,7 @@ impl Summary {
             channels,
             ledger,
             reception,
+            listening: None,
             report,
         }
     }
@@ -91,6 +96,9 @@ impl fmt::Display for Summary {
         writeln!(f, "Stages\n{}\n", self.report)?;
         writeln!(f, "Ledger of visibilities\n{}\n", self.ledger)?;
         writeln!(f, "Reception\n{}\n", self.reception)?;
+        if let Some(listening) = &self.listening {
+            writeln!(f, "Senders\n{listening}\n")?;
+        }
         writeln!(f, "Maps")?;
         for channel in &self.channels {
             writeln!(f, "{channel}")?;

@@ -71,6 +71,13 @@ impl Assembler {
         tails.chain(heads).fold((0, 0), |(count, bytes), piece| (count + 1, bytes + piece.len() as u64))
     }
 
+    /// Memory taken, as near as can be told: pieces, and a tree's entries.
+    pub(super) fn held_bytes(&self) -> usize {
+        let entries =
+            self.pieces.len() * size_of::<(u64, Pieces)>() + self.seen.len() * size_of::<(u64, u32)>();
+        self.waiting().1 as usize + 2 * entries
+    }
+
     /// Takes a frame; appends the packets that it completes to `out`.
     pub(super) fn take(
         &mut self,

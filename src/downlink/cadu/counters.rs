@@ -61,6 +61,38 @@ pub struct FrameCounters {
 }
 
 impl FrameCounters {
+    /// Adds the account of another stream; the interleave stays that of the first.
+    pub(in crate::downlink) fn add(&mut self, other: &Self) {
+        self.bytes += other.bytes;
+        self.interleave = if self.interleave == 0 { other.interleave } else { self.interleave };
+        self.frames += other.frames;
+        self.frames_corrected += other.frames_corrected;
+        self.bytes_corrected += other.bytes_corrected;
+        self.frames_uncorrectable += other.frames_uncorrectable;
+        self.frames_foreign += other.frames_foreign;
+        self.frames_malformed += other.frames_malformed;
+        self.frames_idle += other.frames_idle;
+        self.sync_losses += other.sync_losses;
+        self.bits_skipped += other.bits_skipped;
+        self.inversions += other.inversions;
+        self.bytes_truncated += other.bytes_truncated;
+        self.bytes_idle_packets += other.bytes_idle_packets;
+        self.fragments += other.fragments;
+        self.bytes_fragments += other.bytes_fragments;
+        for counts in &other.channels {
+            let known = self.channels.iter_mut().find(|known| known.channel == counts.channel);
+            let Some(known) = known else {
+                self.channels.push(counts.clone());
+                continue;
+            };
+            known.frames += counts.frames;
+            known.gaps += counts.gaps;
+            known.missing += counts.missing;
+            known.late += counts.late;
+            known.duplicates += counts.duplicates;
+        }
+    }
+
     /// Whether nothing is missing and nothing had to be corrected.
     #[must_use]
     pub fn is_sound(&self) -> bool {

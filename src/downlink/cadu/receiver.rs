@@ -84,10 +84,11 @@ impl CaduReceiver {
         self.code.is_some()
     }
 
-    /// Memory taken for bytes of the stream; bounded by twice the greatest chunk and half a megabyte.
+    /// Memory taken: for bytes of the stream, at most twice the greatest chunk and half a megabyte; and for what
+    /// assemblers remember.
     #[must_use]
     pub fn held_bytes(&self) -> usize {
-        self.buffer.capacity()
+        self.buffer.capacity() + self.channels.values().map(Assembler::held_bytes).sum::<usize>()
     }
 
     /// The account so far.

@@ -44,7 +44,7 @@ impl<T> Default for Listing<T> {
 }
 
 impl<T> Listing<T> {
-    fn push(&mut self, entry: T) {
+    pub(super) fn push(&mut self, entry: T) {
         self.count += 1;
         if self.listed.len() < LISTED_MAX {
             self.listed.push(entry);

@@ -11,7 +11,7 @@ use super::settings::{compare, settings_of};
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::Calibrator;
 use crate::downlink::{Collector, Delivery, DownlinkError, Kind, PacketHeader};
-use crate::frames::{GroundFrame, PlacedFrame, PlacedVisibilities, VisibilityBlock};
+use crate::frames::{GroundFrame, Instrument, PlacedFrame, PlacedVisibilities, VisibilityBlock};
 use crate::pipeline::config::Config;
 use crate::pipeline::ground::GroundOutcome;
 use crate::runtime::{Ledger, LedgerReport, Outlet, Stage, Units};
@@ -139,6 +139,12 @@ impl Keeper {
         self.outcome.ledger.post_report(&part.outcome.ledger.report());
         self.notes.extend(part.notes);
         Ok(())
+    }
+
+    /// The instrument that it knows.
+    #[must_use]
+    pub fn instrument(&self) -> Option<&Instrument> {
+        self.collector.instrument()
     }
 
     /// Packets of visibilities in its sums.

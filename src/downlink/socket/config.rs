@@ -1,0 +1,92 @@
+//! What senders may do.
+
+use serde::{Deserialize, Serialize};
+
+use super::error::SocketError;
+
+/// The `[downlink.listen]` section: limits of a ground that listens. Memory for senders stays below
+/// `connections_max` times `memory_bytes_max` and twice 64 KiB, and `backlog_bytes_max`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ListenConfig {
+    /// Connections at a time; others are refused.
+    pub connections_max: usize,
+    /// Time from connecting to the first sound packet or frame, s; 0 for no limit.
+    pub first_packet_s_max: f64,
+    /// Time between sound packets or frames, s; 0 for no limit. Bytes alone are no sign of life.
+    pub idle_s_max: f64,
+    /// Bytes a second that are read from a connection; 0 for no limit. TCP slows the sender to it.
+    pub bytes_per_s_max: f64,
+    /// Bytes of a connection without a sound packet or frame among them.
+    pub garbage_bytes_max: u64,
+    /// Memory for what a connection has begun and not ended, bytes.
+    pub memory_bytes_max: u64,
+    /// Bytes of packets that wait for the ground, of all connections together.
+    pub backlog_bytes_max: u64,
+}
+
+impl Default for ListenConfig {
+    fn default() -> Self {
+        Self {
+            connections_max: 16,
+            first_packet_s_max: 30.0,
+            idle_s_max: 600.0,
+            bytes_per_s_max: 1e8,
+            garbage_bytes_max: 4 << 20,
+            memory_bytes_max: 32 << 20,
+            backlog_bytes_max: 8 << 20,
+        }
+    }
+}
+
+impl ListenConfig {
+    /// Everything that is wrong with the limits; empty if they are good.
+    #[must_use]
+    pub fn problems(&self) -> Vec<SocketError> {
+        let mut found = Vec::new();
+        let mut require = |key, value: f64, good: bool, expected| {
+            if !good {
+                found.push(SocketError::Limit { key, value, expected });
+            }
+        };
+        let Self { connections_max: connections, bytes_per_s_max: rate, .. } = *self;
+        require("connections_max", connections as f64, (1..=1024).contains(&connections), "1 to 1024");
+        for (key, value) in [("first_packet_s_max", self.first_packet_s_max), ("idle_s_max", self.idle_s_max)]
+        {
+            require(key, value, (0.0..=1e9).contains(&value), "0 s to 1e9 s");
+        }
+        let good = rate == 0.0 || (1e3..=1e12).contains(&rate);
+        require("bytes_per_s_max", rate, good, "1e3 to 1e12 bytes a second, or 0 for no limit");
+        for (key, value, least, expected) in [
+            ("garbage_bytes_max", self.garbage_bytes_max, 1 << 16, "65536 to 2^40 bytes"),
+            ("memory_bytes_max", self.memory_bytes_max, 1 << 21, "2097152 to 2^40 bytes"),
+            ("backlog_bytes_max", self.backlog_bytes_max, 1 << 17, "131072 to 2^30 bytes"),
+        ] {
+            let most = if key == "backlog_bytes_max" { 1 << 30 } else { 1 << 40 };
+            require(key, value as f64, (least..=most).contains(&value), expected);
+        }
+        found
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_limit_is_checked() {
+        assert!(ListenConfig::default().problems().is_empty());
+        let bad = ListenConfig {
+            connections_max: 0,
+            first_packet_s_max: -1.0,
+            idle_s_max: f64::NAN,
+            bytes_per_s_max: 5.0,
+            garbage_bytes_max: 0,
+            memory_bytes_max: 0,
+            backlog_bytes_max: u64::MAX,
+        };
+        assert_eq!(bad.problems().len(), 7);
+        let open = ListenConfig { first_packet_s_max: 0.0, idle_s_max: 0.0, bytes_per_s_max: 0.0, ..bad };
+        assert_eq!(open.problems().len(), 4);
+    }
+}

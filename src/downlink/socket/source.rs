@@ -1,0 +1,186 @@
+//! Packets of all senders, as a source.
+
+use std::io;
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use crossbeam_channel::{Receiver, RecvTimeoutError, unbounded};
+use tokio::sync::{Semaphore, watch};
+
+use super::account::Listening;
+use super::config::ListenConfig;
+use super::error::SocketError;
+use super::line::Mission;
+use super::listener::{Delivery, Notes, Shared, Teller, Until, listen};
+use super::url::TcpUrl;
+use crate::downlink::error::DownlinkError;
+use crate::frames::Instrument;
+use crate::runtime::{Flow, Outlet, Source, Units};
+
+/// How long to wait for packets before looking whether the run has been ended.
+const POLL: Duration = Duration::from_millis(100);
+
+/// Listens, and gives whole packets of all senders in the order in which they are found.
+pub struct SocketSource {
+    address: SocketAddr,
+    config: ListenConfig,
+    until: Until,
+    /// Until the run begins.
+    waiting: Option<(std::net::TcpListener, Mission, Teller)>,
+    running: Option<(Receiver<Delivery>, JoinHandle<()>)>,
+    room: Arc<Semaphore>,
+    stop: Arc<watch::Sender<bool>>,
+    listening: Listening,
+    bytes: u64,
+}
+
+impl SocketSource {
+    /// Binds one of the addresses. Senders may connect from now on; they are served when the run begins.
+    ///
+    /// # Errors
+    /// Addresses that cannot be listened on.
+    pub fn bind(addresses: &[SocketAddr], config: &ListenConfig, until: Until) -> Result<Self, SocketError> {
+        let failed = |source| {
+            let none = SocketAddr::from(([0, 0, 0, 0], 0));
+            SocketError::Listen { url: TcpUrl::from(addresses.first().copied().unwrap_or(none)), source }
+        };
+        let bound = std::net::TcpListener::bind(addresses).and_then(|listener| {
+            listener.set_nonblocking(true)?;
+            Ok((listener.local_addr()?, listener))
+        });
+        let (address, listener) = bound.map_err(failed)?;
+        let listening = Listening::default();
+        listening.write().address = TcpUrl::from(address).to_string();
+        Ok(Self {
+            address,
+            config: config.clone(),
+            until,
+            waiting: Some((listener, Mission::default(), Box::new(|_| {}))),
+            running: None,
+            room: Arc::new(Semaphore::new(Shared::room_bytes(config))),
+            stop: Arc::new(watch::Sender::new(false)),
+            listening,
+            bytes: 0,
+        })
+    }
+
+    /// Takes packets of this instrument alone; without it, of the one that is described first.
+    #[must_use]
+    pub fn knowing(mut self, instrument: Option<Instrument>) -> Self {
+        if let Some((_, mission, _)) = &mut self.waiting {
+            *mission = Mission::of(instrument);
+        }
+        self
+    }
+
+    /// Says what becomes of connections; a note at a time.
+    #[must_use]
+    pub fn telling(mut self, tell: Teller) -> Self {
+        if let Some((_, _, teller)) = &mut self.waiting {
+            *teller = tell;
+        }
+        self
+    }
+
+    /// Where it listens; the port is the one that was chosen if none was named.
+    #[must_use]
+    pub fn url(&self) -> TcpUrl {
+        TcpUrl::from(self.address)
+    }
+
+    /// What can be seen of its connections, on the way and at the end.
+    #[must_use]
+    pub fn listening(&self) -> Listening {
+        self.listening.clone()
+    }
+
+    /// Starts the listener's thread.
+    fn start(&mut self) -> Result<(), SocketError> {
+        let Some((listener, mission, tell)) = self.waiting.take() else { return Ok(()) };
+        let failed = |source: io::Error| SocketError::Start { source };
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_io()
+            .enable_time()
+            .max_blocking_threads(self.config.connections_max)
+            .thread_name("listen-work")
+            .build()
+            .map_err(failed)?;
+        let listener = {
+            let _inside = runtime.enter();
+            tokio::net::TcpListener::from_std(listener).map_err(failed)?
+        };
+        // Bounded by the room that deliveries take.
+        let (deliveries, receiver) = unbounded();
+        let shared = Arc::new(Shared {
+            config: self.config.clone(),
+            until: self.until,
+            mission,
+            listening: self.listening.clone(),
+            room: Arc::clone(&self.room),
+            deliveries,
+            stop: Arc::clone(&self.stop),
+            notes: Notes::new(tell),
+            sign: Mutex::new(tokio::time::Instant::now()),
+        });
+        let run = move || runtime.block_on(listen(listener, shared));
+        let thread = std::thread::Builder::new().name("listen-net".to_owned()).spawn(run).map_err(failed)?;
+        self.running = Some((receiver, thread));
+        Ok(())
+    }
+
+    fn give(&mut self, delivery: Delivery, out: &mut Outlet<Vec<u8>>) {
+        self.bytes += delivery.bytes.len() as u64;
+        out.push(delivery.bytes);
+        drop(delivery.room);
+    }
+
+    /// Waits for the listener's thread, which has nothing left to do.
+    fn join(&mut self) -> Result<(), SocketError> {
+        match self.running.take().map(|(_, thread)| thread.join()) {
+            Some(Err(_)) => Err(SocketError::Fallen),
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Source for SocketSource {
+    type Out = Vec<u8>;
+    type Error = DownlinkError;
+
+    fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, DownlinkError> {
+        self.start()?;
+        let Some((receiver, _)) = &self.running else { return Ok(Flow::Done) };
+        match receiver.recv_timeout(POLL) {
+            Ok(delivery) => self.give(delivery, out),
+            Err(RecvTimeoutError::Timeout) => self.listening.status.clear_backlog(),
+            Err(RecvTimeoutError::Disconnected) => {
+                self.join()?;
+                return Ok(Flow::Done);
+            }
+        }
+        Ok(Flow::Continue)
+    }
+
+    /// Reads no further, but hands on what has been read.
+    fn finish(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
+        self.stop.send_replace(true);
+        while let Some(delivery) = self.running.as_ref().and_then(|(receiver, _)| receiver.recv().ok()) {
+            self.give(delivery, out);
+        }
+        Ok(self.join()?)
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.bytes, "bytes")
+    }
+}
+
+impl Drop for SocketSource {
+    /// After a failure elsewhere nobody takes packets any more: whoever waits for room must not wait for ever.
+    fn drop(&mut self) {
+        self.stop.send_replace(true);
+        self.room.close();
+    }
+}

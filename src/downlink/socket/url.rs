@@ -1,0 +1,131 @@
+//! `tcp://HOST:PORT`.
+
+use std::fmt;
+use std::net::{SocketAddr, ToSocketAddrs};
+use std::str::FromStr;
+
+use super::error::SocketError;
+
+/// A place that speaks TCP.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TcpUrl {
+    host: String,
+    port: u16,
+}
+
+impl TcpUrl {
+    /// Its addresses.
+    ///
+    /// # Errors
+    /// A host without any.
+    pub fn addresses(&self) -> Result<Vec<SocketAddr>, SocketError> {
+        let found = (self.host.as_str(), self.port).to_socket_addrs().map(Vec::from_iter);
+        match found {
+            Ok(found) if !found.is_empty() => Ok(found),
+            Ok(_) => {
+                Err(SocketError::Resolve { url: self.clone(), source: std::io::ErrorKind::NotFound.into() })
+            }
+            Err(source) => Err(SocketError::Resolve { url: self.clone(), source }),
+        }
+    }
+
+    /// Its addresses, if all are this machine's own.
+    ///
+    /// # Errors
+    /// [`SocketError::Remote`]; a host without an address.
+    pub fn own_addresses(&self) -> Result<Vec<SocketAddr>, SocketError> {
+        let found = self.addresses()?;
+        match found.iter().all(|address| address.ip().to_canonical().is_loopback()) {
+            true => Ok(found),
+            false => Err(SocketError::Remote { url: self.clone() }),
+        }
+    }
+}
+
+impl From<SocketAddr> for TcpUrl {
+    fn from(address: SocketAddr) -> Self {
+        Self { host: address.ip().to_string(), port: address.port() }
+    }
+}
+
+impl FromStr for TcpUrl {
+    type Err = SocketError;
+
+    fn from_str(text: &str) -> Result<Self, SocketError> {
+        let parse = || {
+            let (host, port) = text.strip_prefix("tcp://")?.rsplit_once(':')?;
+            let port = port.bytes().all(|digit| digit.is_ascii_digit()).then(|| port.parse().ok())??;
+            let host = match host.strip_prefix('[') {
+                Some(rest) => {
+                    rest.strip_suffix(']').filter(|host| host.parse::<std::net::Ipv6Addr>().is_ok())?
+                }
+                None => host,
+            };
+            let bad = |c: char| c.is_whitespace() || c.is_control() || "/@[]?#".contains(c);
+            let of_numbers = text.contains('[');
+            let good = !host.is_empty() && !host.contains(bad) && (of_numbers || !host.contains(':'));
+            good.then(|| Self { host: host.to_owned(), port })
+        };
+        parse().ok_or_else(|| SocketError::Url { text: text.to_owned() })
+    }
+}
+
+impl fmt::Display for TcpUrl {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { host, port } = self;
+        match host.contains(':') {
+            true => write!(f, "tcp://[{host}]:{port}"),
+            false => write!(f, "tcp://{host}:{port}"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn places_are_read_and_written() {
+        for text in
+            ["tcp://127.0.0.1:4711", "tcp://[::1]:0", "tcp://localhost:65535", "tcp://ground.example:1"]
+        {
+            assert_eq!(text.parse::<TcpUrl>().unwrap().to_string(), text);
+        }
+        for text in [
+            "",
+            "127.0.0.1:4711",
+            "tcp://",
+            "tcp://:1",
+            "tcp://host",
+            "tcp://host:",
+            "tcp://host:65536",
+            "tcp://host:+1",
+            "tcp://::1:4711",
+            "tcp://[::1:4711",
+            "tcp://[host]:1",
+            "udp://host:1",
+            "tcp://host:1/",
+            "tcp://a b:1",
+            "tcp://me@host:1",
+        ] {
+            let error = text.parse::<TcpUrl>().unwrap_err().to_string();
+            assert!(error.contains("expected tcp://HOST:PORT") && error.contains(text), "{error}");
+        }
+    }
+
+    #[test]
+    fn only_this_machine_is_its_own() {
+        for (text, own) in [
+            ("tcp://127.0.0.1:1", true),
+            ("tcp://127.9.9.9:1", true),
+            ("tcp://[::1]:1", true),
+            ("tcp://[::ffff:127.0.0.1]:1", true),
+            ("tcp://0.0.0.0:1", false),
+            ("tcp://[::]:1", false),
+            ("tcp://192.0.2.7:1", false),
+            ("tcp://[2001:db8::7]:1", false),
+        ] {
+            assert_eq!(text.parse::<TcpUrl>().unwrap().own_addresses().is_ok(), own, "{text}");
+        }
+    }
+}
