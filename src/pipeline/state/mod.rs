@@ -35,8 +35,8 @@
 //! written anew, so that a damaged one does not bring the packets back.
 //!
 //! # Size
-//! The journal takes some 70 bytes a packet in a checkpoint and 250 in memory: of 26 million visibilities, in packets of
-//! 200 as windows give them, 9 MB and 33 MB a channel, a sixtieth of what came down. Waiting packets take up to
+//! The journal takes some 80 bytes a packet of visibilities in a checkpoint and 250 in memory: of 26 million, in packets
+//! of 215 as windows give them, 10 MB and 30 MB a channel, of 550 MB that came down. Waiting packets take up to
 //! `wait_bytes` in either. The set of packets that have come grows with the number of gaps alone; positions of
 //! 8192 windows, more than two years, take 72 MB.
 //!
