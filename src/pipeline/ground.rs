@@ -69,7 +69,7 @@ pub fn add(
 }
 
 /// The stages from bytes to sums, when nothing is kept.
-fn add_sums(
+pub(super) fn add_sums(
     graph: &mut Graph,
     bytes: Link<Vec<u8>>,
     config: &Config,
