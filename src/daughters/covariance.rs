@@ -230,7 +230,8 @@ impl Plan {
         let stride = (2 * self.nodes).next_multiple_of(COLUMNS);
         let mut known = vec![0.0; self.instants * stride];
         for (row, found) in known.chunks_exact_mut(stride).zip(found.chunks_exact(self.nodes)) {
-            let (re, im) = row.split_at_mut(self.nodes);
+            let (re, rest) = row.split_at_mut(self.nodes);
+            let (im, _) = rest.split_at_mut(self.nodes);
             // Below the diagonal stands V_ji, the conjugate.
             basis.coefficients(|k| found[k].re, re);
             basis.coefficients(|k| -found[k].im, im);
