@@ -1,8 +1,9 @@
-//! The correlator's kernel against the machine's multiply-adds and against a library's matrix product.
+//! The correlator's kernel against the machine's multiply-adds and against matrix products of libraries.
 //!
 //! `cargo bench --bench correlator`. One thread. Everything is measured in turns in the same run, and the best
-//! of some rounds is taken. Operations are those that the products ask for: 4 multiply-adds for a pair, 2 for
-//! a daughter with itself.
+//! of many short rounds is taken. Operations are those that the products ask for: 4 multiply-adds for a pair, 2 for
+//! a daughter with itself. `LUNARRAY_PYTHON` names a Python with numpy; it and its
+//! BLAS then multiply the same blocks as complex64.
 #![allow(clippy::unwrap_used)] // A program for people at a terminal.
 
 use std::hint::black_box;
@@ -16,7 +17,9 @@ use pulp::{Arch, Simd, WithSimd};
 
 const DAUGHTERS: usize = 8;
 /// Samples of one channel in a round.
-const SAMPLES: usize = 1 << 14;
+const SAMPLES: usize = 1 << 10;
+/// Rounds, of which the best counts.
+const ROUNDS: usize = 150;
 
 /// Multiply-adds that depend on nothing but registers.
 struct Peak(usize);
@@ -38,6 +41,95 @@ impl WithSimd for Peak {
         let total = sums.into_iter().map(|sum| simd.reduce_sum_f32s(sum)).sum();
         (self.0 * CHAINS * S::F32_LANES, total)
     }
+}
+
+/// Multiply-adds of pairs of 16 bits into 32, by the best that the kernel could use, and a value that depends on all.
+#[cfg(target_arch = "x86_64")]
+fn integer_peak(arch: Arch, rounds: usize) -> Option<(usize, i32)> {
+    use pulp::x86::V3;
+    use std::arch::x86_64::__m256i;
+
+    #[inline(always)]
+    fn chains(simd: V3, rounds: usize) -> (usize, i32) {
+        const CHAINS: usize = 12;
+        let avx2 = simd.avx2;
+        let a: __m256i = pulp::cast(black_box([3_i16; 16]));
+        let mut sums: [__m256i; CHAINS] = [pulp::cast([1_i32; 8]); CHAINS];
+        for k in 0..rounds {
+            let a = avx2._mm256_xor_si256(a, pulp::cast([k as i32; 8]));
+            for sum in &mut sums {
+                *sum = avx2._mm256_add_epi32(*sum, avx2._mm256_madd_epi16(a, *sum));
+            }
+        }
+        let total = sums.into_iter().flat_map(pulp::cast::<__m256i, [i32; 8]>).fold(0, i32::wrapping_add);
+        (rounds * CHAINS * 16, total)
+    }
+
+    let simd = match arch {
+        Arch::V3(simd) => simd,
+        Arch::V4(simd) => *simd,
+        _ => return None,
+    };
+    Some(simd.vectorize(
+        #[inline(always)]
+        || chains(simd, rounds),
+    ))
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+fn integer_peak(_: Arch, _: usize) -> Option<(usize, i32)> {
+    None
+}
+
+/// Seconds for the products of all channels' blocks: numpy's product, and BLAS's rank-k update.
+const PYTHON: &str = r#"
+import sys, time, glob, os, ctypes
+import numpy
+channels, daughters, samples, rounds = map(int, sys.argv[1:])
+random = numpy.random.default_rng(1)
+parts = random.integers(-128, 128, (2, channels, daughters, samples)) + numpy.float32(0.5)
+x = (parts[0] + 1j * parts[1]).astype(numpy.complex64)
+def best(work):
+    times = []
+    for _ in range(rounds):
+        since = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - since)
+    return min(times)
+print("numpy", best(lambda: x @ x.conj().swapaxes(1, 2)))
+folder = os.path.join(os.path.dirname(numpy.__path__[0]), "numpy.libs")
+for library in glob.glob(os.path.join(folder, "libscipy_openblas64_*")):
+    blas = ctypes.CDLL(library)
+    cherk = blas.scipy_cblas_cherk64_
+    size, real, pointer = ctypes.c_int64, ctypes.c_float, ctypes.c_void_p
+    cherk.argtypes = [ctypes.c_int] * 3 + [size, size, real, pointer, size, real, pointer, size]
+    out = numpy.zeros((channels, daughters, daughters), numpy.complex64)
+    # Rows, upper triangle, not transposed.
+    def update():
+        for block, product in zip(x, out):
+            cherk(101, 121, 111, daughters, samples, 1.0, block.ctypes.data, samples, 0.0, product.ctypes.data, daughters)
+    print("BLAS rank-k update", best(update))
+    expected = numpy.triu(x[0] @ x[0].conj().T)
+    assert abs(numpy.triu(out[0]) - expected).max() < 1e-3 * abs(expected).max()
+"#;
+
+/// Names of peers, with their multiply-adds a second.
+fn peers(threads: usize, operations: f64) -> Vec<(String, f64)> {
+    let Some(python) = std::env::var_os("LUNARRAY_PYTHON") else {
+        println!("skipped: numpy and BLAS, for LUNARRAY_PYTHON is not set");
+        return Vec::new();
+    };
+    let mut command = std::process::Command::new(python);
+    command.args(["-c", PYTHON]).args([LANES, DAUGHTERS, SAMPLES, ROUNDS].map(|n| n.to_string()));
+    for variable in ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"] {
+        command.env(variable, threads.to_string());
+    }
+    let text = String::from_utf8(command.output().unwrap().stdout).unwrap();
+    let rate = |line: &str| {
+        let (name, seconds) = line.rsplit_once(' ')?;
+        Some((format!("{name}, {threads} thread(s)"), operations / seconds.parse::<f64>().ok()?))
+    };
+    text.lines().filter_map(rate).collect()
 }
 
 fn seconds(work: impl FnOnce()) -> f64 {
@@ -71,13 +163,15 @@ fn main() {
         packed.put_all(daughter, |lane| Some(&blocks[lane * DAUGHTERS + daughter]), 0);
     }
     let operations = (Packed::multiply_adds(DAUGHTERS) * slices) as f64;
-    let [mut peak, mut kernel, mut packing] = [0.0_f64; 3];
+    let [mut peak, mut float_peak, mut kernel, mut packing] = [0.0_f64; 4];
     let mut library = [0.0_f64; 3];
     // Samples between two results of the library: a whole block, a dump, and a short one.
     let depths = [SAMPLES, 64, 16];
-    for _ in 0..15 {
+    for _ in 0..ROUNDS {
         let mut done = 0;
-        let spent = seconds(|| done = black_box(arch.dispatch(Peak(400_000))).0);
+        let spent = seconds(|| done = black_box(arch.dispatch(Peak(20_000))).0);
+        float_peak = float_peak.max(done as f64 / spent);
+        let spent = seconds(|| done = black_box(integer_peak(arch, 20_000)).map_or(0, |(done, _)| done));
         peak = peak.max(done as f64 / spent);
         let mut sums = no_sums(DAUGHTERS);
         let spent = seconds(|| (0..slices).for_each(|_| correlate(arch, black_box(&packed), &mut sums)));
@@ -110,24 +204,32 @@ fn main() {
             *library = library.max(operations / spent);
         }
     }
-    println!("multiply-adds a second of one core, f32");
-    println!("peak                                  {:8.2e}", peak);
+    // Where whole numbers have no instructions of their own, the kernel is a plain loop.
+    let peak = if peak > 0.0 { peak } else { float_peak };
+    println!("multiply-adds a second of one core, codes of 8 bits");
+    println!("peak of pairs of 16 bits              {peak:8.2e}  (of f32: {float_peak:8.2e})");
     println!(
-        "kernel                                {:8.2e}  {:5.1} % of the peak",
-        kernel,
+        "kernel                                {kernel:8.2e}  {:5.1} % of the peak",
         100.0 * kernel / peak
     );
     println!(
-        "kernel with unpacking of 8 bits       {:8.2e}  {:5.1} % of the peak",
-        packing,
+        "kernel with unpacking                 {packing:8.2e}  {:5.1} % of the peak",
         100.0 * packing / peak
     );
-    for (library, depth) in library.into_iter().zip(depths) {
+    let compare = |name: &str, rate: f64| {
         println!(
-            "library's product of {depth:5} samples   {library:8.2e}  the kernel is {:.2} times as fast, {:.2} with unpacking",
-            kernel / library,
-            packing / library
+            "{name:<38}{rate:8.2e}  the kernel is {:.2} times as fast, {:.2} with unpacking",
+            kernel / rate,
+            packing / rate
         );
+    };
+    for (library, depth) in library.into_iter().zip(depths) {
+        compare(&format!("faer's product of {depth:5} samples"), library);
+    }
+    for threads in [1, 2] {
+        for (name, rate) in peers(threads, operations) {
+            compare(&name, rate);
+        }
     }
     let samples = packing / operations * (SAMPLES * DAUGHTERS * LANES) as f64;
     println!("samples a second with unpacking       {samples:8.2e}");

@@ -11,7 +11,8 @@ use crate::pipeline::{BENCH_STAGES, BenchSettings, ConfigSource, Plan, bench, be
 ///
 /// Without a pipeline, 16 s of the design are measured: 30 channels, eight daughters, 8 bits, over a generated
 /// sky of nside 8. Prints samples, visibilities and bytes a second, the ratio to real time of the design, the
-/// spread over runs, latencies, queues and the stage that saturates first.
+/// spread over runs, processor time, latencies from sample to packet and from packet to sums, queues and the stage that
+/// saturates first.
 #[derive(Debug, Args)]
 pub(super) struct BenchArgs {
     /// Pipeline file (TOML); its first window is measured, of spacecraft.window_s_max at best.
@@ -26,7 +27,10 @@ pub(super) struct BenchArgs {
     /// Runs of each stage.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..=1000))]
     runs: u16,
-    /// One JSON object instead of a table.
+    /// Run the chain at other sizes as well: channels, daughters, blocks.
+    #[arg(long)]
+    growth: bool,
+    /// One JSON object instead of a table; with the queues' depths as they changed.
     #[arg(long)]
     json: bool,
 }
@@ -41,7 +45,7 @@ pub(super) fn execute(args: &BenchArgs) -> CommandResult {
     };
     let plan = Plan::new(config)?;
     use_threads(&plan.config.runtime)?;
-    let settings = BenchSettings { stage: args.stage.clone(), runs: args.runs.into() };
+    let settings = BenchSettings { stage: args.stage.clone(), runs: args.runs.into(), growth: args.growth };
     let measured = bench(&plan, &settings)?;
     if args.json {
         print_json_line(&measured)?;

@@ -2,18 +2,21 @@
 //!
 //! A visibility is a smooth function of time and of the frequency's offset from the channel's centre: its
 //! phase sweeps at most `2 pi |v| nu T / c` in a time T and `2 pi |b| dnu / c` over the channel. Both are
-//! expanded by interpolation at Chebyshev points, as many as that sweep asks for: `z + 2.5 z^(1/3) + 2` for
-//! a phase of +-z, which leaves 5e-4 of the visibility.
+//! interpolated from equally spaced nodes, as many as that sweep asks for ([`super::nodes`]).
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use num_complex::Complex64;
+
+use super::nodes::{Basis, Interpolation, node, nodes_for};
 use crate::array::Array;
+use crate::array::response::Comb;
 use crate::array::response::kernel::fused;
 use crate::frames::Channel;
 use crate::mother::{ModelError, PairPosition, Prediction, VisibilityModel};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
-use crate::units::vector::{Vec3, add, norm, scale, sub};
+use crate::units::vector::{norm, sub};
 use crate::units::{Pair, all_pairs};
 
 /// Equally spaced instants at which covariances are wanted.
@@ -27,13 +30,23 @@ pub struct Epochs {
     pub count: usize,
 }
 
-/// Visibilities of one pair at each epoch, at Chebyshev points over the channel.
-struct PairSeries {
-    pair: Pair,
-    /// Points over the channel.
-    points: usize,
-    /// K sr; by epoch: real parts at the points, then imaginary parts.
+/// Visibilities V_ji of one pair at each epoch, expanded over the channel.
+pub(super) struct PairSeries {
+    pub(super) pair: Pair,
+    /// The functions of frequency.
+    pub(super) basis: Arc<Basis>,
+    /// Values from one epoch to the next: a multiple of `COLUMNS`.
+    stride: usize,
+    /// K sr; by epoch: coefficients of the real part, then of the imaginary part.
     values: Vec<f32>,
+}
+
+impl PairSeries {
+    /// Coefficients of the real and of the imaginary part at one epoch.
+    pub(super) fn at(&self, epoch: usize) -> (&[f32], &[f32]) {
+        let nodes = self.basis.nodes();
+        self.values[epoch * self.stride..][..2 * nodes].split_at(nodes)
+    }
 }
 
 /// The covariance of all daughters in one channel, over frequency and some epochs.
@@ -46,32 +59,46 @@ pub struct Covariances {
     powers: Vec<Vec<f32>>,
 }
 
-/// Interpolations from Chebyshev points in time to epochs, which channels and stretches have in common.
+/// Interpolations over time and over the channel, which channels and stretches have in common.
 #[derive(Debug, Default)]
-pub struct Tables(Mutex<TableMap>);
+pub struct Tables {
+    /// By numbers of instants and of epochs.
+    times: Mutex<HashMap<(usize, usize), Arc<[f32]>>>,
+    /// By number of nodes.
+    bases: Mutex<HashMap<usize, Arc<Basis>>>,
+}
 
-/// By numbers of instants and of epochs.
-type TableMap = HashMap<(usize, usize), Arc<[f32]>>;
-
-/// Most tables that are kept: some 200 kB each.
+/// Most tables that are kept: some 100 kB each.
 const TABLES_MAX: usize = 256;
 
 impl Tables {
-    /// The table of `instants` points for `count` epochs.
-    fn get(&self, instants: usize, count: usize) -> Arc<[f32]> {
-        let lock = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(table) = lock().get(&(instants, count)) {
-            return Arc::clone(table);
-        }
-        // Two threads may both make one; they are equal.
-        let table: Arc<[f32]> = time_matrix(instants, count).into();
-        let mut tables = lock();
-        if tables.len() >= TABLES_MAX {
-            tables.clear();
-        }
-        tables.insert((instants, count), Arc::clone(&table));
-        table
+    /// Weights of `instants` nodes at `count` epochs and up to the next multiple of `EPOCHS`.
+    fn times(&self, instants: usize, count: usize) -> Arc<[f32]> {
+        shared(&self.times, (instants, count), || time_matrix(instants, count).into())
     }
+
+    fn basis(&self, nodes: usize) -> Arc<Basis> {
+        shared(&self.bases, nodes, || Arc::new(Basis::new(nodes)))
+    }
+}
+
+/// The table of `key`, made if it is not there. Two threads may both make one; they are equal.
+fn shared<K: Copy + Eq + std::hash::Hash, T: ?Sized>(
+    tables: &Mutex<HashMap<K, Arc<T>>>,
+    key: K,
+    make: impl FnOnce() -> Arc<T>,
+) -> Arc<T> {
+    let lock = || tables.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(table) = lock().get(&key) {
+        return Arc::clone(table);
+    }
+    let table = make();
+    let mut tables = lock();
+    if tables.len() >= TABLES_MAX {
+        tables.clear();
+    }
+    tables.insert(key, Arc::clone(&table));
+    table
 }
 
 /// Where a model of one channel is asked.
@@ -97,11 +124,12 @@ impl Covariances {
         let daughters = request.array.satellites();
         let plans: Vec<Plan> =
             all_pairs(daughters).into_iter().map(|pair| Plan::new(request, pair)).collect();
-        let mut positions = Vec::new();
+        let mut series = Vec::with_capacity(plans.len());
         for plan in &plans {
-            plan.positions(request, &mut positions);
+            series.push(plan.series(model, request)?);
         }
         let steady = Plan::steady();
+        let mut positions = Vec::with_capacity(daughters * steady.instants);
         for daughter in 0..daughters {
             positions.extend(steady.instants_s(request.epochs).map(|t_s| {
                 // The plane of the orbit, which a dipole stands on, asks for two places: 1.5 m apart.
@@ -111,19 +139,10 @@ impl Covariances {
         }
         let mut predictions = vec![Prediction::default(); positions.len()];
         model.predict(&positions, &mut predictions)?;
-        let mut rest = &predictions[..];
-        let mut series = Vec::with_capacity(plans.len());
-        for plan in &plans {
-            let (own, others) = rest.split_at(plan.instants * plan.points);
-            rest = others;
-            series.push(plan.series(request, own));
-        }
-        let matrix = request.tables.get(steady.instants, request.epochs.count);
-        let powers = (0..daughters).map(|daughter| {
-            let own: Vec<f32> = rest[daughter * steady.instants..][..steady.instants]
-                .iter()
-                .map(|p| (p.zero_spacing_k_sr + request.receiver_noise_k_sr) as f32)
-                .collect();
+        let matrix = request.tables.times(steady.instants, request.epochs.count);
+        let powers = predictions.chunks_exact(steady.instants).map(|own| {
+            let own: Vec<f32> =
+                own.iter().map(|p| (p.zero_spacing_k_sr + request.receiver_noise_k_sr) as f32).collect();
             matrix
                 .chunks_exact(steady.instants)
                 .map(|row| row.iter().zip(&own).map(|(a, b)| a * b).sum())
@@ -145,18 +164,9 @@ impl Covariances {
         self.powers[daughter][epoch]
     }
 
-    /// Pairs with their values at one epoch: points over the channel, and real and imaginary parts at them.
-    pub fn at(&self, epoch: usize) -> impl Iterator<Item = (Pair, usize, &[f32])> {
-        self.series.iter().map(move |series| {
-            let points = series.points;
-            (series.pair, points, &series.values[epoch * 2 * points..][..2 * points])
-        })
-    }
-
-    /// Most points over the channel of any pair.
-    #[must_use]
-    pub fn points_max(&self) -> usize {
-        self.series.iter().map(|series| series.points).max().unwrap_or(1)
+    /// All pairs.
+    pub(super) fn pairs(&self) -> &[PairSeries] {
+        &self.series
     }
 }
 
@@ -164,7 +174,8 @@ impl Covariances {
 struct Plan {
     pair: Pair,
     instants: usize,
-    points: usize,
+    /// Nodes over the channel.
+    nodes: usize,
 }
 
 impl Plan {
@@ -180,123 +191,115 @@ impl Plan {
         let length_m = norm(sub(i.position_m, j.position_m));
         Self {
             pair,
-            instants: points_for(per_m * request.channel.frequency_hz * speed_m_s * half_s),
-            points: points_for(per_m * length_m * 0.5 * request.channel.width_hz),
+            instants: nodes_for(per_m * request.channel.frequency_hz * speed_m_s * half_s),
+            nodes: nodes_for(per_m * length_m * 0.5 * request.channel.width_hz),
         }
     }
 
     /// For powers, which change as the Moon's limb moves over the sky.
     fn steady() -> Self {
-        Self { pair: Pair::default(), instants: 6, points: 1 }
+        Self { pair: Pair::default(), instants: 6, nodes: 1 }
     }
 
-    /// Chebyshev points over the epochs and one step on either side, s.
+    /// Nodes over the epochs and one step on either side, s.
     fn instants_s(&self, epochs: Epochs) -> impl Iterator<Item = f64> {
         let half_s = 0.5 * epochs.step_s * (epochs.count + 1) as f64;
         let middle_s = epochs.start_s + half_s - epochs.step_s;
-        chebyshev_points(self.instants).map(move |x| middle_s + half_s * x)
+        (0..self.instants).map(move |k| middle_s + half_s * node(k, self.instants))
     }
 
-    fn positions(&self, request: &Request<'_>, out: &mut Vec<PairPosition>) {
-        let relative = 0.5 * request.channel.width_hz / request.channel.frequency_hz;
-        for t_s in self.instants_s(request.epochs) {
-            let r_i_m = request.array.position_m(self.pair.i.into(), t_s);
-            let r_j_m = request.array.position_m(self.pair.j.into(), t_s);
-            out.extend(chebyshev_points(self.points).map(|x| stretched(r_i_m, r_j_m, 1.0 + relative * x)));
+    /// Asks the model at the instants, and interpolates to the epochs.
+    fn series(
+        &self,
+        model: &mut dyn VisibilityModel,
+        request: &Request<'_>,
+    ) -> Result<PairSeries, ModelError> {
+        let place = |n: u8, t_s| request.array.position_m(n.into(), t_s);
+        let position = |t_s| PairPosition {
+            r_i_m: place(self.pair.i, t_s),
+            r_j_m: place(self.pair.j, t_s),
+            span_rad: 0.0,
+        };
+        let positions: Vec<PairPosition> = self.instants_s(request.epochs).map(position).collect();
+        let half = 0.5 * request.channel.width_hz / request.channel.frequency_hz;
+        let step = 2.0 * half / (self.nodes - 1) as f64;
+        let comb = Comb { first: -half, step, count: self.nodes };
+        let mut found = vec![Complex64::ZERO; positions.len() * self.nodes];
+        model.predict_comb(&positions, comb, &mut found)?;
+        let basis = request.tables.basis(self.nodes);
+        let stride = (2 * self.nodes).next_multiple_of(COLUMNS);
+        let mut known = vec![0.0; self.instants * stride];
+        for (row, found) in known.chunks_exact_mut(stride).zip(found.chunks_exact(self.nodes)) {
+            let (re, rest) = row.split_at_mut(self.nodes);
+            let (im, _) = rest.split_at_mut(self.nodes);
+            // Below the diagonal stands V_ji, the conjugate.
+            basis.coefficients(|k| found[k].re, re);
+            basis.coefficients(|k| -found[k].im, im);
         }
-    }
-
-    fn series(&self, request: &Request<'_>, predictions: &[Prediction]) -> PairSeries {
-        let count = request.epochs.count;
-        let width = 2 * self.points;
-        let mut known = Vec::with_capacity(self.instants * width);
-        for row in predictions.chunks_exact(self.points) {
-            known.extend(row.iter().map(|p| p.visibility_k_sr.re as f32));
-            known.extend(row.iter().map(|p| p.visibility_k_sr.im as f32));
-        }
-        let mut values = vec![0.0; count * width];
-        let matrix = request.tables.get(self.instants, count);
-        for (out, weights) in values.chunks_exact_mut(width).zip(matrix.chunks_exact(self.instants)) {
-            combine(weights, &known, out);
-        }
-        PairSeries { pair: self.pair, points: self.points, values }
+        let matrix = request.tables.times(self.instants, request.epochs.count);
+        let mut values = vec![0.0; matrix.len() / self.instants * stride];
+        combine(&matrix, &known, stride, &mut values);
+        Ok(PairSeries { pair: self.pair, basis, stride, values })
     }
 }
 
-/// Weights of the instants at each epoch, by epoch: interpolation, and sharpening for the blending of epochs.
+/// Epochs and values that are interpolated together.
+const EPOCHS: usize = 4;
+const COLUMNS: usize = 8;
+
+/// Weights of the instants at each epoch, by epoch: interpolation, and sharpening for the blending of epochs. Zeros
+/// for what fills the last `EPOCHS`.
 fn time_matrix(instants: usize, count: usize) -> Vec<f32> {
     // Variance of a density cos^2 of half width 1, halved.
     let flattening = 0.5 * (1.0 / 3.0 - 2.0 / std::f64::consts::PI.powi(2));
-    let points: Vec<f64> = chebyshev_points(instants).collect();
+    let interpolation = Interpolation::new(instants);
     let step = 2.0 / (count + 1) as f64;
     let mut weights = vec![0.0; (count + 2) * instants];
     for (k, row) in weights.chunks_exact_mut(instants).enumerate() {
-        interpolate(&points, -1.0 + step * k as f64, row);
+        interpolation.weights(-1.0 + step * k as f64, row);
     }
     let sharpened = |k: usize| {
         let (before, here, after) = (weights[k - instants], weights[k], weights[k + instants]);
         (here - flattening * (after - 2.0 * here + before)) as f32
     };
-    (instants..(count + 1) * instants).map(sharpened).collect()
+    let mut matrix: Vec<f32> = (instants..(count + 1) * instants).map(sharpened).collect();
+    matrix.resize(count.next_multiple_of(EPOCHS) * instants, 0.0);
+    matrix
 }
 
-/// `out = sum of weight x row`.
+/// `out = weights x rows`: rows of `stride`, as many of them as a row of `weights` has values.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn combine(weights: &[f32], rows: &[f32], out: &mut [f32]) {
+fn combine(weights: &[f32], rows: &[f32], stride: usize, out: &mut [f32]) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
-    for (weight, row) in weights.iter().zip(rows.chunks_exact(out.len())) {
-        for (out, value) in out.iter_mut().zip(row) {
-            *out = fused::<FMA>(*weight, *value, *out);
+    let count = rows.len() / stride;
+    for (out, weights) in out.chunks_exact_mut(EPOCHS * stride).zip(weights.chunks_exact(EPOCHS * count)) {
+        let (first, rest) = weights.split_at(count);
+        let (second, rest) = rest.split_at(count);
+        let (third, fourth) = rest.split_at(count);
+        for column in (0..stride).step_by(COLUMNS) {
+            let mut sums = [[0.0_f32; COLUMNS]; EPOCHS];
+            let own = first.iter().zip(second).zip(third.iter().zip(fourth));
+            for (row, ((a, b), (c, d))) in rows.chunks_exact(stride).zip(own) {
+                let Some(row) = row[column..].first_chunk::<COLUMNS>() else { continue };
+                for k in 0..COLUMNS {
+                    sums[0][k] = fused::<FMA>(*a, row[k], sums[0][k]);
+                    sums[1][k] = fused::<FMA>(*b, row[k], sums[1][k]);
+                    sums[2][k] = fused::<FMA>(*c, row[k], sums[2][k]);
+                    sums[3][k] = fused::<FMA>(*d, row[k], sums[3][k]);
+                }
+            }
+            for (epoch, sums) in sums.iter().enumerate() {
+                out[epoch * stride + column..][..COLUMNS].copy_from_slice(sums);
+            }
         }
     }
-}
-
-/// Points that interpolate a phase of +-`z` to 5e-4.
-fn points_for(z: f64) -> usize {
-    (z + 2.5 * z.cbrt() + 2.0).ceil() as usize
-}
-
-/// Chebyshev points of the first kind between -1 and 1.
-pub(super) fn chebyshev_points(count: usize) -> impl Iterator<Item = f64> {
-    (0..count).map(move |k| (std::f64::consts::PI * (k as f64 + 0.5) / count as f64).cos())
-}
-
-/// Weights that interpolate values at Chebyshev points to `x` (the barycentric formula).
-pub(super) fn interpolate(points: &[f64], x: f64, weights: &mut [f64]) {
-    if let Some(exact) = points.iter().position(|point| *point == x) {
-        weights.fill(0.0);
-        weights[exact] = 1.0;
-        return;
-    }
-    let mut total = 0.0;
-    for ((weight, point), k) in weights.iter_mut().zip(points).zip(0..) {
-        // sin of the point's angle, with alternating sign.
-        let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
-        *weight = sign * (1.0 - point * point).sqrt() / (x - point);
-        total += *weight;
-    }
-    for weight in weights {
-        *weight /= total;
-    }
-}
-
-/// A pair moved apart along its circle about the Moon until the chord is `factor` times as long.
-///
-/// At the centre's frequency it has the fringes that the pair has at `factor` times that. The Moon's limb
-/// is moved by half the added length: 2e-5 rad for 100 km at 10 MHz, 1e-3 rad at 0.1 MHz.
-pub(super) fn stretched(r_i_m: Vec3, r_j_m: Vec3, factor: f64) -> PairPosition {
-    let (middle, half) = (scale(0.5, add(r_i_m, r_j_m)), scale(0.5 * factor, sub(r_i_m, r_j_m)));
-    let (middle_m, half_m, radius_m) = (norm(middle), norm(half), norm(r_i_m));
-    let depth_m = (radius_m * radius_m - half_m * half_m).max(0.0).sqrt();
-    let centre = scale(depth_m / middle_m, middle);
-    PairPosition { r_i_m: add(centre, half), r_j_m: sub(centre, half), span_rad: 0.0 }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use num_complex::Complex64;
+    use crate::units::vector::Vec3;
 
     /// A point source: V = exp(-2 pi i (nu / c) n . r_ij) at 20 MHz.
     struct Point(Vec3);
@@ -335,15 +338,12 @@ mod tests {
         assert!((found.power(3, 100) - 1.5).abs() < 1e-5);
         for epoch in [0, 100, 256] {
             let t_s = from_s + step_s * epoch as f64;
-            for (pair, points, values) in found.at(epoch) {
-                let nodes: Vec<f64> = chebyshev_points(points).collect();
-                let mut weights = vec![0.0; points];
+            for series in found.pairs() {
+                let pair = series.pair;
+                let (re, im) = series.at(epoch);
                 for x in [-1.0, -0.3, 0.9] {
-                    interpolate(&nodes, x, &mut weights);
-                    let part = |values: &[f32]| {
-                        weights.iter().zip(values).map(|(w, v)| w * f64::from(*v)).sum::<f64>()
-                    };
-                    let value = Complex64::new(part(&values[..points]), part(&values[points..]));
+                    // V_ij again.
+                    let value = Complex64::new(series.basis.value(re, x), -series.basis.value(im, x));
                     let (i, j) = (array.state(pair.i.into(), t_s), array.state(pair.j.into(), t_s));
                     let frequency_hz = FREQUENCY_HZ + 4e3 * x;
                     let expected = fringe(n_hat, frequency_hz, i.position_m, j.position_m);

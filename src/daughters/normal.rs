@@ -6,36 +6,33 @@ use rand::Rng;
 use crate::array::response::kernel::{cos_sin_turns, fused, polynomial};
 
 /// Deviates made at a time.
-const CHUNK: usize = 64;
+pub(super) const CHUNK: usize = 64;
 
-/// Fills `re` and `im` (of equal length) with complex normal deviates of variance one: 1/2 in each part.
+/// Random bytes of a chunk.
+pub(super) type Bytes = [[u8; 4]; 2 * CHUNK];
+
+/// Fills `re` and `im` (of equal numbers of chunks) with complex normal deviates of variance one: 1/2 in each part.
 ///
 /// Box and Muller's transform in `f32`: |z| is at most sqrt(33 ln 2) = 4.8 where a normal deviate exceeds
 /// it once in 1e10, and relative errors are below 1e-5.
-pub(super) fn fill_complex_normal(rng: &mut impl Rng, re: &mut [f32], im: &mut [f32]) {
-    let mut bytes = [0_u8; 8 * CHUNK];
-    for (re, im) in re.chunks_mut(CHUNK).zip(im.chunks_mut(CHUNK)) {
-        rng.fill_bytes(&mut bytes);
-        let mut words = [0_u32; 2 * CHUNK];
-        for (word, bytes) in words.iter_mut().zip(bytes.as_chunks::<4>().0) {
-            *word = u32::from_le_bytes(*bytes);
-        }
-        let (mut x, mut y) = ([0.0; CHUNK], [0.0; CHUNK]);
-        transform(&words, &mut x, &mut y);
-        re.copy_from_slice(&x[..re.len()]);
-        im.copy_from_slice(&y[..im.len()]);
+pub(super) fn fill_complex_normal(rng: &mut impl Rng, bytes: &mut Bytes, re: &mut [f32], im: &mut [f32]) {
+    let chunks = re.as_chunks_mut::<CHUNK>().0.iter_mut().zip(im.as_chunks_mut::<CHUNK>().0);
+    for (re, im) in chunks {
+        rng.fill_bytes(bytes.as_flattened_mut());
+        transform(bytes, re, im);
     }
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn transform(words: &[u32; 2 * CHUNK], x: &mut [f32; CHUNK], y: &mut [f32; CHUNK]) {
+fn transform(words: &Bytes, x: &mut [f32; CHUNK], y: &mut [f32; CHUNK]) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     for k in 0..CHUNK {
         // Halves of 32 bits: never 0.
-        let uniform = (words[k] >> 1) as i32 as f32 * 2.0_f32.powi(-31) + 2.0_f32.powi(-33);
+        let uniform =
+            (u32::from_le_bytes(words[k]) >> 1) as i32 as f32 * 2.0_f32.powi(-31) + 2.0_f32.powi(-33);
         let radius = minus_ln::<FMA>(uniform).max(0.0).sqrt();
-        let turns = words[CHUNK + k].cast_signed() as f32 * 2.0_f32.powi(-32);
+        let turns = i32::from_le_bytes(words[CHUNK + k]) as f32 * 2.0_f32.powi(-32);
         let (cos, sin) = cos_sin_turns::<FMA>(turns);
         x[k] = radius * cos;
         y[k] = radius * sin;
@@ -79,7 +76,7 @@ mod tests {
         const COUNT: usize = 1 << 20;
         let (mut re, mut im) = (vec![0.0; COUNT], vec![0.0; COUNT]);
         let mut rng = random_stream(1, StreamKind::Samples, [0, 0]);
-        fill_complex_normal(&mut rng, &mut re, &mut im);
+        fill_complex_normal(&mut rng, &mut [[0; 4]; 2 * CHUNK], &mut re, &mut im);
         let mean = |f: &dyn Fn(f64, f64) -> f64| {
             re.iter().zip(&im).map(|(&x, &y)| f(x.into(), y.into())).sum::<f64>() / COUNT as f64
         };

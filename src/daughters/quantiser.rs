@@ -38,23 +38,37 @@ impl Quantiser {
 
     /// Quantises a block of samples (sqrt(K sr)), and counts parts out of range. The level is that of the blocks before; the
     /// first block sets its own.
-    pub fn quantise(&mut self, re: Vec<f32>, im: Vec<f32>) -> (Samples, u32) {
+    pub fn quantise(&mut self, re: &[f32], im: &[f32]) -> (Samples, u32) {
         if self.bits == FLOAT_BITS || re.is_empty() {
-            return (Samples::Float { re, im }, 0);
+            return (Samples::Float { re: re.to_vec(), im: im.to_vec() }, 0);
         }
-        let square = |values: &[f32]| values.iter().map(|&x| f64::from(x) * f64::from(x)).sum::<f64>();
-        let measured = (square(&re) + square(&im)) / re.len() as f64;
+        let measured = (square(re) + square(im)) / re.len() as f64;
         let power = self.power.unwrap_or(measured);
         self.power = Some(power + self.following * (measured - power));
         // Silence has no level; any will do.
         let step = (spacing(self.bits) * (0.5 * power).sqrt()).max(f64::from(f32::MIN_POSITIVE)) as f32;
         let half = 1_i32 << (self.bits - 1);
         let (mut re_codes, mut im_codes) = (vec![0; re.len()], vec![0; im.len()]);
-        let beyond = encode(&re, step, half, &mut re_codes) + encode(&im, step, half, &mut im_codes);
+        let beyond = encode(re, step, half, &mut re_codes) + encode(im, step, half, &mut im_codes);
         // A sign has no range.
         let saturated = if self.bits == 1 { 0 } else { beyond };
         (Samples::Codes { bits: self.bits as u8, step, re: re_codes, im: im_codes }, saturated)
     }
+}
+
+/// Sum of squares, in the order of `LANES` sums side by side.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn square(values: &[f32]) -> f64 {
+    const LANES: usize = 16;
+    let mut sums = [0.0_f64; LANES];
+    let (chunks, rest) = values.as_chunks::<LANES>();
+    for chunk in chunks {
+        for (sum, value) in sums.iter_mut().zip(chunk) {
+            *sum += f64::from(*value) * f64::from(*value);
+        }
+    }
+    let rest: f64 = rest.iter().map(|&x| f64::from(x) * f64::from(x)).sum();
+    sums.iter().sum::<f64>() + rest
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq", "x86_64+avx2", "aarch64+neon"))]
@@ -85,7 +99,7 @@ mod tests {
         {
             let mut quantiser = Quantiser::new(bits, 0.1, 10.0);
             quantiser.power = Some(2.0);
-            let (samples, saturated) = quantiser.quantise(values.clone(), values.clone());
+            let (samples, saturated) = quantiser.quantise(&values, &values);
             let Samples::Codes { step, re, im, .. } = samples else { panic!("not quantised") };
             assert_eq!((&re[..4], &re), (&expected[..], &im), "{bits} bits");
             assert!((f64::from(step) - spacing(bits)).abs() < 1e-6);
@@ -100,7 +114,7 @@ mod tests {
         let mut quantiser = Quantiser::new(8, 0.1, 1.0);
         let mut step = 0.0;
         for k in 0..=10 {
-            let (samples, _) = quantiser.quantise(block(if k == 0 { 1.0 } else { 2.0 }), block(0.0));
+            let (samples, _) = quantiser.quantise(&block(if k == 0 { 1.0 } else { 2.0 }), &block(0.0));
             let Samples::Codes { step: found, .. } = samples else { panic!("not quantised") };
             step = found;
         }

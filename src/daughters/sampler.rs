@@ -4,20 +4,21 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 
-use super::colour::Repairs;
 use super::config::DaughtersConfig;
 use super::covariance::{Covariances, Epochs, Request, Tables};
 use super::disturbances::Stretch;
 use super::quantiser::Quantiser;
-use super::synthesis::{DrawKey, HOP, Response, Synthesis};
+use super::repair::Repairs;
+use super::synthesis::{Draft, DrawKey, HOP, Planes, Response, Synthesis};
 use crate::array::Array;
 use crate::frames::{Channel, ObservingWindow, SampleBlock, SpaceFrame};
 use crate::mother::{ModelError, VisibilityModel};
 use crate::runtime::{Flow, Outlet, Source, Units};
 use crate::units::{ChannelId, MissionTime, TICKS_PER_SECOND};
 
-/// Samples that are made of one prediction: 4 s at 8 kHz.
-const CHUNK_SAMPLES: usize = 1 << 15;
+/// Samples that are made of one prediction: 2 s at 8 kHz. Longer stretches ask for fewer instants of slow fringes, shorter
+/// ones for a shorter sum over instants at each epoch.
+const CHUNK_SAMPLES: usize = 1 << 14;
 
 /// What the daughters listen to, and where they are.
 pub struct Scene {
@@ -44,7 +45,7 @@ pub struct SamplerCounts {
     pub repairs: Repairs,
 }
 
-/// Samples windows, one stretch of all channels and daughters after another.
+/// Samples windows, one stretch of all channels and daughters after another. While one is handed on, the next is made.
 ///
 /// Windows are cut to whole hops of 64 samples. The same seed gives the same samples, whatever the threads.
 pub struct Sampler {
@@ -57,12 +58,18 @@ pub struct Sampler {
     counts: Arc<Mutex<SamplerCounts>>,
 }
 
+/// Blocks of each channel in one stretch.
+type Made = Vec<(Vec<SampleBlock>, Repairs)>;
+
 /// How far a window has been sampled.
 struct Progress {
     window: ObservingWindow,
     /// Samples that the window has.
     samples: usize,
+    /// Samples that were made.
     done: usize,
+    /// What of them was not handed on.
+    ready: Option<Made>,
     /// By channel and daughter.
     quantisers: Vec<Vec<Quantiser>>,
 }
@@ -96,7 +103,7 @@ impl Sampler {
         let block_s = self.config.block_samples as f64 / width_hz;
         let quantiser = Quantiser::new(self.config.bits, block_s, self.config.level_time_constant_s);
         let quantisers = vec![vec![quantiser; self.scene.array.satellites()]; self.scene.channels.len()];
-        Progress { window, samples, done: 0, quantisers }
+        Progress { window, samples, done: 0, ready: None, quantisers }
     }
 
     fn width_hz(&self) -> f64 {
@@ -107,48 +114,52 @@ impl Sampler {
         start.plus_ticks(sample_ticks(samples as u64, self.width_hz()))
     }
 
-    /// The next stretch of the current window.
+    /// Makes the next stretch of the current window, and hands on the one before.
     fn stretch(&mut self, progress: &mut Progress, out: &mut Outlet<SpaceFrame>) -> Result<(), ModelError> {
-        let samples = CHUNK_SAMPLES.max(self.config.block_samples).min(progress.samples - progress.done);
-        let width_hz = self.width_hz();
-        let from = self.time(progress.window.start, progress.done);
-        let epochs =
-            Epochs { start_s: from.seconds(), step_s: HOP as f64 / width_hz, count: samples / HOP + 1 };
-        let Scene { array, models, channels, receiver_noise_k_sr, .. } = &mut self.scene;
-        let request = |channel| Request {
-            array: &*array,
-            channel,
-            receiver_noise_k_sr: *receiver_noise_k_sr,
-            epochs,
-            tables: &self.tables,
-        };
-        let asked = models.par_iter_mut().zip(&*channels);
-        let predicted: Vec<Result<Covariances, ModelError>> =
-            asked.map(|(model, &channel)| Covariances::predict(model.as_mut(), &request(channel))).collect();
-        // The first error in the order of channels, whichever thread was first.
-        let covariances = predicted.into_iter().collect::<Result<Vec<_>, _>>()?;
-        for covariances in &covariances {
-            self.synthesis.prepare(covariances);
-        }
-        let job = |(k, quantisers): (usize, &mut Vec<Quantiser>)| {
-            let work = ChannelWork {
-                sampler: self,
-                id: ChannelId(k as u16),
-                window: progress.window,
-                first: progress.done,
-                samples,
-            };
-            work.run(&covariances[k], quantisers)
-        };
-        let made: Vec<(Vec<SampleBlock>, Repairs)> =
-            progress.quantisers.par_iter_mut().enumerate().map(job).collect();
-        progress.done += samples;
-        self.hand_on(made, out);
+        let ready = progress.ready.take();
+        // Models are taken out, so that threads may have one each.
+        let mut models = std::mem::take(&mut self.scene.models);
+        let mut made = None;
+        let sampler = &*self;
+        rayon::in_place_scope(|scope| {
+            if progress.done < progress.samples {
+                scope.spawn(|_| made = Some(sampler.make(&mut models, progress)));
+            }
+            if let Some(ready) = ready {
+                sampler.hand_on(ready, out);
+            }
+        });
+        self.scene.models = models;
+        progress.ready = made.transpose()?;
         Ok(())
     }
 
+    fn make(
+        &self,
+        models: &mut [Box<dyn VisibilityModel>],
+        progress: &mut Progress,
+    ) -> Result<Made, ModelError> {
+        let samples = CHUNK_SAMPLES.max(self.config.block_samples).min(progress.samples - progress.done);
+        let (window, first) = (progress.window, progress.done);
+        let epochs = Epochs {
+            start_s: self.time(window.start, first).seconds(),
+            step_s: HOP as f64 / self.width_hz(),
+            count: samples / HOP + 1,
+        };
+        let asked = models.par_iter_mut().zip(progress.quantisers.par_iter_mut()).enumerate();
+        let job =
+            |(k, (model, quantisers)): (usize, (&mut Box<dyn VisibilityModel>, &mut Vec<Quantiser>))| {
+                let work = ChannelWork { sampler: self, id: ChannelId(k as u16), window, first, samples };
+                work.run(model.as_mut(), epochs, quantisers)
+            };
+        let made: Vec<Result<_, ModelError>> = asked.with_max_len(1).map(job).collect();
+        progress.done += samples;
+        // The first error in the order of channels, whichever thread was first.
+        made.into_iter().collect()
+    }
+
     /// Blocks in the order of time, channel, daughter.
-    fn hand_on(&self, made: Vec<(Vec<SampleBlock>, Repairs)>, out: &mut Outlet<SpaceFrame>) {
+    fn hand_on(&self, made: Made, out: &mut Outlet<SpaceFrame>) {
         let daughters = self.scene.array.satellites();
         let mut counts = SamplerCounts::default();
         let mut channels = Vec::with_capacity(made.len());
@@ -189,33 +200,49 @@ struct ChannelWork<'a> {
 }
 
 impl ChannelWork<'_> {
-    fn run(&self, covariances: &Covariances, quantisers: &mut [Quantiser]) -> (Vec<SampleBlock>, Repairs) {
+    fn run(
+        &self,
+        model: &mut dyn VisibilityModel,
+        epochs: Epochs,
+        quantisers: &mut [Quantiser],
+    ) -> Result<(Vec<SampleBlock>, Repairs), ModelError> {
         let Self { sampler, .. } = self;
+        let request = Request {
+            array: &sampler.scene.array,
+            channel: sampler.scene.channels[usize::from(self.id.0)],
+            receiver_noise_k_sr: sampler.scene.receiver_noise_k_sr,
+            epochs,
+            tables: &sampler.tables,
+        };
+        let covariances = Covariances::predict(model, &request)?;
         let daughters = quantisers.len();
         let block_samples = sampler.config.block_samples;
         let mut draft = sampler.synthesis.draft(daughters);
+        let mut planes = vec![[vec![0.0; block_samples], vec![0.0; block_samples]]; daughters];
         // The epoch before the first sample only leaves its second half behind.
-        let mut repairs = self.draw(covariances, 0, &mut draft);
-        let mut planes = vec![[Vec::new(), Vec::new()]; daughters];
+        let mut repairs = self.draw(&covariances, 0, &mut draft, (&mut planes, 0));
         let mut blocks = Vec::with_capacity(self.samples.div_ceil(block_samples) * daughters);
         for hop in 0..self.samples / HOP {
-            repairs.absorb(self.draw(covariances, hop + 1, &mut draft));
-            for ([re, im], samples) in planes.iter_mut().zip(draft.samples.chunks_exact(HOP)) {
-                re.extend(samples.iter().map(|x| x.re));
-                im.extend(samples.iter().map(|x| x.im));
-            }
-            let made = (hop + 1) * HOP;
-            if made.is_multiple_of(block_samples) || made == self.samples {
-                for (daughter, (plane, quantiser)) in planes.iter_mut().zip(&mut *quantisers).enumerate() {
-                    let plane = std::mem::take(plane);
-                    blocks.push(self.block(daughter, made, plane, quantiser));
+            let at = hop * HOP % block_samples;
+            repairs.absorb(self.draw(&covariances, hop + 1, &mut draft, (&mut planes, at)));
+            let (length, made) = (at + HOP, (hop + 1) * HOP);
+            if length == block_samples || made == self.samples {
+                for (daughter, ([re, im], quantiser)) in planes.iter_mut().zip(&mut *quantisers).enumerate() {
+                    let planes = [&mut re[..length], &mut im[..length]];
+                    blocks.push(self.block(daughter, made, planes, quantiser));
                 }
             }
         }
-        (blocks, repairs)
+        Ok((blocks, repairs))
     }
 
-    fn draw(&self, covariances: &Covariances, epoch: usize, draft: &mut super::synthesis::Draft) -> Repairs {
+    fn draw(
+        &self,
+        covariances: &Covariances,
+        epoch: usize,
+        draft: &mut Draft,
+        planes: (&mut [Planes], usize),
+    ) -> Repairs {
         let Sampler { scene, config, synthesis, .. } = self.sampler;
         let time = self.sampler.time(self.window.start, self.first + epoch * HOP);
         let key = DrawKey { seed: scene.seed, channel: self.id.0, ticks: time.0 };
@@ -226,7 +253,7 @@ impl ChannelWork<'_> {
         } else {
             Vec::new()
         };
-        synthesis.draw(covariances, epoch, key, &responses, draft)
+        synthesis.draw(covariances, (epoch, key), &responses, draft, planes)
     }
 
     /// The block of one daughter that ends `made` samples into the stretch.
@@ -234,7 +261,7 @@ impl ChannelWork<'_> {
         &self,
         daughter: usize,
         made: usize,
-        [mut re, mut im]: [Vec<f32>; 2],
+        [re, im]: [&mut [f32]; 2],
         quantiser: &mut Quantiser,
     ) -> SampleBlock {
         let Sampler { scene, config, .. } = self.sampler;
@@ -250,7 +277,7 @@ impl ChannelWork<'_> {
                 first: first as u64,
                 seed: scene.seed,
             };
-            stretch.add_tones(&mut re, &mut im);
+            stretch.add_tones(re, im);
         }
         let (samples, saturated) = quantiser.quantise(re, im);
         SampleBlock {
@@ -280,10 +307,8 @@ impl Source for Sampler {
                 progress
             }
         };
-        if progress.done < progress.samples {
-            self.stretch(&mut progress, out)?;
-        }
-        if progress.done < progress.samples {
+        self.stretch(&mut progress, out)?;
+        if progress.ready.is_some() {
             self.current = Some(progress);
         } else {
             out.push(SpaceFrame::WindowEnd(progress.window));
@@ -293,7 +318,10 @@ impl Source for Sampler {
 
     /// A window that is broken off ends where its samples end.
     fn finish(&mut self, out: &mut Outlet<SpaceFrame>) -> Result<(), ModelError> {
-        if let Some(progress) = self.current.take() {
+        if let Some(mut progress) = self.current.take() {
+            if let Some(ready) = progress.ready.take() {
+                self.hand_on(ready, out);
+            }
             let end = self.time(progress.window.start, progress.done);
             out.push(SpaceFrame::WindowEnd(ObservingWindow { end, ..progress.window }));
         }

@@ -17,9 +17,13 @@ use std::sync::Arc;
 use num_complex::{Complex32, Complex64};
 use rustfft::{Fft, FftPlanner};
 
-use super::colour::{Repairs, TILE, Tile, colour, element, expand, factor};
-use super::covariance::{Covariances, chebyshev_points, interpolate};
-use super::normal::fill_complex_normal;
+use multiversion::multiversion;
+use pulp::Arch;
+
+use super::colour::{Colour, Expand, Factor, HALF, TILE, Tile};
+use super::covariance::Covariances;
+use super::normal::{Bytes, CHUNK, fill_complex_normal};
+use super::repair::{Repairs, factor};
 use crate::units::{StreamKind, random_stream};
 
 /// Frequencies over the channel.
@@ -30,11 +34,10 @@ const TILES: usize = BINS / TILE;
 
 /// What does not change from channel to channel.
 pub struct Synthesis {
+    arch: Arch,
     fft: Arc<dyn Fft<f32>>,
     /// The window, the turning of the lowest frequency and the transform's scale.
-    window: Vec<Complex32>,
-    /// For each number of points over the channel, its interpolation to the bins: point by point a tile, by tile.
-    bases: Vec<[Vec<[f32; TILE]>; TILES]>,
+    window: [[f32; BINS]; 2],
 }
 
 /// What a daughter does to its own signal at one epoch.
@@ -46,17 +49,20 @@ pub struct Response {
     pub turns: f64,
 }
 
-/// Samples of all daughters, and room to make them in.
+/// Samples of one daughter: real parts, imaginary parts.
+pub type Planes = [Vec<f32>; 2];
+
+/// Room to make samples of all daughters in, and what is left from one epoch to the next.
 pub struct Draft {
     daughters: usize,
+    bytes: Bytes,
     noise: [Vec<[f32; TILE]>; 2],
     tile: Tile,
+    coloured: Vec<[[f32; TILE]; 2]>,
     spectra: Vec<Complex32>,
     scratch: Vec<Complex32>,
     /// Second halves of the segments before.
-    tails: Vec<Complex32>,
-    /// The latest `HOP` samples of each daughter, one daughter after another, sqrt(K sr).
-    pub samples: Vec<Complex32>,
+    tails: Vec<[[f32; HOP]; 2]>,
 }
 
 /// Identity of the random numbers of one epoch.
@@ -80,21 +86,15 @@ impl Synthesis {
     /// The tables.
     #[must_use]
     pub fn new() -> Self {
-        let window = (0..BINS).map(|n| {
-            let n = n as f64;
-            let amplitude = (PI * (n + 0.5) / BINS as f64).sin() / (BINS as f64).sqrt();
+        let mut window = [[0.0; BINS]; 2];
+        for n in 0..BINS {
+            let x = n as f64;
+            let amplitude = (PI * (x + 0.5) / BINS as f64).sin() / (BINS as f64).sqrt();
             // Frequencies are (k + 1/2) / BINS - 1/2.
-            let value = amplitude * Complex64::cis(PI * n * (1.0 - 1.0 / BINS as f64));
-            Complex32::new(value.re as f32, value.im as f32)
-        });
-        Self { fft: FftPlanner::new().plan_fft_forward(BINS), window: window.collect(), bases: Vec::new() }
-    }
-
-    /// Makes the tables that `covariances` need.
-    pub fn prepare(&mut self, covariances: &Covariances) {
-        for points in self.bases.len()..=covariances.points_max() {
-            self.bases.push(basis(points));
+            let value = amplitude * Complex64::cis(PI * x * (1.0 - 1.0 / BINS as f64));
+            (window[0][n], window[1][n]) = (value.re as f32, value.im as f32);
         }
+        Self { arch: Arch::new(), fft: FftPlanner::new().plan_fft_forward(BINS), window }
     }
 
     /// Room for `daughters`.
@@ -102,78 +102,100 @@ impl Synthesis {
     pub fn draft(&self, daughters: usize) -> Draft {
         Draft {
             daughters,
+            bytes: [[0; 4]; 2 * CHUNK],
             noise: std::array::from_fn(|_| vec![[0.0; TILE]; daughters * TILES]),
             tile: Tile::new(daughters),
+            coloured: vec![[[0.0; TILE]; 2]; daughters],
             spectra: vec![Complex32::ZERO; daughters * BINS],
             scratch: vec![Complex32::ZERO; self.fft.get_inplace_scratch_len()],
-            tails: vec![Complex32::ZERO; daughters * HOP],
-            samples: vec![Complex32::ZERO; daughters * HOP],
+            tails: vec![[[0.0; HOP]; 2]; daughters],
         }
     }
 
-    /// Draws the segment of an epoch; `draft.samples` are then the `HOP` samples before the epoch.
+    /// Draws the segment of an epoch, and puts the `HOP` samples before the epoch (sqrt(K sr)) into the planes of each
+    /// daughter, from `first` on.
     ///
-    /// `covariances` are those that [`Self::prepare`] has seen; `responses` are none, or one a daughter.
+    /// `responses` are none, or one a daughter.
     pub fn draw(
         &self,
         covariances: &Covariances,
-        epoch: usize,
-        key: DrawKey,
+        (epoch, key): (usize, DrawKey),
         responses: &[Response],
         draft: &mut Draft,
+        (planes, first): (&mut [Planes], usize),
     ) -> Repairs {
         let mut rng =
             random_stream(key.seed, StreamKind::Samples, [u64::from(key.channel), key.ticks.cast_unsigned()]);
         let [re, im] = &mut draft.noise;
-        fill_complex_normal(&mut rng, re.as_flattened_mut(), im.as_flattened_mut());
+        fill_complex_normal(&mut rng, &mut draft.bytes, re.as_flattened_mut(), im.as_flattened_mut());
         let mut repairs = Repairs::default();
-        for tile in 0..TILES {
-            self.fill(covariances, epoch, tile, &mut draft.tile);
-            repairs.absorb(factor(&mut draft.tile, draft.daughters));
-            let noise = [&draft.noise[0][tile..], &draft.noise[1][tile..]];
-            for daughter in 0..draft.daughters {
-                let mut x = [[0.0; TILE]; 2];
-                colour(&draft.tile, daughter, noise, TILES, &mut x);
-                let out = &mut draft.spectra[daughter * BINS + tile * TILE..][..TILE];
-                for (out, (re, im)) in out.iter_mut().zip(x[0].iter().zip(&x[1])) {
-                    *out = Complex32::new(*re, *im);
-                }
+        for group in 0..TILES {
+            repairs.absorb(self.factor(covariances, epoch, group, draft));
+            let Draft { tile, coloured, spectra, noise: [re, im], .. } = draft;
+            self.arch.dispatch(Colour {
+                tile,
+                noise: [&re[group..], &im[group..]],
+                stride: TILES,
+                x: coloured,
+            });
+            for (spectrum, coloured) in spectra.chunks_exact_mut(BINS).zip(coloured) {
+                spread(coloured, group, spectrum);
             }
         }
         for (spectrum, response) in draft.spectra.chunks_exact_mut(BINS).zip(responses) {
             response.apply(spectrum);
         }
         self.fft.process_with_scratch(&mut draft.spectra, &mut draft.scratch);
-        self.blend(draft);
+        let segments = draft.spectra.as_chunks::<BINS>().0.iter().zip(&mut draft.tails);
+        for ((segment, tail), [re, im]) in segments.zip(planes) {
+            blend(segment, &self.window, tail, [&mut re[first..], &mut im[first..]]);
+        }
         repairs
     }
 
-    fn fill(&self, covariances: &Covariances, epoch: usize, tile: usize, out: &mut Tile) {
-        for daughter in 0..covariances.daughters() {
-            let at = element(daughter, daughter);
-            out.re[at] = [covariances.power(daughter, epoch); TILE];
-            out.im[at] = [0.0; TILE];
+    /// The factor of the covariances of one group of bins.
+    fn factor(&self, covariances: &Covariances, epoch: usize, group: usize, draft: &mut Draft) -> Repairs {
+        let Draft { daughters, tile, .. } = draft;
+        self.arch.dispatch(Expand { covariances, epoch, group, tile });
+        if self.arch.dispatch(Factor { tile, order: *daughters }) {
+            return Repairs::none(*daughters);
         }
-        for (pair, points, values) in covariances.at(epoch) {
-            // Below the diagonal stands V_ji, the conjugate.
-            let at = element(pair.j.into(), pair.i.into());
-            let basis = &self.bases[points][tile];
-            expand(&values[..points], basis, 1.0, &mut out.re[at]);
-            expand(&values[points..], basis, -1.0, &mut out.im[at]);
-        }
+        self.arch.dispatch(Expand { covariances, epoch, group, tile });
+        factor(tile, *daughters)
     }
+}
 
-    fn blend(&self, draft: &mut Draft) {
-        let (first, second) = self.window.split_at(HOP);
-        let daughters = draft.spectra.chunks_exact(BINS);
-        let kept = draft.samples.chunks_exact_mut(HOP).zip(draft.tails.chunks_exact_mut(HOP));
-        for (segment, (samples, tail)) in daughters.zip(kept) {
-            let (early, late) = segment.split_at(HOP);
-            for k in 0..HOP {
-                samples[k] = tail[k] + early[k] * first[k];
-                tail[k] = late[k] * second[k];
-            }
-        }
+/// Puts the signal of a group of bins and their mirrors into its places.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn spread([re, im]: &[[f32; TILE]; 2], group: usize, spectrum: &mut [Complex32]) {
+    let (below, above) = spectrum.split_at_mut(BINS / 2);
+    let above = &mut above[BINS / 2 - (group + 1) * HALF..][..HALF];
+    for (k, out) in below[group * HALF..][..HALF].iter_mut().enumerate() {
+        *out = Complex32::new(re[k], im[k]);
+    }
+    for (k, out) in above.iter_mut().enumerate() {
+        *out = Complex32::new(re[TILE - 1 - k], im[TILE - 1 - k]);
+    }
+}
+
+/// The segment's first half and what was left of the one before make samples; its second half is left.
+#[multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn blend(
+    segment: &[Complex32; BINS],
+    [window_re, window_im]: &[[f32; BINS]; 2],
+    [tail_re, tail_im]: &mut [[f32; HOP]; 2],
+    [re, im]: [&mut [f32]; 2],
+) {
+    let (re, im) = (&mut re[..HOP], &mut im[..HOP]);
+    for k in 0..HOP {
+        let (x, w) = (segment[k], (window_re[k], window_im[k]));
+        re[k] = tail_re[k] + (x.re * w.0 - x.im * w.1);
+        im[k] = tail_im[k] + (x.re * w.1 + x.im * w.0);
+    }
+    for k in 0..HOP {
+        let (x, w) = (segment[HOP + k], (window_re[HOP + k], window_im[HOP + k]));
+        tail_re[k] = x.re * w.0 - x.im * w.1;
+        tail_im[k] = x.re * w.1 + x.im * w.0;
     }
 }
 
@@ -187,23 +209,6 @@ impl Response {
 }
 
 /// Frequency of a bin from the channel's centre, in widths of the channel.
-fn bin_offset(bin: usize) -> f64 {
+pub(super) fn bin_offset(bin: usize) -> f64 {
     (bin as f64 + 0.5) / BINS as f64 - 0.5
-}
-
-/// Weights of `points` Chebyshev points over the channel at the bins, by tile.
-fn basis(points: usize) -> [Vec<[f32; TILE]>; TILES] {
-    let nodes: Vec<f64> = chebyshev_points(points).collect();
-    let mut weights = vec![0.0; points];
-    let mut basis: [Vec<[f32; TILE]>; TILES] = std::array::from_fn(|_| vec![[0.0; TILE]; points]);
-    if points == 0 {
-        return basis;
-    }
-    for bin in 0..BINS {
-        interpolate(&nodes, 2.0 * bin_offset(bin), &mut weights);
-        for (row, weight) in basis[bin / TILE].iter_mut().zip(&weights) {
-            row[bin % TILE] = *weight as f32;
-        }
-    }
-    basis
 }

@@ -1,7 +1,9 @@
 //! Visibilities by direct sum over a sky's pixels.
 
+use num_complex::Complex64;
+
 use super::model::{ModelError, PairPosition, Prediction, VisibilityModel};
-use crate::array::response::{Directions, PairGeometry, sky_sums};
+use crate::array::response::{Comb, Directions, PairGeometry, comb_sums, sky_sums};
 use crate::frames::AntennaResponse;
 use crate::sky::SkyMap;
 use crate::sky::healpix::pixel_area_sr;
@@ -35,8 +37,8 @@ impl DirectSum {
     }
 }
 
-impl VisibilityModel for DirectSum {
-    fn predict(&mut self, positions: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError> {
+impl DirectSum {
+    fn pairs(&self, positions: &[PairPosition]) -> Result<Vec<PairGeometry>, ModelError> {
         if positions.iter().any(|position| position.span_rad != 0.0) {
             return Err(ModelError::Smearing { frequency_hz: self.frequency_hz });
         }
@@ -47,12 +49,32 @@ impl VisibilityModel for DirectSum {
             moon_radius_m: self.moon_radius_m,
             response: self.response,
         };
-        let pairs: Vec<PairGeometry> = positions.iter().map(pair).collect();
+        Ok(positions.iter().map(pair).collect())
+    }
+}
+
+impl VisibilityModel for DirectSum {
+    fn predict(&mut self, positions: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError> {
+        let pairs = self.pairs(positions)?;
         // Lengths agree by construction, so there is always an answer.
         let sums = sky_sums(&pairs, &self.directions, &self.values, self.area_sr).unwrap_or_default();
         for (out, sum) in out.iter_mut().zip(sums) {
             *out =
                 Prediction { visibility_k_sr: sum.visibility_k_sr, zero_spacing_k_sr: sum.zero_spacing_k_sr };
+        }
+        Ok(())
+    }
+    fn predict_comb(
+        &mut self,
+        positions: &[PairPosition],
+        comb: Comb,
+        out: &mut [Complex64],
+    ) -> Result<(), ModelError> {
+        let pairs = self.pairs(positions)?;
+        // As above.
+        let sums = comb_sums(&pairs, comb, &self.directions, &self.values, self.area_sr).unwrap_or_default();
+        for (out, sum) in out.iter_mut().zip(sums) {
+            *out = sum;
         }
         Ok(())
     }

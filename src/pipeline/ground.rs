@@ -76,22 +76,30 @@ pub fn add(
         Arc::clone(&outcome.channels),
     )?;
     // Sums are large: one waits while another is solved.
-    let capacity = config.runtime.queue_capacity;
-    let account = Arc::clone(&outcome.reception);
     let sums = match receiving {
         Receiving::Kept(keeper) => graph.stage("keep", 1, bytes, *keeper),
-        Receiving::AsTheyCome => {
-            let frames = graph.stage("receive", capacity, bytes, Reception::new(account));
-            add_sums(graph, frames, config, &outcome)?
-        }
+        Receiving::AsTheyCome => add_sums_of_stream(graph, bytes, config, &outcome)?,
         Receiving::InOrder { wait_bytes } => {
-            let frames = graph.stage("receive", capacity, bytes, Gathering::new(wait_bytes, account));
+            let gathering = Gathering::new(wait_bytes, Arc::clone(&outcome.reception));
+            let frames = graph.stage("receive", config.runtime.queue_capacity, bytes, gathering);
             add_sums(graph, frames, config, &outcome)?
         }
     };
     let maps = graph.stage("solve", 1, sums, Solver::new(setup));
     graph.sink("publish", maps, publisher);
     Ok(outcome)
+}
+
+/// The stages from the bytes of one stream to sums, when nothing is kept.
+pub(super) fn add_sums_of_stream(
+    graph: &mut Graph,
+    bytes: Link<Vec<u8>>,
+    config: &Config,
+    outcome: &GroundOutcome,
+) -> Result<Link<Snapshot>, PipelineError> {
+    let reception = Reception::new(Arc::clone(&outcome.reception));
+    let frames = graph.stage("receive", config.runtime.queue_capacity, bytes, reception);
+    add_sums(graph, frames, config, outcome)
 }
 
 /// The stages from frames to sums, when nothing is kept.

@@ -17,7 +17,9 @@ mod space;
 pub mod state;
 mod summary;
 
-pub use bench::{BENCH_STAGES, Bench, BenchSettings, Machine, Rate, bench, bench_config};
+pub use bench::{
+    BENCH_STAGES, Bench, BenchSettings, ChainRun, GrowthRow, Machine, QueueDepths, Rate, bench, bench_config,
+};
 pub use config::{Config, ConfigError, ConfigSource, Problems, QUICKLOOK};
 pub use cost::{ChannelCost, Cost};
 pub use error::PipelineError;

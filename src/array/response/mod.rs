@@ -10,6 +10,7 @@
 
 mod average;
 mod blocks;
+mod combs;
 mod directions;
 mod edge;
 pub mod exact;
@@ -20,6 +21,7 @@ mod sums;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+pub use combs::{Comb, comb_sums};
 pub use directions::Directions;
 pub use rows::{RowMaker, RowValue};
 pub use sums::{SkySum, sky_sums};

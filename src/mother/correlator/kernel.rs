@@ -1,12 +1,13 @@
 //! Products of all daughters, 16 channels at a time: the hot loop of the mission.
 //!
-//! A lane of a register is a channel, so nothing is ever summed across lanes. Samples are packed in slices of
+//! Codes are multiplied in whole numbers ([`Levels`]), which is twice as fast; what is not quantised, here. A lane of a register is a channel, so nothing is ever summed across lanes. Samples are packed in slices of
 //! `SLICE` that stay in the first-level cache, and each tile of two daughters by two keeps its sums in
 //! registers.
 
 use multiversion::multiversion;
 use pulp::{Arch, Simd, WithSimd};
 
+use super::integers::{Codes, Levels};
 use crate::frames::Samples;
 
 /// Channels that are worked on together.
@@ -26,9 +27,15 @@ pub fn product(i: usize, j: usize) -> usize {
 /// A slice of samples of all daughters in the kernel's order: sample, daughter, part, channel.
 #[derive(Clone, Debug)]
 pub struct Packed {
+    arch: Arch,
     /// Groups of two daughters.
     groups: usize,
+    /// What is not quantised, and the values of what is, once anything came that is not.
     data: Vec<f32>,
+    levels: Levels,
+    /// The latest codes of each daughter, from which values can be made.
+    codes: Vec<Codes>,
+    quantised: bool,
 }
 
 impl Packed {
@@ -36,7 +43,14 @@ impl Packed {
     #[must_use]
     pub fn new(daughters: usize) -> Self {
         let groups = daughters.div_ceil(2);
-        Self { groups, data: vec![0.0; SLICE * groups * PLANES * LANES] }
+        Self {
+            arch: Arch::new(),
+            groups,
+            data: vec![0.0; SLICE * groups * PLANES * LANES],
+            levels: Levels::new(daughters),
+            codes: vec![Codes::NONE; daughters],
+            quantised: true,
+        }
     }
 
     /// Puts `SLICE` samples of one daughter from `first` on into their lanes, a block a channel; zeros for those
@@ -51,27 +65,51 @@ impl Packed {
         first: usize,
     ) {
         let mut planes = [[0.0; SLICE * LANES]; 2];
-        let mut codes = [[0; SLICE * LANES]; 2];
-        // Of what is not quantised, levels add nothing.
-        let mut steps = [0.0; SLICE * LANES];
+        let mut whole = true;
+        let codes = &mut self.codes[daughter];
+        *codes = Codes::NONE;
         let range = first..first + SLICE;
         for lane in 0..LANES {
-            let row = lane * SLICE..(lane + 1) * SLICE;
             match blocks(lane) {
                 Some(Samples::Float { re, im }) => {
+                    let row = lane * SLICE..(lane + 1) * SLICE;
                     planes[0][row.clone()].copy_from_slice(&re[range.clone()]);
                     planes[1][row].copy_from_slice(&im[range.clone()]);
+                    whole = false;
                 }
                 Some(Samples::Codes { step, re, im, .. }) => {
-                    codes[0][row.clone()].copy_from_slice(&re[range.clone()]);
-                    codes[1][row.clone()].copy_from_slice(&im[range.clone()]);
-                    steps[row].fill(*step);
+                    codes.parts[0][lane].copy_from_slice(&re[range.clone()]);
+                    codes.parts[1][lane].copy_from_slice(&im[range.clone()]);
+                    codes.steps[lane] = *step;
                 }
                 None => {}
             }
         }
-        for (plane, codes) in planes.iter_mut().zip(&codes) {
-            turn(plane, codes, &steps);
+        if self.quantised && whole {
+            self.levels.put(self.arch, daughter, codes);
+            return;
+        }
+        if self.quantised {
+            // From now on everything is a value; so is what came before in this slice.
+            self.quantised = false;
+            for other in (0..self.codes.len()).filter(|&other| other != daughter) {
+                self.put_values(other, [[0.0; SLICE * LANES]; 2]);
+            }
+        }
+        self.put_values(daughter, planes);
+    }
+
+    /// Puts the values of codes and others into their lanes, those of a channel side by side.
+    fn put_values(&mut self, daughter: usize, mut planes: [[f32; SLICE * LANES]; 2]) {
+        let codes = &self.codes[daughter];
+        // Of what is not quantised, levels add nothing.
+        let mut steps = [0.0; SLICE * LANES];
+        for (steps, step) in steps.chunks_exact_mut(SLICE).zip(codes.steps) {
+            steps.fill(step);
+        }
+        for (plane, codes) in planes.iter_mut().zip(&codes.parts) {
+            let codes = codes.as_flattened();
+            turn(plane, codes.first_chunk().unwrap_or(&[0; SLICE * LANES]), &steps);
         }
         let [re, im] = &planes;
         let [re, im] = [re.as_chunks::<LANES>().0, im.as_chunks::<LANES>().0];
@@ -125,6 +163,9 @@ pub fn no_sums(daughters: usize) -> Sums {
 
 /// Adds the products of a slice to `sums`.
 pub fn correlate(arch: Arch, packed: &Packed, sums: &mut Sums) {
+    if packed.quantised {
+        return packed.levels.correlate(arch, sums);
+    }
     arch.dispatch(Correlate { packed, sums });
 }
 
@@ -244,7 +285,18 @@ fn diagonal<S: Simd, const PARTS: usize>(
 mod tests {
     use super::*;
 
-    /// Small whole numbers, so that sums are exact.
+    /// Small whole numbers, so that sums are exact; those of one daughter may not be codes.
+    fn samples(daughter: usize, lane: usize, float: Option<usize>) -> Samples {
+        match codes(daughter, lane) {
+            Samples::Codes { step, re, im, .. } if float == Some(daughter) => {
+                let values =
+                    |codes: Vec<i8>| codes.into_iter().map(|code| (f32::from(code) + 0.5) * step).collect();
+                Samples::Float { re: values(re), im: values(im) }
+            }
+            codes => codes,
+        }
+    }
+
     fn codes(daughter: usize, lane: usize) -> Samples {
         let code = |part: usize| {
             (0..2 * SLICE)
@@ -261,10 +313,11 @@ mod tests {
 
     #[test]
     fn products_are_those_of_a_plain_loop_for_any_number_of_daughters() {
-        for daughters in [2, 3, 8] {
+        let all = [2, 3, 8].into_iter();
+        for (daughters, float) in all.flat_map(|n| [None, Some(0), Some(1)].map(|float| (n, float))) {
             let mut packed = Packed::new(daughters);
             for daughter in 0..daughters {
-                let blocks: Vec<Samples> = (0..LANES).map(|lane| codes(daughter, lane)).collect();
+                let blocks: Vec<Samples> = (0..LANES).map(|lane| samples(daughter, lane, float)).collect();
                 let there = |lane: usize| (daughter != 1 || lane != 3).then(|| &blocks[lane]);
                 packed.put_all(daughter, there, SLICE);
             }

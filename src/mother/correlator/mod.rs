@@ -5,6 +5,7 @@
 //! ([`GroupIntegrator`]). [`Correlator`] is the stage.
 
 mod align;
+mod integers;
 mod integrate;
 pub mod kernel;
 mod stage;

@@ -266,7 +266,9 @@ impl Keeper {
 /// Calibration and sums that know nothing yet.
 fn stages(config: &Config, ledger: &Ledger) -> Result<(Calibrator, Accumulator), StateError> {
     let calibration = config.calibration.build(Path::new(""))?;
-    let calibrator = Calibrator::new(calibration, ledger.clone()).with_segments(SEGMENTS_MAX);
+    let calibrator = Calibrator::new(calibration, ledger.clone())
+        .with_van_vleck(config.calibration.van_vleck()?)
+        .with_segments(SEGMENTS_MAX);
     Ok((calibrator, Accumulator::new(config.map.clone(), ledger.clone())))
 }
 

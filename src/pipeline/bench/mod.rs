@@ -1,9 +1,12 @@
 //! How fast the stages of sample fidelity are, each alone and all in a chain.
 
+mod chain;
+mod display;
+mod growth;
+
 use std::convert::Infallible;
-use std::fmt;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use serde::Serialize;
 
@@ -11,12 +14,15 @@ use super::config::Config;
 use super::error::PipelineError;
 use super::plan::Plan;
 use super::sampling::{SampleCounts, sample_stages};
-use super::space;
+use super::{models, space};
 use crate::downlink::{Reception, Transmitter};
 use crate::frames::{GroundFrame, SpaceFrame};
-use crate::mother::{Fidelity, Store};
-use crate::runtime::{Cancel, Flow, Graph, Outlet, Report, Sink, Source, Stage, Units};
+use crate::mother::Fidelity;
+use crate::runtime::{Flow, Outlet, Report, Source, Stage};
 use crate::sky::SkyMap;
+
+pub use chain::{ChainRun, QueueDepths};
+pub use growth::GrowthRow;
 
 /// Stages that can be measured alone, and the chain of them.
 pub const BENCH_STAGES: [&str; 6] = ["sample", "link", "correlate", "transmit", "receive", "chain"];
@@ -31,6 +37,8 @@ pub struct BenchSettings {
     pub stage: Option<String>,
     /// Runs of each.
     pub runs: usize,
+    /// Whether the chain is also run with other numbers of channels and daughters, and other blocks.
+    pub growth: bool,
 }
 
 /// The rate of one stage over several runs.
@@ -48,6 +56,9 @@ pub struct Rate {
     pub bytes_per_s: f64,
     /// Median rate over that of eight daughters with 30 channels of 8 kHz.
     pub times_real_time: f64,
+    /// Seconds of processor time for one second of the mission, median over runs: what does not depend on who else works
+    /// on the machine. `None` where the system does not tell.
+    pub core_s_per_mission_s: Option<f64>,
 }
 
 /// The machine.
@@ -79,9 +90,13 @@ pub struct Bench {
     /// Stage by stage.
     pub rates: Vec<Rate>,
     /// The last run of the chain: shares of time, latencies since sampling, queues.
-    pub chain: Option<Report>,
+    pub chain: Option<ChainRun>,
+    /// The last run of its packets through the ground segment, up to the sums: latencies since the packet.
+    pub ground: Option<ChainRun>,
     /// The stage that worked most of the chain's time.
     pub saturates_first: Option<String>,
+    /// The chain at other sizes; empty unless asked for.
+    pub growth: Vec<GrowthRow>,
 }
 
 /// The pipeline that is measured when none is named: the design's 30 channels, 8 bits, a small sky.
@@ -118,37 +133,68 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
     let config = &plan.config;
     let material = material(&plan, &skies)?;
     let wanted = |stage: &str| settings.stage.as_deref().is_none_or(|only| only == stage);
+    let mission_s = seconds_of(&plan);
     let mut rates = Vec::new();
-    let mut chain = None;
+    let (mut chain, mut ground) = (None, None);
     for stage in BENCH_STAGES.into_iter().filter(|stage| wanted(stage)) {
-        let mut seconds = Vec::new();
+        let (mut seconds, mut core_seconds) = (Vec::new(), Vec::new());
         for _ in 0..settings.runs.max(1) {
+            let before_s = core_seconds_used();
             if stage == "chain" {
                 let since = Instant::now();
-                chain = Some(run_chain(&plan, &skies)?);
+                chain = Some(chain::run(&plan, &skies)?);
                 seconds.push(since.elapsed().as_secs_f64());
             } else {
                 seconds.push(time_stage(&plan, &skies, &material, stage)?);
             }
+            core_seconds
+                .extend(core_seconds_used().zip(before_s).map(|(after_s, before_s)| after_s - before_s));
         }
-        rates.push(material.rate(stage, seconds));
+        let spent_s = (!core_seconds.is_empty()).then(|| median(&mut core_seconds) / mission_s);
+        rates.push(material.rate(stage, seconds, spent_s));
+        if stage == "chain" {
+            ground = Some(chain::run_ground(config, &material.packets)?);
+        }
     }
+    let growth = if settings.growth { growth::rows(&plan, &skies, settings.runs)? } else { Vec::new() };
     let busiest = |report: &Report| {
         let stages = report.stages.iter();
         stages.max_by(|a, b| a.working.total_s.total_cmp(&b.working.total_s)).map(|s| s.name.clone())
     };
     Ok(Bench {
         machine: Machine { processor: processor(), threads: rayon::current_num_threads() },
-        mission_s: plan.windows.iter().map(|w| (w.end.0 - w.start.0) as f64 * 1e-6).sum(),
+        mission_s,
         channels: plan.instrument.channels.len(),
         daughters: plan.array.satellites(),
         bits: config.daughters.bits,
         block_samples: config.daughters.block_samples,
         sky_pixels,
         rates,
-        saturates_first: chain.as_ref().and_then(busiest),
+        saturates_first: chain.as_ref().and_then(|chain: &ChainRun| busiest(&chain.report)),
         chain,
+        ground,
+        growth,
     })
+}
+
+/// Mission time of a plan's windows, s.
+fn seconds_of(plan: &Plan) -> f64 {
+    plan.windows.iter().map(|window| (window.end.0 - window.start.0) as f64 * 1e-6).sum()
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// Processor time of all threads of this process, s, to a hundredth. Linux counts it in ticks of 10 ms for programs to
+/// read, whatever its own clock (proc(5), fields 14 and 15 of stat).
+fn core_seconds_used() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // The name, in parentheses, may hold spaces.
+    let mut fields = text.rsplit_once(')')?.1.split_whitespace().skip(11);
+    let mut ticks = || fields.next()?.parse::<f64>().ok();
+    Some((ticks()? + ticks()?) / 100.0)
 }
 
 fn source<S: Source>(mut source: S) -> Result<Vec<S::Out>, S::Error> {
@@ -174,8 +220,7 @@ fn never<T>(result: Result<T, Infallible>) -> T {
 }
 
 fn material(plan: &Plan, skies: &[SkyMap]) -> Result<Material, PipelineError> {
-    let (sampler, _, correlator) =
-        sample_stages(plan, super::models::build(plan, skies)?, &SampleCounts::default());
+    let (sampler, _, correlator) = sample_stages(plan, models::build(plan, skies)?, &SampleCounts::default());
     let samples = source(sampler)?;
     let visibilities = never(stage(correlator, samples.clone()));
     let packets = stage(Transmitter::new(&plan.config.downlink)?, visibilities.clone())?;
@@ -201,7 +246,7 @@ fn material(plan: &Plan, skies: &[SkyMap]) -> Result<Material, PipelineError> {
 /// Seconds of one run of a stage alone.
 fn time_stage(plan: &Plan, skies: &[SkyMap], material: &Material, name: &str) -> Result<f64, PipelineError> {
     let (sampler, link, correlator) =
-        sample_stages(plan, super::models::build(plan, skies)?, &SampleCounts::default());
+        sample_stages(plan, models::build(plan, skies)?, &SampleCounts::default());
     // Input is copied before the clock starts, and output dropped after it has stopped.
     Ok(match name {
         "sample" => {
@@ -239,46 +284,10 @@ fn timed<T>(work: impl FnOnce() -> T) -> (f64, T) {
     (since.elapsed().as_secs_f64(), value)
 }
 
-fn run_chain(plan: &Plan, skies: &[SkyMap]) -> Result<Report, PipelineError> {
-    let capacity = plan.config.runtime.queue_capacity;
-    let (sampler, link, correlator) =
-        sample_stages(plan, super::models::build(plan, skies)?, &SampleCounts::default());
-    let mut graph = Graph::new();
-    let samples = graph.source("sample", capacity, sampler);
-    let samples = graph.stage("link", capacity, samples, link);
-    let visibilities = graph.stage("correlate", capacity, samples, correlator);
-    let passes =
-        graph.stage("store", capacity, visibilities, Store::new(plan.config.spacecraft.store_bytes_max));
-    let packets = graph.stage("transmit", capacity, passes, Transmitter::new(&plan.config.downlink)?);
-    let received = graph.stage("receive", capacity, packets, Reception::new(Arc::default()));
-    graph.sink("drop", received, Forget(0));
-    Ok(graph.run(&Cancel::new(), Duration::from_secs_f64(plan.config.runtime.shutdown_s))?)
-}
-
-/// Counts visibilities and forgets them.
-struct Forget(u64);
-
-impl Sink for Forget {
-    type In = GroundFrame;
-    type Error = Infallible;
-
-    fn take(&mut self, input: GroundFrame) -> Result<(), Infallible> {
-        if let GroundFrame::Visibilities(block) = input {
-            self.0 += block.len() as u64;
-        }
-        Ok(())
-    }
-
-    fn units(&self) -> Units {
-        Units::of(self.0, "visibilities")
-    }
-}
-
 impl Material {
-    fn rate(&self, stage: &'static str, mut seconds: Vec<f64>) -> Rate {
-        seconds.sort_by(f64::total_cmp);
+    fn rate(&self, stage: &'static str, mut seconds: Vec<f64>, core_s_per_mission_s: Option<f64>) -> Rate {
+        let median_s = median(&mut seconds);
         let (least_s, most_s) = (seconds[0], seconds[seconds.len() - 1]);
-        let median_s = seconds[seconds.len() / 2];
         let bytes = match stage {
             "transmit" | "receive" => self.packet_bytes,
             _ => self.sample_bytes,
@@ -292,6 +301,7 @@ impl Material {
             visibilities_per_s: visibilities / median_s,
             bytes_per_s: bytes / median_s,
             times_real_time: samples_per_s / DESIGN_SAMPLES_PER_S,
+            core_s_per_mission_s,
         }
     }
 }
@@ -301,44 +311,4 @@ fn processor() -> String {
     let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let named = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
     named.map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
-}
-
-impl fmt::Display for Bench {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Machine { processor, threads } = &self.machine;
-        writeln!(f, "{processor}, {threads} worker threads")?;
-        writeln!(
-            f,
-            "{:.1} s of {} channels x {} daughters, {} bits, blocks of {}, {} sky pixels\n",
-            self.mission_s, self.channels, self.daughters, self.bits, self.block_samples, self.sky_pixels
-        )?;
-        writeln!(
-            f,
-            "{:<10} {:>11} {:>23} {:>15} {:>12} {:>16}",
-            "stage", "samples/s", "slowest .. fastest", "visibilities/s", "bytes/s", "times real time"
-        )?;
-        for rate in &self.rates {
-            let [slow, fast] = rate.samples_per_s_range;
-            let range = format!("{slow:.2e} .. {fast:.2e}");
-            writeln!(
-                f,
-                "{:<10} {:>11.3e} {range:>23} {:>15.3e} {:>12.3e} {:>16.1}",
-                rate.stage,
-                rate.samples_per_s,
-                rate.visibilities_per_s,
-                rate.bytes_per_s,
-                rate.times_real_time
-            )?;
-        }
-        if let Some(chain) = &self.chain {
-            writeln!(
-                f,
-                "\nThe chain's last run; \"since source\" is from sample to what the stage made\n{chain}"
-            )?;
-        }
-        if let Some(stage) = &self.saturates_first {
-            write!(f, "\nsaturates first: {stage}")?;
-        }
-        Ok(())
-    }
 }

@@ -1,0 +1,135 @@
+//! What is a little less than a covariance, made one.
+
+use multiversion::multiversion;
+
+use super::colour::{PIVOT_MIN, TILE, Tile, element};
+use crate::array::response::kernel::fused;
+
+/// Changes of a correlation that are counted; smaller ones are rounding.
+const CHANGE_COUNTED: f32 = 1e-5;
+
+/// What had to be done to covariances.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Repairs {
+    /// Correlations looked at.
+    pub elements: u64,
+    /// Those made smaller by more than `CHANGE_COUNTED` so that a matrix became a covariance.
+    pub changed: u64,
+    /// Greatest change, as a part of the two daughters' powers.
+    pub change_max: f32,
+}
+
+impl Repairs {
+    /// Of a tile for `order` daughters that needed none.
+    pub(super) fn none(order: usize) -> Self {
+        Self { elements: (order * (order - 1) / 2 * TILE) as u64, ..Self::default() }
+    }
+
+    /// Adds what another part has counted.
+    pub fn absorb(&mut self, other: Self) {
+        self.elements += other.elements;
+        self.changed += other.changed;
+        self.change_max = self.change_max.max(other.change_max);
+    }
+}
+
+/// As [`super::colour::Factor`], where C may lack something to be a covariance.
+///
+/// Rounding and interpolation can make C a little less than a covariance. A daughter then has less power left than
+/// its correlation with another asks for; the correlation is made as small as the power that is left. Powers
+/// stay, and no correlation changes by more than C lacks.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+pub(super) fn factor(tile: &mut Tile, order: usize) -> Repairs {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
+    let mut repairs = Repairs::none(order);
+    let powers: Vec<[f32; TILE]> = (0..order).map(|i| tile.re[element(i, i)]).collect();
+    let mut left = powers.clone();
+    for j in 0..order {
+        let (mut pivot, mut inverse) = ([0.0_f32; TILE], [0.0_f32; TILE]);
+        for t in 0..TILE {
+            // No power at all is a daughter that hears nothing.
+            pivot[t] = left[j][t].max(PIVOT_MIN * powers[j][t]).max(f32::MIN_POSITIVE).sqrt();
+            inverse[t] = 1.0 / pivot[t];
+        }
+        tile.re[element(j, j)] = pivot;
+        tile.im[element(j, j)] = [0.0; TILE];
+        for i in j + 1..order {
+            let at = element(i, j);
+            let (mut re, mut im) = (tile.re[at], tile.im[at]);
+            for k in 0..j {
+                let (a, b) = (element(i, k), element(j, k));
+                let (a_re, a_im, b_re, b_im) = (&tile.re[a], &tile.im[a], &tile.re[b], &tile.im[b]);
+                for t in 0..TILE {
+                    re[t] = fused::<FMA>(-a_re[t], b_re[t], fused::<FMA>(-a_im[t], b_im[t], re[t]));
+                    im[t] = fused::<FMA>(-a_im[t], b_re[t], fused::<FMA>(a_re[t], b_im[t], im[t]));
+                }
+            }
+            let mut lacking = 0_u32;
+            for t in 0..TILE {
+                re[t] *= inverse[t];
+                im[t] *= inverse[t];
+                let asked = re[t] * re[t] + im[t] * im[t];
+                lacking += u32::from(asked > left[i][t]);
+                left[i][t] -= asked;
+            }
+            if lacking > 0 {
+                shrink(
+                    [&mut re, &mut im],
+                    &mut left[i],
+                    |t| pivot[t] / (powers[i][t] * powers[j][t]).sqrt(),
+                    &mut repairs,
+                );
+            }
+            tile.re[at] = re;
+            tile.im[at] = im;
+        }
+    }
+    repairs
+}
+
+/// Makes the elements smaller that took more power than was left; `unit` is a change of one, as a part of the powers.
+fn shrink(
+    [re, im]: [&mut [f32; TILE]; 2],
+    left: &mut [f32; TILE],
+    unit: impl Fn(usize) -> f32,
+    repairs: &mut Repairs,
+) {
+    for t in 0..TILE {
+        if left[t] >= 0.0 {
+            continue;
+        }
+        let asked = re[t] * re[t] + im[t] * im[t];
+        let there = (left[t] + asked).max(0.0);
+        left[t] = 0.0;
+        let scale = (there / asked).sqrt();
+        let change = unit(t) * asked.sqrt() * (1.0 - scale);
+        repairs.changed += u64::from(change > CHANGE_COUNTED);
+        repairs.change_max = repairs.change_max.max(change);
+        re[t] *= scale;
+        im[t] *= scale;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::colour::Factor;
+    use super::*;
+
+    #[test]
+    fn what_is_no_covariance_keeps_its_powers_and_loses_correlation() {
+        // Two daughters of power 1 that correlate by 1.01.
+        let mut tile = Tile::new(2);
+        for t in 0..TILE {
+            (tile.re[0][t], tile.re[2][t], tile.re[1][t], tile.im[1][t]) = (1.0, 1.0, 0.0, 1.01);
+        }
+        assert!(!pulp::Arch::new().dispatch(Factor { tile: &mut tile.clone(), order: 2 }));
+        let repairs = factor(&mut tile, 2);
+        assert_eq!(repairs.changed, TILE as u64);
+        assert!((repairs.change_max - 0.01).abs() < 1e-5, "{}", repairs.change_max);
+        assert!((tile.im[1][0] * tile.re[0][0] - 1.0).abs() < 1e-6);
+        let power = tile.im[1][0].powi(2) + tile.re[2][0].powi(2);
+        // The least pivot is added.
+        assert!((power - 1.0).abs() < 2e-6, "{power}");
+    }
+}

@@ -1,0 +1,86 @@
+//! The chain at other sizes.
+
+use std::time::Instant;
+
+use serde::Serialize;
+
+use super::{chain, core_seconds_used, median, seconds_of};
+use crate::pipeline::config::Config;
+use crate::pipeline::error::PipelineError;
+use crate::pipeline::plan::Plan;
+use crate::sky::SkyMap;
+
+/// The chain at one size.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct GrowthRow {
+    /// Number of channels.
+    pub channels: usize,
+    /// Number of daughters.
+    pub daughters: usize,
+    /// Samples of a block.
+    pub block_samples: usize,
+    /// Complex samples a second, median over runs.
+    pub samples_per_s: f64,
+    /// The slowest run and the fastest.
+    pub samples_per_s_range: [f64; 2],
+    /// Seconds of the mission in one second, at this size.
+    pub times_real_time: f64,
+    /// Seconds of processor time for one second of the mission at this size, median over runs.
+    pub core_s_per_mission_s: Option<f64>,
+}
+
+/// Numbers of daughters that are tried.
+const DAUGHTERS: [usize; 3] = [4, 8, 16];
+/// Blocks that are tried, samples.
+const BLOCKS: [usize; 4] = [256, 1024, 4096, 16_384];
+
+/// Runs of the chain with a third, two thirds and all of the channels, and with other daughters and blocks.
+pub(super) fn rows(plan: &Plan, skies: &[SkyMap], runs: usize) -> Result<Vec<GrowthRow>, PipelineError> {
+    let all = plan.config.spacecraft.channels_hz.len();
+    let mut rows = Vec::new();
+    for channels in [all.div_ceil(3), (2 * all).div_ceil(3), all] {
+        let mut config = plan.config.clone();
+        config.spacecraft.channels_hz.truncate(channels);
+        // Files and priors are given channel by channel; the chain needs none of them.
+        rows.push(row(config, plan, &skies[..channels], runs)?);
+    }
+    for daughters in DAUGHTERS {
+        let mut config = plan.config.clone();
+        config.array.satellites = daughters;
+        rows.push(row(config, plan, skies, runs)?);
+    }
+    for block_samples in BLOCKS {
+        let mut config = plan.config.clone();
+        config.daughters.block_samples = block_samples;
+        rows.push(row(config, plan, skies, runs)?);
+    }
+    Ok(rows)
+}
+
+fn row(config: Config, plan: &Plan, skies: &[SkyMap], runs: usize) -> Result<GrowthRow, PipelineError> {
+    let own = Plan::new(config)?;
+    let windows = own.windows.iter().take(plan.windows.len()).copied().collect();
+    let own = Plan { windows, ..own };
+    let mission_s = seconds_of(&own);
+    let (mut rates, mut core_seconds) = (Vec::new(), Vec::new());
+    for _ in 0..runs.max(1) {
+        let (before_s, since) = (core_seconds_used(), Instant::now());
+        let run = chain::run(&own, skies)?;
+        let elapsed_s = since.elapsed().as_secs_f64();
+        let samples = run.report.stage("sample").map_or(0, |stage| stage.units);
+        rates.push(samples as f64 / elapsed_s);
+        core_seconds.extend(core_seconds_used().zip(before_s).map(|(after_s, before_s)| after_s - before_s));
+    }
+    let samples_per_s = median(&mut rates);
+    let (channels, daughters) = (own.instrument.channels.len(), own.array.satellites());
+    let width_hz = own.instrument.channels.first().map_or(1.0, |channel| channel.width_hz);
+    Ok(GrowthRow {
+        channels,
+        daughters,
+        block_samples: own.config.daughters.block_samples,
+        samples_per_s,
+        samples_per_s_range: [rates[0], rates[rates.len() - 1]],
+        times_real_time: samples_per_s / ((channels * daughters) as f64 * width_hz),
+        core_s_per_mission_s: (!core_seconds.is_empty()).then(|| median(&mut core_seconds) / mission_s),
+    })
+}
