@@ -8,13 +8,15 @@ use super::config::Config;
 use super::error::PipelineError;
 use super::ground::{self, GroundOutcome};
 use super::plan::Plan;
+use super::sample_summary::SampleSummary;
+use super::sampling::SampleCounts;
 use super::space;
 use super::state::Keeper;
 use super::summary::{Segment, Summary};
 use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
 use crate::downlink::{FileSource, Format, Recorder};
-use crate::products::{ProductsError, Truth};
+use crate::products::{ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig};
 use crate::solve::SolveWatch;
 
@@ -47,7 +49,8 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     make_folder(out)?;
     let skies = space::skies(plan)?;
     let mut graph = Graph::new();
-    let bytes = space::add(&mut graph, plan, &skies)?;
+    let counts = SampleCounts::default();
+    let bytes = space::add(&mut graph, plan, &skies, &counts)?;
     let file = out.join(downlink_file(plan.config.downlink.format));
     let bytes = add_link(&mut graph, bytes, &plan.config, &file)?;
     let recorder = Recorder::create(&file)?;
@@ -62,7 +65,7 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     let solving = SolveWatch::new(cancel.clone());
     let outcome = ground::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()), None)?;
     let report = start(graph, &plan.config.runtime, (cancel, solving), watch)?;
-    conclude(Segment::Whole, &plan.config, Some(out), report, outcome)
+    conclude(Segment::Whole, &plan.config, Some(out), report, (outcome, counts.close(plan)?))
 }
 
 /// The space segment alone, to a downlink file.
@@ -77,11 +80,14 @@ pub fn simulate(
 ) -> Result<Report, PipelineError> {
     let skies = space::skies(plan)?;
     let mut graph = Graph::new();
-    let bytes = space::add(&mut graph, plan, &skies)?;
+    let counts = SampleCounts::default();
+    let bytes = space::add(&mut graph, plan, &skies, &counts)?;
     drop(skies);
     let bytes = add_link(&mut graph, bytes, &plan.config, file)?;
     graph.sink("record", bytes, Recorder::create(file)?);
-    start(graph, &plan.config.runtime, (cancel, SolveWatch::default()), watch)
+    let report = start(graph, &plan.config.runtime, (cancel, SolveWatch::default()), watch)?;
+    counts.close(plan)?;
+    Ok(report)
 }
 
 /// The ground segment alone, from downlink files; with a `keeper`, on top of what it holds.
@@ -102,7 +108,7 @@ pub fn replay(
     let solving = SolveWatch::new(cancel.clone());
     let outcome = ground::add(&mut graph, bytes, config, out, (Truth::unknown(), solving.clone()), keeper)?;
     let report = start(graph, &config.runtime, (cancel, solving), watch)?;
-    conclude(Segment::Ground, config, Some(out), report, outcome)
+    conclude(Segment::Ground, config, Some(out), report, (outcome, None))
 }
 
 /// The link's faults, if any are asked for; the truth about them goes beside the downlink file.
@@ -125,11 +131,14 @@ fn make_folder(out: &Path) -> Result<(), PipelineError> {
 }
 
 fn start(
-    graph: Graph,
+    mut graph: Graph,
     config: &RuntimeConfig,
     (cancel, solving): (&Cancel, SolveWatch),
     watch: Watcher<'_>,
 ) -> Result<Report, PipelineError> {
+    if config.stall_s > 0.0 {
+        graph.fail_after_stall(Duration::from_secs_f64(config.stall_s));
+    }
     watch(Watched { metrics: graph.metrics(), solving });
     Ok(graph.run(cancel, Duration::from_secs_f64(config.shutdown_s))?)
 }
@@ -139,12 +148,16 @@ fn conclude(
     config: &Config,
     out: Option<&Path>,
     report: Report,
-    outcome: GroundOutcome,
+    (outcome, samples): (GroundOutcome, Option<SampleSummary>),
 ) -> Result<Summary, PipelineError> {
     let reception = outcome.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = outcome.channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let ledger = outcome.ledger.close()?;
-    let summary = Summary::new(segment, config, report, ledger, reception, channels);
+    if let Some(out) = out {
+        let mut autos = outcome.autos.lock().unwrap_or_else(PoisonError::into_inner);
+        write_autos(&mut autos, out, config.products.pictures)?;
+    }
+    let summary = Summary { samples, ..Summary::new(segment, config, report, ledger, reception, channels) };
     if let Some(out) = out {
         summary.write(out)?;
     }

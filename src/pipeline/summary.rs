@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::config::Config;
+use super::sample_summary::SampleSummary;
 use crate::downlink::ReceptionCounters;
 use crate::files::write_atomically;
 use crate::products::{ChannelSummary, ProductsError};
@@ -42,6 +43,9 @@ pub struct Summary {
     pub channels: Vec<ChannelSummary>,
     /// What became of every visibility.
     pub ledger: LedgerReport,
+    /// What became of samples; absent without sample fidelity.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub samples: Option<SampleSummary>,
     /// What was received, and what was wrong with it.
     pub reception: ReceptionCounters,
     /// Stages: throughput, times, queues.
@@ -69,6 +73,7 @@ impl Summary {
             ground_hash: format!("{:016x}", config.ground_hash()),
             channels,
             ledger,
+            samples: None,
             reception,
             report,
         }
@@ -90,6 +95,9 @@ impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "Stages\n{}\n", self.report)?;
         writeln!(f, "Ledger of visibilities\n{}\n", self.ledger)?;
+        if let Some(samples) = &self.samples {
+            writeln!(f, "Samples\n{samples}\n")?;
+        }
         writeln!(f, "Reception\n{}\n", self.reception)?;
         writeln!(f, "Maps")?;
         for channel in &self.channels {

@@ -9,7 +9,7 @@ use lunarray::frames::{
     AntennaResponse, Channel, GroundFrame, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame,
     VisibilityBlock,
 };
-use lunarray::mother::correlator::{Correlator, CorrelatorCounts, CorrelatorSetup};
+use lunarray::mother::correlator::{Correlator, CorrelatorCounts, CorrelatorSetup, Division};
 use lunarray::mother::{ModelError, PairPosition, Prediction, Schedule, VisibilityModel};
 use lunarray::runtime::{Flow, Outlet, Source, Stage};
 use lunarray::units::MissionTime;
@@ -71,6 +71,8 @@ pub struct Spacecraft {
     pub rule: IntegrationRule,
     pub daughters: DaughtersConfig,
     pub window: ObservingWindow,
+    pub division: Division,
+    pub auto_integration_s: f64,
 }
 
 impl Spacecraft {
@@ -86,6 +88,8 @@ impl Spacecraft {
             rule: IntegrationRule::default(),
             daughters: DaughtersConfig { bits: 32, ..DaughtersConfig::default() },
             window: ObservingWindow { index: 0, start, end },
+            division: Division::NONE,
+            auto_integration_s: 0.0,
         }
     }
 
@@ -111,9 +115,10 @@ impl Spacecraft {
     }
 
     pub fn correlate(&self, frames: Vec<SpaceFrame>) -> (Vec<VisibilityBlock>, CorrelatorCounts) {
-        let schedule = |&frequency_hz: &f64| Schedule {
+        let channels = self.division.divided(&self.channels());
+        let schedule = |channel: &Channel| Schedule {
             rule: self.rule,
-            frequency_hz,
+            frequency_hz: channel.frequency_hz,
             baseline_wavelengths_max: 0.0,
             every_nth: 1,
             every_nth_window: 1,
@@ -125,12 +130,14 @@ impl Spacecraft {
                 epoch_tai_s: 0.0,
                 moon_radius_m: self.array.moon_radius_m(),
                 satellites: 8,
-                channels: self.channels(),
+                channels: channels.clone(),
                 response: AntennaResponse::Isotropic,
                 seed: 0,
                 configuration_hash: 0,
             },
-            schedules: self.frequencies_hz.iter().map(schedule).collect(),
+            schedules: channels.iter().map(schedule).collect(),
+            division: self.division,
+            auto_integration_s: self.auto_integration_s,
             block_samples: self.daughters.block_samples,
             wait_blocks: 4,
         };

@@ -5,9 +5,12 @@
 #[path = "../common/mod.rs"]
 mod common;
 
+mod autos;
 mod chain;
 mod craft;
 mod delays;
+mod disturbances;
 mod integration;
 mod noise;
+mod robust;
 mod signal;
