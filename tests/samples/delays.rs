@@ -144,7 +144,7 @@ fn sub_bands_and_delays_keep_what_they_should_on_every_baseline() {
             _ => 0.93,
         };
         assert!(least > floor, "{bands} {centred}: {least}");
-        // Of a full channel, nothing is left somewhere: sinc(pi 2.67) is 0.10.
+        // Of a full channel nothing is left where the delay is two samples, and 0.10 of the longest.
         assert!(bands > 1 || centred || least < 0.12, "{least}");
     }
 }
