@@ -93,13 +93,14 @@ impl Write for AtomicFile {
 
 impl Drop for AtomicFile {
     fn drop(&mut self) {
-        if self.file.take().is_none() {
+        if self.file.is_none() {
             return;
         }
+        // What went wrong before is what counts; remains are a nuisance, not an error.
         match self.unfinished {
-            // What went wrong before is what counts; remains are a nuisance, not an error.
             Unfinished::Remove => drop(fs::remove_file(&self.partial_path)),
-            Unfinished::Keep => {}
+            // All that was handed over, and not only what filled a buffer.
+            Unfinished::Keep => drop(self.flush()),
         }
     }
 }
@@ -142,10 +143,12 @@ mod tests {
         for (unfinished, remains) in [(Unfinished::Remove, false), (Unfinished::Keep, true)] {
             let path = folder.path().join(format!("{unfinished:?}"));
             let mut file = AtomicFile::create(&path, unfinished).unwrap();
-            file.write_all(&vec![7; WRITE_BYTES]).unwrap();
+            file.write_all(&vec![7; WRITE_BYTES + 5]).unwrap();
+            file.write_all(&[8; 3]).unwrap();
             drop(file);
             assert!(!path.exists());
-            assert_eq!(path.with_extension("partial").exists(), remains);
+            let left = fs::read(path.with_extension("partial")).ok();
+            assert_eq!(left.map(|bytes| bytes.len()), remains.then_some(WRITE_BYTES + 8));
         }
     }
 }

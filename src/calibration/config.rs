@@ -4,7 +4,10 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{AntennaGains, Calibration, CalibrationError, Identity, VanVleck};
+use super::{AntennaGains, Calibration, CalibrationError, Identity, SubBands, VanVleck};
+
+/// Most sub-bands of a channel.
+const SUB_BANDS_MAX: usize = 64;
 
 /// Which calibration is applied.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -18,7 +21,7 @@ pub enum CalibrationHook {
 }
 
 /// The `[calibration]` section.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CalibrationConfig {
     /// Which calibration is applied.
@@ -28,6 +31,14 @@ pub struct CalibrationConfig {
     pub gains_file: Option<PathBuf>,
     /// Bits of the samples whose correlations are corrected: 1, 2 or 4; 0 for no correction.
     pub quantiser_bits: u32,
+    /// Successive channels of the downlink, sub-bands of one, that go into one map.
+    pub sub_bands: usize,
+}
+
+impl Default for CalibrationConfig {
+    fn default() -> Self {
+        Self { hook: CalibrationHook::Identity, gains_file: None, quantiser_bits: 0, sub_bands: 1 }
+    }
 }
 
 impl CalibrationConfig {
@@ -37,6 +48,13 @@ impl CalibrationConfig {
         let mut found = Vec::new();
         if let Err(problem) = self.van_vleck() {
             found.push(problem);
+        }
+        if !(1..=SUB_BANDS_MAX).contains(&self.sub_bands) {
+            found.push(CalibrationError::Parameter {
+                key: "calibration.sub_bands".to_owned(),
+                value: self.sub_bands.to_string(),
+                expected: "1 to 64",
+            });
         }
         let expected = match (self.hook, &self.gains_file) {
             (CalibrationHook::AntennaGains, None) => "the path of a file, for hook = \"antenna-gains\"",
@@ -71,9 +89,13 @@ impl CalibrationConfig {
         if let Some(problem) = self.problems().into_iter().next() {
             return Err(problem);
         }
-        Ok(match &self.gains_file {
+        let calibration: Box<dyn Calibration> = match &self.gains_file {
             Some(file) => Box::new(AntennaGains::read(&folder.join(file))?),
             None => Box::new(Identity),
+        };
+        Ok(match self.sub_bands {
+            1 => calibration,
+            count => Box::new(SubBands::new(calibration, count)),
         })
     }
 }

@@ -63,6 +63,17 @@ pub enum CalibrationError {
         /// Largest distance that is accepted, Hz.
         tolerance_hz: f64,
     },
+    /// Channels that are not sub-bands side by side.
+    #[error(
+        "calibration.sub_bands = {sub_bands}: expected the number of adjoining sub-bands of each channel in the \
+         downlink, which has {channels} channels"
+    )]
+    SubBands {
+        /// Number asked for.
+        sub_bands: usize,
+        /// Channels of the downlink.
+        channels: usize,
+    },
     /// A satellite without gains.
     #[error("no gains for pair {pair}: the gains file has {satellites} satellites; is it for this array?")]
     Satellite {

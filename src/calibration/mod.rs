@@ -3,13 +3,14 @@
 //! A [`Calibration`] turns measured visibilities into what ideal antennas would have measured, and
 //! gives each the weight that is left to it. [`Identity`] does nothing; [`AntennaGains`] divides by
 //! complex gains from a file. [`CalibrationConfig`] chooses. Before either, [`VanVleck`] takes out what
-//! quantisers of few bits do to correlations.
+//! quantisers of few bits do to correlations; after it, [`SubBands`] brings sub-bands of a channel together.
 
 mod config;
 mod error;
 mod gains;
 mod gains_file;
 mod stage;
+mod sub_bands;
 mod van_vleck;
 
 pub use config::{CalibrationConfig, CalibrationHook};
@@ -17,14 +18,23 @@ pub use error::CalibrationError;
 pub use gains::AntennaGains;
 pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation};
 pub use stage::{Calibrator, CalibratorState, DUPLICATE};
+pub use sub_bands::SubBands;
 pub use van_vleck::{QuantiserBitsError, VanVleck};
 
-use crate::frames::PlacedVisibilities;
+use crate::frames::{Instrument, PlacedVisibilities};
 
 /// Corrects visibilities in place.
 pub trait Calibration: Send {
     /// Name as in the configuration.
     fn name(&self) -> &'static str;
+
+    /// Hears of the instrument that measured what will come, and says what it looks like afterwards.
+    ///
+    /// # Errors
+    /// [`CalibrationError`] if it is none that this calibration was made for.
+    fn describe(&mut self, instrument: &Instrument) -> Result<Instrument, CalibrationError> {
+        Ok(instrument.clone())
+    }
 
     /// Corrects values and weights of a block, and takes out what cannot be corrected; order and
     /// equal lengths of the arrays are kept.

@@ -2,13 +2,21 @@
 
 use std::collections::{BTreeMap, HashSet};
 
+use std::sync::{Arc, Mutex, PoisonError};
+
+use num_complex::Complex64;
+
 use super::{Calibration, CalibrationError, VanVleck};
 use crate::array::{Ephemeris, FlaggedCounts};
 use crate::frames::{
-    EphemerisSegment, GroundFrame, Housekeeping, Instrument, PlacedFrame, PlacedVisibilities, VisibilityBlock,
+    AutoPower, Channel, EphemerisSegment, GroundFrame, Housekeeping, Instrument, PlacedFrame,
+    PlacedVisibilities, VisibilityBlock,
 };
 use crate::runtime::{Ledger, Outlet, Stage, Units};
 use crate::units::{ChannelId, MissionTime, Pair};
+
+/// Most powers of daughters that are kept: 100 MB, more than two hours of every second of 30 channels.
+const AUTOS_MAX: usize = 2_000_000;
 
 /// Identity of a block of visibilities, the beginning of its first integration in it: every one is used once,
 /// however often it arrives.
@@ -37,6 +45,8 @@ pub struct CalibratorState {
 /// what the link lost. Visibilities after the last housekeeping packet count as sampled when received.
 pub struct Calibrator {
     van_vleck: Option<VanVleck>,
+    /// Where the daughters' own powers go.
+    autos: Option<Arc<Mutex<Vec<AutoPower>>>>,
     calibration: Box<dyn Calibration>,
     ledger: Ledger,
     ephemeris: Ephemeris,
@@ -54,6 +64,7 @@ impl Calibrator {
     pub fn new(calibration: Box<dyn Calibration>, ledger: Ledger) -> Self {
         Self {
             van_vleck: None,
+            autos: None,
             calibration,
             ledger,
             ephemeris: Ephemeris::default(),
@@ -80,6 +91,7 @@ impl Calibrator {
     pub fn absorb(&mut self, state: CalibratorState) {
         let CalibratorState { instrument, ephemeris, received, reports } = state;
         self.instrument = self.instrument.take().or(instrument);
+        self.describe();
         for segment in ephemeris {
             self.ephemeris.insert(segment);
         }
@@ -96,7 +108,9 @@ impl Calibrator {
         for segment in ephemeris {
             self.ephemeris.insert(segment);
         }
-        Self { instrument, received, reports, ..self }
+        let mut resumed = Self { instrument, received, reports, ..self };
+        resumed.describe();
+        resumed
     }
 
     /// Keeps positions of so many segments.
@@ -151,10 +165,62 @@ impl Calibrator {
         }
     }
 
+    /// Tells the calibration of an instrument that another has seen. A refusal then comes with the first visibilities.
+    fn describe(&mut self) {
+        if let Some(instrument) = &self.instrument {
+            self.calibration.describe(instrument).ok();
+        }
+    }
+
     /// Takes out first what quantisers of few bits do.
     #[must_use]
     pub fn with_van_vleck(self, van_vleck: Option<VanVleck>) -> Self {
         Self { van_vleck, ..self }
+    }
+
+    /// Keeps the daughters' own powers in `autos`; without that they are left out.
+    #[must_use]
+    pub fn with_autos(self, autos: Arc<Mutex<Vec<AutoPower>>>) -> Self {
+        Self { autos: Some(autos), ..self }
+    }
+
+    /// Calibrates and keeps the powers of one daughter.
+    fn autos(&mut self, block: &VisibilityBlock, channel: Channel) -> Result<(), CalibrationError> {
+        let good: Vec<usize> = (0..block.len()).filter(|&k| block.flags[k].is_good()).collect();
+        let mut flagged = FlaggedCounts::default();
+        block.flags.iter().for_each(|&flags| flagged.add(flags));
+        self.post_flagged(&flagged);
+        let mut placed = PlacedVisibilities {
+            channel: block.channel,
+            frequency_hz: channel.frequency_hz,
+            pair: block.pair,
+            time_s: good.iter().map(|&k| block.middle_s(k)).collect(),
+            r_i_m: vec![[0.0; 3]; good.len()],
+            r_j_m: vec![[0.0; 3]; good.len()],
+            value_k_sr: good.iter().map(|&k| Complex64::new(block.value_k_sr[k].re.into(), 0.0)).collect(),
+            weight: good.iter().map(|&k| f64::from(block.weight[k])).collect(),
+        };
+        let calibrated = self.calibration.apply(&mut placed)?;
+        for (reason, count) in calibrated.removed() {
+            self.ledger.flagged(reason, count as u64);
+        }
+        let Some(autos) = &self.autos else {
+            self.ledger.flagged("auto-correlation", placed.len() as u64);
+            return Ok(());
+        };
+        let mut autos = autos.lock().unwrap_or_else(PoisonError::into_inner);
+        let kept = placed.len().min(AUTOS_MAX.saturating_sub(autos.len()));
+        autos.extend((0..kept).map(|k| AutoPower {
+            daughter: block.pair.i,
+            frequency_hz: channel.frequency_hz,
+            width_hz: channel.width_hz,
+            time_s: placed.time_s[k],
+            power_k_sr: placed.value_k_sr[k].re,
+            sigma_k_sr: placed.weight[k].sqrt().recip(),
+        }));
+        self.ledger.accumulated(kept as u64);
+        self.ledger.flagged("auto-correlation beyond the table", (placed.len() - kept) as u64);
+        Ok(())
     }
 
     fn visibilities(
@@ -176,16 +242,20 @@ impl Calibrator {
         Ok(())
     }
 
-    /// Places and calibrates a block; `None` for want of an instrument.
+    /// Places and calibrates a block; `None` for want of an instrument, and of a daughter's own powers.
     fn place(&mut self, mut block: VisibilityBlock) -> Result<Option<PlacedVisibilities>, CalibrationError> {
         let count = block.len() as u64;
         let channel = self.instrument.as_ref().and_then(|i| i.channels.get(usize::from(block.channel.0)));
-        let Some(channel) = channel else {
+        let Some(&channel) = channel else {
             self.ledger.flagged("no instrument description", count);
             return Ok(None);
         };
         if let Some(van_vleck) = &self.van_vleck {
             van_vleck.apply(&mut block, channel.width_hz);
+        }
+        if block.pair.i == block.pair.j {
+            self.autos(&block, channel)?;
+            return Ok(None);
         }
         let (mut placed, placing) = self.ephemeris.place(&block, channel.frequency_hz);
         self.ledger.flagged("no ephemeris", placing.without_ephemeris);
@@ -221,8 +291,8 @@ impl Stage for Calibrator {
             GroundFrame::Instrument(instrument) => {
                 // The decoder reports descriptions that contradict the first.
                 if self.instrument.is_none() {
-                    self.instrument = Some(instrument.clone());
-                    out.push(PlacedFrame::Instrument(instrument));
+                    out.push(PlacedFrame::Instrument(self.calibration.describe(&instrument)?));
+                    self.instrument = Some(instrument);
                 }
             }
             GroundFrame::Ephemeris(segment) => {

@@ -96,6 +96,14 @@ impl VanVleck {
     /// The daughters' powers follow from the mother's weights, `2 n / (P_i P_j)`, where n is taken as all samples of
     /// the integration.
     pub fn apply(&self, block: &mut VisibilityBlock, width_hz: f64) {
+        if block.pair.i == block.pair.j {
+            // A power knows no correlation: it is scaled as all powers are.
+            for (value, weight) in block.value_k_sr.iter_mut().zip(&mut block.weight) {
+                *value /= self.power_ratio as f32;
+                *weight *= self.power_ratio.powi(2) as f32;
+            }
+            return;
+        }
         let weak = self.quantised[1] / (FRAC_PI_2 / STEPS as f64).sin();
         for k in 0..block.value_k_sr.len() {
             let samples = width_hz * f64::from(block.duration_ticks[k]) * 1e-6;

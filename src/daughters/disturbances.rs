@@ -73,14 +73,18 @@ pub(super) struct Stretch<'a> {
 }
 
 impl Stretch<'_> {
-    /// Adds the calibration tone and the Earth's leak. Both pass the daughter's own gain.
+    /// Adds the calibration tone and the Earth's leak. Both pass the daughter's own gain and clock.
     pub(super) fn add_tones(&self, re: &mut [f32], im: &mut [f32]) {
         let d = self.disturbances;
         let t_s = self.window_s + self.first as f64 / self.channel.width_hz;
-        let gain = d.response(self.daughter, self.channel, t_s).gain;
+        let response = d.response(self.daughter, self.channel, t_s);
+        let gain_at = |offset_hz: f64| {
+            response.gain * Complex64::cis(TAU * response.turns * offset_hz / self.channel.width_hz)
+        };
         if d.calibration_k_sr > 0.0 {
             let start = Complex64::from_polar(d.calibration_k_sr.sqrt(), d.calibration_phase_rad);
-            self.add(gain * start, d.calibration_offset_hz, re, im);
+            let offset_hz = d.calibration_offset_hz;
+            self.add(gain_at(offset_hz) * start, [offset_hz, 0.0], re, im);
         }
         if d.interference_k_sr > 0.0 {
             let depth_m = self.array.earth_depth_of_m(self.daughter, t_s).max(0.0);
@@ -89,22 +93,24 @@ impl Stretch<'_> {
             let identity = [self.channel.frequency_hz.to_bits(), self.window_s.to_bits()];
             let mut rng = random_stream(self.seed, StreamKind::Interference, identity);
             let turns = f64::from(rng.next_u32()) / 2.0_f64.powi(32);
-            let along_m = dot(self.array.earth_hat(t_s), self.array.position_m(self.daughter, t_s));
-            let frequency_hz = self.channel.frequency_hz + d.interference_offset_hz;
-            let fringe = (turns - frequency_hz / SPEED_OF_LIGHT_M_S * along_m).fract();
-            self.add(
-                gain * Complex64::from_polar(power.sqrt(), TAU * fringe),
-                d.interference_offset_hz,
-                re,
-                im,
-            );
+            let offset_hz = d.interference_offset_hz;
+            let per_m = (self.channel.frequency_hz + offset_hz) / SPEED_OF_LIGHT_M_S;
+            let along_m = |t_s| dot(self.array.earth_hat(t_s), self.array.position_m(self.daughter, t_s));
+            // Motion turns the phase on over the stretch, so that it goes on where the next one begins.
+            let length_s = re.len() as f64 / self.channel.width_hz;
+            let moved_m = along_m(t_s + length_s) - along_m(t_s);
+            let start = Complex64::from_polar(power.sqrt(), TAU * (turns - per_m * along_m(t_s)).fract());
+            self.add(gain_at(offset_hz) * start, [offset_hz, per_m * moved_m / length_s], re, im);
         }
     }
 
-    fn add(&self, start: Complex64, offset_hz: f64, re: &mut [f32], im: &mut [f32]) {
+    /// Adds a tone that starts as it would have at the window's first sample; of its two frequencies the second
+    /// counts from the stretch's first.
+    fn add(&self, start: Complex64, [offset_hz, shift_hz]: [f64; 2], re: &mut [f32], im: &mut [f32]) {
         let turns = offset_hz / self.channel.width_hz;
         let from = Complex64::cis(-TAU * (turns * self.first as f64).fract());
-        let (mut value, step) = (start * from, Complex64::cis(-TAU * turns));
+        let step = Complex64::cis(-TAU * (turns + shift_hz / self.channel.width_hz));
+        let mut value = start * from;
         for (re, im) in re.iter_mut().zip(im) {
             let tone = Complex32::new(value.re as f32, value.im as f32);
             *re += tone.re;

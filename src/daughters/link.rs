@@ -4,13 +4,15 @@ use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use serde::Serialize;
+
 use super::config::{DaughtersConfig, DropPolicy};
 use crate::frames::{SampleBlock, SpaceFrame};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{MissionTime, TICKS_PER_SECOND};
 
 /// What the links have carried and dropped, all daughters together.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct LinkCounts {
     /// Blocks sent.
     pub sent: u64,
@@ -18,8 +20,17 @@ pub struct LinkCounts {
     pub bits: u64,
     /// Blocks dropped because a buffer was full.
     pub dropped: u64,
+    /// Their samples.
+    pub dropped_samples: u64,
     /// Most bits that waited in one buffer.
     pub waiting_bits_max: u64,
+}
+
+impl LinkCounts {
+    fn count_dropped(&mut self, samples: u64) {
+        self.dropped += 1;
+        self.dropped_samples += samples;
+    }
 }
 
 /// Sends blocks at a limited rate out of a bounded buffer, one of each a daughter. A block that does not fit
@@ -57,7 +68,7 @@ impl SampleLink {
 
     fn take(&mut self, block: SampleBlock, out: &mut Outlet<SpaceFrame>) {
         let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
-        let bits = block.samples.bits();
+        let (bits, samples) = (block.samples.bits(), block.samples.len() as u64);
         if self.rate_bits_per_s <= 0.0 {
             counts.sent += 1;
             counts.bits += bits;
@@ -66,7 +77,7 @@ impl SampleLink {
             return;
         }
         let Some(buffer) = self.buffers.get_mut(usize::from(block.daughter)) else {
-            counts.dropped += 1;
+            counts.count_dropped(samples);
             return;
         };
         for sent in buffer.work_until(block.time, self.rate_bits_per_s) {
@@ -75,12 +86,14 @@ impl SampleLink {
             out.push(SpaceFrame::Samples(sent));
         }
         if self.policy == DropPolicy::Oldest {
-            while buffer.bits + bits > self.capacity_bits && buffer.drop_oldest() {
-                counts.dropped += 1;
+            while buffer.bits + bits > self.capacity_bits
+                && let Some(samples) = buffer.drop_oldest()
+            {
+                counts.count_dropped(samples);
             }
         }
         if buffer.bits + bits > self.capacity_bits {
-            counts.dropped += 1;
+            counts.count_dropped(samples);
         } else {
             buffer.bits += bits;
             buffer.waiting.push_back(block);
@@ -110,11 +123,12 @@ impl Buffer {
         sent
     }
 
-    fn drop_oldest(&mut self) -> bool {
+    /// Samples of the block that was dropped.
+    fn drop_oldest(&mut self) -> Option<u64> {
         // The first is on its way already.
-        let Some(oldest) = self.waiting.remove(1) else { return false };
+        let oldest = self.waiting.remove(1)?;
         self.bits -= oldest.samples.bits();
-        true
+        Some(oldest.samples.len() as u64)
     }
 }
 
@@ -212,6 +226,7 @@ mod tests {
         ] {
             let (sent, counts) = numbers(80e3, 4096, policy);
             assert_eq!(counts.sent + counts.dropped, 12);
+            assert_eq!(counts.dropped_samples, 1000 * counts.dropped);
             assert_eq!(counts.sent, sent.len() as u64);
             assert!(counts.waiting_bits_max <= 4096 * 8);
             assert_eq!(sent, expected, "{policy:?}");

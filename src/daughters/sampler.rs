@@ -285,8 +285,7 @@ impl ChannelWork<'_> {
             daughter: daughter as u8,
             number: (first / config.block_samples) as u64,
             time,
-            // The daughters believe their clocks to be right; steering them is the mother's business.
-            clock_offset_s: 0.0,
+            clock_offset_s: config.disturbances.clock_offset_s(daughter, time.seconds()),
             saturated,
             samples,
         }

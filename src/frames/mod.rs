@@ -15,7 +15,7 @@ pub use ground::PlacedFrame;
 pub use housekeeping::Housekeeping;
 pub use instrument::{AntennaResponse, Channel, Instrument};
 pub use samples::{SampleBlock, Samples, SpaceFrame};
-pub use visibility::{Flags, PlacedVisibilities, VisibilityBlock};
+pub use visibility::{AutoPower, Flags, PlacedVisibilities, VisibilityBlock};
 
 /// What the ground reads from a downlink, in the order in which it was sent.
 #[derive(Clone, Debug, PartialEq)]

@@ -73,6 +73,23 @@ impl VisibilityBlock {
     }
 }
 
+/// The power of one daughter in one channel, calibrated.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AutoPower {
+    /// Daughter, from 0.
+    pub daughter: u8,
+    /// Centre frequency of the channel or sub-band, Hz.
+    pub frequency_hz: f64,
+    /// Its width, Hz.
+    pub width_hz: f64,
+    /// Middle of the integration, s since the mission epoch.
+    pub time_s: f64,
+    /// Mean of |x|^2, K sr: sky and receiver.
+    pub power_k_sr: f64,
+    /// Standard deviation of its noise, K sr.
+    pub sigma_k_sr: f64,
+}
+
 /// Calibrated visibilities with the positions of their two satellites, ready for accumulation.
 ///
 /// Structure of arrays; all arrays have the same length. Times increase.

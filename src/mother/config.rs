@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::choice::ModelChoice;
+use super::correlator::{Division, SUB_BANDS_MAX};
 use crate::array::IntegrationRule;
 use crate::frames::{AntennaResponse, Channel};
 use crate::units::PerChannel;
@@ -50,6 +51,13 @@ pub struct SpacecraftConfig {
     pub receiver_noise_k_sr: f64,
     /// Antenna response of the daughters.
     pub antenna: Antenna,
+    /// Sub-bands that each channel of samples is divided into before it is correlated: a power of two, 1 for none.
+    pub sub_bands: usize,
+    /// Ecliptic longitude and latitude, deg, towards which samples are delayed before they are correlated; nothing
+    /// for no delays.
+    pub delay_centre_deg: Vec<f64>,
+    /// Time over which the powers of the daughters' samples are integrated and sent down, s; 0 to leave them out.
+    pub auto_integration_s: f64,
     /// Numbers that a block of samples may be ahead of one that the mother waits for.
     pub wait_blocks: u64,
     /// Capacity of the onboard store, bytes.
@@ -108,6 +116,9 @@ impl Default for SpacecraftConfig {
             thermal_noise: true,
             receiver_noise_k_sr: 0.0,
             antenna: Antenna::default(),
+            sub_bands: 1,
+            delay_centre_deg: Vec::new(),
+            auto_integration_s: 1.0,
             wait_blocks: 16,
             store_bytes_max: 4 << 30,
             // 2027-01-01T00:00:00 TAI: 69 years of which 17 are leap years.
@@ -152,6 +163,17 @@ pub enum SpacecraftError {
         /// Number of channels.
         channels: usize,
     },
+    /// Sub-bands of visibilities that were never samples.
+    #[error(
+        "spacecraft.sub_bands and spacecraft.delay_centre_deg are of samples: expected 1 and [] with \
+         spacecraft.fidelity = \"visibilities\", which have no bandwidth to lose"
+    )]
+    Division,
+    /// A direction that cannot be.
+    #[error(
+        "spacecraft.delay_centre_deg = {0:?}: expected ecliptic longitude and latitude, -90 to 90 degrees, or []"
+    )]
+    DelayCentre(Vec<f64>),
     /// Averages asked of direct sums.
     #[error(
         "spacecraft.smear_integrations: direct sums are of instants; expected spacecraft.model = \"harmonic\" or \
@@ -182,6 +204,49 @@ impl SpacecraftConfig {
     pub fn channels(&self) -> Vec<Channel> {
         let width_hz = self.channel_width_hz;
         self.channels_hz.iter().map(|&frequency_hz| Channel { frequency_hz, width_hz }).collect()
+    }
+
+    /// Delays and sub-bands of samples.
+    #[must_use]
+    pub fn division(&self) -> Division {
+        let delay_centre = match self.delay_centre_deg[..] {
+            [longitude_deg, latitude_deg] => {
+                let (sin, cos) = longitude_deg.to_radians().sin_cos();
+                let (up, across) = latitude_deg.to_radians().sin_cos();
+                Some([across * cos, across * sin, up])
+            }
+            _ => None,
+        };
+        Division { sub_bands: self.sub_bands.max(1), delay_centre }
+    }
+
+    /// What is wrong with delays and sub-bands.
+    fn division_problems(&self) -> Vec<SpacecraftError> {
+        let mut found = Vec::new();
+        let good = match self.delay_centre_deg[..] {
+            [] => true,
+            [longitude_deg, latitude_deg] => {
+                longitude_deg.is_finite() && (-90.0..=90.0).contains(&latitude_deg)
+            }
+            _ => false,
+        };
+        if !good {
+            found.push(SpacecraftError::DelayCentre(self.delay_centre_deg.clone()));
+        }
+        let divided = self.sub_bands != 1 || !self.delay_centre_deg.is_empty();
+        if divided && self.fidelity == Fidelity::Visibilities {
+            found.push(SpacecraftError::Division);
+        }
+        if self.sub_bands > 1 {
+            // Sub-bands are channels of the downlink, which has them within the band.
+            for (index, &value) in self.channels_hz.iter().enumerate() {
+                let half_hz = 0.5 * self.channel_width_hz;
+                if value - half_hz < BAND_HZ[0] || value + half_hz > BAND_HZ[1] {
+                    found.push(SpacecraftError::Frequency { index, value });
+                }
+            }
+        }
+        found
     }
 
     /// The rule of the adaptive integration.
@@ -229,6 +294,7 @@ impl SpacecraftConfig {
         if self.smear_integrations && self.model == ModelChoice::Direct {
             found.push(SpacecraftError::Smearing);
         }
+        found.extend(self.division_problems());
         let mut require = |key, value: f64, good: bool, expected| {
             if !(good && value.is_finite()) {
                 found.push(SpacecraftError::Parameter { key, value, expected });
@@ -246,6 +312,12 @@ impl SpacecraftConfig {
         require("motion_wavelengths_max", motion, (1e-3..=1.0).contains(&motion), "0.001 to 1");
         let store = self.store_bytes_max;
         require("store_bytes_max", store as f64, store >= 1 << 20, "at least 1 MiB (1048576)");
+        let bands = self.sub_bands;
+        let good = bands.is_power_of_two() && bands <= SUB_BANDS_MAX;
+        require("sub_bands", bands as f64, good, "a power of two from 1 to 64");
+        let autos = self.auto_integration_s;
+        let good = autos == 0.0 || (1e-3..=1000.0).contains(&autos);
+        require("auto_integration_s", autos, good, "0.001 s to 1000 s, or 0 for none");
         let wait = self.wait_blocks;
         require("wait_blocks", wait as f64, (1..=1024).contains(&wait), "1 to 1024 blocks");
         let noisy = self.thermal_noise || self.fidelity == Fidelity::Visibilities;

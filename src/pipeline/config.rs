@@ -83,6 +83,14 @@ pub enum ConfigError {
     /// A name that cannot be a folder's.
     #[error("name = {0:?}: expected at most 60 bytes, without slashes and control characters")]
     Name(String),
+    /// A ground that takes sub-bands for something else than the spacecraft.
+    #[error("calibration.sub_bands = {ground}: expected spacecraft.sub_bands, which is {space}")]
+    SubBands {
+        /// Of the spacecraft.
+        space: usize,
+        /// Of the ground.
+        ground: usize,
+    },
     /// A key that pipelines do not have.
     #[error("{0}: no such key; pipelines/reference.toml holds all of them")]
     Unknown(String),
@@ -216,6 +224,10 @@ impl Config {
         found.extend(boxed(self.daughters.problems(self.array.satellites)));
         found.extend(boxed(self.spacecraft.problems()));
         found.extend(boxed(self.downlink.problems()));
+        let (space, ground) = (self.spacecraft.sub_bands, self.calibration.sub_bands);
+        if space != ground {
+            found.push(Box::new(ConfigError::SubBands { space, ground }));
+        }
         for key in self.map.misfits(channels) {
             found.push(Box::new(MapConfigError::Misfit { key, channels }));
         }

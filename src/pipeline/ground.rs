@@ -5,12 +5,12 @@ use std::sync::{Arc, Mutex};
 
 use super::config::Config;
 use super::error::PipelineError;
+use super::gathering::Gathering;
 use super::state::Keeper;
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::Calibrator;
-use super::gathering::Gathering;
 use crate::downlink::{Reception, ReceptionCounters};
-use crate::frames::GroundFrame;
+use crate::frames::{AutoPower, GroundFrame};
 use crate::products::{ChannelSummary, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Ledger, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
@@ -36,6 +36,8 @@ pub struct GroundOutcome {
     pub ledger: Ledger,
     /// What was received, and what was wrong with it.
     pub reception: Arc<Mutex<ReceptionCounters>>,
+    /// The daughters' own powers, in the order of arrival; none with a keeper.
+    pub autos: Arc<Mutex<Vec<AutoPower>>>,
     /// Final map of each channel, in figures.
     pub channels: Arc<Mutex<Vec<ChannelSummary>>>,
 }
@@ -113,6 +115,7 @@ fn add_sums(
     let calibration = config.calibration.build(Path::new(""))?;
     let calibrator =
         Calibrator::new(calibration, outcome.ledger.clone()).with_van_vleck(config.calibration.van_vleck()?);
+    let calibrator = calibrator.with_autos(Arc::clone(&outcome.autos));
     let placed = graph.stage("calibrate", capacity, frames, calibrator);
     let accumulator = Accumulator::new(config.map.clone(), outcome.ledger.clone());
     Ok(graph.stage("accumulate", 1, placed, accumulator))

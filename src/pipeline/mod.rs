@@ -12,6 +12,7 @@ mod ground;
 mod models;
 mod plan;
 mod run;
+mod sample_summary;
 mod sampling;
 mod space;
 pub mod state;
@@ -28,6 +29,7 @@ pub use plan::{Expected, Plan};
 pub use run::{
     Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, simulate, use_threads,
 };
+pub use sample_summary::{BlockSummary, SampleSummary};
 pub use sampling::{SampleCounts, sample_stages};
 pub use space::INTEGRATE;
 pub use summary::{Segment, Summary};

@@ -89,12 +89,14 @@ impl Plan {
     #[must_use]
     pub fn visibilities(&self) -> Vec<Expected> {
         let map = &self.config.map;
+        let bands = self.config.spacecraft.sub_bands as f64;
         let expected = |schedule: &Schedule| {
             let limit_m = map.baseline_m_max(schedule.frequency_hz);
             let mut expected = Expected::default();
             for &window in &self.windows {
                 for pair in all_pairs(self.array.satellites()) {
                     let (count, length_m) = schedule.estimate(&self.array, window, pair);
+                    let count = count * bands;
                     expected.sent += count;
                     if length_m < limit_m {
                         expected.mapped += count;

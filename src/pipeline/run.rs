@@ -8,13 +8,15 @@ use super::config::Config;
 use super::error::PipelineError;
 use super::ground::{self, GroundOutcome, Receiving};
 use super::plan::Plan;
+use super::sample_summary::SampleSummary;
+use super::sampling::SampleCounts;
 use super::space;
 use super::summary::{Segment, Summary};
 use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
 use crate::downlink::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
-use crate::products::{ProductsError, Truth};
+use crate::products::{ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::solve::SolveWatch;
 
@@ -89,7 +91,8 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     make_folder(out)?;
     let skies = space::skies(plan)?;
     let mut graph = Graph::new();
-    let bytes = space::add(&mut graph, plan, &skies)?;
+    let counts = SampleCounts::default();
+    let bytes = space::add(&mut graph, plan, &skies, &counts)?;
     let file = out.join(downlink_file(plan.config.downlink.format));
     let bytes = add_link(&mut graph, bytes, &plan.config, &file)?;
     let recorder = Recorder::create(&file)?;
@@ -106,7 +109,7 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     let outcome = ground::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()), receiving)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: None };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
-    conclude(Segment::Whole, &plan.config, out, report, (outcome, None))
+    conclude(Segment::Whole, &plan.config, out, report, (outcome, None, counts.close(plan)?))
 }
 
 /// The space segment alone, to a downlink file, a ground that listens, or both.
@@ -125,7 +128,8 @@ pub fn simulate(
     }
     let skies = space::skies(plan)?;
     let mut graph = Graph::new();
-    let mut bytes = space::add(&mut graph, plan, &skies)?;
+    let counts = SampleCounts::default();
+    let mut bytes = space::add(&mut graph, plan, &skies, &counts)?;
     drop(skies);
     if let Some(file) = &file {
         bytes = add_link(&mut graph, bytes, &plan.config, file)?;
@@ -142,7 +146,9 @@ pub fn simulate(
         (None, None) => drop(bytes),
     }
     let watched = Watched { metrics: graph.metrics(), solving: SolveWatch::default(), listening: None };
-    start(graph, &plan.config.runtime, cancel, (watched, watch))
+    let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
+    counts.close(plan)?;
+    Ok(report)
 }
 
 /// The ground segment alone, from downlink files or senders.
@@ -166,7 +172,7 @@ pub fn replay<S: GroundSource + 'static>(
     let outcome = ground::add(&mut graph, bytes, config, out, watching, receiving)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone() };
     let report = start(graph, &config.runtime, cancel, (watched, watch))?;
-    conclude(Segment::Ground, config, out, report, (outcome, listening))
+    conclude(Segment::Ground, config, out, report, (outcome, listening, None))
 }
 
 /// The link's faults, if any are asked for; the truth about them goes beside the downlink file.
@@ -189,11 +195,14 @@ fn make_folder(out: &Path) -> Result<(), PipelineError> {
 }
 
 fn start(
-    graph: Graph,
+    mut graph: Graph,
     config: &RuntimeConfig,
     cancel: &Cancel,
     (watched, watch): (Watched, Watcher<'_>),
 ) -> Result<Report, PipelineError> {
+    if config.stall_s > 0.0 {
+        graph.fail_after_stall(Duration::from_secs_f64(config.stall_s));
+    }
     watch(watched);
     Ok(graph.run(cancel, Duration::from_secs_f64(config.shutdown_s))?)
 }
@@ -203,7 +212,7 @@ fn conclude(
     config: &Config,
     out: &Path,
     report: Report,
-    (outcome, listening): (GroundOutcome, Option<Listening>),
+    (outcome, listening, samples): (GroundOutcome, Option<Listening>, Option<SampleSummary>),
 ) -> Result<Summary, PipelineError> {
     let mut reception = outcome.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = outcome.channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
@@ -212,8 +221,10 @@ fn conclude(
     if let Some(account) = &listening {
         account.complete(&mut reception);
     }
+    let mut autos = outcome.autos.lock().unwrap_or_else(PoisonError::into_inner);
+    write_autos(&mut autos, out, config.products.pictures)?;
     let mut summary = Summary::new(segment, config, report, ledger, reception, channels);
-    summary.listening = listening;
+    (summary.listening, summary.samples) = (listening, samples);
     summary.write(out)?;
     Ok(summary)
 }

@@ -2,11 +2,13 @@
 
 use std::sync::{Arc, Mutex};
 
+use super::error::PipelineError;
 use super::plan::Plan;
+use super::sample_summary::SampleSummary;
 use crate::daughters::{LinkCounts, SampleLink, Sampler, SamplerCounts, Scene};
-use crate::frames::GroundFrame;
-use crate::mother::VisibilityModel;
+use crate::frames::{Channel, GroundFrame, Instrument};
 use crate::mother::correlator::{Correlator, CorrelatorCounts, CorrelatorSetup};
+use crate::mother::{Fidelity, Schedule, VisibilityModel};
 use crate::runtime::{Graph, Link};
 
 /// What the stages of sample fidelity count while they run.
@@ -20,6 +22,14 @@ pub struct SampleCounts {
     pub correlator: Arc<Mutex<CorrelatorCounts>>,
 }
 
+impl SampleCounts {
+    /// The account of samples of a plan's run; `None` without samples.
+    pub(super) fn close(&self, plan: &Plan) -> Result<Option<SampleSummary>, PipelineError> {
+        let sampled = plan.config.spacecraft.fidelity == Fidelity::Samples;
+        Ok(sampled.then(|| SampleSummary::close(self)).transpose()?)
+    }
+}
+
 /// The stages of sample fidelity for a plan, not yet in a graph.
 #[must_use]
 pub fn sample_stages(
@@ -31,17 +41,27 @@ pub fn sample_stages(
     let scene = Scene {
         array: Arc::clone(array),
         models,
-        channels: instrument.channels.clone(),
+        channels: config.spacecraft.channels(),
         receiver_noise_k_sr: config.spacecraft.receiver_noise_k_sr,
         seed: config.seed,
     };
     let daughters = &config.daughters;
     let sampler = Sampler::new(scene, daughters.clone(), windows.clone(), Arc::clone(&counts.sampler));
     let link = SampleLink::new(daughters, array.satellites(), Arc::clone(&counts.link));
+    let division = config.spacecraft.division();
+    // What comes down are sub-bands, each a channel of its own.
+    let channels = division.divided(&instrument.channels);
+    let instrument = Instrument { channels, ..instrument.clone() };
+    let of_band = |(k, band): (usize, &Channel)| Schedule {
+        frequency_hz: band.frequency_hz,
+        ..schedules[k / division.sub_bands]
+    };
     let setup = CorrelatorSetup {
         array: Arc::clone(array),
-        instrument: instrument.clone(),
-        schedules: schedules.clone(),
+        schedules: instrument.channels.iter().enumerate().map(of_band).collect(),
+        instrument,
+        division,
+        auto_integration_s: config.spacecraft.auto_integration_s,
         block_samples: daughters.block_samples,
         wait_blocks: config.spacecraft.wait_blocks,
     };
@@ -53,9 +73,10 @@ pub(super) fn samples(
     graph: &mut Graph,
     plan: &Plan,
     models: Vec<Box<dyn VisibilityModel>>,
+    counts: &SampleCounts,
 ) -> Link<GroundFrame> {
     let capacity = plan.config.runtime.queue_capacity;
-    let (sampler, link, correlator) = sample_stages(plan, models, &SampleCounts::default());
+    let (sampler, link, correlator) = sample_stages(plan, models, counts);
     let sent = graph.source("sample", capacity, sampler);
     let received = graph.stage("link", capacity, sent, link);
     graph.stage("correlate", capacity, received, correlator)

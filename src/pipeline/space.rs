@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::config::Problems;
 use super::error::PipelineError;
 use super::plan::Plan;
-use super::sampling::samples;
+use super::sampling::{SampleCounts, samples};
 use crate::downlink::Transmitter;
 use crate::frames::GroundFrame;
 use crate::mother::{Fidelity, Integrator, MeasurementOptions, NoiseModel, Observer, Store};
@@ -51,16 +51,22 @@ pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
     plan.config.spacecraft.channels_hz.iter().enumerate().map(sky).collect()
 }
 
-/// Adds the space segment to `graph`; what comes out are the bytes of the downlink.
+/// Adds the space segment to `graph`; what comes out are the bytes of the downlink. With sample fidelity its stages
+/// count in `counts`.
 ///
 /// # Errors
 /// A model of the visibilities or a downlink configuration that cannot be.
-pub fn add(graph: &mut Graph, plan: &Plan, skies: &[SkyMap]) -> Result<Link<Vec<u8>>, PipelineError> {
+pub fn add(
+    graph: &mut Graph,
+    plan: &Plan,
+    skies: &[SkyMap],
+    counts: &SampleCounts,
+) -> Result<Link<Vec<u8>>, PipelineError> {
     let Plan { config, array, instrument, schedules, windows } = plan;
     let capacity = config.runtime.queue_capacity;
     let models = super::models::build(plan, skies)?;
     if config.spacecraft.fidelity == Fidelity::Samples {
-        let frames = samples(graph, plan, models);
+        let frames = samples(graph, plan, models, counts);
         return transmit(graph, plan, frames);
     }
     let noise = NoiseModel {

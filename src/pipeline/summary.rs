@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::config::Config;
+use super::sample_summary::SampleSummary;
 use crate::downlink::ReceptionCounters;
 use crate::downlink::socket::ListenAccount;
 use crate::files::write_atomically;
@@ -43,6 +44,9 @@ pub struct Summary {
     pub channels: Vec<ChannelSummary>,
     /// What became of every visibility.
     pub ledger: LedgerReport,
+    /// What became of samples; absent without sample fidelity.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub samples: Option<SampleSummary>,
     /// What was received, and what was wrong with it.
     pub reception: ReceptionCounters,
     /// The senders, if the ground listened.
@@ -73,6 +77,7 @@ impl Summary {
             ground_hash: format!("{:016x}", config.ground_hash()),
             channels,
             ledger,
+            samples: None,
             reception,
             listening: None,
             report,
@@ -95,6 +100,9 @@ impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "Stages\n{}\n", self.report)?;
         writeln!(f, "Ledger of visibilities\n{}\n", self.ledger)?;
+        if let Some(samples) = &self.samples {
+            writeln!(f, "Samples\n{samples}\n")?;
+        }
         writeln!(f, "Reception\n{}\n", self.reception)?;
         if let Some(listening) = &self.listening {
             writeln!(f, "Senders\n{listening}\n")?;

@@ -2,6 +2,7 @@
 //!
 //! Uses [`crate::solve`] and [`crate::sky`].
 
+mod autos;
 mod channel;
 mod config;
 mod error;
@@ -11,6 +12,7 @@ mod publisher;
 mod summary;
 mod truth;
 
+pub use autos::{AutoSummary, summarise, write_autos};
 pub use channel::draw_comparison;
 pub use config::{ProductsConfig, ProductsConfigError};
 pub use error::ProductsError;

@@ -13,11 +13,14 @@ pub struct RuntimeConfig {
     pub threads: usize,
     /// Time that stages have to end after a failure, s.
     pub shutdown_s: f64,
+    /// Time in which something has to move, s, or the run fails; longer than the longest step, that of a solution for
+    /// example. 0 for ever.
+    pub stall_s: f64,
 }
 
 impl Default for RuntimeConfig {
     fn default() -> Self {
-        Self { queue_capacity: 64, threads: 0, shutdown_s: 10.0 }
+        Self { queue_capacity: 64, threads: 0, shutdown_s: 10.0, stall_s: 0.0 }
     }
 }
 
@@ -48,6 +51,13 @@ impl RuntimeConfig {
         require("threads", self.threads as f64, self.threads <= 1024, "at most 1024, or 0 for one a core");
         let seconds = self.shutdown_s;
         require("shutdown_s", seconds, (0.0..=3600.0).contains(&seconds), "0 s to 3600 s");
+        let stall = self.stall_s;
+        require(
+            "stall_s",
+            stall,
+            stall == 0.0 || (0.1..=1e6).contains(&stall),
+            "0.1 s to 1e6 s, or 0 for ever",
+        );
         found
     }
 }

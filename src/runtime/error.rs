@@ -76,6 +76,16 @@ pub enum RuntimeError {
         /// Who did not stop in time.
         laggards: Laggards,
     },
+    /// Nothing moved any more.
+    #[error("nothing has moved for {:.1} s, in work: `{}`{laggards}", waited.as_secs_f64(), stages.join("`, `"))]
+    Stalled {
+        /// Names of the stages that were neither waiting for input nor for room.
+        stages: Vec<String>,
+        /// How long nothing moved.
+        waited: Duration,
+        /// Who did not stop in time.
+        laggards: Laggards,
+    },
     /// A thread could not be started.
     #[error("no thread for stage `{stage}`{laggards}; the system's limit on threads may be too low")]
     Thread {

@@ -11,7 +11,7 @@ use super::metrics::{Counters, Metrics};
 use super::outlet::{Outlet, Queue, Stamped};
 use super::report::Report;
 use super::stage::{Sink, Source, Stage};
-use super::supervisor;
+use super::supervisor::{self, Limits};
 use super::worker::{Inlet, SinkWorker, SourceWorker, StageWorker, Worker};
 
 /// The output of a source or stage that nothing takes yet.
@@ -37,6 +37,8 @@ pub struct Graph {
     nodes: Vec<Node>,
     metrics: Arc<Metrics>,
     halt: Arc<Halt>,
+    /// Time without any movement after which the run fails; none for ever.
+    stall: Option<Duration>,
     /// First mistake made while building.
     mistake: Option<RuntimeError>,
 }
@@ -51,7 +53,13 @@ impl Graph {
     /// A graph without stages.
     #[must_use]
     pub fn new() -> Self {
-        Self { nodes: Vec::new(), metrics: Arc::default(), halt: Arc::new(Halt::new()), mistake: None }
+        Self {
+            nodes: Vec::new(),
+            metrics: Arc::default(),
+            halt: Arc::new(Halt::new()),
+            stall: None,
+            mistake: None,
+        }
     }
 
     /// Adds a source whose output queue holds `capacity` items.
@@ -94,6 +102,12 @@ impl Graph {
         self.add(counters, Box::new(SinkWorker { sink, inlet }), true);
     }
 
+    /// Lets the run fail when for so long nothing has moved in it: no step of any stage has ended, no item has been
+    /// taken or given. Must be longer than the longest step.
+    pub fn fail_after_stall(&mut self, stall: Duration) {
+        self.stall = Some(stall);
+    }
+
     /// Counters that may be polled while the graph runs.
     #[must_use]
     pub fn metrics(&self) -> Arc<Metrics> {
@@ -115,7 +129,7 @@ impl Graph {
         if let Some(open) = self.nodes.iter().find(|node| !node.taken) {
             return Err(RuntimeError::OpenEnd { stage: open.counters.name.clone() });
         }
-        supervisor::run(self.nodes, &self.halt, cancel, deadline)
+        supervisor::run(self.nodes, &self.halt, cancel, Limits { deadline, stall: self.stall })
     }
 
     fn counters(&mut self, name: &str, queue: Option<usize>, unit: &'static str) -> Arc<Counters> {

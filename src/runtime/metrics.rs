@@ -16,6 +16,10 @@ pub(super) struct Counters {
     items_out: AtomicU64,
     units: AtomicU64,
     queue_depth_max: AtomicUsize,
+    /// Steps that have ended.
+    steps: AtomicU64,
+    /// Whether the stage is in a step, and not waiting for room.
+    working: AtomicBool,
     ended: AtomicBool,
 }
 
@@ -29,6 +33,8 @@ impl Counters {
             items_out: AtomicU64::new(0),
             units: AtomicU64::new(0),
             queue_depth_max: AtomicUsize::new(0),
+            steps: AtomicU64::new(0),
+            working: AtomicBool::new(false),
             ended: AtomicBool::new(false),
         }
     }
@@ -49,6 +55,24 @@ impl Counters {
         if depth > self.queue_depth_max() {
             self.queue_depth_max.store(depth, Ordering::Relaxed);
         }
+    }
+
+    pub(super) fn count_step(&self) {
+        self.steps.store(self.steps.load(Ordering::Relaxed) + 1, Ordering::Relaxed);
+    }
+
+    pub(super) fn set_working(&self, working: bool) {
+        self.working.store(working, Ordering::Relaxed);
+    }
+
+    pub(super) fn is_working(&self) -> bool {
+        self.working.load(Ordering::Relaxed) && !self.ended.load(Ordering::Relaxed)
+    }
+
+    /// Changes whenever the stage has done something.
+    pub(super) fn moves(&self) -> [u64; 4] {
+        let ended = u64::from(self.ended.load(Ordering::Relaxed));
+        [self.items_in(), self.items_out(), self.steps.load(Ordering::Relaxed), ended]
     }
 
     pub(super) fn end(&self) {

@@ -126,10 +126,12 @@ impl<T> Queue<T> {
 
     fn wait_and_push(&mut self, stamped: Stamped<T>) {
         let since = Instant::now();
+        self.counters.set_working(false);
         select! {
             send(self.sender, stamped) -> sent => self.closed = sent.is_err(),
             recv(self.halt.stop()) -> _ => self.closed = true,
         }
+        self.counters.set_working(true);
         self.waited += since.elapsed();
     }
 }

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use crossbeam_channel::{Receiver, Sender, bounded, never, select};
+use crossbeam_channel::{Receiver, Sender, after, bounded, never, select, tick};
 
 use super::cancel::{Cancel, Halt};
 use super::error::{Laggards, RuntimeError};
@@ -46,18 +46,48 @@ struct Member {
     timings: Option<Timings>,
 }
 
+/// How long a run waits for its stages.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Limits {
+    /// For all to end after a failure.
+    pub(super) deadline: Duration,
+    /// For anything to move; for ever if there is none.
+    pub(super) stall: Option<Duration>,
+}
+
+/// Looks whether anything moves.
+struct StallWatch {
+    patience: Duration,
+    seen: Vec<[u64; 4]>,
+    since: Instant,
+}
+
+impl StallWatch {
+    /// Stages at work, if nothing has moved for as long as the patience lasts.
+    fn look(&mut self, members: &[Member]) -> Option<Vec<String>> {
+        let now: Vec<[u64; 4]> = members.iter().map(|member| member.counters.moves()).collect();
+        if now != self.seen {
+            (self.seen, self.since) = (now, Instant::now());
+            return None;
+        }
+        let stalled = self.since.elapsed() >= self.patience;
+        stalled.then(|| names(members.iter().filter(|member| member.counters.is_working())))
+    }
+}
+
 pub(super) fn run(
     nodes: Vec<Node>,
     halt: &Arc<Halt>,
     cancel: &Cancel,
-    deadline: Duration,
+    limits: Limits,
 ) -> Result<Report, RuntimeError> {
+    let deadline = limits.deadline;
     let since = Instant::now();
     let verdict = Arc::new(Verdict { halt: Arc::clone(halt), first: Mutex::new(None) });
     let (say, heard) = bounded(nodes.len().max(1));
     let mut members = start(nodes, &verdict, cancel, &say);
     drop(say);
-    let cancelled = join(&mut members, &heard, halt, deadline);
+    let cancelled = join(&mut members, &heard, &verdict, limits);
     let laggards =
         Laggards { stages: names(members.iter().filter(|member| member.handle.is_some())), waited: deadline };
     if let Some(error) = verdict.take() {
@@ -134,11 +164,14 @@ fn panic_message(payload: &(dyn Any + Send)) -> String {
 
 /// Waits for all members, but after a failure no longer than `deadline`; members that ended have no
 /// handle any more. Returns whether a source was cut short by cancellation.
-fn join(members: &mut [Member], heard: &Receiver<Ended>, halt: &Halt, deadline: Duration) -> bool {
+fn join(members: &mut [Member], heard: &Receiver<Ended>, verdict: &Verdict, limits: Limits) -> bool {
     let mut cancelled = false;
     let mut remaining = members.len();
-    let mut stop = halt.stop().clone();
+    let mut stop = verdict.halt.stop().clone();
     let mut give_up = never();
+    let patience = limits.stall.unwrap_or_default();
+    let mut watch = StallWatch { patience, seen: Vec::new(), since: Instant::now() };
+    let mut look = limits.stall.map_or_else(never, |stall| tick(stall / 8));
     while remaining > 0 {
         select! {
             recv(heard) -> ended => {
@@ -154,7 +187,13 @@ fn join(members: &mut [Member], heard: &Receiver<Ended>, halt: &Halt, deadline: 
             }
             recv(stop) -> _ => {
                 stop = never();
-                give_up = crossbeam_channel::after(deadline);
+                look = never();
+                give_up = after(limits.deadline);
+            }
+            recv(look) -> _ => {
+                if let Some(stages) = watch.look(members) {
+                    verdict.fail(RuntimeError::Stalled { stages, waited: patience, laggards: Laggards::default() });
+                }
             }
             recv(give_up) -> _ => break,
         }
@@ -165,6 +204,7 @@ fn join(members: &mut [Member], heard: &Receiver<Ended>, halt: &Halt, deadline: 
 fn with_laggards(mut error: RuntimeError, found: Laggards) -> RuntimeError {
     if let RuntimeError::Failed { laggards, .. }
     | RuntimeError::Panicked { laggards, .. }
+    | RuntimeError::Stalled { laggards, .. }
     | RuntimeError::Thread { laggards, .. } = &mut error
     {
         *laggards = found;

@@ -85,6 +85,7 @@ impl Watch {
             self.timings.since_source.record(now.saturating_duration_since(born));
         }
         self.counters.set_units(units);
+        self.counters.count_step();
         self.mark = now;
     }
 
@@ -115,12 +116,14 @@ impl<T> Inlet<T> {
     /// Waits for the next item; timed and counted.
     fn receive(&mut self, watch: &mut Watch) -> Received<T> {
         let depth = self.receiver.len();
+        watch.counters.set_working(false);
         let received = match self.receiver.try_recv() {
             Ok(stamped) => Some(stamped),
             Err(TryRecvError::Empty) => self.wait(&watch.halt),
             Err(TryRecvError::Disconnected) => None,
         };
         watch.received();
+        watch.counters.set_working(true);
         // After the wait: a closed channel means an end only if nothing failed.
         if watch.halt.is_set() {
             return Received::Halt;
@@ -150,6 +153,7 @@ pub(super) struct SourceWorker<S: Source> {
 impl<S: Source> Worker for SourceWorker<S> {
     fn work(&mut self, watch: &mut Watch) -> Result<Ending, BoxError> {
         let Self { source, out } = self;
+        watch.counters.set_working(true);
         let ending = loop {
             if watch.halt.is_set() {
                 return Ok(Ending::Halted);

@@ -54,6 +54,8 @@ impl GeometrySurvey {
                 // What could not be used shows as visibilities without ephemeris.
                 self.ephemeris.insert(segment.clone());
             }
+            // A daughter's own power has no baseline.
+            GroundFrame::Visibilities(block) if block.pair.i == block.pair.j => {}
             GroundFrame::Visibilities(block) => {
                 let channel = usize::from(block.channel.0);
                 let Some(channel) = self.instrument.as_ref().and_then(|i| i.channels.get(channel)) else {

@@ -17,6 +17,26 @@ pub struct AlignerCounts {
     pub duplicate: u64,
     /// Blocks with a number, time tag, length or origin that cannot be.
     pub malformed: u64,
+    /// Samples of the blocks that were used.
+    pub used_samples: u64,
+    /// Samples of late ones.
+    pub late_samples: u64,
+    /// Samples of malformed ones.
+    pub malformed_samples: u64,
+}
+
+impl AlignerCounts {
+    /// Adds what another has counted.
+    pub fn absorb(&mut self, other: Self) {
+        self.used += other.used;
+        self.missing += other.missing;
+        self.late += other.late;
+        self.duplicate += other.duplicate;
+        self.malformed += other.malformed;
+        self.used_samples += other.used_samples;
+        self.late_samples += other.late_samples;
+        self.malformed_samples += other.malformed_samples;
+    }
 }
 
 /// Blocks of one number: those that came, channel by channel, a daughter after another.
@@ -89,13 +109,15 @@ impl Aligner {
     /// Takes a block; gives the rows that are now complete or no longer waited for.
     pub fn put(&mut self, block: SampleBlock) -> Vec<Row> {
         let number = block.number;
-        let length = self.length(number);
+        let (length, samples) = (self.length(number), block.samples.len() as u64);
         if length == 0 || !self.is_well_formed(&block, length) {
             self.counts.malformed += 1;
+            self.counts.malformed_samples += samples;
             return Vec::new();
         }
         if number < self.next {
             self.counts.late += 1;
+            self.counts.late_samples += samples;
             return Vec::new();
         }
         let mut rows = Vec::new();
@@ -136,6 +158,7 @@ impl Aligner {
         let length = self.length(number);
         let waiting = self.waiting.remove(&number).unwrap_or_else(|| Waiting::new(number, length, count));
         self.counts.used += waiting.present as u64;
+        self.counts.used_samples += (waiting.present * waiting.row.samples) as u64;
         self.counts.missing += (count - waiting.present) as u64;
         waiting.row
     }
@@ -207,7 +230,8 @@ mod tests {
         assert!(aligner.put(block(0, 2)).is_empty());
         assert_eq!(shape(&aligner.put(block(1, 2))), [(2, 128, vec![true, true])]);
         assert!(aligner.finish(u64::MAX).is_empty());
-        assert_eq!(aligner.counts(), AlignerCounts { used: 6, ..AlignerCounts::default() });
+        let expected = AlignerCounts { used: 6, used_samples: 4 * 256 + 2 * 128, ..AlignerCounts::default() };
+        assert_eq!(aligner.counts(), expected);
     }
 
     #[test]
@@ -230,7 +254,16 @@ mod tests {
         }
         let rows = aligner.finish(u64::MAX);
         assert_eq!(shape(&rows), [(1, 256, vec![false, false]), (2, 128, vec![true, false])]);
-        let expected = AlignerCounts { used: 2, missing: 4, late: 1, duplicate: 1, malformed: 6 };
+        let expected = AlignerCounts {
+            used: 2,
+            missing: 4,
+            late: 1,
+            duplicate: 1,
+            malformed: 6,
+            used_samples: 256 + 128,
+            late_samples: 256,
+            malformed_samples: 6 * 128 + 2 * 128,
+        };
         assert_eq!(aligner.counts(), expected);
     }
 }

@@ -19,9 +19,9 @@ const NO_WEIGHT: f32 = f32::MIN_POSITIVE;
 /// How dumps become integrations.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DumpRule {
-    /// Samples of a dump.
+    /// Samples of a dump, in each sub-band where there are such.
     pub dump_samples: usize,
-    /// Width of a channel, Hz: the rate of samples.
+    /// Width of a channel or sub-band, Hz: the rate of samples.
     pub width_hz: f64,
     /// An integration with a smaller part of its samples is flagged as incomplete.
     pub complete_min: f64,
@@ -39,11 +39,11 @@ impl DumpRule {
     }
 }
 
-/// What the daughters of one group of channels sent in a block.
+/// What the daughters of one group of channels sent of a dump.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Presence {
-    /// By daughter and lane: whether samples are there.
-    pub there: Vec<[bool; LANES]>,
+    /// By product and lane: samples of the dump that both daughters sent.
+    pub there: Vec<[u32; LANES]>,
     /// By daughter and lane: whether too many of them were out of range.
     pub saturated: Vec<[bool; LANES]>,
 }
@@ -109,16 +109,15 @@ impl GroupIntegrator {
         out: &mut Vec<VisibilityBlock>,
     ) {
         self.now += 1;
-        let samples = self.rule.dump_samples as u32;
         for at in 0..self.pairs.len() {
             let pair = &mut self.pairs[at];
             let (i, j) = (usize::from(pair.pair.i), usize::from(pair.pair.j));
             let [re, im] = &sums[product(i, j)];
+            let both = &presence.there[product(i, j)];
             for lane in 0..LANES {
                 pair.re[lane] += f64::from(re[lane]);
                 pair.im[lane] += f64::from(im[lane]);
-                let both = presence.there[i][lane] & presence.there[j][lane];
-                pair.used[lane] += if both { samples } else { 0 };
+                pair.used[lane] += both[lane];
                 pair.saturated[lane] |= presence.saturated[i][lane] | presence.saturated[j][lane];
             }
             if self.now >= pair.due {

@@ -1,15 +1,19 @@
 //! The mother's correlator: eight streams of samples to integrated visibilities.
 //!
-//! Blocks of the same number are brought together ([`Aligner`]); all products of daughters are summed over
+//! Blocks of the same number are brought together ([`Aligner`]), delayed and divided into sub-bands if that is asked for
+//! ([`Division`]); all products of daughters are summed over
 //! dumps of a few milliseconds ([`kernel`]); dumps are summed for as long as each baseline's motion allows
 //! ([`GroupIntegrator`]). [`Correlator`] is the stage.
 
 mod align;
+mod autos;
 mod integers;
 mod integrate;
 pub mod kernel;
+mod spectra;
 mod stage;
 
 pub use align::{Aligner, AlignerCounts, Row, Streams};
 pub use integrate::{DumpRule, GroupIntegrator, Presence, dump_samples};
+pub use spectra::{Division, SUB_BANDS_MAX};
 pub use stage::{Correlator, CorrelatorCounts, CorrelatorSetup};

@@ -6,8 +6,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use pulp::Arch;
 
 use super::align::{Aligner, AlignerCounts, Row, Streams};
+use super::autos::{AutoIntegrator, RowPowers};
 use super::integrate::{DumpRule, GroupIntegrator, Presence, WINDOW_S_MAX, dump_samples};
 use super::kernel::{LANES, Packed, SLICE, correlate, no_sums};
+use super::spectra::{Divider, Division, Spectra};
 use crate::array::{Array, segments_for};
 use crate::frames::{
     GroundFrame, Housekeeping, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame, VisibilityBlock,
@@ -22,7 +24,7 @@ const SATURATED_MAX: f64 = 0.2;
 
 /// Part of an integration's samples without which it is flagged: its middle may then be off by a twentieth of its
 /// length, 2 degrees of fringe.
-const COMPLETE_MIN: f64 = 0.9;
+pub(super) const COMPLETE_MIN: f64 = 0.9;
 
 /// Time in which the power that weights are made of is averaged, s.
 const POWER_TIME_S: f64 = 10.0;
@@ -34,8 +36,12 @@ pub struct CorrelatorSetup {
     pub array: Arc<Array>,
     /// What she says of herself.
     pub instrument: Instrument,
-    /// One schedule a channel.
+    /// One schedule a channel; with sub-bands one each, as the instrument has them.
     pub schedules: Vec<Schedule>,
+    /// Delays, and sub-bands of the daughters' channels.
+    pub division: Division,
+    /// Time over which the daughters' own powers are integrated, s; 0 to leave them out.
+    pub auto_integration_s: f64,
     /// Samples of a block.
     pub block_samples: usize,
     /// Numbers that a block may be ahead of one that is waited for.
@@ -49,9 +55,11 @@ pub struct CorrelatorCounts {
     pub blocks: AlignerCounts,
     /// Blocks outside any window.
     pub stray: u64,
+    /// Their samples.
+    pub stray_samples: u64,
     /// Visibilities made.
     pub visibilities: u64,
-    /// Sums of |x|^2 (K sr) and samples, by channel and daughter: the auto-correlations.
+    /// Sums of |x|^2 (K sr) and samples, by channel or sub-band and daughter: the auto-correlations.
     pub autos: Vec<Vec<(f64, u64)>>,
 }
 
@@ -64,6 +72,8 @@ pub struct CorrelatorCounts {
 pub struct Correlator {
     setup: CorrelatorSetup,
     rule: DumpRule,
+    /// With delays or sub-bands.
+    divider: Option<Divider>,
     arch: Arch,
     running: Option<Running>,
     counts: Arc<Mutex<CorrelatorCounts>>,
@@ -76,11 +86,15 @@ struct Running {
     window: ObservingWindow,
     aligner: Aligner,
     groups: Vec<Group>,
+    /// A row that waits for the one after it, which has its delayed samples.
+    held: Option<Row>,
 }
 
 struct Group {
     first: usize,
     integrator: GroupIntegrator,
+    /// If the daughters' own powers are wanted.
+    autos: Option<AutoIntegrator>,
     packed: Packed,
     /// By daughter: power of each lane, K sr; 0 before the first block.
     powers: Vec<[f64; LANES]>,
@@ -91,16 +105,21 @@ impl Correlator {
     #[must_use]
     pub fn new(setup: CorrelatorSetup, counts: Arc<Mutex<CorrelatorCounts>>) -> Self {
         let width_hz = setup.instrument.channels.first().map_or(1.0, |channel| channel.width_hz);
-        let rule = DumpRule {
-            dump_samples: dump_samples(&setup.array, &setup.schedules, width_hz),
-            width_hz,
-            complete_min: COMPLETE_MIN,
-        };
+        let bands = setup.division.sub_bands.max(1);
+        let dump = dump_samples(&setup.array, &setup.schedules, width_hz * bands as f64).max(bands);
+        let rule = DumpRule { dump_samples: dump / bands, width_hz, complete_min: COMPLETE_MIN };
+        let divider = (setup.division != Division::NONE).then(|| Divider::new(setup.division));
         lock(&counts).autos = vec![vec![(0.0, 0); setup.array.satellites()]; setup.schedules.len()];
-        Self { setup, rule, arch: Arch::new(), running: None, counts, sampled: 0, samples: 0 }
+        Self { setup, rule, divider, arch: Arch::new(), running: None, counts, sampled: 0, samples: 0 }
+    }
+
+    /// Rate of the daughters' samples, Hz.
+    fn rate_hz(&self) -> f64 {
+        self.rule.width_hz * self.setup.division.sub_bands as f64
     }
 
     fn begin(&mut self, mut window: ObservingWindow, out: &mut Outlet<GroundFrame>) {
+        let rate_hz = self.rate_hz();
         let Self { setup, rule, .. } = self;
         // A window is a third of an orbit; anything else is cut to what time tags can say.
         let end = MissionTime::from_seconds(window.start.seconds() + WINDOW_S_MAX);
@@ -111,27 +130,58 @@ impl Correlator {
         }
         let streams = Streams {
             daughters: setup.array.satellites(),
-            channels: setup.schedules.len(),
+            channels: setup.schedules.len() / setup.division.sub_bands,
             block_samples: setup.block_samples,
-            width_hz: rule.width_hz,
+            width_hz: rate_hz,
             wait_blocks: setup.wait_blocks,
         };
         let aligner = Aligner::new(streams, window);
-        let dumps = aligner.samples() / rule.dump_samples as u64;
+        let dumps = aligner.samples() / (rule.dump_samples * setup.division.sub_bands) as u64;
         let group = |(k, schedules): (usize, &[Schedule])| Group {
             first: k * LANES,
             integrator: GroupIntegrator::new(k * LANES, schedules, *rule, &setup.array, (window, dumps)),
+            autos: (setup.auto_integration_s > 0.0).then(|| {
+                let lanes = (k * LANES, schedules.len());
+                AutoIntegrator::new(lanes, streams.daughters, window, setup.auto_integration_s)
+            }),
             packed: Packed::new(streams.daughters),
             powers: vec![[0.0; LANES]; streams.daughters],
         };
         let groups = setup.schedules.chunks(LANES).enumerate().map(group).collect();
-        self.running = Some(Running { window, aligner, groups });
+        self.running = Some(Running { window, aligner, groups, held: None });
     }
 
-    fn process(&mut self, running: &mut Running, row: &Row, out: &mut Outlet<GroundFrame>) {
+    /// Takes the next row of a window; with delays, the row before it is what is worked on.
+    fn take(&mut self, running: &mut Running, row: Row, out: &mut Outlet<GroundFrame>) {
+        if self.setup.division.delay_centre.is_none() {
+            self.process(running, &row, None, out);
+        } else if let Some(held) = running.held.replace(row) {
+            let next = running.held.take();
+            self.process(running, &held, next.as_ref(), out);
+            running.held = next;
+        }
+    }
+
+    fn process(
+        &mut self,
+        running: &mut Running,
+        row: &Row,
+        next: Option<&Row>,
+        out: &mut Outlet<GroundFrame>,
+    ) {
         let mut made = Vec::new();
-        for group in &mut running.groups {
-            self.process_group(group, row, &mut made);
+        let rate_hz = self.rate_hz();
+        let spectra = self.divider.as_ref().map(|divider| {
+            let ticks = crate::daughters::sample_ticks(row.number * self.setup.block_samples as u64, rate_hz);
+            let t_s = running.window.start.plus_ticks(ticks).seconds();
+            let delays = self.setup.division.delays(&self.setup.array, t_s, rate_hz);
+            divider.divide(row, next, self.setup.array.satellites(), delays)
+        });
+        for (index, group) in running.groups.iter_mut().enumerate() {
+            match &spectra {
+                Some(spectra) => self.process_spectra(group, row, (spectra, index), &mut made),
+                None => self.process_group(group, row, &mut made),
+            }
         }
         self.samples += row.blocks.iter().flatten().map(|block| block.samples.len() as u64).sum::<u64>();
         self.hand_on(made, out);
@@ -140,35 +190,32 @@ impl Correlator {
     fn process_group(&self, group: &mut Group, row: &Row, made: &mut Vec<VisibilityBlock>) {
         let daughters = self.setup.array.satellites();
         let channels = LANES.min(self.setup.schedules.len() - group.first);
+        let first = group.first;
         let block = |lane: usize, daughter: usize| -> Option<&SampleBlock> {
-            row.blocks.get((group.first + lane) * daughters + daughter)?.as_ref()
+            row.blocks.get((first + lane) * daughters + daughter)?.as_ref()
         };
-        let mut presence =
-            Presence { there: vec![[false; LANES]; daughters], saturated: vec![[false; LANES]; daughters] };
-        let following = 1.0 - (-(row.samples as f64) / self.rule.width_hz / POWER_TIME_S).exp();
-        let mut autos = Vec::with_capacity(channels * daughters);
-        for lane in 0..channels {
-            for daughter in 0..daughters {
-                let Some(block) = block(lane, daughter) else {
-                    autos.push((0.0, 0));
-                    continue;
-                };
-                presence.there[daughter][lane] = true;
-                let parts = 2 * row.samples;
-                presence.saturated[daughter][lane] =
-                    f64::from(block.saturated) > SATURATED_MAX * parts as f64;
-                let sum = square(&block.samples);
-                autos.push((sum, row.samples as u64));
-                let power = &mut group.powers[daughter][lane];
-                let measured = sum / row.samples as f64;
-                *power = if *power > 0.0 { *power + following * (measured - *power) } else { measured };
+        let dump_samples = self.rule.dump_samples;
+        let mut there = vec![[0; LANES]; daughters];
+        let mut saturated = vec![[false; LANES]; daughters];
+        let mut sums = vec![[(0.0, 0); LANES]; daughters];
+        for (daughter, sums) in sums.iter_mut().enumerate() {
+            for (lane, sum) in sums[..channels].iter_mut().enumerate() {
+                let Some(block) = block(lane, daughter) else { continue };
+                there[daughter][lane] = dump_samples as u32;
+                saturated[daughter][lane] = is_saturated(block);
+                *sum = (square(&block.samples), row.samples as u64);
             }
         }
-        self.count_autos(group.first, daughters, &autos);
-        for dump in 0..row.samples / self.rule.dump_samples {
+        let samples = row.samples as u64;
+        let powers = RowPowers { sums, samples, saturated: saturated.clone() };
+        self.follow(group, row, &powers, made);
+        let both = |i: usize, j: usize| std::array::from_fn(|lane| there[i][lane].min(there[j][lane]));
+        let there = (0..daughters).flat_map(|j| (0..=j).map(move |i| both(i, j))).collect();
+        let presence = Presence { there, saturated };
+        for dump in 0..row.samples / dump_samples {
             let mut sums = no_sums(daughters);
-            for slice in 0..self.rule.dump_samples / SLICE {
-                let first = dump * self.rule.dump_samples + slice * SLICE;
+            for slice in 0..dump_samples / SLICE {
+                let first = dump * dump_samples + slice * SLICE;
                 for daughter in 0..daughters {
                     let samples =
                         |lane: usize| (lane < channels).then(|| block(lane, daughter))?.map(|b| &b.samples);
@@ -180,12 +227,56 @@ impl Correlator {
         }
     }
 
-    fn count_autos(&self, first: usize, daughters: usize, sums: &[(f64, u64)]) {
+    /// The same with the spectra of a row, of which this is group `index`.
+    fn process_spectra(
+        &self,
+        group: &mut Group,
+        row: &Row,
+        (spectra, index): (&Spectra, usize),
+        made: &mut Vec<VisibilityBlock>,
+    ) {
+        let daughters = self.setup.array.satellites();
+        let lanes = LANES.min(self.setup.schedules.len() - group.first);
+        let bands = self.setup.division.sub_bands;
+        let mut saturated = vec![[false; LANES]; daughters];
+        for (daughter, saturated) in saturated.iter_mut().enumerate() {
+            for (lane, saturated) in saturated[..lanes].iter_mut().enumerate() {
+                let block = row.blocks.get((group.first + lane) / bands * daughters + daughter);
+                *saturated = block.and_then(Option::as_ref).is_some_and(is_saturated);
+            }
+        }
+        let (sums, samples) = (spectra.powers(index), spectra.frames as u64);
+        let powers = RowPowers { sums, samples, saturated: saturated.clone() };
+        self.follow(group, row, &powers, made);
+        let dump = self.rule.dump_samples;
+        for number in 0..spectra.frames / dump {
+            let mut sums = no_sums(daughters);
+            let there = spectra.correlate(index, number * dump..(number + 1) * dump, &mut sums);
+            let presence = Presence { there, saturated: saturated.clone() };
+            group.integrator.add(&sums, &presence, &group.powers, &self.setup.array, made);
+        }
+    }
+
+    /// Follows the powers of a group with those of a row, integrates and counts them.
+    fn follow(&self, group: &mut Group, row: &Row, powers: &RowPowers, made: &mut Vec<VisibilityBlock>) {
+        if let Some(autos) = &mut group.autos {
+            let samples = row.number * self.setup.block_samples as u64 + row.samples as u64;
+            let ticks = crate::daughters::sample_ticks(samples, self.rate_hz()) as u32;
+            autos.add(powers, ticks, made);
+        }
+        let following = 1.0 - (-(row.samples as f64) / self.rate_hz() / POWER_TIME_S).exp();
+        let lanes = LANES.min(self.setup.schedules.len() - group.first);
         let mut counts = lock(&self.counts);
-        for (own, sums) in counts.autos[first..].iter_mut().zip(sums.chunks_exact(daughters)) {
-            for (own, sum) in own.iter_mut().zip(sums) {
-                own.0 += sum.0;
-                own.1 += sum.1;
+        for (daughter, sums) in powers.sums.iter().enumerate() {
+            for (lane, &(sum, count)) in sums[..lanes].iter().enumerate() {
+                if count == 0 {
+                    continue;
+                }
+                let (power, measured) = (&mut group.powers[daughter][lane], sum / count as f64);
+                *power = if *power > 0.0 { *power + following * (measured - *power) } else { measured };
+                let own = &mut counts.autos[group.first + lane][daughter];
+                own.0 += sum;
+                own.1 += count;
             }
         }
     }
@@ -201,21 +292,23 @@ impl Correlator {
     fn end(&mut self, end: MissionTime, out: &mut Outlet<GroundFrame>) {
         let Some(mut running) = self.running.take() else { return };
         let seconds = (end.0 - running.window.start.0) as f64 * 1e-6;
-        for row in running.aligner.finish((seconds * self.rule.width_hz).round().max(0.0) as u64) {
-            self.process(&mut running, &row, out);
+        for row in running.aligner.finish((seconds * self.rate_hz()).round().max(0.0) as u64) {
+            self.take(&mut running, row, out);
+        }
+        if let Some(last) = running.held.take() {
+            self.process(&mut running, &last, None, out);
         }
         let mut made = Vec::new();
         for group in &mut running.groups {
             group.integrator.finish(&group.powers, &mut made);
+            if let Some(autos) = &mut group.autos {
+                let ticks = (end.0 - running.window.start.0).clamp(0, i64::from(u32::MAX));
+                autos.finish(ticks as u32, &mut made);
+            }
         }
         self.hand_on(made, out);
-        let found = running.aligner.counts();
         let mut counts = lock(&self.counts);
-        counts.blocks.used += found.used;
-        counts.blocks.missing += found.missing;
-        counts.blocks.late += found.late;
-        counts.blocks.duplicate += found.duplicate;
-        counts.blocks.malformed += found.malformed;
+        counts.blocks.absorb(running.aligner.counts());
         counts.visibilities = self.sampled;
         drop(counts);
         let (time, sampled) = (end, self.sampled);
@@ -225,6 +318,11 @@ impl Correlator {
 
 fn lock(counts: &Mutex<CorrelatorCounts>) -> std::sync::MutexGuard<'_, CorrelatorCounts> {
     counts.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Whether so many of a block's values were out of range that its visibilities are flagged.
+fn is_saturated(block: &SampleBlock) -> bool {
+    f64::from(block.saturated) > SATURATED_MAX * (2 * block.samples.len()) as f64
 }
 
 /// Sum of |x|^2, K sr.
@@ -272,11 +370,13 @@ impl Stage for Correlator {
             }
             SpaceFrame::Samples(block) => {
                 let Some(mut running) = self.running.take() else {
-                    lock(&self.counts).stray += 1;
+                    let mut counts = lock(&self.counts);
+                    counts.stray += 1;
+                    counts.stray_samples += block.samples.len() as u64;
                     return Ok(());
                 };
                 for row in running.aligner.put(block) {
-                    self.process(&mut running, &row, out);
+                    self.take(&mut running, row, out);
                 }
                 self.running = Some(running);
             }

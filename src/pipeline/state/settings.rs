@@ -11,6 +11,7 @@ pub(super) fn settings_of(config: &Config) -> Result<Vec<(String, String)>, Stat
         config.map.of_sums().into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
     settings.push(("calibration.hook".to_owned(), format!("{:?}", config.calibration.hook)));
     settings.push(("calibration.quantiser_bits".to_owned(), config.calibration.quantiser_bits.to_string()));
+    settings.push(("calibration.sub_bands".to_owned(), config.calibration.sub_bands.to_string()));
     if let Some(path) = &config.calibration.gains_file {
         let bytes = std::fs::read(path).map_err(StateError::io(path, "read"))?;
         let sum = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes);

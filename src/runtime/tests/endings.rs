@@ -145,6 +145,32 @@ fn errors_at_both_ends_say_where() {
 }
 
 #[test]
+fn a_stage_that_stalls_ends_the_run_with_its_name() {
+    let (release, held) = mpsc::channel::<()>();
+    let mut graph = Graph::new();
+    let numbers = graph.source("count", 2, Count::to(u64::MAX));
+    let step = move |n, out: &mut Outlet<u64>| {
+        if n == 9 {
+            // Until the test lets go.
+            held.recv().ok();
+        }
+        pass(n, out);
+        Ok(())
+    };
+    let passed = graph.stage("middle", 2, numbers, Each::new(step));
+    let (sink, kept) = Keep::new();
+    graph.sink("keep", passed, sink);
+    graph.fail_after_stall(Duration::from_secs(1));
+    let error = graph.run(&Cancel::new(), Duration::from_millis(10)).unwrap_err();
+    drop(release);
+    let RuntimeError::Stalled { stages, laggards, .. } = &error else { panic!("{error:?}") };
+    assert!(stages.contains(&"middle".to_owned()) && laggards.stages.contains(&"middle".to_owned()));
+    assert!(error.to_string().contains("`middle`"), "{error}");
+    let kept = kept.lock().unwrap();
+    assert!(!kept.finished && kept.items == (0..9).collect::<Vec<_>>());
+}
+
+#[test]
 fn cancellation_drains_and_finishes() {
     let cancel = Cancel::new();
     let trigger = cancel.clone();

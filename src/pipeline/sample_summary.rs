@@ -1,0 +1,101 @@
+//! What became of the samples of a run in sample fidelity.
+
+use std::fmt;
+use std::sync::{Mutex, PoisonError};
+
+use serde::Serialize;
+
+use super::sampling::SampleCounts;
+use crate::daughters::LinkCounts;
+use crate::runtime::{Ledger, LedgerImbalance, LedgerReport};
+
+/// A run's samples in figures; complex samples of all daughters and channels.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct SampleSummary {
+    /// Real and imaginary parts beyond a quantiser's range.
+    pub saturated: u64,
+    /// Correlations that were looked at while samples were drawn.
+    pub correlations: u64,
+    /// Those that were made smaller so that a matrix became a covariance.
+    pub repaired: u64,
+    /// Greatest change of one, as a part of the two daughters' powers.
+    pub repair_max: f32,
+    /// What the links carried and dropped.
+    pub link: LinkCounts,
+    /// What became of blocks at the mother.
+    pub blocks: BlockSummary,
+    /// Visibilities made of the samples.
+    pub visibilities: u64,
+    /// The account of samples.
+    pub ledger: LedgerReport,
+}
+
+/// Blocks at the mother.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct BlockSummary {
+    /// Correlated.
+    pub used: u64,
+    /// Not there when others went on.
+    pub missing: u64,
+    /// There when others had gone on.
+    pub late: u64,
+    /// There again.
+    pub duplicate: u64,
+    /// Such as cannot be.
+    pub malformed: u64,
+    /// Outside any window.
+    pub stray: u64,
+}
+
+impl SampleSummary {
+    /// Closes the account of samples: sampled = correlated + lost.
+    ///
+    /// # Errors
+    /// [`LedgerImbalance`] if what was sampled is not what became of it.
+    pub fn close(counts: &SampleCounts) -> Result<Self, LedgerImbalance> {
+        fn read<T: Clone>(counts: &Mutex<T>) -> T {
+            counts.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        }
+        let (sampler, link) = (read(&counts.sampler), read(&counts.link));
+        let correlator = read(&counts.correlator);
+        let blocks = correlator.blocks;
+        let ledger = Ledger::new();
+        ledger.sampled(sampler.samples);
+        ledger.accumulated(blocks.used_samples);
+        ledger.lost("link", "buffer full", link.dropped_samples);
+        ledger.lost("correlate", "late", blocks.late_samples);
+        ledger.lost("correlate", "malformed", blocks.malformed_samples);
+        ledger.lost("correlate", "outside any window", correlator.stray_samples);
+        Ok(Self {
+            saturated: sampler.saturated,
+            correlations: sampler.repairs.elements,
+            repaired: sampler.repairs.changed,
+            repair_max: sampler.repairs.change_max,
+            link,
+            blocks: BlockSummary {
+                used: blocks.used,
+                missing: blocks.missing,
+                late: blocks.late,
+                duplicate: blocks.duplicate,
+                malformed: blocks.malformed,
+                stray: correlator.stray,
+            },
+            visibilities: correlator.visibilities,
+            ledger: ledger.close()?,
+        })
+    }
+}
+
+impl fmt::Display for SampleSummary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { saturated, repaired, correlations, repair_max, blocks, .. } = self;
+        writeln!(f, "{}", self.ledger)?;
+        writeln!(f, "parts out of the quantisers' range: {saturated}")?;
+        writeln!(f, "correlations repaired: {repaired} of {correlations}, by {repair_max:.1e} at most")?;
+        let BlockSummary { used, missing, late, duplicate, malformed, stray } = blocks;
+        write!(
+            f,
+            "blocks: {used} used, {missing} missing, {late} late, {duplicate} again, {malformed} malformed, {stray} stray"
+        )
+    }
+}

@@ -1,0 +1,250 @@
+//! What is wrong with daughters, and what is put in on purpose, against closed forms.
+
+use std::f64::consts::TAU;
+
+use lunarray::array::ArrayConfig;
+use lunarray::calibration::{
+    AntennaGains, Calibration, ChannelGains, GainSolution, GainsFile, Interpolation,
+};
+use lunarray::daughters::Disturbances;
+use lunarray::frames::{PlacedVisibilities, SpaceFrame, VisibilityBlock};
+use lunarray::mother::correlator::Division;
+use lunarray::units::constants::SPEED_OF_LIGHT_M_S;
+use lunarray::units::vector::{dot, sub};
+use lunarray::units::{ChannelId, all_pairs};
+use num_complex::Complex64;
+
+use crate::craft::{Spacecraft, WIDTH_HZ, constant, stream};
+use crate::delays::expected;
+
+/// Pairs of time, value and weight of one pair and channel.
+fn measured(
+    blocks: &[VisibilityBlock],
+    pair: lunarray::units::Pair,
+    channel: u16,
+) -> Vec<(f64, Complex64, f64)> {
+    let mut all = Vec::new();
+    for block in blocks.iter().filter(|b| b.pair == pair && b.channel == ChannelId(channel)) {
+        for k in 0..block.len() {
+            let value = block.value_k_sr[k];
+            let value = Complex64::new(value.re.into(), value.im.into());
+            all.push((block.middle_s(k), value, f64::from(block.weight[k])));
+        }
+    }
+    all
+}
+
+/// Weighted mean of value over expectation, and its standard error in each part.
+fn ratio(all: &[(f64, Complex64, f64)], expected: impl Fn(f64) -> Complex64) -> (Complex64, f64) {
+    let (mut product, mut power) = (Complex64::ZERO, 0.0);
+    for &(t_s, value, weight) in all {
+        let expected = expected(t_s);
+        product += value * expected.conj() * weight;
+        power += expected.norm_sqr() * weight;
+    }
+    (product / power, power.sqrt().recip())
+}
+
+/// Daughters' noise is partly common: with a correlation of 0.5 each part of a product has
+/// `1 + r^2` of the noise that weights tell of at most; and both parts count.
+const COMMON: f64 = 1.6;
+
+#[test]
+fn gains_and_phases_scale_visibilities_and_calibration_brings_them_back() {
+    let mut craft = Spacecraft::new(ArrayConfig::default(), vec![1e6], constant(0.5), 16.0);
+    let start_s = craft.window.start.seconds();
+    // Drifts count from the epoch: so much that they turn by a radian and grow by a quarter in the window.
+    let drift = |n: usize| [0.25, 1.0].map(|most| most * (n as f64 - 3.5) / 3.5 / 16.0);
+    let amplitude = |n: usize| 0.1 * (n as f64 - 4.0) - drift(n)[0] * start_s;
+    let phase = |n: usize| 0.8 * n as f64 - drift(n)[1] * start_s;
+    craft.daughters.disturbances = Disturbances {
+        gain_error: (0..8).map(amplitude).collect(),
+        gain_drift_per_s: (0..8).map(|n| drift(n)[0]).collect(),
+        phase_rad: (0..8).map(phase).collect(),
+        phase_drift_rad_per_s: (0..8).map(|n| drift(n)[1]).collect(),
+        ..Disturbances::default()
+    };
+    craft.rule.duration_s_max = 0.5;
+    let blocks = craft.run(21);
+    let gain = |n: u8, t_s: f64| {
+        let [grown, turned] = drift(usize::from(n)).map(|rate| rate * (t_s - start_s));
+        let n = f64::from(n);
+        Complex64::from_polar(1.0 + 0.1 * (n - 4.0) + grown, 0.8 * n + turned)
+    };
+    let solution = |t_s: f64| GainSolution {
+        time_s: t_s,
+        gains: (0..8).map(|n| gain(n, t_s)).map(|g| [g.re, g.im]).collect(),
+    };
+    let solutions = (0..=64).map(|k| solution(start_s + 0.25 * f64::from(k))).collect();
+    let mut calibration = AntennaGains::new(&GainsFile {
+        interpolation: Interpolation::LogLinear,
+        frequency_tolerance_hz: 1.0,
+        channels: vec![ChannelGains { frequency_hz: 1e6, solutions }],
+    })
+    .unwrap();
+    let (mut squares, mut count) = (0.0, 0.0);
+    for pair in all_pairs(8) {
+        let found = measured(&blocks, pair, 0);
+        let (scaled, error) = ratio(&found, |t_s| 0.5 * gain(pair.i, t_s) * gain(pair.j, t_s).conj());
+        assert!((scaled - 1.0).norm() < 4.0 * COMMON * error + 1e-3, "{pair}: {scaled} +- {error}");
+        let mut placed = PlacedVisibilities {
+            frequency_hz: 1e6,
+            pair,
+            time_s: found.iter().map(|f| f.0).collect(),
+            r_i_m: vec![[0.0; 3]; found.len()],
+            r_j_m: vec![[0.0; 3]; found.len()],
+            value_k_sr: found.iter().map(|f| f.1).collect(),
+            weight: found.iter().map(|f| f.2).collect(),
+            ..PlacedVisibilities::default()
+        };
+        assert_eq!(calibration.apply(&mut placed).unwrap().kept, found.len());
+        let restored: Vec<_> =
+            (0..found.len()).map(|k| (placed.time_s[k], placed.value_k_sr[k], placed.weight[k])).collect();
+        let (mean, error) = ratio(&restored, |_| Complex64::new(0.5, 0.0));
+        assert!((mean - 1.0).norm() < 4.0 * COMMON * error + 1e-3, "{pair}: {mean} +- {error}");
+        // Calibrated weights are those of noise of power one, whatever the gains were.
+        for (_, value, weight) in restored {
+            squares += (value - 0.5).norm_sqr() * weight;
+            count += 2.0;
+        }
+    }
+    // (1 - r^2) + (1 + r^2) over two parts: the mean of both is one. Powers that weights are made of lag behind gains that
+    // drift within their ten seconds: 10 %.
+    let mean = squares / count;
+    assert!((mean - 1.0).abs() < 0.15, "{mean}");
+}
+
+#[test]
+fn late_clocks_turn_each_frequency_by_its_own_phase() {
+    let (frequency_hz, bands) = (1e6, 8);
+    let mut craft = Spacecraft::new(ArrayConfig::default(), vec![frequency_hz], constant(0.5), 16.0);
+    let start_s = craft.window.start.seconds();
+    // Up to 60 us, 0.48 samples; and drifts that turn 1 MHz by half a turn in the window.
+    let late_us = [0.0, 5.0, -20.0, 60.0, 1.3, -60.0, 33.0, 0.1];
+    let drift = [0.0, 3e-8, -3e-8, 0.0, 1e-8, 0.0, 2e-8, 0.0];
+    craft.daughters.disturbances = Disturbances {
+        clock_offset_s: (0..8).map(|n| late_us[n] * 1e-6 - drift[n] * start_s).collect(),
+        clock_drift: drift.to_vec(),
+        ..Disturbances::default()
+    };
+    craft.rule.duration_s_max = 0.25;
+    craft.division = Division { sub_bands: bands, delay_centre: None };
+    let frames = craft.sample(22).0;
+    for frame in &frames {
+        let SpaceFrame::Samples(block) = frame else { continue };
+        let n = usize::from(block.daughter);
+        let expected_s = late_us[n] * 1e-6 + drift[n] * (block.time.seconds() - start_s);
+        // Of two numbers of 1e-4 one is taken from the other.
+        assert!((block.clock_offset_s - expected_s).abs() < 1e-15, "{}", block.clock_offset_s);
+    }
+    let blocks = craft.correlate(frames).0;
+    for pair in all_pairs(8) {
+        let late_s = |t_s: f64| {
+            let of = |n: usize| late_us[n] * 1e-6 + drift[n] * (t_s - start_s);
+            of(pair.i.into()) - of(pair.j.into())
+        };
+        for k in 0..bands {
+            // Waves that are heard later by a clock are heard as from farther away.
+            let wanted = |t_s: f64| 0.5 * expected(late_s(t_s) * WIDTH_HZ, 0, [k, bands], frequency_hz);
+            let (found, error) = ratio(&measured(&blocks, pair, k as u16), wanted);
+            // 2e-3: a frequency's phase turns by 0.05 in an integration of 0.25 s; 3e-3 of one: synthesis.
+            assert!((found - 1.0).norm() < 4.0 * COMMON * error + 8e-3, "{pair} {k}: {found} +- {error}");
+        }
+    }
+}
+
+#[test]
+fn a_calibration_tone_comes_out_with_the_amplitude_and_phase_that_went_in() {
+    let mut craft = Spacecraft::new(ArrayConfig::default(), vec![2e6], constant(0.0), 8.0);
+    craft.rule.duration_s_max = 0.5;
+    let (power, offset_hz, phase_rad) = (0.3, 1.3e3, 2.1);
+    craft.daughters.disturbances = Disturbances {
+        calibration_k_sr: power,
+        calibration_offset_hz: offset_hz,
+        calibration_phase_rad: phase_rad,
+        phase_rad: (0..8).map(|n| 0.5 * f64::from(n)).collect(),
+        clock_offset_s: (0..8).map(|n| 1e-5 * f64::from(n)).collect(),
+        ..Disturbances::default()
+    };
+    let frames = craft.sample(23).0;
+    // What daughter n does to the tone: its phase, and its clock at the tone's own frequency.
+    let turned = |n: f64| 0.5 * n - TAU * (2e6 + offset_hz) * 1e-5 * n;
+    for n in 0..8_u8 {
+        let samples = stream(&frames, n);
+        let count = samples.len() as f64;
+        let turn = |k: usize| Complex64::cis(TAU * (offset_hz / WIDTH_HZ * k as f64).fract());
+        let mean = samples.iter().enumerate().map(|(k, x)| x * turn(k)).sum::<Complex64>() / count;
+        let expected = Complex64::from_polar(power.sqrt(), phase_rad + turned(f64::from(n)));
+        // Noise of power one.
+        assert!((mean - expected).norm() < 4.0 / count.sqrt(), "{n}: {mean} {expected}");
+    }
+    let blocks = craft.correlate(frames).0;
+    for pair in all_pairs(8) {
+        let expected = Complex64::from_polar(power, turned(pair.i.into()) - turned(pair.j.into()));
+        let (found, error) = ratio(&measured(&blocks, pair, 0), |_| expected);
+        // Weights are those of all power; a tone's own part of it is no noise.
+        assert!((found - 1.0).norm() < 4.0 * 2.0_f64.sqrt() * error, "{pair}: {found} +- {error}");
+    }
+}
+
+#[test]
+fn the_earths_leak_is_at_the_limb_and_at_its_frequency() {
+    let mut craft = Spacecraft::new(ArrayConfig::default(), vec![5e6], constant(0.0), 24.0);
+    craft.rule.duration_s_max = 0.5;
+    let (power, offset_hz, depth_m) = (100.0, -2.1e3, 2e3);
+    craft.daughters.disturbances = Disturbances {
+        interference_k_sr: power,
+        interference_offset_hz: offset_hz,
+        interference_depth_m: depth_m,
+        ..Disturbances::default()
+    };
+    let frames = craft.sample(24).0;
+    let leak =
+        |n: u8, t_s: f64| power * (-craft.array.earth_depth_of_m(n.into(), t_s).max(0.0) / depth_m).exp();
+    let start_s = craft.window.start.seconds();
+    // The first daughter hears it fade; the last, 100 km behind, still sees the Earth at the end.
+    for n in [0, 1, 7] {
+        let samples = stream(&frames, n);
+        for (k, block) in samples.chunks_exact(4096).enumerate() {
+            let seconds = |sample: f64| start_s + (4096.0 * k as f64 + sample) / WIDTH_HZ;
+            let expected: f64 =
+                (0..64).map(|m| leak(n, seconds(64.0 * f64::from(m) + 32.0))).sum::<f64>() / 64.0;
+            let found = block.iter().map(|x| x.norm_sqr()).sum::<f64>() / 4096.0 - 1.0;
+            // Noise of power one and its beat with the tone. A block's power stands for its first sample: 0.13 s at
+            // 1.3 km/s or less, 4 % of a mean.
+            let error = ((1.0 + 2.0 * expected) / 4096.0).sqrt();
+            assert!((found - expected).abs() < 4.5 * error + 0.06 * expected, "{n} {k}: {found} {expected}");
+        }
+    }
+    assert!(leak(0, start_s + 24.0) < 1e-3 && leak(7, start_s + 24.0) > 99.0);
+    // Its frequency: that of the offset, and the Doppler shift of the daughter's motion.
+    let samples = &stream(&frames, 7)[..8192];
+    let along_m = |t_s: f64| dot(craft.array.earth_hat(t_s), craft.array.position_m(7, t_s));
+    let speed_m_s = along_m(start_s + 1.0) - along_m(start_s);
+    let expected_hz = offset_hz + (5e6 + offset_hz) / SPEED_OF_LIGHT_M_S * speed_m_s;
+    let amplitude = |frequency_hz: f64| {
+        let turned =
+            |(k, x): (usize, &Complex64)| x * Complex64::cis(TAU * frequency_hz / WIDTH_HZ * k as f64);
+        (samples.iter().enumerate().map(turned).sum::<Complex64>() / 8192.0).norm()
+    };
+    // A spectrum's line is 1 Hz wide; its peak stands within a tenth of that.
+    let peak = (-40..=40)
+        .map(|k| 0.1 * f64::from(k))
+        .max_by(|a, b| amplitude(expected_hz + a).total_cmp(&amplitude(expected_hz + b)));
+    assert!(peak.unwrap().abs() < 0.15, "{peak:?}");
+    assert!((amplitude(expected_hz) / power.sqrt() - 1.0).abs() < 0.01, "{}", amplitude(expected_hz));
+    // And it correlates as a source in the Earth's direction while both hear it.
+    let blocks = craft.correlate(frames).0;
+    for pair in all_pairs(8).into_iter().filter(|pair| pair.i >= 4) {
+        let fringe = |t_s: f64| {
+            let [i, j] = [pair.i, pair.j].map(|n| craft.array.position_m(n.into(), t_s));
+            let turns = (5e6 + offset_hz) / SPEED_OF_LIGHT_M_S * dot(craft.array.earth_hat(t_s), sub(i, j));
+            (leak(pair.i, t_s) * leak(pair.j, t_s)).sqrt() * Complex64::cis(-TAU * turns)
+        };
+        let all = measured(&blocks, pair, 0);
+        let early: Vec<_> = all.into_iter().filter(|(t_s, ..)| *t_s < start_s + 8.0).collect();
+        let (found, _) = ratio(&early, fringe);
+        // A hundred times the noise; a motion of lambda / 8 costs up to 2.6 %, a block's power 4 %.
+        assert!((found - 1.0).norm() < 0.06, "{pair}: {found}");
+    }
+}

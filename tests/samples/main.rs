@@ -1,0 +1,16 @@
+//! Sample by sample: what comes out of daughters and correlator is what the model, the radiometer equation and
+//! the literature on quantisers say.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod autos;
+mod chain;
+mod craft;
+mod delays;
+mod disturbances;
+mod integration;
+mod noise;
+mod robust;
+mod signal;

@@ -1,0 +1,139 @@
+//! What is in the sky comes out as the model says, averaged over integrations and channels.
+
+use lunarray::array::{Array, ArrayConfig};
+use lunarray::frames::{AntennaResponse, VisibilityBlock};
+use lunarray::mother::{DirectSum, PairPosition, Prediction, VisibilityModel};
+use lunarray::sky::SkyMap;
+use lunarray::sky::fits::{ReadOptions, read_map};
+use lunarray::units::all_pairs;
+use lunarray::units::vector::unit;
+use num_complex::Complex64;
+
+use crate::common;
+use crate::craft::{Sky, Spacecraft, WIDTH_HZ, fringe, point, smeared};
+
+#[test]
+fn a_point_source_has_the_visibilities_of_the_model() {
+    let frequencies_hz = vec![1e6, 10e6, 30e6];
+    let n_hat = unit([0.3, -0.8, 0.4]);
+    let sky = point(n_hat);
+    let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies_hz, sky, 30.0);
+    craft.receiver_noise_k_sr = 1.0;
+    let blocks = craft.run(3);
+    let (mut squares, mut count) = (0.0, 0.0);
+    for channel in 0..3 {
+        for pair in all_pairs(8) {
+            let (mut product, mut power, mut weight) = (Complex64::ZERO, 0.0, 0.0);
+            for block in blocks.iter().filter(|b| b.pair == pair && usize::from(b.channel.0) == channel) {
+                for k in 0..block.len() {
+                    let from_s = block.start.seconds() + f64::from(block.offset_ticks[k]) * 1e-6;
+                    let dt_s = f64::from(block.duration_ticks[k]) * 1e-6;
+                    let ends = (usize::from(pair.i), usize::from(pair.j));
+                    let at = craft.frequencies_hz[channel];
+                    let expected =
+                        smeared(&craft.array, ends, (from_s, dt_s), at, |frequency_hz, r_i_m, r_j_m| {
+                            fringe(n_hat, frequency_hz, r_i_m, r_j_m)
+                        });
+                    let found = Complex64::new(block.value_k_sr[k].re.into(), block.value_k_sr[k].im.into());
+                    let w = f64::from(block.weight[k]);
+                    product += found * expected.conj() * w;
+                    power += expected.norm_sqr() * w;
+                    weight += expected.norm_sqr() * w;
+                    squares += (found - expected).norm_sqr() * w;
+                    count += 2.0;
+                }
+            }
+            let ratio = product / power;
+            // The weights are those of the noise; 2e-3 is what interpolation may leave, as documented.
+            let error = (1.0 / weight).sqrt();
+            assert!((ratio - 1.0).norm() < 4.0 * 1.5 * error + 2e-3, "{channel} {pair}: {ratio} +- {error}");
+        }
+    }
+    // The source's own noise: half of the power is common to all, so that parts differ; on the mean they have
+    // P_i P_j / (2 n), and neighbouring pairs share it: fewer independent ones than counted.
+    let mean = squares / count;
+    eprintln!("{count} parts, mean square {mean:.4}");
+    assert!((mean - 1.0).abs() < 0.02, "{mean}");
+}
+
+/// What a model expects of integrations: means over four instants of each and 16 frequencies of the channel.
+fn expectations(
+    array: &Array,
+    blocks: &[VisibilityBlock],
+    frequency_hz: f64,
+    model: impl Fn(f64) -> DirectSum,
+) -> Vec<Complex64> {
+    let mut positions = Vec::new();
+    for block in blocks {
+        for k in 0..block.len() {
+            let from_s = block.start.seconds() + f64::from(block.offset_ticks[k]) * 1e-6;
+            let dt_s = f64::from(block.duration_ticks[k]) * 1e-6;
+            positions.extend((0..4).map(|m| {
+                let t_s = from_s + dt_s * (f64::from(m) + 0.5) / 4.0;
+                PairPosition {
+                    r_i_m: array.position_m(block.pair.i.into(), t_s),
+                    r_j_m: array.position_m(block.pair.j.into(), t_s),
+                    span_rad: 0.0,
+                }
+            }));
+        }
+    }
+    let mut expected = vec![Complex64::ZERO; positions.len() / 4];
+    let mut predicted = vec![Prediction::default(); positions.len()];
+    // Frequencies over the channel as channels of their own.
+    for k in 0..16 {
+        let at_hz = frequency_hz + WIDTH_HZ * ((f64::from(k) + 0.5) / 16.0 - 0.5);
+        model(at_hz).predict(&positions, &mut predicted).unwrap();
+        for (sum, four) in expected.iter_mut().zip(predicted.chunks_exact(4)) {
+            *sum += four.iter().map(|p| p.visibility_k_sr).sum::<Complex64>() / 64.0;
+        }
+    }
+    expected
+}
+
+/// The published sky at some MHz, so many seconds of it; `signal` standard errors of it should at least be there.
+fn check_real_sky(mhz: u32, seconds: f64, signal: f64) {
+    let Some(path) = common::shared(&format!("sky/ulsa_{mhz}mhz_galactic_nside64.fits")) else { return };
+    let sky: SkyMap = read_map(&path, &ReadOptions::default()).unwrap();
+    let array = Array::new(&ArrayConfig::default()).unwrap();
+    let moon_radius_m = array.moon_radius_m();
+    let model =
+        move |frequency_hz| DirectSum::new(&sky, frequency_hz, moon_radius_m, AntennaResponse::Isotropic);
+    let frequency_hz = 1e6 * f64::from(mhz);
+    let centre = model(frequency_hz);
+    let sky: Sky = Box::new(move |_| Box::new(centre.clone()));
+    let craft = Spacecraft::new(ArrayConfig::default(), vec![frequency_hz], sky, seconds);
+    let (frames, counts) = craft.sample(4);
+    assert!(f64::from(counts.repairs.change_max) < 1e-3, "{:?}", counts.repairs);
+    let (blocks, _) = craft.correlate(frames);
+    let expected = expectations(&array, &blocks, frequency_hz, model);
+    let (mut squares, mut count, mut product, mut power) = (0.0, 0.0, Complex64::ZERO, 0.0);
+    let mut expected = expected.into_iter();
+    for block in &blocks {
+        for k in 0..block.len() {
+            let (expected, weight) = (expected.next().unwrap(), f64::from(block.weight[k]));
+            let found = Complex64::new(block.value_k_sr[k].re.into(), block.value_k_sr[k].im.into());
+            let square = (found - expected).norm_sqr() * weight;
+            // Four standard errors of each part and more: once in ten million.
+            assert!(square < 32.0, "{} {k}: {square}", block.pair);
+            product += found * expected.conj() * weight;
+            power += expected.norm_sqr() * weight;
+            squares += square;
+            count += 2.0;
+        }
+    }
+    let (ratio, error) = (product / power, power.sqrt().recip());
+    eprintln!("{mhz} MHz: {count} parts, mean square {:.3}, {ratio:.4} +- {error:.4}", squares / count);
+    // All of it together is as strong as it should be, and turned by nothing.
+    assert!((ratio - 1.0).norm() < 4.0 * error + 2e-3, "{mhz} MHz: {ratio} +- {error}");
+    assert!(error < 1.0 / signal, "{mhz} MHz: {error}");
+    // Parts are correlated from pair to pair; a quarter of them as independent is cautious.
+    assert!((squares / count - 1.0).abs() < 4.0 * (2.0 / (count / 4.0)).sqrt(), "{}", squares / count);
+}
+
+#[test]
+fn the_real_sky_has_the_visibilities_of_the_model() {
+    check_real_sky(1, 16.0, 15.0);
+    check_real_sky(3, 16.0, 5.0);
+    check_real_sky(10, 8.0, 4.0);
+}
