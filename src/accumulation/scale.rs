@@ -88,14 +88,15 @@ impl Totals {
 
     /// `None` if more would be taken out than is there.
     pub(super) fn and(self, other: Self, direction: Direction) -> Option<Self> {
-        let (count, weight): (fn(u64, u64) -> Option<u64>, fn(u128, u128) -> Option<u128>) = match direction {
-            Direction::In => (u64::checked_add, u128::checked_add),
-            Direction::Out => (u64::checked_sub, u128::checked_sub),
+        let (visibilities, weight) = match direction {
+            Direction::In => {
+                (self.visibilities.checked_add(other.visibilities), self.weight.checked_add(other.weight))
+            }
+            Direction::Out => {
+                (self.visibilities.checked_sub(other.visibilities), self.weight.checked_sub(other.weight))
+            }
         };
-        Some(Self {
-            visibilities: count(self.visibilities, other.visibilities)?,
-            weight: weight(self.weight, other.weight)?,
-        })
+        Some(Self { visibilities: visibilities?, weight: weight? })
     }
 
     /// The weight in units of the scale, rounded.

@@ -120,7 +120,7 @@ impl SymmetricTiles {
         MatMut::from_column_major_slice_with_stride_mut(values, rows, columns, STRIDE)
     }
 
-    /// Adds A A^T by the library's products: faster to write than [`super::exact`], but of no fixed rounding.
+    /// Adds A A^T by products of the library, which are of no fixed rounding; a yardstick for the engine's own.
     pub fn add_products_f64(&mut self, a: Columns<'_, f64>) {
         let order = self.order;
         self.tiles.par_iter_mut().enumerate().for_each(|(index, tile)| {

@@ -180,62 +180,84 @@ struct Term<'a, const K: usize> {
 impl<const K: usize> Term<'_, K> {
     const EMPTY: Self = Self { values: [0.0; K], alphas: &[0.0; LANES], gammas: &[0.0; LANES] };
 
-    /// Bound of its values, in quanta: kernels are at most one, up to rounding.
+    /// Bound of its values, in quanta, rounded up.
     #[inline(always)]
-    fn greatest(&self, shifts: &[u32; K]) -> f32 {
-        let mut greatest = 0.0_f32;
+    fn greatest(&self, shifts: &[u32; K]) -> u64 {
+        let mut greatest = 0;
         for (value, shift) in self.values.iter().zip(shifts) {
-            greatest = greatest.max(value.abs() * (1_u64 << shift) as f32);
+            greatest = greatest.max((value.abs() as i32 as u64 + 1) << shift);
         }
-        1.0625 * greatest
+        greatest
     }
+}
+
+/// Parts of one in which bounds of kernels are counted.
+const PARTS: u32 = 8;
+
+/// For each alpha the most that a term adds to a sum: its values times its kernels, which are at most one up to
+/// rounding, and half of the power of two that it is rounded to.
+#[inline(always)]
+fn bounds<const K: usize>(terms: &[Term<'_, K>], shifts: &[u32; K]) -> [u64; LANES] {
+    let step = 1_u64 << shifts.iter().fold(0, |most, shift| *shift.max(&most));
+    let mut bounds = [0; LANES];
+    for term in terms {
+        let greatest = term.greatest(shifts);
+        for (bound, alpha) in bounds.iter_mut().zip(term.alphas) {
+            // A sixteenth above the kernel, for what kernels and products are greater than they should be.
+            let part = biased_multiple(alpha.abs() * (1.0625 * (1 << PARTS) as f32)).wrapping_sub(biases(1));
+            *bound += ((greatest * (u64::from(part as u32) + 1)) >> PARTS) + step;
+        }
+    }
+    bounds
 }
 
 /// Adds the outer products of values, alphas and gammas, each term rounded to a whole number.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
 fn spread_rows<const K: usize>(rows: Rows<'_, K>, terms: &[Term<'_, K>]) {
     let [first, gamma] = rows.first.map(|x| x as usize);
-    let mut greatest = [0.0; GROUP];
-    for (greatest, term) in greatest.iter_mut().zip(terms) {
-        *greatest = term.greatest(&rows.shifts);
-    }
-    // A term may be rounded up by half its power of two.
-    let step = 1_u64 << rows.shifts.iter().fold(0, |most, shift| *shift.max(&most));
     let points = rows.rows.len();
     let mut alpha = first;
-    for lane in 0..rows.alphas {
-        let mut most = 0;
-        for (greatest, term) in greatest.iter().zip(terms) {
-            most += (greatest * term.alphas[lane].abs()) as u64 + step;
-        }
+    let bounds = bounds(terms, &rows.shifts);
+    for (lane, bound) in bounds.iter().enumerate().take(rows.alphas) {
         let Some(row) = rows.rows.get_mut(alpha) else { return };
-        row.make_room(most, rows.direction, K * rows.stride);
-        for (k, shift) in rows.shifts.iter().enumerate().take(rows.used) {
-            let start = k * rows.stride + gamma;
-            let mut multiples = [0_i32; LANES];
-            for term in terms {
-                let factor = term.values[k] * term.alphas[lane];
-                for (multiple, gamma) in multiples.iter_mut().zip(term.gammas) {
-                    *multiple = multiple.wrapping_add(biased_multiple(factor * gamma));
-                }
+        row.make_room(*bound, rows.direction, K * rows.stride);
+        let shape = (rows.stride, gamma, rows.used);
+        match &mut row.integers {
+            Integers::Narrow(sums) if rows.shifts == [0; K] => {
+                add_multiples(sums, shape, (terms, lane), |sum, multiple, _| sum.wrapping_add(multiple));
             }
-            let excess = biases(terms.len());
-            match &mut row.integers {
-                Integers::Narrow(sums) => {
-                    let Some(sums) = sums[start..].first_chunk_mut::<LANES>() else { return };
-                    for (sum, multiple) in sums.iter_mut().zip(multiples) {
-                        *sum = sum.wrapping_add(multiple.wrapping_sub(excess) << shift);
-                    }
-                }
-                Integers::Wide(sums) => {
-                    let Some(sums) = sums[start..].first_chunk_mut::<LANES>() else { return };
-                    for (sum, multiple) in sums.iter_mut().zip(multiples) {
-                        *sum = sum.wrapping_add(i64::from(multiple.wrapping_sub(excess)) << shift);
-                    }
-                }
-                Integers::None => {}
-            }
+            Integers::Narrow(sums) => add_multiples(sums, shape, (terms, lane), |sum, multiple, k| {
+                sum.wrapping_add(multiple << rows.shifts[k])
+            }),
+            Integers::Wide(sums) => add_multiples(sums, shape, (terms, lane), |sum, multiple, k| {
+                sum.wrapping_add(i64::from(multiple) << rows.shifts[k])
+            }),
+            Integers::None => {}
         }
         alpha = if alpha + 1 == points { 0 } else { alpha + 1 };
+    }
+}
+
+/// Adds what terms are rounded to to a row at one alpha.
+#[inline(always)]
+fn add_multiples<T: Copy, const K: usize>(
+    sums: &mut [T],
+    (stride, gamma, used): (usize, usize, usize),
+    (terms, lane): (&[Term<'_, K>], usize),
+    add: impl Fn(T, i32, usize) -> T,
+) {
+    let start = 0_i32.wrapping_sub(biases(terms.len()));
+    for k in 0..used {
+        let Some(sums) = sums[k * stride + gamma..].first_chunk_mut::<LANES>() else { return };
+        let mut multiples = [start; LANES];
+        for term in terms {
+            let factor = term.values[k] * term.alphas[lane];
+            for (multiple, gamma) in multiples.iter_mut().zip(term.gammas) {
+                *multiple = multiple.wrapping_add(biased_multiple(factor * gamma));
+            }
+        }
+        for (sum, multiple) in sums.iter_mut().zip(multiples) {
+            *sum = add(*sum, multiple, k);
+        }
     }
 }
