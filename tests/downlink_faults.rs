@@ -464,7 +464,7 @@ proptest! {
         let (received, _) = receive(&packets.concat(), 4096);
         for frame in &received {
             if let GroundFrame::Visibilities(block) = frame {
-                prop_assert!(block.pair.i < block.pair.j && block.pair.j < 8 && block.channel.0 < 2);
+                prop_assert!(block.pair.i <= block.pair.j && block.pair.j < 8 && block.channel.0 < 2);
                 prop_assert!(block.weight.iter().all(|w| *w > 0.0 && w.is_finite()));
                 prop_assert!(block.value_k_sr.iter().all(|v| v.is_finite()));
                 prop_assert!((1..block.len()).all(|k| block.middle_s(k - 1) < block.middle_s(k)));

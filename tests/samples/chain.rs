@@ -65,20 +65,6 @@ fn rms(values: impl ExactSizeIterator<Item = f64>) -> f64 {
 }
 
 #[test]
-fn sub_bands_make_the_map_that_their_channel_makes() {
-    let folder = tempfile::tempdir().unwrap();
-    let (whole, noise) = mapped(folder.path(), "visibilities", &[]);
-    let sets =
-        ["spacecraft.sub_bands=4", "calibration.sub_bands=4", "spacecraft.delay_centre_deg=[40.0, 10.0]"];
-    let (divided, _) = mapped(folder.path(), "samples", &sets);
-    let noise = rms(noise.iter().copied());
-    let difference = rms(divided.iter().zip(&whole).map(|(a, b)| a - b));
-    // As for samples of whole channels, below: the noise of four bands together is that of one.
-    let ratio = difference / (2.0_f64.sqrt() * noise);
-    assert!((0.7..1.4).contains(&ratio), "{ratio}");
-}
-
-#[test]
 fn a_map_of_samples_is_the_map_of_visibilities_within_its_noise() {
     let folder = tempfile::tempdir().unwrap();
     let (visibilities, noise) = mapped(folder.path(), "visibilities", &[]);

@@ -262,7 +262,7 @@ mod tests {
             malformed: 6,
             used_samples: 256 + 128,
             late_samples: 256,
-            malformed_samples: 6 * 128 + 2 * 128,
+            malformed_samples: 3 * 128 + 3 * 256,
         };
         assert_eq!(aligner.counts(), expected);
     }
