@@ -282,11 +282,11 @@ fn combine(weights: &[f32], rows: &[f32], stride: usize, out: &mut [f32]) {
             let own = first.iter().zip(second).zip(third.iter().zip(fourth));
             for (row, ((a, b), (c, d))) in rows.chunks_exact(stride).zip(own) {
                 let Some(row) = row[column..].first_chunk::<COLUMNS>() else { continue };
-                for k in 0..COLUMNS {
-                    sums[0][k] = fused::<FMA>(*a, row[k], sums[0][k]);
-                    sums[1][k] = fused::<FMA>(*b, row[k], sums[1][k]);
-                    sums[2][k] = fused::<FMA>(*c, row[k], sums[2][k]);
-                    sums[3][k] = fused::<FMA>(*d, row[k], sums[3][k]);
+                for (k, value) in row.iter().enumerate() {
+                    sums[0][k] = fused::<FMA>(*a, *value, sums[0][k]);
+                    sums[1][k] = fused::<FMA>(*b, *value, sums[1][k]);
+                    sums[2][k] = fused::<FMA>(*c, *value, sums[2][k]);
+                    sums[3][k] = fused::<FMA>(*d, *value, sums[3][k]);
                 }
             }
             for (epoch, sums) in sums.iter().enumerate() {
