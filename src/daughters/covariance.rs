@@ -59,13 +59,16 @@ pub struct Covariances {
     powers: Vec<Vec<f32>>,
 }
 
+/// Tables by what they are made for.
+type Shared<K, T> = Mutex<HashMap<K, Arc<T>>>;
+
 /// Interpolations over time and over the channel, which channels and stretches have in common.
 #[derive(Debug, Default)]
 pub struct Tables {
     /// By numbers of instants and of epochs.
-    times: Mutex<HashMap<(usize, usize), Arc<[f32]>>>,
+    times: Shared<(usize, usize), [f32]>,
     /// By number of nodes.
-    bases: Mutex<HashMap<usize, Arc<Basis>>>,
+    bases: Shared<usize, Basis>,
 }
 
 /// Most tables that are kept: some 100 kB each.
@@ -84,7 +87,7 @@ impl Tables {
 
 /// The table of `key`, made if it is not there. Two threads may both make one; they are equal.
 fn shared<K: Copy + Eq + std::hash::Hash, T: ?Sized>(
-    tables: &Mutex<HashMap<K, Arc<T>>>,
+    tables: &Shared<K, T>,
     key: K,
     make: impl FnOnce() -> Arc<T>,
 ) -> Arc<T> {
