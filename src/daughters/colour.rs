@@ -90,16 +90,16 @@ fn functions<S: Simd, const P: usize>(
     rows: &[[f32; HALF]],
     [re, im]: [&[f32]; 2],
 ) -> [[S::f32s; P]; 2] {
-    let mut sums = [[simd.splat_f32s(0.0); P]; 2];
+    let [mut sums_re, mut sums_im] = [[simd.splat_f32s(0.0); P]; 2];
     for (row, (re, im)) in rows.iter().zip(re.iter().zip(im)) {
         let row = S::as_simd_f32s(row).0;
         let (re, im) = (simd.splat_f32s(*re), simd.splat_f32s(*im));
         for p in 0..P {
-            sums[0][p] = simd.mul_add_f32s(re, row[p], sums[0][p]);
-            sums[1][p] = simd.mul_add_f32s(im, row[p], sums[1][p]);
+            sums_re[p] = simd.mul_add_f32s(re, row[p], sums_re[p]);
+            sums_im[p] = simd.mul_add_f32s(im, row[p], sums_im[p]);
         }
     }
-    sums
+    [sums_re, sums_im]
 }
 
 /// Replaces covariances C by L with C = L L*, for `order` daughters, where C is a covariance but for rounding; says
@@ -153,9 +153,7 @@ fn part<S: Simd, const P: usize>(lanes: &[f32; TILE], side: usize) -> [S::f32s; 
 #[inline(always)]
 fn set<S: Simd, const P: usize>(lanes: &mut [f32; TILE], side: usize, values: [S::f32s; P]) {
     let lanes = S::as_mut_simd_f32s(&mut lanes[side * HALF..][..HALF]).0;
-    for p in 0..P {
-        lanes[p] = values[p];
-    }
+    lanes[..P].copy_from_slice(&values);
 }
 
 /// What a daughter has left of its power becomes its own amplitude; gives one over it. The imaginary part on the

@@ -59,13 +59,16 @@ pub struct Covariances {
     powers: Vec<Vec<f32>>,
 }
 
+/// Tables by what they are made for.
+type Shared<K, T> = Mutex<HashMap<K, Arc<T>>>;
+
 /// Interpolations over time and over the channel, which channels and stretches have in common.
 #[derive(Debug, Default)]
 pub struct Tables {
     /// By numbers of instants and of epochs.
-    times: Mutex<HashMap<(usize, usize), Arc<[f32]>>>,
+    times: Shared<(usize, usize), [f32]>,
     /// By number of nodes.
-    bases: Mutex<HashMap<usize, Arc<Basis>>>,
+    bases: Shared<usize, Basis>,
 }
 
 /// Most tables that are kept: some 100 kB each.
@@ -84,7 +87,7 @@ impl Tables {
 
 /// The table of `key`, made if it is not there. Two threads may both make one; they are equal.
 fn shared<K: Copy + Eq + std::hash::Hash, T: ?Sized>(
-    tables: &Mutex<HashMap<K, Arc<T>>>,
+    tables: &Shared<K, T>,
     key: K,
     make: impl FnOnce() -> Arc<T>,
 ) -> Arc<T> {
@@ -282,11 +285,11 @@ fn combine(weights: &[f32], rows: &[f32], stride: usize, out: &mut [f32]) {
             let own = first.iter().zip(second).zip(third.iter().zip(fourth));
             for (row, ((a, b), (c, d))) in rows.chunks_exact(stride).zip(own) {
                 let Some(row) = row[column..].first_chunk::<COLUMNS>() else { continue };
-                for k in 0..COLUMNS {
-                    sums[0][k] = fused::<FMA>(*a, row[k], sums[0][k]);
-                    sums[1][k] = fused::<FMA>(*b, row[k], sums[1][k]);
-                    sums[2][k] = fused::<FMA>(*c, row[k], sums[2][k]);
-                    sums[3][k] = fused::<FMA>(*d, row[k], sums[3][k]);
+                for (k, value) in row.iter().enumerate() {
+                    sums[0][k] = fused::<FMA>(*a, *value, sums[0][k]);
+                    sums[1][k] = fused::<FMA>(*b, *value, sums[1][k]);
+                    sums[2][k] = fused::<FMA>(*c, *value, sums[2][k]);
+                    sums[3][k] = fused::<FMA>(*d, *value, sums[3][k]);
                 }
             }
             for (epoch, sums) in sums.iter().enumerate() {

@@ -86,15 +86,15 @@ impl Synthesis {
     /// The tables.
     #[must_use]
     pub fn new() -> Self {
-        let mut window = [[0.0; BINS]; 2];
+        let [mut re, mut im] = [[0.0; BINS]; 2];
         for n in 0..BINS {
             let x = n as f64;
             let amplitude = (PI * (x + 0.5) / BINS as f64).sin() / (BINS as f64).sqrt();
             // Frequencies are (k + 1/2) / BINS - 1/2.
             let value = amplitude * Complex64::cis(PI * x * (1.0 - 1.0 / BINS as f64));
-            (window[0][n], window[1][n]) = (value.re as f32, value.im as f32);
+            (re[n], im[n]) = (value.re as f32, value.im as f32);
         }
-        Self { arch: Arch::new(), fft: FftPlanner::new().plan_fft_forward(BINS), window }
+        Self { arch: Arch::new(), fft: FftPlanner::new().plan_fft_forward(BINS), window: [re, im] }
     }
 
     /// Room for `daughters`.

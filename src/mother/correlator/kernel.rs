@@ -1,6 +1,7 @@
 //! Products of all daughters, 16 channels at a time: the hot loop of the mission.
 //!
-//! Codes are multiplied in whole numbers ([`Levels`]), which is twice as fast; what is not quantised, here. A lane of a register is a channel, so nothing is ever summed across lanes. Samples are packed in slices of
+//! Codes are multiplied in whole numbers (`integers.rs`), which is twice as fast; what is not quantised, here. A
+//! lane of a register is a channel, so nothing is ever summed across lanes. Samples are packed in slices of
 //! `SLICE` that stay in the first-level cache, and each tile of two daughters by two keeps its sums in
 //! registers.
 

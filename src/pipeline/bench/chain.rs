@@ -71,7 +71,8 @@ pub(super) fn run(plan: &Plan, skies: &[SkyMap]) -> Result<ChainRun, PipelineErr
 /// Runs packets through the ground segment, up to the sums.
 pub(super) fn run_ground(config: &Config, packets: &[Vec<u8>]) -> Result<ChainRun, PipelineError> {
     let mut graph = Graph::new();
-    let packets = Packets(packets.to_vec().into_iter());
+    // Taken from the end.
+    let packets = Packets(packets.iter().rev().cloned().collect());
     let bytes = graph.source("packets", config.runtime.queue_capacity, packets);
     let sums = add_sums_of_stream(&mut graph, bytes, config, &GroundOutcome::default())?;
     graph.sink("drop", sums, Drop);
@@ -141,14 +142,14 @@ impl Looks {
 }
 
 /// Gives packets that are in memory.
-struct Packets(std::vec::IntoIter<Vec<u8>>);
+struct Packets(Vec<Vec<u8>>);
 
 impl Source for Packets {
     type Out = Vec<u8>;
     type Error = Infallible;
 
     fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, Infallible> {
-        let Some(packet) = self.0.next() else { return Ok(Flow::Done) };
+        let Some(packet) = self.0.pop() else { return Ok(Flow::Done) };
         out.push(packet);
         Ok(Flow::Continue)
     }
