@@ -1,5 +1,6 @@
 //! Looking into a state, or a downlink file, without going on with it.
 
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use super::error::StateError;
@@ -7,9 +8,11 @@ use super::file::{self, Head};
 use super::folder::checkpoints;
 use super::gaps::{Gaps, find_gaps};
 use super::journal::JournalEntry;
+use crate::accumulation::{Accumulator, MapConfig};
 use crate::downlink::{Collector, Kind, Taken};
 use crate::frames::GroundFrame;
 use crate::products::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
+use crate::runtime::Ledger;
 use crate::units::constants::DAY_S;
 
 /// Bytes that packets of a file wait for those before them.
@@ -74,6 +77,23 @@ impl Survey {
             std::io::copy(engines, &mut std::io::sink()).map_err(StateError::io(path, "read"))?;
             Ok(head)
         })?;
+        Ok(Self::of_head(head))
+    }
+
+    /// Surveys a checkpoint in memory, and reads its engines too, as a session of `map` would that goes on with it.
+    ///
+    /// # Errors
+    /// A checkpoint that does not hold.
+    pub fn of_bytes(bytes: &[u8], map: &MapConfig) -> Result<Self, StateError> {
+        let head: Head = file::read_from(&mut Cursor::new(bytes), Path::new("memory"), |head, engines| {
+            let accumulator = Accumulator::new(map.clone(), Ledger::default());
+            accumulator.resume(head.accumulator.clone(), engines)?;
+            Ok(head)
+        })?;
+        Ok(Self::of_head(head))
+    }
+
+    fn of_head(head: Head) -> Self {
         let mut journal = head.journal;
         // Packets that wait have come too, and are in no journal yet.
         let mut collector = Collector::resume(head.collector.clone());
@@ -82,7 +102,7 @@ impl Survey {
                 journal.extend(JournalEntry::of(header, &block));
             }
         }
-        Ok(Self { journal, taken: taken(|kind| head.collector.taken(kind).cloned()) })
+        Self { journal, taken: taken(|kind| head.collector.taken(kind).cloned()) }
     }
 
     /// What is missing.
