@@ -1,17 +1,23 @@
 //! Packets: how fast frames become bytes and bytes frames.
 //!
 //! `cargo bench --bench downlink`. Limits, measured in the same run over the same bytes: a plain copy, and a pass
-//! that only forms the checksum. One thread throughout.
+//! that only forms the checksum. One thread, but for the replays of a file, whose stages have one each.
 #![allow(clippy::unwrap_used)] // A bench may stop at anything.
 
+use std::convert::Infallible;
 use std::hint::black_box;
+use std::io::Read;
+use std::marker::PhantomData;
 use std::path::Path;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
+use lunarray::accumulation::{Accumulator, EngineKind, MapConfig};
 use lunarray::array::{Array, ArrayConfig, Ephemeris, segments_for};
+use lunarray::calibration::{CalibrationConfig, Calibrator};
 use lunarray::downlink::cadu::{CaduEncoder, CaduReceiver, ReedSolomon, randomize};
-use lunarray::downlink::{DownlinkConfig, DownlinkReader, Packetizer, Receiver};
+use lunarray::downlink::{DownlinkConfig, DownlinkReader, FileSource, Packetizer, Receiver, Reception};
 use lunarray::frames::{AntennaResponse, Channel, Flags, GroundFrame, Instrument, VisibilityBlock};
+use lunarray::runtime::{Cancel, Graph, Ledger, Sink, Units};
 use lunarray::units::{ChannelId, MissionTime, Pair, StreamKind, all_pairs, random_stream};
 use num_complex::Complex32;
 use rand::{Rng, RngExt};
@@ -216,6 +222,7 @@ fn main() {
     report.line("decode frames", best_s(|| assert_eq!(decode(black_box(&bytes), drop), sent)));
     layers(&bytes, report.bytes / copy_s / 1e9);
     place(&bytes, sent);
+    replay(&bytes, sent);
     resynchronise(report.bytes as usize);
 }
 
@@ -235,6 +242,85 @@ fn place(bytes: &[u8], sent: u64) {
     });
     assert_eq!(placed, sent);
     println!("{:<38} {:>7.2} M visibilities/s", "decode and place", sent as f64 / s / 1e6);
+}
+
+/// Counts what comes to an end.
+struct End<T>(u64, PhantomData<T>);
+
+impl<T: Send> Sink for End<T> {
+    type In = T;
+    type Error = Infallible;
+
+    fn take(&mut self, item: T) -> Result<(), Infallible> {
+        black_box(item);
+        self.0 += 1;
+        Ok(())
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.0, "items")
+    }
+}
+
+/// A replay, stages on threads as `lunarray replay` has them: from the file to the engines' door, and through the
+/// engines; beside one thread that reads the same file and forms a checksum.
+fn replay(bytes: &[u8], sent: u64) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bench.ccsds");
+    std::fs::write(&path, bytes).unwrap();
+    let checksum = || {
+        let (mut file, mut chunk) = (std::fs::File::open(&path).unwrap(), vec![0; 1 << 18]);
+        let mut digest = crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi);
+        while let count @ 1.. = file.read(&mut chunk).unwrap() {
+            digest.update(&chunk[..count]);
+        }
+        digest.finalize()
+    };
+    let placed = |graph: &mut Graph, ledger: &Ledger| {
+        let read = graph.source("read", 64, FileSource::open(std::slice::from_ref(&path)).unwrap());
+        let frames = graph.stage("receive", 64, read, Reception::default());
+        let hook = CalibrationConfig::default().build(Path::new("")).unwrap();
+        graph.stage("calibrate", 64, frames, Calibrator::new(hook, ledger.clone()))
+    };
+    let run = |graph: Graph| {
+        graph.run(&Cancel::new(), Duration::from_secs(10)).unwrap();
+    };
+    let to_door = || {
+        let (mut graph, ledger) = (Graph::new(), Ledger::new());
+        let placed = placed(&mut graph, &ledger);
+        graph.sink("door", placed, End(0, PhantomData));
+        run(graph);
+        assert_eq!((ledger.report().sampled, ledger.report().flagged_total()), (sent, 0));
+        sent
+    };
+    let through = || {
+        let (mut graph, ledger) = (Graph::new(), Ledger::new());
+        let placed = placed(&mut graph, &ledger);
+        let map = MapConfig { engine: EngineKind::Harmonic, ..MapConfig::default() };
+        let sums = graph.stage("accumulate", 1, placed, Accumulator::new(map, ledger.clone()));
+        graph.sink("end", sums, End(0, PhantomData));
+        run(graph);
+        ledger.close().unwrap().accumulated
+    };
+    let time = |run: &dyn Fn() -> u64| {
+        let start = Instant::now();
+        let found = black_box(run());
+        (start.elapsed().as_secs_f64(), found)
+    };
+    // In turns, so that whatever else the machine does meets both.
+    let mut best = [f64::INFINITY; 2];
+    for _ in 0..RUNS {
+        best = [best[0].min(time(&checksum).0), best[1].min(time(&to_door).0)];
+    }
+    let (through_s, summed) = time(&through);
+    let line = |what: &str, s: f64| {
+        let gb_s = bytes.len() as f64 / s / 1e9;
+        println!("{what:<38} {gb_s:>7.2} GB/s   {:>5.1} % of the checksum", 100.0 * best[0] / s);
+    };
+    line("file: read and checksum", best[0]);
+    line("file: replay to the engines' door", best[1]);
+    line("file: replay through harmonic engines", through_s);
+    println!("  of {sent} visibilities {summed} within the maps' longest baselines, nside 16, 3 channels");
 }
 
 /// Noise, and the worst that a forger can do: headers that each ask for a check of 64 KiB.

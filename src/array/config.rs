@@ -143,7 +143,6 @@ impl ArrayConfig {
         for (key, value) in [
             ("moon_radius_m", self.moon_radius_m),
             ("altitude_m", self.altitude_m),
-            ("orbital_period_s", self.orbital_period_s),
             ("precession_period_s", self.precession_period_s),
             ("breathing.period_s", breathing.period_s),
             ("breathing.first_spacing_m_min", breathing.first_spacing_m_min),
@@ -157,6 +156,9 @@ impl ArrayConfig {
         {
             require(key, value, value >= 1.0, "a number of at least 1");
         }
+        let period = self.orbital_period_s;
+        // Bounds the number of windows in the longest mission to a million.
+        require("orbital_period_s", period, period >= 1e3, "at least 1000 s");
         let inclination = self.inclination_deg;
         require("inclination_deg", inclination, (0.0..=180.0).contains(&inclination), "0 to 180");
         for (key, value) in [

@@ -44,6 +44,22 @@ impl<'a> ObservingWindows<'a> {
     }
 }
 
+/// How long the Earth is in sight of daughter 1 between two times, s.
+#[must_use]
+pub fn earth_in_sight_s(array: &Array, from_s: f64, until_s: f64) -> f64 {
+    let edges = ObservingWindows::new(array, from_s, until_s);
+    let (mut now_s, mut sight_s) = (from_s, 0.0);
+    if array.earth_depth_m(from_s) > 0.0 {
+        now_s = edges.next_edge_s(from_s, false).unwrap_or(until_s);
+    }
+    while now_s < until_s {
+        let hidden_s = edges.next_edge_s(now_s, true).unwrap_or(until_s);
+        sight_s += hidden_s - now_s;
+        now_s = edges.next_edge_s(hidden_s, false).unwrap_or(until_s);
+    }
+    sight_s
+}
+
 /// The point between `before` and `after` at which `is_past` becomes true, to one tick.
 fn bisect(mut before: f64, mut after: f64, is_past: impl Fn(f64) -> bool) -> f64 {
     while after - before > 1e-7 {

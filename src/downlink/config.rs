@@ -4,8 +4,9 @@ use serde::{Deserialize, Serialize};
 
 use super::cadu::{CaduEncoder, INTERLEAVES, ReedSolomon};
 use super::error::DownlinkError;
-use super::header::PACKET_BYTES_MAX;
+use super::header::{HEADER_BYTES, PACKET_BYTES_MAX, TRAILER_BYTES};
 use super::link::LinkConfig;
+use super::payload::{VISIBILITY_BYTES, visibilities_in};
 use super::socket::ListenConfig;
 
 /// Least packet that holds headers and more than one record of any kind.
@@ -42,6 +43,8 @@ pub struct DownlinkConfig {
     pub spacecraft_id: u8,
     /// Frames of idle data that begin each pass, for `cadu`: the ground needs one to find the stream.
     pub idle_frames: u32,
+    /// Rate of the link, coding and all, bit/s; 0 for no limit. What the passes have no time for stays on board.
+    pub rate_bits_per_s_max: f64,
     /// Faults of the link; none unless asked for.
     pub link: LinkConfig,
     /// Limits of a ground that listens.
@@ -58,6 +61,7 @@ impl Default for DownlinkConfig {
             interleave: 5,
             spacecraft_id: 0x4C,
             idle_frames: 2,
+            rate_bits_per_s_max: 0.0,
             link: LinkConfig::default(),
             listen: ListenConfig::default(),
         }
@@ -97,6 +101,10 @@ impl DownlinkConfig {
                 expected: "at most 1000",
             });
         }
+        let rate = self.rate_bits_per_s_max;
+        if !(rate >= 0.0 && rate.is_finite()) {
+            found.push(DownlinkError::Rate { value: rate });
+        }
         found.extend(self.link.problems(self.format));
         found
     }
@@ -114,6 +122,15 @@ impl DownlinkConfig {
             Format::Packets => 1.0,
             Format::Cadu => (4 + 255 * self.interleave) as f64 / (223 * self.interleave - 8) as f64,
         }
+    }
+
+    /// Rate at which visibilities can be sent, headers and coding taken off, bytes a second; `None` for no limit.
+    #[must_use]
+    pub fn payload_bytes_per_s(&self) -> Option<f64> {
+        let payload = self.packet_bytes_max.saturating_sub(HEADER_BYTES + TRAILER_BYTES);
+        let visibilities = VISIBILITY_BYTES * visibilities_in(payload).max(1);
+        let overhead = self.expansion() * self.packet_bytes_max as f64 / visibilities as f64;
+        (self.rate_bits_per_s_max > 0.0).then(|| self.rate_bits_per_s_max / 8.0 / overhead)
     }
 
     /// The encoder of frames that the format asks for; `None` for plain packets.

@@ -64,6 +64,12 @@ pub enum DownlinkError {
         /// Range that is accepted.
         expected: &'static str,
     },
+    /// A rate of the link that cannot be.
+    #[error("downlink.rate_bits_per_s_max = {value}: expected bits a second, or 0 for no limit")]
+    Rate {
+        /// Value found.
+        value: f64,
+    },
     /// Packets of another mission among those of one.
     #[error(
         "at byte {offset} of the packets: the description of another instrument than the one that the state is of; \

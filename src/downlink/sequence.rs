@@ -1,11 +1,14 @@
 //! Packet counts of one kind: what is missing, late, twice.
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 use super::cuc::CucTime;
 
-/// Stretches of missing packets that are remembered in case they arrive late; bounds the memory.
-const STRETCHES_MAX: usize = 4096;
+/// Stretches of missing packets that are remembered in case they arrive late: fifteen times the packets of the paper's
+/// mission. Bounds the memory to 32 MB a kind, whatever a forger sends; packets of stretches that are older still
+/// count as duplicates.
+const STRETCHES_MAX: usize = 1 << 20;
 
 /// What the count of a packet says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,8 +41,8 @@ pub(super) struct Sequence {
     first: u64,
     next: u64,
     newest: CucTime,
-    /// Missing counts below `next`, in order, at most [`STRETCHES_MAX`] stretches.
-    missing: Vec<Range<u64>>,
+    /// Missing counts below `next`: beginning and end (one beyond the last) of at most [`STRETCHES_MAX`] stretches.
+    missing: BTreeMap<u64, u64>,
 }
 
 impl Sequence {
@@ -95,29 +98,36 @@ impl Sequence {
     }
 
     fn miss(&mut self, stretch: Range<u64>) {
-        match self.missing.last_mut() {
-            _ if stretch.is_empty() => {}
-            Some(last) if last.end == stretch.start => last.end = stretch.end,
-            _ => self.missing.push(stretch),
+        if stretch.is_empty() {
+            return;
         }
-        if self.missing.len() > STRETCHES_MAX {
-            self.missing.remove(0);
+        match self.missing.last_entry().filter(|last| *last.get() == stretch.start) {
+            Some(mut last) => *last.get_mut() = stretch.end,
+            None => drop(self.missing.insert(stretch.start, stretch.end)),
         }
+        self.forget_oldest();
     }
 
     /// The missing stretch that a count lies in.
-    fn stretch_of(&self, count: u64) -> Option<usize> {
-        let at = self.missing.partition_point(|stretch| stretch.end <= count);
-        self.missing.get(at).filter(|stretch| stretch.contains(&count)).map(|_| at)
+    fn stretch_of(&self, count: u64) -> Option<Range<u64>> {
+        let (&start, &end) = self.missing.range(..=count).next_back()?;
+        (count < end).then_some(start..end)
     }
 
     fn fill(&mut self, count: u64) {
-        let Some(at) = self.stretch_of(count) else { return };
-        let stretch = self.missing[at].clone();
-        let parts = [stretch.start..count, count + 1..stretch.end];
-        self.missing.splice(at..=at, parts.into_iter().filter(|part| !part.is_empty()));
+        let Some(stretch) = self.stretch_of(count) else { return };
+        self.missing.remove(&stretch.start);
+        for part in [stretch.start..count, count + 1..stretch.end] {
+            if !part.is_empty() {
+                self.missing.insert(part.start, part.end);
+            }
+        }
+        self.forget_oldest();
+    }
+
+    fn forget_oldest(&mut self) {
         if self.missing.len() > STRETCHES_MAX {
-            self.missing.remove(0);
+            self.missing.pop_first();
         }
     }
 }
@@ -171,9 +181,15 @@ mod tests {
     #[test]
     fn memory_is_bounded() {
         let mut sequence = Sequence::default();
-        for k in 0..3 * STRETCHES_MAX as u64 {
-            sequence.receive(2 * k, at(1));
+        let last = 2 * (STRETCHES_MAX as u64 + 500);
+        for count in (0..=last).step_by(2) {
+            sequence.receive(count, at(1));
         }
         assert_eq!(sequence.missing.len(), STRETCHES_MAX);
+        // The oldest are forgotten, all others are not.
+        assert_eq!(sequence.receive(1, at(1)), Arrival::Duplicate);
+        assert_eq!(sequence.receive(2 * 500 + 1, at(1)), Arrival::Late);
+        assert_eq!(sequence.receive(last - 1, at(1)), Arrival::Late);
+        assert_eq!(sequence.missing.len(), STRETCHES_MAX - 2);
     }
 }

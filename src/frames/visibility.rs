@@ -64,6 +64,24 @@ impl VisibilityBlock {
         self.value_k_sr.is_empty()
     }
 
+    /// Takes off what stands at `at` and behind, as a block of its own.
+    ///
+    /// # Panics
+    /// If the block is shorter than that.
+    #[must_use]
+    pub fn split_off(&mut self, at: usize) -> Self {
+        Self {
+            channel: self.channel,
+            pair: self.pair,
+            start: self.start,
+            offset_ticks: self.offset_ticks.split_off(at),
+            duration_ticks: self.duration_ticks.split_off(at),
+            value_k_sr: self.value_k_sr.split_off(at),
+            weight: self.weight.split_off(at),
+            flags: self.flags.split_off(at),
+        }
+    }
+
     /// Middle of integration `k`, s since the mission epoch.
     #[must_use]
     pub fn middle_s(&self, k: usize) -> f64 {

@@ -62,6 +62,8 @@ pub struct SpacecraftConfig {
     pub wait_blocks: u64,
     /// Capacity of the onboard store, bytes.
     pub store_bytes_max: u64,
+    /// What a full store drops.
+    pub store_drop: StoreDrop,
     /// Mission epoch: TAI seconds since 1958-01-01.
     pub epoch_tai_s: f64,
 }
@@ -75,6 +77,20 @@ pub enum Fidelity {
     Visibilities,
     /// Samples of every daughter, quantised, sent over links and correlated: for minutes to hours.
     Samples,
+}
+
+/// What a full store drops.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum StoreDrop {
+    /// What comes.
+    #[default]
+    Newest,
+    /// What has been there longest.
+    Oldest,
+    /// What adds least to the map a byte: the blocks of least weight a visibility, in terms of what a second of their
+    /// channel weighs. Those are the long baselines, whose integrations are short.
+    LowestValue,
 }
 
 /// Antenna response by name.
@@ -121,6 +137,7 @@ impl Default for SpacecraftConfig {
             auto_integration_s: 1.0,
             wait_blocks: 16,
             store_bytes_max: 4 << 30,
+            store_drop: StoreDrop::default(),
             // 2027-01-01T00:00:00 TAI: 69 years of which 17 are leap years.
             epoch_tai_s: (69.0 * 365.0 + 17.0) * 86_400.0,
         }

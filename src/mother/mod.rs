@@ -17,11 +17,11 @@ mod schedule;
 mod store;
 
 pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
-pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, SpacecraftError};
+pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, SpacecraftError, StoreDrop};
 pub use direct::DirectSum;
 pub use harmonic::{HarmonicSetup, HarmonicSum};
 pub use integrator::{Integrator, MeasurementOptions, NoiseModel};
 pub use model::{ModelError, PairPosition, Prediction, VisibilityModel};
 pub use observer::Observer;
 pub use schedule::{Integration, Schedule};
-pub use store::{Store, VISIBILITY_BYTES};
+pub use store::{PacedLink, Store, VISIBILITY_BYTES};

@@ -131,11 +131,18 @@ impl ConfigSource {
     /// # Errors
     /// An unreadable file, TOML errors with line and column, unknown keys, bad overrides.
     pub fn parse(&self) -> Result<Config, ConfigError> {
+        match &self.file {
+            Some(path) => self.parse_text(&read(path)?),
+            None => self.parse_text(QUICKLOOK),
+        }
+    }
+
+    /// [`Self::parse`] of a text that has been read.
+    ///
+    /// # Errors
+    /// As [`Self::parse`].
+    pub fn parse_text(&self, text: &str) -> Result<Config, ConfigError> {
         let origin = self.origin();
-        let text = match &self.file {
-            Some(path) => read(path)?,
-            None => QUICKLOOK.to_owned(),
-        };
         let parse_error = |origin: String, table: Option<&toml::Table>, source: toml::de::Error| {
             let unknown = table.map(unknown_keys).unwrap_or_default();
             // One alone is told by the parser, which knows its line.
@@ -146,11 +153,11 @@ impl ConfigSource {
             ConfigError::Parse { origin, source: Box::new(source) }
         };
         // Straight from the text first: these errors know their line.
-        let mut config: Config = toml::from_str(&text)
-            .map_err(|source| parse_error(origin.clone(), toml::from_str(&text).ok().as_ref(), source))?;
+        let mut config: Config = toml::from_str(text)
+            .map_err(|source| parse_error(origin.clone(), toml::from_str(text).ok().as_ref(), source))?;
         if !self.overrides.is_empty() {
             let mut table: toml::Table =
-                toml::from_str(&text).map_err(|source| parse_error(origin, None, source))?;
+                toml::from_str(text).map_err(|source| parse_error(origin, None, source))?;
             for text in &self.overrides {
                 set(&mut table, text)?;
             }

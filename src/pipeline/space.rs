@@ -8,7 +8,7 @@ use super::plan::Plan;
 use super::sampling::{SampleCounts, samples};
 use crate::downlink::Transmitter;
 use crate::frames::GroundFrame;
-use crate::mother::{Fidelity, Integrator, MeasurementOptions, NoiseModel, Observer, Store};
+use crate::mother::{Fidelity, Integrator, MeasurementOptions, NoiseModel, Observer, PacedLink, Store};
 use crate::runtime::{Graph, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::generated::generate;
@@ -90,6 +90,8 @@ fn transmit(
 ) -> Result<Link<Vec<u8>>, PipelineError> {
     let config = &plan.config;
     let capacity = config.runtime.queue_capacity;
-    let passes = graph.stage("store", capacity, frames, Store::new(config.spacecraft.store_bytes_max));
+    let paced = |bytes_per_s| PacedLink { array: Arc::clone(&plan.array), bytes_per_s };
+    let store = Store::new(&config.spacecraft, config.downlink.payload_bytes_per_s().map(paced));
+    let passes = graph.stage("store", capacity, frames, store);
     Ok(graph.stage("transmit", capacity, passes, Transmitter::new(&config.downlink)?))
 }

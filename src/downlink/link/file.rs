@@ -41,12 +41,14 @@ pub struct LinkStage {
 }
 
 impl LinkStage {
-    /// A link whose truth goes beside the file `downlink`; `None` if it is to have no faults.
+    /// A link whose truth goes beside the file `downlink`; `None` if it is to have no faults
+    /// and no end of its rate.
     ///
     /// # Errors
     /// A bad configuration.
     pub fn new(config: &DownlinkConfig, seed: u64, downlink: &Path) -> Result<Option<Self>, DownlinkError> {
-        if !config.link.is_on() {
+        // What is dropped for want of time is to be told too.
+        if !config.link.is_on() && config.rate_bits_per_s_max == 0.0 {
             return Ok(None);
         }
         let simulator = LinkSimulator::new(&config.link, seed, config.code())?;

@@ -213,6 +213,10 @@ impl LinkSimulator {
 
     /// Takes the outcomes of a pass into the account.
     fn settle(&mut self, pass: &Pass, outcomes: &[Outcome]) {
+        if let Some(report) = pass.report {
+            self.truth.visibilities_sampled = report.sampled;
+            self.truth.visibilities_dropped = report.dropped;
+        }
         for (unit, outcome) in pass.units.iter().zip(outcomes) {
             self.truth.frames_sent += 1;
             self.truth.frames_recoverable += u64::from(outcome.good > 0);
@@ -223,8 +227,12 @@ impl LinkSimulator {
         }
         for packet in &pass.packets {
             self.truth.packets_sent += 1;
+            self.truth.visibilities_sent += packet.visibilities;
             match packet.units.iter().map(|unit| outcomes[*unit].good).min().unwrap_or(0) {
-                0 => list_packet(&mut self.truth.packets_lost, packet.apid, packet.count),
+                0 => {
+                    self.truth.visibilities_lost += packet.visibilities;
+                    list_packet(&mut self.truth.packets_lost, packet.apid, packet.count);
+                }
                 1 => {}
                 _ => list_packet(&mut self.truth.packets_duplicate, packet.apid, packet.count),
             }

@@ -93,6 +93,14 @@ pub struct Truth {
     pub bytes_delivered: u64,
     /// Packets sent, idle ones left out.
     pub packets_sent: u64,
+    /// Visibilities that the spacecraft had integrated by the end of the last pass, as she counts.
+    pub visibilities_sampled: u64,
+    /// Visibilities of those that she dropped because her store was full.
+    pub visibilities_dropped: u64,
+    /// Visibilities sent.
+    pub visibilities_sent: u64,
+    /// Visibilities in packets that cannot be recovered.
+    pub visibilities_lost: u64,
     /// Coded frames that cannot be recovered.
     pub frames_lost: Vec<LostFrames>,
     /// Packets that cannot be recovered.
@@ -123,7 +131,15 @@ impl fmt::Display for Truth {
             self.copies_duplicate
         )?;
         let lost: u64 = self.packets_lost.iter().map(|range| range.to - range.from + 1).sum();
-        write!(f, "packets        {} sent, {lost} lost", self.packets_sent)
+        writeln!(f, "packets        {} sent, {lost} lost", self.packets_sent)?;
+        write!(
+            f,
+            "visibilities   {} sampled, {} dropped by a full store, {} sent, {} lost",
+            self.visibilities_sampled,
+            self.visibilities_dropped,
+            self.visibilities_sent,
+            self.visibilities_lost
+        )
     }
 }
 

@@ -7,11 +7,16 @@ use crate::downlink::cadu::{
     randomize,
 };
 use crate::downlink::error::DownlinkError;
-use crate::downlink::header::{HEADER_BYTES, PacketHeader};
+use crate::downlink::header::{HEADER_BYTES, PacketHeader, TRAILER_BYTES};
 use crate::downlink::kind::Kind;
+use crate::downlink::payload::{decode_housekeeping, visibilities_in};
+use crate::frames::Housekeeping;
 
 /// Octets of a space packet's primary header.
 const PRIMARY_BYTES: usize = 6;
+
+/// Octets of a packet that are kept: more than housekeeping takes.
+const HEAD_BYTES: usize = 128;
 
 /// A coded frame, or a packet where packets are sent plain.
 #[derive(Debug)]
@@ -26,6 +31,7 @@ pub(super) struct Unit {
 pub(super) struct Span {
     pub(super) apid: u16,
     pub(super) count: u64,
+    pub(super) visibilities: u64,
     pub(super) units: Vec<usize>,
 }
 
@@ -34,6 +40,24 @@ pub(super) struct Span {
 pub(super) struct Pass {
     pub(super) units: Vec<Unit>,
     pub(super) packets: Vec<Span>,
+    /// The spacecraft's own counts at its end.
+    pub(super) report: Option<Housekeeping>,
+}
+
+impl Pass {
+    /// Takes a packet that begins with `head`, in all of it if it is a short one.
+    fn add(&mut self, head: &[u8], units: Vec<usize>) {
+        // Idle packets have other headers than ours.
+        let Some(header) = PacketHeader::parse(head) else { return };
+        let payload = header.bytes - HEADER_BYTES - TRAILER_BYTES;
+        let visibilities =
+            if header.kind == Kind::Visibilities { visibilities_in(payload) as u64 } else { 0 };
+        if header.kind == Kind::Housekeeping {
+            let payload = head.get(HEADER_BYTES..HEADER_BYTES + payload);
+            self.report = payload.and_then(|payload| decode_housekeeping(payload).ok()).or(self.report);
+        }
+        self.packets.push(Span { apid: header.kind.apid(), count: header.count, visibilities, units });
+    }
 }
 
 /// A packet of which not all has been seen.
@@ -109,7 +133,7 @@ impl Splitter {
         let header = PacketHeader::parse(rest).ok_or_else(|| self.unsound())?;
         let Some(bytes) = rest.get(..header.bytes) else { return Ok(None) };
         let units = vec![self.pass.units.len()];
-        self.pass.packets.push(Span { apid: header.kind.apid(), count: header.count, units });
+        self.pass.add(bytes, units);
         self.pass.units.push(Unit { bytes: bytes.to_vec(), frame: None });
         Ok(Some((header.bytes, header.kind == Kind::Housekeeping)))
     }
@@ -145,16 +169,13 @@ impl Splitter {
                 _ => PRIMARY_BYTES,
             };
             let (part, after) = rest.split_at(rest.len().min(total - open.bytes));
-            let wanted = HEADER_BYTES - open.head.len().min(HEADER_BYTES);
+            let wanted = HEAD_BYTES - open.head.len().min(HEAD_BYTES);
             open.head.extend_from_slice(&part[..part.len().min(wanted)]);
             open.bytes += part.len();
             rest = after;
             if total > PRIMARY_BYTES && open.bytes == total {
                 let Open { head, units, .. } = std::mem::take(open);
-                // Idle packets have other headers than ours.
-                if let Some(header) = PacketHeader::parse(&head) {
-                    self.pass.packets.push(Span { apid: header.kind.apid(), count: header.count, units });
-                }
+                self.pass.add(&head, units);
             }
         }
     }

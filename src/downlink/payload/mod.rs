@@ -21,7 +21,7 @@ pub(super) use ephemeris::{decode as decode_ephemeris, encode as encode_ephemeri
 pub(super) use housekeeping::{decode as decode_housekeeping, encode as encode_housekeeping};
 pub(super) use instrument::{decode as decode_instrument, encode as encode_instrument};
 pub(super) use visibilities::{
-    capacity as visibilities_in, check as check_visibilities, count as count_visibilities,
+    VISIBILITY_BYTES, capacity as visibilities_in, check as check_visibilities, count as count_visibilities,
     decode as decode_visibilities, encode as encode_visibilities, span as visibilities_span,
 };
 

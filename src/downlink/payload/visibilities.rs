@@ -19,7 +19,7 @@ use crate::units::{ChannelId, MissionTime, Pair};
 /// Bytes of the record.
 const RECORD_BYTES: usize = 16;
 /// Bytes of one visibility.
-const VISIBILITY_BYTES: usize = 21;
+pub(in crate::downlink) const VISIBILITY_BYTES: usize = 21;
 
 #[derive(Encode, Decode)]
 struct Record {

@@ -60,8 +60,7 @@ pub(super) fn run(plan: &Plan, skies: &[SkyMap]) -> Result<ChainRun, PipelineErr
     let samples = graph.source("sample", capacity, sampler);
     let samples = graph.stage("link", capacity, samples, link);
     let visibilities = graph.stage("correlate", capacity, samples, correlator);
-    let passes =
-        graph.stage("store", capacity, visibilities, Store::new(plan.config.spacecraft.store_bytes_max));
+    let passes = graph.stage("store", capacity, visibilities, Store::new(&plan.config.spacecraft, None));
     let packets = graph.stage("transmit", capacity, passes, Transmitter::new(&plan.config.downlink)?);
     let received = graph.stage("receive", capacity, packets, Reception::new(Arc::default()));
     graph.sink("drop", received, Forget(0));

@@ -1,7 +1,7 @@
 //! Checkpoints, written and read.
 
 use std::fs::File;
-use std::io::{BufReader, BufWriter, Read, Write};
+use std::io::{BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use bincode::enc::write::SizeWriter;
@@ -19,6 +19,9 @@ use crate::runtime::LedgerReport;
 const MAGIC: &[u8; 8] = b"LNRSTA02";
 /// Bytes of magic, length of the head, and checksum.
 const FIXED_BYTES: u64 = 24;
+
+/// Bytes read at a time.
+const PIECE_BYTES: u64 = 1 << 20;
 
 /// Greatest head that is read.
 const HEAD_BYTES_MAX: usize = 1 << 32;
@@ -106,16 +109,26 @@ pub(super) fn is_checkpoint(path: &Path) -> Result<bool, StateError> {
 }
 
 /// Reads a checkpoint; `rest` makes something of the head and the engines.
+pub(super) fn read<T>(
+    path: &Path,
+    rest: impl FnOnce(Head, &mut dyn Read) -> Result<T, StateError>,
+) -> Result<T, StateError> {
+    read_from(&mut File::open(path).map_err(StateError::io(path, "read"))?, path, rest)
+}
+
+/// Reads a checkpoint from anything; messages call it `path`.
 ///
 /// The checksum is compared before anything is believed.
-pub(super) fn read<T>(
+pub(super) fn read_from<T>(
+    from: &mut (impl Read + Seek),
     path: &Path,
     rest: impl FnOnce(Head, &mut dyn Read) -> Result<T, StateError>,
 ) -> Result<T, StateError> {
     let failed = || StateError::io(path, "read");
     let damaged = |found: String, expected| StateError::Damaged { path: path.to_owned(), found, expected };
-    let bytes = checked_length(path)?;
-    let mut from = BufReader::with_capacity(1 << 20, File::open(path).map_err(failed())?);
+    let bytes = checked_length(from, path)?;
+    from.rewind().map_err(failed())?;
+    let mut from = BufReader::with_capacity(bytes.min(PIECE_BYTES) as usize, from);
     let mut fixed = [0; 16];
     from.read_exact(&mut fixed).map_err(failed())?;
     let (magic, length) = fixed.split_at(8);
@@ -143,18 +156,18 @@ pub(super) fn read<T>(
     }
 }
 
-/// Length of a file whose checksum holds.
-fn checked_length(path: &Path) -> Result<u64, StateError> {
+/// Length of a checkpoint whose checksum holds.
+fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, StateError> {
     let failed = || StateError::io(path, "read");
     let damaged = |found: String, expected| StateError::Damaged { path: path.to_owned(), found, expected };
-    let file = File::open(path).map_err(failed())?;
-    let bytes = file.metadata().map_err(failed())?.len();
+    let bytes = from.seek(SeekFrom::End(0)).map_err(failed())?;
     if bytes < FIXED_BYTES {
         return Err(damaged(format!("{bytes} bytes"), "at least 24"));
     }
-    let mut body = (&file).take(bytes - 8);
+    from.rewind().map_err(failed())?;
+    let mut body = from.by_ref().take(bytes - 8);
     let mut crc = Digest::new(CrcAlgorithm::Crc64Nvme);
-    let mut chunk = vec![0; 1 << 20];
+    let mut chunk = vec![0; bytes.min(PIECE_BYTES) as usize];
     loop {
         match body.read(&mut chunk).map_err(failed())? {
             0 => break,
@@ -162,7 +175,7 @@ fn checked_length(path: &Path) -> Result<u64, StateError> {
         }
     }
     let mut stored = [0; 8];
-    (&file).read_exact(&mut stored).map_err(failed())?;
+    from.read_exact(&mut stored).map_err(failed())?;
     let found = crc.finalize();
     if found != u64::from_le_bytes(stored) {
         return Err(damaged(format!("checksum {found:016x}"), "the checksum that it was written with"));

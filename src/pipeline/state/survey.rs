@@ -1,5 +1,6 @@
 //! Looking into a state, or a downlink file, without going on with it.
 
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use super::error::StateError;
@@ -7,9 +8,11 @@ use super::file::{self, Head};
 use super::folder::checkpoints;
 use super::gaps::{Gaps, find_gaps};
 use super::journal::JournalEntry;
+use crate::accumulation::{Accumulator, MapConfig};
 use crate::downlink::{Collector, Delivery, Kind, Taken};
 use crate::frames::GroundFrame;
 use crate::products::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
+use crate::runtime::Ledger;
 use crate::units::constants::DAY_S;
 
 /// Bytes that packets of a file wait for those before them.
@@ -70,6 +73,23 @@ impl Survey {
             std::io::copy(engines, &mut std::io::sink()).map_err(StateError::io(path, "read"))?;
             Ok(head)
         })?;
+        Ok(Self::of_head(head))
+    }
+
+    /// Surveys a checkpoint in memory, and reads its engines too, as a session of `map` would that goes on with it.
+    ///
+    /// # Errors
+    /// A checkpoint that does not hold.
+    pub fn of_bytes(bytes: &[u8], map: &MapConfig) -> Result<Self, StateError> {
+        let head: Head = file::read_from(&mut Cursor::new(bytes), Path::new("memory"), |head, engines| {
+            let accumulator = Accumulator::new(map.clone(), Ledger::default());
+            accumulator.resume(head.accumulator.clone(), engines)?;
+            Ok(head)
+        })?;
+        Ok(Self::of_head(head))
+    }
+
+    fn of_head(head: Head) -> Self {
         let mut journal: Vec<JournalEntry> = head.journal.entries().copied().collect();
         // Packets that wait have come too, and are in no journal yet.
         let taken = taken(|kind| head.collector.taken(kind).cloned());
@@ -77,7 +97,7 @@ impl Survey {
         while let Some(found) = collector.next_waiting() {
             journal.extend(entry_of(&found));
         }
-        Ok(Self { journal, taken })
+        Self { journal, taken }
     }
 
     /// What is missing.
