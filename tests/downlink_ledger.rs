@@ -226,7 +226,7 @@ fn hold_to_the_truth(sent: &Sent) {
     // What the ground says is lost, as far as the spacecraft's last word about it has come.
     let reports_lost = counts_of(&truth.packets_lost, Kind::Housekeeping);
     let last_report_came = !reports_lost.contains(&(WINDOWS as u64 - 1));
-    if last_report_came && reception.instrument.packets > 0 && unread == 0 {
+    if last_report_came && reception.instrument.packets > 0 && reception.payloads_before_instrument == 0 {
         assert_eq!(ledger.sampled, SAMPLED);
         assert_eq!(lost(ledger, "store"), truth.visibilities_dropped);
         assert_eq!(lost(ledger, "downlink"), truth.visibilities_lost);
