@@ -12,7 +12,7 @@ use lunarray::array::{Array, ArrayConfig, ObservingWindows, segments_for};
 use lunarray::calibration::{CalibrationConfig, Calibrator};
 use lunarray::downlink::link::{LinkConfig, LinkSimulator, PacketRange, Truth};
 use lunarray::downlink::{
-    Collector, Decoder, DownlinkConfig, Event, Format, Intake, Kind, Reception, ReceptionCounters,
+    Collector, Decoder, Delivery, DownlinkConfig, Event, Format, Intake, Kind, Reception, ReceptionCounters,
     Transmission,
 };
 use lunarray::frames::{
@@ -242,28 +242,28 @@ fn hold_the_collector_to_the_truth(sent: &Sent) {
     let mut frames = Vec::new();
     for part in sent.arrived.chunks(5_000) {
         collector.push(part);
-        while let Some(frame) = collector.next_frame().unwrap() {
+        while let Some(frame) = collector.next_delivery(&|_| true).unwrap() {
             frames.push(frame);
         }
     }
     collector.finish();
-    while let Some(frame) = collector.next_frame().unwrap() {
+    while let Some(frame) = collector.next_delivery(&|_| true).unwrap() {
         frames.push(frame);
     }
     while let Some(frame) = collector.next_waiting() {
         frames.push(frame);
     }
     let mut seen = BTreeSet::new();
-    for (header, frame) in &frames {
-        if let GroundFrame::Visibilities(block) = frame {
-            assert_eq!(numbers(block), by_packet[&header.count]);
+    for Delivery { packets, frame } in &frames {
+        if let Some(GroundFrame::Visibilities(block)) = frame {
+            assert_eq!(numbers(block), by_packet[&packets[0].0.count]);
             assert!(numbers(block).into_iter().all(|number| seen.insert(number)), "taken twice");
         }
     }
-    if !frames.iter().any(|(_, frame)| matches!(frame, GroundFrame::Instrument(_))) {
+    if !frames.iter().any(|found| matches!(found.frame, Some(GroundFrame::Instrument(_)))) {
         return; // Nothing could be read.
     }
-    let state = collector.state();
+    let state = collector.into_state();
     for kind in Kind::ALL {
         let Some(taken) = state.taken(kind).filter(|taken| !taken.is_empty()) else { continue };
         let missing: BTreeSet<u64> = taken.missing().into_iter().flatten().flatten().collect();

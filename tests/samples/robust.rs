@@ -152,7 +152,7 @@ fn broken(hold: Option<mpsc::Receiver<()>>) -> (RuntimeError, usize) {
     // A window of 4 s has 32 blocks of each daughter, a start and an end.
     let passed = graph.stage("faulty", 8, received, Faulty { left: 2 * (32 * 8 + 2) + 100, hold });
     let frames = graph.stage("correlate", 8, passed, correlator);
-    let passes = graph.stage("store", 8, frames, Store::new(1 << 30));
+    let passes = graph.stage("store", 8, frames, Store::new(&plan.config.spacecraft, None));
     let bytes = graph.stage("transmit", 8, passes, Transmitter::new(&plan.config.downlink).unwrap());
     let file = folder.path().join("downlink.ccsds");
     graph.sink("record", bytes, Recorder::create(&file).unwrap());
