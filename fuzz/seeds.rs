@@ -149,6 +149,7 @@ fn engines() {
         moon_radius_m,
         response,
         companion_seed: 1,
+        weight_max: 10.0,
     };
     save_engine(PixelEngine::new(setup).expect("good"), 2, "pixel");
     let orbit = NominalOrbit {
@@ -164,6 +165,7 @@ fn engines() {
         response,
         orbit,
         companion_seed: 1,
+        weight_max: 10.0,
     };
     save_engine(HarmonicEngine::new(setup).expect("good"), 3, "harmonic");
 }

@@ -260,7 +260,6 @@ fn a_frame_that_the_ground_would_refuse_is_not_sent() {
     for frame in [
         GroundFrame::Visibilities(block(2, 1, 0, 3)),
         GroundFrame::Visibilities(block(0, 8, 0, 3)),
-        GroundFrame::Visibilities(block(0, 0, 0, 3)),
         GroundFrame::Visibilities(block(0, 1, i64::MAX, 3)),
         GroundFrame::Visibilities(uneven),
         GroundFrame::Visibilities(disordered),

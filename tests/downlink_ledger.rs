@@ -166,8 +166,8 @@ fn receive(arrived: &[u8]) -> Received {
         calibrator.step(frame, &mut placed).unwrap();
     }
     calibrator.finish(&mut placed).unwrap();
-    // All baselines: what is placed is summed.
-    let map = MapConfig { nside: 1, baseline_bp_max: 1e6, ..MapConfig::default() };
+    // All baselines and weights: what is placed is summed.
+    let map = MapConfig { nside: 1, baseline_bp_max: 1e6, weight_max: 1e3, ..MapConfig::default() };
     let mut accumulator = Accumulator::new(map, ledger.clone());
     let (mut summed, mut maps) = (Vec::new(), Outlet::collect());
     for frame in placed.into_vec() {

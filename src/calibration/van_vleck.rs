@@ -165,6 +165,7 @@ mod tests {
         let rho: [f64; 2] = [0.3, -0.7];
         let quantised = rho.map(|rho| (relation.forward(rho) * power) as f32);
         let mut block = VisibilityBlock {
+            pair: crate::units::Pair { i: 0, j: 1 },
             offset_ticks: vec![0],
             duration_ticks: vec![1_000_000],
             value_k_sr: vec![Complex32::new(quantised[0], quantised[1])],

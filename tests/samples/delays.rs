@@ -125,8 +125,10 @@ fn sub_bands_and_delays_keep_what_they_should_on_every_baseline() {
                 greatest_error = greatest_error.max(error * wanted.norm());
                 amplitudes += (found * wanted).norm() / bands as f64;
                 // 1.5: the source's own noise is common to both daughters. 3e-3 of one: synthesis, as documented.
+                // 5.5: of 2604 complex numbers the worst is beyond 4 errors about every time, exp(-4^2 / 2) each, and
+                // beyond 5.5 once in a thousand.
                 assert!(
-                    (found - 1.0).norm() * wanted.norm() < 4.0 * 1.5 * error * wanted.norm() + 3e-3,
+                    (found - 1.0).norm() * wanted.norm() < 5.5 * 1.5 * error * wanted.norm() + 3e-3,
                     "{bands} {centred} {pair} {k}: {found} of {wanted} +- {error}"
                 );
             }
