@@ -17,7 +17,7 @@ const INTEGRATION_S: f64 = 25.0;
 /// Room above the weight expected of a sky of Cane's brightness: for longer integrations, fainter skies and gains.
 const HEAD_ROOM: f64 = 1024.0;
 /// Greatest signal-to-noise ratio of one visibility; thermal noise of the sky itself allows 600.
-pub(super) const SIGNAL_TO_NOISE_MAX: f64 = 524_288.0;
+pub(super) const SIGNAL_TO_NOISE_MAX: f64 = 16_384.0;
 /// Weights are counted in this part of the scale.
 const WEIGHT_STEPS: f64 = 18_446_744_073_709_551_616.0; // 2^64
 

@@ -19,7 +19,7 @@ use crate::accumulation::scale::Scale;
 /// Quanta of the greatest weight that is taken; expected ones are 2^-10 of it and keep 20 bits.
 const WEIGHT_QUANTA: f64 = 1_073_741_824.0; // 2^30
 /// Quanta of a side of the greatest weight at a signal-to-noise ratio of one.
-const SIDE_QUANTA: f64 = 524_288.0; // 2^19
+const SIDE_QUANTA: f64 = 16_777_216.0; // 2^24
 
 /// Added to a term it leaves whole numbers; even, so that a term and its negative are rounded alike.
 const BIAS: f32 = 12_582_912.0; // 1.5 2^23
