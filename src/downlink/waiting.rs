@@ -59,7 +59,7 @@ impl WaitingPacket {
     }
 
     fn cost(&self) -> u64 {
-        self.header.bytes as u64 + KEEPING_BYTES
+        (self.header.bytes as u64).saturating_add(KEEPING_BYTES)
     }
 }
 
@@ -75,6 +75,7 @@ impl WaitingPacket {
 #[derive(Clone, Debug, Default, PartialEq, Encode, Decode)]
 pub struct Waiting {
     visibilities: BTreeMap<Sent, WaitingPacket>,
+    /// A state that was read may lie about it, so it never wraps.
     bytes: u64,
     others: BTreeMap<(Kind, Sent), WaitingPacket>,
     others_bytes: u64,
@@ -98,7 +99,7 @@ impl Waiting {
             Kind::Visibilities => (self.visibilities.insert((time, count), packet), &mut self.bytes),
             _ => (self.others.insert((kind, (time, count)), packet), &mut self.others_bytes),
         };
-        *bytes = *bytes + cost - replaced.map_or(0, |packet| packet.cost());
+        *bytes = bytes.saturating_add(cost).saturating_sub(replaced.map_or(0, |packet| packet.cost()));
     }
 
     /// All packets, visibilities first.
@@ -123,7 +124,7 @@ impl Waiting {
             Kind::Visibilities => (self.visibilities.remove(&sent), &mut self.bytes),
             kind => (self.others.remove(&(kind, sent)), &mut self.others_bytes),
         };
-        *bytes -= found.as_ref().map_or(0, WaitingPacket::cost);
+        *bytes = bytes.saturating_sub(found.as_ref().map_or(0, WaitingPacket::cost));
         found
     }
 
@@ -158,7 +159,7 @@ impl Waiting {
     /// The first visibilities, due or not.
     pub fn first_visibilities(&mut self) -> Option<WaitingPacket> {
         let (sent, packet) = self.visibilities.pop_first()?;
-        self.bytes -= packet.cost();
+        self.bytes = self.bytes.saturating_sub(packet.cost());
         self.gone = self.gone.max(Some(sent));
         Some(packet)
     }
@@ -203,7 +204,7 @@ impl Waiting {
 
     /// The first packet if nobody can read it for want of a description and more wait than may.
     pub fn next_unread(&mut self) -> Option<WaitingPacket> {
-        if self.bytes + self.others_bytes <= self.bytes_max.max(PATIENCE_BYTES) {
+        if self.bytes.saturating_add(self.others_bytes) <= self.bytes_max.max(PATIENCE_BYTES) {
             return None;
         }
         self.first_visibilities().or_else(|| self.first_other())
@@ -212,7 +213,7 @@ impl Waiting {
     /// The first packet other than visibilities.
     pub fn first_other(&mut self) -> Option<WaitingPacket> {
         let (_, packet) = self.others.pop_first()?;
-        self.others_bytes -= packet.cost();
+        self.others_bytes = self.others_bytes.saturating_sub(packet.cost());
         Some(packet)
     }
 }
@@ -249,6 +250,22 @@ mod tests {
             order.extend(due.map(|packet| packet.header.count));
         }
         (order, waiting)
+    }
+
+    /// Found by fuzzing: a state that says that less waits than does.
+    #[test]
+    fn what_waits_may_be_more_than_a_forged_state_says() {
+        let mut forged = Waiting::new(0);
+        forged.put(packet(5));
+        forged.put(packet(7));
+        (forged.bytes, forged.others_bytes) = (1, u64::MAX);
+        forged.put(WaitingPacket {
+            header: PacketHeader { bytes: usize::MAX, ..packet(9).header },
+            ..packet(9)
+        });
+        assert!(forged.take_out(&packet(5).header).is_some());
+        while forged.first_visibilities().is_some() {}
+        assert!(forged.visibilities.is_empty() && forged.next_unread().is_none());
     }
 
     proptest! {
