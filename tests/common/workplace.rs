@@ -6,6 +6,26 @@ use std::path::{Path, PathBuf};
 use assert_cmd::Command;
 use serde_json::Value;
 
+/// Real geometry, two channels, few visibilities.
+pub const SMALL: &str = r#"
+name = "small"
+seed = 7
+[sky]
+nside = 8
+[spacecraft]
+channels_hz = [3.0e6, 10.0e6]
+every_nth_window = 300
+every_nth_integration = 2
+baseline_wavelengths_max = 16.0
+[downlink]
+packet_bytes_max = 2048
+[map]
+nside = 4
+epsilon = 1e-4
+[products]
+pictures = false
+"#;
+
 /// A folder with a pipeline file in it.
 pub struct Workplace {
     folder: tempfile::TempDir,

@@ -14,28 +14,8 @@ mod sums;
 
 use std::path::{Path, PathBuf};
 
-use common::workplace::{Workplace, json};
+use common::workplace::{SMALL, Workplace, json};
 use serde_json::Value;
-
-/// Real geometry, two channels, few visibilities.
-const SMALL: &str = r#"
-name = "small"
-seed = 7
-[sky]
-nside = 8
-[spacecraft]
-channels_hz = [3.0e6, 10.0e6]
-every_nth_window = 300
-every_nth_integration = 2
-baseline_wavelengths_max = 16.0
-[downlink]
-packet_bytes_max = 2048
-[map]
-nside = 4
-epsilon = 1e-4
-[products]
-pictures = false
-"#;
 
 /// The two engines, each with what is to be added to the pipeline.
 ///
