@@ -1,6 +1,7 @@
 //! Tabulated positions: made on the spacecraft, interpolated on the ground.
 //!
-//! Interpolation is Lagrange's through the eight nodes about the time asked for, within one segment. Its
+//! Interpolation is Lagrange's through the eight nodes about the time asked for, within one segment, written as one
+//! polynomial from each node to the next: many visibilities lie between two nodes. Its
 //! error is at most `|d8r/dt8| h^8 max|s (s-1) .. (s-7)| / 8!` (Abramowitz and Stegun 25.2.27); on an orbit
 //! of radius R and angular speed w it is R (w h)^8 / 940 in the middle of a segment and 28 times that in its
 //! outermost steps: about a micrometre for nodes a minute apart.
@@ -176,10 +177,11 @@ impl Ephemeris {
         if !time_s.is_finite() {
             return None;
         }
-        let segment = self.stretch_at(MissionTime::from_seconds(time_s)).segment?;
-        let x = (time_s - segment.start.seconds()) / (f64::from(segment.step_ticks) * 1e-6);
-        let known = satellite < usize::from(segment.satellites);
-        known.then(|| Interpolation::new(segment, x).position_m(segment, satellite))
+        let time = MissionTime::from_seconds(time_s);
+        let piece = Piece::at(self.stretch_at(time).segment?, 2 * time.0, [satellite])?;
+        let middle_s = piece.middle_half_ticks as f64 / 2e6;
+        let [position_m] = piece.positions_m((time_s - middle_s) * 2e6);
+        Some(position_m)
     }
 
     /// The segment that holds at a time and the times up to which it does: the latest to begin that covers
@@ -197,57 +199,102 @@ impl Ephemeris {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stretch<'a> {
     pub(super) segment: Option<&'a EphemerisSegment>,
-    first: MissionTime,
-    last: MissionTime,
+    pub(super) first: MissionTime,
+    pub(super) last: MissionTime,
 }
 
-impl Stretch<'_> {
-    pub(super) fn holds_at(&self, time: MissionTime) -> bool {
-        self.first <= time && time <= self.last
-    }
-}
-
-/// Lagrange's coefficients at one time of a segment; the same for all its satellites.
+/// The interpolating polynomials of some satellites from one node of a segment to the next.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Interpolation {
-    node: usize,
-    coefficients: [f64; NODES],
+pub(super) struct Piece<const N: usize> {
+    /// Middle between the two nodes, half ticks after the mission epoch.
+    pub(super) middle_half_ticks: i64,
+    /// Half of the time between them, half ticks.
+    pub(super) reach_half_ticks: i64,
+    steps_per_half_tick: f64,
+    /// Coefficient of each power of the steps after the middle, for each coordinate.
+    coefficients_m: [[[f64; 3]; N]; NODES],
 }
 
-impl Interpolation {
-    /// Coefficients at `x` steps after the first node of a segment of at least eight nodes.
-    ///
-    /// `l_m = prod_{k != m} (s - k) / (m - k)`, the products formed from both ends, without a division
-    /// that a node would make zero.
-    #[inline]
-    pub(super) fn new(segment: &EphemerisSegment, x: f64) -> Self {
-        const SCALE: [f64; NODES] = inverse_products();
-        let node = (x.max(0.0) as usize).saturating_sub(NODES / 2 - 1).min(segment.nodes() - NODES);
-        let s = x - node as f64;
-        let mut coefficients = SCALE;
-        let (mut below, mut above) = (1.0, 1.0);
-        for k in 0..NODES {
-            coefficients[k] *= below;
-            below *= s - k as f64;
-            coefficients[NODES - 1 - k] *= above;
-            above *= s - (NODES - 1 - k) as f64;
+impl<const N: usize> Piece<N> {
+    /// The piece that holds at a time, which the first and last of a segment go beyond; `None` if the segment has
+    /// fewer than eight nodes or lacks a satellite.
+    pub(super) fn at(segment: &EphemerisSegment, half_ticks: i64, satellites: [usize; N]) -> Option<Self> {
+        const MONOMIALS: [[[f64; NODES]; NODES]; NODES - 1] = monomials();
+        let known = usize::from(segment.satellites);
+        let last_first = segment.nodes().checked_sub(NODES)?;
+        if satellites.iter().any(|&satellite| satellite >= known) {
+            return None;
         }
-        Self { node, coefficients }
+        let step = i64::from(segment.step_ticks);
+        let intervals = segment.nodes() as i64 - 1;
+        let interval = ((half_ticks - 2 * segment.start.0) / (2 * step)).clamp(0, intervals - 1) as usize;
+        let first = interval.saturating_sub(NODES / 2 - 1).min(last_first);
+        let mut coefficients_m = [[[0.0; 3]; N]; NODES];
+        for (node, monomials) in MONOMIALS[interval - first].iter().enumerate() {
+            let positions_m = &segment.positions_m[(first + node) * known..];
+            for (n, &satellite) in satellites.iter().enumerate() {
+                for (sum, monomial) in coefficients_m.iter_mut().zip(monomials) {
+                    for (sum, r) in sum[n].iter_mut().zip(positions_m[satellite]) {
+                        *sum += monomial * r;
+                    }
+                }
+            }
+        }
+        Some(Self {
+            middle_half_ticks: 2 * segment.start.0 + (2 * interval as i64 + 1) * step,
+            reach_half_ticks: step,
+            steps_per_half_tick: 0.5 / step as f64,
+            coefficients_m,
+        })
     }
 
-    /// Position of a satellite that the segment has, m.
-    #[inline]
-    pub(super) fn position_m(&self, segment: &EphemerisSegment, satellite: usize) -> Vec3 {
-        let satellites = usize::from(segment.satellites);
-        let nodes = segment.positions_m[self.node * satellites..].chunks_exact(satellites);
-        let mut sum = [0.0; 3];
-        for (node, coefficient) in nodes.zip(self.coefficients) {
-            for (sum, r) in sum.iter_mut().zip(node[satellite]) {
-                *sum += coefficient * r;
+    /// Positions, m, so many half ticks after the middle.
+    #[inline(always)] // For the registers of the caller.
+    pub(super) fn positions_m(&self, half_ticks_after: f64) -> [Vec3; N] {
+        let steps = half_ticks_after * self.steps_per_half_tick;
+        let [lower @ .., highest] = &self.coefficients_m;
+        let mut sum = *highest;
+        for coefficients in lower.iter().rev() {
+            for (sum, coefficient) in sum.as_flattened_mut().iter_mut().zip(coefficients.as_flattened()) {
+                *sum = *sum * steps + coefficient;
             }
         }
         sum
     }
+}
+
+/// Lagrange's polynomials through nodes 0 to 7 in powers of `s - o - 1/2`: `[o][m]` has the coefficients of
+/// `l_m(s) = prod_{k != m} (s - k) / (m - k)`.
+const fn monomials() -> [[[f64; NODES]; NODES]; NODES - 1] {
+    const SCALE: [f64; NODES] = inverse_products();
+    let mut all = [[[0.0; NODES]; NODES]; NODES - 1];
+    let mut o = 0;
+    while o < NODES - 1 {
+        let mut m = 0;
+        while m < NODES {
+            let mut product = [0.0; NODES];
+            product[0] = SCALE[m];
+            let (mut k, mut degree) = (0, 0);
+            while k < NODES {
+                if k != m {
+                    // Times `(s - o - 1/2) + (o + 1/2 - k)`; exact but for the scale: halves of whole numbers.
+                    let shift = o as f64 + 0.5 - k as f64;
+                    degree += 1;
+                    let mut power = degree;
+                    while power > 0 {
+                        product[power] = product[power] * shift + product[power - 1];
+                        power -= 1;
+                    }
+                    product[0] *= shift;
+                }
+                k += 1;
+            }
+            all[o][m] = product;
+            m += 1;
+        }
+        o += 1;
+    }
+    all
 }
 
 /// `1 / prod_{k != m} (m - k)` for each node m.
@@ -354,12 +401,18 @@ mod tests {
     }
 
     #[test]
-    fn nodes_are_returned_exactly() {
+    fn nodes_are_returned() {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         let segment = segments_for(&array, MissionTime(0), MissionTime(1_200_000_000), 60.0).remove(0);
         for k in 0..segment.nodes() {
-            let at_node = Interpolation::new(&segment, k as f64).position_m(&segment, 3);
-            assert_eq!(at_node, segment.positions_m[8 * k + 3]);
+            let time = segment.start.plus_ticks(k as i64 * i64::from(segment.step_ticks));
+            let piece = Piece::at(&segment, 2 * time.0, [3, 5]).unwrap();
+            let found = piece.positions_m((2 * time.0 - piece.middle_half_ticks) as f64);
+            for (found, satellite) in found.into_iter().zip([3, 5]) {
+                let node = segment.positions_m[8 * k + satellite];
+                // 1e-8 m: some tens of roundings of 1e6 m.
+                assert!(norm(sub(found, node)) < 1e-8, "{k}: {found:?} {node:?}");
+            }
         }
     }
 

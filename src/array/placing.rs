@@ -1,8 +1,12 @@
 //! Visibilities to their satellites' positions.
 
+use std::ops::Range;
+
+use multiversion::multiversion;
+use num_complex::Complex64;
 use serde::Serialize;
 
-use super::ephemeris::{Ephemeris, Interpolation};
+use super::ephemeris::{Ephemeris, Piece};
 use crate::frames::{Flags, PlacedVisibilities, VisibilityBlock};
 use crate::units::MissionTime;
 
@@ -72,34 +76,75 @@ impl Ephemeris {
             weight: Vec::with_capacity(block.len()),
         };
         let mut counts = PlacingCounts::default();
-        let [i, j] = [block.pair.i, block.pair.j].map(usize::from);
-        let mut stretch = self.stretch_at(block.start);
-        for k in 0..block.len() {
-            if !block.flags[k].is_good() {
-                counts.flagged.add(block.flags[k]);
-                continue;
-            }
-            let half_ticks = middle_half_ticks(block, k);
-            let time = MissionTime(half_ticks >> 1);
-            if !stretch.holds_at(time) {
-                stretch = self.stretch_at(time);
-            }
-            let Some(segment) = stretch.segment.filter(|s| i.max(j) < usize::from(s.satellites)) else {
-                counts.without_ephemeris += 1;
-                continue;
-            };
-            let since_half_ticks = half_ticks - 2 * segment.start.0;
-            let steps = since_half_ticks as f64 / (2.0 * f64::from(segment.step_ticks));
-            let interpolation = Interpolation::new(segment, steps);
-            out.time_s.push(half_ticks as f64 / 2e6);
-            out.r_i_m.push(interpolation.position_m(segment, i));
-            out.r_j_m.push(interpolation.position_m(segment, j));
-            let value = block.value_k_sr[k];
-            out.value_k_sr.push(num_complex::Complex64::new(f64::from(value.re), f64::from(value.im)));
-            out.weight.push(f64::from(block.weight[k]));
+        let mut from = 0;
+        while from < block.len() {
+            let to = self.place_run(block, from, &mut out, &mut counts);
+            from = to;
         }
         counts.placed = out.len() as u64;
         (out, counts)
+    }
+
+    /// Places the visibilities from `from` on that share its piece of the ephemeris, or its fate; the index of the
+    /// first that does not.
+    fn place_run(
+        &self,
+        block: &VisibilityBlock,
+        from: usize,
+        out: &mut PlacedVisibilities,
+        counts: &mut PlacingCounts,
+    ) -> usize {
+        if !block.flags[from].is_good() {
+            counts.flagged.add(block.flags[from]);
+            return from + 1;
+        }
+        let half_ticks = middle_half_ticks(block, from);
+        let stretch = self.stretch_at(MissionTime(half_ticks >> 1));
+        let mut holds = [2 * stretch.first.0, stretch.last.0.saturating_mul(2).saturating_add(1)];
+        let satellites = [block.pair.i, block.pair.j].map(usize::from);
+        let piece = stretch.segment.and_then(|segment| Piece::at(segment, half_ticks, satellites));
+        if let Some(piece) = &piece {
+            // The first and last pieces go beyond their nodes: they hold at this time in any case.
+            let end = (piece.middle_half_ticks + piece.reach_half_ticks - 1).max(half_ticks);
+            holds[1] = holds[1].min(end);
+        }
+        let goes_on = |&k: &usize| {
+            let half_ticks = middle_half_ticks(block, k);
+            block.flags[k].is_good() && holds[0] <= half_ticks && half_ticks <= holds[1]
+        };
+        let to = from + (from..block.len()).take_while(goes_on).count();
+        match piece {
+            Some(piece) => extend(out, block, from..to, &piece),
+            None => counts.without_ephemeris += (to - from) as u64,
+        }
+        to
+    }
+}
+
+/// Appends the visibilities in `range`, for all of which `piece` holds.
+///
+/// Compiled for wide registers, in plain loops, as closures in iterators would not be; no multiplication is fused with an addition, so that every version gives the same bits.
+#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2"))]
+fn extend(out: &mut PlacedVisibilities, block: &VisibilityBlock, range: Range<usize>, piece: &Piece<2>) {
+    let (from, to) = (out.time_s.len(), out.time_s.len() + range.len());
+    out.time_s.resize(to, 0.0);
+    out.r_i_m.resize(to, [0.0; 3]);
+    out.r_j_m.resize(to, [0.0; 3]);
+    out.value_k_sr.resize(to, Complex64::ZERO);
+    out.weight.resize(to, 0.0);
+    let twice_start = 2 * block.start.0;
+    let ticks = block.offset_ticks[range.clone()].iter().zip(&block.duration_ticks[range.clone()]);
+    let places = out.time_s[from..].iter_mut().zip(&mut out.r_i_m[from..]).zip(&mut out.r_j_m[from..]);
+    for ((&offset, &duration), ((time_s, r_i_m), r_j_m)) in ticks.zip(places) {
+        let half_ticks = twice_start + 2 * i64::from(offset) + i64::from(duration);
+        *time_s = half_ticks as f64 / 2e6;
+        [*r_i_m, *r_j_m] = piece.positions_m((half_ticks - piece.middle_half_ticks) as f64);
+    }
+    for (wide, value) in out.value_k_sr[from..].iter_mut().zip(&block.value_k_sr[range.clone()]) {
+        *wide = Complex64::new(f64::from(value.re), f64::from(value.im));
+    }
+    for (wide, weight) in out.weight[from..].iter_mut().zip(&block.weight[range]) {
+        *wide = f64::from(*weight);
     }
 }
 
