@@ -15,10 +15,9 @@ use crate::accumulation::checked::{Checked, RESPONSES, Summed, number_of, refuse
 use crate::accumulation::scale::Totals;
 use crate::array::harmonic::{GeometryLimits, NominalOrbit};
 
-const MAGIC: &[u8; 8] = b"LNRHRM02";
+const MAGIC: &[u8; 8] = b"LNRHRM03";
 
-const VERSION: &str =
-    "a harmonic engine's checkpoint, version 02; sums of version 01 were not exact: sum the data anew";
+const VERSION: &str = "a harmonic engine's checkpoint, version 03; those before rounded otherwise or were not exact: sum the data anew";
 
 #[derive(bincode::Encode, bincode::Decode)]
 struct Head {

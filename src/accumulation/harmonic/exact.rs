@@ -1,6 +1,6 @@
 //! Exact sums at the nodes in baseline length: integers, row by row of a torus.
 //!
-//! A term is a product in f32, rounded to a multiple of the quantum by adding [`BIAS`] to it alone; its multiple is
+//! A term is a product, rounded to a multiple of the quantum by adding [`BIAS`] in the same operation; its multiple is
 //! what the bits of the sum are above those of the bias. A visibility whose terms would be greater than 2^21 quanta
 //! has them rounded to the quantum times a power of two instead, so that it keeps its 21 bits: which power depends
 //! on that visibility alone.
@@ -22,17 +22,11 @@ const WEIGHT_QUANTA: f64 = 1_073_741_824.0; // 2^30
 const SIDE_QUANTA: f64 = 16_777_216.0; // 2^24
 
 /// Added to a term it leaves whole numbers; even, so that a term and its negative are rounded alike.
-const BIAS: f32 = 12_582_912.0; // 1.5 2^23
+pub(super) const BIAS: f32 = 12_582_912.0; // 1.5 2^23
 /// Greatest term, in its own quanta.
 pub(super) const TERM_MAX: f64 = 2_097_152.0; // 2^21
 /// Bounds below this hold in 32 bits.
 const NARROW: u64 = 1 << 31;
-
-/// The multiple that a term is rounded to, above that of the bias.
-#[inline(always)]
-pub(super) fn biased_multiple(term: f32) -> i32 {
-    (term + BIAS).to_bits() as i32
-}
 
 /// What `terms` biased multiples hold too much.
 #[inline(always)]

@@ -1,6 +1,8 @@
 //! Spreading visibilities onto the sums at the nodes.
 
-use super::exact::{ExactNode, Integers, Quanta, Row, TERM_MAX, biased_multiple, biases};
+use pulp::{Arch, Simd, WithSimd};
+
+use super::exact::{BIAS, ExactNode, Integers, Quanta, Row, TERM_MAX, biases};
 use super::grid::{Grids, NODES};
 use crate::accumulation::Direction;
 use crate::array::harmonic::kernel::LANES;
@@ -34,9 +36,11 @@ pub(super) struct Located {
     u: [f32; LANES],
     weight_first: [u32; 2],
     weight_alpha: [f32; LANES],
+    weight_parts: [u16; LANES],
     weight_gamma: [f32; LANES],
     data_first: [u32; 2],
     data_alpha: [f32; LANES],
+    data_parts: [u16; LANES],
     data_gamma: [f32; LANES],
     /// In 2^shift quanta.
     weight: f32,
@@ -75,9 +79,11 @@ impl Located {
             u,
             weight_first: [a, g],
             weight_alpha,
+            weight_parts: parts(&weight_alpha),
             weight_gamma,
             data_first: [da, dg],
             data_alpha,
+            data_parts: parts(&data_alpha),
             data_gamma,
             weight,
             weight_shift,
@@ -105,6 +111,7 @@ pub(super) fn spread(
     (located, reaching): (&[Located], &[u32]),
     node: &mut ExactNode,
 ) {
+    let arch = Arch::new();
     let of = |k: &u32| &located[*k as usize];
     let cell = |k: &u32| (of(k).first_node, of(k).weight_first, of(k).weight_shift);
     for run in reaching.chunk_by(|a, b| cell(a) == cell(b)) {
@@ -122,10 +129,14 @@ pub(super) fn spread(
             let mut terms = [Term::EMPTY; GROUP];
             for (term, k) in terms.iter_mut().zip(group) {
                 let one = of(k);
-                *term =
-                    Term { values: one.diagonals(at), alphas: &one.weight_alpha, gammas: &one.weight_gamma };
+                *term = Term {
+                    values: one.diagonals(at),
+                    alphas: &one.weight_alpha,
+                    parts: &one.weight_parts,
+                    gammas: &one.weight_gamma,
+                };
             }
-            spread_rows(rows, &terms[..group.len()]);
+            arch.dispatch(Spreading { rows, terms: &terms[..group.len()] });
         }
     }
     let cell = |k: &u32| (of(k).first_node, of(k).data_first, of(k).side_shifts);
@@ -145,9 +156,10 @@ pub(super) fn spread(
             for (term, k) in terms.iter_mut().zip(group) {
                 let one = of(k);
                 let values = one.sides.map(|side| side * one.u[at]);
-                *term = Term { values, alphas: &one.data_alpha, gammas: &one.data_gamma };
+                *term =
+                    Term { values, alphas: &one.data_alpha, parts: &one.data_parts, gammas: &one.data_gamma };
             }
-            spread_rows(rows, &terms[..group.len()]);
+            arch.dispatch(Spreading { rows, terms: &terms[..group.len()] });
         }
     }
 }
@@ -174,90 +186,108 @@ struct Rows<'a, const K: usize> {
 struct Term<'a, const K: usize> {
     values: [f32; K],
     alphas: &'a [f32; LANES],
+    /// Bounds of the alphas.
+    parts: &'a [u16; LANES],
     gammas: &'a [f32; LANES],
 }
 
 impl<const K: usize> Term<'_, K> {
-    const EMPTY: Self = Self { values: [0.0; K], alphas: &[0.0; LANES], gammas: &[0.0; LANES] };
+    const EMPTY: Self =
+        Self { values: [0.0; K], alphas: &[0.0; LANES], parts: &[0; LANES], gammas: &[0.0; LANES] };
 
-    /// Bound of its values, in quanta, rounded up.
+    /// Bound of its values, in quanta times the power of two that each is a multiple of, rounded up.
     #[inline(always)]
-    fn greatest(&self, shifts: &[u32; K]) -> u64 {
-        let mut greatest = 0;
-        for (value, shift) in self.values.iter().zip(shifts) {
-            greatest = greatest.max((value.abs() as i32 as u64 + 1) << shift);
-        }
-        greatest
+    fn greatest(&self) -> u32 {
+        self.values.iter().fold(0, |most, value| most.max(value.abs() as i32 as u32)) + 1
     }
 }
 
 /// Parts of one in which bounds of kernels are counted.
 const PARTS: u32 = 8;
 
-/// For each alpha the most that a term adds to a sum: its values times its kernels, which are at most one up to
-/// rounding, and half of the power of two that it is rounded to.
+/// Bounds of kernels, which are at most one up to rounding: a sixteenth more, for what kernels and products are greater
+/// than they should be.
 #[inline(always)]
-fn bounds<const K: usize>(terms: &[Term<'_, K>], shifts: &[u32; K]) -> [u64; LANES] {
-    let step = 1_u64 << shifts.iter().fold(0, |most, shift| *shift.max(&most));
-    let mut bounds = [0; LANES];
+fn parts(kernel: &[f32; LANES]) -> [u16; LANES] {
+    kernel.map(|alpha| (alpha.abs() * 1.0625 * (1 << PARTS) as f32) as u16 + 1)
+}
+
+/// For each alpha the most that terms add to a sum, in quanta times the greatest power of two that values are multiples
+/// of: their values times their kernels, and half of what they are rounded to.
+///
+/// 32 bits hold it: 2^21 times 2^8 and an eighth, and 2^22 for each term of a group.
+#[inline(always)]
+fn bounds<const K: usize>(terms: &[Term<'_, K>]) -> [u32; LANES] {
+    let mut bounds = [0_u32; LANES];
     for term in terms {
-        let greatest = term.greatest(shifts);
-        for (bound, alpha) in bounds.iter_mut().zip(term.alphas) {
-            // A sixteenth above the kernel, for what kernels and products are greater than they should be.
-            let part = biased_multiple(alpha.abs() * (1.0625 * (1 << PARTS) as f32)).wrapping_sub(biases(1));
-            *bound += ((greatest * (u64::from(part as u32) + 1)) >> PARTS) + step;
+        let greatest = term.greatest();
+        for (bound, part) in bounds.iter_mut().zip(term.parts) {
+            *bound = bound.wrapping_add((greatest.wrapping_mul(u32::from(*part)) >> PARTS) + 1);
         }
     }
     bounds
 }
 
 /// Adds the outer products of values, alphas and gammas, each term rounded to a whole number.
-#[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
-fn spread_rows<const K: usize>(rows: Rows<'_, K>, terms: &[Term<'_, K>]) {
-    let [first, gamma] = rows.first.map(|x| x as usize);
-    let points = rows.rows.len();
-    let mut alpha = first;
-    let bounds = bounds(terms, &rows.shifts);
-    for (lane, bound) in bounds.iter().enumerate().take(rows.alphas) {
-        let Some(row) = rows.rows.get_mut(alpha) else { return };
-        row.make_room(*bound, rows.direction, K * rows.stride);
-        let shape = (rows.stride, gamma, rows.used);
-        match &mut row.integers {
-            Integers::Narrow(sums) if rows.shifts == [0; K] => {
-                add_multiples(sums, shape, (terms, lane), |sum, multiple, _| sum.wrapping_add(multiple));
+struct Spreading<'a, const K: usize> {
+    rows: Rows<'a, K>,
+    terms: &'a [Term<'a, K>],
+}
+
+impl<const K: usize> WithSimd for Spreading<'_, K> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { rows, terms } = self;
+        let [first, gamma] = rows.first.map(|x| x as usize);
+        let points = rows.rows.len();
+        let mut alpha = first;
+        let bounds = bounds(terms);
+        let shift = rows.shifts.iter().fold(0, |most, shift| *shift.max(&most));
+        for (lane, bound) in bounds.iter().enumerate().take(rows.alphas) {
+            let Some(row) = rows.rows.get_mut(alpha) else { return };
+            row.make_room(u64::from(*bound) << shift, rows.direction, K * rows.stride);
+            for k in 0..rows.used {
+                let multiples = multiples(simd, terms, lane, k);
+                let at = k * rows.stride + gamma;
+                match &mut row.integers {
+                    Integers::Narrow(sums) => add(sums, at, &multiples, |sum, multiple| {
+                        sum.wrapping_add(multiple << rows.shifts[k])
+                    }),
+                    Integers::Wide(sums) => add(sums, at, &multiples, |sum, multiple| {
+                        sum.wrapping_add(i64::from(multiple) << rows.shifts[k])
+                    }),
+                    Integers::None => {}
+                }
             }
-            Integers::Narrow(sums) => add_multiples(sums, shape, (terms, lane), |sum, multiple, k| {
-                sum.wrapping_add(multiple << rows.shifts[k])
-            }),
-            Integers::Wide(sums) => add_multiples(sums, shape, (terms, lane), |sum, multiple, k| {
-                sum.wrapping_add(i64::from(multiple) << rows.shifts[k])
-            }),
-            Integers::None => {}
+            alpha = if alpha + 1 == points { 0 } else { alpha + 1 };
         }
-        alpha = if alpha + 1 == points { 0 } else { alpha + 1 };
     }
 }
 
-/// Adds what terms are rounded to to a row at one alpha.
+/// What the terms of one alpha are rounded to, summed over visibilities.
+///
+/// In registers by name: a compiler left to itself takes several visibilities at a time, and gathers.
 #[inline(always)]
-fn add_multiples<T: Copy, const K: usize>(
-    sums: &mut [T],
-    (stride, gamma, used): (usize, usize, usize),
-    (terms, lane): (&[Term<'_, K>], usize),
-    add: impl Fn(T, i32, usize) -> T,
-) {
-    let start = 0_i32.wrapping_sub(biases(terms.len()));
-    for k in 0..used {
-        let Some(sums) = sums[k * stride + gamma..].first_chunk_mut::<LANES>() else { return };
-        let mut multiples = [start; LANES];
-        for term in terms {
-            let factor = term.values[k] * term.alphas[lane];
-            for (multiple, gamma) in multiples.iter_mut().zip(term.gammas) {
-                *multiple = multiple.wrapping_add(biased_multiple(factor * gamma));
-            }
+fn multiples<S: Simd, const K: usize>(simd: S, terms: &[Term<'_, K>], lane: usize, k: usize) -> [u32; LANES] {
+    let mut multiples = [biases(terms.len()).wrapping_neg().cast_unsigned(); LANES];
+    let (sums, _) = S::as_mut_simd_u32s(&mut multiples);
+    let bias = simd.splat_f32s(BIAS);
+    for term in terms {
+        let factor = simd.splat_f32s(term.values[k] * term.alphas[lane]);
+        for (sum, gammas) in sums.iter_mut().zip(S::as_simd_f32s(term.gammas).0) {
+            let biased = simd.mul_add_f32s(factor, *gammas, bias);
+            *sum = simd.add_u32s(*sum, simd.transmute_u32s_f32s(biased));
         }
-        for (sum, multiple) in sums.iter_mut().zip(multiples) {
-            *sum = add(*sum, multiple, k);
-        }
+    }
+    multiples
+}
+
+#[inline(always)]
+fn add<T: Copy>(sums: &mut [T], at: usize, multiples: &[u32; LANES], add: impl Fn(T, i32) -> T) {
+    let Some(sums) = sums.get_mut(at..).and_then(|sums| sums.first_chunk_mut::<LANES>()) else { return };
+    for (sum, multiple) in sums.iter_mut().zip(multiples) {
+        *sum = add(*sum, multiple.cast_signed());
     }
 }
