@@ -48,6 +48,14 @@ impl CollectorState {
     pub fn waiting(&self) -> &Waiting {
         &self.waiting
     }
+
+    /// Whether a collector can have left it, which of one that was read is not sure.
+    #[must_use]
+    pub fn is_sound(&self) -> bool {
+        self.taken.len() <= Kind::ALL.len()
+            && self.taken.iter().all(Taken::is_sound)
+            && self.waiting.is_sound()
+    }
 }
 
 /// Packets that have been read, and what they say.
@@ -311,7 +319,7 @@ impl Collector {
             counts.restarts = missing.len().saturating_sub(1) as u64;
             let gaps = missing.into_iter().flatten();
             (counts.gaps, counts.missing) =
-                gaps.fold((0, 0), |(n, sum), gap| (n + 1, sum + gap.end - gap.start));
+                gaps.fold((0, 0_u64), |(n, sum), gap| (n + 1, sum.saturating_add(gap.end - gap.start)));
         }
         counters
     }

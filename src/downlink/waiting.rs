@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use bincode::{Decode, Encode};
 
 use super::cuc::CucTime;
-use super::header::{PacketHeader, Segment};
+use super::header::{COUNT_MAX, PACKET_BYTES_MAX, PacketHeader, Segment};
 use super::kind::Kind;
 use super::payload::visibilities_span;
 use super::receiver::{Event, Packet};
@@ -100,6 +100,26 @@ impl Waiting {
             _ => (self.others.insert((kind, (time, count)), packet), &mut self.others_bytes),
         };
         *bytes = bytes.saturating_add(cost).saturating_sub(replaced.map_or(0, |packet| packet.cost()));
+    }
+
+    /// Whether it is as taking packets makes it, which one that was read need not be.
+    pub(super) fn is_sound(&self) -> bool {
+        let is_packet = |packet: &WaitingPacket| {
+            packet.header.count <= COUNT_MAX && packet.header.bytes <= PACKET_BYTES_MAX
+        };
+        let sent = |packet: &WaitingPacket| (packet.header.time, packet.header.count);
+        let cost = |packets: &mut dyn Iterator<Item = &WaitingPacket>| -> u64 {
+            packets.map(WaitingPacket::cost).sum()
+        };
+        self.packets().all(is_packet)
+            && self.gone.is_none_or(|(_, count)| count <= COUNT_MAX)
+            && self
+                .visibilities
+                .iter()
+                .all(|(key, packet)| (*key, Kind::Visibilities) == (sent(packet), packet.header.kind))
+            && self.others.iter().all(|(key, packet)| *key == (packet.header.kind, sent(packet)))
+            && self.bytes == cost(&mut self.visibilities.values())
+            && self.others_bytes == cost(&mut self.others.values())
     }
 
     /// All packets, visibilities first.
@@ -258,6 +278,12 @@ mod tests {
         let mut forged = Waiting::new(0);
         forged.put(packet(5));
         forged.put(packet(7));
+        assert!(forged.is_sound());
+        for (bytes, others_bytes, gone) in
+            [(1, 0, None), (2 * (BYTES + KEEPING_BYTES), 1, None), (316, 0, Some((CucTime(0), u64::MAX)))]
+        {
+            assert!(!Waiting { bytes, others_bytes, gone, ..forged.clone() }.is_sound());
+        }
         (forged.bytes, forged.others_bytes) = (1, u64::MAX);
         forged.put(WaitingPacket {
             header: PacketHeader { bytes: usize::MAX, ..packet(9).header },

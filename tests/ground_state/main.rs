@@ -5,6 +5,7 @@
 mod common;
 
 mod damage;
+mod forged;
 mod gaps;
 mod kill;
 mod merge;

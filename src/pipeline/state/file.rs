@@ -5,7 +5,7 @@ use std::io::{BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use bincode::enc::write::SizeWriter;
-use bincode::error::EncodeError;
+use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 use crc_fast::{CrcAlgorithm, Digest};
 
@@ -23,8 +23,9 @@ const FIXED_BYTES: u64 = 24;
 /// Bytes read at a time.
 const PIECE_BYTES: u64 = 1 << 20;
 
-/// Greatest head that is read.
-const HEAD_BYTES_MAX: usize = 1 << 32;
+/// Most memory that a decoded head may take for each of its bytes on disk: the hungriest of what it is made of, a line
+/// on a packet of positions, takes 80 bytes for at least 9.
+const MEMORY_A_BYTE: usize = 16;
 
 /// A checkpoint without its engines.
 #[derive(Clone, Debug, PartialEq, Decode)]
@@ -141,10 +142,7 @@ pub(super) fn read_from<T>(
     }
     let mut head = vec![0; length as usize];
     from.read_exact(&mut head).map_err(failed())?;
-    // Lengths that a forger claims are held against it.
-    let config = bincode::config::standard().with_limit::<HEAD_BYTES_MAX>();
-    let (head, used) = bincode::decode_from_slice::<Head, _>(&head, config)
-        .map_err(|error| damaged(error.to_string(), "a head"))?;
+    let (head, used) = decode(&head).map_err(|error| damaged(error.to_string(), "a head"))?;
     if used as u64 != length {
         return Err(damaged("bytes behind the head".into(), "none"));
     }
@@ -154,6 +152,9 @@ pub(super) fn read_from<T>(
         0 => Ok(found),
         left => Err(damaged(format!("{left} bytes behind the engines"), "none")),
     }
+    if !head.collector.is_sound() {
+        return Err(damaged("packets that cannot have come".into(), "those that a ground has taken"));
+    }
 }
 
 /// Length of a checkpoint whose checksum holds.
@@ -162,6 +163,27 @@ fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, Sta
     let damaged = |found: String, expected| StateError::Damaged { path: path.to_owned(), found, expected };
     let bytes = from.seek(SeekFrom::End(0)).map_err(failed())?;
     if bytes < FIXED_BYTES {
+/// A head, and the bytes of it. Lengths that a forger claims are held against a limit, before memory is reserved, that
+/// follows from the bytes that are there: the least of some that the decoder knows, at most four times as much.
+fn decode(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
+    let most = bytes.len().saturating_mul(MEMORY_A_BYTE);
+    match usize::BITS - most.leading_zeros() {
+        0..=20 => decode_within::<{ 1 << 20 }>(bytes),
+        21..=22 => decode_within::<{ 1 << 22 }>(bytes),
+        23..=24 => decode_within::<{ 1 << 24 }>(bytes),
+        25..=26 => decode_within::<{ 1 << 26 }>(bytes),
+        27..=28 => decode_within::<{ 1 << 28 }>(bytes),
+        29..=30 => decode_within::<{ 1 << 30 }>(bytes),
+        31..=32 => decode_within::<{ 1 << 32 }>(bytes),
+        33..=34 => decode_within::<{ 1 << 34 }>(bytes),
+        _ => decode_within::<{ 1 << 36 }>(bytes),
+    }
+}
+
+fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
+    bincode::decode_from_slice(bytes, bincode::config::standard().with_limit::<LIMIT>())
+}
+
         return Err(damaged(format!("{bytes} bytes"), "at least 24"));
     }
     from.rewind().map_err(failed())?;
@@ -336,3 +358,24 @@ mod tests {
         });
     }
 }
+    #[test]
+    fn announced_lengths_reserve_no_more_than_the_bytes_there_allow() {
+        // A list of settings that announces as many as 4 GiB of memory hold, in heads of 60 bytes and of a megabyte;
+        // the same that they really may be is read on, to where the bytes end.
+        let settings = size_of::<(String, String)>() as u64;
+        for (bytes, limit) in [(60, 1 << 20), (1 << 20, 1 << 26)] {
+            for (announced, is_refused) in [
+                ((1_u64 << 32) / settings, true),
+                (limit / settings + 1, true),
+                (limit / settings - 1, false),
+            ] {
+                let mut forged = vec![0xFD];
+                forged.extend(announced.to_le_bytes());
+                forged.resize(bytes, 1);
+                let error = decode(&forged).unwrap_err();
+                let refused = matches!(error, DecodeError::LimitExceeded);
+                assert_eq!(refused, is_refused, "{bytes}, {announced}: {error}");
+            }
+        }
+    }
+
