@@ -36,7 +36,7 @@ pub struct GroundOutcome {
     pub ledger: Ledger,
     /// What was received, and what was wrong with it.
     pub reception: Arc<Mutex<ReceptionCounters>>,
-    /// The daughters' own powers, in the order of arrival; none with a keeper.
+    /// The daughters' own powers, by channel, daughter and time.
     pub autos: Arc<Mutex<Vec<AutoPower>>>,
     /// Final map of each channel, in figures.
     pub channels: Arc<Mutex<Vec<ChannelSummary>>>,

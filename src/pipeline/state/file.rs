@@ -12,11 +12,15 @@ use crc_fast::{CrcAlgorithm, Digest};
 use super::error::StateError;
 use super::journal::Journal;
 use crate::accumulation::AccumulatorState;
-use crate::calibration::CalibratorState;
+use crate::calibration::{AutoTable, CalibratorState};
 use crate::downlink::{CollectorState, CollectorView};
 use crate::runtime::LedgerReport;
 
-const MAGIC: &[u8; 8] = b"LNRSTA02";
+const MAGIC: &[u8; 8] = b"LNRSTA03";
+/// Beginning of the magic in every version.
+const ANY_VERSION: &[u8; 6] = b"LNRSTA";
+const VERSION: &str = "a checkpoint of the ground's state, version 03; version 02 has none of the daughters' own powers: \
+                       replay its files into a new folder";
 /// Bytes of magic, length of the head, and checksum.
 const FIXED_BYTES: u64 = 24;
 
@@ -34,6 +38,7 @@ pub(super) struct Head {
     pub(super) settings: Vec<(String, String)>,
     pub(super) collector: CollectorState,
     pub(super) calibrator: CalibratorState,
+    pub(super) powers: AutoTable,
     pub(super) accumulator: AccumulatorState,
     pub(super) ledger: LedgerReport,
     pub(super) journal: Journal,
@@ -45,6 +50,7 @@ pub(super) struct HeadView<'a> {
     pub(super) settings: &'a Vec<(String, String)>,
     pub(super) collector: CollectorView<'a>,
     pub(super) calibrator: CalibratorState,
+    pub(super) powers: &'a AutoTable,
     pub(super) accumulator: AccumulatorState,
     pub(super) ledger: LedgerReport,
     pub(super) journal: &'a Journal,
@@ -101,12 +107,12 @@ pub(super) fn write(
     out.write_all(&crc.to_le_bytes()).map_err(failed())
 }
 
-/// Whether a file begins as a checkpoint does.
+/// Whether a file begins as a checkpoint of any version does.
 pub(super) fn is_checkpoint(path: &Path) -> Result<bool, StateError> {
     let mut magic = Vec::new();
     let file = File::open(path).map_err(StateError::io(path, "open the file"))?;
     file.take(MAGIC.len() as u64).read_to_end(&mut magic).map_err(StateError::io(path, "read"))?;
-    Ok(magic == MAGIC)
+    Ok(magic.len() == MAGIC.len() && magic.starts_with(ANY_VERSION))
 }
 
 /// Reads a checkpoint; `rest` makes something of the head and the engines.
@@ -134,7 +140,7 @@ pub(super) fn read_from<T>(
     from.read_exact(&mut fixed).map_err(failed())?;
     let (magic, length) = fixed.split_at(8);
     if magic != MAGIC {
-        return Err(damaged(format!("{magic:02x?}"), "a checkpoint of the ground's state, version 02"));
+        return Err(damaged(format!("{magic:02x?}"), VERSION));
     }
     let length = length.first_chunk().map_or(0, |length| u64::from_le_bytes(*length));
     if length > bytes - FIXED_BYTES {
@@ -146,23 +152,17 @@ pub(super) fn read_from<T>(
     if used as u64 != length {
         return Err(damaged("bytes behind the head".into(), "none"));
     }
+    if !head.collector.is_sound() {
+        return Err(damaged("packets that cannot have come".into(), "those that a ground has taken"));
+    }
     let mut engines = from.take(bytes - FIXED_BYTES - length);
     let found = rest(head, &mut engines)?;
     match engines.limit() {
         0 => Ok(found),
         left => Err(damaged(format!("{left} bytes behind the engines"), "none")),
     }
-    if !head.collector.is_sound() {
-        return Err(damaged("packets that cannot have come".into(), "those that a ground has taken"));
-    }
 }
 
-/// Length of a checkpoint whose checksum holds.
-fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, StateError> {
-    let failed = || StateError::io(path, "read");
-    let damaged = |found: String, expected| StateError::Damaged { path: path.to_owned(), found, expected };
-    let bytes = from.seek(SeekFrom::End(0)).map_err(failed())?;
-    if bytes < FIXED_BYTES {
 /// A head, and the bytes of it. Lengths that a forger claims are held against a limit, before memory is reserved, that
 /// follows from the bytes that are there: the least of some that the decoder knows, at most four times as much.
 fn decode(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
@@ -184,6 +184,12 @@ fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(Head, usize), Deco
     bincode::decode_from_slice(bytes, bincode::config::standard().with_limit::<LIMIT>())
 }
 
+/// Length of a checkpoint whose checksum holds.
+fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, StateError> {
+    let failed = || StateError::io(path, "read");
+    let damaged = |found: String, expected| StateError::Damaged { path: path.to_owned(), found, expected };
+    let bytes = from.seek(SeekFrom::End(0)).map_err(failed())?;
+    if bytes < FIXED_BYTES {
         return Err(damaged(format!("{bytes} bytes"), "at least 24"));
     }
     from.rewind().map_err(failed())?;
@@ -209,13 +215,17 @@ fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(Head, usize), Deco
 mod tests {
     use std::ops::Range;
 
+    use num_complex::Complex32;
+
     use super::*;
     use crate::accumulation::Accumulator;
     use crate::calibration::{Calibrator, Identity};
     use crate::downlink::{
         Collector, CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PacketHeader, Segment, Transmission,
     };
-    use crate::frames::{AntennaResponse, Channel, GroundFrame, Housekeeping, Instrument, PlacedFrame};
+    use crate::frames::{
+        AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock,
+    };
     use crate::runtime::{Ledger, Outlet, Stage};
     use crate::units::MissionTime;
 
@@ -232,14 +242,24 @@ mod tests {
             seed: 7,
             configuration_hash: 1,
         };
+        let own = VisibilityBlock {
+            offset_ticks: vec![0],
+            duration_ticks: vec![10],
+            value_k_sr: vec![Complex32::new(3.0, 0.0)],
+            weight: vec![1.0],
+            flags: vec![Flags::GOOD],
+            ..VisibilityBlock::default()
+        };
         let frames = [
             GroundFrame::Instrument(instrument.clone()),
+            GroundFrame::Visibilities(own),
             GroundFrame::Housekeeping(Housekeeping { time: MissionTime(5), sampled: 9, dropped: 1 }),
         ];
         let ledger = Ledger::new();
         ledger.flagged("far", 4);
         let mut accumulator = Accumulator::new(Default::default(), ledger.clone());
-        let mut calibrator = Calibrator::new(Box::new(Identity), ledger.clone());
+        let mut calibrator =
+            Calibrator::new(Box::new(Identity), ledger.clone()).with_autos(Default::default());
         let mut collector = Collector::new(1000);
         let mut transmission = Transmission::new(&DownlinkConfig::default()).unwrap();
         let mut bytes = Vec::new();
@@ -260,6 +280,7 @@ mod tests {
             settings: &settings,
             collector: collector.view(),
             calibrator: calibrator.state(),
+            powers: calibrator.powers(),
             accumulator: accumulator.state(),
             ledger: ledger.report(),
             journal: &journal,
@@ -293,6 +314,7 @@ mod tests {
             ("settings", length(bincode::encode_to_vec(head.settings, config))),
             ("collector", length(bincode::encode_to_vec(&head.collector, config))),
             ("calibrator", length(bincode::encode_to_vec(&head.calibrator, config))),
+            ("powers", length(bincode::encode_to_vec(head.powers, config))),
             ("accumulator", length(bincode::encode_to_vec(&head.accumulator, config))),
             ("ledger", length(bincode::encode_to_vec(&head.ledger, config))),
             ("journal", length(bincode::encode_to_vec(head.journal, config))),
@@ -347,18 +369,6 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read() {
-        with_head(|head| {
-            let found = read_back(&written(head)).unwrap();
-            assert_eq!(found.journal, *head.journal);
-            assert_eq!((found.ledger, found.calibrator), (head.ledger.clone(), head.calibrator.clone()));
-            assert_eq!(found.accumulator, head.accumulator);
-            let again = Collector::resume(found.collector);
-            assert_eq!(again.view(), head.collector);
-        });
-    }
-}
-    #[test]
     fn announced_lengths_reserve_no_more_than_the_bytes_there_allow() {
         // A list of settings that announces as many as 4 GiB of memory hold, in heads of 60 bytes and of a megabyte;
         // the same that they really may be is read on, to where the bytes end.
@@ -379,3 +389,16 @@ mod tests {
         }
     }
 
+    #[test]
+    fn what_is_written_is_read() {
+        with_head(|head| {
+            let found = read_back(&written(head)).unwrap();
+            assert_eq!(found.journal, *head.journal);
+            assert_eq!((found.ledger, found.calibrator), (head.ledger.clone(), head.calibrator.clone()));
+            assert_eq!(found.accumulator, head.accumulator);
+            assert!(found.powers == *head.powers && found.powers != AutoTable::default());
+            let again = Collector::resume(found.collector);
+            assert_eq!(again.view(), head.collector);
+        });
+    }
+}
