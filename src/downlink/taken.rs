@@ -95,21 +95,6 @@ impl Taken {
         era.is_some_and(|era| era.contains(count))
     }
 
-    /// Whether every packet of the same era from the count `from` up to this one, which is one of them, has come.
-    #[must_use]
-    pub fn is_whole(&self, from: u64, count: u64, time: CucTime) -> bool {
-        let Some(era) = self.eras.iter().rev().find(|era| era.from <= time) else { return false };
-        let stretch = era.stretches.range(..=count).next_back();
-        stretch.is_some_and(|(&start, &end)| start <= from.min(count) && end > count)
-    }
-
-    /// Whether two packets, of which the times are given, are of one era.
-    #[must_use]
-    pub fn are_of_one_era(&self, a: CucTime, b: CucTime) -> bool {
-        let of = |time: CucTime| self.eras.iter().rposition(|era| era.from <= time);
-        of(a) == of(b)
-    }
-
     /// Takes what another set has too. Eras of the two are one if their times overlap, or if the counts of the later
     /// go on above those of the earlier; false, with nothing taken, if that would make one of two that are known apart.
     pub fn absorb(&mut self, other: &Self) -> bool {
@@ -294,18 +279,6 @@ mod tests {
         let before = two.clone();
         assert!(!two.absorb(&one));
         assert_eq!(two, before);
-    }
-
-    #[test]
-    fn packets_in_a_row_are_told_from_those_behind_a_gap() {
-        let mut taken = Taken::default();
-        for count in [0, 1, 2, 5, 6] {
-            taken.take(count, at(count));
-        }
-        assert!(taken.is_whole(0, 2, at(2)) && taken.is_whole(1, 2, at(2)) && taken.is_whole(6, 6, at(6)));
-        assert!(!taken.is_whole(0, 5, at(5)) && !taken.is_whole(3, 5, at(5)) && !taken.is_whole(0, 3, at(3)));
-        taken.take(0, at(9));
-        assert!(taken.is_whole(0, 0, at(9)) && !taken.are_of_one_era(at(6), at(9)));
     }
 
     #[test]

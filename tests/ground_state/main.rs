@@ -11,7 +11,6 @@ mod kill;
 mod merge;
 mod order;
 mod retract;
-mod sums;
 
 use std::path::{Path, PathBuf};
 

@@ -16,7 +16,7 @@ use crate::pipeline::config::Config;
 use crate::pipeline::ground::GroundOutcome;
 use crate::runtime::{Ledger, LedgerReport, Outlet, Stage, Units};
 
-/// Bytes that visibilities wait for those before them, if nothing else is said: a week of thirty channels.
+/// Bytes of visibilities that wait for their positions, if nothing else is said: a week of thirty channels.
 pub const WAIT_BYTES: u64 = 1 << 28;
 
 /// Windows whose positions are kept: more than two years of them.
@@ -42,7 +42,7 @@ impl Keeper {
     /// A keeper that goes on from the newest checkpoint in `folder`, or from nothing if there is none.
     ///
     /// A checkpoint is written whenever `checkpoint_every` visibilities have been taken, and at the end. A new state
-    /// lets packets wait for those before them until `wait_bytes` of them do.
+    /// lets visibilities wait for their positions until `wait_bytes` of them do.
     ///
     /// # Errors
     /// A folder that cannot be used or is in use; a state that was summed with other settings, or of which no
