@@ -218,6 +218,87 @@ fn noise_around_a_stream_costs_nothing_of_it() {
     );
 }
 
+/// A frame of which so many octets at its beginning or end have come, and what follows.
+fn cut(coded: &[u8], cadu: usize, at: usize, left: usize, keep_end: bool) -> Vec<u8> {
+    let (before, rest) = coded.split_at(at * cadu);
+    let (this, after) = rest.split_at(cadu);
+    [before, if keep_end { &this[cadu - left..] } else { &this[..left] }, after].concat()
+}
+
+#[test]
+fn a_frame_cut_anywhere_costs_no_other() {
+    // Few octets too early or too late, frames are corrected to their own rotations at depths 1, 2, 4 and 8.
+    let frames = mission(1, 60);
+    for interleave in INTERLEAVES {
+        let coded = transmit(&frames, &config(interleave));
+        let cadu = 4 + 255 * interleave;
+        let sound = (coded.len() / cadu) as u64;
+        // Near the ends every octet counts.
+        let near = 16 * interleave + 8;
+        let is_tried = |left: &usize| *left < near || *left + near > cadu || left.is_multiple_of(7);
+        for at in [0, 3] {
+            for left in (0..cadu).filter(is_tried) {
+                for keep_end in [false, true] {
+                    let stream = cut(&coded, cadu, at, left, keep_end);
+                    let account = receive(&stream, 10_000).1;
+                    let place = format!("{interleave}, {at}, {left}, {keep_end}: {account:?}");
+                    assert!(account.frames + 1 >= sound, "{place}");
+                    assert_eq!((account.frames_foreign, account.frames_malformed), (0, 0), "{place}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_cut_frame_in_any_chunks_and_noise_leaves_the_stream_in_step() {
+    let frames = mission(1, 60);
+    for interleave in [1, 2, 4, 8] {
+        let coded = transmit(&frames, &config(interleave));
+        let cadu = 4 + 255 * interleave;
+        for (left, keep_end) in [(3, false), (5, false), (11, true), (cadu - 9, false)] {
+            let mut stream = cut(&coded, cadu, 4, left, keep_end);
+            // A wrong octet in every codeword of every frame.
+            for block in stream.chunks_mut(cadu) {
+                block.iter_mut().skip(cadu / 2).take(interleave).for_each(|octet| *octet ^= 0x40);
+            }
+            let whole = receive(&stream, usize::MAX);
+            assert!(whole.1.frames + 1 >= (coded.len() / cadu) as u64, "{interleave}: {:?}", whole.1);
+            assert_eq!(whole.1.frames_foreign, 0);
+            for chunk in [1, 7, 100] {
+                assert!(receive(&stream, chunk) == whole, "{interleave}, {left}, {chunk}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_stream_of_markers_costs_no_more_than_its_length_earns() {
+    let sound = transmit(&mission(1, 1_000), &config(5));
+    let markers: Vec<u8> = SYNC_MARKER.to_be_bytes().repeat(1 << 20);
+    let inverted: Vec<u8> = markers.iter().map(|octet| !octet).collect();
+    for (name, hostile) in [("markers", &markers), ("inverted", &inverted)] {
+        for known in [false, true] {
+            let first = if known { sound.as_slice() } else { &[] };
+            let stream = [first, hostile, &sound].concat();
+            let (mut receiver, mut recovered) = (CaduReceiver::new(), Vec::new());
+            for chunk in stream.chunks(10_000) {
+                receiver.push(chunk, &mut recovered);
+                // What has been looked at when the last was afforded, and one more look at every depth: 23 codewords
+                // and as many again behind and for the best of them.
+                let earned = 4 * receiver.counters().bytes + (1 << 20) + 3 * 23 * 255;
+                assert!(receiver.octets_decoded() <= earned, "{name}, {known}");
+            }
+            receiver.finish(&mut recovered);
+            let account = receiver.counters();
+            // The stream behind is found once a look at all depths is earned again: 18 kB at four octets each, that is
+            // four frames; twice that, because the markers before count as places too.
+            let frames = (first.len() + sound.len()) as u64 / 1279;
+            assert!(account.frames + 8 >= frames, "{name}, {known}: {account:?}");
+        }
+    }
+}
+
 /// A CADU of one codeword with that frame.
 fn cadu_of(frame: &[u8]) -> Vec<u8> {
     let code = ReedSolomon::new(1).unwrap();

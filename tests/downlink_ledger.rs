@@ -10,6 +10,7 @@ use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 use lunarray::accumulation::{Accumulator, MapConfig};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows, segments_for};
 use lunarray::calibration::{CalibrationConfig, Calibrator};
+use lunarray::downlink::cadu::INTERLEAVES;
 use lunarray::downlink::link::{LinkConfig, LinkSimulator, PacketRange, Truth};
 use lunarray::downlink::{
     Collector, Decoder, Delivery, DownlinkConfig, Event, Format, Intake, Kind, Reception, ReceptionCounters,
@@ -287,9 +288,7 @@ fn any_case() -> impl Strategy<Value = Case> {
         prop_oneof![Just(StoreDrop::Newest), Just(StoreDrop::Oldest), Just(StoreDrop::LowestValue)],
         prop_oneof![Just(0.0), 1.0..40.0_f64],
     );
-    // With fewer codewords a frame, the ground can take a stream that goes on within a frame for another's: not held
-    // to the truth yet.
-    let format = (any::<bool>(), Just(5_usize), 256_usize..3_000, 1_u32..3);
+    let format = (any::<bool>(), proptest::sample::select(&INTERLEAVES), 256_usize..3_000, 1_u32..3);
     (any::<u64>(), bits, frames, passes, onboard, format).prop_map(
         |(seed, bits, frames, passes, onboard, (coded, interleave, packet_bytes_max, idle_frames))| {
             let bursts = bits.1;

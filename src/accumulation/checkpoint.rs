@@ -8,10 +8,11 @@ use std::io::{Read, Write};
 
 use super::checked::{Checked, RESPONSES, Summed, number_of, refused};
 use super::error::AccumulationError;
-use super::pixel::{PixelEngine, PixelSetup};
+use super::exact::ExactTiles;
+use super::pixel::{ExactSums, PixelEngine, PixelSetup};
 use super::scale::Totals;
 use crate::array::response::PixelMethod;
-use crate::sky::healpix::is_valid_nside;
+use crate::sky::healpix::{is_valid_nside, pixel_count};
 
 const MAGIC: &[u8; 8] = b"LNRPIX02";
 const VERSION: &str =
@@ -67,15 +68,17 @@ pub(super) fn read(from: &mut dyn Read) -> Result<PixelEngine, AccumulationError
         return Err(refused(format!("{magic:02x?}"), VERSION));
     }
     let head: Head = from.head()?;
-    let mut engine = PixelEngine::new(setup_of(&head)?)?;
-    for column in engine.sums.normal.columns_mut() {
-        from.integers(column, i64::from_le_bytes)?;
-    }
-    from.integers(&mut engine.sums.right, i128::from_le_bytes)?;
-    from.integers(&mut engine.sums.noise, i128::from_le_bytes)?;
-    engine.totals = head.totals;
-    from.finish()?;
-    Ok(engine)
+    let setup = setup_of(&head)?;
+    PixelEngine::of(setup, head.totals, || {
+        // Memory follows the data that is there, not what the head announces: gigabytes for the finest map.
+        let pixels = pixel_count(setup.nside);
+        let normal = ExactTiles::read(pixels, |column| from.integers(column, i64::from_le_bytes))?;
+        let (mut right, mut noise) = (vec![0; pixels], vec![0; pixels]);
+        from.integers(&mut right, i128::from_le_bytes)?;
+        from.integers(&mut noise, i128::from_le_bytes)?;
+        from.finish()?;
+        Ok(ExactSums { normal, right, noise })
+    })
 }
 
 fn setup_of(head: &Head) -> Result<PixelSetup, AccumulationError> {

@@ -149,13 +149,22 @@ impl ExactTiles {
         })
     }
 
-    /// As [`Self::columns`], to be filled.
-    pub(super) fn columns_mut(&mut self) -> impl Iterator<Item = &mut [i64]> {
-        let order = self.order;
-        self.tiles.iter_mut().enumerate().flat_map(move |(index, tile)| {
-            let rows = extent(order, place(index).0);
-            tile.chunks_exact_mut(STRIDE).map(move |column| &mut column[..rows])
-        })
+    /// A matrix of which `read` fills the columns, in the order of [`Self::columns`]. Memory follows what could be read,
+    /// but for a tile of two megabytes.
+    pub(super) fn read<E>(
+        order: usize,
+        mut read: impl FnMut(&mut [i64]) -> Result<(), E>,
+    ) -> Result<Self, E> {
+        let along = tiles_along(order);
+        let mut tiles = Vec::new();
+        for (i, j) in (0..along * (along + 1) / 2).map(place) {
+            let mut tile = vec![0; STRIDE * extent(order, j)];
+            for column in tile.chunks_exact_mut(STRIDE) {
+                read(&mut column[..extent(order, i)])?;
+            }
+            tiles.push(tile);
+        }
+        Ok(Self { order, tiles })
     }
 }
 

@@ -150,11 +150,20 @@ impl PixelEngine {
     /// # Errors
     /// An nside for which there are no rows, or a `weight_max` that is none.
     pub fn new(setup: PixelSetup) -> Result<Self, AccumulationError> {
+        Self::of(setup, Totals::default(), || Ok(ExactSums::zeros(setup.nside)))
+    }
+
+    /// An engine of these sums, made when the setup is known to be sound.
+    pub(super) fn of(
+        setup: PixelSetup,
+        totals: Totals,
+        sums: impl FnOnce() -> Result<ExactSums, AccumulationError>,
+    ) -> Result<Self, AccumulationError> {
         Ok(Self {
             scale: Scale::new(setup.weight_max)?,
             rows: RowMaker::new(setup.nside, setup.method)?,
-            sums: ExactSums::zeros(setup.nside),
-            totals: Totals::default(),
+            sums: sums()?,
+            totals,
             pending: Vec::with_capacity(BLOCK),
             direction: Direction::In,
             setup,

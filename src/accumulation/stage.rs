@@ -87,13 +87,13 @@ impl Engine {
     }
 }
 
-/// What an accumulator holds besides its engines, for another to go on with; its ledger is apart.
+/// What an accumulator holds besides its engines, for another to go on with; its ledger is apart. Snapshots are numbered
+/// anew: when they were taken depends on how the data came.
 #[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct AccumulatorState {
     instrument: Option<Instrument>,
-    /// First and last time, and number of snapshots, of channels that have an engine.
-    channels: Vec<Option<([f64; 2], u32)>>,
-    next_snapshot_s: Option<f64>,
+    /// First and last time of channels that have an engine.
+    channels: Vec<Option<[f64; 2]>>,
     accumulated: u64,
 }
 
@@ -134,11 +134,9 @@ impl Accumulator {
     /// What it holds besides its engines.
     #[must_use]
     pub fn state(&self) -> AccumulatorState {
-        let kept = |sums: &ChannelSums| (sums.span_s, sums.snapshots);
         AccumulatorState {
             instrument: self.instrument.as_deref().cloned(),
-            channels: self.channels.iter().map(|slot| slot.as_ref().map(kept)).collect(),
-            next_snapshot_s: self.next_snapshot_s,
+            channels: self.channels.iter().map(|slot| slot.as_ref().map(|sums| sums.span_s)).collect(),
             accumulated: self.accumulated,
         }
     }
@@ -162,10 +160,10 @@ impl Accumulator {
     /// # Errors
     /// Engines that are damaged, or of another kind than the configuration asks for.
     pub fn resume(self, state: AccumulatorState, from: &mut dyn Read) -> Result<Self, AccumulationError> {
-        let AccumulatorState { instrument, channels: kept, next_snapshot_s, accumulated } = state;
+        let AccumulatorState { instrument, channels: kept, accumulated } = state;
         let mut channels = Vec::new();
         for kept in kept {
-            let Some((span_s, snapshots)) = kept else {
+            let Some(span_s) = kept else {
                 channels.push(None);
                 continue;
             };
@@ -173,9 +171,9 @@ impl Accumulator {
                 EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
                 EngineKind::Harmonic => Engine::Harmonic(Box::new(HarmonicEngine::restore(from)?)),
             };
-            channels.push(Some(ChannelSums { engine, span_s, snapshots }));
+            channels.push(Some(ChannelSums { engine, span_s, snapshots: 0 }));
         }
-        Ok(Self { instrument: instrument.map(Arc::new), channels, next_snapshot_s, accumulated, ..self })
+        Ok(Self { instrument: instrument.map(Arc::new), channels, accumulated, ..self })
     }
 
     /// Adds what another holds, channel by channel.
@@ -201,12 +199,9 @@ impl Accumulator {
                     }
                     let ([first, last], [from, to]) = (ours.span_s, theirs.span_s);
                     ours.span_s = [first.min(from), last.max(to)];
-                    ours.snapshots = ours.snapshots.max(theirs.snapshots);
                 }
             }
         }
-        let next_s = [self.next_snapshot_s, other.next_snapshot_s].into_iter().flatten();
-        self.next_snapshot_s = next_s.reduce(f64::max);
         self.accumulated += other.accumulated;
         Ok(())
     }

@@ -5,6 +5,7 @@
 //! complex gains from a file. [`CalibrationConfig`] chooses. Before either, [`VanVleck`] takes out what
 //! quantisers of few bits do to correlations; after it, [`SubBands`] brings sub-bands of a channel together.
 
+mod autos;
 mod config;
 mod error;
 mod gains;
@@ -13,6 +14,7 @@ mod stage;
 mod sub_bands;
 mod van_vleck;
 
+pub use autos::{AUTOS_MAX, AutoTable};
 pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 pub use gains::AntennaGains;

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use num_complex::Complex64;
 
+use super::autos::{AUTOS_MAX, AutoTable};
 use super::{Calibration, CalibrationError, VanVleck};
 use crate::array::{Ephemeris, FlaggedCounts};
 use crate::frames::{
@@ -14,9 +15,6 @@ use crate::frames::{
 };
 use crate::runtime::{Ledger, Outlet, Stage, Units};
 use crate::units::{ChannelId, MissionTime, Pair};
-
-/// Most powers of daughters that are kept: 100 MB, more than two hours of every second of 30 channels.
-const AUTOS_MAX: usize = 2_000_000;
 
 /// Identity of a block of visibilities, the beginning of its first integration in it: every one is used once,
 /// however often it arrives.
@@ -28,8 +26,8 @@ pub const DUPLICATE: &str = "duplicate";
 /// Greatest number of the spacecraft's reports that are kept.
 const REPORTS_MAX: usize = 1 << 16;
 
-/// What a calibrator has learnt and counted, for another to go on with; its ledger and the blocks that it has used
-/// are apart.
+/// What a calibrator has learnt and counted, for another to go on with; its ledger, the blocks that it has used and the
+/// daughters' own powers are apart.
 #[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct CalibratorState {
     instrument: Option<Instrument>,
@@ -45,8 +43,9 @@ pub struct CalibratorState {
 /// what the link lost. Visibilities after the last housekeeping packet count as sampled when received.
 pub struct Calibrator {
     van_vleck: Option<VanVleck>,
-    /// Where the daughters' own powers go.
+    /// Where the daughters' own powers go at the end.
     autos: Option<Arc<Mutex<Vec<AutoPower>>>>,
+    powers: AutoTable,
     calibration: Box<dyn Calibration>,
     ledger: Ledger,
     ephemeris: Ephemeris,
@@ -65,6 +64,7 @@ impl Calibrator {
         Self {
             van_vleck: None,
             autos: None,
+            powers: AutoTable::default(),
             calibration,
             ledger,
             ephemeris: Ephemeris::default(),
@@ -88,8 +88,10 @@ impl Calibrator {
 
     /// Takes what another knows as well; of ephemeris segments that begin at the same time its own stay. Blocks that
     /// the other has used are to be told by [`Calibrator::has_used`].
-    pub fn absorb(&mut self, state: CalibratorState) {
-        let CalibratorState { instrument, ephemeris, received, reports } = state;
+    pub fn absorb(&mut self, other: Self) {
+        self.powers.absorb(other.powers);
+        let (instrument, received, reports) = (other.instrument, other.received, other.reports);
+        let ephemeris: Vec<EphemerisSegment> = other.ephemeris.segments().cloned().collect();
         self.instrument = self.instrument.take().or(instrument);
         self.describe();
         for segment in ephemeris {
@@ -103,12 +105,12 @@ impl Calibrator {
 
     /// Goes on with what another knew; blocks that it has used are to be told by [`Calibrator::has_used`].
     #[must_use]
-    pub fn resume(mut self, state: CalibratorState) -> Self {
+    pub fn resume(mut self, state: CalibratorState, powers: AutoTable) -> Self {
         let CalibratorState { instrument, ephemeris, received, reports } = state;
         for segment in ephemeris {
             self.ephemeris.insert(segment);
         }
-        let mut resumed = Self { instrument, received, reports, ..self };
+        let mut resumed = Self { instrument, received, reports, powers, ..self };
         resumed.describe();
         resumed
     }
@@ -152,6 +154,23 @@ impl Calibrator {
         Ok(placed?.unwrap_or_default())
     }
 
+    /// Takes the powers of a daughter that a block has brought out again; how many there were.
+    ///
+    /// # Errors
+    /// As [`Calibrator::step`].
+    pub fn take_out_powers(&mut self, block: VisibilityBlock) -> Result<u64, CalibrationError> {
+        let aside = std::mem::replace(&mut self.ledger, Ledger::new());
+        let placed = self.own_powers(block);
+        self.ledger = aside;
+        Ok(placed?.map_or(0, |placed| self.powers.remove(&placed)))
+    }
+
+    /// The daughters' own powers so far.
+    #[must_use]
+    pub fn powers(&self) -> &AutoTable {
+        &self.powers
+    }
+
     /// Forgets a block that was used; the ledger is the caller's affair.
     pub fn forget_block(&mut self, block: &VisibilityBlock) {
         if let Some(key) = key_of(block) {
@@ -178,14 +197,19 @@ impl Calibrator {
         Self { van_vleck, ..self }
     }
 
-    /// Keeps the daughters' own powers in `autos`; without that they are left out.
+    /// Keeps the daughters' own powers and leaves them in `autos` at the end, each once, by channel, daughter and time;
+    /// without that they are left out.
     #[must_use]
     pub fn with_autos(self, autos: Arc<Mutex<Vec<AutoPower>>>) -> Self {
         Self { autos: Some(autos), ..self }
     }
 
-    /// Calibrates and keeps the powers of one daughter.
-    fn autos(&mut self, block: &VisibilityBlock, channel: Channel) -> Result<(), CalibrationError> {
+    /// The powers of one daughter, calibrated; `None` for want of an instrument.
+    fn own_powers(
+        &mut self,
+        mut block: VisibilityBlock,
+    ) -> Result<Option<PlacedVisibilities>, CalibrationError> {
+        let Some(channel) = self.prepare(&mut block) else { return Ok(None) };
         let good: Vec<usize> = (0..block.len()).filter(|&k| block.flags[k].is_good()).collect();
         let mut flagged = FlaggedCounts::default();
         block.flags.iter().for_each(|&flags| flagged.add(flags));
@@ -200,27 +224,21 @@ impl Calibrator {
             value_k_sr: good.iter().map(|&k| Complex64::new(block.value_k_sr[k].re.into(), 0.0)).collect(),
             weight: good.iter().map(|&k| f64::from(block.weight[k])).collect(),
         };
-        let calibrated = self.calibration.apply(&mut placed)?;
-        for (reason, count) in calibrated.removed() {
-            self.ledger.flagged(reason, count as u64);
-        }
-        let Some(autos) = &self.autos else {
+        self.calibrate(&mut placed)?;
+        // Sub-bands are not brought together here.
+        placed.channel = block.channel;
+        Ok(Some(placed))
+    }
+
+    fn keep_powers(&mut self, placed: &PlacedVisibilities) {
+        if self.autos.is_none() {
             self.ledger.flagged("auto-correlation", placed.len() as u64);
-            return Ok(());
-        };
-        let mut autos = autos.lock().unwrap_or_else(PoisonError::into_inner);
-        let kept = placed.len().min(AUTOS_MAX.saturating_sub(autos.len()));
-        autos.extend((0..kept).map(|k| AutoPower {
-            daughter: block.pair.i,
-            frequency_hz: channel.frequency_hz,
-            width_hz: channel.width_hz,
-            time_s: placed.time_s[k],
-            power_k_sr: placed.value_k_sr[k].re,
-            sigma_k_sr: placed.weight[k].sqrt().recip(),
-        }));
-        self.ledger.accumulated(kept as u64);
-        self.ledger.flagged("auto-correlation beyond the table", (placed.len() - kept) as u64);
-        Ok(())
+            return;
+        }
+        let account = self.powers.take(placed, AUTOS_MAX);
+        self.ledger.accumulated(account.kept);
+        self.ledger.flagged("auto-correlation beyond the table", account.beyond);
+        self.ledger.flagged("auto-correlation of an integration that has one", account.twice);
     }
 
     fn visibilities(
@@ -236,35 +254,45 @@ impl Calibrator {
             return Ok(());
         }
         *self.received.entry(block.start.0).or_default() += count;
-        if let Some(placed) = self.place(block)?.filter(|placed| !placed.is_empty()) {
+        if block.pair.i == block.pair.j {
+            if let Some(placed) = self.own_powers(block)? {
+                self.keep_powers(&placed);
+            }
+        } else if let Some(placed) = self.place(block)?.filter(|placed| !placed.is_empty()) {
             out.push(PlacedFrame::Visibilities(placed));
         }
         Ok(())
     }
 
-    /// Places and calibrates a block; `None` for want of an instrument, and of a daughter's own powers.
-    fn place(&mut self, mut block: VisibilityBlock) -> Result<Option<PlacedVisibilities>, CalibrationError> {
-        let count = block.len() as u64;
+    /// Takes out of a block what its quantiser did; its channel, if there is an instrument that has it.
+    fn prepare(&self, block: &mut VisibilityBlock) -> Option<Channel> {
         let channel = self.instrument.as_ref().and_then(|i| i.channels.get(usize::from(block.channel.0)));
         let Some(&channel) = channel else {
-            self.ledger.flagged("no instrument description", count);
-            return Ok(None);
+            self.ledger.flagged("no instrument description", block.len() as u64);
+            return None;
         };
         if let Some(van_vleck) = &self.van_vleck {
-            van_vleck.apply(&mut block, channel.width_hz);
+            van_vleck.apply(block, channel.width_hz);
         }
-        if block.pair.i == block.pair.j {
-            self.autos(&block, channel)?;
-            return Ok(None);
-        }
+        Some(channel)
+    }
+
+    /// Places and calibrates a block of two daughters; `None` for want of an instrument.
+    fn place(&mut self, mut block: VisibilityBlock) -> Result<Option<PlacedVisibilities>, CalibrationError> {
+        let Some(channel) = self.prepare(&mut block) else { return Ok(None) };
         let (mut placed, placing) = self.ephemeris.place(&block, channel.frequency_hz);
         self.ledger.flagged("no ephemeris", placing.without_ephemeris);
         self.post_flagged(&placing.flagged);
-        let calibrated = self.calibration.apply(&mut placed)?;
+        self.calibrate(&mut placed)?;
+        Ok(Some(placed))
+    }
+
+    fn calibrate(&mut self, placed: &mut PlacedVisibilities) -> Result<(), CalibrationError> {
+        let calibrated = self.calibration.apply(placed)?;
         for (reason, count) in calibrated.removed() {
             self.ledger.flagged(reason, count as u64);
         }
-        Ok(Some(placed))
+        Ok(())
     }
 
     fn post_flagged(&self, flagged: &FlaggedCounts) {
@@ -312,6 +340,9 @@ impl Stage for Calibrator {
     }
 
     fn finish(&mut self, _: &mut Outlet<PlacedFrame>) -> Result<(), CalibrationError> {
+        if let (Some(autos), Some(instrument)) = (&self.autos, &self.instrument) {
+            *autos.lock().unwrap_or_else(PoisonError::into_inner) = self.powers.list(instrument);
+        }
         let all: u64 = self.received.values().sum();
         let Some((_, report)) = self.reports.last_key_value() else {
             self.ledger.sampled(all);

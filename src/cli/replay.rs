@@ -16,7 +16,7 @@ use crate::pipeline::{
 use crate::runtime::Cancel;
 use crate::units::constants::DAY_S;
 
-/// Bytes that packets wait for those before them where several senders are listened to and nothing is kept.
+/// Bytes of visibilities that wait for positions where several senders are listened to and nothing is kept.
 const WAIT_BYTES_LIVE: u64 = 1 << 20;
 
 /// Make maps from downlink files, or from stations that send, alone.
@@ -46,7 +46,7 @@ pub(super) struct ReplayArgs {
     /// Visibilities between two checkpoints of the state; there is one at the end in any case.
     #[arg(long, value_name = "NUMBER", default_value_t = 1_000_000, requires = "state")]
     checkpoint_every: u64,
-    /// Bytes of packets that may wait for missing ones sent before them, or for positions, to be applied in order:
+    /// Bytes of visibilities that may wait for their positions; beyond it, those sent first are flagged for want of them:
     /// 256 MiB of a new state, an old one keeps its own; 1 MiB when listening without a state.
     #[arg(long, value_name = "BYTES", requires = "ordered")]
     wait_bytes: Option<u64>,
@@ -184,7 +184,7 @@ fn from_senders(
     eprintln!("listening on {}", source.url());
     let receiving = match keeper {
         Some(keeper) => Receiving::Kept(Box::new(keeper)),
-        None => Receiving::InOrder { wait_bytes: args.wait_bytes.unwrap_or(WAIT_BYTES_LIVE) },
+        None => Receiving::Gathered { wait_bytes: args.wait_bytes.unwrap_or(WAIT_BYTES_LIVE) },
     };
     Ok(watched(source, args, config, receiving, &cancel)?)
 }

@@ -1,4 +1,4 @@
-//! Packets to frames, each once and in the order of sending, across files and sessions.
+//! Packets to frames, each once, across files and sessions.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -48,6 +48,14 @@ impl CollectorState {
     pub fn waiting(&self) -> &Waiting {
         &self.waiting
     }
+
+    /// Whether a collector can have left it, which of one that was read is not sure.
+    #[must_use]
+    pub fn is_sound(&self) -> bool {
+        self.taken.len() <= Kind::ALL.len()
+            && self.taken.iter().all(Taken::is_sound)
+            && self.waiting.is_sound()
+    }
 }
 
 /// Packets that have been read, and what they say.
@@ -62,8 +70,8 @@ pub struct Delivery {
 /// Whether positions are known over a stretch of time.
 pub type Placed<'a> = &'a dyn Fn([MissionTime; 2]) -> bool;
 
-/// Takes bytes of a downlink as they come, and gives what every packet says once: visibilities in the order in which
-/// they were sent as far as [`Waiting`] reaches, everything else as soon as it is there.
+/// Takes bytes of a downlink as they come, and gives what every packet says once: visibilities as soon as their positions
+/// are known, as far as [`Waiting`] reaches, everything else as soon as it is there.
 ///
 /// Until the description of the instrument has come, nobody can read anything, and all packets wait.
 #[derive(Debug)]
@@ -76,10 +84,12 @@ pub struct Collector {
     link: Decoder,
     /// Packets that may wait although nothing keeps them from being read.
     again: VecDeque<PacketHeader>,
+    /// Whether positions have come since visibilities that wait were looked at.
+    has_new_positions: bool,
 }
 
 impl Collector {
-    /// A collector that knows nothing; visibilities wait for those before them until so many bytes do.
+    /// A collector that knows nothing; visibilities wait for their positions until so many bytes do.
     #[must_use]
     pub fn new(wait_bytes: u64) -> Self {
         Self {
@@ -89,6 +99,7 @@ impl Collector {
             decoder: Decoder::new(),
             link: Decoder::new(),
             again: VecDeque::new(),
+            has_new_positions: false,
         }
     }
 
@@ -142,7 +153,6 @@ impl Collector {
         if !self.decoder.absorb(decoder) {
             return Err(DownlinkError::OtherInstrument { offset: 0 });
         }
-        self.waiting.absorb_gone(&their_waiting);
         for packet in their_waiting.packets() {
             self.waiting.put(packet.clone());
         }
@@ -180,6 +190,8 @@ impl Collector {
                 self.set_aside_unread();
             }
             match self.take_event()? {
+                // Looked at once for all positions of a piece of the stream: of what waits there may be much.
+                Taking::Nothing if self.look_again() => {}
                 Taking::Nothing => return Ok(None),
                 Taking::Event => {}
                 Taking::Delivery(found) => return Ok(Some(found)),
@@ -268,9 +280,6 @@ impl Collector {
     /// Says anew which packets of a kind have been read, in the order of sending; those that wait have come too.
     pub fn retake(&mut self, kind: Kind, read: impl Iterator<Item = (CucTime, u64)>) {
         let mut all: Vec<(CucTime, u64)> = read.collect();
-        if kind == Kind::Visibilities {
-            self.waiting.set_gone(all.last().copied());
-        }
         let waiting = self.waiting.packets().map(|packet| packet.header).filter(|header| header.kind == kind);
         all.extend(waiting.map(|header| (header.time, header.count)));
         all.sort_unstable();
@@ -311,7 +320,7 @@ impl Collector {
             counts.restarts = missing.len().saturating_sub(1) as u64;
             let gaps = missing.into_iter().flatten();
             (counts.gaps, counts.missing) =
-                gaps.fold((0, 0), |(n, sum), gap| (n + 1, sum + gap.end - gap.start));
+                gaps.fold((0, 0_u64), |(n, sum), gap| (n + 1, sum.saturating_add(gap.end - gap.start)));
         }
         counters
     }
@@ -328,19 +337,36 @@ impl Collector {
 
     /// What waits and need not, once the instrument is known.
     fn next_due(&mut self, placed: Placed<'_>) -> Option<Delivery> {
-        while let Some(header) = self.again.pop_front() {
-            if header.kind != Kind::Visibilities
-                && let Some(payload) = self.waiting.payload_of(&header)
-            {
-                return Some(self.read(&payload));
+        loop {
+            while let Some(header) = self.again.pop_front() {
+                let found = match header.kind {
+                    Kind::Visibilities => {
+                        self.waiting.placed_visibilities(&header, placed).map(|packet| vec![packet])
+                    }
+                    _ => self.waiting.payload_of(&header),
+                };
+                if let Some(packets) = found {
+                    return Some(self.read(&packets));
+                }
+            }
+            if !self.waiting.is_full() {
+                let packet = self.waiting.next_given_up()?;
+                return Some(self.give_up(packet));
+            }
+            if !self.look_again() {
+                let packet = self.waiting.first_visibilities()?;
+                return Some(self.read(&[packet]));
             }
         }
-        let taken = &self.taken[Kind::Visibilities.index()];
-        if let Some(packet) = self.waiting.next_visibilities(taken, placed) {
-            return Some(self.read(&[packet]));
+    }
+
+    /// Whether visibilities that wait are to be looked at again.
+    fn look_again(&mut self) -> bool {
+        let is_due = std::mem::take(&mut self.has_new_positions) && self.knows_instrument();
+        if is_due {
+            self.again = headers(&self.waiting);
         }
-        let packet = self.waiting.next_given_up()?;
-        Some(self.give_up(packet))
+        is_due
     }
 
     /// Nobody can read what has waited too long for a description; it may come again when somebody can.
@@ -357,6 +383,7 @@ impl Collector {
         for packet in packets {
             frame = self.decoder.accept(&packet.event()).or(frame);
         }
+        self.has_new_positions |= matches!(frame, Some(GroundFrame::Ephemeris(_)));
         Delivery { packets: packets.iter().map(|packet| (packet.header, packet.check)).collect(), frame }
     }
 
@@ -384,7 +411,11 @@ impl Collector {
             return Ok(Taking::Event);
         }
         self.waiting.put(WaitingPacket::of(&packet));
-        if header.kind == Kind::Visibilities || !describes && !self.knows_instrument() {
+        if !describes && !self.knows_instrument() {
+            return Ok(Taking::Event);
+        }
+        if header.kind == Kind::Visibilities {
+            self.again.push_back(header);
             return Ok(Taking::Event);
         }
         let Some(payload) = self.waiting.payload_of(&header) else { return Ok(Taking::Event) };

@@ -6,6 +6,7 @@ use std::ops::Range;
 use bincode::{Decode, Encode};
 
 use super::cuc::CucTime;
+use super::header::COUNT_MAX;
 
 /// The counts between two times at which the spacecraft began to count anew.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
@@ -94,21 +95,6 @@ impl Taken {
         era.is_some_and(|era| era.contains(count))
     }
 
-    /// Whether every packet of the same era from the count `from` up to this one, which is one of them, has come.
-    #[must_use]
-    pub fn is_whole(&self, from: u64, count: u64, time: CucTime) -> bool {
-        let Some(era) = self.eras.iter().rev().find(|era| era.from <= time) else { return false };
-        let stretch = era.stretches.range(..=count).next_back();
-        stretch.is_some_and(|(&start, &end)| start <= from.min(count) && end > count)
-    }
-
-    /// Whether two packets, of which the times are given, are of one era.
-    #[must_use]
-    pub fn are_of_one_era(&self, a: CucTime, b: CucTime) -> bool {
-        let of = |time: CucTime| self.eras.iter().rposition(|era| era.from <= time);
-        of(a) == of(b)
-    }
-
     /// Takes what another set has too. Eras of the two are one if their times overlap, or if the counts of the later
     /// go on above those of the earlier; false, with nothing taken, if that would make one of two that are known apart.
     pub fn absorb(&mut self, other: &Self) -> bool {
@@ -138,10 +124,25 @@ impl Taken {
         sound
     }
 
+    /// Whether it is as taking packets makes it, which one that was read need not be: stretches of counts that packets
+    /// have, in order and apart.
+    pub(super) fn is_sound(&self) -> bool {
+        self.eras.iter().all(|era| {
+            let ends = std::iter::once(None).chain(era.stretches.values().map(Some));
+            let mut stretches = ends.zip(&era.stretches);
+            era.newest.0 <= COUNT_MAX
+                && stretches.all(|(before, (start, end))| {
+                    before.is_none_or(|before| before < start) && start < end && *end <= COUNT_MAX + 1
+                })
+        })
+    }
+
     /// Number of packets.
     #[must_use]
     pub fn len(&self) -> u64 {
-        self.eras.iter().flat_map(|era| &era.stretches).map(|(start, end)| end - start).sum()
+        let stretches = self.eras.iter().flat_map(|era| &era.stretches);
+        // A hostile stream makes eras of 2^46 packets, one a packet.
+        stretches.fold(0, |sum: u64, (start, end)| sum.saturating_add(end - start))
     }
 
     /// Whether none has been taken.
@@ -281,15 +282,25 @@ mod tests {
     }
 
     #[test]
-    fn packets_in_a_row_are_told_from_those_behind_a_gap() {
+    fn forged_stretches_are_not_sound() {
         let mut taken = Taken::default();
-        for count in [0, 1, 2, 5, 6] {
-            taken.take(count, at(count));
+        for (count, s) in [(3, 1), (4, 1), (9, 2), (COUNT_MAX, 3), (2, 7)] {
+            taken.take(count, at(s));
         }
-        assert!(taken.is_whole(0, 2, at(2)) && taken.is_whole(1, 2, at(2)) && taken.is_whole(6, 6, at(6)));
-        assert!(!taken.is_whole(0, 5, at(5)) && !taken.is_whole(3, 5, at(5)) && !taken.is_whole(0, 3, at(3)));
-        taken.take(0, at(9));
-        assert!(taken.is_whole(0, 0, at(9)) && !taken.are_of_one_era(at(6), at(9)));
+        assert!(taken.is_sound() && Taken::default().is_sound());
+        taken.forget(3, at(1));
+        assert!(taken.is_sound());
+        let forged = |stretches: &[(u64, u64)]| {
+            let stretches = stretches.iter().copied().collect();
+            Taken { eras: vec![Era { stretches, ..Era::default() }] }.is_sound()
+        };
+        assert!(forged(&[(1, 2), (3, 9)]));
+        // Nothing in it, backwards, overlapping, touching, and beyond all counts.
+        for bad in [&[(4, 4)][..], &[(4, 3)], &[(1, 5), (4, 9)], &[(1, 5), (5, 9)], &[(7, u64::MAX)]] {
+            assert!(!forged(bad), "{bad:?}");
+        }
+        let newest = (u64::MAX, at(1));
+        assert!(!Taken { eras: vec![Era { newest, ..Era::default() }] }.is_sound());
     }
 
     #[test]

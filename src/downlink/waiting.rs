@@ -1,15 +1,14 @@
-//! Packets that wait for those that were sent before them.
+//! Packets that wait: visibilities for their positions, parts of payloads for each other.
 
 use std::collections::BTreeMap;
 
 use bincode::{Decode, Encode};
 
 use super::cuc::CucTime;
-use super::header::{PacketHeader, Segment};
+use super::header::{COUNT_MAX, PACKET_BYTES_MAX, PacketHeader, Segment};
 use super::kind::Kind;
 use super::payload::visibilities_span;
 use super::receiver::{Event, Packet};
-use super::taken::Taken;
 use crate::units::MissionTime;
 
 /// Memory that a packet takes while it waits, beyond its bytes.
@@ -63,15 +62,10 @@ impl WaitingPacket {
     }
 }
 
-/// Puts visibilities in the order in which they were sent, and payloads together, within bounds.
+/// Keeps visibilities until their positions are known, and parts of payloads until the others have come, within bounds.
 ///
-/// A packet of visibilities goes on at once if all of its kind that were sent before it have come and its positions
-/// are known; if not, it waits, and those behind it. When more bytes wait than may, the first goes on as it is, with
-/// those that follow it without a gap; one that comes later still goes on as it comes. Other packets wait for
-/// the rest of their payload alone.
-///
-/// As long as none comes later than that, what waits and what has gone is a function of the set of packets that have
-/// come, not of their order.
+/// When more bytes wait than may, the visibilities that were sent first go on as they are. As long as they need not,
+/// what waits and what has gone is a function of the set of packets that have come, not of their order.
 #[derive(Clone, Debug, Default, PartialEq, Encode, Decode)]
 pub struct Waiting {
     visibilities: BTreeMap<Sent, WaitingPacket>,
@@ -80,8 +74,6 @@ pub struct Waiting {
     others: BTreeMap<(Kind, Sent), WaitingPacket>,
     others_bytes: u64,
     bytes_max: u64,
-    /// The latest visibilities that have gone.
-    gone: Option<Sent>,
 }
 
 impl Waiting {
@@ -100,6 +92,25 @@ impl Waiting {
             _ => (self.others.insert((kind, (time, count)), packet), &mut self.others_bytes),
         };
         *bytes = bytes.saturating_add(cost).saturating_sub(replaced.map_or(0, |packet| packet.cost()));
+    }
+
+    /// Whether it is as taking packets makes it, which one that was read need not be.
+    pub(super) fn is_sound(&self) -> bool {
+        let is_packet = |packet: &WaitingPacket| {
+            packet.header.count <= COUNT_MAX && packet.header.bytes <= PACKET_BYTES_MAX
+        };
+        let sent = |packet: &WaitingPacket| (packet.header.time, packet.header.count);
+        let cost = |packets: &mut dyn Iterator<Item = &WaitingPacket>| -> u64 {
+            packets.map(WaitingPacket::cost).sum()
+        };
+        self.packets().all(is_packet)
+            && self
+                .visibilities
+                .iter()
+                .all(|(key, packet)| (*key, Kind::Visibilities) == (sent(packet), packet.header.kind))
+            && self.others.iter().all(|(key, packet)| *key == (packet.header.kind, sent(packet)))
+            && self.bytes == cost(&mut self.visibilities.values())
+            && self.others_bytes == cost(&mut self.others.values())
     }
 
     /// All packets, visibilities first.
@@ -128,39 +139,25 @@ impl Waiting {
         found
     }
 
-    /// Order of the latest visibilities that have gone; those before it do not wait for others any more.
-    pub(super) fn set_gone(&mut self, gone: Option<Sent>) {
-        self.gone = gone;
-    }
-
-    /// As if all had gone that went in another.
-    pub(super) fn absorb_gone(&mut self, other: &Self) {
-        self.gone = self.gone.max(other.gone);
-    }
-
-    /// The next visibilities that need not wait, given all that have come and whether the positions are known over a
-    /// stretch of time.
-    pub fn next_visibilities(
+    /// Visibilities that wait and need not: positions are known over all their time, or it cannot be told.
+    pub fn placed_visibilities(
         &mut self,
-        taken: &Taken,
+        header: &PacketHeader,
         placed: &dyn Fn([MissionTime; 2]) -> bool,
     ) -> Option<WaitingPacket> {
-        let (&sent, packet) = self.visibilities.first_key_value()?;
-        let (time, count) = sent;
-        let is_late = self.gone.is_some_and(|gone| sent < gone);
-        let from =
-            self.gone.filter(|(gone, _)| taken.are_of_one_era(*gone, time)).map_or(0, |(_, gone)| gone + 1);
-        let is_due = is_late
-            || self.bytes > self.bytes_max
-            || taken.is_whole(from, count, time) && packet.span().is_none_or(placed);
-        if is_due { self.first_visibilities() } else { None }
+        if self.get(header)?.span().is_none_or(placed) { self.take_out(header) } else { None }
+    }
+
+    /// Whether more visibilities wait than may.
+    #[must_use]
+    pub fn is_full(&self) -> bool {
+        self.bytes > self.bytes_max
     }
 
     /// The first visibilities, due or not.
     pub fn first_visibilities(&mut self) -> Option<WaitingPacket> {
-        let (sent, packet) = self.visibilities.pop_first()?;
+        let (_, packet) = self.visibilities.pop_first()?;
         self.bytes = self.bytes.saturating_sub(packet.cost());
-        self.gone = self.gone.max(Some(sent));
         Some(packet)
     }
 
@@ -220,8 +217,6 @@ impl Waiting {
 
 #[cfg(test)]
 mod tests {
-    use proptest::prelude::*;
-
     use super::*;
     use crate::downlink::FORMAT_VERSION;
 
@@ -239,25 +234,16 @@ mod tests {
         WaitingPacket { header, payload: Vec::new(), check: 0 }
     }
 
-    fn through(counts: &[u64], packets_max: u64) -> (Vec<u64>, Waiting) {
-        let mut waiting = Waiting::new(packets_max * (BYTES + KEEPING_BYTES));
-        let (mut order, mut taken) = (Vec::new(), Taken::default());
-        for &count in counts {
-            let packet = packet(count);
-            assert!(taken.take(count, packet.header.time));
-            waiting.put(packet);
-            let due = std::iter::from_fn(|| waiting.next_visibilities(&taken, &|_| true));
-            order.extend(due.map(|packet| packet.header.count));
-        }
-        (order, waiting)
-    }
-
     /// Found by fuzzing: a state that says that less waits than does.
     #[test]
     fn what_waits_may_be_more_than_a_forged_state_says() {
         let mut forged = Waiting::new(0);
         forged.put(packet(5));
         forged.put(packet(7));
+        assert!(forged.is_sound());
+        for (bytes, others_bytes) in [(1, 0), (2 * (BYTES + KEEPING_BYTES), 1)] {
+            assert!(!Waiting { bytes, others_bytes, ..forged.clone() }.is_sound());
+        }
         (forged.bytes, forged.others_bytes) = (1, u64::MAX);
         forged.put(WaitingPacket {
             header: PacketHeader { bytes: usize::MAX, ..packet(9).header },
@@ -268,35 +254,9 @@ mod tests {
         assert!(forged.visibilities.is_empty() && forged.next_unread().is_none());
     }
 
-    proptest! {
-        #[test]
-        fn disorder_within_the_limit_leaves_no_trace(
-            shifts in proptest::collection::vec(0..8_u64, 200),
-            lost in proptest::collection::btree_set(0..200_u64, 0..9),
-        ) {
-            let sorted: Vec<u64> = (0..200).filter(|count| !lost.contains(count)).collect();
-            let mut shuffled = sorted.clone();
-            shuffled.sort_by_key(|&count| count + shifts[count as usize]);
-            // Eight packets may come before one that was sent before them.
-            let (clean, disordered) = (through(&sorted, 8), through(&shuffled, 8));
-            prop_assert!(clean == disordered);
-            prop_assert!(clean.0.is_sorted());
-            // Only gaps make packets wait: all but those that follow a gap by less than the limit have gone.
-            let gone = clean.0.len();
-            prop_assert!(gone + 8 >= sorted.len());
-            let waits_for_nothing = lost.range(..*sorted.last().unwrap()).next().is_none();
-            prop_assert!(!waits_for_nothing || gone == sorted.len());
-            // Without room, all goes out as it comes, and nothing is kept.
-            let (order, waiting) = through(&shuffled, 0);
-            prop_assert_eq!(order, shuffled);
-            prop_assert!(waiting.visibilities.is_empty() && waiting.bytes == 0);
-        }
-    }
-
     #[test]
     fn visibilities_wait_for_their_positions() {
-        let mut waiting = Waiting::new(1 << 20);
-        let mut taken = Taken::default();
+        let mut waiting = Waiting::new(2 * (BYTES + KEEPING_BYTES));
         for count in 0..3 {
             let mut packet = packet(count);
             // Record and arrays of one visibility: channel, pair, start, count; offset, duration, value, weight, flags.
@@ -305,7 +265,6 @@ mod tests {
             packet.payload.extend(1_u32.to_le_bytes());
             packet.payload.extend([5_u32, 10].map(u32::to_le_bytes).concat());
             packet.payload.resize(16 + 21, 0);
-            taken.take(count, packet.header.time);
             waiting.put(packet);
         }
         let seen = std::cell::RefCell::new(Vec::new());
@@ -316,13 +275,18 @@ mod tests {
                 to.0 <= end
             }
         };
-        assert!(waiting.next_visibilities(&taken, &until(0)).is_none());
-        assert_eq!(
-            waiting.next_visibilities(&taken, &until(1000)).map(|packet| packet.header.count),
-            Some(0)
-        );
-        assert!(waiting.next_visibilities(&taken, &until(1000)).is_none());
-        assert_eq!(*seen.borrow(), [(5, 15), (5, 15), (1005, 1015)]);
+        let mut placed =
+            |count: u64, end: i64| waiting.placed_visibilities(&packet(count).header, &until(end)).is_some();
+        // The second goes before the first: what lies in between does not matter.
+        assert!(!placed(0, 0) && !placed(1, 500) && placed(1, 1015) && !placed(1, 1015) && !placed(7, 9999));
+        assert_eq!(*seen.borrow(), [(5, 15), (1005, 1015), (1005, 1015)]);
+        assert!(!waiting.is_full());
+        waiting.put(packet(9));
+        assert!(waiting.is_full());
+        assert_eq!(waiting.first_visibilities().map(|packet| packet.header.count), Some(0));
+        assert!(!waiting.is_full());
+        // One that does not say which time it is of waits for nothing.
+        assert!(waiting.placed_visibilities(&packet(9).header, &until(0)).is_some());
     }
 
     #[test]

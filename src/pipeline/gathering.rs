@@ -7,7 +7,7 @@ use crate::downlink::{Collector, Delivery, DownlinkError, ReceptionCounters};
 use crate::frames::GroundFrame;
 use crate::runtime::{Outlet, Stage, Units};
 
-/// Gives every frame once, in the order in which it was sent as far as its reach goes, however many send it.
+/// Gives every frame once, visibilities behind their positions as far as its reach goes, however many send it.
 #[derive(Debug)]
 pub struct Gathering {
     collector: Collector,
@@ -17,7 +17,7 @@ pub struct Gathering {
 }
 
 impl Gathering {
-    /// Visibilities wait for those before them and for positions until `wait_bytes` do. Leaves its account in
+    /// Visibilities wait for positions until `wait_bytes` do. Leaves its account in
     /// `account` at the end.
     #[must_use]
     pub fn new(wait_bytes: u64, account: Arc<Mutex<ReceptionCounters>>) -> Self {

@@ -20,12 +20,12 @@ use crate::solve::{SolveWatch, Solver, SolverSetup, StoppingRule};
 pub enum Receiving {
     /// From one stream, as they come.
     AsTheyCome,
-    /// From any number of senders: every packet once, and in the order of sending among so many bytes of later ones.
-    InOrder {
-        /// Bytes that packets wait for those before them.
+    /// From any number of senders: every packet once, visibilities when their positions have come.
+    Gathered {
+        /// Bytes of visibilities that may wait for positions.
         wait_bytes: u64,
     },
-    /// As [`Receiving::InOrder`], and kept for later sessions.
+    /// As [`Receiving::Gathered`], and kept for later sessions.
     Kept(Box<Keeper>),
 }
 
@@ -36,7 +36,7 @@ pub struct GroundOutcome {
     pub ledger: Ledger,
     /// What was received, and what was wrong with it.
     pub reception: Arc<Mutex<ReceptionCounters>>,
-    /// The daughters' own powers, in the order of arrival; none with a keeper.
+    /// The daughters' own powers, by channel, daughter and time.
     pub autos: Arc<Mutex<Vec<AutoPower>>>,
     /// Final map of each channel, in figures.
     pub channels: Arc<Mutex<Vec<ChannelSummary>>>,
@@ -81,7 +81,7 @@ pub fn add(
     let sums = match receiving {
         Receiving::Kept(keeper) => graph.stage("keep", 1, bytes, *keeper),
         Receiving::AsTheyCome => add_sums_of_stream(graph, bytes, config, &outcome)?,
-        Receiving::InOrder { wait_bytes } => {
+        Receiving::Gathered { wait_bytes } => {
             let gathering = Gathering::new(wait_bytes, Arc::clone(&outcome.reception));
             let frames = graph.stage("receive", config.runtime.queue_capacity, bytes, gathering);
             add_sums(graph, frames, config, &outcome)?

@@ -5,12 +5,12 @@
 mod common;
 
 mod damage;
+mod forged;
 mod gaps;
 mod kill;
 mod merge;
 mod order;
 mod retract;
-mod sums;
 
 use std::path::{Path, PathBuf};
 

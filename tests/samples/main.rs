@@ -14,3 +14,4 @@ mod integration;
 mod noise;
 mod robust;
 mod signal;
+mod states;

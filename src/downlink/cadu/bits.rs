@@ -39,6 +39,12 @@ pub(super) fn marker(word: u32) -> Option<Polarity> {
     }
 }
 
+/// Wrong bits of a marker.
+pub(super) fn marker_errors(word: u32, polarity: Polarity) -> u32 {
+    let wrong = (word ^ SYNC_MARKER).count_ones();
+    if polarity == Polarity::Upright { wrong } else { 32 - wrong }
+}
+
 /// Whether the bits of a stream are as they were sent.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) enum Polarity {

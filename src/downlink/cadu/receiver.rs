@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 
 use super::SYNC_MARKER_BYTES;
 use super::assembler::Assembler;
-use super::bits::{Polarity, copy_at, find_marker, marker, word_at};
+use super::bits::{Polarity, copy_at, find_marker, marker, marker_errors, word_at};
 use super::counters::FrameCounters;
 use super::frame::{FRAME_HEADER_BYTES, FrameHeader, IDLE};
 use super::randomizer::randomize;
-use super::reed_solomon::{CODEWORD_BYTES, INTERLEAVES, PARITY_BYTES, ReedSolomon};
+use super::reed_solomon::{CODEWORD_BYTES, ERRORS_MAX, INTERLEAVES, PARITY_BYTES, ReedSolomon};
 
 /// Virtual channels that are kept apart, besides that of idle frames; bounds the memory.
 const CHANNELS_MAX: usize = 8;
@@ -18,14 +18,51 @@ const MARKER_BITS: usize = 8 * SYNC_MARKER_BYTES;
 /// Bytes in front of the one at which the stream is looked at that may be passed over without notice.
 const SPENT_BYTES: usize = 1 << 18;
 
+/// Octets put through the code for each of the stream, at most: a stream full of markers may not cost more. In lock
+/// it is one.
+const WORK_A_BYTE: u64 = 4;
+
+/// So many more: a few dozen places looked at for every depth of interleaving.
+const WORK_BYTES: u64 = 1 << 20;
+
+/// A frame that could be corrected.
+#[derive(Clone, Copy, Debug)]
+struct Found {
+    /// Bit of the buffer where its marker begins, or should.
+    at: usize,
+    code: ReedSolomon,
+    polarity: Polarity,
+    /// Octets corrected in its block.
+    corrected: usize,
+    /// What speaks against it: octets corrected, wrong bits of the marker, and a header that is none of ours. Each
+    /// befalls about one in a thousand on a poor link.
+    faults: usize,
+}
+
+/// What a place in the stream holds.
+#[derive(Clone, Copy, Debug)]
+enum Place {
+    Frame(Found),
+    Nothing,
+    /// More bytes will tell.
+    Unsure,
+}
+
 /// Finds frames in a stream of bits, corrects them, and puts their packets together.
 ///
 /// Three states, as receivers have them. *Search*: the stream is searched bit by bit for a marker with 3 wrong bits
-/// at most, upright or inverted, and looked at where a frame would be due. *Check*: a place that was found counts if a block that can be corrected
-/// follows it. *Lock*: frames follow one another; a bad
-/// marker is passed over if its block can be corrected, a bad block if another marker follows; otherwise the
-/// search begins there, or where the last block might have ended had bits been lost in it. Interleave and
-/// polarity are found out.
+/// at most, upright or inverted, and looked at where a frame would be due. *Check*: a place that was found counts if
+/// a block that can be corrected follows it. *Lock*: frames follow one another; a bad marker is passed over if its
+/// block can be corrected, a bad block if another marker follows; otherwise the search begins there, or where the
+/// last block might have ended had bits been lost in it. Interleave and polarity are found out.
+///
+/// That a block can be corrected does not prove that it begins there. The code is cyclic, and where 1, 2, 4 or 8
+/// codewords are interleaved a shifted randomizer differs from itself by a codeword: up to 16 octets a codeword too early
+/// or too late, a frame is corrected to its own rotation, and so is every frame after it. So a frame in which
+/// anything was corrected, or whose header is none of ours, has rivals: places so near with a marker. The one
+/// with the fewest faults is taken.
+///
+/// Work is bounded: places are not looked at where a stream has brought forth too many.
 #[derive(Debug, Default)]
 pub struct CaduReceiver {
     buffer: Vec<u8>,
@@ -43,6 +80,10 @@ pub struct CaduReceiver {
     block: Vec<u8>,
     channels: BTreeMap<u8, Assembler>,
     account: FrameCounters,
+    /// Bits of the buffer that must be there before it is looked at again.
+    wanted: usize,
+    /// Octets put through the code.
+    worked: u64,
 }
 
 impl CaduReceiver {
@@ -75,7 +116,7 @@ impl CaduReceiver {
         }
         self.before += 8 * self.buffer.len() as u64;
         self.buffer.clear();
-        (self.at, self.locked) = (0, false);
+        (self.at, self.wanted, self.locked) = (0, 0, false);
     }
 
     /// Whether a frame has been found.
@@ -89,6 +130,13 @@ impl CaduReceiver {
     #[must_use]
     pub fn held_bytes(&self) -> usize {
         self.buffer.capacity() + self.channels.values().map(Assembler::held_bytes).sum::<usize>()
+    }
+
+    /// Octets put through the code so far, those of frames that were none included: at most four for each octet of
+    /// the stream, and a megabyte.
+    #[must_use]
+    pub fn octets_decoded(&self) -> u64 {
+        self.worked
     }
 
     /// The account so far.
@@ -107,7 +155,7 @@ impl CaduReceiver {
     /// Bits of a marker and its block.
     fn frame_bits(&self) -> usize {
         let longest = INTERLEAVES[INTERLEAVES.len() - 1];
-        MARKER_BITS + 8 * CODEWORD_BYTES * self.code.map_or(longest, ReedSolomon::interleave)
+        self.code.map_or(MARKER_BITS + 8 * CODEWORD_BYTES * longest, frame_bits)
     }
 
     /// So many bits of a block may be missing at its end and yet be corrected.
@@ -117,7 +165,7 @@ impl CaduReceiver {
 
     /// Goes on as far as the bytes that are there allow.
     fn look(&mut self, at_end: bool, out: &mut Vec<u8>) {
-        loop {
+        while at_end || 8 * self.buffer.len() >= self.wanted {
             let go_on = if self.locked { self.follow(at_end, out) } else { self.search(at_end, out) };
             if !go_on {
                 return;
@@ -127,30 +175,42 @@ impl CaduReceiver {
 
     /// In lock: the frame that is due. False if more bytes are needed.
     fn follow(&mut self, at_end: bool, out: &mut Vec<u8>) -> bool {
-        let frame = self.frame_bits();
-        if self.at + frame > 8 * self.buffer.len() {
+        let (frame, bits) = (self.frame_bits(), 8 * self.buffer.len());
+        if self.at + frame > bits {
             return false;
         }
         let polarity = marker(word_at(&self.buffer, self.at));
-        let good = self.correct(self.at, self.code, polarity.unwrap_or(self.polarity));
-        match (good, polarity) {
-            (Some(corrected), _) => self.deliver(corrected, polarity.unwrap_or(self.polarity), out),
-            (None, _) if self.at + frame + MARKER_BITS > 8 * self.buffer.len() && !at_end => return false,
-            (None, Some(polarity)) if at_end || self.another_follows(self.at, self.code, polarity) => {
-                self.turn(polarity);
-                self.account.frames_uncorrectable += 1;
+        match self.place(self.at, self.code, polarity.unwrap_or(self.polarity), at_end) {
+            Place::Unsure => return false,
+            Place::Frame(found) => {
+                if found.at != self.at {
+                    self.account.sync_losses += 1;
+                    self.account.bits_skipped += found.at.saturating_sub(self.at) as u64;
+                }
+                self.at = found.at;
+                self.deliver(found, out);
             }
-            // Bits may have got lost in this frame, or, if its marker is bad too, in the one before.
-            (None, _) => {
-                self.account.sync_losses += 1;
-                self.locked = false;
-                self.lost_at = Some(self.before + self.at as u64);
-                self.at = match polarity {
-                    Some(_) => self.at + 1,
-                    None => self.at.saturating_sub(self.slack_bits()),
-                };
-                return true;
-            }
+            Place::Nothing => match polarity {
+                _ if self.at + frame + MARKER_BITS > bits && !at_end => {
+                    self.wanted = self.at + frame + MARKER_BITS;
+                    return false;
+                }
+                Some(polarity) if at_end || self.another_follows(self.at, self.code, polarity) => {
+                    self.turn(polarity);
+                    self.account.frames_uncorrectable += 1;
+                }
+                // Bits may have got lost in this frame, or, if its marker is bad too, in the one before.
+                polarity => {
+                    self.account.sync_losses += 1;
+                    self.locked = false;
+                    self.lost_at = Some(self.before + self.at as u64);
+                    self.at = match polarity {
+                        Some(_) => self.at + 1,
+                        None => self.at.saturating_sub(self.slack_bits()),
+                    };
+                    return true;
+                }
+            },
         }
         self.at += frame;
         true
@@ -173,15 +233,21 @@ impl CaduReceiver {
             return false;
         };
         let polarity = marker(word_at(&self.buffer, found)).unwrap_or(self.polarity);
-        if let Some((code, corrected)) = self.check(found, polarity, at_end) {
-            self.code = Some(code);
-            self.account.interleave = code.interleave();
-            self.lock(found);
-            self.deliver(corrected, polarity, out);
-            self.at = found + self.frame_bits();
-        } else {
+        let place = if self.affords(found) { self.check(found, polarity, at_end) } else { Place::Nothing };
+        match place {
+            Place::Frame(found) => {
+                self.code = Some(found.code);
+                self.account.interleave = found.code.interleave();
+                self.lock(found.at);
+                self.deliver(found, out);
+                self.at = found.at + self.frame_bits();
+            }
             // Not even if another marker follows: data repeated at the distance of a frame brings forth such pairs.
-            self.pass(found + 1);
+            Place::Nothing => self.pass(found + 1),
+            Place::Unsure => {
+                self.pass(found);
+                return false;
+            }
         }
         true
     }
@@ -193,29 +259,70 @@ impl CaduReceiver {
         Some(self.at + (due - now) as usize)
     }
 
-    /// Corrects the block at `found`, and finds out the depth of interleaving if it is not known.
-    fn check(&mut self, found: usize, polarity: Polarity, at_end: bool) -> Option<(ReedSolomon, usize)> {
-        if let Some(code) = self.code {
-            return self.correct(found, Some(code), polarity).map(|corrected| (code, corrected));
+    /// What is at `at`; finds out the depth of interleaving if it is not known.
+    fn check(&mut self, at: usize, polarity: Polarity, at_end: bool) -> Place {
+        if self.code.is_some() {
+            return self.place(at, self.code, polarity, at_end);
         }
         for code in INTERLEAVES.into_iter().filter_map(ReedSolomon::new) {
+            let place = self.place(at, Some(code), polarity, at_end);
+            let Place::Frame(found) = place else { continue };
             // A block of equal octets is a codeword at every depth, so what follows must fit as well.
-            let next = found + MARKER_BITS + 8 * code.block_bytes();
-            let good = self.correct(found, Some(code), polarity).is_some()
-                && (at_end
-                    || self.another_follows(found, Some(code), polarity)
-                    || self.correct(next, Some(code), polarity).is_some());
-            if good {
-                return self.correct(found, Some(code), polarity).map(|corrected| (code, corrected));
+            let good = at_end
+                || self.another_follows(found.at, Some(code), polarity)
+                || self.correct(found.at + frame_bits(code), code, polarity).is_some();
+            if good && self.correct(found.at, code, polarity).is_some() {
+                return place;
             }
         }
-        None
+        Place::Nothing
+    }
+
+    /// The frame at bit `at`, or the rival that it is only a shifted image of; its block is in `self.block`.
+    fn place(&mut self, at: usize, code: Option<ReedSolomon>, polarity: Polarity, at_end: bool) -> Place {
+        let Some(found) = code.and_then(|code| self.correct(at, code, polarity)) else {
+            return Place::Nothing;
+        };
+        if found.corrected == 0 && self.header().is_some() {
+            return Place::Frame(found);
+        }
+        let reach = 8 * ERRORS_MAX * found.code.interleave();
+        // In a search, what lies before has been looked at.
+        let earliest = if self.locked { 0 } else { self.at };
+        let (mut best, mut in_block) = (found, at);
+        for rival in (at % 8 + (at - at % 8).saturating_sub(reach)..=at + reach).step_by(8) {
+            let is_marked = marker(word_at(&self.buffer, rival)) == Some(polarity);
+            if rival == at || rival < earliest || !is_marked || !self.affords(at) {
+                continue;
+            }
+            let end = rival + frame_bits(found.code);
+            if end > 8 * self.buffer.len() && !at_end {
+                self.wanted = end;
+                return Place::Unsure;
+            }
+            if let Some(other) = self.correct(rival, found.code, polarity) {
+                best = if other.faults < best.faults { other } else { best };
+            }
+            in_block = rival;
+        }
+        if in_block != best.at && self.correct(best.at, best.code, polarity).is_none() {
+            return Place::Nothing;
+        }
+        // Neither marker nor header: an image of a frame whose beginning is gone.
+        let is_image = marker(word_at(&self.buffer, best.at)).is_none() && self.header().is_none();
+        if is_image { Place::Nothing } else { Place::Frame(best) }
+    }
+
+    /// Whether a place may be looked at: the work until now is in proportion to the stream before it. Told by the
+    /// place and not by what has come, so that chunks do not matter.
+    fn affords(&self, at: usize) -> bool {
+        self.worked <= WORK_BYTES + WORK_A_BYTE * ((self.before + at as u64) / 8)
     }
 
     /// Whether a marker stands where the frame after that at `found` should begin.
     fn another_follows(&self, found: usize, code: Option<ReedSolomon>, polarity: Polarity) -> bool {
         let Some(code) = code else { return false };
-        let next = found + MARKER_BITS + 8 * code.block_bytes();
+        let next = found + frame_bits(code);
         next + MARKER_BITS <= 8 * self.buffer.len() && marker(word_at(&self.buffer, next)) == Some(polarity)
     }
 
@@ -247,33 +354,41 @@ impl CaduReceiver {
         self.polarity = polarity;
     }
 
-    /// Corrects the block behind the marker at bit `at` into `self.block`; the bytes corrected.
-    fn correct(&mut self, at: usize, code: Option<ReedSolomon>, polarity: Polarity) -> Option<usize> {
-        let code = code?;
-        if at + MARKER_BITS + 8 * code.block_bytes() > 8 * self.buffer.len() {
+    /// Corrects the block behind the marker at bit `at` into `self.block`.
+    fn correct(&mut self, at: usize, code: ReedSolomon, polarity: Polarity) -> Option<Found> {
+        if at + frame_bits(code) > 8 * self.buffer.len() {
             return None;
         }
+        self.worked += code.block_bytes() as u64;
         self.block.resize(code.block_bytes(), 0);
         copy_at(&self.buffer, at + MARKER_BITS, &mut self.block);
         if polarity == Polarity::Inverted {
             self.block.iter_mut().for_each(|octet| *octet = !*octet);
         }
         randomize(&mut self.block);
-        code.decode(&mut self.block).ok()
+        let corrected = code.decode(&mut self.block).ok()?;
+        let wrong = marker_errors(word_at(&self.buffer, at), polarity) as usize;
+        let faults = corrected + wrong + usize::from(self.header().is_none());
+        Some(Found { at, code, polarity, corrected, faults })
+    }
+
+    /// The header of the frame in `self.block`, if it is one of ours.
+    fn header(&self) -> Option<FrameHeader> {
+        let ours = |header: &FrameHeader| self.spacecraft.is_none_or(|known| known == header.spacecraft);
+        self.block.get(..FRAME_HEADER_BYTES).and_then(FrameHeader::parse).filter(ours)
     }
 
     /// Takes the frame in `self.block`.
-    fn deliver(&mut self, corrected: usize, polarity: Polarity, out: &mut Vec<u8>) {
-        self.turn(polarity);
+    fn deliver(&mut self, found: Found, out: &mut Vec<u8>) {
+        self.turn(found.polarity);
         self.account.frames += 1;
-        self.account.frames_corrected += u64::from(corrected > 0);
-        self.account.bytes_corrected += corrected as u64;
-        let frame = &self.block[..self.block.len() / CODEWORD_BYTES * (CODEWORD_BYTES - PARITY_BYTES)];
-        let ours = |header: &FrameHeader| self.spacecraft.is_none_or(|known| known == header.spacecraft);
-        let Some(header) = frame.get(..FRAME_HEADER_BYTES).and_then(FrameHeader::parse).filter(ours) else {
+        self.account.frames_corrected += u64::from(found.corrected > 0);
+        self.account.bytes_corrected += found.corrected as u64;
+        let Some(header) = self.header() else {
             self.account.frames_foreign += 1;
             return;
         };
+        let frame = &self.block[..found.code.data_bytes()];
         self.spacecraft = Some(header.spacecraft);
         if header.channel == IDLE {
             self.account.frames_idle += 1;
@@ -292,7 +407,13 @@ impl CaduReceiver {
         if spent >= SPENT_BYTES || spent == self.buffer.len() {
             self.buffer.drain(..spent);
             self.at -= 8 * spent;
+            self.wanted = self.wanted.saturating_sub(8 * spent);
             self.before += 8 * spent as u64;
         }
     }
+}
+
+/// Bits of a marker and a block of that code.
+fn frame_bits(code: ReedSolomon) -> usize {
+    MARKER_BITS + 8 * code.block_bytes()
 }

@@ -5,26 +5,31 @@ use std::io::{BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use bincode::enc::write::SizeWriter;
-use bincode::error::EncodeError;
+use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 use crc_fast::{CrcAlgorithm, Digest};
 
 use super::error::StateError;
 use super::journal::Journal;
 use crate::accumulation::AccumulatorState;
-use crate::calibration::CalibratorState;
+use crate::calibration::{AutoTable, CalibratorState};
 use crate::downlink::{CollectorState, CollectorView};
 use crate::runtime::LedgerReport;
 
-const MAGIC: &[u8; 8] = b"LNRSTA02";
+const MAGIC: &[u8; 8] = b"LNRSTA03";
+/// Beginning of the magic in every version.
+const ANY_VERSION: &[u8; 6] = b"LNRSTA";
+const VERSION: &str = "a checkpoint of the ground's state, version 03; version 02 has none of the daughters' own powers: \
+                       replay its files into a new folder";
 /// Bytes of magic, length of the head, and checksum.
 const FIXED_BYTES: u64 = 24;
 
 /// Bytes read at a time.
 const PIECE_BYTES: u64 = 1 << 20;
 
-/// Greatest head that is read.
-const HEAD_BYTES_MAX: usize = 1 << 32;
+/// Most memory that a decoded head may take for each of its bytes on disk: the hungriest of what it is made of, a line
+/// on a packet of positions, takes 80 bytes for at least 9.
+const MEMORY_A_BYTE: usize = 16;
 
 /// A checkpoint without its engines.
 #[derive(Clone, Debug, PartialEq, Decode)]
@@ -33,6 +38,7 @@ pub(super) struct Head {
     pub(super) settings: Vec<(String, String)>,
     pub(super) collector: CollectorState,
     pub(super) calibrator: CalibratorState,
+    pub(super) powers: AutoTable,
     pub(super) accumulator: AccumulatorState,
     pub(super) ledger: LedgerReport,
     pub(super) journal: Journal,
@@ -44,6 +50,7 @@ pub(super) struct HeadView<'a> {
     pub(super) settings: &'a Vec<(String, String)>,
     pub(super) collector: CollectorView<'a>,
     pub(super) calibrator: CalibratorState,
+    pub(super) powers: &'a AutoTable,
     pub(super) accumulator: AccumulatorState,
     pub(super) ledger: LedgerReport,
     pub(super) journal: &'a Journal,
@@ -100,12 +107,12 @@ pub(super) fn write(
     out.write_all(&crc.to_le_bytes()).map_err(failed())
 }
 
-/// Whether a file begins as a checkpoint does.
+/// Whether a file begins as a checkpoint of any version does.
 pub(super) fn is_checkpoint(path: &Path) -> Result<bool, StateError> {
     let mut magic = Vec::new();
     let file = File::open(path).map_err(StateError::io(path, "open the file"))?;
     file.take(MAGIC.len() as u64).read_to_end(&mut magic).map_err(StateError::io(path, "read"))?;
-    Ok(magic == MAGIC)
+    Ok(magic.len() == MAGIC.len() && magic.starts_with(ANY_VERSION))
 }
 
 /// Reads a checkpoint; `rest` makes something of the head and the engines.
@@ -133,7 +140,7 @@ pub(super) fn read_from<T>(
     from.read_exact(&mut fixed).map_err(failed())?;
     let (magic, length) = fixed.split_at(8);
     if magic != MAGIC {
-        return Err(damaged(format!("{magic:02x?}"), "a checkpoint of the ground's state, version 02"));
+        return Err(damaged(format!("{magic:02x?}"), VERSION));
     }
     let length = length.first_chunk().map_or(0, |length| u64::from_le_bytes(*length));
     if length > bytes - FIXED_BYTES {
@@ -141,12 +148,12 @@ pub(super) fn read_from<T>(
     }
     let mut head = vec![0; length as usize];
     from.read_exact(&mut head).map_err(failed())?;
-    // Lengths that a forger claims are held against it.
-    let config = bincode::config::standard().with_limit::<HEAD_BYTES_MAX>();
-    let (head, used) = bincode::decode_from_slice::<Head, _>(&head, config)
-        .map_err(|error| damaged(error.to_string(), "a head"))?;
+    let (head, used) = decode(&head).map_err(|error| damaged(error.to_string(), "a head"))?;
     if used as u64 != length {
         return Err(damaged("bytes behind the head".into(), "none"));
+    }
+    if !head.collector.is_sound() {
+        return Err(damaged("packets that cannot have come".into(), "those that a ground has taken"));
     }
     let mut engines = from.take(bytes - FIXED_BYTES - length);
     let found = rest(head, &mut engines)?;
@@ -154,6 +161,27 @@ pub(super) fn read_from<T>(
         0 => Ok(found),
         left => Err(damaged(format!("{left} bytes behind the engines"), "none")),
     }
+}
+
+/// A head, and the bytes of it. Lengths that a forger claims are held against a limit, before memory is reserved, that
+/// follows from the bytes that are there: the least of some that the decoder knows, at most four times as much.
+fn decode(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
+    let most = bytes.len().saturating_mul(MEMORY_A_BYTE);
+    match usize::BITS - most.leading_zeros() {
+        0..=20 => decode_within::<{ 1 << 20 }>(bytes),
+        21..=22 => decode_within::<{ 1 << 22 }>(bytes),
+        23..=24 => decode_within::<{ 1 << 24 }>(bytes),
+        25..=26 => decode_within::<{ 1 << 26 }>(bytes),
+        27..=28 => decode_within::<{ 1 << 28 }>(bytes),
+        29..=30 => decode_within::<{ 1 << 30 }>(bytes),
+        31..=32 => decode_within::<{ 1 << 32 }>(bytes),
+        33..=34 => decode_within::<{ 1 << 34 }>(bytes),
+        _ => decode_within::<{ 1 << 36 }>(bytes),
+    }
+}
+
+fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
+    bincode::decode_from_slice(bytes, bincode::config::standard().with_limit::<LIMIT>())
 }
 
 /// Length of a checkpoint whose checksum holds.
@@ -187,13 +215,17 @@ fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, Sta
 mod tests {
     use std::ops::Range;
 
+    use num_complex::Complex32;
+
     use super::*;
     use crate::accumulation::Accumulator;
     use crate::calibration::{Calibrator, Identity};
     use crate::downlink::{
         Collector, CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PacketHeader, Segment, Transmission,
     };
-    use crate::frames::{AntennaResponse, Channel, GroundFrame, Housekeeping, Instrument, PlacedFrame};
+    use crate::frames::{
+        AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock,
+    };
     use crate::runtime::{Ledger, Outlet, Stage};
     use crate::units::MissionTime;
 
@@ -210,14 +242,24 @@ mod tests {
             seed: 7,
             configuration_hash: 1,
         };
+        let own = VisibilityBlock {
+            offset_ticks: vec![0],
+            duration_ticks: vec![10],
+            value_k_sr: vec![Complex32::new(3.0, 0.0)],
+            weight: vec![1.0],
+            flags: vec![Flags::GOOD],
+            ..VisibilityBlock::default()
+        };
         let frames = [
             GroundFrame::Instrument(instrument.clone()),
+            GroundFrame::Visibilities(own),
             GroundFrame::Housekeeping(Housekeeping { time: MissionTime(5), sampled: 9, dropped: 1 }),
         ];
         let ledger = Ledger::new();
         ledger.flagged("far", 4);
         let mut accumulator = Accumulator::new(Default::default(), ledger.clone());
-        let mut calibrator = Calibrator::new(Box::new(Identity), ledger.clone());
+        let mut calibrator =
+            Calibrator::new(Box::new(Identity), ledger.clone()).with_autos(Default::default());
         let mut collector = Collector::new(1000);
         let mut transmission = Transmission::new(&DownlinkConfig::default()).unwrap();
         let mut bytes = Vec::new();
@@ -238,6 +280,7 @@ mod tests {
             settings: &settings,
             collector: collector.view(),
             calibrator: calibrator.state(),
+            powers: calibrator.powers(),
             accumulator: accumulator.state(),
             ledger: ledger.report(),
             journal: &journal,
@@ -271,6 +314,7 @@ mod tests {
             ("settings", length(bincode::encode_to_vec(head.settings, config))),
             ("collector", length(bincode::encode_to_vec(&head.collector, config))),
             ("calibrator", length(bincode::encode_to_vec(&head.calibrator, config))),
+            ("powers", length(bincode::encode_to_vec(head.powers, config))),
             ("accumulator", length(bincode::encode_to_vec(&head.accumulator, config))),
             ("ledger", length(bincode::encode_to_vec(&head.ledger, config))),
             ("journal", length(bincode::encode_to_vec(head.journal, config))),
@@ -325,12 +369,34 @@ mod tests {
     }
 
     #[test]
+    fn announced_lengths_reserve_no_more_than_the_bytes_there_allow() {
+        // A list of settings that announces as many as 4 GiB of memory hold, in heads of 60 bytes and of a megabyte;
+        // the same that they really may be is read on, to where the bytes end.
+        let settings = size_of::<(String, String)>() as u64;
+        for (bytes, limit) in [(60, 1 << 20), (1 << 20, 1 << 26)] {
+            for (announced, is_refused) in [
+                ((1_u64 << 32) / settings, true),
+                (limit / settings + 1, true),
+                (limit / settings - 1, false),
+            ] {
+                let mut forged = vec![0xFD];
+                forged.extend(announced.to_le_bytes());
+                forged.resize(bytes, 1);
+                let error = decode(&forged).unwrap_err();
+                let refused = matches!(error, DecodeError::LimitExceeded);
+                assert_eq!(refused, is_refused, "{bytes}, {announced}: {error}");
+            }
+        }
+    }
+
+    #[test]
     fn what_is_written_is_read() {
         with_head(|head| {
             let found = read_back(&written(head)).unwrap();
             assert_eq!(found.journal, *head.journal);
             assert_eq!((found.ledger, found.calibrator), (head.ledger.clone(), head.calibrator.clone()));
             assert_eq!(found.accumulator, head.accumulator);
+            assert!(found.powers == *head.powers && found.powers != AutoTable::default());
             let again = Collector::resume(found.collector);
             assert_eq!(again.view(), head.collector);
         });

@@ -232,17 +232,23 @@ impl Schedule {
             let of_pass = self.entries[next..].iter();
             sent = of_pass.take_while(|entry| (entry.channel, entry.pair) == stream).count() as u64;
         }
+        let usual = |stream: &Stream| self.usual.get(stream).map_or(1, |usual| usual.packets.max(1));
+        let pass: u64 = self.order.iter().map(usual).sum();
         let mut left = missing;
         while left > 0 && !self.order.is_empty() {
             let stream = self.order[at];
-            let usual = self.usual.get(&stream).map_or(1, |usual| usual.packets.max(1));
-            let packets = usual.saturating_sub(sent).min(left);
+            let packets = usual(&stream).saturating_sub(sent).min(left);
             if packets > 0 {
                 *filled.entry(stream).or_default() += packets;
             }
             left -= packets;
             sent = 0;
             at = (at + step) % self.order.len();
+            // Whole passes at once: a packet may claim any count.
+            for stream in self.order.iter().filter(|_| left >= pass) {
+                *filled.entry(*stream).or_default() += left / pass * usual(stream);
+            }
+            left %= pass;
         }
         filled
     }
@@ -324,6 +330,23 @@ mod tests {
                 .collect();
             assert_eq!(told, held, "{gap:?}");
         }
+    }
+
+    #[test]
+    fn a_gap_of_any_length_is_told_at_once() {
+        // As many whole passes as fit 2^46 packets, of 12 each, and four packets: one of each pair of channel 0, and the
+        // first of channel 1, pair by pair behind the six passes that came.
+        let entries = journal();
+        let last = entries.len() as u64;
+        let missing = ((1 << 46) - last - 5) / 12 * 12 + 4;
+        let far = JournalEntry { count: last + missing, start: MissionTime::from_seconds(1e9), ..entries[0] };
+        let far = JournalEntry { end: MissionTime::from_seconds(1e9 + 600.0), ..far };
+        let schedule = Schedule::learn([entries, vec![far]].concat());
+        let report = schedule.report(Kind::Visibilities, &(last..last + missing));
+        let packets: Vec<u64> = report.lost.iter().map(|lost| lost.packets).collect();
+        let passes = missing / 12;
+        let [one, three] = [passes + 1, 3 * passes];
+        assert_eq!(packets, [one, one, one, three + 1, three, three]);
     }
 
     #[test]

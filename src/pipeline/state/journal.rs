@@ -197,9 +197,11 @@ impl Journal {
         spans
     }
 
-    /// Whether visibilities with positions of a stretch of time are in the sums.
+    /// Whether visibilities with positions of a stretch of time are in the sums; daughters' own powers have none.
     pub(super) fn uses(&self, [from, to]: [MissionTime; 2]) -> bool {
-        let within = |line: &Line| line.accumulated > 0 && line.entry.start <= to && line.entry.end >= from;
+        let within = |Line { entry, accumulated, .. }: &Line| {
+            *accumulated > 0 && entry.pair.i != entry.pair.j && entry.start <= to && entry.end >= from
+        };
         self.visibilities.values().any(within)
     }
 }

@@ -1,7 +1,7 @@
 //! The ground stage from bytes to sums that remembers what it has done.
 
 use std::path::{Path, PathBuf};
-use std::sync::PoisonError;
+use std::sync::{Arc, PoisonError};
 
 use super::error::StateError;
 use super::file::{self, HeadView};
@@ -16,7 +16,7 @@ use crate::pipeline::config::Config;
 use crate::pipeline::ground::GroundOutcome;
 use crate::runtime::{Ledger, LedgerReport, Outlet, Stage, Units};
 
-/// Bytes that visibilities wait for those before them, if nothing else is said: a week of thirty channels.
+/// Bytes of visibilities that wait for their positions, if nothing else is said: a week of thirty channels.
 pub const WAIT_BYTES: u64 = 1 << 28;
 
 /// Windows whose positions are kept: more than two years of them.
@@ -42,7 +42,7 @@ impl Keeper {
     /// A keeper that goes on from the newest checkpoint in `folder`, or from nothing if there is none.
     ///
     /// A checkpoint is written whenever `checkpoint_every` visibilities have been taken, and at the end. A new state
-    /// lets packets wait for those before them until `wait_bytes` of them do.
+    /// lets visibilities wait for their positions until `wait_bytes` of them do.
     ///
     /// # Errors
     /// A folder that cannot be used or is in use; a state that was summed with other settings, or of which no
@@ -55,13 +55,14 @@ impl Keeper {
     ) -> Result<Self, StateError> {
         let mut folder = StateFolder::open(folder)?;
         let settings = settings_of(config)?;
+        let outcome = GroundOutcome::default();
         let read = |path: &Path| {
             file::read(path, |head, engines| {
                 compare(path, &head.settings, &settings)?;
                 let tally = Ledger::new();
-                let (calibrator, accumulator) = stages(config, &tally)?;
+                let (calibrator, accumulator) = stages(config, &tally, &outcome)?;
                 let accumulator = accumulator.resume(head.accumulator, engines)?;
-                let mut calibrator = calibrator.resume(head.calibrator);
+                let mut calibrator = calibrator.resume(head.calibrator, head.powers);
                 for entry in head.journal.entries() {
                     calibrator.has_used(entry.channel, entry.pair, entry.start);
                 }
@@ -74,12 +75,11 @@ impl Keeper {
             Some(found) => found,
             None => {
                 let tally = Ledger::new();
-                let (calibrator, accumulator) = stages(config, &tally)?;
+                let (calibrator, accumulator) = stages(config, &tally, &outcome)?;
                 let collector = Collector::new(wait_bytes);
                 (collector, calibrator, accumulator, Journal::default(), LedgerReport::default(), tally)
             }
         };
-        let outcome = GroundOutcome::default();
         outcome.ledger.post_report(&ledger);
         Ok(Self {
             folder,
@@ -134,7 +134,7 @@ impl Keeper {
         for (kind, line) in both {
             self.collector.uncount(kind, 1, u64::from(line.bytes));
         }
-        self.calibrator.absorb(part.calibrator.state());
+        self.calibrator.absorb(part.calibrator);
         self.accumulator.absorb(part.accumulator)?;
         self.outcome.ledger.post_report(&part.outcome.ledger.report());
         self.notes.extend(part.notes);
@@ -239,7 +239,7 @@ impl Keeper {
 
     /// Forgets all that is not in packets.
     pub(super) fn begin_anew(&mut self, config: &Config) -> Result<(), StateError> {
-        (self.calibrator, self.accumulator) = stages(config, &self.tally)?;
+        (self.calibrator, self.accumulator) = stages(config, &self.tally, &self.outcome)?;
         let _ = self.outcome.ledger.take();
         self.journal = Journal::default();
         Ok(())
@@ -253,6 +253,7 @@ impl Keeper {
             collector: self.collector.view(),
             calibrator: self.calibrator.state(),
             accumulator: self.accumulator.state(),
+            powers: self.calibrator.powers(),
             ledger: self.outcome.ledger.report(),
             journal: &self.journal,
         };
@@ -264,10 +265,15 @@ impl Keeper {
 }
 
 /// Calibration and sums that know nothing yet.
-fn stages(config: &Config, ledger: &Ledger) -> Result<(Calibrator, Accumulator), StateError> {
+fn stages(
+    config: &Config,
+    ledger: &Ledger,
+    outcome: &GroundOutcome,
+) -> Result<(Calibrator, Accumulator), StateError> {
     let calibration = config.calibration.build(Path::new(""))?;
     let calibrator = Calibrator::new(calibration, ledger.clone())
         .with_van_vleck(config.calibration.van_vleck()?)
+        .with_autos(Arc::clone(&outcome.autos))
         .with_segments(SEGMENTS_MAX);
     Ok((calibrator, Accumulator::new(config.map.clone(), ledger.clone())))
 }

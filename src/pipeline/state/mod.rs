@@ -8,21 +8,19 @@
 //! # Order
 //! Every packet is applied once. The description of the instrument comes first; until it has come, everything waits.
 //! Positions and the spacecraft's own counts are read as soon as they are there. A packet of visibilities goes into the
-//! sums at once if all visibilities that were sent before it are there, and positions over its whole time are known.
-//! Otherwise it waits, and those behind it: so gaps alone make packets wait, until what is missing comes, or until more
-//! than `wait_bytes` wait. Then the first goes on as it is, with those behind it up to the next gap; visibilities
-//! without positions are then flagged, for good.
+//! sums as soon as positions over its whole time are known; gaps make nothing wait. Until then it waits, or until more
+//! than `wait_bytes` do: then those that were sent first go on, and are flagged for want of positions, for good.
 //!
-//! Within that reach, doubles and disorder leave no trace: sums, journal and accounts are a function of the set of
-//! packets that have come, bit for bit, not of their order. A packet that comes later still is applied when it
-//! comes: the sums are exact and do not tell, the journal's order does. After a restart of the spacecraft's counts, the
-//! packets after it do not wait for those before it.
+//! Unless that happens, doubles and disorder leave no trace, however late: sums, journal and accounts are a function
+//! of the set of packets that have come, bit for bit, not of their order. The sums are exact, and snapshots on the way
+//! are no part of a state. What the spacecraft has sent twice under different counts is not covered: of such
+//! blocks the one that comes first is used.
 //!
 //! The maps at the end of a session hold what waits as well; the checkpoint keeps it waiting.
 //!
 //! # Merging
 //! Packets that one state has read and that still wait in the other are taken once; visibilities that both have summed
-//! are refused. Gaps that another state fills make packets wait no longer. The sums are the same in whichever order
+//! are refused. Packets whose positions another state knows wait no longer. The sums are the same in whichever order
 //! states are named.
 //!
 //! # Taking out again
@@ -41,7 +39,7 @@
 //! 8192 windows, more than two years, take 72 MB.
 //!
 //! # A checkpoint
-//! Magic `LNRSTA02`; length of the head (u64 LE); head (bincode); the channels' engines as they write
+//! Magic `LNRSTA03`; length of the head (u64 LE); head (bincode); the channels' engines as they write
 //! themselves; CRC-64/NVME of all that (u64 LE). It is written under another name, put on the disk and renamed; the
 //! one before is kept, and used, with a message, if the newest does not hold.
 

@@ -181,15 +181,19 @@ impl Keeper {
         let is_double = account.sampled > 0;
         let block = self.collector.read_again(&packet);
         if let Some(block) = block.filter(|_| !is_double) {
-            let placed = self.calibrator.place_again(block.clone())?;
             if line.accumulated > 0 {
-                if digest(&placed) != line.digest {
-                    found.refuse(&header, OTHER_POSITIONS);
-                    return Ok(());
-                }
-                let removed = self.accumulator.remove(&placed)?;
-                if removed.visibilities != u64::from(line.accumulated) {
-                    let (expected, found) = (line.accumulated, removed.visibilities);
+                let removed = if block.pair.i == block.pair.j {
+                    self.calibrator.take_out_powers(block.clone())?
+                } else {
+                    let placed = self.calibrator.place_again(block.clone())?;
+                    if digest(&placed) != line.digest {
+                        found.refuse(&header, OTHER_POSITIONS);
+                        return Ok(());
+                    }
+                    self.accumulator.remove(&placed)?.visibilities
+                };
+                if removed != u64::from(line.accumulated) {
+                    let (expected, found) = (line.accumulated, removed);
                     return Err(StateError::NotInSums { count: header.count, found, expected });
                 }
             }
