@@ -158,9 +158,9 @@ impl Sampler {
         made.into_iter().collect()
     }
 
-    /// Blocks in the order of time, channel, daughter.
+    /// Blocks in the order of time, daughter, channel: what a daughter sends of one time travels together, so that
+    /// threads do not wake each other for every block.
     fn hand_on(&self, made: Made, out: &mut Outlet<SpaceFrame>) {
-        let daughters = self.scene.array.satellites();
         let mut counts = SamplerCounts::default();
         let mut channels = Vec::with_capacity(made.len());
         for (blocks, repairs) in made {
@@ -176,10 +176,9 @@ impl Sampler {
         all.saturated += counts.saturated;
         all.repairs.absorb(counts.repairs);
         drop(all);
+        // Each channel's blocks come daughter by daughter.
         while channels.iter().any(|blocks| blocks.len() > 0) {
-            for blocks in &mut channels {
-                blocks.take(daughters).for_each(|block| out.push(SpaceFrame::Samples(block)));
-            }
+            out.push(SpaceFrame::Samples(channels.iter_mut().filter_map(Iterator::next).collect()));
         }
     }
 }
