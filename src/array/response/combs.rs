@@ -4,7 +4,7 @@
 use multiversion::multiversion;
 use num_complex::Complex64;
 
-use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused};
+use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused, total};
 use super::{Directions, PairGeometry, ResponseError};
 
 /// Equally spaced frequencies.
@@ -20,6 +20,9 @@ pub struct Comb {
 
 /// Pixels of one chunk whose fringes are summed in `f32` before the rest is summed in `f64`.
 const LANES: usize = 16;
+
+/// Frequencies for which fringes are read and written once.
+const TURNS: usize = 2;
 
 /// Visibilities (K sr) of a sky (K) at `directions`, `area_sr` each, at the frequencies of `comb`: those of one pair
 /// after another. The Moon hides what it hides at any frequency.
@@ -76,9 +79,10 @@ fn add_chunk(pair: &Prepared, comb: Comb, n: [&[f64]; 3], sky_k: &[f32], sums: &
             fringes.begin::<FMA>(pair, comb, [&at[0], &at[1], &at[2]], &sky);
         }
     }
-    for sum in sums {
-        let [re, im] = fringes.sum_and_turn::<FMA>();
-        *sum += Complex64::new(re, im);
+    for sums in sums.chunks_mut(TURNS) {
+        for (sum, [re, im]) in sums.iter_mut().zip(fringes.sum_and_turn::<FMA>()) {
+            *sum += Complex64::new(re, im);
+        }
     }
 }
 
@@ -128,21 +132,24 @@ impl Fringes {
         }
     }
 
+    /// Sums at this frequency and those that follow it.
     #[inline(always)]
-    fn sum_and_turn<const FMA: bool>(&mut self) -> [f64; 2] {
-        let mut lanes = [[0.0_f32; LANES]; 2];
+    fn sum_and_turn<const FMA: bool>(&mut self) -> [[f64; 2]; TURNS] {
+        let mut lanes = [[[0.0_f32; LANES]; 2]; TURNS];
         let parts = self.re.as_chunks_mut::<LANES>().0.iter_mut().zip(self.im.as_chunks_mut::<LANES>().0);
         let turns = self.turn_re.as_chunks::<LANES>().0.iter().zip(self.turn_im.as_chunks::<LANES>().0);
         for ((re, im), (turn_re, turn_im)) in parts.zip(turns) {
-            for k in 0..LANES {
-                lanes[0][k] += re[k];
-                lanes[1][k] += im[k];
-                let turned = fused::<FMA>(re[k], turn_re[k], -(im[k] * turn_im[k]));
-                im[k] = fused::<FMA>(re[k], turn_im[k], im[k] * turn_re[k]);
-                re[k] = turned;
+            for lanes in &mut lanes {
+                for k in 0..LANES {
+                    lanes[0][k] += re[k];
+                    lanes[1][k] += im[k];
+                    let turned = fused::<FMA>(re[k], turn_re[k], -(im[k] * turn_im[k]));
+                    im[k] = fused::<FMA>(re[k], turn_im[k], im[k] * turn_re[k]);
+                    re[k] = turned;
+                }
             }
         }
-        lanes.map(|lane| lane.iter().map(|&value| f64::from(value)).sum())
+        lanes.map(|[re, im]| [total(&re), total(&im)])
     }
 }
 

@@ -4,7 +4,7 @@ use multiversion::multiversion;
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused};
+use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused, total};
 use super::{Directions, PairGeometry, ResponseError};
 
 /// Pairs that one task takes over a stretch of the sky.
@@ -132,5 +132,5 @@ fn chunk<const FMA: bool>(pair: &Prepared, [x, y, z]: [&[f64; CHUNK]; 3], sky_k:
             lanes[2][k] += seen[k];
         }
     }
-    lanes.map(|lane| lane.iter().map(|&value| f64::from(value)).sum())
+    [total(&lanes[0]), total(&lanes[1]), total(&lanes[2])]
 }
