@@ -21,9 +21,6 @@ pub struct Comb {
 /// Pixels of one chunk whose fringes are summed in `f32` before the rest is summed in `f64`.
 const LANES: usize = 16;
 
-/// Frequencies for which fringes are read and written once.
-const TURNS: usize = 2;
-
 /// Visibilities (K sr) of a sky (K) at `directions`, `area_sr` each, at the frequencies of `comb`: those of one pair
 /// after another. The Moon hides what it hides at any frequency.
 ///
@@ -79,10 +76,9 @@ fn add_chunk(pair: &Prepared, comb: Comb, n: [&[f64]; 3], sky_k: &[f32], sums: &
             fringes.begin::<FMA>(pair, comb, [&at[0], &at[1], &at[2]], &sky);
         }
     }
-    for sums in sums.chunks_mut(TURNS) {
-        for (sum, [re, im]) in sums.iter_mut().zip(fringes.sum_and_turn::<FMA>()) {
-            *sum += Complex64::new(re, im);
-        }
+    for sum in sums {
+        let [re, im] = fringes.sum_and_turn::<FMA>();
+        *sum += Complex64::new(re, im);
     }
 }
 
@@ -114,7 +110,7 @@ impl Fringes {
             step[k] = fraction(turns * comb.step);
             let depth_i = dot64::<FMA>(pair.i_hat, x[k], y[k], z[k]) + pair.limb_i;
             let depth_j = dot64::<FMA>(pair.j_hat, x[k], y[k], z[k]) + pair.limb_j;
-            seen[k] = if depth_i.min(depth_j) >= 0.0 { sky_k[k] } else { 0.0 };
+            seen[k] = if (depth_i >= 0.0) & (depth_j >= 0.0) { sky_k[k] } else { 0.0 };
         }
         if let Some(dipole) = pair.dipole {
             for k in 0..CHUNK {
@@ -132,24 +128,21 @@ impl Fringes {
         }
     }
 
-    /// Sums at this frequency and those that follow it.
     #[inline(always)]
-    fn sum_and_turn<const FMA: bool>(&mut self) -> [[f64; 2]; TURNS] {
-        let mut lanes = [[[0.0_f32; LANES]; 2]; TURNS];
+    fn sum_and_turn<const FMA: bool>(&mut self) -> [f64; 2] {
+        let mut lanes = [[0.0_f32; LANES]; 2];
         let parts = self.re.as_chunks_mut::<LANES>().0.iter_mut().zip(self.im.as_chunks_mut::<LANES>().0);
         let turns = self.turn_re.as_chunks::<LANES>().0.iter().zip(self.turn_im.as_chunks::<LANES>().0);
         for ((re, im), (turn_re, turn_im)) in parts.zip(turns) {
-            for lanes in &mut lanes {
-                for k in 0..LANES {
-                    lanes[0][k] += re[k];
-                    lanes[1][k] += im[k];
-                    let turned = fused::<FMA>(re[k], turn_re[k], -(im[k] * turn_im[k]));
-                    im[k] = fused::<FMA>(re[k], turn_im[k], im[k] * turn_re[k]);
-                    re[k] = turned;
-                }
+            for k in 0..LANES {
+                lanes[0][k] += re[k];
+                lanes[1][k] += im[k];
+                let turned = fused::<FMA>(re[k], turn_re[k], -(im[k] * turn_im[k]));
+                im[k] = fused::<FMA>(re[k], turn_im[k], im[k] * turn_re[k]);
+                re[k] = turned;
             }
         }
-        lanes.map(|[re, im]| [total(&re), total(&im)])
+        [total(&lanes[0]), total(&lanes[1])]
     }
 }
 

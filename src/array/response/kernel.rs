@@ -68,9 +68,9 @@ pub(super) fn dot32<const FMA: bool>(a: [f32; 3], x: f32, y: f32, z: f32) -> f32
     fused::<FMA>(a[0], x, fused::<FMA>(a[1], y, a[2] * z))
 }
 
-/// Sum of 16 values in `f64`: four sums side by side, then those.
+/// Sum of values, a multiple of four, in `f64`: four sums side by side, then those.
 #[inline(always)]
-pub(super) fn total(lanes: &[f32; 16]) -> f64 {
+pub(super) fn total<const LANES: usize>(lanes: &[f32; LANES]) -> f64 {
     let mut four = [0.0_f64; 4];
     for values in lanes.as_chunks::<4>().0 {
         for (sum, value) in four.iter_mut().zip(values) {

@@ -114,7 +114,7 @@ fn chunk<const FMA: bool>(pair: &Prepared, [x, y, z]: [&[f64; CHUNK]; 3], sky_k:
         turns[k] = fraction(dot64::<FMA>(pair.u, x[k], y[k], z[k]));
         let depth_i = dot64::<FMA>(pair.i_hat, x[k], y[k], z[k]) + pair.limb_i;
         let depth_j = dot64::<FMA>(pair.j_hat, x[k], y[k], z[k]) + pair.limb_j;
-        seen[k] = if depth_i.min(depth_j) >= 0.0 { sky_k[k] } else { 0.0 };
+        seen[k] = if (depth_i >= 0.0) & (depth_j >= 0.0) { sky_k[k] } else { 0.0 };
     }
     if let Some(dipole) = pair.dipole {
         for k in 0..CHUNK {
