@@ -1,6 +1,6 @@
 //! From independent noise to noise of a given covariance, many frequencies at a time.
 
-use pulp::{Simd, WithSimd};
+use pulp::{Arch, Simd, WithSimd};
 
 use super::covariance::Covariances;
 
@@ -31,6 +31,34 @@ impl Tile {
     }
 }
 
+/// Work on the frequencies of a tile.
+pub(super) trait Tiled {
+    type Output;
+    /// Does it; `P` registers hold one side.
+    fn run<S: Simd, const P: usize>(self, simd: S) -> Self::Output;
+}
+
+/// Does `work` with the widest registers that there are.
+pub(super) fn on_tile<W: Tiled>(arch: Arch, work: W) -> W::Output {
+    arch.dispatch(Widest(work))
+}
+
+struct Widest<W>(W);
+
+impl<W: Tiled> WithSimd for Widest<W> {
+    type Output = W::Output;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> W::Output {
+        match S::F32_LANES {
+            16 => self.0.run::<S, 1>(simd),
+            8 => self.0.run::<S, 2>(simd),
+            4 => self.0.run::<S, 4>(simd),
+            _ => self.0.run::<S, HALF>(simd),
+        }
+    }
+}
+
 /// Puts the covariances of one group of bins and their mirrors into a tile.
 pub(super) struct Expand<'a> {
     pub(super) covariances: &'a Covariances,
@@ -39,33 +67,20 @@ pub(super) struct Expand<'a> {
     pub(super) tile: &'a mut Tile,
 }
 
-impl WithSimd for Expand<'_> {
+impl Tiled for Expand<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        match S::F32_LANES {
-            16 => self.run::<S, 1>(simd),
-            8 => self.run::<S, 2>(simd),
-            4 => self.run::<S, 4>(simd),
-            _ => self.run::<S, HALF>(simd),
-        }
-    }
-}
-
-impl Expand<'_> {
-    /// `P` registers hold one side.
-    #[inline(always)]
     fn run<S: Simd, const P: usize>(self, simd: S) {
         let Self { covariances, epoch, group, tile } = self;
-        for daughter in 0..covariances.daughters() {
+        let values = covariances.epoch(epoch);
+        for (daughter, power) in values[..covariances.daughters()].iter().enumerate() {
             let at = element(daughter, daughter);
-            tile.re[at] = [covariances.power(daughter, epoch); TILE];
-            tile.im[at] = [0.0; TILE];
+            (tile.re[at], tile.im[at]) = ([*power; TILE], [0.0; TILE]);
         }
         for series in covariances.pairs() {
             let at = element(series.pair.j.into(), series.pair.i.into());
-            let (re, im) = series.at(epoch);
+            let (re, im) = series.of(values);
             let (even_rows, odd_rows) = series.basis.group(group);
             let ((re_even, re_odd), (im_even, im_odd)) =
                 (re.split_at(even_rows.len()), im.split_at(even_rows.len()));
@@ -109,33 +124,18 @@ pub(super) struct Factor<'a> {
     pub(super) order: usize,
 }
 
-impl WithSimd for Factor<'_> {
+impl Tiled for Factor<'_> {
     type Output = bool;
 
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) -> bool {
-        match S::F32_LANES {
-            16 => self.run::<S, 1>(simd),
-            8 => self.run::<S, 2>(simd),
-            4 => self.run::<S, 4>(simd),
-            _ => self.run::<S, HALF>(simd),
-        }
-    }
-}
-
-impl Factor<'_> {
     #[inline(always)]
     fn run<S: Simd, const P: usize>(self, simd: S) -> bool {
         let Self { tile, order } = self;
         let mut least = simd.splat_f32s(0.0);
-        for side in 0..2 {
-            for j in 0..order {
-                let inverse = pivot::<S, P>(simd, tile, j, side);
-                for i in j + 1..order {
-                    let left = row::<S, P>(simd, tile, [i, j, side], inverse);
-                    for left in left {
-                        least = simd.min_f32s(least, left);
-                    }
+        for j in 0..order {
+            let inverse = pivot::<S, P>(simd, tile, j);
+            for i in j + 1..order {
+                for left in row::<S, P>(simd, tile, [i, j], inverse).as_flattened() {
+                    least = simd.min_f32s(least, *left);
                 }
             }
         }
@@ -143,39 +143,42 @@ impl Factor<'_> {
     }
 }
 
-/// One side of an element.
+/// An element at all frequencies, side by side. Both sides at a time keep more sums going than an addition takes
+/// cycles.
+type Lanes<S, const P: usize> = [[<S as Simd>::f32s; P]; 2];
+
 #[inline(always)]
-fn part<S: Simd, const P: usize>(lanes: &[f32; TILE], side: usize) -> [S::f32s; P] {
-    let lanes = S::as_simd_f32s(&lanes[side * HALF..][..HALF]).0;
-    std::array::from_fn(|p| lanes[p])
+fn lanes<S: Simd, const P: usize>(element: &[f32; TILE]) -> Lanes<S, P> {
+    let element = S::as_simd_f32s(element).0;
+    std::array::from_fn(|side| std::array::from_fn(|p| element[side * P + p]))
 }
 
 #[inline(always)]
-fn set<S: Simd, const P: usize>(lanes: &mut [f32; TILE], side: usize, values: [S::f32s; P]) {
-    let lanes = S::as_mut_simd_f32s(&mut lanes[side * HALF..][..HALF]).0;
-    lanes[..P].copy_from_slice(&values);
+fn set<S: Simd, const P: usize>(element: &mut [f32; TILE], values: Lanes<S, P>) {
+    S::as_mut_simd_f32s(element).0.copy_from_slice(values.as_flattened());
 }
 
 /// What a daughter has left of its power becomes its own amplitude; gives one over it. The imaginary part on the
 /// diagonal, which is none, keeps the power.
 #[inline(always)]
-fn pivot<S: Simd, const P: usize>(simd: S, tile: &mut Tile, j: usize, side: usize) -> [S::f32s; P] {
+fn pivot<S: Simd, const P: usize>(simd: S, tile: &mut Tile, j: usize) -> Lanes<S, P> {
     let at = element(j, j);
-    let (mut left, mut power) = (part::<S, P>(&tile.re[at], side), part::<S, P>(&tile.im[at], side));
+    let (mut left, mut power) = (lanes::<S, P>(&tile.re[at]), lanes::<S, P>(&tile.im[at]));
     if j == 0 {
         power = left;
     }
     let mut inverse = left;
-    for p in 0..P {
-        // No power at all is a daughter that hears nothing.
-        let least = simd.mul_f32s(simd.splat_f32s(PIVOT_MIN), power[p]);
-        let least = simd.max_f32s(least, simd.splat_f32s(f32::MIN_POSITIVE));
-        left[p] = simd.sqrt_f32s(simd.max_f32s(left[p], least));
-        inverse[p] = simd.div_f32s(simd.splat_f32s(1.0), left[p]);
-        power[p] = simd.splat_f32s(0.0);
+    for side in 0..2 {
+        for p in 0..P {
+            // No power at all is a daughter that hears nothing.
+            let least = simd.mul_f32s(simd.splat_f32s(PIVOT_MIN), power[side][p]);
+            let least = simd.max_f32s(least, simd.splat_f32s(f32::MIN_POSITIVE));
+            left[side][p] = simd.sqrt_f32s(simd.max_f32s(left[side][p], least));
+            inverse[side][p] = simd.div_f32s(simd.splat_f32s(1.0), left[side][p]);
+        }
     }
-    set::<S, P>(&mut tile.re[at], side, left);
-    set::<S, P>(&mut tile.im[at], side, power);
+    set::<S, P>(&mut tile.re[at], left);
+    tile.im[at] = [0.0; TILE];
     inverse
 }
 
@@ -184,35 +187,43 @@ fn pivot<S: Simd, const P: usize>(simd: S, tile: &mut Tile, j: usize, side: usiz
 fn row<S: Simd, const P: usize>(
     simd: S,
     tile: &mut Tile,
-    [i, j, side]: [usize; 3],
-    inverse: [S::f32s; P],
-) -> [S::f32s; P] {
+    [i, j]: [usize; 2],
+    inverse: Lanes<S, P>,
+) -> Lanes<S, P> {
     let (at, own) = (element(i, j), element(i, i));
-    let (mut re, mut im) = (part::<S, P>(&tile.re[at], side), part::<S, P>(&tile.im[at], side));
+    let (mut re, mut im) = (lanes::<S, P>(&tile.re[at]), lanes::<S, P>(&tile.im[at]));
     for k in 0..j {
         let (a, b) = (element(i, k), element(j, k));
-        let (a_re, a_im) = (part::<S, P>(&tile.re[a], side), part::<S, P>(&tile.im[a], side));
-        let (b_re, b_im) = (part::<S, P>(&tile.re[b], side), part::<S, P>(&tile.im[b], side));
-        for p in 0..P {
-            let (minus_re, minus_im) = (simd.neg_f32s(a_re[p]), simd.neg_f32s(a_im[p]));
-            re[p] = simd.mul_add_f32s(minus_re, b_re[p], simd.mul_add_f32s(minus_im, b_im[p], re[p]));
-            im[p] = simd.mul_add_f32s(minus_im, b_re[p], simd.mul_add_f32s(a_re[p], b_im[p], im[p]));
+        let (a_re, a_im) = (S::as_simd_f32s(&tile.re[a]).0, S::as_simd_f32s(&tile.im[a]).0);
+        let (b_re, b_im) = (S::as_simd_f32s(&tile.re[b]).0, S::as_simd_f32s(&tile.im[b]).0);
+        for side in 0..2 {
+            for p in 0..P {
+                let at = side * P + p;
+                let (re, im) = (&mut re[side][p], &mut im[side][p]);
+                *re = simd.mul_add_f32s(simd.neg_f32s(a_re[at]), b_re[at], *re);
+                *im = simd.mul_add_f32s(simd.neg_f32s(a_im[at]), b_re[at], *im);
+                *re = simd.mul_add_f32s(simd.neg_f32s(a_im[at]), b_im[at], *re);
+                *im = simd.mul_add_f32s(a_re[at], b_im[at], *im);
+            }
         }
     }
-    let mut left = part::<S, P>(&tile.re[own], side);
+    let mut left = lanes::<S, P>(&tile.re[own]);
     if j == 0 {
         // The power, for the pivot.
-        set::<S, P>(&mut tile.im[own], side, left);
+        set::<S, P>(&mut tile.im[own], left);
     }
-    for p in 0..P {
-        re[p] = simd.mul_f32s(re[p], inverse[p]);
-        im[p] = simd.mul_f32s(im[p], inverse[p]);
-        let asked = simd.mul_add_f32s(re[p], re[p], simd.mul_f32s(im[p], im[p]));
-        left[p] = simd.sub_f32s(left[p], asked);
+    for side in 0..2 {
+        for p in 0..P {
+            let (re, im) = (&mut re[side][p], &mut im[side][p]);
+            *re = simd.mul_f32s(*re, inverse[side][p]);
+            *im = simd.mul_f32s(*im, inverse[side][p]);
+            let asked = simd.mul_add_f32s(*re, *re, simd.mul_f32s(*im, *im));
+            left[side][p] = simd.sub_f32s(left[side][p], asked);
+        }
     }
-    set::<S, P>(&mut tile.re[at], side, re);
-    set::<S, P>(&mut tile.im[at], side, im);
-    set::<S, P>(&mut tile.re[own], side, left);
+    set::<S, P>(&mut tile.re[at], re);
+    set::<S, P>(&mut tile.im[at], im);
+    set::<S, P>(&mut tile.re[own], left);
     left
 }
 
@@ -225,42 +236,32 @@ pub(super) struct Colour<'a> {
     pub(super) x: &'a mut [[[f32; TILE]; 2]],
 }
 
-impl WithSimd for Colour<'_> {
+impl Tiled for Colour<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        match S::F32_LANES {
-            16 => self.run::<S, 1>(simd),
-            8 => self.run::<S, 2>(simd),
-            4 => self.run::<S, 4>(simd),
-            _ => self.run::<S, HALF>(simd),
-        }
-    }
-}
-
-impl Colour<'_> {
-    #[inline(always)]
     fn run<S: Simd, const P: usize>(self, simd: S) {
         let Self { tile, noise, stride, x } = self;
-        for side in 0..2 {
-            for (i, x) in x.iter_mut().enumerate() {
-                let [mut re, mut im] = [[simd.splat_f32s(0.0); P]; 2];
-                for j in 0..=i {
-                    let at = element(i, j);
-                    let (l_re, l_im) = (part::<S, P>(&tile.re[at], side), part::<S, P>(&tile.im[at], side));
-                    let z_re = part::<S, P>(&noise[0][j * stride], side);
-                    let z_im = part::<S, P>(&noise[1][j * stride], side);
+        for (i, x) in x.iter_mut().enumerate() {
+            let [mut re, mut im] = [[[simd.splat_f32s(0.0); P]; 2]; 2];
+            for j in 0..=i {
+                let at = element(i, j);
+                let (l_re, l_im) = (S::as_simd_f32s(&tile.re[at]).0, S::as_simd_f32s(&tile.im[at]).0);
+                let (z_re, z_im) =
+                    (S::as_simd_f32s(&noise[0][j * stride]).0, S::as_simd_f32s(&noise[1][j * stride]).0);
+                for side in 0..2 {
                     for p in 0..P {
-                        let minus = simd.neg_f32s(l_im[p]);
-                        re[p] = simd.mul_add_f32s(l_re[p], z_re[p], simd.mul_add_f32s(minus, z_im[p], re[p]));
-                        im[p] =
-                            simd.mul_add_f32s(l_re[p], z_im[p], simd.mul_add_f32s(l_im[p], z_re[p], im[p]));
+                        let at = side * P + p;
+                        let (re, im) = (&mut re[side][p], &mut im[side][p]);
+                        *re = simd.mul_add_f32s(l_re[at], z_re[at], *re);
+                        *im = simd.mul_add_f32s(l_re[at], z_im[at], *im);
+                        *re = simd.mul_add_f32s(simd.neg_f32s(l_im[at]), z_im[at], *re);
+                        *im = simd.mul_add_f32s(l_im[at], z_re[at], *im);
                     }
                 }
-                set::<S, P>(&mut x[0], side, re);
-                set::<S, P>(&mut x[1], side, im);
             }
+            set::<S, P>(&mut x[0], re);
+            set::<S, P>(&mut x[1], im);
         }
     }
 }
@@ -297,7 +298,7 @@ mod tests {
         let mut careful = tile.clone();
         let repairs = factor(&mut careful, ORDER);
         assert_eq!((repairs.changed, repairs.elements), (0, 320));
-        assert!(pulp::Arch::new().dispatch(Factor { tile: &mut tile, order: ORDER }));
+        assert!(on_tile(Arch::new(), Factor { tile: &mut tile, order: ORDER }));
         for (one, other) in tile.re.iter().chain(&tile.im).zip(careful.re.iter().chain(&careful.im)) {
             // Elements of up to 19; the two differ in rounding.
             assert!(one.iter().zip(other).all(|(a, b)| (a - b).abs() < 1e-3), "{one:?} {other:?}");
@@ -333,7 +334,8 @@ mod tests {
         let z_re = vec![[1.0; TILE]; ORDER];
         let z_im: Vec<[f32; TILE]> = (0..ORDER).map(|j| [j as f32; TILE]).collect();
         let mut x = vec![[[0.0; TILE]; 2]; ORDER];
-        pulp::Arch::new().dispatch(Colour { tile: &tile, noise: [&z_re, &z_im], stride: 1, x: &mut x });
+        let colour = Colour { tile: &tile, noise: [&z_re, &z_im], stride: 1, x: &mut x };
+        on_tile(Arch::new(), colour);
         for (i, x) in x.iter().enumerate() {
             for (t, (re, im)) in x[0].iter().zip(&x[1]).enumerate() {
                 let sum = |term: &dyn Fn(usize) -> usize| (0..=i).map(term).sum::<usize>() as f32;

@@ -9,10 +9,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use num_complex::Complex64;
 
-use super::nodes::{Basis, Interpolation, node, nodes_for};
+use super::epochs::{COLUMNS, EPOCHS, combine, time_matrix};
+use super::nodes::{Basis, node, nodes_for};
 use crate::array::Array;
 use crate::array::response::Comb;
-use crate::array::response::kernel::fused;
 use crate::frames::Channel;
 use crate::mother::{ModelError, PairPosition, Prediction, VisibilityModel};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
@@ -30,22 +30,20 @@ pub struct Epochs {
     pub count: usize,
 }
 
-/// Visibilities V_ji of one pair at each epoch, expanded over the channel.
+/// Where visibilities V_ji of one pair are, expanded over the channel.
 pub(super) struct PairSeries {
     pub(super) pair: Pair,
     /// The functions of frequency.
     pub(super) basis: Arc<Basis>,
-    /// Values from one epoch to the next: a multiple of `COLUMNS`.
-    stride: usize,
-    /// K sr; by epoch: coefficients of the real part, then of the imaginary part.
-    values: Vec<f32>,
+    /// Place of the first coefficient in an epoch.
+    at: usize,
 }
 
 impl PairSeries {
-    /// Coefficients of the real and of the imaginary part at one epoch.
-    pub(super) fn at(&self, epoch: usize) -> (&[f32], &[f32]) {
+    /// Coefficients of the real and of the imaginary part in what belongs to an epoch.
+    pub(super) fn of<'a>(&self, epoch: &'a [f32]) -> (&'a [f32], &'a [f32]) {
         let nodes = self.basis.nodes();
-        self.values[epoch * self.stride..][..2 * nodes].split_at(nodes)
+        epoch[self.at..][..2 * nodes].split_at(nodes)
     }
 }
 
@@ -53,10 +51,15 @@ impl PairSeries {
 ///
 /// Values are sharpened for the daughters' blending of epochs: with weights cos^2 the blend of two epochs
 /// `h` apart flattens a second derivative by (1/3 - 2/pi^2) h^2 / 2, which is taken off beforehand.
+#[derive(Default)]
 pub struct Covariances {
+    daughters: usize,
     series: Vec<PairSeries>,
-    /// Power of each daughter by epoch, receiver included, K sr.
-    powers: Vec<Vec<f32>>,
+    /// Values of an epoch, a multiple of `COLUMNS`.
+    stride: usize,
+    /// K sr; by epoch, as they are read: the power of each daughter, receiver included; of each pair, coefficients of the
+    /// real part, then of the imaginary part.
+    values: Vec<f32>,
 }
 
 /// Tables by what they are made for.
@@ -124,47 +127,86 @@ impl Covariances {
     /// # Errors
     /// [`ModelError`], for positions that the model does not cover.
     pub fn predict(model: &mut dyn VisibilityModel, request: &Request<'_>) -> Result<Self, ModelError> {
-        let daughters = request.array.satellites();
-        let plans: Vec<Plan> =
-            all_pairs(daughters).into_iter().map(|pair| Plan::new(request, pair)).collect();
-        let mut series = Vec::with_capacity(plans.len());
-        for plan in &plans {
-            series.push(plan.series(model, request)?);
+        let mut own = Self::default();
+        own.predict_again(model, request)?;
+        Ok(own)
+    }
+
+    /// As [`Covariances::predict`], in the memory of what was predicted before.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn predict_again(
+        &mut self,
+        model: &mut dyn VisibilityModel,
+        request: &Request<'_>,
+    ) -> Result<(), ModelError> {
+        self.daughters = request.array.satellites();
+        self.stride = self.daughters.next_multiple_of(COLUMNS);
+        let mut plans = Vec::new();
+        for pair in all_pairs(self.daughters) {
+            let plan = Plan::new(request, pair, self.stride);
+            self.stride += plan.width();
+            plans.push(plan);
         }
+        // All of it is written below.
+        self.values.resize(request.epochs.count.next_multiple_of(EPOCHS) * self.stride, 0.0);
+        self.predict_powers(model, request)?;
+        self.series.clear();
+        for plan in &plans {
+            let (basis, known) = plan.coefficients(model, request)?;
+            let matrix = request.tables.times(plan.instants, request.epochs.count);
+            combine(&matrix, &known, plan.width(), (&mut self.values[plan.at..], self.stride));
+            self.series.push(PairSeries { pair: plan.pair, basis, at: plan.at });
+        }
+        Ok(())
+    }
+
+    fn predict_powers(
+        &mut self,
+        model: &mut dyn VisibilityModel,
+        request: &Request<'_>,
+    ) -> Result<(), ModelError> {
         let steady = Plan::steady();
-        let mut positions = Vec::with_capacity(daughters * steady.instants);
-        for daughter in 0..daughters {
-            positions.extend(steady.instants_s(request.epochs).map(|t_s| {
-                // The plane of the orbit, which a dipole stands on, asks for two places: 1.5 m apart.
-                let place = |t_s| request.array.position_m(daughter, t_s);
-                PairPosition { r_i_m: place(t_s), r_j_m: place(t_s + 1e-3), span_rad: 0.0 }
+        let mut positions = Vec::with_capacity(self.daughters * steady.instants);
+        for t_s in steady.instants_s(request.epochs) {
+            // The plane of the orbit, which a dipole stands on, asks for two places: 1.5 m apart.
+            let place = |daughter, t_s| request.array.position_m(daughter, t_s);
+            positions.extend((0..self.daughters).map(|daughter| PairPosition {
+                r_i_m: place(daughter, t_s),
+                r_j_m: place(daughter, t_s + 1e-3),
+                span_rad: 0.0,
             }));
         }
         let mut predictions = vec![Prediction::default(); positions.len()];
         model.predict(&positions, &mut predictions)?;
+        let width = self.daughters.next_multiple_of(COLUMNS);
+        let mut known = vec![0.0; steady.instants * width];
+        for (known, found) in known.chunks_exact_mut(width).zip(predictions.chunks_exact(self.daughters)) {
+            for (known, found) in known.iter_mut().zip(found) {
+                *known = (found.zero_spacing_k_sr + request.receiver_noise_k_sr) as f32;
+            }
+        }
         let matrix = request.tables.times(steady.instants, request.epochs.count);
-        let powers = predictions.chunks_exact(steady.instants).map(|own| {
-            let own: Vec<f32> =
-                own.iter().map(|p| (p.zero_spacing_k_sr + request.receiver_noise_k_sr) as f32).collect();
-            matrix
-                .chunks_exact(steady.instants)
-                .map(|row| row.iter().zip(&own).map(|(a, b)| a * b).sum())
-                .collect()
-        });
-        let powers = powers.collect();
-        Ok(Self { series, powers })
+        combine(&matrix, &known, width, (&mut self.values, self.stride));
+        Ok(())
     }
 
     /// Number of daughters.
     #[must_use]
     pub fn daughters(&self) -> usize {
-        self.powers.len()
+        self.daughters
     }
 
     /// Power of a daughter, K sr.
     #[must_use]
     pub fn power(&self, daughter: usize, epoch: usize) -> f32 {
-        self.powers[daughter][epoch]
+        self.epoch(epoch)[daughter]
+    }
+
+    /// What belongs to an epoch: powers by daughter, and what series find.
+    pub(super) fn epoch(&self, epoch: usize) -> &[f32] {
+        &self.values[epoch * self.stride..][..self.stride]
     }
 
     /// All pairs.
@@ -179,10 +221,12 @@ struct Plan {
     instants: usize,
     /// Nodes over the channel.
     nodes: usize,
+    /// Place of its first coefficient in an epoch.
+    at: usize,
 }
 
 impl Plan {
-    fn new(request: &Request<'_>, pair: Pair) -> Self {
+    fn new(request: &Request<'_>, pair: Pair, at: usize) -> Self {
         let Epochs { start_s, step_s, count } = request.epochs;
         let half_s = 0.5 * step_s * (count + 1) as f64;
         let middle_s = start_s + half_s - step_s;
@@ -196,12 +240,18 @@ impl Plan {
             pair,
             instants: nodes_for(per_m * request.channel.frequency_hz * speed_m_s * half_s),
             nodes: nodes_for(per_m * length_m * 0.5 * request.channel.width_hz),
+            at,
         }
     }
 
     /// For powers, which change as the Moon's limb moves over the sky.
     fn steady() -> Self {
-        Self { pair: Pair::default(), instants: 6, nodes: 1 }
+        Self { pair: Pair::default(), instants: 6, nodes: 1, at: 0 }
+    }
+
+    /// Coefficients of both parts, with zeros up to the next multiple of `COLUMNS`.
+    fn width(&self) -> usize {
+        (2 * self.nodes).next_multiple_of(COLUMNS)
     }
 
     /// Nodes over the epochs and one step on either side, s.
@@ -211,12 +261,12 @@ impl Plan {
         (0..self.instants).map(move |k| middle_s + half_s * node(k, self.instants))
     }
 
-    /// Asks the model at the instants, and interpolates to the epochs.
-    fn series(
+    /// Asks the model at the instants: functions of frequency, and `width` coefficients an instant.
+    fn coefficients(
         &self,
         model: &mut dyn VisibilityModel,
         request: &Request<'_>,
-    ) -> Result<PairSeries, ModelError> {
+    ) -> Result<(Arc<Basis>, Vec<f32>), ModelError> {
         let place = |n: u8, t_s| request.array.position_m(n.into(), t_s);
         let position = |t_s| PairPosition {
             r_i_m: place(self.pair.i, t_s),
@@ -230,72 +280,15 @@ impl Plan {
         let mut found = vec![Complex64::ZERO; positions.len() * self.nodes];
         model.predict_comb(&positions, comb, &mut found)?;
         let basis = request.tables.basis(self.nodes);
-        let stride = (2 * self.nodes).next_multiple_of(COLUMNS);
-        let mut known = vec![0.0; self.instants * stride];
-        for (row, found) in known.chunks_exact_mut(stride).zip(found.chunks_exact(self.nodes)) {
+        let mut known = vec![0.0; self.instants * self.width()];
+        for (row, found) in known.chunks_exact_mut(self.width()).zip(found.chunks_exact(self.nodes)) {
             let (re, rest) = row.split_at_mut(self.nodes);
             let (im, _) = rest.split_at_mut(self.nodes);
             // Below the diagonal stands V_ji, the conjugate.
             basis.coefficients(|k| found[k].re, re);
             basis.coefficients(|k| -found[k].im, im);
         }
-        let matrix = request.tables.times(self.instants, request.epochs.count);
-        let mut values = vec![0.0; matrix.len() / self.instants * stride];
-        combine(&matrix, &known, stride, &mut values);
-        Ok(PairSeries { pair: self.pair, basis, stride, values })
-    }
-}
-
-/// Epochs and values that are interpolated together.
-const EPOCHS: usize = 4;
-const COLUMNS: usize = 8;
-
-/// Weights of the instants at each epoch, by epoch: interpolation, and sharpening for the blending of epochs. Zeros
-/// for what fills the last `EPOCHS`.
-fn time_matrix(instants: usize, count: usize) -> Vec<f32> {
-    // Variance of a density cos^2 of half width 1, halved.
-    let flattening = 0.5 * (1.0 / 3.0 - 2.0 / std::f64::consts::PI.powi(2));
-    let interpolation = Interpolation::new(instants);
-    let step = 2.0 / (count + 1) as f64;
-    let mut weights = vec![0.0; (count + 2) * instants];
-    for (k, row) in weights.chunks_exact_mut(instants).enumerate() {
-        interpolation.weights(-1.0 + step * k as f64, row);
-    }
-    let sharpened = |k: usize| {
-        let (before, here, after) = (weights[k - instants], weights[k], weights[k + instants]);
-        (here - flattening * (after - 2.0 * here + before)) as f32
-    };
-    let mut matrix: Vec<f32> = (instants..(count + 1) * instants).map(sharpened).collect();
-    matrix.resize(count.next_multiple_of(EPOCHS) * instants, 0.0);
-    matrix
-}
-
-/// `out = weights x rows`: rows of `stride`, as many of them as a row of `weights` has values.
-#[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn combine(weights: &[f32], rows: &[f32], stride: usize, out: &mut [f32]) {
-    const FMA: bool =
-        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
-    let count = rows.len() / stride;
-    for (out, weights) in out.chunks_exact_mut(EPOCHS * stride).zip(weights.chunks_exact(EPOCHS * count)) {
-        let (first, rest) = weights.split_at(count);
-        let (second, rest) = rest.split_at(count);
-        let (third, fourth) = rest.split_at(count);
-        for column in (0..stride).step_by(COLUMNS) {
-            let mut sums = [[0.0_f32; COLUMNS]; EPOCHS];
-            let own = first.iter().zip(second).zip(third.iter().zip(fourth));
-            for (row, ((a, b), (c, d))) in rows.chunks_exact(stride).zip(own) {
-                let Some(row) = row[column..].first_chunk::<COLUMNS>() else { continue };
-                for (k, value) in row.iter().enumerate() {
-                    sums[0][k] = fused::<FMA>(*a, *value, sums[0][k]);
-                    sums[1][k] = fused::<FMA>(*b, *value, sums[1][k]);
-                    sums[2][k] = fused::<FMA>(*c, *value, sums[2][k]);
-                    sums[3][k] = fused::<FMA>(*d, *value, sums[3][k]);
-                }
-            }
-            for (epoch, sums) in sums.iter().enumerate() {
-                out[epoch * stride + column..][..COLUMNS].copy_from_slice(sums);
-            }
-        }
+        Ok((basis, known))
     }
 }
 
@@ -343,7 +336,7 @@ mod tests {
             let t_s = from_s + step_s * epoch as f64;
             for series in found.pairs() {
                 let pair = series.pair;
-                let (re, im) = series.at(epoch);
+                let (re, im) = series.of(found.epoch(epoch));
                 for x in [-1.0, -0.3, 0.9] {
                     // V_ij again.
                     let value = Complex64::new(series.basis.value(re, x), -series.basis.value(im, x));

@@ -27,6 +27,11 @@ pub struct LinkCounts {
 }
 
 impl LinkCounts {
+    fn count_sent(&mut self, blocks: &[SampleBlock]) {
+        self.sent += blocks.len() as u64;
+        self.bits += blocks.iter().map(|block| block.samples.bits()).sum::<u64>();
+    }
+
     fn count_dropped(&mut self, samples: u64) {
         self.dropped += 1;
         self.dropped_samples += samples;
@@ -66,25 +71,34 @@ impl SampleLink {
         }
     }
 
-    fn take(&mut self, block: SampleBlock, out: &mut Outlet<SpaceFrame>) {
-        let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
-        let (bits, samples) = (block.samples.bits(), block.samples.len() as u64);
-        if self.rate_bits_per_s <= 0.0 {
-            counts.sent += 1;
-            counts.bits += bits;
-            drop(counts);
-            out.push(SpaceFrame::Samples(block));
-            return;
+    /// Takes blocks that came together; what they let leave leaves together.
+    fn take(&mut self, blocks: Vec<SampleBlock>, out: &mut Outlet<SpaceFrame>) {
+        let counts = Arc::clone(&self.counts);
+        let mut counts = counts.lock().unwrap_or_else(PoisonError::into_inner);
+        let sent = if self.rate_bits_per_s <= 0.0 {
+            blocks
+        } else {
+            let mut sent = Vec::new();
+            for block in blocks {
+                self.queue(block, &mut counts, &mut sent);
+            }
+            sent
+        };
+        counts.count_sent(&sent);
+        drop(counts);
+        if !sent.is_empty() {
+            out.push(SpaceFrame::Samples(sent));
         }
+    }
+
+    /// Puts a block into its daughter's buffer, after what leaves it by then.
+    fn queue(&mut self, block: SampleBlock, counts: &mut LinkCounts, sent: &mut Vec<SampleBlock>) {
+        let (bits, samples) = (block.samples.bits(), block.samples.len() as u64);
         let Some(buffer) = self.buffers.get_mut(usize::from(block.daughter)) else {
             counts.count_dropped(samples);
             return;
         };
-        for sent in buffer.work_until(block.time, self.rate_bits_per_s) {
-            counts.sent += 1;
-            counts.bits += sent.samples.bits();
-            out.push(SpaceFrame::Samples(sent));
-        }
+        buffer.work_until(block.time, self.rate_bits_per_s, sent);
         if self.policy == DropPolicy::Oldest {
             while buffer.bits + bits > self.capacity_bits
                 && let Some(samples) = buffer.drop_oldest()
@@ -103,12 +117,11 @@ impl SampleLink {
 }
 
 impl Buffer {
-    /// Blocks that leave by `time`.
-    fn work_until(&mut self, time: MissionTime, rate_bits_per_s: f64) -> Vec<SampleBlock> {
+    /// Adds the blocks that leave by `time` to `sent`.
+    fn work_until(&mut self, time: MissionTime, rate_bits_per_s: f64, sent: &mut Vec<SampleBlock>) {
         let since = self.now.replace(time).unwrap_or(time);
         let ticks = (time.0 - since.0).max(0);
         let mut budget = self.sent_bits + rate_bits_per_s * ticks as f64 / TICKS_PER_SECOND as f64;
-        let mut sent = Vec::new();
         while let Some(first) = self.waiting.front() {
             let bits = first.samples.bits();
             if bits as f64 > budget {
@@ -120,7 +133,6 @@ impl Buffer {
         }
         // An idle link saves nothing up.
         self.sent_bits = if self.waiting.is_empty() { 0.0 } else { budget };
-        sent
     }
 
     /// Samples of the block that was dropped.
@@ -139,7 +151,7 @@ impl Stage for SampleLink {
 
     fn step(&mut self, frame: SpaceFrame, out: &mut Outlet<SpaceFrame>) -> Result<(), Infallible> {
         match frame {
-            SpaceFrame::Samples(block) => self.take(block, out),
+            SpaceFrame::Samples(blocks) => self.take(blocks, out),
             SpaceFrame::WindowStart(_) => out.push(frame),
             SpaceFrame::WindowEnd(_) => {
                 self.finish(out)?;
@@ -153,10 +165,10 @@ impl Stage for SampleLink {
     fn finish(&mut self, out: &mut Outlet<SpaceFrame>) -> Result<(), Infallible> {
         let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
         for buffer in &mut self.buffers {
-            for block in std::mem::take(buffer).waiting {
-                counts.sent += 1;
-                counts.bits += block.samples.bits();
-                out.push(SpaceFrame::Samples(block));
+            let left: Vec<SampleBlock> = std::mem::take(buffer).waiting.into();
+            if !left.is_empty() {
+                counts.count_sent(&left);
+                out.push(SpaceFrame::Samples(left));
             }
         }
         Ok(())
@@ -197,15 +209,15 @@ mod tests {
         let mut link = SampleLink::new(&config, 1, Arc::clone(&counts));
         let mut out = Outlet::collect();
         for number in 0..12 {
-            link.step(SpaceFrame::Samples(block(number)), &mut out).unwrap();
+            link.step(SpaceFrame::Samples(vec![block(number)]), &mut out).unwrap();
         }
         link.finish(&mut out).unwrap();
-        let number = |frame: &SpaceFrame| match frame {
-            SpaceFrame::Samples(block) => block.number,
+        let numbers = |frame: SpaceFrame| match frame {
+            SpaceFrame::Samples(blocks) => blocks.into_iter().map(|block| block.number),
             other => panic!("{other:?}"),
         };
         let counts = *counts.lock().unwrap();
-        (out.items().iter().map(number).collect(), counts)
+        (out.into_vec().into_iter().flat_map(numbers).collect(), counts)
     }
 
     #[test]

@@ -10,6 +10,7 @@ mod colour;
 mod config;
 mod covariance;
 mod disturbances;
+mod epochs;
 mod link;
 mod nodes;
 mod normal;

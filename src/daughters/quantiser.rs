@@ -73,12 +73,16 @@ fn square(values: &[f32]) -> f64 {
 
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq", "x86_64+avx2", "aarch64+neon"))]
 fn encode(values: &[f32], step: f32, half: i32, codes: &mut [i8]) -> u32 {
+    // Numbers of 256 to 512 have 8 bits of whole numbers before 15 bits of the rest: their bits are the floor. A
+    // conversion asks for more than that, and is not made for many at a time.
+    const UP: f32 = 256.0;
+    const REST: u32 = 15;
     let (scale, limit) = (1.0 / step, half as f32);
     let mut beyond = 0_u32;
     for (code, value) in codes.iter_mut().zip(values) {
-        // In range before the conversion; a shift makes truncation a floor.
-        let level = (value * scale).clamp(-limit, limit - 0.5);
-        *code = ((level + limit) as i32 - half) as i8;
+        let level = (value * scale).max(-limit).min(limit - 0.5);
+        let whole = (level + (limit + UP)).to_bits() >> REST;
+        *code = (whole as u8).wrapping_sub(half as u8).cast_signed();
         beyond += u32::from(value.abs() * scale > limit);
     }
     beyond

@@ -113,7 +113,7 @@ fn shrink(
 
 #[cfg(test)]
 mod tests {
-    use super::super::colour::Factor;
+    use super::super::colour::{Factor, on_tile};
     use super::*;
 
     #[test]
@@ -123,7 +123,7 @@ mod tests {
         for t in 0..TILE {
             (tile.re[0][t], tile.re[2][t], tile.re[1][t], tile.im[1][t]) = (1.0, 1.0, 0.0, 1.01);
         }
-        assert!(!pulp::Arch::new().dispatch(Factor { tile: &mut tile.clone(), order: 2 }));
+        assert!(!on_tile(pulp::Arch::new(), Factor { tile: &mut tile.clone(), order: 2 }));
         let repairs = factor(&mut tile, 2);
         assert_eq!(repairs.changed, TILE as u64);
         assert!((repairs.change_max - 0.01).abs() < 1e-5, "{}", repairs.change_max);

@@ -55,7 +55,16 @@ pub struct Sampler {
     current: Option<Progress>,
     synthesis: Synthesis,
     tables: Tables,
+    /// Room to work in that no thread has at the moment.
+    spare: Mutex<Vec<Room>>,
     counts: Arc<Mutex<SamplerCounts>>,
+}
+
+/// Room to make the samples of a channel in.
+struct Room {
+    covariances: Covariances,
+    draft: Draft,
+    planes: Vec<Planes>,
 }
 
 /// Blocks of each channel in one stretch.
@@ -91,6 +100,7 @@ impl Sampler {
             current: None,
             synthesis: Synthesis::new(),
             tables: Tables::default(),
+            spare: Mutex::default(),
             counts,
         }
     }
@@ -158,9 +168,23 @@ impl Sampler {
         made.into_iter().collect()
     }
 
-    /// Blocks in the order of time, channel, daughter.
+    /// Room that is spare, or new; it goes back to `spare`. What is in it is of no use.
+    fn room(&self) -> Room {
+        let spare = self.spare.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        spare.unwrap_or_else(|| {
+            let (daughters, samples) = (self.scene.array.satellites(), self.config.block_samples);
+            let planes = || [vec![0.0; samples], vec![0.0; samples]];
+            Room {
+                covariances: Covariances::default(),
+                draft: self.synthesis.draft(daughters),
+                planes: std::iter::repeat_with(planes).take(daughters).collect(),
+            }
+        })
+    }
+
+    /// Blocks in the order of time, daughter, channel: what a daughter sends of one time travels together, so that
+    /// threads do not wake each other for every block.
     fn hand_on(&self, made: Made, out: &mut Outlet<SpaceFrame>) {
-        let daughters = self.scene.array.satellites();
         let mut counts = SamplerCounts::default();
         let mut channels = Vec::with_capacity(made.len());
         for (blocks, repairs) in made {
@@ -176,10 +200,9 @@ impl Sampler {
         all.saturated += counts.saturated;
         all.repairs.absorb(counts.repairs);
         drop(all);
+        // Each channel's blocks come daughter by daughter.
         while channels.iter().any(|blocks| blocks.len() > 0) {
-            for blocks in &mut channels {
-                blocks.take(daughters).for_each(|block| out.push(SpaceFrame::Samples(block)));
-            }
+            out.push(SpaceFrame::Samples(channels.iter_mut().filter_map(Iterator::next).collect()));
         }
     }
 }
@@ -214,17 +237,17 @@ impl ChannelWork<'_> {
             epochs,
             tables: &sampler.tables,
         };
-        let covariances = Covariances::predict(model, &request)?;
+        let mut room = sampler.room();
+        let Room { covariances, draft, planes } = &mut room;
+        covariances.predict_again(model, &request)?;
         let daughters = quantisers.len();
         let block_samples = sampler.config.block_samples;
-        let mut draft = sampler.synthesis.draft(daughters);
-        let mut planes = vec![[vec![0.0; block_samples], vec![0.0; block_samples]]; daughters];
         // The epoch before the first sample only leaves its second half behind.
-        let mut repairs = self.draw(&covariances, 0, &mut draft, (&mut planes, 0));
+        let mut repairs = self.draw(covariances, 0, draft, (planes, 0));
         let mut blocks = Vec::with_capacity(self.samples.div_ceil(block_samples) * daughters);
         for hop in 0..self.samples / HOP {
             let at = hop * HOP % block_samples;
-            repairs.absorb(self.draw(&covariances, hop + 1, &mut draft, (&mut planes, at)));
+            repairs.absorb(self.draw(covariances, hop + 1, draft, (planes, at)));
             let (length, made) = (at + HOP, (hop + 1) * HOP);
             if length == block_samples || made == self.samples {
                 for (daughter, ([re, im], quantiser)) in planes.iter_mut().zip(&mut *quantisers).enumerate() {
@@ -233,6 +256,7 @@ impl ChannelWork<'_> {
                 }
             }
         }
+        sampler.spare.lock().unwrap_or_else(PoisonError::into_inner).push(room);
         Ok((blocks, repairs))
     }
 

@@ -20,7 +20,7 @@ use rustfft::{Fft, FftPlanner};
 use multiversion::multiversion;
 use pulp::Arch;
 
-use super::colour::{Colour, Expand, Factor, HALF, TILE, Tile};
+use super::colour::{Colour, Expand, Factor, HALF, TILE, Tile, on_tile};
 use super::covariance::Covariances;
 use super::normal::{Bytes, CHUNK, fill_complex_normal};
 use super::repair::{Repairs, factor};
@@ -132,12 +132,8 @@ impl Synthesis {
         for group in 0..TILES {
             repairs.absorb(self.factor(covariances, epoch, group, draft));
             let Draft { tile, coloured, spectra, noise: [re, im], .. } = draft;
-            self.arch.dispatch(Colour {
-                tile,
-                noise: [&re[group..], &im[group..]],
-                stride: TILES,
-                x: coloured,
-            });
+            let noise = [&re[group..], &im[group..]];
+            on_tile(self.arch, Colour { tile, noise, stride: TILES, x: coloured });
             for (spectrum, coloured) in spectra.chunks_exact_mut(BINS).zip(coloured) {
                 spread(coloured, group, spectrum);
             }
@@ -156,11 +152,11 @@ impl Synthesis {
     /// The factor of the covariances of one group of bins.
     fn factor(&self, covariances: &Covariances, epoch: usize, group: usize, draft: &mut Draft) -> Repairs {
         let Draft { daughters, tile, .. } = draft;
-        self.arch.dispatch(Expand { covariances, epoch, group, tile });
-        if self.arch.dispatch(Factor { tile, order: *daughters }) {
+        on_tile(self.arch, Expand { covariances, epoch, group, tile });
+        if on_tile(self.arch, Factor { tile, order: *daughters }) {
             return Repairs::none(*daughters);
         }
-        self.arch.dispatch(Expand { covariances, epoch, group, tile });
+        on_tile(self.arch, Expand { covariances, epoch, group, tile });
         factor(tile, *daughters)
     }
 }

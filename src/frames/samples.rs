@@ -78,8 +78,8 @@ pub struct SampleBlock {
 pub enum SpaceFrame {
     /// A window begins; before its first block.
     WindowStart(ObservingWindow),
-    /// Samples of the window.
-    Samples(SampleBlock),
+    /// Samples of the window: blocks that travel together, any number of them and from anyone.
+    Samples(Vec<SampleBlock>),
     /// The window has ended; after its last block.
     WindowEnd(ObservingWindow),
 }

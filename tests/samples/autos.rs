@@ -5,12 +5,12 @@ use std::path::Path;
 
 use lunarray::array::ArrayConfig;
 use lunarray::calibration::VanVleck;
-use lunarray::frames::{Flags, SpaceFrame, VisibilityBlock};
+use lunarray::frames::{Flags, VisibilityBlock};
 use lunarray::mother::correlator::Division;
 use lunarray::sky::fits::{WriteOptions, write_map};
 use lunarray::sky::{Frame, SkyMap};
 
-use crate::craft::{Spacecraft, WIDTH_HZ, constant};
+use crate::craft::{Spacecraft, WIDTH_HZ, block_by_block, constant};
 
 fn is_auto(block: &&VisibilityBlock) -> bool {
     block.pair.i == block.pair.j
@@ -63,10 +63,11 @@ fn powers_are_those_of_sky_and_receiver_with_their_own_noise() {
 fn powers_with_missing_blocks_are_flagged_and_weigh_less() {
     let mut craft = Spacecraft::new(ArrayConfig::default(), vec![1e6], constant(0.0), 2.048);
     craft.auto_integration_s = 0.256;
-    let frames = craft.sample(32).0.into_iter().filter(|frame| {
-        !matches!(frame, SpaceFrame::Samples(block) if block.daughter == 3 && [4, 8, 9].contains(&block.number))
+    let frames = block_by_block(craft.sample(32).0, |block| {
+        let lost = block.daughter == 3 && [4, 8, 9].contains(&block.number);
+        (!lost).then_some(block)
     });
-    let blocks = craft.correlate(frames.collect()).0;
+    let blocks = craft.correlate(frames).0;
     let autos: Vec<&VisibilityBlock> = blocks.iter().filter(is_auto).collect();
     assert_eq!(autos.len(), 8);
     for block in autos {

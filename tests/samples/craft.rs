@@ -208,13 +208,36 @@ pub fn smeared(
 /// Samples of one daughter, one block after another.
 pub fn stream(frames: &[SpaceFrame], daughter: u8) -> Vec<Complex64> {
     let mut all = Vec::new();
-    for frame in frames {
-        if let SpaceFrame::Samples(SampleBlock { daughter: d, samples: Samples::Float { re, im }, .. }) =
-            frame
-            && *d == daughter
-        {
+    for block in blocks(frames).filter(|block| block.daughter == daughter) {
+        if let Samples::Float { re, im } = &block.samples {
             all.extend(re.iter().zip(im).map(|(&re, &im)| Complex64::new(re.into(), im.into())));
         }
     }
     all
+}
+
+/// All blocks of frames, in their order.
+pub fn blocks(frames: &[SpaceFrame]) -> impl Iterator<Item = &SampleBlock> {
+    frames.iter().flat_map(|frame| match frame {
+        SpaceFrame::Samples(blocks) => blocks.as_slice(),
+        _ => &[],
+    })
+}
+
+/// Frames of one block each, as `change` leaves them; `None` for a block that is lost.
+pub fn block_by_block(
+    frames: Vec<SpaceFrame>,
+    mut change: impl FnMut(SampleBlock) -> Option<SampleBlock>,
+) -> Vec<SpaceFrame> {
+    let mut out = Vec::new();
+    for frame in frames {
+        match frame {
+            SpaceFrame::Samples(blocks) => {
+                let blocks = blocks.into_iter().filter_map(&mut change);
+                out.extend(blocks.map(|block| SpaceFrame::Samples(vec![block])));
+            }
+            other => out.push(other),
+        }
+    }
+    out
 }

@@ -3,14 +3,14 @@
 use std::f64::consts::{PI, TAU};
 
 use lunarray::array::{Array, ArrayConfig, BreathingConfig, ObservingWindows};
-use lunarray::frames::{SampleBlock, Samples, SpaceFrame, VisibilityBlock};
+use lunarray::frames::{SampleBlock, Samples, VisibilityBlock};
 use lunarray::mother::correlator::Division;
 use lunarray::units::constants::SPEED_OF_LIGHT_M_S;
 use lunarray::units::vector::{Vec3, dot, sub, unit};
 use lunarray::units::{ChannelId, Pair, all_pairs};
 use num_complex::Complex64;
 
-use crate::craft::{Spacecraft, WIDTH_HZ, constant, point, stream};
+use crate::craft::{Spacecraft, WIDTH_HZ, block_by_block, constant, point, stream};
 
 /// An array that hardly moves and does not breathe, at its greatest extent.
 fn still() -> ArrayConfig {
@@ -178,22 +178,15 @@ fn weights_of_sub_bands_add_up_to_the_frames_that_arrived_whole() {
     let mut craft = Spacecraft::new(ArrayConfig::default(), vec![5e6], constant(0.0), 12.288);
     craft.division = Division { sub_bands: bands, delay_centre: Some(n_hat) };
     let mut lost = std::collections::HashSet::new();
-    let mut frames = Vec::new();
-    for frame in craft.sample(6).0 {
-        match frame {
-            SpaceFrame::Samples(SampleBlock { number, daughter, .. })
-                if (number * 8 + u64::from(daughter)) % 37 == 0 =>
-            {
-                lost.insert((daughter, number));
-            }
-            SpaceFrame::Samples(block) => {
-                let length = block.samples.len();
-                let samples = Samples::Float { re: vec![1.0; length], im: vec![0.0; length] };
-                frames.push(SpaceFrame::Samples(SampleBlock { samples, ..block }));
-            }
-            other => frames.push(other),
+    let frames = block_by_block(craft.sample(6).0, |block| {
+        if (block.number * 8 + u64::from(block.daughter)) % 37 == 0 {
+            lost.insert((block.daughter, block.number));
+            return None;
         }
-    }
+        let length = block.samples.len();
+        let samples = Samples::Float { re: vec![1.0; length], im: vec![0.0; length] };
+        Some(SampleBlock { samples, ..block })
+    });
     let blocks = craft.correlate(frames).0;
     // The first daughter is ahead of all: the others are read later, by whole samples below or above.
     let later =

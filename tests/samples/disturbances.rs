@@ -7,14 +7,14 @@ use lunarray::calibration::{
     AntennaGains, Calibration, ChannelGains, GainSolution, GainsFile, Interpolation,
 };
 use lunarray::daughters::Disturbances;
-use lunarray::frames::{PlacedVisibilities, SpaceFrame, VisibilityBlock};
+use lunarray::frames::{PlacedVisibilities, VisibilityBlock};
 use lunarray::mother::correlator::Division;
 use lunarray::units::constants::SPEED_OF_LIGHT_M_S;
 use lunarray::units::vector::{dot, sub};
 use lunarray::units::{ChannelId, all_pairs};
 use num_complex::Complex64;
 
-use crate::craft::{Spacecraft, WIDTH_HZ, constant, stream};
+use crate::craft::{Spacecraft, WIDTH_HZ, blocks, constant, stream};
 use crate::delays::expected;
 
 /// Pairs of time, value and weight of one pair and channel.
@@ -130,8 +130,7 @@ fn late_clocks_turn_each_frequency_by_its_own_phase() {
     craft.rule.duration_s_max = 0.25;
     craft.division = Division { sub_bands: bands, delay_centre: None };
     let frames = craft.sample(22).0;
-    for frame in &frames {
-        let SpaceFrame::Samples(block) = frame else { continue };
+    for block in blocks(&frames) {
         let n = usize::from(block.daughter);
         let expected_s = late_us[n] * 1e-6 + drift[n] * (block.time.seconds() - start_s);
         // Of two numbers of 1e-4 one is taken from the other.

@@ -6,7 +6,7 @@ use lunarray::units::constants::SPEED_OF_LIGHT_M_S;
 use lunarray::units::vector::{norm, sub};
 use lunarray::units::{ChannelId, all_pairs};
 
-use crate::craft::{Spacecraft, WIDTH_HZ, constant};
+use crate::craft::{Spacecraft, WIDTH_HZ, block_by_block, constant};
 
 #[test]
 fn no_baseline_moves_more_than_an_eighth_of_a_wavelength() {
@@ -54,15 +54,15 @@ fn weights_add_up_to_the_samples_that_arrived() {
     // Some blocks are lost, some come again, and some come too late.
     let (mut frames, mut late, mut arrived) = (Vec::new(), Vec::new(), std::collections::HashMap::new());
     let (mut lost, mut again) = (0, 0);
-    for frame in craft.sample(6).0 {
-        let SpaceFrame::Samples(block) = frame else {
+    for frame in block_by_block(craft.sample(6).0, |block| Some(ones(block))) {
+        let SpaceFrame::Samples(mut blocks) = frame else {
             if matches!(frame, SpaceFrame::WindowEnd(_)) {
-                frames.extend(late.drain(..).map(SpaceFrame::Samples));
+                frames.push(SpaceFrame::Samples(std::mem::take(&mut late)));
             }
             frames.push(frame);
             continue;
         };
-        let block = ones(block);
+        let block = blocks.pop().unwrap();
         let key = block.number * 16 + u64::from(block.channel.0) * 8 + u64::from(block.daughter);
         match key % 37 {
             0 => lost += 1,
@@ -71,9 +71,9 @@ fn weights_add_up_to_the_samples_that_arrived() {
                 arrived.insert((block.channel, block.daughter, block.number), block.samples.len() as u64);
                 if more == 2 {
                     again += 1;
-                    frames.push(SpaceFrame::Samples(block.clone()));
+                    frames.push(SpaceFrame::Samples(vec![block.clone()]));
                 }
-                frames.push(SpaceFrame::Samples(block));
+                frames.push(SpaceFrame::Samples(vec![block]));
             }
         }
     }

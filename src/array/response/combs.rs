@@ -4,7 +4,7 @@
 use multiversion::multiversion;
 use num_complex::Complex64;
 
-use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused};
+use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused, total};
 use super::{Directions, PairGeometry, ResponseError};
 
 /// Equally spaced frequencies.
@@ -110,7 +110,7 @@ impl Fringes {
             step[k] = fraction(turns * comb.step);
             let depth_i = dot64::<FMA>(pair.i_hat, x[k], y[k], z[k]) + pair.limb_i;
             let depth_j = dot64::<FMA>(pair.j_hat, x[k], y[k], z[k]) + pair.limb_j;
-            seen[k] = if depth_i.min(depth_j) >= 0.0 { sky_k[k] } else { 0.0 };
+            seen[k] = if (depth_i >= 0.0) & (depth_j >= 0.0) { sky_k[k] } else { 0.0 };
         }
         if let Some(dipole) = pair.dipole {
             for k in 0..CHUNK {
@@ -142,7 +142,7 @@ impl Fringes {
                 re[k] = turned;
             }
         }
-        lanes.map(|lane| lane.iter().map(|&value| f64::from(value)).sum())
+        [total(&lanes[0]), total(&lanes[1])]
     }
 }
 

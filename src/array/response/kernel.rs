@@ -68,6 +68,18 @@ pub(super) fn dot32<const FMA: bool>(a: [f32; 3], x: f32, y: f32, z: f32) -> f32
     fused::<FMA>(a[0], x, fused::<FMA>(a[1], y, a[2] * z))
 }
 
+/// Sum of values, a multiple of four, in `f64`: four sums side by side, then those.
+#[inline(always)]
+pub(super) fn total<const LANES: usize>(lanes: &[f32; LANES]) -> f64 {
+    let mut four = [0.0_f64; 4];
+    for values in lanes.as_chunks::<4>().0 {
+        for (sum, value) in four.iter_mut().zip(values) {
+            *sum += f64::from(*value);
+        }
+    }
+    (four[0] + four[1]) + (four[2] + four[3])
+}
+
 /// `turns` less the nearest whole number.
 ///
 /// Adding 1.5 2^52 leaves no bits for a fraction; exact for |turns| < 2^51, and no call for any target.

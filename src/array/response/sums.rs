@@ -4,7 +4,7 @@ use multiversion::multiversion;
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused};
+use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused, total};
 use super::{Directions, PairGeometry, ResponseError};
 
 /// Pairs that one task takes over a stretch of the sky.
@@ -114,7 +114,7 @@ fn chunk<const FMA: bool>(pair: &Prepared, [x, y, z]: [&[f64; CHUNK]; 3], sky_k:
         turns[k] = fraction(dot64::<FMA>(pair.u, x[k], y[k], z[k]));
         let depth_i = dot64::<FMA>(pair.i_hat, x[k], y[k], z[k]) + pair.limb_i;
         let depth_j = dot64::<FMA>(pair.j_hat, x[k], y[k], z[k]) + pair.limb_j;
-        seen[k] = if depth_i.min(depth_j) >= 0.0 { sky_k[k] } else { 0.0 };
+        seen[k] = if (depth_i >= 0.0) & (depth_j >= 0.0) { sky_k[k] } else { 0.0 };
     }
     if let Some(dipole) = pair.dipole {
         for k in 0..CHUNK {
@@ -132,5 +132,5 @@ fn chunk<const FMA: bool>(pair: &Prepared, [x, y, z]: [&[f64; CHUNK]; 3], sky_k:
             lanes[2][k] += seen[k];
         }
     }
-    lanes.map(|lane| lane.iter().map(|&value| f64::from(value)).sum())
+    [total(&lanes[0]), total(&lanes[1]), total(&lanes[2])]
 }

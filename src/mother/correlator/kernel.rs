@@ -65,30 +65,31 @@ impl Packed {
         blocks: impl Fn(usize) -> Option<&'a Samples>,
         first: usize,
     ) {
-        let mut planes = [[0.0; SLICE * LANES]; 2];
         let mut whole = true;
         let codes = &mut self.codes[daughter];
-        *codes = Codes::NONE;
         let range = first..first + SLICE;
         for lane in 0..LANES {
-            match blocks(lane) {
-                Some(Samples::Float { re, im }) => {
-                    let row = lane * SLICE..(lane + 1) * SLICE;
-                    planes[0][row.clone()].copy_from_slice(&re[range.clone()]);
-                    planes[1][row].copy_from_slice(&im[range.clone()]);
-                    whole = false;
-                }
-                Some(Samples::Codes { step, re, im, .. }) => {
-                    codes.parts[0][lane].copy_from_slice(&re[range.clone()]);
-                    codes.parts[1][lane].copy_from_slice(&im[range.clone()]);
-                    codes.steps[lane] = *step;
-                }
-                None => {}
+            let [re_codes, im_codes] = codes.parts.each_mut().map(|part| &mut part[lane]);
+            if let Some(Samples::Codes { step, re, im, .. }) = blocks(lane) {
+                re_codes.copy_from_slice(&re[range.clone()]);
+                im_codes.copy_from_slice(&im[range.clone()]);
+                codes.steps[lane] = *step;
+            } else {
+                (*re_codes, *im_codes, codes.steps[lane]) = ([0; SLICE], [0; SLICE], 0.0);
+                whole &= blocks(lane).is_none();
             }
         }
         if self.quantised && whole {
             self.levels.put(self.arch, daughter, codes);
             return;
+        }
+        let mut planes = [[0.0; SLICE * LANES]; 2];
+        for lane in 0..LANES {
+            if let Some(Samples::Float { re, im }) = blocks(lane) {
+                let row = lane * SLICE..(lane + 1) * SLICE;
+                planes[0][row.clone()].copy_from_slice(&re[range.clone()]);
+                planes[1][row].copy_from_slice(&im[range.clone()]);
+            }
         }
         if self.quantised {
             // From now on everything is a value; so is what came before in this slice.

@@ -368,15 +368,18 @@ impl Stage for Correlator {
                 self.finish(out)?;
                 self.begin(window, out);
             }
-            SpaceFrame::Samples(block) => {
+            SpaceFrame::Samples(blocks) => {
                 let Some(mut running) = self.running.take() else {
                     let mut counts = lock(&self.counts);
-                    counts.stray += 1;
-                    counts.stray_samples += block.samples.len() as u64;
+                    counts.stray += blocks.len() as u64;
+                    counts.stray_samples +=
+                        blocks.iter().map(|block| block.samples.len() as u64).sum::<u64>();
                     return Ok(());
                 };
-                for row in running.aligner.put(block) {
-                    self.take(&mut running, row, out);
+                for block in blocks {
+                    for row in running.aligner.put(block) {
+                        self.take(&mut running, row, out);
+                    }
                 }
                 self.running = Some(running);
             }

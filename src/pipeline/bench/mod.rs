@@ -16,7 +16,7 @@ use super::plan::Plan;
 use super::sampling::{SampleCounts, sample_stages};
 use super::{models, space};
 use crate::downlink::{Reception, Transmitter};
-use crate::frames::{GroundFrame, SpaceFrame};
+use crate::frames::{GroundFrame, Samples, SpaceFrame};
 use crate::mother::Fidelity;
 use crate::runtime::{Flow, Outlet, Report, Source, Stage};
 use crate::sky::SkyMap;
@@ -224,23 +224,27 @@ fn material(plan: &Plan, skies: &[SkyMap]) -> Result<Material, PipelineError> {
     let samples = source(sampler)?;
     let visibilities = never(stage(correlator, samples.clone()));
     let packets = stage(Transmitter::new(&plan.config.downlink)?, visibilities.clone())?;
-    let length = |frame: &SpaceFrame| match frame {
-        SpaceFrame::Samples(block) => (block.samples.len() as f64, block.samples.bits() as f64 / 8.0),
-        _ => (0.0, 0.0),
-    };
     let count = |frame: &GroundFrame| match frame {
         GroundFrame::Visibilities(block) => block.len() as f64,
         _ => 0.0,
     };
     Ok(Material {
-        sample_count: samples.iter().map(|frame| length(frame).0).sum(),
-        sample_bytes: samples.iter().map(|frame| length(frame).1).sum(),
+        sample_count: samples_of(&samples).map(|samples| samples.len() as f64).sum(),
+        sample_bytes: samples_of(&samples).map(|samples| samples.bits() as f64 / 8.0).sum(),
         visibility_count: visibilities.iter().map(count).sum(),
         packet_bytes: packets.iter().map(|packet| packet.len() as f64).sum(),
         samples,
         visibilities,
         packets,
     })
+}
+
+fn samples_of(frames: &[SpaceFrame]) -> impl Iterator<Item = &Samples> {
+    let blocks = frames.iter().flat_map(|frame| match frame {
+        SpaceFrame::Samples(blocks) => blocks.as_slice(),
+        _ => &[],
+    });
+    blocks.map(|block| &block.samples)
 }
 
 /// Seconds of one run of a stage alone.
