@@ -192,6 +192,7 @@ impl Calibrator {
         self.post_flagged(&flagged);
         let mut placed = PlacedVisibilities {
             channel: block.channel,
+            band: 0,
             frequency_hz: channel.frequency_hz,
             pair: block.pair,
             time_s: good.iter().map(|&k| block.middle_s(k)).collect(),
