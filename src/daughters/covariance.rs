@@ -14,7 +14,7 @@ use crate::array::Array;
 use crate::array::response::Comb;
 use crate::array::response::kernel::fused;
 use crate::frames::Channel;
-use crate::mother::{ModelError, PairPosition, Prediction, VisibilityModel};
+use crate::mother::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
 use crate::units::{Pair, all_pairs};
@@ -134,18 +134,17 @@ impl Covariances {
         let steady = Plan::steady();
         let mut positions = Vec::with_capacity(daughters * steady.instants);
         for daughter in 0..daughters {
-            positions.extend(steady.instants_s(request.epochs).map(|t_s| {
-                // The plane of the orbit, which a dipole stands on, asks for two places: 1.5 m apart.
-                let place = |t_s| request.array.position_m(daughter, t_s);
-                PairPosition { r_i_m: place(t_s), r_j_m: place(t_s + 1e-3), span_rad: 0.0 }
+            positions.extend(steady.instants_s(request.epochs).map(|t_s| DaughterPosition {
+                r_m: request.array.position_m(daughter, t_s),
+                normal_hat: request.array.orbit_normal_hat(t_s),
             }));
         }
-        let mut predictions = vec![Prediction::default(); positions.len()];
-        model.predict(&positions, &mut predictions)?;
+        let mut predictions = vec![0.0; positions.len()];
+        model.predict_powers(&positions, &mut predictions)?;
         let matrix = request.tables.times(steady.instants, request.epochs.count);
         let powers = predictions.chunks_exact(steady.instants).map(|own| {
             let own: Vec<f32> =
-                own.iter().map(|p| (p.zero_spacing_k_sr + request.receiver_noise_k_sr) as f32).collect();
+                own.iter().map(|power| (power + request.receiver_noise_k_sr) as f32).collect();
             matrix
                 .chunks_exact(steady.instants)
                 .map(|row| row.iter().zip(&own).map(|(a, b)| a * b).sum())
@@ -302,6 +301,7 @@ fn combine(weights: &[f32], rows: &[f32], stride: usize, out: &mut [f32]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mother::Prediction;
     use crate::units::vector::Vec3;
 
     /// A point source: V = exp(-2 pi i (nu / c) n . r_ij) at 20 MHz.
@@ -320,6 +320,11 @@ mod tests {
                 let visibility_k_sr = fringe(self.0, FREQUENCY_HZ, at.r_i_m, at.r_j_m);
                 *out = Prediction { visibility_k_sr, zero_spacing_k_sr: 1.0 };
             }
+            Ok(())
+        }
+
+        fn predict_powers(&mut self, _: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
+            out.fill(1.0);
             Ok(())
         }
     }

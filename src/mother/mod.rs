@@ -21,7 +21,7 @@ pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, Spa
 pub use direct::DirectSum;
 pub use harmonic::{HarmonicSetup, HarmonicSum};
 pub use integrator::{Integrator, MeasurementOptions, NoiseModel};
-pub use model::{ModelError, PairPosition, Prediction, VisibilityModel};
+pub use model::{DaughterPosition, ModelError, PairPosition, Prediction, VisibilityModel};
 pub use observer::Observer;
 pub use schedule::{Integration, Schedule};
 pub use store::{PacedLink, Store, VISIBILITY_BYTES};
