@@ -92,3 +92,26 @@ fn a_map_of_samples_is_the_map_of_visibilities_within_its_noise() {
         assert!((0.7..1.3).contains(&(own / noise)), "{bands}: {own} {noise}");
     }
 }
+
+#[test]
+fn the_harmonic_model_is_refused_for_samples_with_the_way_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let pipeline = folder.path().join("samples.toml");
+    std::fs::write(&pipeline, "name = \"refused\"\n[spacecraft]\nfidelity = \"samples\"\n").unwrap();
+    for (set, refused) in [
+        ("spacecraft.model=harmonic", true),
+        ("spacecraft.smear_integrations=true", true),
+        ("spacecraft.model=direct", false),
+        ("spacecraft.model=auto", false),
+    ] {
+        let mut command = assert_cmd::Command::cargo_bin("lunarray").unwrap();
+        let short = ["--set", "spacecraft.duration_s=1e4", "--set", "sky.nside=4", "--set", "map.nside=1"];
+        command.args(["check", pipeline.to_str().unwrap(), "--set", set]).args(short);
+        let done = command.output().unwrap();
+        let said = String::from_utf8_lossy(&done.stderr).replace('\n', " ");
+        assert_eq!(done.status.success(), !refused, "{set}: {said}");
+        let message = "spacecraft.fidelity = \"samples\" takes direct sums of instants: expected spacecraft.model = \
+                       \"auto\" or \"direct\", and spacecraft.smear_integrations = false";
+        assert_eq!(said.contains(message), refused, "{set}: {said}");
+    }
+}
