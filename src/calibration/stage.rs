@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use num_complex::Complex64;
 
-use super::{Calibration, CalibrationError, VanVleck};
+use super::{Calibration, CalibrationError, Identity, VanVleck};
 use crate::array::{Ephemeris, FlaggedCounts};
 use crate::frames::{
     AutoPower, Channel, EphemerisSegment, GroundFrame, Housekeeping, Instrument, PlacedFrame,
@@ -185,7 +185,12 @@ impl Calibrator {
     }
 
     /// Calibrates and keeps the powers of one daughter.
-    fn autos(&mut self, block: &VisibilityBlock, channel: Channel) -> Result<(), CalibrationError> {
+    fn autos(
+        &self,
+        block: &VisibilityBlock,
+        channel: Channel,
+        calibration: &mut dyn Calibration,
+    ) -> Result<(), CalibrationError> {
         let good: Vec<usize> = (0..block.len()).filter(|&k| block.flags[k].is_good()).collect();
         let mut flagged = FlaggedCounts::default();
         block.flags.iter().for_each(|&flags| flagged.add(flags));
@@ -201,7 +206,7 @@ impl Calibrator {
             value_k_sr: good.iter().map(|&k| Complex64::new(block.value_k_sr[k].re.into(), 0.0)).collect(),
             weight: good.iter().map(|&k| f64::from(block.weight[k])).collect(),
         };
-        let calibrated = self.calibration.apply(&mut placed)?;
+        let calibrated = calibration.apply(&mut placed)?;
         for (reason, count) in calibrated.removed() {
             self.ledger.flagged(reason, count as u64);
         }
@@ -246,16 +251,26 @@ impl Calibrator {
     /// Places and calibrates a block; `None` for want of an instrument, and of a daughter's own powers.
     fn place(&mut self, mut block: VisibilityBlock) -> Result<Option<PlacedVisibilities>, CalibrationError> {
         let count = block.len() as u64;
-        let channel = self.instrument.as_ref().and_then(|i| i.channels.get(usize::from(block.channel.0)));
-        let Some(&channel) = channel else {
+        let instrument = self.instrument.as_ref();
+        let channel = instrument.and_then(|i| i.channel_of(block.channel, block.pair));
+        let is_spectrum = instrument.is_some_and(|i| i.is_spectrum(block.pair));
+        let Some(channel) = channel else {
             self.ledger.flagged("no instrument description", count);
             return Ok(None);
         };
+        if is_spectrum {
+            // Neither quantised with the samples nor one of the antennas whose gains are known.
+            self.autos(&block, channel, &mut Identity)?;
+            return Ok(None);
+        }
         if let Some(van_vleck) = &self.van_vleck {
             van_vleck.apply(&mut block, channel.width_hz);
         }
         if block.pair.i == block.pair.j {
-            self.autos(&block, channel)?;
+            let mut calibration = std::mem::replace(&mut self.calibration, Box::new(Identity));
+            let kept = self.autos(&block, channel, calibration.as_mut());
+            self.calibration = calibration;
+            kept?;
             return Ok(None);
         }
         let (mut placed, placing) = self.ephemeris.place(&block, channel.frequency_hz);

@@ -105,6 +105,7 @@ mod tests {
             response: AntennaResponse::Isotropic,
             seed: 0,
             configuration_hash: 0,
+            spectrometer: None,
         }
     }
 

@@ -144,6 +144,7 @@ impl Spacecraft {
                 response: AntennaResponse::Isotropic,
                 seed: 0,
                 configuration_hash: 0,
+                spectrometer: None,
             },
             schedules: channels.iter().map(schedule).collect(),
             division: self.division,

@@ -16,7 +16,7 @@ use crate::calibration::CalibratorState;
 use crate::downlink::{CollectorState, CollectorView};
 use crate::runtime::LedgerReport;
 
-const MAGIC: &[u8; 8] = b"LNRSTA02";
+const MAGIC: &[u8; 8] = b"LNRSTA03";
 /// Bytes of magic, length of the head, and checksum.
 const FIXED_BYTES: u64 = 24;
 
@@ -209,6 +209,7 @@ mod tests {
             response: AntennaResponse::Isotropic,
             seed: 7,
             configuration_hash: 1,
+            spectrometer: None,
         };
         let frames = [
             GroundFrame::Instrument(instrument.clone()),

@@ -41,7 +41,7 @@
 //! 8192 windows, more than two years, take 72 MB.
 //!
 //! # A checkpoint
-//! Magic `LNRSTA02`; length of the head (u64 LE); head (bincode); the channels' engines as they write
+//! Magic `LNRSTA03`; length of the head (u64 LE); head (bincode); the channels' engines as they write
 //! themselves; CRC-64/NVME of all that (u64 LE). It is written under another name, put on the disk and renamed; the
 //! one before is kept, and used, with a message, if the newest does not hold.
 
