@@ -37,6 +37,7 @@ fn instrument() -> Instrument {
         response: AntennaResponse::Isotropic,
         seed: 0,
         configuration_hash: 0,
+        spectrometer: None,
     }
 }
 

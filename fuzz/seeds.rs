@@ -64,6 +64,7 @@ fn mission() -> Vec<GroundFrame> {
         response: AntennaResponse::Isotropic,
         seed: 1,
         configuration_hash: 2,
+        spectrometer: None,
     })];
     for pass in 0..2 {
         let start = MissionTime(8_000_000_000 * pass);

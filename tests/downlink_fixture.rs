@@ -25,6 +25,7 @@ fn sent() -> Vec<GroundFrame> {
             response: AntennaResponse::DipoleNormal,
             seed: 11,
             configuration_hash: 12,
+            spectrometer: None,
         }),
         GroundFrame::Ephemeris(EphemerisSegment {
             start: MissionTime(-1_000_000),

@@ -36,6 +36,7 @@ fuzz_target!(|data: &[u8]| {
         response: AntennaResponse::Isotropic,
         seed: 1,
         configuration_hash: 2,
+        spectrometer: None,
     });
     let mut packetizer = Packetizer::new(&Default::default()).expect("default");
     packetizer.encode(&instrument, &mut stream).expect("sound");

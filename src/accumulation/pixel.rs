@@ -183,12 +183,26 @@ impl PixelEngine {
         &self.setup
     }
 
+    fn pair(&self, r_i_m: Vec3, r_j_m: Vec3) -> PairGeometry {
+        PairGeometry {
+            r_i_m,
+            r_j_m,
+            frequency_hz: self.setup.frequency_hz,
+            moon_radius_m: self.setup.moon_radius_m,
+            response: self.setup.response,
+        }
+    }
+
     /// What is summed of a visibility, or why it is not.
     fn place(&self, placed: &PlacedVisibilities, k: usize) -> Result<(Pending, Totals), Refusal> {
         let (r_i_m, r_j_m, value, weight) =
             (placed.r_i_m[k], placed.r_j_m[k], placed.value_k_sr[k], placed.weight[k]);
         if [r_i_m, r_j_m].into_iter().any(|r_m| !norm(r_m).is_normal()) {
             return Err(Refusal::Geometry(GeometryRefusal::NotFinite));
+        }
+        let dipoles = self.setup.response == AntennaResponse::DipoleNormal;
+        if dipoles && self.pair(r_i_m, r_j_m).orbit_normal().is_none() {
+            return Err(Refusal::Geometry(GeometryRefusal::Degenerate));
         }
         self.scale.check(value, weight, self.setup.weight_max)?;
         let root = weight.sqrt();
@@ -293,21 +307,18 @@ impl NormalEngine for PixelEngine {
         }
         let (pixels, columns) = (self.rows.pixels(), 2 * block.len());
         let stride = pixels + PADDING;
-        let pair = |visibility: &Pending| PairGeometry {
-            r_i_m: visibility.r_i_m,
-            r_j_m: visibility.r_j_m,
-            frequency_hz: self.setup.frequency_hz,
-            moon_radius_m: self.setup.moon_radius_m,
-            response: self.setup.response,
-        };
-        block.iter().for_each(|visibility| self.rows.prepare(&pair(visibility)));
+        let pairs: Vec<PairGeometry> =
+            block.iter().map(|visibility| self.pair(visibility.r_i_m, visibility.r_j_m)).collect();
+        pairs.iter().for_each(|pair| self.rows.prepare(pair));
         let mut a = vec![0.0_f64; columns * stride];
-        a.par_chunks_exact_mut(2 * stride).zip(&block).for_each(|(rows, visibility)| {
-            let (re, im) = rows.split_at_mut(stride);
-            let factor = FACTORS * visibility.root / self.scale.root;
-            self.rows.fill(&pair(visibility), factor, &mut re[..pixels], &mut im[..pixels]);
-            round_factors(rows);
-        });
+        a.par_chunks_exact_mut(2 * stride).zip(block.par_iter().zip(&pairs)).for_each(
+            |(rows, (visibility, pair))| {
+                let (re, im) = rows.split_at_mut(stride);
+                let factor = FACTORS * visibility.root / self.scale.root;
+                self.rows.fill(pair, factor, &mut re[..pixels], &mut im[..pixels]);
+                round_factors(rows);
+            },
+        );
         let sign = self.direction.sign();
         self.sums.add_sides(&a, stride, &block, sign);
         let panels = Panels::new(Columns { values: &a, columns, stride }, pixels, sign);

@@ -374,6 +374,7 @@ fn within(placed: &PlacedVisibilities, baseline_m_max: f64) -> PlacedVisibilitie
     }
     PlacedVisibilities {
         channel: placed.channel,
+        band: placed.band,
         frequency_hz: placed.frequency_hz,
         pair: placed.pair,
         time_s: pick(&placed.time_s, &kept),

@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use super::config::{ArrayConfig, ArrayError, NodeMotion};
 use super::formation::Formation;
 use crate::units::constants::SIDEREAL_MONTH_S;
-use crate::units::vector::{Vec3, dot};
+use crate::units::vector::{Vec3, add, cross, dot, scale};
 
 /// Position and velocity of one daughter.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -123,6 +123,23 @@ impl Array {
                 radius * phase_rate * along[k] + self.node_rate_rad_s * around[k]
             }),
         }
+    }
+
+    /// Position of a satellite that trails daughter 1 by an arc of so many metres on the same circle, m.
+    #[must_use]
+    pub fn trailing_m(&self, arc_m: f64, t_s: f64) -> Vec3 {
+        let ahead_m = self.position_m(0, t_s);
+        let (sin, cos) = ((self.formation.arc_m(0, t_s).0 - arc_m) / self.orbit_radius_m).sin_cos();
+        let along_m = cross(self.orbit_normal_hat(t_s), ahead_m);
+        add(scale(cos, ahead_m), scale(sin, along_m))
+    }
+
+    /// Normal of the plane in which the daughters are.
+    #[must_use]
+    pub fn orbit_normal_hat(&self, t_s: f64) -> Vec3 {
+        let (sin_o, cos_o) = (self.node_rad + self.node_rate_rad_s * t_s).sin_cos();
+        let (sin_i, cos_i) = self.inclination_rad.sin_cos();
+        [sin_i * sin_o, -sin_i * cos_o, cos_i]
     }
 
     /// Position of daughter `n` (from 0), m.

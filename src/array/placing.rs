@@ -67,6 +67,7 @@ impl Ephemeris {
     pub fn place(&self, block: &VisibilityBlock, frequency_hz: f64) -> (PlacedVisibilities, PlacingCounts) {
         let mut out = PlacedVisibilities {
             channel: block.channel,
+            band: 0,
             frequency_hz,
             pair: block.pair,
             time_s: Vec::with_capacity(block.len()),

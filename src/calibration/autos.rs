@@ -78,7 +78,7 @@ impl AutoTable {
     #[must_use]
     pub fn list(&self, instrument: &Instrument) -> Vec<AutoPower> {
         let power = |(&(channel, daughter, half_ticks), &[power_k_sr, sigma_k_sr]): (&Key, &Power)| {
-            let channel = instrument.channels.get(usize::from(channel.0))?;
+            let channel = instrument.channel_of(channel, Pair { i: daughter, j: daughter })?;
             Some(AutoPower {
                 daughter,
                 frequency_hz: channel.frequency_hz,
@@ -149,6 +149,7 @@ mod tests {
             response: AntennaResponse::Isotropic,
             seed: 7,
             configuration_hash: 1,
+            spectrometer: None,
         };
         let power = |daughter, time_s, power_k_sr| AutoPower {
             daughter,

@@ -216,6 +216,7 @@ impl Calibrator {
         self.post_flagged(&flagged);
         let mut placed = PlacedVisibilities {
             channel: block.channel,
+            band: 0,
             frequency_hz: channel.frequency_hz,
             pair: block.pair,
             time_s: good.iter().map(|&k| block.middle_s(k)).collect(),
@@ -224,7 +225,10 @@ impl Calibrator {
             value_k_sr: good.iter().map(|&k| Complex64::new(block.value_k_sr[k].re.into(), 0.0)).collect(),
             weight: good.iter().map(|&k| f64::from(block.weight[k])).collect(),
         };
-        self.calibrate(&mut placed)?;
+        // A spectrometer is none of the antennas whose gains are known.
+        if !self.is_spectrum(block.pair) {
+            self.calibrate(&mut placed)?;
+        }
         // Sub-bands are not brought together here.
         placed.channel = block.channel;
         Ok(Some(placed))
@@ -264,14 +268,21 @@ impl Calibrator {
         Ok(())
     }
 
+    fn is_spectrum(&self, pair: Pair) -> bool {
+        self.instrument.as_ref().is_some_and(|instrument| instrument.is_spectrum(pair))
+    }
+
     /// Takes out of a block what its quantiser did; its channel, if there is an instrument that has it.
     fn prepare(&self, block: &mut VisibilityBlock) -> Option<Channel> {
-        let channel = self.instrument.as_ref().and_then(|i| i.channels.get(usize::from(block.channel.0)));
-        let Some(&channel) = channel else {
+        let channel = self.instrument.as_ref().and_then(|i| i.channel_of(block.channel, block.pair));
+        let Some(channel) = channel else {
             self.ledger.flagged("no instrument description", block.len() as u64);
             return None;
         };
-        if let Some(van_vleck) = &self.van_vleck {
+        // A spectrum is not quantised with the samples.
+        if let Some(van_vleck) = &self.van_vleck
+            && !self.is_spectrum(block.pair)
+        {
             van_vleck.apply(block, channel.width_hz);
         }
         Some(channel)

@@ -65,6 +65,7 @@ impl Calibration for SubBands {
         for (r_i_m, r_j_m) in block.r_i_m.iter_mut().zip(&mut block.r_j_m) {
             (*r_i_m, *r_j_m) = stretched(*r_i_m, *r_j_m, factor);
         }
+        block.band = block.channel.0 % self.count as u16;
         block.channel = ChannelId(index as u16);
         block.frequency_hz = channel.frequency_hz;
         Ok(report)
@@ -104,6 +105,7 @@ mod tests {
             response: AntennaResponse::Isotropic,
             seed: 0,
             configuration_hash: 0,
+            spectrometer: None,
         }
     }
 
@@ -124,6 +126,7 @@ mod tests {
         for (channel, frequency_hz) in [(2, 1.9e6), (3, 2.1e6)] {
             let mut block = PlacedVisibilities {
                 channel: ChannelId(channel),
+                band: 0,
                 frequency_hz,
                 pair: Pair { i: 0, j: 1 },
                 time_s: vec![0.0],
@@ -134,6 +137,7 @@ mod tests {
             };
             assert_eq!(bands.apply(&mut block).unwrap().kept, 1);
             assert_eq!((block.channel, block.frequency_hz), (ChannelId(1), whole.channels[1].frequency_hz));
+            assert_eq!(block.band, channel - 2);
             // Any direction has the same phase; rounding of 2e6 m leaves some 1e-9 m.
             for n_hat in [[1.0, 0.0, 0.0], [0.0, 0.6, -0.8], [0.6, 0.48, 0.64]] {
                 let path_m = |r_i_m, r_j_m| dot(n_hat, sub(r_i_m, r_j_m));

@@ -17,7 +17,7 @@ use crate::sky::{Frame, GENERATED_NSIDE_MAX, SkyMap};
 /// in K and ecliptic coordinates. The same seed gives the same sky at every frequency and nside.
 #[derive(Debug, Args)]
 pub(super) struct SkyArgs {
-    /// Frequency, Hz: 0.1 MHz to 30 MHz.
+    /// Frequency, Hz: 0.1 MHz to 120 MHz.
     #[arg(long)]
     freq_hz: f64,
     /// HEALPix nside: a power of two up to 1024.

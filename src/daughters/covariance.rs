@@ -14,7 +14,7 @@ use super::nodes::{Basis, node, nodes_for};
 use crate::array::Array;
 use crate::array::response::Comb;
 use crate::frames::Channel;
-use crate::mother::{ModelError, PairPosition, Prediction, VisibilityModel};
+use crate::mother::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
 use crate::units::{Pair, all_pairs};
@@ -170,21 +170,19 @@ impl Covariances {
         let steady = Plan::steady();
         let mut positions = Vec::with_capacity(self.daughters * steady.instants);
         for t_s in steady.instants_s(request.epochs) {
-            // The plane of the orbit, which a dipole stands on, asks for two places: 1.5 m apart.
-            let place = |daughter, t_s| request.array.position_m(daughter, t_s);
-            positions.extend((0..self.daughters).map(|daughter| PairPosition {
-                r_i_m: place(daughter, t_s),
-                r_j_m: place(daughter, t_s + 1e-3),
-                span_rad: 0.0,
+            let normal_hat = request.array.orbit_normal_hat(t_s);
+            positions.extend((0..self.daughters).map(|daughter| DaughterPosition {
+                r_m: request.array.position_m(daughter, t_s),
+                normal_hat,
             }));
         }
-        let mut predictions = vec![Prediction::default(); positions.len()];
-        model.predict(&positions, &mut predictions)?;
+        let mut powers = vec![0.0; positions.len()];
+        model.predict_powers(&positions, &mut powers)?;
         let width = self.daughters.next_multiple_of(COLUMNS);
         let mut known = vec![0.0; steady.instants * width];
-        for (known, found) in known.chunks_exact_mut(width).zip(predictions.chunks_exact(self.daughters)) {
+        for (known, found) in known.chunks_exact_mut(width).zip(powers.chunks_exact(self.daughters)) {
             for (known, found) in known.iter_mut().zip(found) {
-                *known = (found.zero_spacing_k_sr + request.receiver_noise_k_sr) as f32;
+                *known = (found + request.receiver_noise_k_sr) as f32;
             }
         }
         let matrix = request.tables.times(steady.instants, request.epochs.count);
@@ -295,6 +293,7 @@ impl Plan {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mother::Prediction;
     use crate::units::vector::Vec3;
 
     /// A point source: V = exp(-2 pi i (nu / c) n . r_ij) at 20 MHz.
@@ -313,6 +312,11 @@ mod tests {
                 let visibility_k_sr = fringe(self.0, FREQUENCY_HZ, at.r_i_m, at.r_j_m);
                 *out = Prediction { visibility_k_sr, zero_spacing_k_sr: 1.0 };
             }
+            Ok(())
+        }
+
+        fn predict_powers(&mut self, _: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
+            out.fill(1.0);
             Ok(())
         }
     }

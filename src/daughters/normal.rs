@@ -71,6 +71,81 @@ mod tests {
         assert!((minus_ln::<false>(least) - 33.0 * std::f32::consts::LN_2).abs() < 1e-5);
     }
 
+    /// The error function by its series (Abramowitz & Stegun 7.1.6), whose terms are all positive.
+    fn erf(x: f64) -> f64 {
+        let (mut term, mut sum) = (x, x);
+        for n in 1..200 {
+            term *= 2.0 * x * x / f64::from(2 * n + 1);
+            sum += term;
+        }
+        sum * std::f64::consts::FRAC_2_SQRT_PI * (-x * x).exp()
+    }
+
+    #[test]
+    fn the_error_function_is_that_of_the_tables() {
+        // Abramowitz & Stegun, Table 7.1.
+        for (x, expected) in
+            [(0.1, 0.112_462_916_0), (0.5, 0.520_499_877_8), (1.0, 0.842_700_792_9), (2.0, 0.995_322_265_0)]
+        {
+            assert!((erf(x) - expected).abs() < 1e-10 && (erf(-x) + expected).abs() < 1e-10, "{x}");
+        }
+    }
+
+    #[test]
+    fn deviates_have_the_distribution_of_a_normal_variable() {
+        const COUNT: usize = 1 << 21;
+        let (mut re, mut im) = (vec![0.0; COUNT], vec![0.0; COUNT]);
+        let mut rng = random_stream(5, StreamKind::Samples, [0, 0]);
+        fill_complex_normal(&mut rng, &mut [[0; 4]; 2 * CHUNK], &mut re, &mut im);
+        for part in [&mut re, &mut im] {
+            part.sort_unstable_by(f32::total_cmp);
+            let n = COUNT as f64;
+            let mut distance = 0.0_f64;
+            for (k, &x) in part.iter().enumerate() {
+                // Of variance 1/2.
+                let expected = 0.5 * (1.0 + erf(f64::from(x)));
+                distance =
+                    distance.max((k as f64 / n - expected).abs()).max(((k + 1) as f64 / n - expected).abs());
+            }
+            // Kolmogorov: beyond 1.95 / sqrt(n) once in a thousand.
+            assert!(distance * n.sqrt() < 1.95, "{distance}");
+        }
+    }
+
+    #[test]
+    fn tails_are_as_heavy_as_they_should_be_to_five_deviations() {
+        const COUNT: usize = 1 << 20;
+        const ROUNDS: usize = 64;
+        // Beyond so many standard deviations on either side: 1 - erf(k / sqrt 2), as published in any table of them.
+        const TAILS: [(f32, f64); 4] =
+            [(3.0, 2.699_796e-3), (4.0, 6.334_248e-5), (4.5, 6.795_346e-6), (5.0, 5.733_031e-7)];
+        let (mut re, mut im) = (vec![0.0; COUNT], vec![0.0; COUNT]);
+        let mut rng = random_stream(6, StreamKind::Samples, [0, 0]);
+        // By part and sign.
+        let mut beyond = [[0_u32; 4]; TAILS.len()];
+        for _ in 0..ROUNDS {
+            fill_complex_normal(&mut rng, &mut [[0; 4]; 2 * CHUNK], &mut re, &mut im);
+            for (part, values) in [&re, &im].into_iter().enumerate() {
+                for &x in values.iter().filter(|x| x.abs() > 3.0 * std::f32::consts::FRAC_1_SQRT_2) {
+                    for (counts, (deviations, _)) in beyond.iter_mut().zip(TAILS) {
+                        let far = x.abs() > deviations * std::f32::consts::FRAC_1_SQRT_2;
+                        counts[2 * part + usize::from(x < 0.0)] += u32::from(far);
+                    }
+                }
+            }
+        }
+        for (counts, (deviations, probability)) in beyond.into_iter().zip(TAILS) {
+            let expected = 0.5 * probability * (COUNT * ROUNDS) as f64;
+            for count in counts {
+                // Poisson: four standard errors, of 19 at five deviations.
+                assert!(
+                    (f64::from(count) - expected).abs() < 4.0 * expected.sqrt(),
+                    "{deviations}: {counts:?}"
+                );
+            }
+        }
+    }
+
     #[test]
     fn moments_are_those_of_a_complex_normal() {
         const COUNT: usize = 1 << 20;

@@ -1,5 +1,7 @@
 //! The instrument description: all that the ground knows of the array besides its ephemeris.
 
+use crate::units::{ChannelId, Pair};
+
 /// One frequency channel.
 #[derive(Clone, Copy, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct Channel {
@@ -18,6 +20,30 @@ pub enum AntennaResponse {
     Isotropic,
     /// A short dipole along the orbit normal: A = 1 - (n . w)^2, fixed in the body frame.
     DipoleNormal,
+}
+
+/// A spectrometer: one more satellite that hears the whole sky by herself, in adjoining channels.
+#[derive(Clone, Copy, Debug, PartialEq, bincode::Encode, bincode::Decode)]
+pub struct Spectrometer {
+    /// Lowest frequency of the first channel, Hz.
+    pub low_hz: f64,
+    /// Width of each channel, Hz.
+    pub width_hz: f64,
+    /// Number of channels.
+    pub channels: u16,
+}
+
+impl Spectrometer {
+    /// Channel `k`.
+    #[must_use]
+    pub fn channel(&self, k: u16) -> Channel {
+        Channel { frequency_hz: self.low_hz + (f64::from(k) + 0.5) * self.width_hz, width_hz: self.width_hz }
+    }
+
+    /// All of them.
+    pub fn channels(&self) -> impl Iterator<Item = Channel> {
+        (0..self.channels).map(|k| self.channel(k))
+    }
 }
 
 /// What the spacecraft says of itself at the start of a downlink.
@@ -39,4 +65,27 @@ pub struct Instrument {
     pub seed: u64,
     /// Hash of the space segment's configuration; 0 for real data.
     pub configuration_hash: u64,
+    /// One more satellite, behind those that are correlated, whose channels count on behind theirs.
+    pub spectrometer: Option<Spectrometer>,
+}
+
+impl Instrument {
+    /// The channel in which `pair` measures; `None` if it has no such channel.
+    #[must_use]
+    pub fn channel_of(&self, channel: ChannelId, pair: Pair) -> Option<Channel> {
+        let index = usize::from(channel.0);
+        if !self.is_spectrum(pair) {
+            let daughters = pair.i.max(pair.j) < self.satellites;
+            return self.channels.get(index).copied().filter(|_| daughters);
+        }
+        let spectrometer = self.spectrometer.as_ref()?;
+        let k = u16::try_from(index.checked_sub(self.channels.len())?).ok()?;
+        (k < spectrometer.channels).then(|| spectrometer.channel(k))
+    }
+
+    /// Whether `pair` is the spectrometer with herself.
+    #[must_use]
+    pub fn is_spectrum(&self, pair: Pair) -> bool {
+        self.spectrometer.is_some() && (pair.i, pair.j) == (self.satellites, self.satellites)
+    }
 }

@@ -13,7 +13,7 @@ mod visibility;
 pub use ephemeris::EphemerisSegment;
 pub use ground::PlacedFrame;
 pub use housekeeping::Housekeeping;
-pub use instrument::{AntennaResponse, Channel, Instrument};
+pub use instrument::{AntennaResponse, Channel, Instrument, Spectrometer};
 pub use samples::{SampleBlock, Samples, SpaceFrame};
 pub use visibility::{AutoPower, Flags, PlacedVisibilities, VisibilityBlock};
 

@@ -115,6 +115,8 @@ pub struct AutoPower {
 pub struct PlacedVisibilities {
     /// Channel.
     pub channel: ChannelId,
+    /// Which of the channel's sub-bands was measured, from 0, where several make one channel; else 0.
+    pub band: u16,
     /// Centre frequency of the channel, Hz.
     pub frequency_hz: f64,
     /// Pair.

@@ -5,6 +5,7 @@ use thiserror::Error;
 
 use super::choice::ModelChoice;
 use super::correlator::{Division, SUB_BANDS_MAX};
+use super::ninth::NinthConfig;
 use crate::array::IntegrationRule;
 use crate::frames::{AntennaResponse, Channel};
 use crate::units::PerChannel;
@@ -66,6 +67,8 @@ pub struct SpacecraftConfig {
     pub store_drop: StoreDrop,
     /// Mission epoch: TAI seconds since 1958-01-01.
     pub epoch_tai_s: f64,
+    /// The ninth daughter.
+    pub ninth: NinthConfig,
 }
 
 /// How much of the spacecraft is simulated; what comes down looks the same.
@@ -140,6 +143,7 @@ impl Default for SpacecraftConfig {
             store_drop: StoreDrop::default(),
             // 2027-01-01T00:00:00 TAI: 69 years of which 17 are leap years.
             epoch_tai_s: (69.0 * 365.0 + 17.0) * 86_400.0,
+            ninth: NinthConfig::default(),
         }
     }
 }
@@ -312,6 +316,7 @@ impl SpacecraftConfig {
             found.push(SpacecraftError::Smearing);
         }
         found.extend(self.division_problems());
+        found.extend(self.ninth.problems());
         let mut require = |key, value: f64, good: bool, expected| {
             if !(good && value.is_finite()) {
                 found.push(SpacecraftError::Parameter { key, value, expected });

@@ -2,8 +2,10 @@
 
 use num_complex::Complex64;
 
-use super::model::{ModelError, PairPosition, Prediction, VisibilityModel};
-use crate::array::response::{Comb, Directions, PairGeometry, comb_sums, sky_sums};
+use super::model::{DaughterPosition, ModelError, PairPosition, Prediction, VisibilityModel};
+use crate::array::response::{
+    Comb, Directions, PairGeometry, SingleGeometry, comb_sums, sky_powers, sky_sums,
+};
 use crate::frames::AntennaResponse;
 use crate::sky::SkyMap;
 use crate::sky::healpix::pixel_area_sr;
@@ -49,7 +51,12 @@ impl DirectSum {
             moon_radius_m: self.moon_radius_m,
             response: self.response,
         };
-        Ok(positions.iter().map(pair).collect())
+        let pairs: Vec<PairGeometry> = positions.iter().map(pair).collect();
+        let dipoles = self.response == AntennaResponse::DipoleNormal;
+        if dipoles && pairs.iter().any(|pair| pair.orbit_normal().is_none()) {
+            return Err(ModelError::NoPlane { frequency_hz: self.frequency_hz });
+        }
+        Ok(pairs)
     }
 }
 
@@ -64,6 +71,23 @@ impl VisibilityModel for DirectSum {
         }
         Ok(())
     }
+
+    fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
+        let single = |daughter: &DaughterPosition| SingleGeometry {
+            r_m: daughter.r_m,
+            normal_hat: daughter.normal_hat,
+            moon_radius_m: self.moon_radius_m,
+            response: self.response,
+        };
+        let singles: Vec<SingleGeometry> = daughters.iter().map(single).collect();
+        // As above.
+        let powers = sky_powers(&singles, &self.directions, &self.values, self.area_sr).unwrap_or_default();
+        for (out, power) in out.iter_mut().zip(powers) {
+            *out = power;
+        }
+        Ok(())
+    }
+
     fn predict_comb(
         &mut self,
         positions: &[PairPosition],

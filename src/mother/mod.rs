@@ -3,7 +3,8 @@
 //!
 //! There are two fidelities, which give the same frames: [`Integrator`] is the spacecraft at the level of
 //! integrated visibilities, what the correlator would put out for a given sky, with thermal noise;
-//! [`correlator`] makes them from the samples of [`crate::daughters`]. Uses [`crate::frames`], [`crate::array`], [`crate::sky`].
+//! [`correlator`] makes them from the samples of [`crate::daughters`]. [`Ninth`] adds the spectra of one more daughter.
+//! Uses [`crate::frames`], [`crate::array`], [`crate::sky`].
 
 mod choice;
 mod config;
@@ -12,6 +13,7 @@ mod direct;
 mod harmonic;
 mod integrator;
 mod model;
+mod ninth;
 mod observer;
 mod schedule;
 mod store;
@@ -21,7 +23,8 @@ pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, Spa
 pub use direct::DirectSum;
 pub use harmonic::{HarmonicSetup, HarmonicSum};
 pub use integrator::{Integrator, MeasurementOptions, NoiseModel};
-pub use model::{ModelError, PairPosition, Prediction, VisibilityModel};
+pub use model::{DaughterPosition, ModelError, PairPosition, Prediction, VisibilityModel};
+pub use ninth::{NINTH_BAND_HZ, Ninth, NinthConfig, NinthSetup, NinthSky};
 pub use observer::Observer;
 pub use schedule::{Integration, Schedule};
 pub use store::{PacedLink, Store, VISIBILITY_BYTES};

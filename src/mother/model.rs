@@ -18,6 +18,15 @@ pub struct PairPosition {
     pub span_rad: f64,
 }
 
+/// Where one daughter is, to be heard by herself.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct DaughterPosition {
+    /// Position, m.
+    pub r_m: Vec3,
+    /// Normal of the orbit, a unit vector; dipoles point along it.
+    pub normal_hat: Vec3,
+}
+
 /// A visibility without noise.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Prediction {
@@ -49,6 +58,15 @@ pub enum ModelError {
         /// What it said.
         source: HarmonicError,
     },
+    /// Two daughters in one direction from the Moon's centre, with dipoles.
+    #[error(
+        "visibility model at {frequency_hz} Hz: two daughters in one direction from the Moon's centre, or opposite each \
+         other, have no orbital plane for their dipoles to stand on"
+    )]
+    NoPlane {
+        /// Frequency, Hz.
+        frequency_hz: f64,
+    },
     /// Averages over integrations were asked of a model that has instants only.
     #[error(
         "visibility model at {frequency_hz} Hz: direct sums are of instants; set spacecraft.model = \"harmonic\" \
@@ -75,6 +93,13 @@ pub trait VisibilityModel: Send + Sync {
     /// # Errors
     /// [`ModelError`], for positions that the model does not cover.
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError>;
+
+    /// Predicts the power `Int T A S dn` (K sr) that each of the daughters hears by herself; `out` has the length of
+    /// `daughters`.
+    ///
+    /// # Errors
+    /// As [`Self::predict`].
+    fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError>;
 
     /// Predicts the visibilities (K sr) of each position at the frequencies of `comb`: `comb.count` for one position
     /// after another.

@@ -8,6 +8,7 @@ use serde::Serialize;
 use super::engine_cost::EngineCost;
 use super::plan::Plan;
 use crate::array::response::{Directions, PairGeometry, sky_sums};
+use crate::frames::ObservingWindow;
 use crate::mother::{ModelKind, ModelPlan, VISIBILITY_BYTES};
 use crate::sky::healpix::{pixel_area_sr, pixel_count, pixel_directions};
 
@@ -54,6 +55,8 @@ pub struct Cost {
     /// Rate that the daughters' samples need on their links to the mother, all together, bit/s; with
     /// samples alone.
     pub samples_bits_per_s: Option<f64>,
+    /// Rate of the ninth daughter's spectra on the downlink while the array observes, bit/s; with her alone.
+    pub ninth_bits_per_s: Option<f64>,
     /// Time on this machine, s, from a measurement of a fraction of a second.
     pub predicted_s: f64,
 }
@@ -118,11 +121,24 @@ impl Plan {
             windows: self.windows.len(),
             solutions,
             downlink_bytes: self.config.downlink.expansion()
-                * (sent * VISIBILITY_BYTES as f64 + self.windows.len() as f64 * 10_000.0),
+                * (sent * VISIBILITY_BYTES as f64
+                    + self.windows.len() as f64 * 10_000.0
+                    + self.ninth_bytes()),
             memory_bytes,
             samples_bits_per_s: self.samples_bits_per_s(),
+            ninth_bits_per_s: self.ninth_bits_per_s(),
             predicted_s,
         }
+    }
+
+    /// Bytes of the ninth daughter's spectra, with headers of a packet a channel and window.
+    fn ninth_bytes(&self) -> f64 {
+        const PACKET_BYTES: f64 = 42.0;
+        let Some(rate) = self.ninth_bits_per_s() else { return 0.0 };
+        let length_s = |window: &ObservingWindow| window.end.seconds() - window.start.seconds();
+        let seconds: f64 = self.windows.iter().map(length_s).sum();
+        let packets = self.config.spacecraft.ninth.channels * self.windows.len();
+        seconds * rate / 8.0 + PACKET_BYTES * packets as f64
     }
 
     fn solutions(&self) -> u64 {
@@ -195,6 +211,9 @@ impl fmt::Display for Cost {
         writeln!(f, "memory           {:.2} GB", self.memory_bytes / 1e9)?;
         if let Some(rate) = self.samples_bits_per_s {
             writeln!(f, "samples          {:.3} Mbit/s from all daughters", rate / 1e6)?;
+        }
+        if let Some(rate) = self.ninth_bits_per_s {
+            writeln!(f, "ninth daughter   {:.3} kbit/s of spectra while observing", rate / 1e3)?;
         }
         write!(f, "predicted time   {:.0} s on this machine", self.predicted_s)
     }

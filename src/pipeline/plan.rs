@@ -42,6 +42,7 @@ impl Plan {
             response: spacecraft.antenna.into(),
             seed: config.seed,
             configuration_hash: config.space_hash(),
+            spectrometer: spacecraft.ninth.spectrometer(),
         };
         let schedule = |(channel, &frequency_hz): (usize, &f64)| Schedule {
             rule: spacecraft.rule(),
@@ -74,6 +75,13 @@ impl Plan {
         let (count, channels) = (self.array.satellites(), spacecraft.channels_hz.len());
         (spacecraft.fidelity == Fidelity::Samples)
             .then(|| daughters.rate_bits_per_s(count, channels, spacecraft.channel_width_hz))
+    }
+
+    /// Rate of the ninth daughter's spectra while the array observes, bit/s; `None` without her.
+    #[must_use]
+    pub fn ninth_bits_per_s(&self) -> Option<f64> {
+        let ninth = &self.config.spacecraft.ninth;
+        ninth.on.then(|| ninth.bits_per_s())
     }
 
     /// Windows by which progress is measured; 0 where stages are not paced by them.

@@ -8,7 +8,10 @@ use super::plan::Plan;
 use super::sampling::{SampleCounts, samples};
 use crate::downlink::Transmitter;
 use crate::frames::GroundFrame;
-use crate::mother::{Fidelity, Integrator, MeasurementOptions, NoiseModel, Observer, PacedLink, Store};
+use crate::mother::{
+    DirectSum, Fidelity, Integrator, MeasurementOptions, Ninth, NinthSetup, NinthSky, NoiseModel, Observer,
+    PacedLink, Store,
+};
 use crate::runtime::{Graph, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::generated::generate;
@@ -67,6 +70,7 @@ pub fn add(
     let models = super::models::build(plan, skies)?;
     if config.spacecraft.fidelity == Fidelity::Samples {
         let frames = samples(graph, plan, models, counts);
+        let frames = add_ninth(graph, plan, skies, frames)?;
         return transmit(graph, plan, frames);
     }
     let noise = NoiseModel {
@@ -79,7 +83,55 @@ pub fn add(
     // A window waiting is nothing; a window's visibilities are.
     let windows = graph.source("observe", 1, Observer::new(windows.clone()));
     let frames = graph.stage(INTEGRATE, capacity, windows, integrator);
+    let frames = add_ninth(graph, plan, skies, frames)?;
     transmit(graph, plan, frames)
+}
+
+/// The ninth daughter's spectra among the frames, if there is one.
+fn add_ninth(
+    graph: &mut Graph,
+    plan: &Plan,
+    skies: &[SkyMap],
+    frames: Link<GroundFrame>,
+) -> Result<Link<GroundFrame>, PipelineError> {
+    let Plan { config, array, windows, .. } = plan;
+    if !config.spacecraft.ninth.on {
+        return Ok(frames);
+    }
+    let setup = NinthSetup {
+        array: Arc::clone(array),
+        config: config.spacecraft.ninth.clone(),
+        sky: ninth_sky(plan, skies)?,
+        windows: windows.clone(),
+        seed: config.spacecraft.thermal_noise.then_some(config.seed),
+    };
+    let capacity = config.runtime.queue_capacity;
+    Ok(match Ninth::new(setup) {
+        Some(ninth) => graph.stage("ninth", capacity, frames, ninth),
+        None => frames,
+    })
+}
+
+/// What the ninth daughter hears: the generated sky at her own frequencies, or the file of the highest channel, carried
+/// on as a power of frequency.
+fn ninth_sky(plan: &Plan, skies: &[SkyMap]) -> Result<NinthSky, PipelineError> {
+    let Plan { config, array, instrument, .. } = plan;
+    let model = |sky: &SkyMap, at_hz| DirectSum::new(sky, at_hz, array.moon_radius_m(), instrument.response);
+    let ninth = &config.spacecraft.ninth;
+    let channels = skies.iter().zip(&config.spacecraft.channels_hz);
+    let highest = channels.max_by(|a, b| a.1.total_cmp(b.1));
+    if let (Some(_), Some((sky, &frequency_hz))) = (&config.sky.file, highest) {
+        return Ok(NinthSky::PowerLaw {
+            model: model(sky, frequency_hz),
+            frequency_hz,
+            index: ninth.file_index,
+        });
+    }
+    let map = |at_hz: f64| -> Result<(f64, DirectSum), PipelineError> {
+        let values = generate(&config.sky.generated, at_hz, config.sky.nside, config.seed)?;
+        Ok((at_hz, model(&SkyMap::new(Frame::Ecliptic, values)?, at_hz)))
+    };
+    Ok(NinthSky::Maps(NinthSky::nodes_hz(ninth.band_hz).into_iter().map(map).collect::<Result<_, _>>()?))
 }
 
 /// What comes after the visibilities, however they were made.

@@ -21,6 +21,8 @@ pub enum StreamKind {
     Samples = 6,
     /// Phases of interference.
     Interference = 7,
+    /// Noise of the ninth daughter's spectra.
+    Spectrometer = 8,
     /// Faults of a simulated link.
     Link = 20,
 }

@@ -10,7 +10,7 @@ use lunarray::frames::{
     VisibilityBlock,
 };
 use lunarray::mother::correlator::{Correlator, CorrelatorCounts, CorrelatorSetup, Division};
-use lunarray::mother::{ModelError, PairPosition, Prediction, Schedule, VisibilityModel};
+use lunarray::mother::{DaughterPosition, ModelError, PairPosition, Prediction, Schedule, VisibilityModel};
 use lunarray::runtime::{Flow, Outlet, Source, Stage};
 use lunarray::units::MissionTime;
 use lunarray::units::constants::SPEED_OF_LIGHT_M_S;
@@ -27,6 +27,11 @@ pub struct Constant {
 impl VisibilityModel for Constant {
     fn predict(&mut self, _: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError> {
         out.fill(Prediction { visibility_k_sr: Complex64::new(self.cross, 0.0), zero_spacing_k_sr: 1.0 });
+        Ok(())
+    }
+
+    fn predict_powers(&mut self, _: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
+        out.fill(1.0);
         Ok(())
     }
 }
@@ -47,6 +52,11 @@ impl VisibilityModel for Point {
             let visibility_k_sr = fringe(self.n_hat, self.frequency_hz, at.r_i_m, at.r_j_m);
             *out = Prediction { visibility_k_sr, zero_spacing_k_sr: 1.0 };
         }
+        Ok(())
+    }
+
+    fn predict_powers(&mut self, _: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
+        out.fill(1.0);
         Ok(())
     }
 }
@@ -134,6 +144,7 @@ impl Spacecraft {
                 response: AntennaResponse::Isotropic,
                 seed: 0,
                 configuration_hash: 0,
+                spectrometer: None,
             },
             schedules: channels.iter().map(schedule).collect(),
             division: self.division,

@@ -170,6 +170,34 @@ impl PairOrientation {
             return Err(GeometryRefusal::Degenerate);
         }
         let x = scale(1.0 / across_m, across);
+        Ok(Self {
+            baseline_m,
+            radius_m: 0.5 * (radius_i_m + radius_j_m),
+            radius_difference_m: radius_i_m - radius_j_m,
+            ..Self::of_axes(x, y)
+        })
+    }
+
+    /// Of one satellite at a position (m, Moon-centred, ecliptic axes) on an orbit with this normal: a pair of length 0.
+    ///
+    /// # Errors
+    /// [`GeometryRefusal::NotFinite`], [`GeometryRefusal::Degenerate`] for a position along the normal.
+    pub fn single(r_m: Vec3, normal_hat: Vec3) -> Result<Self, GeometryRefusal> {
+        let radius_m = norm(r_m);
+        if !(radius_m.is_finite() && norm(normal_hat).is_finite() && radius_m > 0.0) {
+            return Err(GeometryRefusal::NotFinite);
+        }
+        let (x, along) = (scale(1.0 / radius_m, r_m), cross(normal_hat, r_m));
+        let along_m = norm(along);
+        if along_m <= BASELINE_M_MIN {
+            return Err(GeometryRefusal::Degenerate);
+        }
+        Ok(Self { radius_m, ..Self::of_axes(x, scale(1.0 / along_m, along)) })
+    }
+
+    /// The angles of two axes square to each other, without lengths.
+    #[inline]
+    fn of_axes(x: Vec3, y: Vec3) -> Self {
         let z = cross(x, y);
         let sin_inclination = z[0].hypot(z[1]);
         // In the ecliptic the node is nowhere; any one will do with a phase counted from it.
@@ -178,14 +206,14 @@ impl PairOrientation {
         } else {
             [1.0, 0.0]
         };
-        Ok(Self {
+        Self {
             node_rad: node[1].atan2(node[0]),
             inclination_rad: sin_inclination.atan2(z[2]),
             phase_rad: (-y[0] * node[0] - y[1] * node[1]).atan2(x[0] * node[0] + x[1] * node[1]),
-            baseline_m,
-            radius_m: 0.5 * (radius_i_m + radius_j_m),
-            radius_difference_m: radius_i_m - radius_j_m,
-        })
+            baseline_m: 0.0,
+            radius_m: 0.0,
+            radius_difference_m: 0.0,
+        }
     }
 }
 
@@ -263,6 +291,33 @@ mod tests {
 
     fn apply(r: Matrix, v: Vec3) -> Vec3 {
         std::array::from_fn(|i| dot(r[i], v))
+    }
+
+    #[test]
+    fn one_satellite_has_the_frame_of_a_pair_about_her() {
+        let array = Array::new(&ArrayConfig::default()).unwrap();
+        for t_s in [0.0, 1234.5, 7e6] {
+            let (r_m, normal_hat) = (array.position_m(2, t_s), array.orbit_normal_hat(t_s));
+            let (behind, ahead) = (array.position_m(2, t_s - 1.0), array.position_m(2, t_s + 1.0));
+            let single = PairOrientation::single(r_m, normal_hat).unwrap();
+            let about = PairOrientation::of(ahead, behind).unwrap();
+            for (found, expected) in [
+                (single.node_rad, about.node_rad),
+                (single.inclination_rad, about.inclination_rad),
+                (single.phase_rad, about.phase_rad),
+            ] {
+                // The node moves by 1.5e-7 rad in these 2 s, 2e-4 of the way along the orbit.
+                assert!(wrap(found - expected).abs() < 3e-4, "{t_s}: {found} {expected}");
+            }
+            // The daughters are in their plane; rounding of 2e6 m.
+            assert!(dot(normal_hat, r_m).abs() < 1e-8 && (norm(normal_hat) - 1.0).abs() < 1e-15);
+            assert_eq!((single.baseline_m, single.radius_difference_m), (0.0, 0.0));
+        }
+        assert_eq!(
+            PairOrientation::single([0.0, 0.0, 1e6], [0.0, 0.0, 1.0]),
+            Err(GeometryRefusal::Degenerate)
+        );
+        assert_eq!(PairOrientation::single([f64::NAN; 3], [0.0, 0.0, 1.0]), Err(GeometryRefusal::NotFinite));
     }
 
     /// A pair at +-`half` of the body's x axis.

@@ -4,7 +4,7 @@
 //! AVX2, baseline) and chosen at run time. Fused multiply-adds are used only where the hardware has
 //! them, because elsewhere they are calls into the C library.
 
-use super::PairGeometry;
+use super::{PairGeometry, SingleGeometry};
 use crate::frames::AntennaResponse;
 use crate::units::vector::{Vec3, dot, scale};
 
@@ -28,19 +28,32 @@ pub(super) struct Prepared {
     pub dipole: Option<Vec3>,
 }
 
+/// Direction of a position, and the cosine of the limb's distance from the direction of the Moon.
+fn limb(r_m: Vec3, moon_radius_m: f64) -> (Vec3, f64) {
+    let length_m = dot(r_m, r_m).sqrt();
+    let ratio = moon_radius_m / length_m;
+    (scale(1.0 / length_m, r_m), (1.0 - ratio * ratio).max(0.0).sqrt())
+}
+
 impl Prepared {
     pub fn new(pair: &PairGeometry) -> Self {
-        let limb = |r_m: Vec3| {
-            let length_m = dot(r_m, r_m).sqrt();
-            let ratio = pair.moon_radius_m / length_m;
-            (scale(1.0 / length_m, r_m), (1.0 - ratio * ratio).max(0.0).sqrt())
-        };
-        let ((i_hat, limb_i), (j_hat, limb_j)) = (limb(pair.r_i_m), limb(pair.r_j_m));
+        let (i_hat, limb_i) = limb(pair.r_i_m, pair.moon_radius_m);
+        let (j_hat, limb_j) = limb(pair.r_j_m, pair.moon_radius_m);
         let dipole = match pair.response {
             AntennaResponse::Isotropic => None,
-            AntennaResponse::DipoleNormal => Some(pair.orbit_normal()),
+            // Dipoles without a plane to stand on have no answer.
+            AntennaResponse::DipoleNormal => Some(pair.orbit_normal().unwrap_or([f64::NAN; 3])),
         };
         Self { u: pair.baseline_wavelengths(), i_hat, limb_i, j_hat, limb_j, dipole }
+    }
+
+    pub fn single(single: &SingleGeometry) -> Self {
+        let (i_hat, limb_i) = limb(single.r_m, single.moon_radius_m);
+        let dipole = match single.response {
+            AntennaResponse::Isotropic => None,
+            AntennaResponse::DipoleNormal => Some(single.normal_hat),
+        };
+        Self { u: [0.0; 3], i_hat, limb_i, j_hat: i_hat, limb_j: limb_i, dipole }
     }
 }
 

@@ -16,6 +16,7 @@ mod edge;
 pub mod exact;
 pub(crate) mod kernel;
 mod rows;
+mod single;
 mod sums;
 
 use serde::{Deserialize, Serialize};
@@ -24,6 +25,7 @@ use thiserror::Error;
 pub use combs::{Comb, comb_sums};
 pub use directions::Directions;
 pub use rows::{RowMaker, RowValue};
+pub use single::{SingleGeometry, sky_powers};
 pub use sums::{SkySum, sky_sums};
 
 use crate::frames::AntennaResponse;
@@ -87,23 +89,24 @@ impl PairGeometry {
     }
 
     /// Normal of the plane that holds both satellites and the Moon's centre: the orbit normal, which
-    /// the dipoles of [`AntennaResponse::DipoleNormal`] point along. The z axis if there is no such plane.
+    /// the dipoles of [`AntennaResponse::DipoleNormal`] point along. `None` if the two are in one direction from the
+    /// centre, or opposite each other: then there is no such plane. For one satellite there is [`SingleGeometry`].
     #[must_use]
-    pub fn orbit_normal(&self) -> Vec3 {
+    pub fn orbit_normal(&self) -> Option<Vec3> {
         let normal = cross(self.r_i_m, self.r_j_m);
         let length = norm(normal);
         // Parallel positions leave only rounding errors of the product.
         let least = 1e-12 * norm(self.r_i_m) * norm(self.r_j_m);
-        if length > least { scale(1.0 / length, normal) } else { [0.0, 0.0, 1.0] }
+        (length > least).then(|| scale(1.0 / length, normal))
     }
 
-    /// Power response A in direction `n_hat`.
+    /// Power response A in direction `n_hat`; not a number for dipoles without a plane to stand on.
     #[must_use]
     pub fn antenna(&self, n_hat: Vec3) -> f64 {
         match self.response {
             AntennaResponse::Isotropic => 1.0,
             AntennaResponse::DipoleNormal => {
-                let along = dot(n_hat, self.orbit_normal());
+                let along = self.orbit_normal().map_or(f64::NAN, |normal| dot(n_hat, normal));
                 1.0 - along * along
             }
         }

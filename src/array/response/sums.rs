@@ -37,29 +37,42 @@ pub fn sky_sums(
     sky_k: &[f32],
     area_sr: f64,
 ) -> Result<Vec<SkySum>, ResponseError> {
+    sums_of(pairs, Prepared::new, directions, sky_k, area_sr)
+}
+
+/// As [`sky_sums`] for whatever `prepare` makes ready.
+pub(super) fn sums_of<G: Sync>(
+    geometries: &[G],
+    prepare: fn(&G) -> Prepared,
+    directions: &Directions,
+    sky_k: &[f32],
+    area_sr: f64,
+) -> Result<Vec<SkySum>, ResponseError> {
     if sky_k.len() != directions.len() {
         return Err(ResponseError::SkyLength { sky: sky_k.len(), directions: directions.len() });
     }
-    let mut sums = vec![SkySum::default(); pairs.len()];
-    sums.par_chunks_mut(PAIRS_PER_TASK)
-        .zip(pairs.par_chunks(PAIRS_PER_TASK))
-        .for_each(|(sums, pairs)| sum_pairs(sums, pairs, directions, sky_k, area_sr));
+    let mut sums = vec![SkySum::default(); geometries.len()];
+    sums.par_chunks_mut(PAIRS_PER_TASK).zip(geometries.par_chunks(PAIRS_PER_TASK)).for_each(
+        |(sums, geometries)| {
+            let prepared: Vec<Prepared> = geometries.iter().map(prepare).collect();
+            sum_prepared(sums, &prepared, directions, sky_k, area_sr);
+        },
+    );
     Ok(sums)
 }
 
-fn sum_pairs(
+fn sum_prepared(
     sums: &mut [SkySum],
-    pairs: &[PairGeometry],
+    prepared: &[Prepared],
     directions: &Directions,
     sky_k: &[f32],
     area_sr: f64,
 ) {
-    let prepared: Vec<Prepared> = pairs.iter().map(Prepared::new).collect();
     for first in (0..sky_k.len()).step_by(STRETCH) {
         let range = first..sky_k.len().min(first + STRETCH);
         let (x, y, z) =
             (&directions.x[range.clone()], &directions.y[range.clone()], &directions.z[range.clone()]);
-        for (sum, pair) in sums.iter_mut().zip(&prepared) {
+        for (sum, pair) in sums.iter_mut().zip(prepared) {
             let [re, im, zero] = sum_stretch(pair, [x, y, z], &sky_k[range.clone()]);
             sum.visibility_k_sr += Complex64::new(re, im);
             sum.zero_spacing_k_sr += zero;

@@ -26,6 +26,7 @@ fn block(time_s: Vec<f64>) -> PlacedVisibilities {
     let by_time = |f: fn(f64) -> f64| time_s.iter().map(|&t| f(t)).collect::<Vec<f64>>();
     PlacedVisibilities {
         channel: ChannelId(0),
+        band: 0,
         frequency_hz: FREQUENCY_HZ,
         pair: Pair { i: 0, j: 2 },
         r_i_m: time_s.iter().map(|&t| [t, 1.0, 0.0]).collect(),

@@ -3,7 +3,8 @@
 //! Record: `channel` u16, `i` u8, `j` u8 (satellites from 0), `start_ticks` i64, `count` u32. Arrays of `count`
 //! each: `offset_ticks` u32, `duration_ticks` u32, value (re, im) f32 x 2, `weight` f32, `flags` u8.
 //!
-//! A satellite with itself (`i` = `j`) is its own power: the mean of |x|^2, with the weight n / P^2.
+//! A satellite with itself (`i` = `j`) is its own power: the mean of |x|^2, with the weight n / P^2. A spectrometer is
+//! the satellite behind the last, and its channels count on behind the last.
 //!
 //! A long block is split over packets that stand each for itself: same record but for the count.
 
@@ -107,9 +108,10 @@ pub(in crate::downlink) fn check(
 ) -> Result<(), PayloadFault> {
     let Pair { i, j } = block.pair;
     require(i <= j, "trailing satellite of a pair", f64::from(j), "the leading one or after it")?;
-    require(j < instrument.satellites, "satellite of a pair", f64::from(j), "one of the instrument's")?;
+    let there = j < instrument.satellites || instrument.is_spectrum(block.pair);
+    require(there, "satellite of a pair", f64::from(j), "one of the instrument's")?;
     let channel = block.channel.0;
-    let known = usize::from(channel) < instrument.channels.len();
+    let known = instrument.channel_of(block.channel, block.pair).is_some();
     require(known, "channel", f64::from(channel), "one of the instrument's")?;
     require_time(block.start)?;
     for length in

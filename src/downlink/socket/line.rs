@@ -197,6 +197,7 @@ mod tests {
             response: AntennaResponse::Isotropic,
             seed: 7,
             configuration_hash: 1,
+            spectrometer: None,
         }
     }
 

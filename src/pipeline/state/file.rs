@@ -241,6 +241,7 @@ mod tests {
             response: AntennaResponse::Isotropic,
             seed: 7,
             configuration_hash: 1,
+            spectrometer: None,
         };
         let own = VisibilityBlock {
             offset_ticks: vec![0],

@@ -7,7 +7,7 @@ use crate::sky::harmonics::HarmonicsError;
 use crate::sky::healpix::is_valid_nside;
 
 /// Frequencies for which there is a sky, Hz.
-const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=30e6;
+const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=120e6;
 /// Finest map.
 const NSIDE_MAX: usize = 1024;
 
@@ -78,7 +78,7 @@ pub enum GeneratedSkyError {
         expected: &'static str,
     },
     /// A frequency for which there is no model.
-    #[error("no generated sky at {frequency_hz} Hz; expected 1e5 to 3e7 Hz")]
+    #[error("no generated sky at {frequency_hz} Hz; expected 1e5 to 1.2e8 Hz")]
     Frequency {
         /// Value found, Hz.
         frequency_hz: f64,

@@ -1,5 +1,5 @@
 //! A sky from a formula: diffuse Galactic emission behind and among absorbing gas, fluctuations,
-//! point sources, at any frequency of 0.1-30 MHz.
+//! point sources, at any frequency of 0.1-120 MHz.
 //!
 //! The transfer of synchrotron emission through warm ionised gas is solved along lines of sight through
 //! a smooth Galaxy, so the plane goes dark below about 10 MHz while near things - the radio loops, the
@@ -55,7 +55,7 @@ const FLUCTUATION_FLOOR: f64 = 0.05;
 /// degrees above `3 nside - 1` that a map cannot hold. Point sources fill the one pixel they lie in.
 ///
 /// # Errors
-/// If the configuration is wrong (its first problem), the frequency lies outside 0.1-30 MHz, or `nside` is not a
+/// If the configuration is wrong (its first problem), the frequency lies outside 0.1-120 MHz, or `nside` is not a
 /// power of two between 1 and 1024.
 pub fn generate(
     config: &GeneratedSky,

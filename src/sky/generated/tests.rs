@@ -148,7 +148,7 @@ fn small_scales_have_the_slope_of_the_formula() {
 #[test]
 fn wrong_requests_are_named() {
     let config = GeneratedSky::default();
-    for hz in [0.0, 9e4, 31e6, f64::NAN, f64::INFINITY] {
+    for hz in [0.0, 9e4, 121e6, f64::NAN, f64::INFINITY] {
         assert!(matches!(generate(&config, hz, 8, 0), Err(GeneratedSkyError::Frequency { .. })));
     }
     for nside in [0, 3, 2048, usize::MAX] {

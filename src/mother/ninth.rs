@@ -1,0 +1,293 @@
+//! The ninth daughter: the spectrum of the whole sky from 30 to 120 MHz, which carries the monopole there.
+
+use std::sync::Arc;
+
+use num_complex::Complex32;
+use rand_distr::{Distribution, StandardNormal};
+use serde::{Deserialize, Serialize};
+
+use super::config::SpacecraftError;
+use super::direct::DirectSum;
+use super::model::{DaughterPosition, ModelError, VisibilityModel};
+use crate::array::Array;
+use crate::frames::{Flags, GroundFrame, Housekeeping, ObservingWindow, Spectrometer, VisibilityBlock};
+use crate::runtime::{Outlet, Stage, Units};
+use crate::units::{ChannelId, Pair, StreamKind, TICKS_PER_SECOND, random_stream};
+
+/// Lowest and highest frequency that a ninth daughter may listen to, Hz.
+pub const NINTH_BAND_HZ: [f64; 2] = [30e6, 120e6];
+
+/// Samples of an integration, width times time, from which a power's noise is Gaussian: its skewness is then 2 %.
+const SAMPLES_MIN: f64 = 1e4;
+
+/// The `[spacecraft.ninth]` section.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct NinthConfig {
+    /// Whether there is a ninth daughter.
+    pub on: bool,
+    /// Lowest and highest frequency of her spectrum, Hz.
+    pub band_hz: [f64; 2],
+    /// Channels that the band is divided into.
+    pub channels: usize,
+    /// Length of an integration, s.
+    pub integration_s: f64,
+    /// Receiver noise T_rec / zeta, as the antenna would see it from the sky, K sr.
+    pub receiver_noise_k_sr: f64,
+    /// Arc by which she trails the first daughter on the same circle, m.
+    pub arc_m: f64,
+    /// Index of temperature over frequency by which a sky from files goes on from its highest channel.
+    pub file_index: f64,
+}
+
+impl Default for NinthConfig {
+    fn default() -> Self {
+        Self {
+            on: false,
+            band_hz: NINTH_BAND_HZ,
+            channels: 90,
+            integration_s: 10.0,
+            receiver_noise_k_sr: 0.0,
+            arc_m: 110e3,
+            file_index: -2.51,
+        }
+    }
+}
+
+impl NinthConfig {
+    /// The spectrometer, if there is one, as the instrument description has it.
+    #[must_use]
+    pub fn spectrometer(&self) -> Option<Spectrometer> {
+        let [low_hz, high_hz] = self.band_hz;
+        // At most 1024, as has been checked.
+        let channels = self.channels as u16;
+        let width_hz = (high_hz - low_hz) / f64::from(channels.max(1));
+        self.on.then_some(Spectrometer { low_hz, width_hz, channels })
+    }
+
+    /// Everything that is wrong with the section; empty if it is good.
+    #[must_use]
+    pub fn problems(&self) -> Vec<SpacecraftError> {
+        let mut found = Vec::new();
+        let mut require = |key, value: f64, good: bool, expected| {
+            if !(good && value.is_finite()) {
+                found.push(SpacecraftError::Parameter { key, value, expected });
+            }
+        };
+        let [low_hz, high_hz] = self.band_hz;
+        let inside = NINTH_BAND_HZ[0] <= low_hz && low_hz < high_hz && high_hz <= NINTH_BAND_HZ[1];
+        require("ninth.band_hz", high_hz, inside, "two frequencies, rising, from 30e6 to 120e6 Hz");
+        let channels = self.channels;
+        require("ninth.channels", channels as f64, (1..=1024).contains(&channels), "1 to 1024");
+        let length_s = self.integration_s;
+        require("ninth.integration_s", length_s, (1e-3..=1000.0).contains(&length_s), "0.001 s to 1000 s");
+        let samples = (high_hz - low_hz) / channels.max(1) as f64 * length_s;
+        let many = samples >= SAMPLES_MIN || !inside;
+        require(
+            "ninth.integration_s",
+            length_s,
+            many,
+            "1e4 samples or more: so much over a channel's width, Hz",
+        );
+        let noise = self.receiver_noise_k_sr;
+        require("ninth.receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
+        require("ninth.arc_m", self.arc_m, (0.0..=1e6).contains(&self.arc_m), "0 m to 1e6 m");
+        let index = self.file_index;
+        require("ninth.file_index", index, (-4.0..=0.0).contains(&index), "-4 to 0");
+        found
+    }
+
+    /// Rate of her spectra while the array observes, bit/s, without packet headers.
+    #[must_use]
+    pub fn bits_per_s(&self) -> f64 {
+        if !self.on {
+            return 0.0;
+        }
+        8.0 * super::VISIBILITY_BYTES as f64 * self.channels as f64 / self.integration_s
+    }
+}
+
+/// The sky over a band of frequencies, as one daughter hears it.
+pub enum NinthSky {
+    /// One map whose temperatures go as a power of frequency.
+    PowerLaw {
+        /// The map's sums.
+        model: DirectSum,
+        /// Its frequency, Hz.
+        frequency_hz: f64,
+        /// The power.
+        index: f64,
+    },
+    /// Maps at some frequencies, Hz, rising; between them the logarithm of power is a polynomial in that of frequency.
+    Maps(Vec<(f64, DirectSum)>),
+}
+
+impl NinthSky {
+    /// Frequencies at which maps tell a smooth spectrum over a band: Chebyshev points in the logarithm.
+    #[must_use]
+    pub fn nodes_hz([low_hz, high_hz]: [f64; 2]) -> Vec<f64> {
+        const NODES: usize = 6;
+        let (middle, half) = (0.5 * (low_hz * high_hz).ln(), 0.5 * (high_hz / low_hz).ln());
+        let at = |k: usize| {
+            let angle = std::f64::consts::PI * (k as f64 + 0.5) / NODES as f64;
+            (middle - half * angle.cos()).exp()
+        };
+        (0..NODES).map(at).collect()
+    }
+
+    /// Powers (K sr) of each place at each frequency.
+    ///
+    /// # Errors
+    /// [`ModelError`], for places that a model does not cover.
+    pub fn powers(
+        &mut self,
+        places: &[DaughterPosition],
+        frequencies_hz: &[f64],
+    ) -> Result<Vec<Vec<f64>>, ModelError> {
+        match self {
+            Self::PowerLaw { model, frequency_hz, index } => {
+                let mut powers = vec![0.0; places.len()];
+                model.predict_powers(places, &mut powers)?;
+                let factors: Vec<f64> =
+                    frequencies_hz.iter().map(|at_hz| (at_hz / *frequency_hz).powf(*index)).collect();
+                let scaled = |power: f64| factors.iter().map(|factor| power * factor).collect();
+                Ok(powers.into_iter().map(scaled).collect())
+            }
+            Self::Maps(maps) => {
+                let mut found = vec![vec![0.0; places.len()]; maps.len()];
+                for ((_, model), powers) in maps.iter_mut().zip(&mut found) {
+                    model.predict_powers(places, powers)?;
+                }
+                let nodes: Vec<f64> = maps.iter().map(|(frequency_hz, _)| frequency_hz.ln()).collect();
+                let weights: Vec<Vec<f64>> =
+                    frequencies_hz.iter().map(|at_hz| lagrange(&nodes, at_hz.ln())).collect();
+                let at = |place: usize, weights: &Vec<f64>| {
+                    weights.iter().zip(&found).map(|(w, powers)| w * powers[place].ln()).sum::<f64>().exp()
+                };
+                Ok((0..places.len()).map(|place| weights.iter().map(|w| at(place, w)).collect()).collect())
+            }
+        }
+    }
+}
+
+/// Weights of values at `nodes` for the polynomial through them at `x`.
+fn lagrange(nodes: &[f64], x: f64) -> Vec<f64> {
+    let weight = |k: usize| {
+        let others = nodes.iter().enumerate().filter(|(m, _)| *m != k);
+        others.map(|(_, node)| (x - node) / (nodes[k] - node)).product()
+    };
+    (0..nodes.len()).map(weight).collect()
+}
+
+/// What a ninth daughter is made for.
+pub struct NinthSetup {
+    /// The array whose orbit she shares.
+    pub array: Arc<Array>,
+    /// Her settings.
+    pub config: NinthConfig,
+    /// What she hears.
+    pub sky: NinthSky,
+    /// Windows in which she observes, in the order of time.
+    pub windows: Vec<ObservingWindow>,
+    /// Seed of her noise; `None` adds none.
+    pub seed: Option<u64>,
+}
+
+/// Lets frames pass, and adds the ninth daughter's spectra of each window before the frame that closes it.
+///
+/// A power is that of sky and receiver in the middle of an integration, with noise of P / sqrt(dnu dt) (the radiometer
+/// equation of one receiver); its weight is dnu dt / P^2 with the power that was found. Windows are divided
+/// into integrations from their start, the last one cut at the end.
+pub struct Ninth {
+    setup: NinthSetup,
+    spectrometer: Spectrometer,
+    windows: std::iter::Peekable<std::vec::IntoIter<ObservingWindow>>,
+    /// Channels and satellites of the instrument, behind which hers count.
+    before: (usize, u8),
+    sampled: u64,
+}
+
+impl Ninth {
+    /// The ninth daughter of a setup; `None` if it has none.
+    #[must_use]
+    pub fn new(mut setup: NinthSetup) -> Option<Self> {
+        let windows = std::mem::take(&mut setup.windows).into_iter().peekable();
+        let spectrometer = setup.config.spectrometer()?;
+        Some(Self { setup, spectrometer, windows, before: (0, 0), sampled: 0 })
+    }
+
+    /// Her spectra of a window, channel by channel.
+    fn spectra(&mut self, window: ObservingWindow) -> Result<Vec<VisibilityBlock>, ModelError> {
+        let config = &self.setup.config;
+        let length = (window.end.0 - window.start.0).clamp(0, i64::from(u32::MAX)) as u32;
+        let step = ((config.integration_s * TICKS_PER_SECOND as f64) as u32).max(1);
+        let offsets: Vec<u32> = (0..length).step_by(step as usize).collect();
+        let durations: Vec<u32> = offsets.iter().map(|offset| step.min(length - offset)).collect();
+        let place = |(offset, duration): (&u32, &u32)| {
+            let middle = f64::from(*offset) + 0.5 * f64::from(*duration);
+            let t_s = window.start.seconds() + middle / TICKS_PER_SECOND as f64;
+            let r_m = self.setup.array.trailing_m(config.arc_m, t_s);
+            DaughterPosition { r_m, normal_hat: self.setup.array.orbit_normal_hat(t_s) }
+        };
+        let places: Vec<DaughterPosition> = offsets.iter().zip(&durations).map(place).collect();
+        let channels: Vec<_> = self.spectrometer.channels().collect();
+        let frequencies_hz: Vec<f64> = channels.iter().map(|channel| channel.frequency_hz).collect();
+        let powers = self.setup.sky.powers(&places, &frequencies_hz)?;
+        let (first, satellite) = self.before;
+        let blocks = channels.iter().enumerate().map(|(k, channel)| {
+            let mut noise = self
+                .setup
+                .seed
+                .map(|seed| random_stream(seed, StreamKind::Spectrometer, [k as u64, window.start.0 as u64]));
+            let mut block = VisibilityBlock {
+                channel: ChannelId((first + k) as u16),
+                pair: Pair { i: satellite, j: satellite },
+                start: window.start,
+                offset_ticks: offsets.clone(),
+                duration_ticks: durations.clone(),
+                flags: vec![Flags::GOOD; offsets.len()],
+                ..VisibilityBlock::default()
+            };
+            for (powers, duration) in powers.iter().zip(&durations) {
+                let samples = channel.width_hz * f64::from(*duration) / TICKS_PER_SECOND as f64;
+                let draw: f64 = noise.as_mut().map_or(0.0, |stream| StandardNormal.sample(stream));
+                let power = (powers[k] + config.receiver_noise_k_sr) * (1.0 + draw / samples.sqrt());
+                block.value_k_sr.push(Complex32::new(power as f32, 0.0));
+                block.weight.push((samples / (power * power)) as f32);
+            }
+            block
+        });
+        Ok(blocks.collect())
+    }
+}
+
+impl Stage for Ninth {
+    type In = GroundFrame;
+    type Out = GroundFrame;
+    type Error = ModelError;
+
+    fn step(&mut self, frame: GroundFrame, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
+        match frame {
+            GroundFrame::Instrument(instrument) => {
+                self.before = (instrument.channels.len(), instrument.satellites);
+                out.push(GroundFrame::Instrument(instrument));
+            }
+            GroundFrame::Housekeeping(report) => {
+                while let Some(window) = self.windows.next_if(|window| window.start < report.time) {
+                    for block in self.spectra(window)? {
+                        self.sampled += block.len() as u64;
+                        out.push(GroundFrame::Visibilities(block));
+                    }
+                }
+                let sampled = report.sampled + self.sampled;
+                out.push(GroundFrame::Housekeeping(Housekeeping { sampled, ..report }));
+            }
+            other => out.push(other),
+        }
+        Ok(())
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.sampled, "powers")
+    }
+}
