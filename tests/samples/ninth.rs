@@ -255,6 +255,12 @@ fn spectra_come_down_with_the_visibilities_of_either_fidelity() {
             assert!((power / expected - 1.0).abs() < 5.0 * error, "{row:?}: {expected}");
             assert!((sigma / power * 2e6_f64.sqrt() - 1.0).abs() < 2e-3, "{row:?}");
         }
+        let inspected = lunarray(&["inspect", out.join("downlink.ccsds").to_str().unwrap()], &[]);
+        assert!(
+            inspected.contains("satellite 9 a spectrometer: 30.000 to 120.000 MHz in 90 channels"),
+            "{inspected}"
+        );
+        assert!(!inspected.contains("9-9"), "{inspected}");
         // The ground alone has it from the bytes that came down, and its map knows nothing of it.
         let (ground, alone) = (folder.path().join("ground"), folder.path().join("alone"));
         let downlink = out.join("downlink.ccsds");

@@ -88,6 +88,8 @@ pub struct InstrumentSummary {
     pub seed: u64,
     /// Hash of the space segment's configuration, hexadecimal.
     pub configuration_hash: String,
+    /// Band and channels of the spectrometer behind the daughters, if there is one.
+    pub spectrometer: Option<String>,
 }
 
 /// Packets of one kind.

@@ -235,6 +235,10 @@ fn instrument_summary(instrument: &Instrument) -> InstrumentSummary {
         },
         seed: instrument.seed,
         configuration_hash: format!("{:016x}", instrument.configuration_hash),
+        spectrometer: instrument.spectrometer.map(|own| {
+            let (low, high) = (own.low_hz, own.low_hz + own.width_hz * f64::from(own.channels));
+            format!("{:.3} to {:.3} MHz in {} channels", low / 1e6, high / 1e6, own.channels)
+        }),
     }
 }
 

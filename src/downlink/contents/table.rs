@@ -46,6 +46,13 @@ impl Contents {
                 )?;
                 writeln!(f, "              epoch {} TAI, Moon {} m", i.epoch_tai, i.moon_radius_m)?;
                 writeln!(f, "              seed {}, configuration {}", i.seed, i.configuration_hash)?;
+                if let Some(spectrometer) = &i.spectrometer {
+                    writeln!(
+                        f,
+                        "              satellite {} a spectrometer: {spectrometer}",
+                        i.satellites + 1
+                    )?;
+                }
             }
         }
         if let Some(span) = &self.span {
@@ -120,6 +127,8 @@ impl Contents {
         pairs.dedup();
         let rows = self.baselines.iter().map(|row| ((&*row.pair, row.channel), row.visibilities.count));
         let counts: BTreeMap<(&str, u16), u64> = rows.collect();
+        // The spectrometer has other channels.
+        pairs.retain(|pair| self.channels.iter().any(|row| counts.contains_key(&(*pair, row.channel))));
         for channels in self.channels.chunks(CHANNELS_A_ROW) {
             if pairs.is_empty() {
                 break;
