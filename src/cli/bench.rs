@@ -13,6 +13,9 @@ use crate::pipeline::{BENCH_STAGES, BenchSettings, ConfigSource, Plan, bench, be
 /// sky of nside 8. Prints samples, visibilities and bytes a second, the ratio to real time of the design, the
 /// spread over runs, processor time, latencies from sample to packet and from packet to sums, queues and the stage that
 /// saturates first.
+///
+/// Every run begins with nothing prepared: what sampling and the chain take is with their first tables, and with the
+/// predictions of a sky that they sum for themselves.
 #[derive(Debug, Args)]
 pub(super) struct BenchArgs {
     /// Pipeline file (TOML); its first window is measured, of spacecraft.window_s_max at best.

@@ -11,6 +11,7 @@ mod craft;
 mod delays;
 mod disturbances;
 mod integration;
+mod late;
 mod ninth;
 mod noise;
 mod robust;

@@ -1,10 +1,8 @@
 //! The chain at other sizes.
 
-use std::time::Instant;
-
 use serde::Serialize;
 
-use super::{chain, core_seconds_used, median, seconds_of};
+use super::{chain, median, seconds_of, timed};
 use crate::pipeline::config::Config;
 use crate::pipeline::error::PipelineError;
 use crate::pipeline::plan::Plan;
@@ -64,12 +62,10 @@ fn row(config: Config, plan: &Plan, skies: &[SkyMap], runs: usize) -> Result<Gro
     let mission_s = seconds_of(&own);
     let (mut rates, mut core_seconds) = (Vec::new(), Vec::new());
     for _ in 0..runs.max(1) {
-        let (before_s, since) = (core_seconds_used(), Instant::now());
-        let run = chain::run(&own, skies)?;
-        let elapsed_s = since.elapsed().as_secs_f64();
-        let samples = run.report.stage("sample").map_or(0, |stage| stage.units);
-        rates.push(samples as f64 / elapsed_s);
-        core_seconds.extend(core_seconds_used().zip(before_s).map(|(after_s, before_s)| after_s - before_s));
+        let (spent, run) = timed(|| chain::run(&own, skies));
+        let samples = run?.report.stage("sample").map_or(0, |stage| stage.units);
+        rates.push(samples as f64 / spent.seconds);
+        core_seconds.extend(spent.core_seconds);
     }
     let samples_per_s = median(&mut rates);
     let (channels, daughters) = (own.instrument.channels.len(), own.array.satellites());

@@ -139,16 +139,15 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
     for stage in BENCH_STAGES.into_iter().filter(|stage| wanted(stage)) {
         let (mut seconds, mut core_seconds) = (Vec::new(), Vec::new());
         for _ in 0..settings.runs.max(1) {
-            let before_s = core_seconds_used();
-            if stage == "chain" {
-                let since = Instant::now();
-                chain = Some(chain::run(&plan, &skies)?);
-                seconds.push(since.elapsed().as_secs_f64());
+            let spent = if stage == "chain" {
+                let (spent, run) = timed(|| chain::run(&plan, &skies));
+                chain = Some(run?);
+                spent
             } else {
-                seconds.push(time_stage(&plan, &skies, &material, stage)?);
-            }
-            core_seconds
-                .extend(core_seconds_used().zip(before_s).map(|(after_s, before_s)| after_s - before_s));
+                time_stage(&plan, &skies, &material, stage)?
+            };
+            seconds.push(spent.seconds);
+            core_seconds.extend(spent.core_seconds);
         }
         let spent_s = (!core_seconds.is_empty()).then(|| median(&mut core_seconds) / mission_s);
         rates.push(material.rate(stage, seconds, spent_s));
@@ -247,16 +246,21 @@ fn samples_of(frames: &[SpaceFrame]) -> impl Iterator<Item = &Samples> {
     blocks.map(|block| &block.samples)
 }
 
-/// Seconds of one run of a stage alone.
-fn time_stage(plan: &Plan, skies: &[SkyMap], material: &Material, name: &str) -> Result<f64, PipelineError> {
+/// What one run of a stage alone takes.
+fn time_stage(
+    plan: &Plan,
+    skies: &[SkyMap],
+    material: &Material,
+    name: &str,
+) -> Result<Spent, PipelineError> {
     let (sampler, link, correlator) =
         sample_stages(plan, models::build(plan, skies)?, &SampleCounts::default());
     // Input is copied before the clock starts, and output dropped after it has stopped.
     Ok(match name {
         "sample" => {
-            let (seconds, sampled) = timed(|| source(sampler));
+            let (spent, sampled) = timed(|| source(sampler));
             sampled?;
-            seconds
+            spent
         }
         "link" => {
             let input = material.samples.clone();
@@ -269,23 +273,32 @@ fn time_stage(plan: &Plan, skies: &[SkyMap], material: &Material, name: &str) ->
         "transmit" => {
             let (input, transmitter) =
                 (material.visibilities.clone(), Transmitter::new(&plan.config.downlink)?);
-            let (seconds, sent) = timed(|| stage(transmitter, input));
+            let (spent, sent) = timed(|| stage(transmitter, input));
             sent?;
-            seconds
+            spent
         }
         _ => {
             let (input, reception) = (material.packets.clone(), Reception::new(Arc::default()));
-            let (seconds, received) = timed(|| stage(reception, input));
+            let (spent, received) = timed(|| stage(reception, input));
             received?;
-            seconds
+            spent
         }
     })
 }
 
-fn timed<T>(work: impl FnOnce() -> T) -> (f64, T) {
-    let since = Instant::now();
+/// Time that some work took.
+struct Spent {
+    seconds: f64,
+    /// Processor time of the whole process, s; `None` where the system does not tell.
+    core_seconds: Option<f64>,
+}
+
+fn timed<T>(work: impl FnOnce() -> T) -> (Spent, T) {
+    let (before_s, since) = (core_seconds_used(), Instant::now());
     let value = work();
-    (since.elapsed().as_secs_f64(), value)
+    let seconds = since.elapsed().as_secs_f64();
+    let core_seconds = core_seconds_used().zip(before_s).map(|(after_s, before_s)| after_s - before_s);
+    (Spent { seconds, core_seconds }, value)
 }
 
 impl Material {
