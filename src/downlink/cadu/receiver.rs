@@ -25,6 +25,10 @@ const WORK_A_BYTE: u64 = 4;
 /// So many more: a few dozen places looked at for every depth of interleaving.
 const WORK_BYTES: u64 = 1 << 20;
 
+/// Faults up to which a frame with a header of ours is taken as it is. An image with a marker stands four octets or more
+/// from its frame, three if the marker lacks bits, and all of those octets are wrong in it.
+const FAULTS_OF_NO_IMAGE: usize = 2;
+
 /// A frame that could be corrected.
 #[derive(Clone, Copy, Debug)]
 struct Found {
@@ -59,8 +63,8 @@ enum Place {
 /// That a block can be corrected does not prove that it begins there. The code is cyclic, and where 1, 2, 4 or 8
 /// codewords are interleaved a shifted randomizer differs from itself by a codeword: up to 16 octets a codeword too early
 /// or too late, a frame is corrected to its own rotation, and so is every frame after it. So a frame in which
-/// anything was corrected, or whose header is none of ours, has rivals: places so near with a marker. The one
-/// with the fewest faults is taken.
+/// more than an octet or two were corrected, or whose header is none of ours, has rivals: places so near with a marker.
+/// The one with the fewest faults is taken.
 ///
 /// Work is bounded: places are not looked at where a stream has brought forth too many.
 #[derive(Debug, Default)]
@@ -283,7 +287,7 @@ impl CaduReceiver {
         let Some(found) = code.and_then(|code| self.correct(at, code, polarity)) else {
             return Place::Nothing;
         };
-        if found.corrected == 0 && self.header().is_some() {
+        if (found.corrected == 0 || found.faults <= FAULTS_OF_NO_IMAGE) && self.header().is_some() {
             return Place::Frame(found);
         }
         let reach = 8 * ERRORS_MAX * found.code.interleave();
