@@ -33,7 +33,7 @@ fn state(data: &[u8], map: &MapConfig) {
 fn engine<E: NormalEngine>(data: &[u8]) {
     let mut file = data.to_vec();
     file.extend((crc_fast::checksum(Crc32Iscsi, &file) as u32).to_le_bytes());
-    if let Ok(engine) = E::restore(&mut file.as_slice()) {
+    if let Ok(mut engine) = E::restore(&mut file.as_slice()) {
         let mut again = Vec::new();
         engine.checkpoint(&mut again).expect("memory takes everything");
         assert!(E::restore(&mut again.as_slice()).is_ok());
