@@ -17,8 +17,9 @@ fn start(args: &[String]) -> Child {
 }
 
 /// Starts `begin` again and again and kills it, at moments spread evenly over `length` in golden steps; `ended` is
-/// told each time whether it had come to its end before.
-fn kill(kills: u32, length: Duration, begin: impl Fn() -> Child, mut ended: impl FnMut(bool)) {
+/// told each time whether it had come to its end before. The span follows how long sessions take: one that was
+/// measured on a busy machine would mostly see them end by themselves.
+fn kill(kills: u32, mut length: Duration, begin: impl Fn() -> Child, mut ended: impl FnMut(bool)) {
     let mut share: f64 = 0.1;
     let mut killed = 0;
     while killed < kills {
@@ -29,6 +30,7 @@ fn kill(kills: u32, length: Duration, begin: impl Fn() -> Child, mut ended: impl
         child.kill().unwrap();
         child.wait().unwrap();
         killed += u32::from(!is_over);
+        length = length.mul_f64(if is_over { 0.9 } else { 1.02 });
         ended(is_over);
     }
 }
