@@ -234,3 +234,27 @@ proptest! {
         prop_assert!(parse(&bytes).is_err());
     }
 }
+
+#[test]
+fn temperatures_come_in_kelvin_whatever_their_unit() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("map.fits");
+    let map = map(2);
+    let bytes = bytes_of(&map, &WriteOptions { precision: Precision::Double, ..WriteOptions::default() });
+    let read = |unit: &str| {
+        fs::write(&path, forged(&bytes, &format!("TUNIT1  = '{unit}'"))).unwrap();
+        read_whole_map(&path, &ReadOptions::default())
+    };
+    for (unit, factor) in
+        [("K", 1.0), ("", 1.0), ("K_RJ", 1.0), ("Kelvin", 1.0), ("mK", 1e-3), ("uK_CMB", 1e-6), ("MK", 1e6)]
+    {
+        let found = read(unit).unwrap();
+        for (found, value) in found.values().iter().zip(map.values()) {
+            assert_eq!(*found, factor * value, "{unit}");
+        }
+    }
+    for unit in ["MJy/sr", "Jy/beam", "counts", "mJy"] {
+        let refused = read(unit).unwrap_err().to_string();
+        assert!(refused.contains(&format!("`{unit}`")) && refused.contains("expected K"), "{refused}");
+    }
+}

@@ -111,6 +111,14 @@ pub enum FitsProblem {
              the keyword, or name the frame to assume"
     )]
     NoFrame,
+    /// A map of something else than temperature.
+    #[error(
+        "the map's unit (TUNIT) is `{found}`; expected K, mK, uK, kK, MK or none, which is K: convert the map"
+    )]
+    Unit {
+        /// The unit.
+        found: String,
+    },
     /// No such column.
     #[error("the table has no map column {column} (counted from 0); expected one of its {columns}")]
     NoColumn {

@@ -50,14 +50,46 @@ pub fn read_map(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError>
     read_map_file(path, options).map(|file| file.map)
 }
 
-/// Reads a map that must have a usable value in every pixel.
+/// Reads a map of temperatures that must have a usable value in every pixel, and brings it to K.
 ///
 /// # Errors
-/// [`FitsError`], also with [`crate::sky::MapError::BadPixels`] for pixels that are NaN, infinite or UNSEEN.
+/// [`FitsError`], also with [`FitsProblem::Unit`] for a unit that is not one of temperature, and with
+/// [`crate::sky::MapError::BadPixels`] for pixels that are NaN, infinite or UNSEEN.
 pub fn read_whole_map(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError> {
-    let map = read_map(path, options)?;
-    map.check_whole().map_err(|problem| FitsError::new(path, problem.into()))?;
-    Ok(map)
+    read_whole_map_file(path, options).map(|file| file.map)
+}
+
+/// [`read_whole_map`] with the header.
+///
+/// # Errors
+/// As [`read_whole_map`].
+pub fn read_whole_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile, FitsError> {
+    let MapFile { map, name, unit, frame_assumed, header } = read_map_file(path, options)?;
+    let refuse = |problem| FitsError::new(path, problem);
+    map.check_whole().map_err(|problem| refuse(problem.into()))?;
+    let map = match kelvin(&unit).ok_or_else(|| refuse(FitsProblem::Unit { found: unit.clone() }))? {
+        1.0 => map,
+        factor => {
+            let values = map.values().iter().map(|value| factor * value).collect();
+            SkyMap::new(map.frame(), values).map_err(|problem| refuse(problem.into()))?
+        }
+    };
+    Ok(MapFile { map, name, unit, frame_assumed, header })
+}
+
+/// How many K a unit of temperature is, without regard to whether it is one of thermodynamics or of Rayleigh and Jeans:
+/// at these frequencies they are the same. `None` for a unit of something else; a map without one is in K.
+fn kelvin(unit: &str) -> Option<f64> {
+    let unit = unit.trim().trim_matches(['[', ']', '(', ')']);
+    let name = unit.split_once('_').map_or(unit, |(name, _)| name);
+    match name {
+        "" | "K" | "Kelvin" | "kelvin" | "KELVIN" | "Kelvins" => Some(1.0),
+        "mK" => Some(1e-3),
+        "uK" | "muK" | "microK" => Some(1e-6),
+        "kK" => Some(1e3),
+        "MK" => Some(1e6),
+        _ => None,
+    }
 }
 
 /// Reads a map with its header.
