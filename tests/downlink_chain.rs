@@ -108,3 +108,72 @@ fn a_bad_link_is_accounted_for() {
         assert_eq!(of_kinds(&of_bad, "packets") + packets_lost, of_kinds(&of_sound, "packets"));
     }
 }
+
+/// A command that goes on by itself, and what it printed at its end.
+fn replay_of(place: &Workplace, file: &str, out: &str, more: &[&str]) -> std::process::Child {
+    let mut command = std::process::Command::new(assert_cmd::cargo::cargo_bin("lunarray"));
+    command.args(["replay", file, "--map", &place.pipeline, "--out", &place.path(out), "--json"]).args(more);
+    command.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped()).spawn().unwrap()
+}
+
+#[cfg(unix)]
+#[test]
+fn a_pipe_is_read_from_its_first_byte() {
+    let place = Workplace::new(SMALL);
+    for (name, format) in [("plain.ccsds", "packets"), ("coded.cadu", "cadu")] {
+        let file = place.simulate(name, &["--format", format]);
+        let (whole, _) = replay(&place, &file);
+        let pipe = place.path(&format!("{name}.pipe"));
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let child = replay_of(&place, &pipe, "piped", &[]);
+        std::fs::write(&pipe, std::fs::read(&file).unwrap()).unwrap();
+        let output = child.wait_with_output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let piped: Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(piped["ledger"], whole["ledger"]);
+    }
+}
+
+#[test]
+fn a_followed_file_has_the_format_of_those_before_it_and_stays_the_same_file() {
+    let place = Workplace::new(SMALL);
+    let plain = place.simulate("plain.ccsds", &[]);
+    let coded = place.simulate("coded.cadu", &["--format", "cadu"]);
+    let follow = ["--follow", "--idle-s", "1"];
+    let both = ["replay", &plain, &coded, "--map", &place.pipeline, "--out", &place.path("both")];
+    assert!(fail(&[&both[..], &follow].concat()).contains("different formats"));
+
+    let bytes = std::fs::read(&plain).unwrap();
+    let growing = place.file("growing", &bytes[..bytes.len() / 2]);
+    let child = replay_of(&place, &growing, "followed", &["--follow", "--idle-s", "60s"]);
+    // It has read what is there once it has made a folder and a moment has passed; sooner, it sees the short file alone,
+    // which is then not cut while it is read: give it time.
+    while !Path::new(&place.path("followed")).exists() {
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    std::thread::sleep(std::time::Duration::from_secs(2));
+    std::fs::write(&growing, &bytes[..bytes.len() / 4]).unwrap();
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success() && said.contains("cut short or replaced"), "{said}");
+}
+
+#[test]
+fn a_sound_file_is_not_written_over_by_its_damaged_self() {
+    let place = Workplace::new(SMALL);
+    let file = place.simulate("plain.ccsds", &[]);
+    let before = std::fs::read(&file).unwrap();
+    let said = fail(&["corrupt", &file, "--out", &file, "--frame-loss", "0.5"]);
+    assert!(said.contains("the file that is read"), "{said}");
+    assert!(std::fs::read(&file).unwrap() == before);
+}
+
+#[test]
+fn a_downlink_of_any_number_of_channels_needs_no_map_file() {
+    let place = Workplace::new(SMALL);
+    let file = place.simulate("plain.ccsds", &[]);
+    let out = place.path("default");
+    let summary =
+        json(&["replay", &file, "--out", &out, "--set", "map.nside=4", "--set", "products.pictures=false"]);
+    assert_eq!(summary["channels"][0]["diagnostics"]["epsilon"], 1e-4);
+}

@@ -128,6 +128,24 @@ pub enum DownlinkError {
         /// One before it, of the other format.
         other: PathBuf,
     },
+    /// A followed file that is not what it was.
+    #[error(
+        "{}: after {read} bytes of it were read, the file was removed, cut short or replaced by another; expected it to \
+         grow. Replay what is there now beside what was there, with --state",
+        path.display()
+    )]
+    Replaced {
+        /// The file.
+        path: PathBuf,
+        /// Bytes of it that were read.
+        read: u64,
+    },
+    /// A file that would be written over while it is read.
+    #[error("{}: this is the file that is read; expected another place for what is written", path.display())]
+    SameFile {
+        /// The file.
+        path: PathBuf,
+    },
     /// A file in which nothing of ours was found.
     #[error(
         "{}: not one downlink packet in {bytes} bytes; expected CCSDS space packets with APIDs 0x101 to \

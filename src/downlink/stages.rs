@@ -155,30 +155,84 @@ struct Patience {
 /// Reads downlink files one after the other.
 #[derive(Debug)]
 pub struct FileSource {
-    files: VecDeque<PathBuf>,
-    now: Option<(PathBuf, File)>,
+    /// To come; open already if they can be opened only once.
+    files: VecDeque<(PathBuf, Option<File>)>,
+    now: Option<Reading>,
     bytes: u64,
+    /// What the first file with a packet holds.
+    format: Option<(PathBuf, Format)>,
     /// Of the last file, if it is followed.
     patience: Option<Patience>,
 }
 
+/// A file that is being read.
+#[derive(Debug)]
+struct Reading {
+    path: PathBuf,
+    file: File,
+    /// Bytes of it so far.
+    bytes: u64,
+    /// Looks for the first packet in a file that could not be looked into before.
+    probe: Option<Box<Intake>>,
+}
+
 impl FileSource {
-    /// Looks into all files, so that a wrong one is known at once.
+    /// Looks into all files, so that a wrong one is known at once; into what can be read only once, a pipe, as it is read.
     ///
     /// # Errors
     /// A file that cannot be opened, is empty, does not hold a packet of ours, or is of another format than the first.
     pub fn open(paths: &[PathBuf]) -> Result<Self, DownlinkError> {
-        let mut first: Option<(&PathBuf, Format)> = None;
+        let mut source = Self { files: VecDeque::new(), now: None, bytes: 0, format: None, patience: None };
         for path in paths {
-            let format = format_of(path)?;
-            match first {
-                Some((other, expected)) if expected != format => {
-                    return Err(DownlinkError::Mixed { path: path.clone(), other: other.clone() });
-                }
-                _ => first = Some((path, format)),
+            let file = File::open(path).map_err(io_error(path, "open the file"))?;
+            if is_regular(&file) {
+                source.note_format(path, format_of(path, file)?)?;
+                source.files.push_back((path.clone(), None));
+            } else {
+                source.files.push_back((path.clone(), Some(file)));
             }
         }
-        Ok(Self { files: paths.iter().cloned().collect(), now: None, bytes: 0, patience: None })
+        Ok(source)
+    }
+
+    /// One stream has one format.
+    fn note_format(&mut self, path: &Path, format: Format) -> Result<(), DownlinkError> {
+        match &self.format {
+            Some((other, expected)) if *expected != format => {
+                Err(DownlinkError::Mixed { path: path.to_owned(), other: other.clone() })
+            }
+            Some(_) => Ok(()),
+            None => {
+                self.format = Some((path.to_owned(), format));
+                Ok(())
+            }
+        }
+    }
+
+    /// The next file.
+    fn begin(&mut self) -> Result<Option<Reading>, DownlinkError> {
+        let Some((path, file)) = self.files.pop_front() else { return Ok(None) };
+        let is_followed = self.patience.is_some() && self.files.is_empty();
+        let probe = (is_followed || file.is_some()).then(Box::default);
+        let file = match file {
+            Some(file) => file,
+            None => File::open(&path).map_err(io_error(&path, "open the file"))?,
+        };
+        Ok(Some(Reading { path, file, bytes: 0, probe }))
+    }
+
+    /// Looks for the first packet in what has come of a file, if none has been found in it yet.
+    fn probe(&mut self, reading: &mut Reading, bytes: &[u8]) -> Result<(), DownlinkError> {
+        let Some(probe) = &mut reading.probe else { return Ok(()) };
+        probe.push(bytes);
+        while let Some(event) = probe.next_event() {
+            if matches!(event, Event::Packet(_)) {
+                let format = probe.format().unwrap_or_default();
+                reading.probe = None;
+                return self.note_format(&reading.path, format);
+            }
+        }
+        Ok(())
     }
 
     /// As [`FileSource::open`], but the last file, which may hold nothing yet, is read on as it grows: until it has not
@@ -188,29 +242,64 @@ impl FileSource {
     /// Those of [`FileSource::open`] for all files but the last, which need only be there.
     pub fn follow(paths: &[PathBuf], idle_s: f64) -> Result<Self, DownlinkError> {
         let Some((last, others)) = paths.split_last() else { return Self::open(paths) };
-        File::open(last).map_err(io_error(last, "open the file"))?;
+        let file = File::open(last).map_err(io_error(last, "open the file"))?;
         let mut source = Self::open(others)?;
-        source.files.push_back(last.clone());
+        source.files.push_back((last.clone(), Some(file)));
         let polls_max = (idle_s > 0.0).then(|| (idle_s / POLL.as_secs_f64()).ceil() as u64);
         source.patience = Some(Patience { polls_max, polls: 0 });
         Ok(source)
     }
 
     /// Waits a little for the last file to grow; whether to look again.
-    fn wait(&mut self) -> bool {
-        let Some(patience) = self.patience.as_mut().filter(|_| self.files.is_empty()) else { return false };
+    fn wait(&mut self, reading: &Reading) -> Result<bool, DownlinkError> {
+        let Some(patience) = self.patience.as_mut().filter(|_| self.files.is_empty()) else {
+            return Ok(false);
+        };
+        reading.check_place()?;
         patience.polls += 1;
         if patience.polls_max.is_some_and(|most| patience.polls > most) {
-            return false;
+            return Ok(false);
         }
         std::thread::sleep(POLL);
-        true
+        Ok(true)
     }
 }
 
+impl Reading {
+    /// A followed file must stay what it was: what is written over what was read would be passed by.
+    fn check_place(&self) -> Result<(), DownlinkError> {
+        let path = &self.path;
+        let Ok(there) = std::fs::metadata(path) else {
+            return Err(DownlinkError::Replaced { path: path.clone(), read: self.bytes });
+        };
+        let here = self.file.metadata().map_err(io_error(path, "examine the file"))?;
+        if there.is_file() && (there.len() < self.bytes || !is_same(&here, &there)) {
+            return Err(DownlinkError::Replaced { path: path.clone(), read: self.bytes });
+        }
+        Ok(())
+    }
+}
+
+/// Whether a file can be opened again and is then the same: a pipe is not.
+fn is_regular(file: &File) -> bool {
+    file.metadata().is_ok_and(|found| found.is_file())
+}
+
+/// Whether an open file is the one that its path leads to.
+#[cfg(unix)]
+fn is_same(here: &std::fs::Metadata, there: &std::fs::Metadata) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    (here.dev(), here.ino()) == (there.dev(), there.ino())
+}
+
+/// Whether an open file is the one that its path leads to; not known here.
+#[cfg(not(unix))]
+fn is_same(_: &std::fs::Metadata, _: &std::fs::Metadata) -> bool {
+    true
+}
+
 /// Reads until the first packet of ours; all of a foreign file, in bounded memory.
-fn format_of(path: &Path) -> Result<Format, DownlinkError> {
-    let mut file = File::open(path).map_err(io_error(path, "open the file"))?;
+fn format_of(path: &Path, mut file: File) -> Result<Format, DownlinkError> {
     let mut receiver = Intake::new();
     let mut at_end = false;
     loop {
@@ -234,25 +323,24 @@ impl Source for FileSource {
     type Error = DownlinkError;
 
     fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, DownlinkError> {
-        let (path, mut file) = match self.now.take() {
-            Some(now) => now,
-            None => {
-                let Some(path) = self.files.pop_front() else { return Ok(Flow::Done) };
-                let file = File::open(&path).map_err(io_error(&path, "open the file"))?;
-                (path, file)
-            }
+        let begun = match self.now.take() {
+            Some(reading) => Some(reading),
+            None => self.begin()?,
         };
+        let Some(mut reading) = begun else { return Ok(Flow::Done) };
         let mut bytes = Vec::with_capacity(READ_BYTES);
-        let read = Read::by_ref(&mut file).take(READ_BYTES as u64).read_to_end(&mut bytes);
-        if read.map_err(io_error(&path, "read"))? > 0 {
+        let read = Read::by_ref(&mut reading.file).take(READ_BYTES as u64).read_to_end(&mut bytes);
+        if read.map_err(io_error(&reading.path, "read"))? > 0 {
             self.bytes += bytes.len() as u64;
+            reading.bytes += bytes.len() as u64;
+            self.probe(&mut reading, &bytes)?;
             out.push(bytes);
-            self.now = Some((path, file));
+            self.now = Some(reading);
             if let Some(patience) = &mut self.patience {
                 patience.polls = 0;
             }
-        } else if self.wait() {
-            self.now = Some((path, file));
+        } else if self.wait(&reading)? {
+            self.now = Some(reading);
         }
         Ok(Flow::Continue)
     }

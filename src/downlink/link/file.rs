@@ -93,6 +93,9 @@ impl Stage for LinkStage {
 /// # Errors
 /// Files that cannot be read or written, a file that is no sound downlink, a bad configuration.
 pub fn corrupt(from: &Path, to: &Path, config: &LinkConfig, seed: u64) -> Result<Truth, DownlinkError> {
+    if std::fs::canonicalize(to).is_ok_and(|to| std::fs::canonicalize(from).is_ok_and(|from| from == to)) {
+        return Err(DownlinkError::SameFile { path: to.to_owned() });
+    }
     let mut simulator = LinkSimulator::new(config, seed, code_of(from)?)?;
     let mut source = File::open(from).map_err(io_error(from, "open the file"))?;
     let mut file = AtomicFile::create(to, Unfinished::Remove).map_err(io_error(to, "create the file"))?;
