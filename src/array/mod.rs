@@ -10,6 +10,7 @@ mod formation;
 mod integration;
 mod orbit;
 mod placing;
+mod stretch;
 mod windows;
 
 pub mod harmonic;
@@ -21,4 +22,5 @@ pub use formation::Formation;
 pub use integration::{IntegrationRule, integration_time_s};
 pub use orbit::{Array, SatelliteState, hidden_by_moon};
 pub use placing::{FlaggedCounts, PlacingCounts};
+pub use stretch::stretched;
 pub use windows::{ObservingWindows, earth_in_sight_s};

@@ -1,9 +1,9 @@
 //! Sub-bands of a channel, as one channel.
 
 use super::{Calibration, CalibrationError, CalibrationReport};
+use crate::array::stretched;
 use crate::frames::{Channel, Instrument, PlacedVisibilities};
 use crate::units::ChannelId;
-use crate::units::vector::{Vec3, add, norm, scale, sub};
 
 /// Takes successive channels of the downlink for sub-bands of one, after another calibration.
 ///
@@ -72,25 +72,13 @@ impl Calibration for SubBands {
     }
 }
 
-/// Two positions moved on their circle until their distance is `factor` times what it was.
-fn stretched(r_i_m: Vec3, r_j_m: Vec3, factor: f64) -> (Vec3, Vec3) {
-    let (middle, half) = (scale(0.5, add(r_i_m, r_j_m)), scale(0.5, sub(r_i_m, r_j_m)));
-    let half_m = norm(half);
-    // What the chord grows, its distance from the centre shrinks.
-    let depth_m = norm(middle);
-    let squared = depth_m * depth_m + half_m * half_m * (1.0 - factor * factor);
-    let centre = scale(squared.max(0.0).sqrt() / depth_m, middle);
-    let half = scale(factor, half);
-    (add(centre, half), sub(centre, half))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::calibration::Identity;
     use crate::frames::AntennaResponse;
     use crate::units::Pair;
-    use crate::units::vector::dot;
+    use crate::units::vector::{dot, norm, scale, sub};
 
     fn instrument(channels: &[[f64; 2]]) -> Instrument {
         Instrument {

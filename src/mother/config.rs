@@ -17,6 +17,10 @@ pub const CHANNELS_MAX: usize = 30;
 /// Lowest and highest channel frequency, Hz: the mission's band.
 pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 
+/// Narrowest channel of samples, Hz: those made together, 2^14, take half a minute, in which the array moves by some
+/// degrees; what narrower ones would need grows with the third power of that time.
+const SAMPLES_WIDTH_HZ_MIN: f64 = 500.0;
+
 /// The space segment at the level of integrated visibilities.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -46,6 +50,9 @@ pub struct SpacecraftConfig {
     /// Whether visibilities are averages over their integrations (motion along the orbit; harmonic model only) or
     /// of the instants in their middle.
     pub smear_integrations: bool,
+    /// Whether visibilities are averages over their channel's width, as those of samples are: the integrand times
+    /// `sinc(pi n . r_ij dnu / c)`. Rows of B that the ground makes are of the channel's centre.
+    pub smear_bandwidth: bool,
     /// Whether thermal noise is added. Weights are those of the noise either way.
     pub thermal_noise: bool,
     /// Receiver noise T_rec / zeta, as the antenna would see it from the sky, K sr.
@@ -132,6 +139,7 @@ impl Default for SpacecraftConfig {
             baseline_wavelengths_max: PerChannel::All(0.0),
             model: ModelChoice::default(),
             smear_integrations: false,
+            smear_bandwidth: false,
             thermal_noise: true,
             receiver_noise_k_sr: 0.0,
             antenna: Antenna::default(),
@@ -160,6 +168,19 @@ pub enum SpacecraftError {
         /// Value found, Hz.
         value: f64,
     },
+    /// A channel that leaves the band.
+    #[error(
+        "spacecraft.channels_hz[{index}] = {value} Hz: a channel of channel_width_hz = {width_hz} Hz about it reaches below \
+         zero, or its sub-bands out of {} Hz to {} Hz; expected all of it within", BAND_HZ[0], BAND_HZ[1]
+    )]
+    Edge {
+        /// Place in the list.
+        index: usize,
+        /// Value found.
+        value: f64,
+        /// Width, Hz.
+        width_hz: f64,
+    },
     /// Two channels that overlap.
     #[error(
         "spacecraft.channels_hz[{first}] and [{second}] are {distance_hz} Hz apart: expected at least \
@@ -187,7 +208,7 @@ pub enum SpacecraftError {
     /// Sub-bands of visibilities that were never samples.
     #[error(
         "spacecraft.sub_bands and spacecraft.delay_centre_deg are of samples: expected 1 and [] with \
-         spacecraft.fidelity = \"visibilities\", which have no bandwidth to lose"
+         spacecraft.fidelity = \"visibilities\", which are of one frequency, or averages over the whole channel"
     )]
     Division,
     /// A direction that cannot be.
@@ -204,7 +225,7 @@ pub enum SpacecraftError {
     /// Samples asked of a model that they do not have.
     #[error(
         "spacecraft.fidelity = \"samples\" takes direct sums of instants: expected spacecraft.model = \"auto\" or \
-         \"direct\", and spacecraft.smear_integrations = false"
+         \"direct\", and spacecraft.smear_integrations = false; smear_bandwidth = false too, as samples are of the whole channel"
     )]
     SamplesModel,
     /// A parameter outside its range.
@@ -258,13 +279,13 @@ impl SpacecraftConfig {
         if divided && self.fidelity == Fidelity::Visibilities {
             found.push(SpacecraftError::Division);
         }
-        if self.sub_bands > 1 {
-            // Sub-bands are channels of the downlink, which has them within the band.
-            for (index, &value) in self.channels_hz.iter().enumerate() {
-                let half_hz = 0.5 * self.channel_width_hz;
-                if value - half_hz < BAND_HZ[0] || value + half_hz > BAND_HZ[1] {
-                    found.push(SpacecraftError::Frequency { index, value });
-                }
+        for (index, &value) in self.channels_hz.iter().enumerate() {
+            let half_hz = 0.5 * self.channel_width_hz;
+            // Sub-bands are channels of the downlink, which has them within the band; others only must not reach zero.
+            let out = value - half_hz < BAND_HZ[0] || value + half_hz > BAND_HZ[1];
+            if half_hz >= value || (self.sub_bands > 1 && out) {
+                let width_hz = self.channel_width_hz;
+                found.push(SpacecraftError::Edge { index, value, width_hz });
             }
         }
         found
@@ -308,7 +329,7 @@ impl SpacecraftConfig {
                 found.push(SpacecraftError::PerChannel { key, channels });
             }
         }
-        let direct = self.model != ModelChoice::Harmonic && !self.smear_integrations;
+        let direct = self.model != ModelChoice::Harmonic && !self.smear_integrations && !self.smear_bandwidth;
         if self.fidelity == Fidelity::Samples && !direct {
             found.push(SpacecraftError::SamplesModel);
         }
@@ -328,6 +349,8 @@ impl SpacecraftConfig {
         require("window_s_max", window, window >= 0.0, "seconds, or 0 for all of a window");
         let width = self.channel_width_hz;
         require("channel_width_hz", width, width > 0.0 && width <= 1e6, "above 0 Hz and at most 1 MHz");
+        let moving = self.fidelity == Fidelity::Visibilities || width >= SAMPLES_WIDTH_HZ_MIN;
+        require("channel_width_hz", width, moving, "at least 500 Hz with fidelity = \"samples\"");
         let longest = self.integration_s_max;
         require("integration_s_max", longest, (1e-3..=1000.0).contains(&longest), "0.001 s to 1000 s");
         let motion = self.motion_wavelengths_max;

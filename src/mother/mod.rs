@@ -6,6 +6,7 @@
 //! [`correlator`] makes them from the samples of [`crate::daughters`]. [`Ninth`] adds the spectra of one more daughter.
 //! Uses [`crate::frames`], [`crate::array`], [`crate::sky`].
 
+mod bandwidth;
 mod choice;
 mod config;
 pub mod correlator;
@@ -18,6 +19,7 @@ mod observer;
 mod schedule;
 mod store;
 
+pub use bandwidth::BandAverage;
 pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
 pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, SpacecraftError, StoreDrop};
 pub use direct::DirectSum;

@@ -5,7 +5,8 @@ use thiserror::Error;
 
 use crate::array::harmonic::{GeometryRefusal, HarmonicError};
 use crate::array::response::Comb;
-use crate::units::vector::{Vec3, add, norm, scale, sub};
+use crate::array::stretched;
+use crate::units::vector::Vec3;
 
 /// Where the two daughters of a pair are.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -116,7 +117,7 @@ pub trait VisibilityModel: Send + Sync {
     ) -> Result<(), ModelError> {
         let factors = (0..comb.count).map(|k| 1.0 + comb.first + comb.step * k as f64);
         let apart: Vec<PairPosition> =
-            positions.iter().flat_map(|pair| factors.clone().map(|factor| stretched(pair, factor))).collect();
+            positions.iter().flat_map(|pair| factors.clone().map(|factor| pair.stretched(factor))).collect();
         let mut predictions = vec![Prediction::default(); apart.len()];
         self.predict(&apart, &mut predictions)?;
         for (out, prediction) in out.iter_mut().zip(predictions) {
@@ -126,15 +127,11 @@ pub trait VisibilityModel: Send + Sync {
     }
 }
 
-/// A pair moved apart along its circle about the Moon until the chord is `factor` times as long.
-///
-/// At the centre's frequency it has the fringes that the pair has at `factor` times that. The Moon's limb
-/// is moved by half the added length: 2e-5 rad for 100 km at 10 MHz, 1e-3 rad at 0.1 MHz.
-fn stretched(pair: &PairPosition, factor: f64) -> PairPosition {
-    let PairPosition { r_i_m, r_j_m, span_rad } = *pair;
-    let (middle, half) = (scale(0.5, add(r_i_m, r_j_m)), scale(0.5 * factor, sub(r_i_m, r_j_m)));
-    let (middle_m, half_m, radius_m) = (norm(middle), norm(half), norm(r_i_m));
-    let depth_m = (radius_m * radius_m - half_m * half_m).max(0.0).sqrt();
-    let centre = scale(depth_m / middle_m, middle);
-    PairPosition { r_i_m: add(centre, half), r_j_m: sub(centre, half), span_rad }
+impl PairPosition {
+    /// The pair moved apart, as [`stretched`] has it.
+    #[must_use]
+    pub fn stretched(&self, factor: f64) -> Self {
+        let (r_i_m, r_j_m) = stretched(self.r_i_m, self.r_j_m, factor);
+        Self { r_i_m, r_j_m, span_rad: self.span_rad }
+    }
 }

@@ -8,8 +8,8 @@ use super::plan::Plan;
 use crate::array::Array;
 use crate::array::harmonic::RotationTable;
 use crate::mother::{
-    DirectSum, Fidelity, HarmonicSetup, HarmonicSum, Load, ModelChoice, ModelKind, ModelPlan, Schedule,
-    VisibilityModel,
+    BandAverage, DirectSum, Fidelity, HarmonicSetup, HarmonicSum, Load, ModelChoice, ModelKind, ModelPlan,
+    Schedule, VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
@@ -23,10 +23,20 @@ impl Plan {
         let spacecraft = &self.config.spacecraft;
         let plan = |((schedule, expected), &sky_nside): ((&Schedule, _), &usize)| {
             let expected: super::Expected = expected;
+            let longest = longest_baseline_wavelengths(&self.array, schedule);
+            let (frequencies, stretch) = match spacecraft.smear_bandwidth {
+                true => {
+                    let width_hz = spacecraft.channel_width_hz;
+                    let longest_m = longest * SPEED_OF_LIGHT_M_S / schedule.frequency_hz;
+                    let frequencies = BandAverage::frequencies(longest_m, width_hz);
+                    (frequencies, BandAverage::stretch(schedule.frequency_hz, width_hz))
+                }
+                false => (1, 1.0),
+            };
             let load = Load {
-                visibilities: expected.sent,
+                visibilities: expected.sent * frequencies as f64,
                 sky_nside,
-                baseline_wavelengths_max: longest_baseline_wavelengths(&self.array, schedule),
+                baseline_wavelengths_max: longest * stretch,
                 l_max: self.config.sky.l_max,
                 smeared: spacecraft.smear_integrations,
             };
@@ -84,7 +94,8 @@ pub(super) fn build(plan: &Plan, skies: &[SkyMap]) -> Result<Vec<Box<dyn Visibil
     for ((model, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {
         let (frequency_hz, response) = (schedule.frequency_hz, plan.instrument.response);
         if model.kind == ModelKind::Direct {
-            models.push(Box::new(DirectSum::new(sky, frequency_hz, array.moon_radius_m(), response)));
+            let direct = DirectSum::new(sky, frequency_hz, array.moon_radius_m(), response);
+            models.push(averaged(plan, Box::new(direct), frequency_hz));
             continue;
         }
         let alm = coefficients(sky, model.l_max)?;
@@ -98,9 +109,18 @@ pub(super) fn build(plan: &Plan, skies: &[SkyMap]) -> Result<Vec<Box<dyn Visibil
         };
         let table = || Arc::new(RotationTable::new(model.l_max, array.inclination_rad()));
         let rotation = Arc::clone(rotations.entry(model.l_max).or_insert_with(table));
-        models.push(Box::new(HarmonicSum::new(alm, setup, rotation)?));
+        models.push(averaged(plan, Box::new(HarmonicSum::new(alm, setup, rotation)?), frequency_hz));
     }
     Ok(models)
+}
+
+/// The model as it is, or averaged over its channel.
+fn averaged(plan: &Plan, model: Box<dyn VisibilityModel>, frequency_hz: f64) -> Box<dyn VisibilityModel> {
+    let spacecraft = &plan.config.spacecraft;
+    match spacecraft.smear_bandwidth {
+        true => Box::new(BandAverage::new(model, frequency_hz, spacecraft.channel_width_hz)),
+        false => model,
+    }
 }
 
 /// Coefficients of a map in any frame on ecliptic axes, up to `l_max`.

@@ -101,6 +101,7 @@ fn the_harmonic_model_is_refused_for_samples_with_the_way_out() {
     for (set, refused) in [
         ("spacecraft.model=harmonic", true),
         ("spacecraft.smear_integrations=true", true),
+        ("spacecraft.smear_bandwidth=true", true),
         ("spacecraft.model=direct", false),
         ("spacecraft.model=auto", false),
     ] {

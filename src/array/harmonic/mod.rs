@@ -16,7 +16,7 @@ pub(crate) mod kernel;
 mod legendre;
 mod model;
 mod pattern;
-mod quadrature;
+pub(crate) mod quadrature;
 pub(crate) mod real;
 mod ring;
 pub(crate) mod rotation;
