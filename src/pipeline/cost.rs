@@ -5,11 +5,12 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::bench::sampling_cost;
 use super::engine_cost::EngineCost;
 use super::plan::Plan;
 use crate::array::response::{Directions, PairGeometry, sky_sums};
 use crate::frames::ObservingWindow;
-use crate::mother::{ModelKind, ModelPlan, VISIBILITY_BYTES};
+use crate::mother::{Fidelity, ModelKind, ModelPlan, VISIBILITY_BYTES};
 use crate::sky::healpix::{pixel_area_sr, pixel_count, pixel_directions};
 
 /// Greatest nside on which fringes are timed.
@@ -57,6 +58,9 @@ pub struct Cost {
     pub samples_bits_per_s: Option<f64>,
     /// Rate of the ninth daughter's spectra on the downlink while the array observes, bit/s; with her alone.
     pub ninth_bits_per_s: Option<f64>,
+    /// Time to draw, quantise, send and correlate the samples, s, from a run of a few seconds of mission time; with
+    /// samples alone.
+    pub sampling_s: Option<f64>,
     /// Time on this machine, s, from a measurement of a fraction of a second.
     pub predicted_s: f64,
 }
@@ -72,7 +76,8 @@ impl ChannelCost {
 }
 
 impl Plan {
-    /// Counts and measures what the pipeline will cost. Takes well under a second but for large maps.
+    /// Counts and measures what the pipeline will cost. Takes well under a second but for large maps and for samples, of
+    /// which some are made.
     #[must_use]
     pub fn cost(&self) -> Cost {
         let map = &self.config.map;
@@ -112,7 +117,9 @@ impl Plan {
             + sky_pixels * 8.0 * (frequencies.len() + 3) as f64
             + channels.iter().map(|channel| channel.simulation.bytes).sum::<f64>();
         let solving_s = solutions as f64 * engines.iter().map(|engine| engine.solution_s).sum::<f64>();
-        let simulating_s: f64 = channels.iter().map(ChannelCost::simulation_s).sum();
+        let sampling_s = self.sampling_s();
+        let simulating_s: f64 =
+            sampling_s.unwrap_or_else(|| channels.iter().map(ChannelCost::simulation_s).sum());
         let accumulating_s: f64 =
             engines.iter().zip(&expected).map(|(engine, e)| engine.visibility_s * e.mapped).sum();
         let predicted_s = simulating_s + accumulating_s + solving_s;
@@ -123,22 +130,46 @@ impl Plan {
             downlink_bytes: self.config.downlink.expansion()
                 * (sent * VISIBILITY_BYTES as f64
                     + self.windows.len() as f64 * 10_000.0
+                    + self.auto_bytes()
                     + self.ninth_bytes()),
             memory_bytes,
             samples_bits_per_s: self.samples_bits_per_s(),
             ninth_bits_per_s: self.ninth_bits_per_s(),
+            sampling_s,
             predicted_s,
         }
+    }
+
+    /// Mission time in which the array observes, s.
+    fn observing_s(&self) -> f64 {
+        let length_s = |window: &ObservingWindow| window.end.seconds() - window.start.seconds();
+        self.windows.iter().map(length_s).sum()
+    }
+
+    /// Time that samples take; NaN if they cannot be made.
+    fn sampling_s(&self) -> Option<f64> {
+        (self.config.spacecraft.fidelity == Fidelity::Samples).then(|| {
+            let [set_up_s, rate] = sampling_cost(self).unwrap_or([f64::NAN; 2]);
+            set_up_s + rate * self.observing_s()
+        })
+    }
+
+    /// Bytes of the daughters' own powers.
+    fn auto_bytes(&self) -> f64 {
+        let spacecraft = &self.config.spacecraft;
+        if spacecraft.fidelity != Fidelity::Samples || spacecraft.auto_integration_s == 0.0 {
+            return 0.0;
+        }
+        let series = self.array.satellites() * spacecraft.channels_hz.len() * spacecraft.sub_bands;
+        VISIBILITY_BYTES as f64 * series as f64 * self.observing_s() / spacecraft.auto_integration_s
     }
 
     /// Bytes of the ninth daughter's spectra, with headers of a packet a channel and window.
     fn ninth_bytes(&self) -> f64 {
         const PACKET_BYTES: f64 = 42.0;
         let Some(rate) = self.ninth_bits_per_s() else { return 0.0 };
-        let length_s = |window: &ObservingWindow| window.end.seconds() - window.start.seconds();
-        let seconds: f64 = self.windows.iter().map(length_s).sum();
         let packets = self.config.spacecraft.ninth.channels * self.windows.len();
-        seconds * rate / 8.0 + PACKET_BYTES * packets as f64
+        self.observing_s() * rate / 8.0 + PACKET_BYTES * packets as f64
     }
 
     fn solutions(&self) -> u64 {
@@ -193,13 +224,16 @@ impl fmt::Display for Cost {
             )?;
         }
         writeln!(f)?;
-        for channel in &self.channels {
+        if let Some(sampling_s) = self.sampling_s {
+            writeln!(f, "samples are drawn, sent and correlated in {sampling_s:.1} s")?;
+        }
+        for channel in self.channels.iter().filter(|_| self.sampling_s.is_none()) {
             let ModelPlan { kind, why, l_max, .. } = channel.simulation;
             let [set_up_s, visibilities_s] = channel.simulation_harmonic_s;
             writeln!(
                 f,
-                "{:>8.3} MHz simulated by {kind} ({why}): direct sums {:.3e} s, harmonics to l = {l_max} \
-                 {set_up_s:.0} s + {visibilities_s:.1} s",
+                "{:>8.3} MHz simulated by {kind} ({why}): direct sums would take {:.1} s, harmonics to l = {l_max} \
+                 {set_up_s:.1} s to set up and {visibilities_s:.1} s for visibilities",
                 channel.frequency_hz / 1e6,
                 channel.simulation_direct_s
             )?;
