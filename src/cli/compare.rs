@@ -5,9 +5,8 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::{CommandError, CommandResult, Outcome, print_json_line, print_text};
-use crate::products::draw_comparison;
-use crate::products::pictures::{MapPanel, Sampling, Scale, View, draw_map};
-use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::products::{draw_comparison, draw_relative_error};
+use crate::sky::fits::{ReadOptions, read_whole_map_file};
 use crate::sky::{Comparison, Frame, SkyMap, compare};
 
 /// Compare a map with the truth, degree by degree.
@@ -47,12 +46,17 @@ pub(super) struct CompareArgs {
 }
 
 pub(super) fn execute(args: &CompareArgs) -> CommandResult {
-    let map = read(&args.map)?;
-    let mut truth = read(&args.truth)?;
+    let (map, map_hz) = read(&args.map)?;
+    let (mut truth, truth_hz) = read(&args.truth)?;
+    if let (Some(map_hz), Some(truth_hz)) = (map_hz, truth_hz)
+        && (map_hz - truth_hz).abs() > 1e-6 * truth_hz
+    {
+        eprintln!("note: the map is of {map_hz} Hz, the truth of {truth_hz} Hz (FREQ)");
+    }
     if let Some(l_max) = args.band_limit {
         truth = truth.band_limited(map.nside(), l_max)?;
     }
-    let noise = args.noise.as_deref().map(read).transpose()?;
+    let noise = args.noise.as_deref().map(read).transpose()?.map(|(noise, _)| noise);
     let comparison = compare(&map, &truth, noise.as_ref(), args.l_max)?;
     if args.json {
         print_json_line(&comparison)?;
@@ -71,10 +75,13 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     Ok(Outcome::Done)
 }
 
-/// A file that does not say its frame is taken to be ecliptic, as all maps of this program are.
-fn read(path: impl AsRef<Path>) -> Result<SkyMap, CommandError> {
+/// A map in K, and its frequency, Hz, if the file tells. A file that does not say its frame is taken to be ecliptic, as
+/// all maps of this program are.
+fn read(path: impl AsRef<Path>) -> Result<(SkyMap, Option<f64>), CommandError> {
     let options = ReadOptions { frame_if_missing: Some(Frame::Ecliptic), ..ReadOptions::default() };
-    Ok(read_whole_map(path.as_ref(), &options)?)
+    let file = read_whole_map_file(path.as_ref(), &options)?;
+    let frequency_hz = file.header.real("FREQ");
+    Ok((file.map, frequency_hz))
 }
 
 fn draw(args: &CompareArgs, comparison: &Comparison) -> Result<Vec<PathBuf>, CommandError> {
@@ -83,15 +90,7 @@ fn draw(args: &CompareArgs, comparison: &Comparison) -> Result<Vec<PathBuf>, Com
     let plot = args.plot.clone().unwrap_or_else(|| beside(&args.map, "-spectra"));
     let error = beside(&plot, "-error");
     draw_comparison(&title, comparison)?.write(&plot)?;
-    let values = comparison.relative_error_map.values();
-    let panel = MapPanel {
-        values,
-        caption: title,
-        scale: Scale::symmetric(values),
-        unit: "(map - truth) / truth".to_owned(),
-    };
-    let view = View { sampling: Sampling::Interpolated, ..View::default() };
-    draw_map(&panel, "", &view)?.write(&error)?;
+    draw_relative_error(&title, "", comparison)?.write(&error)?;
     Ok(vec![plot, error])
 }
 
@@ -103,7 +102,7 @@ fn beside(path: &Path, suffix: &str) -> PathBuf {
 
 fn table(comparison: &Comparison) -> String {
     let mut lines =
-        vec![format!("{:>5} {:>12} {:>12} {:>9} {:>12}", "l", "C_l map", "C_l truth", "rho_l", "SNR_l")];
+        vec![format!("{:>5} {:>12} {:>12} {:>9} {:>12}", "l", "C_l map, K²", "truth, K²", "rho_l", "SNR_l")];
     let l_max = comparison.l.last().copied().unwrap_or(0);
     let step = (l_max / 24).max(1);
     for &l in comparison.l.iter().step_by(step) {
@@ -117,6 +116,6 @@ fn table(comparison: &Comparison) -> String {
         ));
     }
     let error = &comparison.relative_error;
-    lines.push(format!("relative error: mean {:+.4}, rms {:.4}", error.mean, error.rms));
+    lines.push(format!("(map - truth) / truth: mean {:+.4}, rms {:.4}", error.mean, error.rms));
     lines.join("\n")
 }

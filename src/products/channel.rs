@@ -27,8 +27,8 @@ pub(super) struct ChannelFolder {
     name: String,
     frequency_hz: f64,
     truth: Option<SkyMap>,
-    /// Maps so far, with their captions, for the sheet.
-    shown: Vec<(Vec<f64>, String)>,
+    /// Some of the maps so far, for the sheet.
+    shown: Shown,
     snapshots: Vec<SnapshotSummary>,
     files: Vec<String>,
     summary: Option<ChannelSummary>,
@@ -54,7 +54,7 @@ impl ChannelFolder {
             name,
             frequency_hz,
             truth: truth.cloned(),
-            shown: Vec::new(),
+            shown: Shown::default(),
             snapshots: Vec::new(),
             files: Vec::new(),
             summary: None,
@@ -78,6 +78,7 @@ impl ChannelFolder {
             self.write_map(&format!("snapshot-{:03}.fits", solution.number), &map, provenance, solution)?;
         }
         if self.config.pictures {
+            self.shown.take(&solution.map_k, &caption(solution));
             self.draw_snapshot(solution)?;
         }
         if solution.is_final {
@@ -96,14 +97,14 @@ impl ChannelFolder {
     }
 
     fn note(&mut self, solution: &Solution, comparison: Option<&Comparison>) {
-        let until_s = solution.span_s[1];
-        let days = (until_s - solution.span_s[0]) / DAY_S;
-        self.shown.push((solution.map_k.clone(), format!("after {days:.0} days")));
         self.snapshots.push(SnapshotSummary {
             number: solution.number,
-            until_s,
+            until_s: solution.span_s[1],
             visibilities: solution.visibilities,
-            relative_error: self.truth.as_ref().map(|truth| relative_error(&solution.map_k, truth.values())),
+            rms_error_over_rms_truth: self
+                .truth
+                .as_ref()
+                .map(|truth| rms_error_over_rms_truth(&solution.map_k, truth.values())),
             rho_mean: comparison.map(|c| mean_rho(&c.rho, 2 * solution.nside)),
         });
     }
@@ -180,10 +181,10 @@ impl ChannelFolder {
     }
 
     fn draw_snapshot(&mut self, solution: &Solution) -> Result<(), ProductsError> {
-        let Some((map, caption)) = self.shown.last().cloned() else { return Ok(()) };
-        let title = format!("{} MHz, {caption}", self.frequency_hz / 1e6);
+        let map = &solution.map_k;
+        let title = format!("{} MHz, {}", self.frequency_hz / 1e6, caption(solution));
         let subtitle = format!("{} visibilities", solution.visibilities);
-        let panel = self.panel(&map, "", self.scale(&map));
+        let panel = self.panel(map, "", self.scale(map));
         let path = self.file(&format!("snapshot-{:03}.png", solution.number));
         // Half the size of the final picture: there are many.
         let sheet = Sheet { title, subtitle, width_px: 800, view: view(), ..Sheet::default() };
@@ -206,32 +207,22 @@ impl ChannelFolder {
             let panel = self.panel(truth.values(), &format!("Input at {mhz} MHz"), scale);
             let path = self.file("input.png");
             draw_map(&panel, "", &view())?.write(&path)?;
-            let error: Vec<f64> = map.iter().zip(truth.values()).map(|(m, t)| (m - t) / t).collect();
-            let panel = MapPanel {
-                unit: "(map - input) / input".to_owned(),
-                ..self.panel(&error, &format!("Relative error at {mhz} MHz"), Scale::symmetric(&error))
-            };
-            let path = self.file("error.png");
-            draw_map(&panel, &subtitle, &view())?.write(&path)?;
         }
         if let Some(comparison) = comparison {
+            let path = self.file("error.png");
+            let title = format!("Relative error at {mhz} MHz");
+            draw_relative_error(&title, &subtitle, comparison)?.write(&path)?;
             let path = self.file("spectra.png");
             draw_comparison(&format!("{mhz} MHz"), comparison)?.write(&path)?;
         }
-        self.draw_sheet(scale)
+        self.draw_sheet(solution, scale)
     }
 
     /// Maps on the way, side by side.
-    fn draw_sheet(&mut self, scale: Scale) -> Result<(), ProductsError> {
-        let count = self.shown.len();
-        let places = SHEET_MAPS_MAX.min(count);
-        let chosen = (0..places).map(|k| if places > 1 { k * (count - 1) / (places - 1) } else { 0 });
-        let panels: Vec<MapPanel<'_>> = chosen
-            .map(|k| {
-                let (map, caption) = &self.shown[k];
-                self.panel(map, caption, scale)
-            })
-            .collect();
+    fn draw_sheet(&mut self, last: &Solution, scale: Scale) -> Result<(), ProductsError> {
+        let caption = caption(last);
+        let shown = self.shown.spread((&last.map_k, &caption));
+        let panels: Vec<MapPanel<'_>> = shown.map(|(map, caption)| self.panel(map, caption, scale)).collect();
         let sheet = Sheet {
             title: format!("The map at {} MHz sharpens", self.frequency_hz / 1e6),
             columns: 3,
@@ -246,12 +237,58 @@ impl ChannelFolder {
     }
 }
 
+/// Maps on the way: the first, and every so many after it, as many as leave a choice for the sheet.
+#[derive(Default)]
+struct Shown {
+    /// With their captions.
+    maps: Vec<(Vec<f64>, String)>,
+    /// Maps that came.
+    came: usize,
+    /// log2 of how many come for each one that is kept.
+    halvings: u32,
+}
+
+impl Shown {
+    /// Keeps a map, or not.
+    fn take(&mut self, map: &[f64], caption: &str) {
+        let is_kept = |came: usize, halvings: u32| came.is_multiple_of(1 << halvings);
+        if is_kept(self.came, self.halvings) && self.maps.len() == 2 * SHEET_MAPS_MAX {
+            let mut is_odd = true;
+            self.maps.retain(|_| {
+                is_odd = !is_odd;
+                !is_odd
+            });
+            self.halvings += 1;
+        }
+        if is_kept(self.came, self.halvings) {
+            self.maps.push((map.to_vec(), caption.to_owned()));
+        }
+        self.came += 1;
+    }
+
+    /// As many as the sheet takes, in equal steps from the first to `last`, which was taken last.
+    fn spread<'a>(&'a self, last: (&'a [f64], &'a str)) -> impl Iterator<Item = (&'a [f64], &'a str)> {
+        let is_last = |k: usize| (k << self.halvings) + 1 == self.came;
+        let others = (0..self.maps.len()).filter(|&k| !is_last(k)).count();
+        let places = SHEET_MAPS_MAX.min(others + 1);
+        (0..places).map(move |place| {
+            let k = if places > 1 { place * others / (places - 1) } else { 0 };
+            let kept = self.maps[..others].get(k);
+            kept.map_or(last, |(map, caption)| (map.as_slice(), caption.as_str()))
+        })
+    }
+}
+
+fn caption(solution: &Solution) -> String {
+    format!("after {:.0} days", (solution.span_s[1] - solution.span_s[0]) / DAY_S)
+}
+
 fn view() -> View {
     View { sampling: Sampling::Interpolated, ..View::default() }
 }
 
 /// rms of (map - truth) over rms of truth.
-fn relative_error(map: &[f64], truth: &[f64]) -> f64 {
+fn rms_error_over_rms_truth(map: &[f64], truth: &[f64]) -> f64 {
     let difference: f64 = map.iter().zip(truth).map(|(m, t)| (m - t) * (m - t)).sum();
     let scale: f64 = truth.iter().map(|t| t * t).sum();
     (difference / scale).sqrt()
@@ -261,6 +298,25 @@ fn relative_error(map: &[f64], truth: &[f64]) -> f64 {
 fn mean_rho(rho: &[f64], l_max: usize) -> f64 {
     let range = &rho[1.min(rho.len())..rho.len().min(l_max + 1)];
     range.iter().sum::<f64>() / range.len().max(1) as f64
+}
+
+/// (map - truth) / truth over the sky.
+///
+/// # Errors
+/// None but a page too large, which one map is not.
+pub fn draw_relative_error(
+    title: &str,
+    subtitle: &str,
+    comparison: &Comparison,
+) -> Result<super::pictures::Picture, super::pictures::PictureError> {
+    let values = comparison.relative_error_map.values();
+    let panel = MapPanel {
+        values,
+        caption: title.to_owned(),
+        scale: Scale::symmetric(values),
+        unit: "(map - truth) / truth".to_owned(),
+    };
+    draw_map(&panel, subtitle, &view())
 }
 
 /// rho_l, the spectra and SNR_l as curves.
@@ -288,7 +344,7 @@ pub fn draw_comparison(
         Plot {
             title: "Angular power".to_owned(),
             x: l.clone(),
-            y: Axis { label: "C_{l} (K^{2} sr)".replace("^{2}", "²"), log: true, limits: None },
+            y: Axis { label: "C_{l} (K²)".to_owned(), log: true, limits: None },
             curves: vec![
                 curve("map", &comparison.cl_map, false),
                 curve("input", &comparison.cl_truth, true),
@@ -307,4 +363,37 @@ pub fn draw_comparison(
         });
     }
     draw_plots(title, &plots, plots.len())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_sheet_goes_from_the_first_map_to_the_last_in_bounded_memory() {
+        for count in [1, 2, 5, 6, 7, 12, 13, 24, 25, 100, 471] {
+            let mut shown = Shown::default();
+            for k in 0..count {
+                shown.take(&[k as f64], &k.to_string());
+                assert!(shown.maps.len() <= 2 * SHEET_MAPS_MAX);
+            }
+            let last = count - 1;
+            let sheet: Vec<(f64, String)> = shown
+                .spread((&[last as f64], &last.to_string()))
+                .map(|(map, caption)| (map[0], caption.to_owned()))
+                .collect();
+            assert_eq!(sheet.len(), SHEET_MAPS_MAX.min(count));
+            assert_eq!((sheet[0].0, sheet[sheet.len() - 1].0), (0.0, last as f64));
+            for (map, caption) in &sheet {
+                assert_eq!(&map.to_string(), caption);
+            }
+            // Whole steps of what is kept, a twelfth to a sixth of all: from a half to twice of equal ones.
+            let equal = last as f64 / (sheet.len().max(2) - 1) as f64;
+            let steps = sheet.windows(2).map(|two| two[1].0 - two[0].0);
+            assert!(
+                steps.clone().all(|step| step >= 0.4 * equal && step <= 2.0 * equal),
+                "{count}: {sheet:?}"
+            );
+        }
+    }
 }

@@ -13,7 +13,7 @@ mod summary;
 mod truth;
 
 pub use autos::{AutoSummary, summarise, write_autos};
-pub use channel::draw_comparison;
+pub use channel::{draw_comparison, draw_relative_error};
 pub use config::{ProductsConfig, ProductsConfigError};
 pub use error::ProductsError;
 pub use provenance::Provenance;

@@ -32,7 +32,7 @@ impl Provenance {
             Card::real("TSTOP", solution.span_s[1], "[s] last data, since the mission epoch"),
             Card::real("EPOCHTAI", *epoch_tai_s, "[s] mission epoch, TAI since 1958-01-01"),
             Card::real("EPSILON", solution.diagnostics.epsilon, "regularisation, of W_max"),
-            Card::real("WMAX", solution.diagnostics.w_max, "[K-2] greatest eigenvalue of BtNB"),
+            Card::real("WMAX", solution.diagnostics.w_max, "[K-2] greatest eigenvalue of BtN^-1B"),
             Card::text("SEED", &format!("{seed:016x}"), "seed of the space segment, hexadecimal"),
             Card::text("HASHSPAC", &format!("{configuration_hash:016x}"), "configuration, space segment"),
             Card::text("HASHGRND", &format!("{:016x}", self.ground_hash), "configuration, ground segment"),

@@ -17,7 +17,7 @@ pub struct SnapshotSummary {
     pub visibilities: u64,
     /// rms of (map - truth) / rms of truth; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub relative_error: Option<f64>,
+    pub rms_error_over_rms_truth: Option<f64>,
     /// Mean of rho_l over 1 <= l <= 2 nside; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rho_mean: Option<f64>,
