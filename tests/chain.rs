@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use common::workplace::{Workplace, files, succeed};
+use common::workplace::{Workplace, fail, files, succeed};
 use serde_json::Value;
 
 /// A mission of a few minutes of work at most: real geometry, small maps.
@@ -27,6 +27,8 @@ nside = 8
 epsilon = [1e-6, 1e-4]
 snapshot_every_s = 1.5e7
 "#;
+
+const NO_PICTURES: [&str; 2] = ["--set", "products.pictures=false"];
 
 fn run(place: &Workplace, out: &str, more: &[&str]) -> BTreeMap<PathBuf, Vec<u8>> {
     let out = place.path(out);
@@ -210,4 +212,51 @@ fn an_interrupt_leaves_maps_of_the_data_so_far() {
     let downlink = Path::new(&out).join("downlink.ccsds");
     let contents = succeed(&["inspect", downlink.to_str().unwrap(), "--json"]);
     assert!(serde_json::from_str::<Value>(&contents).is_ok());
+}
+
+#[test]
+fn a_run_without_a_map_fails_and_says_why() {
+    let place = Workplace::new(SMALL);
+    let out = place.path("none");
+    let none = [&["run", place.pipeline.as_str(), "--out", &out], &NO_PICTURES[..]].concat();
+    let short = fail(&[&none[..], &["--set", "spacecraft.duration_s=100"]].concat());
+    assert!(short.contains("spacecraft.duration_s = 100: there is no observing window"), "{short}");
+    assert!(
+        fail(&["check", &place.pipeline, "--set", "spacecraft.duration_s=100"])
+            .contains("no observing window")
+    );
+    // Weights above the limit: nothing is taken, and the ledger says so.
+    let refused =
+        fail(&[&none[..], &["--set", "map.weight_max=1e-30", "--set", "map.snapshot_every_s=0"]].concat());
+    assert!(refused.contains("no visibility could be used"), "{refused}");
+    assert!(refused.contains("weight above map.weight_max"), "{refused}");
+}
+
+#[test]
+fn a_used_folder_holds_the_products_of_its_last_run_alone() {
+    let place = Workplace::new(SMALL);
+    run(&place, "used", &NO_PICTURES);
+    let own = place.file("used/3.000MHz/notes.txt", b"mine");
+    assert!(Path::new(&place.path("used/10.000MHz/map.fits")).exists());
+    let one = ["--set", "spacecraft.channels_hz=[3e6]", "--set", "map.epsilon=1e-6"];
+    let found = run(&place, "used", &[&NO_PICTURES[..], &one].concat());
+    let fresh = run(&place, "fresh", &[&NO_PICTURES[..], &one].concat());
+    assert!(!Path::new(&place.path("used/10.000MHz")).exists());
+    assert_eq!(std::fs::read(own).unwrap(), b"mine");
+    assert_eq!(found.len(), fresh.len() + 1);
+}
+
+#[test]
+fn the_sky_command_gives_the_sky_of_a_run() {
+    let place = Workplace::new(SMALL);
+    let sky = place.path("sky.fits");
+    succeed(&["sky", &place.pipeline, "--freq-hz", "3e6", "--nside", "8", "--no-picture", "--out", &sky]);
+    // A run draws its sky at sky.nside and averages; here it is drawn at once.
+    let found = run(&place, "out", &[&NO_PICTURES[..], &["--set", "sky.nside=8"]].concat());
+    let read = |path: &str| {
+        let options = lunarray::sky::fits::ReadOptions::default();
+        lunarray::sky::fits::read_whole_map(Path::new(path), &options).unwrap().into_values()
+    };
+    assert!(found.contains_key(Path::new("3.000MHz/input.fits")));
+    assert_eq!(read(&sky), read(&place.path("out/3.000MHz/input.fits")));
 }

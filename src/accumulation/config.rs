@@ -118,10 +118,12 @@ pub enum MapConfigError {
         expected: &'static str,
     },
     /// A list by channel of the wrong length.
-    #[error("map.{key}: expected one value, or one for each of the {channels} channels")]
+    #[error("map.{key} has {found} values: expected one value, or one for each of the {channels} channels")]
     Misfit {
         /// Key.
         key: &'static str,
+        /// Number of values.
+        found: usize,
         /// Number of channels.
         channels: usize,
     },
@@ -219,17 +221,17 @@ impl MapConfig {
         self.baseline_bp_max * SPEED_OF_LIGHT_M_S / frequency_hz / pixel_rad
     }
 
-    /// Settings by channel that do not fit an instrument of `channels` channels, by key.
+    /// Settings by channel that do not fit an instrument of `channels` channels.
     #[must_use]
-    pub fn misfits(&self, channels: usize) -> Vec<&'static str> {
+    pub fn misfits(&self, channels: usize) -> Vec<MapConfigError> {
         let files = self.prior_files.len();
         [
-            ("epsilon", self.epsilon.fits(channels)),
-            ("prior_k", self.prior_k.fits(channels)),
-            ("prior_files", files == 0 || files == channels),
+            ("epsilon", self.epsilon.fits(channels), self.epsilon.values().len()),
+            ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),
+            ("prior_files", files == 0 || files == channels, files),
         ]
         .into_iter()
-        .filter_map(|(key, fits)| (!fits).then_some(key))
+        .filter_map(|(key, fits, found)| (!fits).then_some(MapConfigError::Misfit { key, found, channels }))
         .collect()
     }
 }

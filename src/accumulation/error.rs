@@ -2,6 +2,7 @@
 
 use thiserror::Error;
 
+use super::config::MapConfigError;
 use crate::array::response::ResponseError;
 use crate::units::ChannelId;
 
@@ -37,13 +38,8 @@ pub enum AccumulationError {
         found_hz: f64,
     },
     /// Settings by channel that do not fit the instrument.
-    #[error("map.{key}: the downlink has {channels} channels; expected one value, or one for each of them")]
-    Misfit {
-        /// Key.
-        key: &'static str,
-        /// Channels of the instrument.
-        channels: usize,
-    },
+    #[error("the downlink's channels: {0}")]
+    Misfit(#[from] MapConfigError),
     /// Engines that cannot be merged.
     #[error("engines of different {what} cannot be merged")]
     Mismatch {

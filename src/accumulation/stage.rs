@@ -72,6 +72,15 @@ impl Engine {
         }
     }
 
+    /// Whether nothing is held: then there is nothing to make a map of.
+    fn is_empty(&self) -> bool {
+        let counts = match self {
+            Self::Pixel(engine) => engine.counts(),
+            Self::Harmonic(engine) => engine.counts(),
+        };
+        counts.visibilities == 0
+    }
+
     fn sums(&mut self) -> Sums {
         match self {
             Self::Pixel(engine) => Sums::Pixel(engine.sums()),
@@ -240,8 +249,8 @@ impl Accumulator {
 
     fn open(&mut self, instrument: Instrument) -> Result<(), AccumulationError> {
         let channels = instrument.channels.len();
-        if let Some(&key) = self.config.misfits(channels).first() {
-            return Err(AccumulationError::Misfit { key, channels });
+        if let Some(misfit) = self.config.misfits(channels).into_iter().next() {
+            return Err(misfit.into());
         }
         self.channels = (0..channels).map(|_| None).collect();
         self.instrument = Some(Arc::new(instrument));
@@ -292,7 +301,7 @@ impl Accumulator {
     fn emit(&mut self, out: &mut Outlet<Snapshot>) {
         let Some(instrument) = &self.instrument else { return };
         for (index, slot) in self.channels.iter_mut().enumerate() {
-            let Some(channel) = slot else { continue };
+            let Some(channel) = slot.as_mut().filter(|channel| !channel.engine.is_empty()) else { continue };
             channel.snapshots += 1;
             out.push(Snapshot {
                 instrument: Arc::clone(instrument),
@@ -407,7 +416,11 @@ impl Stage for Accumulator {
     fn finish(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
         let Some(instrument) = self.instrument.take() else { return Ok(()) };
         for (index, slot) in self.channels.drain(..).enumerate() {
-            let Some(ChannelSums { engine, span_s, snapshots, .. }) = slot else { continue };
+            let Some(ChannelSums { engine, span_s, snapshots, .. }) =
+                slot.filter(|sums| !sums.engine.is_empty())
+            else {
+                continue;
+            };
             out.push(Snapshot {
                 instrument: Arc::clone(&instrument),
                 channel: ChannelId(index as u16),

@@ -49,6 +49,13 @@ impl CalibrationConfig {
         if let Err(problem) = self.van_vleck() {
             found.push(problem);
         }
+        if self.quantiser_bits != 0 && self.sub_bands > 1 {
+            found.push(CalibrationError::Parameter {
+                key: "calibration.quantiser_bits".to_owned(),
+                value: self.quantiser_bits.to_string(),
+                expected: "0 with sub-bands: what a quantiser does to a correlation at one lag is spread over them",
+            });
+        }
         if !(1..=SUB_BANDS_MAX).contains(&self.sub_bands) {
             found.push(CalibrationError::Parameter {
                 key: "calibration.sub_bands".to_owned(),

@@ -2,7 +2,7 @@
 
 use clap::Args;
 
-use super::{CommandResult, Outcome, PipelineArgs, print_json_line, print_text};
+use super::{CommandResult, Outcome, PipelineArgs, print_json_line, print_text, tell_notes};
 use crate::pipeline::{ConfigError, Plan};
 
 /// Check a pipeline and say what it will cost, without running it.
@@ -20,7 +20,9 @@ pub(super) struct CheckArgs {
 
 pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let source = args.pipeline.source();
-    let plan = Plan::new(source.load()?)?;
+    let config = source.load()?;
+    tell_notes(&config);
+    let plan = Plan::new(config)?;
     let problems = plan.file_problems();
     if !problems.is_empty() {
         return Err(Box::new(ConfigError::Values { origin: source.origin(), problems }));

@@ -3,7 +3,7 @@
 use clap::Args;
 use serde::Serialize;
 
-use super::{ArrayArgs, CommandResult, Outcome, print_json_line, print_text};
+use super::{ArrayArgs, CommandResult, Outcome, print_json_line, print_text, tell_notes, time_s};
 use crate::array::{Array, integration_time_s};
 use crate::mother::BAND_HZ;
 use crate::units::all_pairs;
@@ -15,8 +15,8 @@ use crate::units::vector::{Vec3, norm, sub};
 /// pole), m. A pair's baseline is r_i - r_j; it is observed while the Moon hides the Earth.
 #[derive(Debug, Args)]
 pub(super) struct GeometryArgs {
-    /// Times, s since the mission epoch.
-    #[arg(long = "at", value_name = "SECONDS", num_args = 1.., required = true, allow_negative_numbers = true)]
+    /// Times since the mission epoch: numbers of seconds, or with s, h or d, such as 7d.
+    #[arg(long = "at", value_name = "TIME", num_args = 1.., required = true, allow_negative_numbers = true, value_parser = time_s)]
     at_s: Vec<f64>,
     /// Frequency for which integration times are given, Hz.
     #[arg(long, default_value_t = 10e6)]
@@ -52,11 +52,9 @@ pub(super) fn execute(args: &GeometryArgs) -> CommandResult {
         );
     }
     let config = args.array.source().load()?;
+    tell_notes(&config);
     let array = Array::new(&config.array)?;
     for &t_s in &args.at_s {
-        if !(-1e9..=1e9).contains(&t_s) {
-            return Err(format!("--at {t_s}: expected seconds, -1e9 to 1e9").into());
-        }
         let rule = config.spacecraft.rule();
         let states: Vec<_> = (0..array.satellites()).map(|n| array.state(n, t_s)).collect();
         let pairs = all_pairs(array.satellites()).into_iter().map(|pair| {

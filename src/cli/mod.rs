@@ -22,7 +22,8 @@ use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
 
-use crate::pipeline::ConfigSource;
+use crate::pipeline::{Config, ConfigSource};
+use crate::units::constants::DAY_S;
 
 /// What went wrong with a command; every variant says where and what was expected.
 type CommandError = Box<dyn std::error::Error + Send + Sync>;
@@ -165,11 +166,33 @@ fn report(error: &(dyn std::error::Error + 'static)) {
     }
 }
 
-/// A time that may be given: seconds, not negative and not beyond 30 years.
+/// Seconds from a time such as `7d`, `12h`, `90s` or `90`, within 30 years.
+fn time_s(text: &str) -> Result<f64, String> {
+    let text = text.trim();
+    let (number, unit_s) = match text.strip_suffix(['s', 'h', 'd']) {
+        Some(number) if text.ends_with('d') => (number, DAY_S),
+        Some(number) if text.ends_with('h') => (number, 3600.0),
+        Some(number) => (number, 1.0),
+        None => (text, 1.0),
+    };
+    match number.trim().parse::<f64>() {
+        Ok(value) if (value * unit_s).abs() <= 1e9 => Ok(value * unit_s),
+        _ => Err("expected a number with s, h or d, such as 90s or 7d, at most 1e9 s".into()),
+    }
+}
+
+/// As [`time_s`], not negative.
 fn not_negative_s(text: &str) -> Result<f64, String> {
-    match text.trim().parse::<f64>() {
-        Ok(value) if (0.0..=1e9).contains(&value) => Ok(value),
-        _ => Err("expected seconds from 0 to 1e9".into()),
+    match time_s(text)? {
+        value if value >= 0.0 => Ok(value),
+        _ => Err("expected a time that is not negative".into()),
+    }
+}
+
+/// Says what is odd about a pipeline that can run as it is.
+fn tell_notes(config: &Config) {
+    for note in config.notes() {
+        eprintln!("note: {note}");
     }
 }
 
@@ -190,4 +213,23 @@ fn print_text(text: &str) -> Result<(), CommandError> {
     out.write_all(text.as_bytes())?;
     out.write_all(b"\n")?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_have_units() {
+        for (text, expected_s) in
+            [("7d", 604_800.0), ("1.5 h", 5400.0), ("90s", 90.0), ("90", 90.0), ("0", 0.0)]
+        {
+            assert_eq!((time_s(text), not_negative_s(text)), (Ok(expected_s), Ok(expected_s)));
+        }
+        assert_eq!(time_s("-1d"), Ok(-86_400.0));
+        assert!(not_negative_s("-1d").is_err());
+        for text in ["", "d", "infd", "7w", "NaN", "1e9d"] {
+            assert!(time_s(text).is_err() && not_negative_s(text).is_err(), "{text}");
+        }
+    }
 }

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::{ArrayArgs, CommandError, CommandResult, Outcome, print_json_line, print_text};
+use super::{ArrayArgs, CommandError, CommandResult, Outcome, print_json_line, print_text, time_s};
 use crate::array::Array;
 use crate::array::response::{PairGeometry, exact};
 use crate::mother::BAND_HZ;
@@ -29,8 +29,8 @@ pub(super) struct PredictArgs {
     /// Frequency, Hz.
     #[arg(long, requires = "at_s")]
     freq_hz: Option<f64>,
-    /// Time, s since the mission epoch.
-    #[arg(long = "at", value_name = "SECONDS", requires_all = ["freq_hz", "pair"])]
+    /// Time since the mission epoch: a number of seconds, or with s, h or d, such as 7d.
+    #[arg(long = "at", value_name = "TIME", requires_all = ["freq_hz", "pair"], value_parser = time_s)]
     at_s: Option<f64>,
     /// Pair of satellites, such as 1-2.
     #[arg(long, requires = "at_s")]

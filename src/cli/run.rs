@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::progress::{Progress, cancel_on_interrupt};
-use super::{CommandResult, Outcome, PipelineArgs, print_json_line, print_text};
+use super::{CommandResult, Outcome, PipelineArgs, print_json_line, print_text, tell_notes};
 use crate::pipeline::{INTEGRATE, Plan, run, use_threads};
 
 /// Run the whole chain: sky, spacecraft, downlink, ground, maps.
@@ -27,7 +27,9 @@ pub(super) struct RunArgs {
 }
 
 pub(super) fn execute(args: &RunArgs) -> CommandResult {
-    let plan = Plan::new(args.pipeline.source().load()?)?;
+    let config = args.pipeline.source().load()?;
+    tell_notes(&config);
+    let plan = Plan::new(config)?;
     use_threads(&plan.config.runtime)?;
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
     let cancel = cancel_on_interrupt()?;

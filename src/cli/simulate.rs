@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering;
 use clap::Args;
 
 use super::progress::{Progress, cancel_on_interrupt};
-use super::{CommandResult, Outcome, PipelineArgs, not_negative_s, print_json_line, print_text};
+use super::{CommandResult, Outcome, PipelineArgs, not_negative_s, print_json_line, print_text, tell_notes};
 use crate::downlink::socket::{SendOptions, SocketSink, TcpUrl};
 use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, use_threads};
 
@@ -45,7 +45,9 @@ fn rate(text: &str) -> Result<f64, String> {
 }
 
 pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
-    let plan = Plan::new(args.pipeline.source().load()?)?;
+    let config = args.pipeline.source().load()?;
+    tell_notes(&config);
+    let plan = Plan::new(config)?;
     use_threads(&plan.config.runtime)?;
     let cancel = cancel_on_interrupt()?;
     let options = SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s };

@@ -5,18 +5,23 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::{CommandResult, Outcome, print_text};
-use crate::mother::BAND_HZ;
+use crate::mother::{BAND_HZ, NINTH_BAND_HZ};
+use crate::pipeline::{Config, ConfigSource};
 use crate::products::pictures::{MapPanel, Palette, Scale, Stretch, View, draw_map};
 use crate::sky::fits::{WriteOptions, write_map};
-use crate::sky::generated::{GeneratedSky, generate};
+use crate::sky::generated::generate;
 use crate::sky::{Frame, GENERATED_NSIDE_MAX, SkyMap};
 
 /// Write the generated sky as a HEALPix FITS map, and a picture of it.
 ///
 /// Diffuse Galactic emission with free-free absorption, small-scale fluctuations and point sources,
-/// in K and ecliptic coordinates. The same seed gives the same sky at every frequency and nside.
+/// in K and ecliptic coordinates: the sky of `lunarray run` with the same pipeline file, seed and settings. The same seed
+/// gives the same sky at every frequency and nside.
 #[derive(Debug, Args)]
 pub(super) struct SkyArgs {
+    /// Pipeline file (TOML) whose seed and sky.generated are meant; the embedded quicklook if none is named.
+    #[arg(value_name = "PIPELINE.toml")]
+    pipeline: Option<PathBuf>,
     /// Frequency, Hz: 0.1 MHz to 120 MHz.
     #[arg(long)]
     freq_hz: f64,
@@ -26,9 +31,12 @@ pub(super) struct SkyArgs {
     /// Map to write (FITS); a picture of it goes beside it with the ending .png.
     #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
-    /// Seed of the fluctuations and sources.
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
+    /// Seed of the fluctuations and sources, in place of the file's.
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Replace one setting, for example --set sky.generated.point_sources=false; may be given again.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
     /// Leave the picture out.
     #[arg(long)]
     no_picture: bool,
@@ -36,15 +44,18 @@ pub(super) struct SkyArgs {
 
 pub(super) fn execute(args: &SkyArgs) -> CommandResult {
     let SkyArgs { freq_hz, nside, seed, .. } = *args;
-    if !(BAND_HZ[0]..=BAND_HZ[1]).contains(&freq_hz) {
-        return Err(format!("--freq-hz {freq_hz}: expected {} Hz to {} Hz", BAND_HZ[0], BAND_HZ[1]).into());
+    let band_hz = [BAND_HZ[0], NINTH_BAND_HZ[1]];
+    if !(band_hz[0]..=band_hz[1]).contains(&freq_hz) {
+        return Err(format!("--freq-hz {freq_hz}: expected {} Hz to {} Hz", band_hz[0], band_hz[1]).into());
     }
+    let source = ConfigSource { file: args.pipeline.clone(), overrides: args.overrides.clone(), seed };
+    let Config { seed, sky, .. } = source.load()?;
     if !nside.is_power_of_two() || nside > GENERATED_NSIDE_MAX {
         return Err(
             format!("--nside {nside}: expected a power of two from 1 to {GENERATED_NSIDE_MAX}").into()
         );
     }
-    let values = generate(&GeneratedSky::default(), freq_hz, nside, seed)?;
+    let values = generate(&sky.generated, freq_hz, nside, seed)?;
     let mean = values.iter().sum::<f64>() / values.len() as f64;
     let map = SkyMap::new(Frame::Ecliptic, values)?;
     write_map(&args.out, &map, &WriteOptions::default())?;

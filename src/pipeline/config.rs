@@ -5,16 +5,18 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::accumulation::{MapConfig, MapConfigError};
+use crate::accumulation::MapConfig;
 use crate::array::{Array, ArrayConfig};
-use crate::calibration::CalibrationConfig;
+use crate::calibration::{CalibrationConfig, VanVleck};
 use crate::daughters::DaughtersConfig;
 use crate::downlink::DownlinkConfig;
-use crate::mother::SpacecraftConfig;
+use crate::mother::{Fidelity, SpacecraftConfig};
 use crate::products::ProductsConfig;
 use crate::runtime::RuntimeConfig;
 use crate::sky::SkyConfig;
 
+/// What messages call the pipeline that runs when no file is named.
+const QUICKLOOK_NAME: &str = "embedded quicklook";
 /// The pipeline that runs when no file is named.
 pub const QUICKLOOK: &str = include_str!("../../pipelines/quicklook.toml");
 
@@ -91,6 +93,21 @@ pub enum ConfigError {
         /// Of the ground.
         ground: usize,
     },
+    /// A correction of another quantiser than the daughters'.
+    #[error(
+        "calibration.quantiser_bits = {ground}: expected {expected}, as daughters.bits is {bits} and spacecraft.fidelity \
+         is \"{fidelity}\""
+    )]
+    QuantiserBits {
+        /// Of the ground.
+        ground: u32,
+        /// What it may be.
+        expected: String,
+        /// Of the daughters.
+        bits: u32,
+        /// Whether there are samples.
+        fidelity: &'static str,
+    },
     /// A key that pipelines do not have.
     #[error("{0}: no such key; pipelines/reference.toml holds all of them")]
     Unknown(String),
@@ -123,7 +140,7 @@ impl ConfigSource {
     /// What messages call this source.
     #[must_use]
     pub fn origin(&self) -> String {
-        self.file.as_deref().map_or_else(|| "embedded quicklook".into(), |path| path.display().to_string())
+        self.file.as_deref().map_or_else(|| QUICKLOOK_NAME.into(), |path| path.display().to_string())
     }
 
     /// Reads, overrides and parses; values are not checked yet.
@@ -184,24 +201,25 @@ impl ConfigSource {
     /// As [`Self::parse`]; [`ConfigError::Values`] with everything that is wrong.
     pub fn load(&self) -> Result<Config, ConfigError> {
         let config = self.parse()?;
-        self.refuse(config.problems()).map(|()| config)
+        refuse(self.origin(), config.problems()).map(|()| config)
     }
 
-    /// [`Self::parse`], then the checks of the ground segment's sections.
+    /// [`Self::parse`], then the checks of the ground segment's sections. Without a file these have their defaults, which
+    /// fit any downlink; the quicklook's are for its own three channels.
     ///
     /// # Errors
     /// As [`Self::load`].
     pub fn load_ground(&self) -> Result<Config, ConfigError> {
-        let config = self.parse()?;
-        self.refuse(config.ground_problems()).map(|()| config)
+        let (config, origin) = match &self.file {
+            Some(_) => (self.parse()?, self.origin()),
+            None => (self.parse_text("")?, "default settings".to_owned()),
+        };
+        refuse(origin, config.ground_problems()).map(|()| config)
     }
+}
 
-    fn refuse(&self, problems: Problems) -> Result<(), ConfigError> {
-        if problems.is_empty() {
-            return Ok(());
-        }
-        Err(ConfigError::Values { origin: self.origin(), problems })
-    }
+fn refuse(origin: String, problems: Problems) -> Result<(), ConfigError> {
+    if problems.is_empty() { Ok(()) } else { Err(ConfigError::Values { origin, problems }) }
 }
 
 /// Things that are wrong, of any folder.
@@ -235,11 +253,24 @@ impl Config {
         if space != ground {
             found.push(Box::new(ConfigError::SubBands { space, ground }));
         }
-        for key in self.map.misfits(channels) {
-            found.push(Box::new(MapConfigError::Misfit { key, channels }));
-        }
+        found.extend(self.quantiser_problem().map(|problem| Box::new(problem) as _));
+        found.extend(boxed(self.map.misfits(channels)));
         found.extend(self.ground_problems());
         found
+    }
+
+    /// A van Vleck correction of a quantiser that the samples did not pass.
+    fn quantiser_problem(&self) -> Option<ConfigError> {
+        let (ground, bits) = (self.calibration.quantiser_bits, self.daughters.bits);
+        let (fidelity, expected) = match self.spacecraft.fidelity {
+            Fidelity::Visibilities => ("visibilities", "0".to_owned()),
+            Fidelity::Samples if VanVleck::new(bits).is_ok() => {
+                ("samples", format!("{bits}, or 0 for no correction"))
+            }
+            Fidelity::Samples => ("samples", "0".to_owned()),
+        };
+        let good = ground == 0 || (self.spacecraft.fidelity == Fidelity::Samples && ground == bits);
+        (!good).then_some(ConfigError::QuantiserBits { ground, expected, bits, fidelity })
     }
 
     /// Everything that is wrong with the ground segment's sections; empty if they are good.
@@ -253,18 +284,33 @@ impl Config {
         found
     }
 
-    /// A hash of the sections that shape the downlink, for provenance.
+    /// A hash of what the spacecraft measures, for provenance: of the sections that shape it, and of the contents of the
+    /// files that they name. What the link then does to it is not part of it: what comes through two stations, or in two
+    /// formats, is the same data.
     #[must_use]
     pub fn space_hash(&self) -> u64 {
         let Self { name, seed, sky, array, daughters, spacecraft, .. } = self;
+        let mut sky = sky.clone();
+        sky.file = sky.file.map(|files| files.map(|path| contents(path)));
         hash(&(name, seed, sky, array, daughters, spacecraft))
     }
 
-    /// A hash of the sections that shape maps from a downlink, for provenance.
+    /// A hash of the sections that shape maps from a downlink, and of the contents of the files that they name, for
+    /// provenance.
     #[must_use]
     pub fn ground_hash(&self) -> u64 {
-        hash(&(&self.calibration, &self.map))
+        let (mut calibration, mut map) = (self.calibration.clone(), self.map.clone());
+        calibration.gains_file = calibration.gains_file.as_deref().map(contents);
+        map.prior_files = map.prior_files.iter().map(|path| contents(path)).collect();
+        hash(&(calibration, map))
     }
+}
+
+/// What stands for a file in a hash: a checksum of what is in it. A file that cannot be read stands for its name; it ends
+/// the run when it is needed.
+fn contents(path: &Path) -> PathBuf {
+    let sum = crc_fast::checksum_file(crc_fast::CrcAlgorithm::Crc64Nvme, &path.to_string_lossy(), None);
+    sum.map_or_else(|_| path.to_owned(), |sum| PathBuf::from(format!("{sum:016x}")))
 }
 
 /// The first 64 bits of a CRC over the JSON form: stable over runs, machines and field order.
@@ -380,6 +426,58 @@ mod tests {
             assert!(told.contains(key), "{key} is not in {told}");
         }
         assert!(!told.contains("map.nside:"), "{told}");
+    }
+
+    #[test]
+    fn a_ground_without_a_file_takes_any_number_of_channels() {
+        let config = ConfigSource::default().load_ground().unwrap();
+        assert_eq!((config.map, config.name.as_str()), (MapConfig::default(), "lunarray"));
+        let told = with(&["spacecraft.channels_hz=[3e6]"]).unwrap().problems();
+        let told: Vec<String> = told.iter().map(ToString::to_string).collect();
+        assert!(told.iter().any(|text| text.contains("map.epsilon has 3 values")), "{told:?}");
+    }
+
+    #[test]
+    fn corrections_are_of_the_quantiser_that_is_there() {
+        let problems = |bits: u32, ground: u32, fidelity: &str| {
+            let fidelity = format!("spacecraft.fidelity={fidelity}");
+            let (bits, ground) =
+                (format!("daughters.bits={bits}"), format!("calibration.quantiser_bits={ground}"));
+            let config = with(&[&bits, &ground, &fidelity]).unwrap();
+            config.quantiser_problem().map(|problem| problem.to_string())
+        };
+        for good in [(1, 1), (2, 2), (4, 4), (2, 0), (8, 0), (32, 0)] {
+            assert_eq!(problems(good.0, good.1, "samples"), None);
+        }
+        for bad in [(1, 2), (2, 4), (8, 1), (32, 4)] {
+            assert!(problems(bad.0, bad.1, "samples").is_some_and(|text| text.contains("daughters.bits is")));
+        }
+        assert!(problems(1, 1, "visibilities").is_some_and(|text| text.contains("expected 0")));
+    }
+
+    #[test]
+    fn hashes_follow_the_contents_of_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name).display().to_string();
+        let hashes = |name: &str| {
+            let sky = format!("sky.file={:?}", path(name));
+            let (prior, gains) = (format!("map.prior_files=[{:?}]", path(name)), path("gains"));
+            let sky = with(&[&sky]).unwrap();
+            let prior = with(&[&prior]).unwrap();
+            let gains = with(&[&format!("calibration.gains_file={gains:?}")]).unwrap();
+            [sky.space_hash(), prior.ground_hash(), gains.ground_hash()]
+        };
+        for (name, text) in [("one", "a"), ("same", "a"), ("other", "b"), ("gains", "c")] {
+            std::fs::write(path(name), text).unwrap();
+        }
+        let first = hashes("one");
+        assert_eq!(first, hashes("same"));
+        let other = hashes("other");
+        assert!(first[0] != other[0] && first[1] != other[1] && first[2] == other[2]);
+        std::fs::write(path("gains"), "d").unwrap();
+        assert_ne!(first[2], hashes("one")[2]);
+        // Nothing there: the name alone.
+        assert_ne!(hashes("none"), hashes("neither"));
     }
 
     #[test]

@@ -54,6 +54,30 @@ pub enum PipelineError {
     /// The state of the ground cannot be kept.
     #[error(transparent)]
     State(#[from] super::state::StateError),
+    /// Nothing to make a map of.
+    #[error(
+        "no visibility could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",
+        summary.display()
+    )]
+    NoMap {
+        /// Where the summary is.
+        summary: std::path::PathBuf,
+        /// What became of every visibility.
+        ledger: Box<crate::runtime::LedgerReport>,
+    },
+    /// The array never observes.
+    #[error(
+        "spacecraft.duration_s = {duration_s}: there is no observing window in it; the first begins when the Earth sets \
+         for daughter 1, at most an orbit of {orbit_s:.0} s later, and every_nth_window = {every_nth} are left out between two"
+    )]
+    NoWindow {
+        /// Length of the mission, s.
+        duration_s: f64,
+        /// An orbit, s.
+        orbit_s: f64,
+        /// Windows from one to the next that is used.
+        every_nth: u64,
+    },
     /// No thread pool.
     #[error("cannot start {threads} worker threads: {reason}")]
     Threads {

@@ -10,6 +10,7 @@ mod error;
 mod gathering;
 mod ground;
 mod models;
+mod notes;
 mod plan;
 mod run;
 mod sample_summary;

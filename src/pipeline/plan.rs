@@ -28,7 +28,7 @@ impl Plan {
     /// The plan of a configuration that [`super::ConfigSource::load`] has checked.
     ///
     /// # Errors
-    /// An array that cannot be.
+    /// An array that cannot be, or that never observes.
     pub fn new(config: Config) -> Result<Self, PipelineError> {
         let array = Arc::new(Array::new(&config.array)?);
         let spacecraft = &config.spacecraft;
@@ -53,6 +53,13 @@ impl Plan {
         };
         let schedules = spacecraft.channels_hz.iter().enumerate().map(schedule).collect();
         let mut windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.every_nth_window);
+        if windows.is_empty() {
+            return Err(PipelineError::NoWindow {
+                duration_s: spacecraft.duration_s,
+                orbit_s: config.array.orbital_period_s,
+                every_nth: spacecraft.every_nth_window,
+            });
+        }
         if spacecraft.window_s_max > 0.0 {
             for window in &mut windows {
                 let cut = MissionTime::from_seconds(window.start.seconds() + spacecraft.window_s_max);

@@ -86,7 +86,7 @@ pub fn downlink_file(format: Format) -> &'static str {
 /// The whole chain in one process: sky, spacecraft, downlink bytes, ground, products in `out`.
 ///
 /// # Errors
-/// The first failure of any stage; a ledger that does not close.
+/// The first failure of any stage; a ledger that does not close; no visibility for any map.
 pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Result<Summary, PipelineError> {
     make_folder(out)?;
     let skies = space::skies(plan)?;
@@ -154,7 +154,7 @@ pub fn simulate(
 /// The ground segment alone, from downlink files or senders.
 ///
 /// # Errors
-/// A file that cannot be read; the first failure of any stage.
+/// A file that cannot be read; the first failure of any stage; no visibility for any map.
 pub fn replay<S: GroundSource + 'static>(
     source: S,
     config: &Config,
@@ -225,7 +225,10 @@ fn conclude(
     write_autos(&mut autos, out, config.products.pictures)?;
     let mut summary = Summary::new(segment, config, report, ledger, reception, channels);
     (summary.listening, summary.samples) = (listening, samples);
-    summary.write(out)?;
+    let path = summary.write(out)?;
+    if summary.channels.is_empty() && !summary.cancelled {
+        return Err(PipelineError::NoMap { summary: path, ledger: Box::new(summary.ledger) });
+    }
     Ok(summary)
 }
 

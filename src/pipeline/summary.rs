@@ -1,9 +1,10 @@
 //! What a run leaves in `summary.json` and prints at its end.
 
+use std::collections::BTreeSet;
 use std::fmt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::config::Config;
 use super::sample_summary::SampleSummary;
@@ -84,16 +85,49 @@ impl Summary {
         }
     }
 
-    /// Writes `summary.json` into `folder`.
+    /// Writes `summary.json` into `folder`; removes the maps and pictures that an earlier run named in its own there
+    /// and that this one did not write, so that all that is there belongs together.
     ///
     /// # Errors
     /// A file that cannot be written.
-    pub(super) fn write(&self, folder: &Path) -> Result<(), ProductsError> {
+    pub(super) fn write(&self, folder: &Path) -> Result<PathBuf, ProductsError> {
         let path = folder.join("summary.json");
         let text = serde_json::to_vec_pretty(self)
             .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
-        write_atomically(&path, &text).map_err(|source| ProductsError::Write { path, source })
+        let before = std::fs::read(&path).unwrap_or_default();
+        write_atomically(&path, &text)
+            .map_err(|source| ProductsError::Write { path: path.clone(), source })?;
+        let ours: BTreeSet<&str> =
+            self.channels.iter().flat_map(|channel| &channel.files).map(String::as_str).collect();
+        for file in files_of(&before).iter().filter(|file| !ours.contains(file.as_str())) {
+            let file = folder.join(file);
+            // What is gone already, or the folder that still holds something, may stay so.
+            let _ = std::fs::remove_file(&file);
+            let _ = file.parent().map(std::fs::remove_dir);
+        }
+        Ok(path)
     }
+}
+
+/// The maps and pictures that a summary names: files in folders of channels, and nothing outside of them.
+fn files_of(summary: &[u8]) -> Vec<String> {
+    #[derive(Default, Deserialize)]
+    #[serde(default)]
+    struct Named {
+        channels: Vec<Files>,
+    }
+    #[derive(Default, Deserialize)]
+    #[serde(default)]
+    struct Files {
+        files: Vec<String>,
+    }
+    let named: Named = serde_json::from_slice(summary).unwrap_or_default();
+    let is_product = |file: &String| {
+        let parts: Vec<&str> = file.split('/').collect();
+        let [folder, name] = parts[..] else { return false };
+        folder.ends_with("MHz") && !name.is_empty() && !folder.contains('\\') && !name.contains('\\')
+    };
+    named.channels.into_iter().flat_map(|channel| channel.files).filter(is_product).collect()
 }
 
 impl fmt::Display for Summary {
@@ -115,5 +149,19 @@ impl fmt::Display for Summary {
             write!(f, "Ended early: all products hold the data so far.")?;
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_products_of_channels_are_named() {
+        let summary =
+            br#"{"channels": [{"files": ["3.000MHz/map.fits", "../MHz/x", "/MHz", "3.000MHz/../../x",
+            "3.000MHz", "notes/x.txt"]}, {}], "more": 1}"#;
+        assert_eq!(files_of(summary), ["3.000MHz/map.fits"]);
+        assert!(files_of(b"").is_empty() && files_of(b"[1]").is_empty());
     }
 }

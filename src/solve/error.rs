@@ -37,7 +37,8 @@ pub enum SolveError {
     /// The matrix has no Cholesky factor.
     #[error(
         "the regularised normal matrix is not positive definite at pixel {pixel}; expected it to be for \
-         epsilon = {epsilon:e}: raise epsilon"
+         epsilon = {epsilon:e}: raise map.epsilon; or lower map.weight_max, if the sky is so bright that all weights are far \
+         below it"
     )]
     NotPositive {
         /// First pixel of the tile in which it failed.

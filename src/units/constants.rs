@@ -8,6 +8,8 @@ pub const BOLTZMANN_J_K: f64 = 1.380_649e-23;
 
 /// Mean radius of the Moon, m (IAU 2015; the paper, Sect. 2).
 pub const MOON_RADIUS_M: f64 = 1_737_100.0;
+/// GM of the Moon, m^3/s^2 (DE440).
+pub const MOON_GM_M3_S2: f64 = 4.902_800_118e12;
 
 /// One Julian day, s.
 pub const DAY_S: f64 = 86_400.0;

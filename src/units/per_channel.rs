@@ -22,6 +22,15 @@ impl<T: Clone> PerChannel<T> {
         }
     }
 
+    /// The same of something else.
+    #[must_use]
+    pub fn map<U>(&self, change: impl Fn(&T) -> U) -> PerChannel<U> {
+        match self {
+            Self::All(value) => PerChannel::All(change(value)),
+            Self::Each(values) => PerChannel::Each(values.iter().map(change).collect()),
+        }
+    }
+
     /// Whether the list, if it is one, has `channels` values.
     #[must_use]
     pub fn fits(&self, channels: usize) -> bool {

@@ -53,7 +53,9 @@ fn run(folder: &Path, name: &str, sets: &[&str]) -> (serde_json::Value, u64) {
         std::thread::sleep(Duration::from_millis(10));
     }
     let done = child.wait_with_output().unwrap();
-    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    // A link that loses too much leaves no map: then the run fails, with its accounts.
+    let said = String::from_utf8_lossy(&done.stderr);
+    assert!(done.status.success() || said.contains("so there is no map"), "{said}");
     let summary = std::fs::read_to_string(out.join("summary.json")).unwrap();
     (serde_json::from_str(&summary).unwrap(), peak_kb)
 }
