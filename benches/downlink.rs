@@ -279,7 +279,8 @@ fn replay(bytes: &[u8], sent: u64) {
     };
     let placed = |graph: &mut Graph, ledger: &Ledger| {
         let read = graph.source("read", 64, FileSource::open(std::slice::from_ref(&path)).unwrap());
-        let frames = graph.stage("receive", 64, read, Reception::default());
+        let frames =
+            graph.stage("receive", 64, read, Reception::new(1 << 28, 8192, std::sync::Arc::default()));
         let hook = CalibrationConfig::default().build(Path::new("")).unwrap();
         graph.stage("calibrate", 64, frames, Calibrator::new(hook, ledger.clone()))
     };

@@ -103,6 +103,34 @@ fn a_slipped_bit_costs_its_frame_at_most() {
 }
 
 #[test]
+fn sound_frames_among_spoilt_ones_are_all_found() {
+    let frames = mission(1, 1_000);
+    let sent = transmit(&frames, &DownlinkConfig::default());
+    let mut random = random_stream(13, StreamKind::Probe, [0, 0]);
+    for interleave in INTERLEAVES {
+        let coded = transmit(&frames, &config(interleave));
+        let cadu = 4 + 255 * interleave;
+        for has_marker in [true, false] {
+            // Six frames with a spoilt one before each, when nothing is known of the stream yet, and one at the end.
+            let mut stream = Vec::new();
+            for (k, sound) in coded.chunks(cadu).enumerate() {
+                if k < 6 || (k + 1) * cadu == coded.len() {
+                    let mut spoilt = vec![0; cadu];
+                    random.fill_bytes(&mut spoilt);
+                    if has_marker {
+                        spoilt[..4].copy_from_slice(&SYNC_MARKER.to_be_bytes());
+                    }
+                    stream.extend(spoilt);
+                }
+                stream.extend(sound);
+            }
+            let (recovered, account) = receive(&stream, 1_000);
+            assert!(recovered == sent, "{interleave}, {has_marker}: {account:?}");
+        }
+    }
+}
+
+#[test]
 fn damaged_markers_cost_nothing_in_lock() {
     let frames = mission(1, 2_000);
     let sent = transmit(&frames, &DownlinkConfig::default());

@@ -36,6 +36,13 @@ pub struct CalibratorState {
     reports: BTreeMap<MissionTime, Housekeeping>,
 }
 
+impl CalibratorState {
+    /// Positions that it knows, in the order of time.
+    pub fn ephemeris(&self) -> impl Iterator<Item = &EphemerisSegment> {
+        self.ephemeris.iter()
+    }
+}
+
 /// Gives each visibility the positions of its satellites, from the ephemeris packets alone, and hands
 /// it to the calibration hook. What cannot be used is flagged in the ledger with its reason.
 ///

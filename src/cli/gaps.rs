@@ -6,15 +6,17 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::{CommandResult, Outcome, print_json_line, print_text};
-use crate::pipeline::state::{GapReport, Gaps, Survey};
+use crate::downlink::Kind;
+use crate::pipeline::state::{GapReport, Gaps, RestartReport, Survey};
 
 /// List packets that are missing, and what they would add to the map.
 ///
 /// Takes a folder of `lunarray replay --state`, one of its checkpoints, or a downlink file. Gaps stand in the order of
-/// what their recovery would add: their weight over that received in the same channel, summed over channels. The range
+/// what their recovery would add: their weight over that in the map of the same channel, summed over channels. The range
 /// of packet counts is what to ask the spacecraft for (the sequence count is its lower 14 bits). What a gap held
-/// is estimated from the order in which channels and pairs are sent and the packets that did arrive. What
-/// was sent after the last packet that arrived is not known to be missing.
+/// is estimated from the order in which channels and pairs are sent and the packets that did arrive, and, for a state, from
+/// how much of those its map has taken; missing positions are worth the visibilities that wait for them. What
+/// was sent after the last packet that arrived, or before a restart of the counts, is not known to be missing.
 #[derive(Debug, Args)]
 pub(super) struct GapsArgs {
     /// State, checkpoint or downlink file.
@@ -33,6 +35,9 @@ pub(super) struct GapsArgs {
 
 pub(super) fn execute(args: &GapsArgs) -> CommandResult {
     let survey = Survey::of(&args.path)?;
+    for note in survey.notes() {
+        eprintln!("note: {note}");
+    }
     let gaps = survey.gaps();
     if let Some(path) = &args.picture {
         survey.picture(&gaps)?.write(path)?;
@@ -48,15 +53,25 @@ pub(super) fn execute(args: &GapsArgs) -> CommandResult {
 fn table(gaps: &Gaps, most: usize) -> String {
     let mut text = String::new();
     // Writing to a string does not fail.
-    let _ = writeln!(text, "channel     packets  received, h  missing, h  missing weight");
+    let _ = writeln!(text, "channel        MHz     packets  received, h  missing, h  missing weight");
     for channel in &gaps.channels {
         let all = channel.weight + channel.missing_weight;
         let share = if all > 0.0 { 100.0 * channel.missing_weight / all } else { 0.0 };
         let (received_h, missing_h) =
             (channel.integration_s / 3600.0, channel.missing_integration_s / 3600.0);
         let (number, packets) = (channel.channel, channel.packets);
-        let _ =
-            writeln!(text, "{number:<8} {packets:>10} {received_h:>12.2} {missing_h:>11.2} {share:>13.3} %");
+        let mhz = channel.frequency_hz.map_or("?".to_owned(), |hz| format!("{:.4}", hz / 1e6));
+        let _ = writeln!(
+            text,
+            "{number:<7} {mhz:>10} {packets:>11} {received_h:>12.2} {missing_h:>11.2} {share:>13.3} %"
+        );
+    }
+    for RestartReport { kind, apid, last } in &gaps.restarts {
+        let _ = write!(
+            text,
+            "\n{apid:#05x}: the spacecraft began to count anew behind packet {last} of {kind}; "
+        );
+        text.push_str("what she sent between is not known\n");
     }
     if gaps.gaps.is_empty() {
         text.push_str("\nNothing is missing between the packets that arrived.");
@@ -79,9 +94,11 @@ fn table(gaps: &Gaps, most: usize) -> String {
 /// The greatest losses of a gap.
 fn streams(gap: &GapReport) -> String {
     const SHOWN: usize = 3;
-    if gap.lost.is_empty() {
-        return gap.kind.to_string();
-    }
+    let kind = match gap.kind {
+        Kind::Visibilities => String::new(),
+        Kind::Ephemeris if !gap.lost.is_empty() => format!("{}, for which wait ", gap.kind),
+        kind => return kind.to_string(),
+    };
     let mut lost: Vec<_> = gap.lost.iter().collect();
     lost.sort_by(|a, b| b.integration_s.total_cmp(&a.integration_s));
     let shown: Vec<String> = lost
@@ -91,5 +108,5 @@ fn streams(gap: &GapReport) -> String {
         .collect();
     let more = lost.len().saturating_sub(SHOWN);
     let rest = if more > 0 { format!(", and {more} more") } else { String::new() };
-    shown.join(", ") + &rest
+    kind + &shown.join(", ") + &rest
 }

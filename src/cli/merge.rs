@@ -38,7 +38,11 @@ pub(super) fn execute(args: &MergeArgs) -> CommandResult {
     for note in whole.notes() {
         eprintln!("note: {note}");
     }
-    let (states, packets, out) = (args.states.len(), whole.packets(), args.out.display());
-    print_text(&format!("{states} states with {packets} packets of visibilities are together in {out}"))?;
+    let (packets, out) = (whole.packets(), args.out.display());
+    let (states, are) = match args.states.len() {
+        1 => ("1 state".to_owned(), "is"),
+        number => (format!("{number} states"), "are together"),
+    };
+    print_text(&format!("{states} with {packets} packets of visibilities {are} in {out}"))?;
     Ok(Outcome::Done)
 }

@@ -9,9 +9,10 @@ use super::progress::{Progress, cancel_on_interrupt};
 use super::{CommandError, CommandResult, Outcome, not_negative_s, print_json_line, print_text};
 use crate::downlink::socket::{SocketError, SocketSource, TcpUrl, Until};
 use crate::downlink::{FileSource, Pace, Paced, Steps};
-use crate::pipeline::state::{Keeper, WAIT_BYTES};
+use crate::pipeline::state::Keeper;
 use crate::pipeline::{
-    Config, ConfigSource, GroundSource, PipelineError, READ, Receiving, Summary, replay, use_threads,
+    Config, ConfigSource, GroundSource, PipelineError, READ, Receiving, Summary, WAIT_BYTES, replay,
+    use_threads,
 };
 use crate::runtime::Cancel;
 
@@ -25,7 +26,6 @@ const WAIT_BYTES_LIVE: u64 = 1 << 20;
 /// map, products, runtime and downlink.listen are used, so the file that made a simulation serves as it is;
 /// replaying it gives, bit for bit, the maps that `lunarray run` gives.
 #[derive(Debug, Args)]
-#[command(group(ArgGroup::new("ordered").args(["state", "listen"]).multiple(true)))]
 #[command(group(ArgGroup::new("live").args(["follow", "listen"])))]
 #[command(group(ArgGroup::new("pace").args(["speed", "step"])))]
 pub(super) struct ReplayArgs {
@@ -46,8 +46,8 @@ pub(super) struct ReplayArgs {
     #[arg(long, value_name = "NUMBER", default_value_t = 1_000_000, requires = "state")]
     checkpoint_every: u64,
     /// Bytes of visibilities that may wait for their positions; beyond it, those sent first are flagged for want of them:
-    /// 256 MiB of a new state, an old one keeps its own; 1 MiB when listening without a state.
-    #[arg(long, value_name = "BYTES", requires = "ordered")]
+    /// 256 MiB, 1 MiB when listening without a state; an old state keeps its own.
+    #[arg(long, value_name = "BYTES")]
     wait_bytes: Option<u64>,
     /// Read on in the last FILE as it grows, until Ctrl-C, which leaves maps of the data so far.
     #[arg(long, requires = "files")]
@@ -158,7 +158,7 @@ fn from_senders(
     eprintln!("listening on {}", source.url());
     let receiving = match keeper {
         Some(keeper) => Receiving::Kept(Box::new(keeper)),
-        None => Receiving::Gathered { wait_bytes: args.wait_bytes.unwrap_or(WAIT_BYTES_LIVE) },
+        None => Receiving::Once { wait_bytes: args.wait_bytes.unwrap_or(WAIT_BYTES_LIVE) },
     };
     Ok(watched(source, args, config, receiving, &cancel)?)
 }
@@ -169,7 +169,10 @@ fn from_files(args: &ReplayArgs, config: &Config, keeper: Option<Keeper>) -> Res
         false => FileSource::open(&args.files)?,
     };
     let cancel = cancel_on_interrupt()?;
-    let receiving = keeper.map_or(Receiving::AsTheyCome, |keeper| Receiving::Kept(Box::new(keeper)));
+    let receiving = match keeper {
+        Some(keeper) => Receiving::Kept(Box::new(keeper)),
+        None => Receiving::Once { wait_bytes: args.wait_bytes.unwrap_or(WAIT_BYTES) },
+    };
     let pace = match (args.step, args.speed) {
         (Some(Step(every_s)), _) => {
             let tell = Box::new(|note: &str| eprintln!("{note}"));

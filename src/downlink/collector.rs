@@ -14,6 +14,7 @@ use super::file::{io_error, require_packets};
 use super::header::{PacketHeader, Segment};
 use super::intake::Intake;
 use super::kind::Kind;
+use super::payload::visibilities_span;
 use super::receiver::Event;
 use super::taken::Taken;
 use super::waiting::{Waiting, WaitingPacket};
@@ -129,7 +130,7 @@ impl Collector {
     /// Takes all that another knows, of which no visibilities have been read by both.
     ///
     /// # Errors
-    /// Another instrument; packet counts that have begun anew where one knows and the other does not.
+    /// Another instrument.
     pub fn absorb(&mut self, other: CollectorState) -> Result<(), DownlinkError> {
         let CollectorState { taken: mut theirs, waiting: mut their_waiting, decoder } = other;
         theirs.resize(Kind::ALL.len(), Taken::default());
@@ -146,9 +147,7 @@ impl Collector {
             }
         }
         for kind in Kind::ALL {
-            if !self.taken[kind.index()].absorb(&theirs[kind.index()]) {
-                return Err(DownlinkError::Restarted { kind });
-            }
+            self.taken[kind.index()].absorb(&theirs[kind.index()]);
         }
         if !self.decoder.absorb(decoder) {
             return Err(DownlinkError::OtherInstrument { offset: 0 });
@@ -189,7 +188,7 @@ impl Collector {
             } else {
                 self.set_aside_unread();
             }
-            match self.take_event()? {
+            match self.take_event(placed)? {
                 // Looked at once for all positions of a piece of the stream: of what waits there may be much.
                 Taking::Nothing if self.look_again() => {}
                 Taking::Nothing => return Ok(None),
@@ -277,14 +276,11 @@ impl Collector {
         self.decoder.uncount(&counters);
     }
 
-    /// Says anew which packets of a kind have been read, in the order of sending; those that wait have come too.
+    /// Says anew which packets of a kind have been read; those that wait have come too.
     pub fn retake(&mut self, kind: Kind, read: impl Iterator<Item = (CucTime, u64)>) {
-        let mut all: Vec<(CucTime, u64)> = read.collect();
         let waiting = self.waiting.packets().map(|packet| packet.header).filter(|header| header.kind == kind);
-        all.extend(waiting.map(|header| (header.time, header.count)));
-        all.sort_unstable();
         let mut taken = Taken::default();
-        for (time, count) in all {
+        for (time, count) in read.chain(waiting.map(|header| (header.time, header.count))) {
             taken.take(count, time);
         }
         self.taken[kind.index()] = taken;
@@ -316,9 +312,9 @@ impl Collector {
             let counts = counters.kind_mut(kind);
             counts.duplicates = link.kind(kind).duplicates;
             counts.damaged = link.kind(kind).damaged;
-            let missing = self.taken[kind.index()].missing();
-            counts.restarts = missing.len().saturating_sub(1) as u64;
-            let gaps = missing.into_iter().flatten();
+            let eras = self.taken[kind.index()].eras();
+            counts.restarts = eras.len().saturating_sub(1) as u64;
+            let gaps = eras.into_iter().flat_map(|era| era.missing);
             (counts.gaps, counts.missing) =
                 gaps.fold((0, 0_u64), |(n, sum), gap| (n + 1, sum.saturating_add(gap.end - gap.start)));
         }
@@ -395,7 +391,7 @@ impl Collector {
     }
 
     /// Takes one event of the stream.
-    fn take_event(&mut self) -> Result<Taking, DownlinkError> {
+    fn take_event(&mut self, placed: Placed<'_>) -> Result<Taking, DownlinkError> {
         let Some(event) = self.intake.next_event() else { return Ok(Taking::Nothing) };
         let Event::Packet(packet) = event else {
             self.link.accept(&event);
@@ -409,6 +405,14 @@ impl Collector {
         if !self.taken[header.kind.index()].take(header.count, header.time) {
             self.link.accept(&Event::Duplicate { offset, header });
             return Ok(Taking::Event);
+        }
+        // As nearly all are: not kept even for a moment.
+        if header.kind == Kind::Visibilities
+            && self.decoder.instrument().is_some()
+            && visibilities_span(packet.payload).is_none_or(placed)
+        {
+            let frame = self.decoder.accept(&event);
+            return Ok(Taking::Delivery(Delivery { packets: vec![(header, packet.check)], frame }));
         }
         self.waiting.put(WaitingPacket::of(&packet));
         if !describes && !self.knows_instrument() {

@@ -185,6 +185,19 @@ impl ReceptionCounters {
         }
     }
 
+    /// What is to be said of restarts of the spacecraft's counts, if there were any.
+    pub(super) fn restarts_text(&self) -> Option<String> {
+        let kinds = Kind::ALL.into_iter().filter(|kind| self.kind(*kind).restarts > 0);
+        let times: Vec<String> =
+            kinds.map(|kind| format!("{kind} {} times", self.kind(kind).restarts)).collect();
+        (!times.is_empty()).then(|| {
+            format!(
+                "the spacecraft began to count anew ({}): what she sent last before that is not known to be missing",
+                times.join(", ")
+            )
+        })
+    }
+
     /// Good packets of all kinds.
     #[must_use]
     pub fn packets(&self) -> u64 {
@@ -206,6 +219,17 @@ impl std::fmt::Display for ReceptionCounters {
                 write!(f, "{name:<14} {packets:>10} packets {bytes:>14} bytes")?;
                 writeln!(f, "  {missing} missing, {damaged} damaged, {duplicates} duplicate")?;
             }
+        }
+        if let Some(restarts) = self.restarts_text() {
+            writeln!(f, "{restarts}")?;
+        }
+        if self.payloads_before_instrument > 0 {
+            let (payloads, visibilities) =
+                (self.payloads_before_instrument, self.visibilities_before_instrument);
+            writeln!(
+                f,
+                "{payloads} payloads with {visibilities} visibilities before any instrument description"
+            )?;
         }
         write!(
             f,

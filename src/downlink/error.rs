@@ -72,8 +72,8 @@ pub enum DownlinkError {
     },
     /// Packets of another mission among those of one.
     #[error(
-        "at byte {offset} of the packets: the description of another instrument than the one that the state is of; \
-         expected one mission a state"
+        "at byte {offset} of the packets: the description of another instrument than that of the packets before it; \
+         expected one mission a replay, and a state"
     )]
     OtherInstrument {
         /// Place in the stream.
@@ -89,14 +89,6 @@ pub enum DownlinkError {
         apid: u16,
         /// Packet count.
         count: u64,
-    },
-    /// States across a restart of the spacecraft's counts.
-    #[error(
-        "packets of {kind} have been counted anew on the way; expected states of one count: replay the files of one into the other"
-    )]
-    Restarted {
-        /// Kind.
-        kind: super::kind::Kind,
     },
     /// A socket.
     #[error(transparent)]

@@ -4,6 +4,7 @@ use std::io::{self, Read};
 
 use super::cadu::{CaduReceiver, FrameCounters};
 use super::config::Format;
+use super::kind::Kind;
 use super::receiver::{Event, Receiver};
 
 /// Bytes that [`Intake::fill_from`] asks for at a time.
@@ -110,6 +111,11 @@ impl Intake {
     pub fn held_bytes(&self) -> usize {
         let chunks = self.chunk.capacity() + self.recovered.capacity();
         self.packets.held_bytes() + self.frames.held_bytes() + chunks
+    }
+
+    /// Times that the spacecraft has begun to count packets of a kind anew, in whatever order they came.
+    pub(super) fn restarts(&self, kind: Kind) -> u64 {
+        self.packets.restarts(kind)
     }
 
     /// The format, once it is known.

@@ -193,6 +193,11 @@ impl Receiver {
         self.steps.iter().any(of_packet)
     }
 
+    /// Times that the spacecraft has begun to count packets of a kind anew, in whatever order they came.
+    pub(super) fn restarts(&self, kind: Kind) -> u64 {
+        self.sequences[kind.index()].restarts()
+    }
+
     /// Bytes taken so far.
     #[must_use]
     pub fn bytes(&self) -> u64 {

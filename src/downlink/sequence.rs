@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 use super::cuc::CucTime;
+use super::taken::Taken;
 
-/// Stretches of missing packets that are remembered in case they arrive late: fifteen times the packets of the paper's
-/// mission. Bounds the memory to 32 MB a kind, whatever a forger sends; packets of stretches that are older still
-/// count as duplicates.
+/// Stretches that are remembered: of packets that came, and of missing ones in case they arrive late. Fifteen times the
+/// packets of the paper's mission. Bounds the memory to some 100 MB a kind, whatever a forger sends.
 const STRETCHES_MAX: usize = 1 << 20;
 
 /// What the count of a packet says.
@@ -22,7 +22,7 @@ pub(super) enum Arrival {
     },
     /// It fills a gap that has been reported.
     Late,
-    /// It was sent before the first of its kind that came.
+    /// It was sent before the first of its kind that came, or before a restart.
     Early,
     /// It has been here before.
     Duplicate,
@@ -40,7 +40,10 @@ pub(super) struct Sequence {
     /// Count of the packet that came first, since the last restart.
     first: u64,
     next: u64,
+    /// Time of the latest good packet.
     newest: CucTime,
+    /// Good packets that came.
+    taken: Taken,
     /// Missing counts below `next`: beginning and end (one beyond the last) of at most [`STRETCHES_MAX`] stretches.
     missing: BTreeMap<u64, u64>,
 }
@@ -52,8 +55,11 @@ impl Sequence {
         match arrival {
             Arrival::InOrder | Arrival::AfterGap { .. } | Arrival::Restart { .. } => self.next = count + 1,
             Arrival::Late | Arrival::Early => self.fill(count),
-            Arrival::Duplicate => {}
+            Arrival::Duplicate => return arrival,
         }
+        self.newest = self.newest.max(time);
+        self.taken.take(count, time);
+        self.taken.forget_oldest(STRETCHES_MAX);
         arrival
     }
 
@@ -68,25 +74,31 @@ impl Sequence {
         arrival
     }
 
+    /// Times that the spacecraft has begun to count anew.
+    pub(super) fn restarts(&self) -> u64 {
+        self.taken.restarts()
+    }
+
     fn judge(&mut self, count: u64, time: CucTime) -> Arrival {
-        let (expected, newest) = (self.next, self.newest);
-        self.newest = newest.max(time);
+        let expected = self.next;
+        if self.taken.contains(count, time) {
+            return Arrival::Duplicate;
+        }
         if !std::mem::replace(&mut self.begun, true) {
             self.begin(count);
-            return Arrival::InOrder;
-        }
-        if count == expected {
             Arrival::InOrder
-        } else if count > expected {
+        } else if time >= self.newest && count == expected {
+            Arrival::InOrder
+        } else if time >= self.newest && count > expected {
             self.miss(expected..count);
             Arrival::AfterGap { expected }
-        } else if time > newest {
+        } else if time > self.newest {
             self.begin(count);
             Arrival::Restart { expected }
-        } else if self.stretch_of(count).is_some() {
-            if count < self.first { Arrival::Early } else { Arrival::Late }
+        } else if count >= self.first && self.stretch_of(count).is_some() {
+            Arrival::Late
         } else {
-            Arrival::Duplicate
+            Arrival::Early
         }
     }
 
@@ -159,6 +171,7 @@ mod tests {
         let mut sequence = Sequence::default();
         assert_eq!(sequence.receive(100, at(5)), Arrival::InOrder);
         assert_eq!(sequence.receive(99, at(5)), Arrival::Early);
+        assert_eq!(sequence.receive(99, at(5)), Arrival::Duplicate);
     }
 
     #[test]
@@ -167,6 +180,22 @@ mod tests {
         sequence.receive(100, at(5));
         assert_eq!(sequence.receive(0, at(6)), Arrival::Restart { expected: 101 });
         assert_eq!(sequence.receive(1, at(6)), Arrival::InOrder);
+        assert_eq!(sequence.restarts(), 1);
+    }
+
+    #[test]
+    fn what_was_sent_before_a_restart_may_come_after_it() {
+        let mut sequence = Sequence::default();
+        for count in 0..3 {
+            assert_eq!(sequence.receive(count, at(9)), Arrival::InOrder);
+        }
+        // Lower counts, the one that is due, and higher ones: none is a duplicate, none tells of a gap.
+        for count in 0..9 {
+            assert_eq!(sequence.receive(count, at(1)), Arrival::Early, "{count}");
+            assert_eq!(sequence.receive(count, at(1)), Arrival::Duplicate, "{count}");
+        }
+        assert_eq!(sequence.receive(3, at(9)), Arrival::InOrder);
+        assert_eq!(sequence.restarts(), 1);
     }
 
     #[test]
@@ -187,7 +216,7 @@ mod tests {
         }
         assert_eq!(sequence.missing.len(), STRETCHES_MAX);
         // The oldest are forgotten, all others are not.
-        assert_eq!(sequence.receive(1, at(1)), Arrival::Duplicate);
+        assert_eq!(sequence.receive(1, at(1)), Arrival::Early);
         assert_eq!(sequence.receive(2 * 500 + 1, at(1)), Arrival::Late);
         assert_eq!(sequence.receive(last - 1, at(1)), Arrival::Late);
         assert_eq!(sequence.missing.len(), STRETCHES_MAX - 2);

@@ -1,15 +1,12 @@
-//! The downlink's stages: packets out of frames, files, frames out of packets.
+//! The downlink's stages up to the ground's door: packets out of frames, and files.
 
 use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use super::config::{DownlinkConfig, Format};
-use super::counters::ReceptionCounters;
-use super::decoder::Decoder;
 use super::error::DownlinkError;
 use super::file::{io_error, require_packets};
 use super::intake::Intake;
@@ -347,54 +344,5 @@ impl Source for FileSource {
 
     fn units(&self) -> Units {
         Units::of(self.bytes, "bytes")
-    }
-}
-
-/// Finds packets in what arrives and makes frames of them: the ground's end of the link.
-#[derive(Debug, Default)]
-pub struct Reception {
-    receiver: Intake,
-    decoder: Decoder,
-    account: Arc<Mutex<ReceptionCounters>>,
-}
-
-impl Reception {
-    /// Leaves its account in `account` at the end.
-    #[must_use]
-    pub fn new(account: Arc<Mutex<ReceptionCounters>>) -> Self {
-        Self { account, ..Self::default() }
-    }
-
-    fn pass_on(&mut self, out: &mut Outlet<GroundFrame>) {
-        while let Some(event) = self.receiver.next_event() {
-            if let Some(frame) = self.decoder.accept(&event) {
-                out.push(frame);
-            }
-        }
-    }
-}
-
-impl Stage for Reception {
-    type In = Vec<u8>;
-    type Out = GroundFrame;
-    type Error = DownlinkError;
-
-    fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<GroundFrame>) -> Result<(), DownlinkError> {
-        self.receiver.push(&bytes);
-        self.pass_on(out);
-        Ok(())
-    }
-
-    fn finish(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), DownlinkError> {
-        self.receiver.finish();
-        self.pass_on(out);
-        self.decoder.finish();
-        *self.account.lock().unwrap_or_else(PoisonError::into_inner) =
-            ReceptionCounters { frames: self.receiver.frames(), ..self.decoder.counters().clone() };
-        Ok(())
-    }
-
-    fn units(&self) -> Units {
-        Units::of(self.receiver.bytes(), "bytes")
     }
 }

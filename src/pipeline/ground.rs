@@ -5,27 +5,30 @@ use std::sync::{Arc, Mutex};
 
 use super::config::Config;
 use super::error::PipelineError;
-use super::gathering::Gathering;
 use super::state::Keeper;
 use crate::accumulation::{Accumulator, Snapshot};
-use crate::calibration::Calibrator;
+use crate::calibration::{CalibrationError, Calibrator};
 use crate::downlink::{Reception, ReceptionCounters};
-use crate::frames::{AutoPower, GroundFrame};
+use crate::frames::AutoPower;
 use crate::products::{ChannelSummary, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Ledger, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::solve::{SolveWatch, Solver, SolverSetup, StoppingRule};
 
+/// Bytes of visibilities that wait for their positions, if nothing else is said: a week of thirty channels.
+pub const WAIT_BYTES: u64 = 1 << 28;
+
+/// Segments of which positions are kept: more than two years of windows.
+const SEGMENTS_MAX: usize = 8192;
+
 /// How packets are taken.
 pub enum Receiving {
-    /// From one stream, as they come.
-    AsTheyCome,
-    /// From any number of senders: every packet once, visibilities when their positions have come.
-    Gathered {
+    /// Every packet once, from one sender or several; visibilities when their positions have come.
+    Once {
         /// Bytes of visibilities that may wait for positions.
         wait_bytes: u64,
     },
-    /// As [`Receiving::Gathered`], and kept for later sessions.
+    /// As [`Receiving::Once`], and kept for later sessions.
     Kept(Box<Keeper>),
 }
 
@@ -80,45 +83,46 @@ pub fn add(
     // Sums are large: one waits while another is solved.
     let sums = match receiving {
         Receiving::Kept(keeper) => graph.stage("keep", 1, bytes, *keeper),
-        Receiving::AsTheyCome => add_sums_of_stream(graph, bytes, config, &outcome)?,
-        Receiving::Gathered { wait_bytes } => {
-            let gathering = Gathering::new(wait_bytes, Arc::clone(&outcome.reception));
-            let frames = graph.stage("receive", config.runtime.queue_capacity, bytes, gathering);
-            add_sums(graph, frames, config, &outcome)?
-        }
+        Receiving::Once { wait_bytes } => add_sums(graph, bytes, config, &outcome, wait_bytes)?,
     };
     let maps = graph.stage("solve", 1, sums, Solver::new(setup));
     graph.sink("publish", maps, publisher);
     Ok(outcome)
 }
 
-/// The stages from the bytes of one stream to sums, when nothing is kept.
-pub(super) fn add_sums_of_stream(
+/// The stages from bytes to sums, when nothing is kept.
+pub(super) fn add_sums(
     graph: &mut Graph,
     bytes: Link<Vec<u8>>,
     config: &Config,
     outcome: &GroundOutcome,
-) -> Result<Link<Snapshot>, PipelineError> {
-    let reception = Reception::new(Arc::clone(&outcome.reception));
-    let frames = graph.stage("receive", config.runtime.queue_capacity, bytes, reception);
-    add_sums(graph, frames, config, outcome)
-}
-
-/// The stages from frames to sums, when nothing is kept.
-fn add_sums(
-    graph: &mut Graph,
-    frames: Link<GroundFrame>,
-    config: &Config,
-    outcome: &GroundOutcome,
+    wait_bytes: u64,
 ) -> Result<Link<Snapshot>, PipelineError> {
     let capacity = config.runtime.queue_capacity;
-    let calibration = config.calibration.build(Path::new(""))?;
-    let calibrator =
-        Calibrator::new(calibration, outcome.ledger.clone()).with_van_vleck(config.calibration.van_vleck()?);
-    let calibrator = calibrator.with_autos(Arc::clone(&outcome.autos));
+    let frames =
+        graph.stage("receive", capacity, bytes, reception(wait_bytes, Arc::clone(&outcome.reception)));
+    let (calibrator, accumulator) = stages(config, &outcome.ledger, outcome)?;
     let placed = graph.stage("calibrate", capacity, frames, calibrator);
-    let accumulator = Accumulator::new(config.map.clone(), outcome.ledger.clone());
     Ok(graph.stage("accumulate", 1, placed, accumulator))
+}
+
+/// Reception that knows as many positions as calibration keeps.
+pub(super) fn reception(wait_bytes: u64, account: Arc<Mutex<ReceptionCounters>>) -> Reception {
+    Reception::new(wait_bytes, SEGMENTS_MAX, account)
+}
+
+/// Calibration and sums that know nothing yet.
+pub(super) fn stages(
+    config: &Config,
+    ledger: &Ledger,
+    outcome: &GroundOutcome,
+) -> Result<(Calibrator, Accumulator), CalibrationError> {
+    let calibration = config.calibration.build(Path::new(""))?;
+    let calibrator = Calibrator::new(calibration, ledger.clone())
+        .with_van_vleck(config.calibration.van_vleck()?)
+        .with_autos(Arc::clone(&outcome.autos))
+        .with_segments(SEGMENTS_MAX);
+    Ok((calibrator, Accumulator::new(config.map.clone(), ledger.clone())))
 }
 
 fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {

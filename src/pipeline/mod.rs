@@ -7,7 +7,6 @@ mod config;
 mod cost;
 mod engine_cost;
 mod error;
-mod gathering;
 mod ground;
 mod models;
 mod notes;
@@ -25,7 +24,7 @@ pub use bench::{
 pub use config::{Config, ConfigError, ConfigSource, Problems, QUICKLOOK};
 pub use cost::{ChannelCost, Cost};
 pub use error::PipelineError;
-pub use ground::Receiving;
+pub use ground::{Receiving, WAIT_BYTES};
 pub use plan::{Expected, Plan};
 pub use run::{
     Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, simulate, use_threads,

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::config::Config;
 use super::error::PipelineError;
-use super::ground::{self, GroundOutcome, Receiving};
+use super::ground::{self, GroundOutcome, Receiving, WAIT_BYTES};
 use super::plan::Plan;
 use super::sample_summary::SampleSummary;
 use super::sampling::SampleCounts;
@@ -105,7 +105,7 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     };
     drop(skies);
     let solving = SolveWatch::new(cancel.clone());
-    let receiving = Receiving::AsTheyCome;
+    let receiving = Receiving::Once { wait_bytes: WAIT_BYTES };
     let outcome = ground::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()), receiving)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: None };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;

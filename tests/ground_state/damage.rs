@@ -1,5 +1,6 @@
 //! Checkpoints that do not hold.
 
+use super::common::workplace::{fail, lunarray};
 use super::{ENGINES, Ground, checkpoints};
 
 use std::path::Path;
@@ -50,4 +51,28 @@ fn a_damaged_checkpoint_is_told_and_the_one_before_used() {
         assert!(!output.status.success() && said.contains("none of its 2 checkpoints holds"), "{said}");
         assert_eq!(checkpoints(Path::new(&folder)).len(), 2);
     }
+}
+
+#[test]
+fn looking_at_a_damaged_state_says_so_and_changes_nothing() {
+    let place = Ground::new();
+    let file = place.downlink();
+    place.replay("state", &[&file], &["--checkpoint-every", "2000"]);
+    let (newest, state, out) = (place.newest("state"), place.path("state"), place.path("merged"));
+    std::fs::write(&newest, b"nothing").unwrap();
+    let merge = ["merge", &state, "--map", &place.pipeline, "--out", &out];
+    for args in [&["gaps", &state][..], &merge] {
+        let output = lunarray(args);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.success(), "{said}");
+        let name = newest.file_name().unwrap().to_str().unwrap();
+        assert!(said.contains(name) && said.contains("going on from the one before"), "{args:?}: {said}");
+        assert_eq!(std::fs::read(&newest).unwrap(), b"nothing", "{args:?}");
+        if args[0] == "merge" {
+            let said = String::from_utf8(output.stdout).unwrap();
+            assert!(said.starts_with("1 state with"), "{said}");
+        }
+    }
+    let twice = fail(&["merge", &state, &state, "--map", &place.pipeline, "--out", &place.path("twice")]);
+    assert!(twice.contains("named twice"), "{twice}");
 }

@@ -1,8 +1,167 @@
 //! What is missing, and a state that is refused.
 
-use super::common::workplace::{json, succeed};
-use super::{Ground, leave_out};
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::path::Path;
+
+use lunarray::accumulation::MapConfig;
+use lunarray::calibration::{CalibrationConfig, Calibrator};
+use lunarray::downlink::{Decoder, Event, Receiver};
+use lunarray::frames::{GroundFrame, PlacedFrame};
+use lunarray::runtime::{Ledger, Outlet, Stage};
 use serde_json::Value;
+
+use super::common::workplace::{SMALL, Workplace, json, succeed};
+use super::{Ground, VISIBILITIES, identity, leave_out, packets};
+
+/// Identifier of packets of positions.
+const POSITIONS: u16 = 0x102;
+
+/// What a map of nside 4 takes of a packet of visibilities.
+#[derive(Clone, Copy, Default)]
+struct Worth {
+    channel: u16,
+    visibilities: u64,
+    weight: f64,
+}
+
+/// What every packet of visibilities in a sound file is worth: what can be placed on baselines within the map's limit.
+fn worth(file: &str) -> BTreeMap<u64, Worth> {
+    let map = MapConfig { nside: 4, ..MapConfig::default() };
+    let hook = CalibrationConfig::default().build(Path::new("")).unwrap();
+    let mut calibrator = Calibrator::new(hook, Ledger::new());
+    let (mut receiver, mut decoder) = (Receiver::new(), Decoder::new());
+    receiver.push(&std::fs::read(file).unwrap());
+    receiver.finish();
+    let mut found = BTreeMap::new();
+    while let Some(event) = receiver.next_event() {
+        let Event::Packet(packet) = event else { continue };
+        let Some(frame) = decoder.accept(&event) else { continue };
+        let mut worth = match &frame {
+            GroundFrame::Visibilities(block) => Worth { channel: block.channel.0, ..Worth::default() },
+            _ => Worth::default(),
+        };
+        let mut placed = Outlet::collect();
+        calibrator.step(frame, &mut placed).unwrap();
+        for frame in placed.items() {
+            let PlacedFrame::Visibilities(placed) = frame else { continue };
+            for (k, (a, b)) in placed.r_i_m.iter().zip(&placed.r_j_m).enumerate() {
+                let length_m = (0..3).map(|x| (a[x] - b[x]).powi(2)).sum::<f64>().sqrt();
+                if length_m <= map.baseline_m_max(placed.frequency_hz) {
+                    worth.visibilities += 1;
+                    worth.weight += placed.weight[k];
+                }
+            }
+        }
+        if packet.header.kind.apid() == VISIBILITIES {
+            found.insert(packet.header.count, worth);
+        }
+    }
+    found
+}
+
+#[test]
+fn gaps_stand_in_the_order_of_what_their_recovery_adds() {
+    // Half a day from pass to pass: the formation breathes in fourteen.
+    let pipeline = SMALL
+        .replace("every_nth_window = 300", "every_nth_window = 5\nduration_s = 1.2e6")
+        .replace("baseline_wavelengths_max = 16.0", "")
+        .replace("[spacecraft]", "[array]\nsatellites = 4\n[spacecraft]");
+    let place = Ground(Workplace::new(&pipeline));
+    let file = place.downlink();
+    let (worth, all) = (worth(&file), packets(&file));
+    let mut passes: Vec<Vec<&Vec<u8>>> = Vec::new();
+    for packet in &all {
+        match passes.last_mut() {
+            Some(pass) if identity(packet).0 != 0x101 => pass.push(packet),
+            _ => passes.push(vec![packet]),
+        }
+    }
+    let counts = |pass: usize, apid: u16| {
+        let of_kind = passes[pass].iter().filter(|packet| identity(packet).0 == apid);
+        let counts: Vec<u64> = of_kind.map(|packet| identity(packet).1).collect();
+        counts[0]..counts[counts.len() - 1] + 1
+    };
+    // A pass; in another its positions; half of a third, one packet of a fourth; and one that weighs something, but of which
+    // the map takes nothing.
+    let (first, third, fourth) = (counts(2, VISIBILITIES), counts(9, VISIBILITIES), counts(12, VISIBILITIES));
+    let useful = fourth.clone().find(|count| worth[count].weight > 0.0).unwrap();
+    let useless = counts(14, VISIBILITIES).find(|count| worth[count].weight == 0.0).unwrap();
+    let lost: [(u16, Range<u64>); 5] = [
+        (POSITIONS, counts(6, POSITIONS)),
+        (VISIBILITIES, first),
+        (VISIBILITIES, third.start..third.start + (third.end - third.start) / 2),
+        (VISIBILITIES, useful..useful + 1),
+        (VISIBILITIES, useless..useless + 1),
+    ];
+    let is_in = |packet: &&Vec<u8>, gap: &(u16, Range<u64>)| {
+        let (apid, count) = identity(packet);
+        apid == gap.0 && gap.1.contains(&count)
+    };
+    let kept: Vec<u8> =
+        all.iter().filter(|packet| !lost.iter().any(|gap| is_in(packet, gap))).flatten().copied().collect();
+    let reach = ["--wait-bytes", "10000000"];
+    let state = place.replay("state", &[&place.file("kept", &kept)], &reach);
+    let found = place.gaps("state");
+    let told: Vec<(u64, u64, f64)> = (found["gaps"].as_array().unwrap().iter())
+        .map(|gap| {
+            (gap["apid"].as_u64().unwrap(), gap["from"].as_u64().unwrap(), gap["gain"].as_f64().unwrap())
+        })
+        .collect();
+
+    // What is in the map, and what the recovery of each gap brings.
+    let without: Vec<u64> =
+        lost[1..].iter().flat_map(|(_, gap)| gap.clone()).chain(counts(6, VISIBILITIES)).collect();
+    let mut in_map: BTreeMap<u16, f64> = BTreeMap::new();
+    for (count, worth) in &worth {
+        *in_map.entry(worth.channel).or_default() += if without.contains(count) { 0.0 } else { worth.weight };
+    }
+    let mut expected: Vec<(u64, u64, f64)> = Vec::new();
+    for (k, gap) in lost.iter().enumerate() {
+        let brought: Vec<u64> =
+            if gap.0 == POSITIONS { counts(6, VISIBILITIES).collect() } else { gap.1.clone().collect() };
+        // Held to what a replay of the gap alone adds.
+        let name = format!("copy {k}");
+        std::fs::create_dir(place.path(&name)).unwrap();
+        let newest = place.newest("state");
+        std::fs::copy(&newest, Path::new(&place.path(&name)).join(newest.file_name().unwrap())).unwrap();
+        let packets: Vec<u8> = all.iter().filter(|packet| is_in(packet, gap)).flatten().copied().collect();
+        let more = place.replay(&name, &[&place.file("more", &packets)], &reach);
+        let accumulated = |told: &Value| told["ledger"]["accumulated"].as_u64().unwrap();
+        let visibilities: u64 = brought.iter().map(|count| worth[count].visibilities).sum();
+        assert_eq!(accumulated(&more) - accumulated(&state), visibilities, "{gap:?}");
+        let gain = brought.iter().map(|count| worth[count].weight / in_map[&worth[count].channel]).sum();
+        expected.push((u64::from(gap.0), gap.1.start, gain));
+    }
+    expected.sort_by(|a, b| b.2.total_cmp(&a.2));
+    println!("{told:?}\n{expected:?}");
+    assert_eq!(told.len(), expected.len());
+    let [most, least] = [expected[0].2, expected[4].2];
+    assert!(most > 0.01 && least == 0.0);
+    for (told, expected) in told.iter().zip(&expected) {
+        assert_eq!((told.0, told.1), (expected.0, expected.1));
+        // A channel and pair is not the same in every pass: the formation breathes.
+        assert!((told.2 - expected.2).abs() < 0.3 * expected.2 + 0.05 * most, "{told:?} {expected:?}");
+    }
+    // The instrument's channels are named; -0 is 0.
+    assert_eq!(found["channels"][1]["frequency_hz"], 10.0e6);
+    assert!(!succeed(&["gaps", &place.path("state")]).contains("-0.0"));
+}
+
+#[test]
+fn a_channel_of_which_nothing_came_is_named() {
+    let place = Ground::new();
+    let file = place.downlink();
+    let of_first = |packet: &&Vec<u8>| {
+        // A record begins with the channel's number.
+        identity(packet).0 != VISIBILITIES || packet[lunarray::downlink::HEADER_BYTES] == 0
+    };
+    let all = packets(&file);
+    let kept: Vec<u8> = all.iter().filter(of_first).flatten().copied().collect();
+    assert!(kept.len() < all.concat().len());
+    let table = succeed(&["gaps", &place.file("first", &kept)]);
+    assert!(table.contains("3.0000") && table.contains("10.0000"), "{table}");
+}
 
 fn total(gaps: &Value, key: &str) -> f64 {
     gaps["channels"].as_array().unwrap().iter().map(|channel| channel[key].as_f64().unwrap()).sum()
@@ -26,9 +185,16 @@ fn gaps_are_told_in_packets_and_in_integration_time() {
     let lost = sent - received;
     assert!(lost > 0.1 * sent && (missing / lost - 1.0).abs() < 0.3, "{missing} s told, {lost} s lost");
 
-    // A state tells the same, and nothing once the packets have come.
+    // A state tells the same packets, and nothing once they have come. Of their weight it counts what its map takes.
     place.replay("state", &[&bad], &[]);
-    assert_eq!(place.gaps("state"), found);
+    let told = place.gaps("state");
+    for key in ["apid", "from", "to", "between_s", "integration_s"] {
+        assert_eq!(told["gaps"][0][key], gap[key]);
+    }
+    for key in ["integration_s", "missing_integration_s"] {
+        assert_eq!(total(&told, key), total(&found, key));
+    }
+    assert!(total(&told, "weight") < total(&found, "weight"));
     let picture = place.path("coverage.png");
     let table = succeed(&["gaps", &place.path("state"), "--picture", &picture]);
     assert!(table.contains("0x103"), "{table}");

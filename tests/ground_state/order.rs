@@ -4,8 +4,10 @@ use std::io::Write;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use super::common::workplace::succeed;
-use super::{ENGINES, Ground};
+use lunarray::downlink::{HEADER_BYTES, PacketHeader, TRAILER_BYTES};
+
+use super::common::workplace::{json, succeed};
+use super::{ENGINES, Ground, identity, packets};
 
 #[test]
 fn what_comes_twice_or_in_disorder_leaves_no_trace() {
@@ -75,6 +77,88 @@ fn visibilities_wait_for_their_positions() {
     let missed = std::fs::read(place.path("missed.out/summary.json")).unwrap();
     let missed: serde_json::Value = serde_json::from_slice(&missed).unwrap();
     assert_eq!(missed["ledger"]["flagged"]["no ephemeris"], once["ledger"]["sampled"]);
+}
+
+#[test]
+fn a_plain_replay_waits_as_a_state_does() {
+    let place = Ground::new();
+    let file = place.downlink();
+    let plain = |name: &str, file: &str, more: &[&str]| {
+        let out = place.path(&format!("{name}.out"));
+        json(&[&["replay", file, "--map", &place.pipeline, "--out", &out], more].concat())
+    };
+    let once = plain("once", &file, &[]);
+    // The other way round: the spacecraft's counts and visibilities, then positions, then the description.
+    let mut turned = packets(&file);
+    turned.sort_by_key(|packet| std::cmp::Reverse(identity(packet).0));
+    let turned = place.file("turned", &turned.concat());
+    let waited = plain("turned", &turned, &[]);
+    assert_eq!(waited["ledger"], once["ledger"]);
+    assert!(place.maps("turned") == place.maps("once"));
+    // What comes before the description is no sound file to look at, and is told.
+    let contents = succeed(&["inspect", &turned]);
+    assert!(
+        contents.contains("before any instrument description") && !contents.contains("\nsound"),
+        "{contents}"
+    );
+    assert!(succeed(&["inspect", &file]).contains("\nsound"));
+}
+
+/// A packet with another count, its checks made anew.
+fn counted(packet: &[u8], count: u64) -> Vec<u8> {
+    let header = PacketHeader { count, ..PacketHeader::parse(packet).unwrap() };
+    let mut bytes = header.to_bytes().to_vec();
+    bytes.extend(&packet[HEADER_BYTES..packet.len() - TRAILER_BYTES]);
+    let check = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc32Iscsi, &bytes) as u32;
+    bytes.extend(check.to_be_bytes());
+    bytes
+}
+
+#[test]
+fn passes_of_both_sides_of_a_restart_may_come_in_any_order() {
+    let place = Ground::new();
+    let mut passes: Vec<Vec<Vec<u8>>> = Vec::new();
+    for packet in packets(&place.downlink()) {
+        match passes.last_mut() {
+            Some(pass) if identity(&packet).0 != 0x101 => pass.push(packet),
+            _ => passes.push(vec![packet]),
+        }
+    }
+    // From the middle on, every kind is counted from 0 again.
+    let middle = passes.len() / 2;
+    let mut first = std::collections::BTreeMap::new();
+    for packet in passes[middle..].iter_mut().flatten() {
+        let (kind, count) = identity(packet);
+        *packet = counted(packet, count - *first.entry(kind).or_insert(count));
+    }
+    let number = passes.len();
+    assert!(number >= 6);
+    let orders = [
+        (0..number).collect::<Vec<_>>(),
+        (middle..number).chain(0..middle).collect(),
+        (0..number).rev().collect(),
+        (0..number).map(|k| k * (number / 2 * 2 - 1) % number).collect(),
+    ];
+    let reach = ["--wait-bytes", "10000000"];
+    for (k, order) in orders.iter().enumerate() {
+        assert_eq!(order.iter().collect::<std::collections::BTreeSet<_>>().len(), number);
+        let bytes: Vec<u8> = order.iter().flat_map(|pass| passes[*pass].concat()).collect();
+        let (name, file) = (format!("order {k}"), place.file(&format!("{k}.ccsds"), &bytes));
+        let told = place.replay(&name, &[&file], &reach);
+        let counts = &told["reception"]["visibilities"];
+        assert_eq!([&counts["duplicates"], &counts["missing"], &counts["restarts"]], [0, 0, 1], "{order:?}");
+        assert!(place.bytes(&name) == place.bytes("order 0"), "{order:?}");
+        // A ground without a memory knows them apart as well, and all say that there was a restart.
+        let out = place.path("plain.out");
+        let plain = succeed(&["replay", &file, "--map", &place.pipeline, "--out", &out]);
+        assert!(place.maps("plain") == place.maps("order 0"), "{order:?}");
+        let (contents, gaps) = (succeed(&["inspect", &file]), succeed(&["gaps", &place.path(&name)]));
+        for text in [&plain, &contents, &gaps] {
+            assert!(text.contains("began to count anew"), "{text}");
+        }
+        let inspected = json(&["inspect", &file]);
+        assert_eq!(inspected["reception"]["visibilities"]["duplicates"], 0, "{order:?}");
+    }
 }
 
 #[test]

@@ -102,7 +102,7 @@ fn late_blocks_are_in_the_accounts_and_in_no_weight() {
     let visibilities = through(correlator, frames);
     let passes = through(Store::new(&plan.config.spacecraft, None), visibilities);
     let packets = through(Transmitter::new(&plan.config.downlink).unwrap(), passes);
-    let received = through(Reception::new(std::sync::Arc::default()), packets);
+    let received = through(Reception::new(0, 1024, std::sync::Arc::default()), packets);
 
     let windows = plan.windows.len() as u64;
     let late: u64 = (0..BLOCKS).map(|number| u64::from(is_late(3, number))).sum();

@@ -168,7 +168,7 @@ fn broken(hold: Option<mpsc::Receiver<()>>) -> (RuntimeError, usize) {
     let (mut bytes, mut out) = (Outlet::collect(), Outlet::collect());
     while source.next(&mut bytes).unwrap() == Flow::Continue {}
     let account = std::sync::Arc::default();
-    let mut reception = Reception::new(std::sync::Arc::clone(&account));
+    let mut reception = Reception::new(0, 1024, std::sync::Arc::clone(&account));
     for bytes in bytes.into_vec() {
         reception.step(bytes, &mut out).unwrap();
     }

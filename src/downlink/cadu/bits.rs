@@ -6,7 +6,7 @@ use super::SYNC_MARKER;
 
 /// Wrong bits of a marker that is still taken for one. Noise has so few, or so few right ones, at 2.6e-6 of
 /// all bits; a true marker has more at 2e-6 of all places when 1 bit in 400 is wrong.
-pub(super) const MARKER_ERRORS_MAX: u32 = 3;
+pub const MARKER_ERRORS_MAX: u32 = 3;
 
 /// The 32 bits from bit `at` on; what lies beyond the end is 0.
 pub(super) fn word_at(bytes: &[u8], at: usize) -> u32 {

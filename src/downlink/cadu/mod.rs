@@ -39,6 +39,7 @@ mod randomizer;
 mod receiver;
 mod reed_solomon;
 
+pub use bits::MARKER_ERRORS_MAX;
 pub use counters::{ChannelCounts, FrameCounters};
 pub use encoder::CaduEncoder;
 pub use frame::{FRAME_HEADER_BYTES, FrameHeader, HOUSEKEEPING, IDLE, SCIENCE};

@@ -56,7 +56,8 @@ enum Place {
 ///
 /// Three states, as receivers have them. *Search*: the stream is searched bit by bit for a marker with 3 wrong bits
 /// at most, upright or inverted, and looked at where a frame would be due. *Check*: a place that was found counts if
-/// a block that can be corrected follows it. *Lock*: frames follow one another; a bad marker is passed over if its
+/// a block that can be corrected follows it; as long as the interleave is not known, if its header is one of ours as well and
+/// next to nothing was wrong, or if another frame follows. *Lock*: frames follow one another; a bad marker is passed over if its
 /// block can be corrected, a bad block if another marker follows; otherwise the search begins there, or where the
 /// last block might have ended had bits been lost in it. Interleave and polarity are found out.
 ///
@@ -271,7 +272,10 @@ impl CaduReceiver {
         for code in INTERLEAVES.into_iter().filter_map(ReedSolomon::new) {
             let place = self.place(at, Some(code), polarity, at_end);
             let Place::Frame(found) = place else { continue };
-            // A block of equal octets is a codeword at every depth, so what follows must fit as well.
+            if found.faults <= FAULTS_OF_NO_IMAGE && self.header().is_some() && !self.is_constant() {
+                return place;
+            }
+            // A block of equal octets, or nearly so, is a codeword at every depth: what follows must fit as well.
             let good = at_end
                 || self.another_follows(found.at, Some(code), polarity)
                 || self.correct(found.at + frame_bits(code), code, polarity).is_some();
@@ -315,6 +319,11 @@ impl CaduReceiver {
         // Neither marker nor header: an image of a frame whose beginning is gone.
         let is_image = marker(word_at(&self.buffer, best.at)).is_none() && self.header().is_none();
         if is_image { Place::Nothing } else { Place::Frame(best) }
+    }
+
+    /// Whether all octets of the block are equal.
+    fn is_constant(&self) -> bool {
+        self.block.iter().all(|octet| Some(octet) == self.block.first())
     }
 
     /// Whether a place may be looked at: the work until now is in proportion to the stream before it. Told by the

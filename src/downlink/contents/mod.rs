@@ -313,16 +313,20 @@ impl Contents {
         }
         decoder.finish();
         require_packets(path, receiver.bytes(), decoder.counters().packets())?;
-        let frames = receiver.frames();
-        let bytes = receiver.bytes();
-        Ok(survey.conclude(path, bytes, &ReceptionCounters { frames, ..decoder.counters().clone() }))
+        let mut reception = ReceptionCounters { frames: receiver.frames(), ..decoder.counters().clone() };
+        for kind in Kind::ALL {
+            reception.kind_mut(kind).restarts = receiver.restarts(kind);
+        }
+        Ok(survey.conclude(path, receiver.bytes(), &reception))
     }
 
-    /// Whether nothing is missing or damaged.
+    /// Whether nothing is missing or damaged, and everything could be understood.
     #[must_use]
     pub fn is_sound(&self) -> bool {
         let clean = self.gaps.count + self.bad_checksums.count + self.garbage.count + self.faults.count == 0;
         let frames_sound = self.reception.frames.as_ref().is_none_or(FrameCounters::is_sound);
-        frames_sound && clean && self.truncated_bytes == 0 && self.reception.instruments_contradictory == 0
+        let understood =
+            self.reception.instruments_contradictory + self.reception.payloads_before_instrument == 0;
+        frames_sound && clean && self.truncated_bytes == 0 && understood
     }
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
+use super::super::counters::ReceptionCounters;
 use super::{Contents, Listing, VisibilityCounts};
 
 /// Columns of channels side by side.
@@ -151,6 +152,9 @@ impl Contents {
     }
 
     fn show_damage(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(restarts) = self.reception.restarts_text() {
+            writeln!(f, "\n{restarts}")?;
+        }
         if self.is_sound() {
             return writeln!(f, "\nsound: no gaps, no bad checksums, no garbage, nothing cut off");
         }
@@ -171,6 +175,15 @@ impl Contents {
         })?;
         if self.truncated_bytes > 0 {
             writeln!(f, "\ncut off: the last {} bytes are the beginning of a packet", self.truncated_bytes)?;
+        }
+        if self.reception.payloads_before_instrument > 0 {
+            let ReceptionCounters { payloads_before_instrument: payloads, .. } = self.reception;
+            let visibilities = self.reception.visibilities_before_instrument;
+            writeln!(
+                f,
+                "\n{payloads} payloads with {visibilities} visibilities stand before any instrument description and are in \
+                 no table above; a replay lets them wait for it"
+            )?;
         }
         if self.reception.instruments_contradictory > 0 {
             let count = self.reception.instruments_contradictory;

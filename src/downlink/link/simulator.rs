@@ -8,7 +8,7 @@ use super::noise::Noise;
 use super::truth::{Fate, Truth, list_packet};
 use super::units::{Pass, Splitter};
 use super::writer::BitWriter;
-use crate::downlink::cadu::{ERRORS_MAX, ReedSolomon, SYNC_MARKER_BYTES};
+use crate::downlink::cadu::{ERRORS_MAX, MARKER_ERRORS_MAX, ReedSolomon, SYNC_MARKER_BYTES};
 use crate::downlink::config::Format;
 use crate::downlink::error::DownlinkError;
 use crate::units::{StreamKind, random_stream};
@@ -22,6 +22,17 @@ struct Dispatch {
     /// So many of its bytes arrive.
     bytes: usize,
     slips: bool,
+}
+
+/// A pass that sets out.
+#[derive(Debug)]
+struct Departure {
+    /// Passes sent, this one included.
+    number: u64,
+    pass: Pass,
+    copies: Vec<Dispatch>,
+    outcomes: Vec<Outcome>,
+    random: ChaCha8Rng,
 }
 
 /// What has become of a unit.
@@ -42,7 +53,10 @@ pub struct LinkSimulator {
     code: Option<ReedSolomon>,
     splitter: Splitter,
     /// A pass that arrives after the next.
-    held: Option<Vec<u8>>,
+    held: Option<Departure>,
+    /// Bits by which frames have been put off since the receiver last stood at the beginning of one; `None` before that.
+    /// Unless they are whole frames, it finds the next by its marker alone.
+    put_off_bits: Option<i64>,
     truth: Truth,
 }
 
@@ -57,7 +71,14 @@ impl LinkSimulator {
             return Err(problem);
         }
         let truth = Truth { seed, link: config.clone(), format, ..Truth::default() };
-        Ok(Self { config: config.clone(), code, splitter: Splitter::new(code), held: None, truth })
+        Ok(Self {
+            config: config.clone(),
+            code,
+            splitter: Splitter::new(code),
+            held: None,
+            put_off_bits: None,
+            truth,
+        })
     }
 
     /// Takes the next bytes of a sound downlink; appends what arrives to `out`.
@@ -68,7 +89,7 @@ impl LinkSimulator {
         let mut passes = Vec::new();
         self.splitter.push(bytes, |pass| passes.push(pass))?;
         for pass in passes {
-            self.send(&pass, out);
+            self.send(pass, out);
         }
         Ok(())
     }
@@ -79,10 +100,10 @@ impl LinkSimulator {
     /// A downlink that ends within a frame or packet.
     pub fn finish(&mut self, out: &mut Vec<u8>) -> Result<&Truth, DownlinkError> {
         if let Some(pass) = self.splitter.finish()? {
-            self.send(&pass, out);
+            self.send(pass, out);
         }
         if let Some(held) = self.held.take() {
-            self.deliver(&held, out);
+            self.deliver(held, out);
         }
         Ok(&self.truth)
     }
@@ -93,39 +114,40 @@ impl LinkSimulator {
         &self.truth
     }
 
-    fn deliver(&mut self, bytes: &[u8], out: &mut Vec<u8>) {
-        self.truth.bytes_delivered += bytes.len() as u64;
-        out.extend_from_slice(bytes);
-    }
-
-    fn send(&mut self, pass: &Pass, out: &mut Vec<u8>) {
-        let number = self.truth.passes;
-        self.truth.passes += 1;
-        let mut random = random_stream(self.truth.seed, StreamKind::Link, [number, 0]);
+    fn send(&mut self, pass: Pass, out: &mut Vec<u8>) {
+        let number = self.truth.passes + 1;
+        self.truth.passes = number;
+        let mut random = random_stream(self.truth.seed, StreamKind::Link, [number - 1, 0]);
         let lost = random.random_bool(self.config.pass_loss);
         let swapped = random.random_bool(self.config.pass_swap);
         let mut outcomes = vec![Outcome::default(); pass.units.len()];
-        let arrived = if lost {
+        let mut copies = Vec::new();
+        if lost {
             self.truth.passes_lost += 1;
             outcomes.fill(Outcome { good: 0, fate: Some(Fate::PassLost) });
-            Vec::new()
         } else {
-            let copies = self.schedule(pass, &mut random, &mut outcomes);
-            self.carry(pass, &copies, &mut random, &mut outcomes)
-        };
-        self.settle(pass, &outcomes);
+            copies = self.schedule(&pass, &mut random, &mut outcomes);
+        }
+        let departure = Departure { number, pass, copies, outcomes, random };
         match self.held.take() {
             None if swapped => {
                 self.truth.passes_swapped += 1;
-                self.held = Some(arrived);
+                self.held = Some(departure);
             }
             earlier => {
-                self.deliver(&arrived, out);
+                self.deliver(departure, out);
                 if let Some(earlier) = earlier {
-                    self.deliver(&earlier, out);
+                    self.deliver(earlier, out);
                 }
             }
         }
+    }
+
+    fn deliver(&mut self, mut departure: Departure, out: &mut Vec<u8>) {
+        let bytes = self.carry(&mut departure);
+        self.settle(&departure.pass, &departure.outcomes);
+        self.truth.bytes_delivered += bytes.len() as u64;
+        out.extend_from_slice(&bytes);
     }
 
     /// The copies that set out and arrive, in the order in which they do.
@@ -168,17 +190,12 @@ impl LinkSimulator {
     }
 
     /// What arrives of the copies, wrong bits and all.
-    fn carry(
-        &mut self,
-        pass: &Pass,
-        copies: &[Dispatch],
-        random: &mut ChaCha8Rng,
-        outcomes: &mut [Outcome],
-    ) -> Vec<u8> {
-        let identity = [self.truth.passes, 1];
-        let mut noise = Noise::new(&self.config, random_stream(self.truth.seed, StreamKind::Link, identity));
+    fn carry(&mut self, departure: &mut Departure) -> Vec<u8> {
+        let Departure { number, pass, copies, outcomes, random } = departure;
+        let mut noise =
+            Noise::new(&self.config, random_stream(self.truth.seed, StreamKind::Link, [*number, 1]));
         let mut writer = BitWriter::default();
-        for copy in copies {
+        for copy in &*copies {
             let sent = &pass.units[copy.unit].bytes;
             let mut bytes = sent[..copy.bytes].to_vec();
             let mut flips = Vec::new();
@@ -191,11 +208,15 @@ impl LinkSimulator {
                 Some(Fate::CutOff)
             } else if copy.slips {
                 Some(Fate::Slipped)
+            } else if is_spoilt(&flips, self.code) || !self.is_found(sent.len(), &flips) {
+                Some(Fate::Spoilt)
             } else {
-                is_spoilt(&flips, self.code).then_some(Fate::Spoilt)
+                self.put_off_bits = Some(0);
+                None
             };
             outcome.good += u32::from(fate.is_none());
             outcome.fate = outcome.fate.max(fate);
+            let begun = writer.bits();
             match self.code.filter(|_| copy.slips && copy.bytes == sent.len()) {
                 Some(code) => {
                     self.truth.copies_slipped += 1;
@@ -207,15 +228,31 @@ impl LinkSimulator {
                 }
                 None => writer.push(&bytes),
             }
+            self.put_off(writer.bits() - begun - 8 * sent.len() as i64);
         }
-        writer.into_bytes()
+        let begun = writer.bits();
+        let bytes = writer.into_bytes();
+        self.put_off(8 * bytes.len() as i64 - begun);
+        bytes
+    }
+
+    fn put_off(&mut self, bits: i64) {
+        self.put_off_bits = self.put_off_bits.map(|before| before + bits);
+    }
+
+    /// Whether the receiver finds a frame of so many bytes: it stands where it is due, or its marker tells.
+    fn is_found(&self, bytes: usize, flips: &[usize]) -> bool {
+        let wrong = flips.iter().filter(|bit| **bit < 8 * SYNC_MARKER_BYTES).count();
+        let is_due = self.put_off_bits.is_some_and(|bits| bits % (8 * bytes as i64) == 0);
+        self.code.is_none() || is_due || wrong <= MARKER_ERRORS_MAX as usize
     }
 
     /// Takes the outcomes of a pass into the account.
     fn settle(&mut self, pass: &Pass, outcomes: &[Outcome]) {
         if let Some(report) = pass.report {
-            self.truth.visibilities_sampled = report.sampled;
-            self.truth.visibilities_dropped = report.dropped;
+            // Of two passes that are swapped the later one says more.
+            self.truth.visibilities_sampled = self.truth.visibilities_sampled.max(report.sampled);
+            self.truth.visibilities_dropped = self.truth.visibilities_dropped.max(report.dropped);
         }
         for (unit, outcome) in pass.units.iter().zip(outcomes) {
             self.truth.frames_sent += 1;

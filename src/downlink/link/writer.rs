@@ -41,6 +41,11 @@ impl BitWriter {
         self.push(after);
     }
 
+    /// Bits that have been put.
+    pub(super) fn bits(&self) -> i64 {
+        8 * self.bytes.len() as i64 - i64::from((8 - self.taken) % 8)
+    }
+
     /// All of it, the last byte filled up with zeros.
     pub(super) fn into_bytes(self) -> Vec<u8> {
         self.bytes
@@ -81,6 +86,7 @@ mod tests {
                     Some(added) => expected.insert(bit, if added { '1' } else { '0' }),
                 }
                 expected += &bits(&sent);
+                assert_eq!(writer.bits(), expected.len() as i64);
                 let found = bits(&writer.into_bytes());
                 assert_eq!(found[..expected.len()], expected, "{bit}, {slip:?}");
                 assert!(

@@ -8,12 +8,12 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 
 use crate::accumulation::Snapshot;
-use crate::downlink::{Reception, Transmitter};
+use crate::downlink::Transmitter;
 use crate::frames::GroundFrame;
 use crate::mother::Store;
 use crate::pipeline::config::Config;
 use crate::pipeline::error::PipelineError;
-use crate::pipeline::ground::{GroundOutcome, add_sums_of_stream};
+use crate::pipeline::ground::{GroundOutcome, WAIT_BYTES, add_sums, reception};
 use crate::pipeline::models;
 use crate::pipeline::plan::Plan;
 use crate::pipeline::sampling::{SampleCounts, sample_stages};
@@ -62,7 +62,7 @@ pub(super) fn run(plan: &Plan, skies: &[SkyMap]) -> Result<ChainRun, PipelineErr
     let visibilities = graph.stage("correlate", capacity, samples, correlator);
     let passes = graph.stage("store", capacity, visibilities, Store::new(&plan.config.spacecraft, None));
     let packets = graph.stage("transmit", capacity, passes, Transmitter::new(&plan.config.downlink)?);
-    let received = graph.stage("receive", capacity, packets, Reception::new(Arc::default()));
+    let received = graph.stage("receive", capacity, packets, reception(WAIT_BYTES, Arc::default()));
     graph.sink("drop", received, Forget(0));
     watched(graph, plan.config.runtime.shutdown_s)
 }
@@ -73,7 +73,7 @@ pub(super) fn run_ground(config: &Config, packets: &[Vec<u8>]) -> Result<ChainRu
     // Taken from the end.
     let packets = Packets(packets.iter().rev().cloned().collect());
     let bytes = graph.source("packets", config.runtime.queue_capacity, packets);
-    let sums = add_sums_of_stream(&mut graph, bytes, config, &GroundOutcome::default())?;
+    let sums = add_sums(&mut graph, bytes, config, &GroundOutcome::default(), WAIT_BYTES)?;
     graph.sink("drop", sums, Drop);
     watched(graph, config.runtime.shutdown_s)
 }

@@ -12,10 +12,11 @@ use serde::Serialize;
 
 use super::config::Config;
 use super::error::PipelineError;
+use super::ground::{WAIT_BYTES, reception};
 use super::plan::Plan;
 use super::sampling::{SampleCounts, sample_stages};
 use super::{models, space};
-use crate::downlink::{Reception, Transmitter};
+use crate::downlink::Transmitter;
 use crate::frames::{GroundFrame, ObservingWindow, Samples, SpaceFrame};
 use crate::mother::Fidelity;
 use crate::runtime::{Flow, Outlet, Report, Source, Stage};
@@ -299,7 +300,7 @@ fn time_stage(
             spent
         }
         _ => {
-            let (input, reception) = (material.packets.clone(), Reception::new(Arc::default()));
+            let (input, reception) = (material.packets.clone(), reception(WAIT_BYTES, Arc::default()));
             let (spent, received) = timed(|| stage(reception, input));
             received?;
             spent

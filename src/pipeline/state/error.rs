@@ -8,6 +8,12 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum StateError {
+    /// A state that is to be put together with itself.
+    #[error("{}: named twice; expected each state once", path.display())]
+    NamedTwice {
+        /// The folder.
+        path: PathBuf,
+    },
     /// The operating system refused.
     #[error("{}: cannot {action}: {source}", path.display())]
     Io {

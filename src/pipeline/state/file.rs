@@ -16,11 +16,11 @@ use crate::calibration::{AutoTable, CalibratorState};
 use crate::downlink::{CollectorState, CollectorView};
 use crate::runtime::LedgerReport;
 
-const MAGIC: &[u8; 8] = b"LNRSTA03";
+const MAGIC: &[u8; 8] = b"LNRSTA04";
 /// Beginning of the magic in every version.
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of the ground's state, version 03; version 02 has none of the daughters' own powers: \
-                       replay its files into a new folder";
+const VERSION: &str = "a checkpoint of the ground's state, version 04; earlier versions do not know at which times \
+                       packets were made: replay their files into a new folder";
 /// Bytes of magic, length of the head, and checksum.
 const FIXED_BYTES: u64 = 24;
 
@@ -275,7 +275,7 @@ mod tests {
         let (kind, segment, time) = (Kind::Visibilities, Segment::Whole, CucTime(3));
         let header = PacketHeader { kind, segment, count: 3, time, version: FORMAT_VERSION, bytes: 60 };
         let mut journal = Journal::default();
-        journal.keep(header, 1, None, (2, Some([1.0, 2.0])), &ledger.report());
+        journal.keep(header, 1, None, (2, 3, Some([1.0, 2.0])), &ledger.report());
         let settings = vec![("map.nside".to_owned(), "4".to_owned())];
         take(&HeadView {
             settings: &settings,

@@ -37,9 +37,10 @@ impl StateFolder {
     }
 
     /// The newest checkpoint that `read` can read, and what is to be said of those that it cannot, which get
-    /// another name; `None` if there is none at all.
+    /// another name if they are to be set aside; `None` if there is none at all.
     pub(super) fn load<T>(
         &mut self,
+        sets_aside: bool,
         read: impl Fn(&Path) -> Result<T, StateError>,
     ) -> Result<(Option<T>, Vec<String>), StateError> {
         let numbers = numbers(&self.path)?;
@@ -49,14 +50,13 @@ impl StateFolder {
             match read(&path) {
                 Ok(found) => {
                     self.newest = number;
-                    let note = |(path, error): (PathBuf, StateError)| -> Result<String, StateError> {
+                    for (path, _) in bad.iter().filter(|_| sets_aside) {
                         let mut aside = path.clone().into_os_string();
                         aside.push(".damaged");
-                        fs::rename(&path, aside).map_err(StateError::io(&path, "rename"))?;
-                        let used = self.name(number);
-                        Ok(format!("{error}; going on from the one before, {}", used.display()))
-                    };
-                    return Ok((Some(found), bad.into_iter().map(note).collect::<Result<_, _>>()?));
+                        fs::rename(path, aside).map_err(StateError::io(path, "rename"))?;
+                    }
+                    let used = self.name(number);
+                    return Ok((Some(found), bad.iter().map(|(_, error)| note(error, &used)).collect()));
                 }
                 Err(error @ (StateError::Damaged { .. } | StateError::Io { .. })) => bad.push((path, error)),
                 Err(error) => return Err(error),
@@ -93,6 +93,11 @@ impl StateFolder {
     fn name(&self, number: u64) -> PathBuf {
         name(&self.path, number)
     }
+}
+
+/// What is to be said of a checkpoint that does not hold when another is used.
+pub(super) fn note(error: &StateError, used: &Path) -> String {
+    format!("{error}; going on from the one before, {}", used.display())
 }
 
 /// The checkpoints in a folder, oldest first.

@@ -6,13 +6,60 @@ use std::ops::Range;
 use serde::Serialize;
 
 use super::journal::JournalEntry;
-use crate::downlink::{Kind, Taken};
-use crate::units::{ChannelId, Pair};
+use super::schedule::{Schedule, Stream, Streams};
+use crate::downlink::{CucTime, Era, Kind, Taken};
+use crate::units::MissionTime;
 
-/// What sends packets in its turn, pass by pass.
-type Stream = (ChannelId, Pair);
+/// Packets of the same channel and pair on either side of one that tell what the map would take of it.
+const NEAR: u64 = 4;
 
-/// What the missing packets of one channel and pair held, estimated.
+/// What has been received, as far as gaps are found from it.
+#[derive(Clone, Debug, Default)]
+pub struct Received {
+    /// Every packet of visibilities that could be read, in the order of sending.
+    pub readings: Vec<Reading>,
+    /// Every packet of positions that could be read, in the order of sending.
+    pub positions: Vec<Positions>,
+    /// Packets by kind.
+    pub taken: Vec<(Kind, Taken)>,
+    /// Frequencies of the instrument's channels, Hz.
+    pub frequencies_hz: Vec<f64>,
+}
+
+/// A packet of visibilities.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Reading {
+    /// What it held.
+    pub entry: JournalEntry,
+    /// Whether its positions have not come.
+    pub waits: bool,
+    /// Share of those of its visibilities that could be placed which the map has taken; `None` if that is not known.
+    pub share: Option<f64>,
+}
+
+/// A packet of positions.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Positions {
+    /// Count of the packet.
+    pub count: u64,
+    /// Time at which the packet was made.
+    pub made: CucTime,
+    /// First and last instant of the positions.
+    pub span: [MissionTime; 2],
+}
+
+/// A restart of the spacecraft's counts.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct RestartReport {
+    /// Kind.
+    pub kind: Kind,
+    /// Application process identifier.
+    pub apid: u16,
+    /// Count of the last packet before it that came. What was sent behind that one is not known.
+    pub last: u64,
+}
+
+/// What the missing packets of one channel and pair held, estimated; or packets that came and wait for the missing ones.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct LostStream {
     /// Channel, from 0.
@@ -23,7 +70,7 @@ pub struct LostStream {
     pub packets: u64,
     /// Integration time in them, s.
     pub integration_s: f64,
-    /// Sum of weights in them, (K sr)^-2.
+    /// Sum of weights in them that the map would take, (K sr)^-2.
     pub weight: f64,
 }
 
@@ -42,22 +89,25 @@ pub struct GapReport {
     pub between_s: [Option<f64>; 2],
     /// Integration time in it, s, over all channels and pairs.
     pub integration_s: f64,
-    /// What it would add: its weight over that received in the same channel, summed over channels.
+    /// What it would add: its weight over that in the map of the same channel, summed over channels; 1 for a channel of
+    /// which the map has nothing.
     pub gain: f64,
-    /// By channel and pair; empty for packets other than visibilities.
+    /// By channel and pair: of visibilities what is missing, of positions what waits for them.
     pub lost: Vec<LostStream>,
 }
 
-/// What has been received of one channel.
+/// What has been received of one channel; of pairs of two daughters.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ChannelCoverage {
     /// Channel, from 0.
     pub channel: u16,
+    /// Its frequency, Hz, once the instrument is known.
+    pub frequency_hz: Option<f64>,
     /// Packets received.
     pub packets: u64,
     /// Integration time received, s, over all pairs.
     pub integration_s: f64,
-    /// Weight received, (K sr)^-2.
+    /// Weight in the map, (K sr)^-2.
     pub weight: f64,
     /// Integration time missing, s.
     pub missing_integration_s: f64,
@@ -68,208 +118,164 @@ pub struct ChannelCoverage {
 /// All that is missing.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Gaps {
-    /// Channels.
+    /// The instrument's channels, whether anything came of them or not.
     pub channels: Vec<ChannelCoverage>,
-    /// Gaps: the one whose recovery adds most first; those of other kinds than visibilities last.
+    /// Gaps: the one whose recovery adds most first.
     pub gaps: Vec<GapReport>,
+    /// Restarts of the spacecraft's counts.
+    pub restarts: Vec<RestartReport>,
 }
 
-/// Finds what is missing between the packets of `journal`, which are those of `taken`.
+/// Finds what is missing between the packets that came.
 ///
 /// Every pass sends channel after channel and pair after pair, each in as many packets as it takes. The order and the
 /// usual number of packets are learnt from what was received; a gap is filled along them from the packet before
-/// it, with packets as the same channel and pair has sent on average. What was sent after the last packet that came is
-/// not known to be missing.
+/// it, with packets as the same channel and pair has sent about that time, of which the map takes as much as of those. Missing positions are worth what waits between the positions on either side. What was sent after the last
+/// packet that came is not known to be missing.
 #[must_use]
-pub fn find_gaps(journal: &[JournalEntry], taken: &[(Kind, &Taken)]) -> Gaps {
-    let mut gaps = Vec::new();
-    let mut channels: BTreeMap<u16, ChannelCoverage> = BTreeMap::new();
-    for entry in journal {
-        let coverage = channels.entry(entry.channel.0).or_default();
-        coverage.packets += 1;
-        coverage.integration_s += entry.integration_s;
-        coverage.weight += entry.weight;
-    }
-    for (kind, taken) in taken {
+pub fn find_gaps(received: &Received) -> Gaps {
+    let mut found = Gaps::default();
+    for (kind, taken) in &received.taken {
         let eras = taken.eras();
-        for (k, (from, missing)) in eras.iter().enumerate() {
-            let until = eras.get(k + 1).map(|(from, _)| *from);
-            let in_era = |entry: &&JournalEntry| {
-                (k == 0 || entry.made >= *from) && until.is_none_or(|until| entry.made < until)
-            };
-            let entries: Vec<JournalEntry> = match kind {
-                Kind::Visibilities => journal.iter().filter(in_era).copied().collect(),
-                _ => Vec::new(),
-            };
-            let schedule = Schedule::learn(entries);
-            gaps.extend(missing.iter().map(|gap| schedule.report(*kind, gap)));
+        for (k, era) in eras.iter().enumerate() {
+            let until = eras.get(k + 1).map(|era| era.from);
+            if until.is_some() {
+                let (kind, apid, last) = (*kind, kind.apid(), era.end.saturating_sub(1));
+                found.restarts.push(RestartReport { kind, apid, last });
+            }
+            let in_era = |made: CucTime| made >= era.from && until.is_none_or(|until| made < until);
+            found.gaps.extend(gaps_of_era(received, *kind, era, &in_era));
         }
     }
-    for gap in &mut gaps {
+    let mut channels = coverage(received);
+    for gap in &mut found.gaps {
+        let mut weights: BTreeMap<u16, f64> = BTreeMap::new();
         for lost in &gap.lost {
             let Some(coverage) = channels.get_mut(&lost.channel) else { continue };
-            coverage.missing_integration_s += lost.integration_s;
-            coverage.missing_weight += lost.weight;
-            gap.gain += if coverage.weight > 0.0 { lost.weight / coverage.weight } else { 0.0 };
+            if gap.kind == Kind::Visibilities {
+                coverage.missing_integration_s += lost.integration_s;
+                coverage.missing_weight += lost.weight;
+            }
+            *weights.entry(lost.channel).or_default() += lost.weight;
+        }
+        for (channel, weight) in weights.into_iter().filter(|(_, weight)| *weight > 0.0) {
+            let in_map = channels.get(&channel).map_or(0.0, |coverage| coverage.weight);
+            gap.gain += if in_map > 0.0 { weight / in_map } else { 1.0 };
         }
     }
-    gaps.sort_by(|a, b| b.gain.total_cmp(&a.gain).then((a.kind, a.from).cmp(&(b.kind, b.from))));
-    let channels = channels.into_iter().map(|(channel, coverage)| ChannelCoverage { channel, ..coverage });
-    Gaps { channels: channels.collect(), gaps }
+    found.gaps.sort_by(|a, b| b.gain.total_cmp(&a.gain).then((a.kind, a.from).cmp(&(b.kind, b.from))));
+    found.channels = channels.into_values().collect();
+    found
 }
 
-/// What a channel and pair sends.
-#[derive(Clone, Copy, Debug, Default)]
-struct Usual {
-    /// Packets a pass.
-    packets: u64,
-    /// Means over its packets.
-    integration_s: f64,
-    weight: f64,
+fn gaps_of_era(
+    received: &Received,
+    kind: Kind,
+    era: &Era,
+    in_era: &dyn Fn(CucTime) -> bool,
+) -> Vec<GapReport> {
+    if era.missing.is_empty() {
+        return Vec::new();
+    }
+    let visibilities = received.readings.iter().filter(|reading| in_era(reading.entry.made));
+    let schedule = Schedule::learn(match kind {
+        Kind::Visibilities => visibilities.copied().collect(),
+        _ => Vec::new(),
+    });
+    let mut positions: Vec<Positions> = match kind {
+        Kind::Ephemeris => received.positions.iter().filter(|known| in_era(known.made)).copied().collect(),
+        _ => Vec::new(),
+    };
+    positions.sort_by_key(|known| known.count);
+    let report = |gap: &Range<u64>| match kind {
+        Kind::Ephemeris => positions_missing(&received.readings, &positions, gap),
+        _ => schedule.report(kind, gap),
+    };
+    era.missing.iter().map(report).collect()
 }
 
-/// How packets follow each other in an era, learnt from those that came.
-struct Schedule {
-    /// By count.
-    entries: Vec<JournalEntry>,
-    /// In the order of sending within a pass.
-    order: Vec<Stream>,
-    usual: BTreeMap<Stream, Usual>,
+/// The instrument's channels, and what came of them.
+fn coverage(received: &Received) -> BTreeMap<u16, ChannelCoverage> {
+    let frequencies = received.frequencies_hz.iter().zip(0..);
+    let mut channels: BTreeMap<u16, ChannelCoverage> = frequencies
+        .map(|(&hz, channel)| {
+            (channel, ChannelCoverage { channel, frequency_hz: Some(hz), ..ChannelCoverage::default() })
+        })
+        .collect();
+    for Reading { entry, waits, share } in received.readings.iter().filter(|reading| !reading.is_own()) {
+        let channel = entry.channel.0;
+        let new = || ChannelCoverage { channel, ..ChannelCoverage::default() };
+        let coverage = channels.entry(channel).or_insert_with(new);
+        coverage.packets += 1;
+        coverage.integration_s += entry.integration_s;
+        coverage.weight += if *waits { 0.0 } else { entry.weight * share.unwrap_or(1.0) };
+    }
+    channels
 }
 
-impl Schedule {
-    fn learn(mut entries: Vec<JournalEntry>) -> Self {
-        entries.sort_by_key(|entry| entry.count);
-        let mut order: Vec<Stream> = Vec::new();
-        let mut at = 0;
-        // Packets of each stream, pass by pass.
-        let mut passes: BTreeMap<Stream, Vec<u64>> = BTreeMap::new();
-        let mut sums: BTreeMap<Stream, (f64, f64)> = BTreeMap::new();
-        let mut before: Option<JournalEntry> = None;
-        for entry in &entries {
-            let stream = (entry.channel, entry.pair);
-            at = match order.iter().position(|known| *known == stream) {
-                Some(at) => at,
-                None => {
-                    let after = (at + 1).min(order.len());
-                    order.insert(after, stream);
-                    after
-                }
-            };
-            let counts = passes.entry(stream).or_default();
-            match counts.last_mut() {
-                Some(count) if before.is_some_and(|before| same_pass(&before, entry)) => *count += 1,
-                _ => counts.push(1),
-            }
-            let (integration_s, weight) = sums.entry(stream).or_default();
-            *integration_s += entry.integration_s;
-            *weight += entry.weight;
-            before = Some(*entry);
-        }
-        let usual = passes.into_iter().map(|(stream, mut counts)| {
-            let packets = counts.iter().sum::<u64>() as f64;
-            counts.sort_unstable();
-            let (integration_s, weight) = sums.get(&stream).copied().unwrap_or_default();
-            let median = counts[counts.len() / 2];
-            let usual =
-                Usual { packets: median, integration_s: integration_s / packets, weight: weight / packets };
-            (stream, usual)
-        });
-        Self { order, usual: usual.collect(), entries }
+/// What waits for the positions in missing packets: between those of the last packet before that came and the next
+/// ones that came.
+fn positions_missing(readings: &[Reading], positions: &[Positions], gap: &Range<u64>) -> GapReport {
+    let next = positions.partition_point(|known| known.count < gap.start);
+    let before = next.checked_sub(1).map(|at| positions[at].span);
+    // What follows may be a repeat of what came before.
+    let mut behind = positions[next..].iter().map(|known| known.span);
+    let after = behind.find(|[start, _]| before.is_none_or(|[from, _]| *start > from));
+    let waits = |reading: &&Reading| {
+        let entry = &reading.entry;
+        reading.waits
+            && before.is_none_or(|[from, _]| entry.end > from)
+            && after.is_none_or(|[from, _]| entry.start < from)
+    };
+    let streams = Streams::of(readings.iter().filter(|reading| reading.share.is_some()).copied());
+    let mut lost: BTreeMap<Stream, LostStream> = BTreeMap::new();
+    for reading in readings.iter().filter(waits) {
+        let stream = reading.stream();
+        let sum = lost.entry(stream).or_insert_with(|| LostStream::nothing(stream));
+        sum.packets += 1;
+        sum.integration_s += reading.entry.integration_s;
+        sum.weight += reading.entry.weight * streams.usual(stream, reading.entry.sent(), NEAR).share();
+    }
+    let between_s = [before.map(|[_, end]| end.seconds()), after.map(|[start, _]| start.seconds())];
+    GapReport::new(Kind::Ephemeris, gap, between_s, lost.into_values().collect())
+}
+
+impl Reading {
+    pub(super) fn stream(&self) -> Stream {
+        (self.entry.channel, self.entry.pair)
     }
 
-    fn report(&self, kind: Kind, gap: &Range<u64>) -> GapReport {
-        let next = self.entries.partition_point(|entry| entry.count < gap.start);
-        let before = next.checked_sub(1).map(|at| &self.entries[at]);
-        let after = self.entries.get(next);
-        let mut lost: Vec<LostStream> = self
-            .fill(gap.end - gap.start, next)
-            .into_iter()
-            .map(|(stream, packets)| {
-                let usual = self.usual.get(&stream).copied().unwrap_or_default();
-                LostStream {
-                    channel: stream.0.0,
-                    pair: stream.1.to_string(),
-                    packets,
-                    integration_s: usual.integration_s * packets as f64,
-                    weight: usual.weight * packets as f64,
-                }
-            })
-            .collect();
-        lost.sort_by(|a, b| (a.channel, &a.pair).cmp(&(b.channel, &b.pair)));
-        GapReport {
-            kind,
-            apid: kind.apid(),
-            from: gap.start,
-            to: gap.end - 1,
-            between_s: [before.map(|entry| entry.end.seconds()), after.map(|entry| entry.start.seconds())],
-            integration_s: lost.iter().map(|lost| lost.integration_s).sum(),
-            gain: 0.0,
-            lost,
-        }
-    }
-
-    /// The streams of `missing` packets before the entry `next`, along the schedule.
-    fn fill(&self, missing: u64, next: usize) -> BTreeMap<Stream, u64> {
-        let mut filled = BTreeMap::new();
-        let before = next.checked_sub(1).map(|at| self.entries[at]);
-        let after = self.entries.get(next);
-        let (mut at, mut sent, mut step) = (0, 0, 1);
-        let place = |stream: Stream| self.order.iter().position(|known| *known == stream).unwrap_or(0);
-        if let Some(before) = before {
-            let stream = (before.channel, before.pair);
-            if after.is_some_and(|after| same_pass(&before, after)) {
-                filled.insert(stream, missing);
-                return filled;
-            }
-            at = place(stream);
-            let of_pass = self.entries[..next].iter().rev();
-            sent = of_pass.take_while(|entry| (entry.channel, entry.pair) == stream).count() as u64;
-        } else if let Some(after) = after {
-            // Nothing came before: backwards from what came first.
-            let stream = (after.channel, after.pair);
-            (at, step) = (place(stream), self.order.len() - 1);
-            let of_pass = self.entries[next..].iter();
-            sent = of_pass.take_while(|entry| (entry.channel, entry.pair) == stream).count() as u64;
-        }
-        let usual = |stream: &Stream| self.usual.get(stream).map_or(1, |usual| usual.packets.max(1));
-        let pass: u64 = self.order.iter().map(usual).sum();
-        let mut left = missing;
-        while left > 0 && !self.order.is_empty() {
-            let stream = self.order[at];
-            let packets = usual(&stream).saturating_sub(sent).min(left);
-            if packets > 0 {
-                *filled.entry(stream).or_default() += packets;
-            }
-            left -= packets;
-            sent = 0;
-            at = (at + step) % self.order.len();
-            // Whole passes at once: a packet may claim any count.
-            for stream in self.order.iter().filter(|_| left >= pass) {
-                *filled.entry(*stream).or_default() += left / pass * usual(stream);
-            }
-            left %= pass;
-        }
-        filled
+    /// Whether it holds a daughter's own powers, which are in no map.
+    fn is_own(&self) -> bool {
+        self.entry.pair.i == self.entry.pair.j
     }
 }
 
-/// Whether a packet goes on with the channel and pair of the one before it, in the same pass.
-fn same_pass(before: &JournalEntry, entry: &JournalEntry) -> bool {
-    // A pass is over when another channel or pair has been in between: then time has gone back, or far ahead.
-    let length_s = (before.end.seconds() - before.start.seconds()).max(1.0);
-    let ahead_s = entry.start.seconds() - before.end.seconds();
-    let packets = entry.count.abs_diff(before.count) as f64;
-    (before.channel, before.pair) == (entry.channel, entry.pair)
-        && ahead_s >= -1e-6
-        && ahead_s <= 4.0 * length_s * packets
+impl LostStream {
+    pub(super) fn nothing((channel, pair): Stream) -> Self {
+        Self { channel: channel.0, pair: pair.to_string(), packets: 0, integration_s: 0.0, weight: 0.0 }
+    }
+}
+
+impl GapReport {
+    pub(super) fn new(
+        kind: Kind,
+        gap: &Range<u64>,
+        between_s: [Option<f64>; 2],
+        lost: Vec<LostStream>,
+    ) -> Self {
+        // An empty sum of floats is -0.
+        let integration_s = lost.iter().map(|lost| lost.integration_s).sum::<f64>() + 0.0;
+        let (from, to, apid) = (gap.start, gap.end - 1, kind.apid());
+        Self { kind, apid, from, to, between_s, integration_s, gain: 0.0, lost }
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::downlink::CucTime;
-    use crate::units::MissionTime;
+    use crate::units::{ChannelId, Pair};
 
     const PASSES: u64 = 6;
     const STREAMS: u64 = 6;
@@ -299,6 +305,10 @@ mod tests {
         entries
     }
 
+    fn read(entry: JournalEntry) -> Reading {
+        Reading { entry, waits: false, share: Some(1.0) }
+    }
+
     /// What is found when packets are left out, and what they held by channel and pair.
     fn without(lost: &[Range<u64>]) -> (Gaps, BTreeMap<(u16, String), f64>) {
         let mut taken = Taken::default();
@@ -312,7 +322,9 @@ mod tests {
                 kept.push(entry);
             }
         }
-        (find_gaps(&kept, &[(Kind::Visibilities, &taken)]), held)
+        let readings = kept.into_iter().map(read).collect();
+        let taken = vec![(Kind::Visibilities, taken)];
+        (find_gaps(&Received { readings, taken, ..Received::default() }), held)
     }
 
     #[test]
@@ -341,7 +353,7 @@ mod tests {
         let missing = ((1 << 46) - last - 5) / 12 * 12 + 4;
         let far = JournalEntry { count: last + missing, start: MissionTime::from_seconds(1e9), ..entries[0] };
         let far = JournalEntry { end: MissionTime::from_seconds(1e9 + 600.0), ..far };
-        let schedule = Schedule::learn([entries, vec![far]].concat());
+        let schedule = Schedule::learn([entries, vec![far]].concat().into_iter().map(read).collect());
         let report = schedule.report(Kind::Visibilities, &(last..last + missing));
         let packets: Vec<u64> = report.lost.iter().map(|lost| lost.packets).collect();
         let passes = missing / 12;
@@ -363,6 +375,7 @@ mod tests {
     #[test]
     fn nothing_missing_and_nothing_received() {
         assert!(without(&[]).0.gaps.is_empty());
-        assert_eq!(find_gaps(&[], &[(Kind::Visibilities, &Taken::default())]), Gaps::default());
+        let taken = vec![(Kind::Visibilities, Taken::default())];
+        assert_eq!(find_gaps(&Received { taken, ..Received::default() }), Gaps::default());
     }
 }

@@ -36,6 +36,11 @@ pub struct JournalEntry {
 }
 
 impl JournalEntry {
+    /// Place in the order of sending.
+    pub(super) fn sent(&self) -> Sent {
+        (self.made, self.count)
+    }
+
     /// The line on a packet: of none, if it holds no visibilities or has been refused.
     pub(super) fn of(header: PacketHeader, block: Option<&VisibilityBlock>) -> Self {
         let none = Self { count: header.count, made: header.time, ..Self::default() };
@@ -69,6 +74,8 @@ pub(super) struct Line {
     pub(super) check: u32,
     /// Of what was handed to the sums: places, values, weights.
     pub(super) digest: u32,
+    /// Visibilities that could be placed and were offered to the sums.
+    pub(super) offered: u32,
     /// Visibilities in the sums.
     pub(super) accumulated: u32,
     /// Visibilities left out, by number of the reason in [`Journal`].
@@ -104,13 +111,21 @@ impl Journal {
         self.visibilities.values().map(|line| &line.entry).filter(|entry| entry.visibilities > 0)
     }
 
+    /// Packets with visibilities, each with the share of what was offered to the sums that they have taken.
+    pub(super) fn shares(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
+        let share =
+            |line: &Line| (line.offered > 0).then(|| f64::from(line.accumulated) / f64::from(line.offered));
+        let with = |line: &&Line| line.entry.visibilities > 0;
+        self.visibilities.values().filter(with).map(move |line| (&line.entry, share(line)))
+    }
+
     /// Keeps a line on a packet of visibilities that became what `account` says.
     pub(super) fn keep(
         &mut self,
         header: PacketHeader,
         check: u32,
         block: Option<&VisibilityBlock>,
-        (digest, used_s): (u32, Option<[f64; 2]>),
+        (digest, offered, used_s): (u32, u32, Option<[f64; 2]>),
         account: &LedgerReport,
     ) {
         let mut flagged = Vec::new();
@@ -118,7 +133,7 @@ impl Journal {
             flagged.push((self.number_of(reason), count as u32));
         }
         let (entry, accumulated) = (JournalEntry::of(header, block), account.accumulated as u32);
-        let line = Line { entry, check, digest, accumulated, flagged, used_s };
+        let line = Line { entry, check, digest, offered, accumulated, flagged, used_s };
         self.visibilities.insert((header.time, header.count), line);
     }
 
@@ -267,9 +282,9 @@ mod tests {
     #[test]
     fn reasons_are_told_again_whatever_was_merged_and_kept() {
         let (mut ours, mut theirs) = (Journal::default(), Journal::default());
-        ours.keep(header(1), 11, None, (0, None), &account(&[("far", 2)]));
-        theirs.keep(header(2), 12, None, (0, None), &account(&[("bright", 3), ("far", 4)]));
-        theirs.keep(header(0), 13, None, (0, None), &account(&[]));
+        ours.keep(header(1), 11, None, (0, 0, None), &account(&[("far", 2)]));
+        theirs.keep(header(2), 12, None, (0, 0, None), &account(&[("bright", 3), ("far", 4)]));
+        theirs.keep(header(0), 13, None, (0, 0, None), &account(&[]));
         assert_eq!(ours.absorb(theirs.clone()), Ok(vec![]));
         let far = |count| ("far".to_owned(), count);
         let expected = vec![(0, vec![]), (1, vec![far(2)]), (2, vec![("bright".to_owned(), 3), far(4)])];
@@ -282,7 +297,7 @@ mod tests {
         assert_eq!((&kept, used), (&ours, bytes.len()));
         // The other way round the same is told.
         let mut first = Journal::default();
-        first.keep(header(1), 11, None, (0, None), &account(&[("far", 2)]));
+        first.keep(header(1), 11, None, (0, 0, None), &account(&[("far", 2)]));
         assert_eq!(theirs.absorb(first.clone()), Ok(vec![]));
         theirs.renumber();
         assert_eq!((told(&theirs), &theirs), (expected, &ours));

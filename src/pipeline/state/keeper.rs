@@ -1,7 +1,8 @@
 //! The ground stage from bytes to sums that remembers what it has done.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, PoisonError};
+use std::sync::PoisonError;
 
 use super::error::StateError;
 use super::file::{self, HeadView};
@@ -13,14 +14,8 @@ use crate::calibration::Calibrator;
 use crate::downlink::{Collector, Delivery, DownlinkError, Kind, PacketHeader};
 use crate::frames::{GroundFrame, Instrument, PlacedFrame, PlacedVisibilities, VisibilityBlock};
 use crate::pipeline::config::Config;
-use crate::pipeline::ground::GroundOutcome;
+use crate::pipeline::ground::{GroundOutcome, stages};
 use crate::runtime::{Ledger, LedgerReport, Outlet, Stage, Units};
-
-/// Bytes of visibilities that wait for their positions, if nothing else is said: a week of thirty channels.
-pub const WAIT_BYTES: u64 = 1 << 28;
-
-/// Windows whose positions are kept: more than two years of them.
-const SEGMENTS_MAX: usize = 8192;
 
 /// Takes the bytes of a downlink and emits sums; everything in between is in its checkpoints.
 pub struct Keeper {
@@ -53,6 +48,16 @@ impl Keeper {
         wait_bytes: u64,
         checkpoint_every: u64,
     ) -> Result<Self, StateError> {
+        Self::load(folder, config, (wait_bytes, checkpoint_every), true)
+    }
+
+    /// As [`Keeper::open`]; checkpoints that do not hold get another name if they are to be set aside.
+    fn load(
+        folder: &Path,
+        config: &Config,
+        (wait_bytes, checkpoint_every): (u64, u64),
+        sets_aside: bool,
+    ) -> Result<Self, StateError> {
         let mut folder = StateFolder::open(folder)?;
         let settings = settings_of(config)?;
         let outcome = GroundOutcome::default();
@@ -70,7 +75,7 @@ impl Keeper {
                 Ok((collector, calibrator, accumulator, head.journal, head.ledger, tally))
             })
         };
-        let (found, notes) = folder.load(read)?;
+        let (found, notes) = folder.load(sets_aside, read)?;
         let (collector, calibrator, accumulator, journal, ledger, tally) = match found {
             Some(found) => found,
             None => {
@@ -99,15 +104,20 @@ impl Keeper {
     /// Puts states together into a new one, in the folder `into`; those of `parts` stay as they are.
     ///
     /// # Errors
-    /// A folder that holds a state already; states of different instruments or settings, or that hold the same
-    /// visibilities.
+    /// A folder that holds a state already; a state that is named twice; states of different instruments or settings, or
+    /// that hold the same visibilities.
     pub fn merge(into: &Path, parts: &[PathBuf], config: &Config) -> Result<Self, StateError> {
         let mut whole: Option<Self> = None;
+        let mut seen = BTreeSet::new();
         for path in parts {
+            let real = path.canonicalize().map_err(StateError::io(path, "find"))?;
+            if !seen.insert(real) {
+                return Err(StateError::NamedTwice { path: path.clone() });
+            }
             if checkpoints(path)?.is_empty() {
                 return Err(StateError::without_checkpoint(path));
             }
-            let part = Self::open(path, config, 0, u64::MAX)?;
+            let part = Self::load(path, config, (0, u64::MAX), false)?;
             match &mut whole {
                 None => whole = Some(part),
                 Some(whole) => whole.absorb(part)?,
@@ -175,7 +185,7 @@ impl Keeper {
             Some(GroundFrame::Visibilities(block)) => Some(block.clone()),
             _ => None,
         };
-        let mut summed = digest(&PlacedVisibilities::default());
+        let (mut summed, mut offered) = (digest(&PlacedVisibilities::default()), 0);
         let mut placed = Outlet::collect();
         if let Some(frame) = frame {
             self.since_checkpoint += block.as_ref().map_or(0, |block| block.len() as u64);
@@ -183,14 +193,14 @@ impl Keeper {
         }
         for frame in placed.into_vec() {
             if let PlacedFrame::Visibilities(placed) = &frame {
-                summed = digest(placed);
+                (summed, offered) = (digest(placed), placed.len() as u32);
             }
             self.accumulator.step(frame, out)?;
         }
         let used_s = self.accumulator.take_latest_s();
         let account = self.tally.take();
         self.outcome.ledger.post_report(&account);
-        self.journal.keep(header, check, block.as_ref(), (summed, used_s), &account);
+        self.journal.keep(header, check, block.as_ref(), (summed, offered, used_s), &account);
         Ok(())
     }
 
@@ -262,20 +272,6 @@ impl Keeper {
             file::write(out, path, &head, |out| accumulator.write_engines(out).map_err(StateError::from))
         })
     }
-}
-
-/// Calibration and sums that know nothing yet.
-fn stages(
-    config: &Config,
-    ledger: &Ledger,
-    outcome: &GroundOutcome,
-) -> Result<(Calibrator, Accumulator), StateError> {
-    let calibration = config.calibration.build(Path::new(""))?;
-    let calibrator = Calibrator::new(calibration, ledger.clone())
-        .with_van_vleck(config.calibration.van_vleck()?)
-        .with_autos(Arc::clone(&outcome.autos))
-        .with_segments(SEGMENTS_MAX);
-    Ok((calibrator, Accumulator::new(config.map.clone(), ledger.clone())))
 }
 
 impl Stage for Keeper {

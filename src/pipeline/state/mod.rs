@@ -35,11 +35,11 @@
 //! # Size
 //! The journal takes some 80 bytes a packet of visibilities in a checkpoint and 250 in memory: of 26 million, in packets
 //! of 215 as windows give them, 10 MB and 30 MB a channel, of 550 MB that came down. Waiting packets take up to
-//! `wait_bytes` in either. The set of packets that have come grows with the number of gaps alone; positions of
+//! `wait_bytes` in either. The set of packets that have come grows with the number of times at which they were made; positions of
 //! 8192 windows, more than two years, take 72 MB.
 //!
 //! # A checkpoint
-//! Magic `LNRSTA03`; length of the head (u64 LE); head (bincode); the channels' engines as they write
+//! Magic `LNRSTA04`; length of the head (u64 LE); head (bincode); the channels' engines as they write
 //! themselves; CRC-64/NVME of all that (u64 LE). It is written under another name, put on the disk and renamed; the
 //! one before is kept, and used, with a message, if the newest does not hold.
 
@@ -50,12 +50,15 @@ mod gaps;
 mod journal;
 mod keeper;
 mod retract;
+mod schedule;
 mod settings;
 mod survey;
 
 pub use error::StateError;
-pub use gaps::{ChannelCoverage, GapReport, Gaps, LostStream, find_gaps};
+pub use gaps::{
+    ChannelCoverage, GapReport, Gaps, LostStream, Positions, Reading, Received, RestartReport, find_gaps,
+};
 pub use journal::JournalEntry;
-pub use keeper::{Keeper, WAIT_BYTES};
+pub use keeper::Keeper;
 pub use retract::{Refused, Retracted};
 pub use survey::Survey;

@@ -5,11 +5,12 @@ use std::path::{Path, PathBuf};
 
 use super::error::StateError;
 use super::file::{self, Head};
-use super::folder::checkpoints;
-use super::gaps::{Gaps, find_gaps};
+use super::folder::{checkpoints, note};
+use super::gaps::{Gaps, Positions, Reading, Received, find_gaps};
 use super::journal::JournalEntry;
 use crate::accumulation::{Accumulator, MapConfig};
-use crate::downlink::{Collector, Delivery, Kind, Taken};
+use crate::array::Ephemeris;
+use crate::downlink::{Collector, Delivery, Kind, PacketHeader};
 use crate::frames::GroundFrame;
 use crate::products::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
 use crate::runtime::Ledger;
@@ -17,6 +18,8 @@ use crate::units::constants::DAY_S;
 
 /// Bytes that packets of a file wait for those before them.
 const WAIT_BYTES: u64 = 1 << 24;
+/// Segments of positions that are looked at.
+const SEGMENTS_MAX: usize = 1 << 14;
 /// Steps of time in a picture.
 const BINS: usize = 240;
 /// Most channels in a picture.
@@ -25,9 +28,10 @@ const PLOTS_MAX: usize = 64;
 /// What has been received.
 #[derive(Clone, Debug, Default)]
 pub struct Survey {
-    /// A line on every packet of visibilities.
-    pub journal: Vec<JournalEntry>,
-    taken: Vec<(Kind, Taken)>,
+    received: Received,
+    /// Positions that are known.
+    ephemeris: Ephemeris,
+    notes: Vec<String>,
 }
 
 impl Survey {
@@ -42,23 +46,30 @@ impl Survey {
         if file::is_checkpoint(path)? {
             return Self::of_checkpoint(path);
         }
-        let mut journal = Vec::new();
+        let mut survey = Self { ephemeris: Ephemeris::new(SEGMENTS_MAX), ..Self::default() };
         let mut collector = Collector::new(WAIT_BYTES);
-        collector.read_file(path, &mut |found| journal.extend(entry_of(&found)))?;
-        let state = collector.into_state();
-        Ok(Self { journal, taken: taken(|kind| state.taken(kind).cloned()) })
+        collector.read_file(path, &mut |found| survey.see(found))?;
+        let Self { received, ephemeris, .. } = &mut survey;
+        for reading in &mut received.readings {
+            reading.waits = !ephemeris.covers([reading.entry.start, reading.entry.end]);
+        }
+        survey.conclude(collector);
+        Ok(survey)
     }
 
     fn of_folder(path: &Path) -> Result<Self, StateError> {
         let files: Vec<PathBuf> = checkpoints(path)?;
-        let mut newest = None;
+        let mut bad = Vec::new();
         for file in files.iter().rev() {
             match Self::of_checkpoint(file) {
-                Ok(found) => return Ok(found),
-                Err(error) => drop(newest.get_or_insert(error)),
+                Ok(found) => {
+                    let notes = bad.iter().map(|error| note(error, file)).collect();
+                    return Ok(Self { notes, ..found });
+                }
+                Err(error) => bad.push(error),
             }
         }
-        match newest {
+        match bad.into_iter().next() {
             Some(newest) => Err(StateError::NoneHolds {
                 path: path.to_owned(),
                 checkpoints: files.len(),
@@ -90,21 +101,74 @@ impl Survey {
     }
 
     fn of_head(head: Head) -> Self {
-        let mut journal: Vec<JournalEntry> = head.journal.entries().copied().collect();
-        // Packets that wait have come too, and are in no journal yet.
-        let taken = taken(|kind| head.collector.taken(kind).cloned());
-        let mut collector = Collector::resume(head.collector);
-        while let Some(found) = collector.next_waiting() {
-            journal.extend(entry_of(&found));
+        let Head { journal, calibrator, collector, .. } = head;
+        let mut survey = Self { ephemeris: Ephemeris::new(SEGMENTS_MAX), ..Self::default() };
+        for segment in calibrator.ephemeris() {
+            survey.ephemeris.insert(segment.clone());
         }
-        Self { journal, taken }
+        let readings = journal.shares().map(|(entry, share)| Reading { entry: *entry, waits: false, share });
+        survey.received.readings = readings.collect();
+        for ((_, (made, count)), line) in &journal.others {
+            let segment = line.segment.and_then(|start| survey.ephemeris.segment(start));
+            let span = segment.map(|segment| [segment.start, segment.end()]);
+            survey.received.positions.extend(span.map(|span| Positions { count: *count, made: *made, span }));
+        }
+        // Packets that wait have come too, and are in no journal yet.
+        let mut collector = Collector::resume(collector);
+        let read = survey.received.readings.len();
+        while let Some(found) = collector.next_waiting() {
+            survey.see(found);
+        }
+        survey.received.readings[read..].iter_mut().for_each(|reading| reading.waits = true);
+        survey.conclude(collector);
+        survey
+    }
+
+    fn see(&mut self, found: Delivery) {
+        let Delivery { packets, frame } = found;
+        match frame {
+            Some(GroundFrame::Visibilities(block)) if !block.is_empty() => {
+                let entry = packets.first().map(|(header, _)| JournalEntry::of(*header, Some(&block)));
+                let reading = entry.map(|entry| Reading { entry, waits: false, share: None });
+                self.received.readings.extend(reading);
+            }
+            Some(GroundFrame::Ephemeris(segment)) => {
+                let span = [segment.start, segment.end()];
+                let positions = |(header, _): &(PacketHeader, u32)| Positions {
+                    count: header.count,
+                    made: header.time,
+                    span,
+                };
+                self.received.positions.extend(packets.iter().map(positions));
+                self.ephemeris.insert(segment);
+            }
+            _ => {}
+        }
+    }
+
+    fn conclude(&mut self, collector: Collector) {
+        let channels = collector.instrument().into_iter().flat_map(|instrument| &instrument.channels);
+        self.received.frequencies_hz = channels.map(|channel| channel.frequency_hz).collect();
+        let state = collector.into_state();
+        let taken = |kind| state.taken(kind).map(|taken| (kind, taken.clone()));
+        self.received.taken = Kind::ALL.into_iter().filter_map(taken).collect();
+    }
+
+    /// What is to be said of checkpoints that do not hold.
+    pub fn notes(&self) -> impl Iterator<Item = &str> {
+        self.notes.iter().map(String::as_str)
+    }
+
+    /// What has been received.
+    #[must_use]
+    pub fn received(&self) -> &Received {
+        &self.received
     }
 
     /// What is missing.
     #[must_use]
     pub fn gaps(&self) -> Gaps {
-        let taken: Vec<(Kind, &Taken)> = self.taken.iter().map(|(kind, taken)| (*kind, taken)).collect();
-        find_gaps(&self.journal, &taken)
+        find_gaps(&self.received)
     }
 
     /// A picture of integration time over mission time, channel by channel: received, and with what is missing.
@@ -112,29 +176,38 @@ impl Survey {
     /// # Errors
     /// [`PictureError::Size`] if nothing has been received. Of more than 64 channels the first are shown.
     pub fn picture(&self, gaps: &Gaps) -> Result<Picture, PictureError> {
-        let first = self.journal.iter().map(|entry| entry.start.seconds()).fold(f64::INFINITY, f64::min);
-        let last = self.journal.iter().map(|entry| entry.end.seconds()).fold(f64::NEG_INFINITY, f64::max);
+        let entries = || self.received.readings.iter().map(|reading| &reading.entry);
+        let first = entries().map(|entry| entry.start.seconds()).fold(f64::INFINITY, f64::min);
+        let last = entries().map(|entry| entry.end.seconds()).fold(f64::NEG_INFINITY, f64::max);
         let bin_s = ((last - first) / BINS as f64).max(1.0);
         let plots: Vec<Plot> = gaps
             .channels
             .iter()
-            .take(PLOTS_MAX)
+            .take(if self.received.readings.is_empty() { 0 } else { PLOTS_MAX })
             .map(|coverage| {
                 let mut received = vec![0.0; BINS];
                 let bin = |time_s: f64| (((time_s - first) / bin_s).max(0.0) as usize).min(BINS - 1);
-                for entry in self.journal.iter().filter(|entry| entry.channel.0 == coverage.channel) {
+                let is_shown = |entry: &&JournalEntry| {
+                    entry.channel.0 == coverage.channel && entry.pair.i != entry.pair.j
+                };
+                for entry in entries().filter(is_shown) {
                     let middle_s = 0.5 * (entry.start.seconds() + entry.end.seconds());
                     received[bin(middle_s)] += entry.integration_s;
                 }
                 let mut all = received.clone();
-                for gap in &gaps.gaps {
-                    let [from, to] = gap.between_s;
-                    let (from, to) = (bin(from.unwrap_or(first)), bin(to.unwrap_or(last)));
-                    let (from, to) = (from.min(to), from.max(to));
+                for gap in gaps.gaps.iter().filter(|gap| gap.kind == Kind::Visibilities) {
                     let of_channel = gap.lost.iter().filter(|lost| lost.channel == coverage.channel);
                     let lost_s: f64 = of_channel.map(|lost| lost.integration_s).sum();
-                    for sum in &mut all[from..=to] {
-                        *sum += lost_s / (to - from + 1) as f64;
+                    let [from, to] = gap.between_s;
+                    let stretches = self.observed([from.unwrap_or(first), to.unwrap_or(last)]);
+                    let length_s: f64 = stretches.iter().map(|[from, to]| to - from).sum();
+                    for [from, to] in stretches {
+                        let bins = bin(from)..=bin(to);
+                        for (k, sum) in bins.clone().zip(&mut all[bins]) {
+                            let (begin, end) = (first + bin_s * k as f64, first + bin_s * (k + 1) as f64);
+                            let within_s = (end.min(to) - begin.max(from)).max(0.0);
+                            *sum += lost_s * within_s / length_s;
+                        }
                     }
                 }
                 let steps = |sums: &[f64]| {
@@ -145,7 +218,10 @@ impl Survey {
                     sums.iter().enumerate().flat_map(corner).collect()
                 };
                 Plot {
-                    title: format!("channel {}", coverage.channel),
+                    title: match coverage.frequency_hz {
+                        Some(hz) => format!("channel {}: {:.4} MHz", coverage.channel, hz / 1e6),
+                        None => format!("channel {}", coverage.channel),
+                    },
                     x: Axis { label: "mission time, days".into(), ..Axis::default() },
                     y: Axis { label: format!("pair hours in {:.2} d", bin_s / DAY_S), ..Axis::default() },
                     curves: vec![
@@ -158,17 +234,15 @@ impl Survey {
             .collect();
         draw_plots("Integration time received", &plots, 1 + usize::from(plots.len() > 3))
     }
-}
 
-fn entry_of(found: &Delivery) -> Option<JournalEntry> {
-    match (found.packets.first(), &found.frame) {
-        (Some((header, _)), Some(GroundFrame::Visibilities(block))) if !block.is_empty() => {
-            Some(JournalEntry::of(*header, Some(block)))
-        }
-        _ => None,
+    /// The parts of a stretch of time, s, in which there were observations, as the positions tell; all of it, at least
+    /// a second, where they tell of none.
+    fn observed(&self, [a, b]: [f64; 2]) -> Vec<[f64; 2]> {
+        let (from, to) = (a.min(b), a.max(b));
+        let segments =
+            self.ephemeris.segments().map(|segment| [segment.start.seconds(), segment.end().seconds()]);
+        let within = segments.map(|[start, end]| [start.max(from), end.min(to)]);
+        let parts: Vec<[f64; 2]> = within.filter(|[start, end]| start < end).collect();
+        if parts.is_empty() { vec![[from, to.max(from + 1.0)]] } else { parts }
     }
-}
-
-fn taken(of: impl Fn(Kind) -> Option<Taken>) -> Vec<(Kind, Taken)> {
-    Kind::ALL.into_iter().filter_map(|kind| of(kind).map(|taken| (kind, taken))).collect()
 }

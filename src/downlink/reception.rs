@@ -1,27 +1,30 @@
-//! The ground's receiving stage where packets come from several senders at once.
+//! The ground's receiving stage where nothing is kept for later sessions.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
+use super::collector::{Collector, Delivery};
+use super::counters::ReceptionCounters;
+use super::error::DownlinkError;
 use crate::array::Ephemeris;
-use crate::downlink::{Collector, Delivery, DownlinkError, ReceptionCounters};
 use crate::frames::GroundFrame;
 use crate::runtime::{Outlet, Stage, Units};
 
-/// Gives every frame once, visibilities behind their positions as far as its reach goes, however many send it.
+/// Finds packets in what arrives, from one sender or several, and makes frames of them: each once, behind the
+/// instrument's description, visibilities behind their positions as far as its reach goes.
 #[derive(Debug)]
-pub struct Gathering {
+pub struct Reception {
     collector: Collector,
     /// What has been passed on, to know which visibilities can be placed.
     ephemeris: Ephemeris,
     account: Arc<Mutex<ReceptionCounters>>,
 }
 
-impl Gathering {
-    /// Visibilities wait for positions until `wait_bytes` do. Leaves its account in
-    /// `account` at the end.
+impl Reception {
+    /// Visibilities wait for positions until `wait_bytes` do; positions of `segments_max` segments are known, as whoever
+    /// places them should. Leaves its account in `account` at the end.
     #[must_use]
-    pub fn new(wait_bytes: u64, account: Arc<Mutex<ReceptionCounters>>) -> Self {
-        Self { collector: Collector::new(wait_bytes), ephemeris: Ephemeris::default(), account }
+    pub fn new(wait_bytes: u64, segments_max: usize, account: Arc<Mutex<ReceptionCounters>>) -> Self {
+        Self { collector: Collector::new(wait_bytes), ephemeris: Ephemeris::new(segments_max), account }
     }
 
     fn pass_on(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), DownlinkError> {
@@ -44,7 +47,7 @@ impl Gathering {
     }
 }
 
-impl Stage for Gathering {
+impl Stage for Reception {
     type In = Vec<u8>;
     type Out = GroundFrame;
     type Error = DownlinkError;

@@ -1,0 +1,197 @@
+//! How packets of visibilities follow each other, and what they usually hold.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+use super::gaps::{GapReport, LostStream, Reading};
+use super::journal::{JournalEntry, Sent};
+use crate::downlink::{CucTime, Kind};
+use crate::units::{ChannelId, Pair};
+
+/// What sends packets in its turn, pass by pass.
+pub(super) type Stream = (ChannelId, Pair);
+
+/// What a channel and pair sends: means over packets.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Usual {
+    integration_s: f64,
+    weight: f64,
+    /// Share of the weight that the map takes, if it is known.
+    share: Option<f64>,
+}
+
+impl Usual {
+    fn of(readings: &[Reading]) -> Self {
+        let packets = readings.len().max(1) as f64;
+        let mean = |of: &dyn Fn(&Reading) -> f64| readings.iter().map(of).sum::<f64>() / packets;
+        let weight = mean(&|reading| reading.entry.weight);
+        let known = mean(&|reading| reading.share.map_or(0.0, |_| reading.entry.weight));
+        let taken = mean(&|reading| reading.share.unwrap_or(0.0) * reading.entry.weight);
+        let share = (known > 0.0).then(|| taken / known);
+        Self { integration_s: mean(&|reading| reading.entry.integration_s), weight, share }
+    }
+
+    /// Share of the weight that the map takes, as far as anyone knows.
+    pub(super) fn share(&self) -> f64 {
+        self.share.unwrap_or(1.0)
+    }
+}
+
+/// Packets by channel and pair, in the order of sending.
+pub(super) struct Streams(BTreeMap<Stream, Vec<Reading>>);
+
+impl Streams {
+    pub(super) fn of(readings: impl Iterator<Item = Reading>) -> Self {
+        let mut streams: BTreeMap<Stream, Vec<Reading>> = BTreeMap::new();
+        for reading in readings {
+            streams.entry(reading.stream()).or_default().push(reading);
+        }
+        streams.values_mut().for_each(|readings| readings.sort_by_key(|reading| reading.entry.sent()));
+        Self(streams)
+    }
+
+    /// What is usual in so many packets on either side of a place in the order of sending: the formation breathes, so
+    /// that others tell less.
+    pub(super) fn usual(&self, stream: Stream, place: Sent, packets: u64) -> Usual {
+        let all = self.0.get(&stream).map_or(&[][..], Vec::as_slice);
+        let at = all.partition_point(|reading| reading.entry.sent() < place);
+        let packets = usize::try_from(packets).unwrap_or(usize::MAX);
+        let near = Usual::of(&all[at.saturating_sub(packets)..all.len().min(at.saturating_add(packets))]);
+        let share = match stream.1.i == stream.1.j {
+            // A daughter's own powers are in no map.
+            true => Some(0.0),
+            false => near.share.or_else(|| Usual::of(all).share),
+        };
+        Usual { share, ..near }
+    }
+}
+
+/// How packets follow each other in an era, learnt from those that came.
+pub(super) struct Schedule {
+    /// By count.
+    entries: Vec<JournalEntry>,
+    /// In the order of sending within a pass.
+    order: Vec<Stream>,
+    /// Packets of each that a pass usually has.
+    packets: BTreeMap<Stream, u64>,
+    streams: Streams,
+}
+
+impl Schedule {
+    pub(super) fn learn(readings: Vec<Reading>) -> Self {
+        let streams = Streams::of(readings.iter().copied());
+        let mut entries: Vec<JournalEntry> = readings.into_iter().map(|reading| reading.entry).collect();
+        entries.sort_by_key(|entry| entry.count);
+        let mut order: Vec<Stream> = Vec::new();
+        let mut at = 0;
+        // Packets of each stream, pass by pass.
+        let mut passes: BTreeMap<Stream, Vec<u64>> = BTreeMap::new();
+        let mut before: Option<JournalEntry> = None;
+        for entry in &entries {
+            let stream = (entry.channel, entry.pair);
+            at = match order.iter().position(|known| *known == stream) {
+                Some(at) => at,
+                None => {
+                    let after = (at + 1).min(order.len());
+                    order.insert(after, stream);
+                    after
+                }
+            };
+            let counts = passes.entry(stream).or_default();
+            match counts.last_mut() {
+                Some(count) if before.is_some_and(|before| same_pass(&before, entry)) => *count += 1,
+                _ => counts.push(1),
+            }
+            before = Some(*entry);
+        }
+        let median = |(stream, mut counts): (Stream, Vec<u64>)| {
+            counts.sort_unstable();
+            (stream, counts[counts.len() / 2])
+        };
+        Self { order, packets: passes.into_iter().map(median).collect(), streams, entries }
+    }
+
+    pub(super) fn report(&self, kind: Kind, gap: &Range<u64>) -> GapReport {
+        let next = self.entries.partition_point(|entry| entry.count < gap.start);
+        let before = next.checked_sub(1).map(|at| &self.entries[at]);
+        let after = self.entries.get(next);
+        let place = after.map_or((CucTime(u64::MAX), u64::MAX), JournalEntry::sent);
+        let mut lost: Vec<LostStream> = self
+            .fill(gap.end - gap.start, next)
+            .into_iter()
+            .map(|(stream, packets)| {
+                let usual = self.streams.usual(stream, place, self.packets_of(&stream));
+                let (integration_s, weight) = (usual.integration_s, usual.weight * usual.share());
+                LostStream {
+                    packets,
+                    integration_s: integration_s * packets as f64,
+                    weight: weight * packets as f64,
+                    ..LostStream::nothing(stream)
+                }
+            })
+            .collect();
+        lost.sort_by(|a, b| (a.channel, &a.pair).cmp(&(b.channel, &b.pair)));
+        let between_s = [before.map(|entry| entry.end.seconds()), after.map(|entry| entry.start.seconds())];
+        GapReport::new(kind, gap, between_s, lost)
+    }
+
+    /// Packets of a pass.
+    fn packets_of(&self, stream: &Stream) -> u64 {
+        self.packets.get(stream).map_or(1, |packets| (*packets).max(1))
+    }
+
+    /// The streams of `missing` packets before the entry `next`, along the schedule.
+    fn fill(&self, missing: u64, next: usize) -> BTreeMap<Stream, u64> {
+        let mut filled = BTreeMap::new();
+        let before = next.checked_sub(1).map(|at| self.entries[at]);
+        let after = self.entries.get(next);
+        let (mut at, mut sent, mut step) = (0, 0, 1);
+        let place = |stream: Stream| self.order.iter().position(|known| *known == stream).unwrap_or(0);
+        if let Some(before) = before {
+            let stream = (before.channel, before.pair);
+            if after.is_some_and(|after| same_pass(&before, after)) {
+                filled.insert(stream, missing);
+                return filled;
+            }
+            at = place(stream);
+            let of_pass = self.entries[..next].iter().rev();
+            sent = of_pass.take_while(|entry| (entry.channel, entry.pair) == stream).count() as u64;
+        } else if let Some(after) = after {
+            // Nothing came before: backwards from what came first.
+            let stream = (after.channel, after.pair);
+            (at, step) = (place(stream), self.order.len() - 1);
+            let of_pass = self.entries[next..].iter();
+            sent = of_pass.take_while(|entry| (entry.channel, entry.pair) == stream).count() as u64;
+        }
+        let usual = |stream: &Stream| self.packets_of(stream);
+        let pass: u64 = self.order.iter().map(usual).sum();
+        let mut left = missing;
+        while left > 0 && !self.order.is_empty() {
+            let stream = self.order[at];
+            let packets = usual(&stream).saturating_sub(sent).min(left);
+            if packets > 0 {
+                *filled.entry(stream).or_default() += packets;
+            }
+            left -= packets;
+            sent = 0;
+            at = (at + step) % self.order.len();
+            // Whole passes at once: a packet may claim any count.
+            for stream in self.order.iter().filter(|_| left >= pass) {
+                *filled.entry(*stream).or_default() += left / pass * usual(stream);
+            }
+            left %= pass;
+        }
+        filled
+    }
+}
+
+/// Whether a packet goes on with the channel and pair of the one before it, in the same pass.
+fn same_pass(before: &JournalEntry, entry: &JournalEntry) -> bool {
+    // A pass is over when another channel or pair has been in between: then time has gone back, or far ahead.
+    let length_s = (before.end.seconds() - before.start.seconds()).max(1.0);
+    let ahead_s = entry.start.seconds() - before.end.seconds();
+    let packets = entry.count.abs_diff(before.count) as f64;
+    (before.channel, before.pair) == (entry.channel, entry.pair)
+        && ahead_s >= -1e-6
+        && ahead_s <= 4.0 * length_s * packets
+}
