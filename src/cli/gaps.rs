@@ -66,11 +66,12 @@ fn table(gaps: &Gaps, most: usize) -> String {
             "{number:<7} {mhz:>10} {packets:>11} {received_h:>12.2} {missing_h:>11.2} {share:>13.3} %"
         );
     }
+    if !gaps.restarts.is_empty() {
+        text.push('\n');
+    }
     for RestartReport { kind, apid, last } in &gaps.restarts {
-        let _ = write!(
-            text,
-            "\n{apid:#05x}: the spacecraft began to count anew behind packet {last} of {kind}; "
-        );
+        let _ =
+            write!(text, "{apid:#05x}: the spacecraft began to count anew behind packet {last} of {kind}; ");
         text.push_str("what she sent between is not known\n");
     }
     if gaps.gaps.is_empty() {

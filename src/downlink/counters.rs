@@ -188,11 +188,10 @@ impl ReceptionCounters {
     /// What is to be said of restarts of the spacecraft's counts, if there were any.
     pub(super) fn restarts_text(&self) -> Option<String> {
         let kinds = Kind::ALL.into_iter().filter(|kind| self.kind(*kind).restarts > 0);
-        let times: Vec<String> =
-            kinds.map(|kind| format!("{kind} {} times", self.kind(kind).restarts)).collect();
+        let times: Vec<String> = kinds.map(|kind| format!("{kind} {}", self.kind(kind).restarts)).collect();
         (!times.is_empty()).then(|| {
             format!(
-                "the spacecraft began to count anew ({}): what she sent last before that is not known to be missing",
+                "the spacecraft began to count anew (times: {}): what she sent last before that is not known to be missing",
                 times.join(", ")
             )
         })

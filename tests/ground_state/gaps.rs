@@ -9,6 +9,7 @@ use lunarray::calibration::{CalibrationConfig, Calibrator};
 use lunarray::downlink::{Decoder, Event, Receiver};
 use lunarray::frames::{GroundFrame, PlacedFrame};
 use lunarray::runtime::{Ledger, Outlet, Stage};
+use lunarray::units::Pair;
 use serde_json::Value;
 
 use super::common::workplace::{SMALL, Workplace, json, succeed};
@@ -21,6 +22,7 @@ const POSITIONS: u16 = 0x102;
 #[derive(Clone, Copy, Default)]
 struct Worth {
     channel: u16,
+    pair: Pair,
     visibilities: u64,
     weight: f64,
 }
@@ -38,7 +40,9 @@ fn worth(file: &str) -> BTreeMap<u64, Worth> {
         let Event::Packet(packet) = event else { continue };
         let Some(frame) = decoder.accept(&event) else { continue };
         let mut worth = match &frame {
-            GroundFrame::Visibilities(block) => Worth { channel: block.channel.0, ..Worth::default() },
+            GroundFrame::Visibilities(block) => {
+                Worth { channel: block.channel.0, pair: block.pair, ..Worth::default() }
+            }
             _ => Worth::default(),
         };
         let mut placed = Outlet::collect();
@@ -65,32 +69,39 @@ fn gaps_stand_in_the_order_of_what_their_recovery_adds() {
     // Half a day from pass to pass: the formation breathes in fourteen.
     let pipeline = SMALL
         .replace("every_nth_window = 300", "every_nth_window = 5\nduration_s = 1.2e6")
+        .replace("packet_bytes_max = 2048", "packet_bytes_max = 1024")
+        .replace("every_nth_integration = 2", "")
         .replace("baseline_wavelengths_max = 16.0", "")
-        .replace("[spacecraft]", "[array]\nsatellites = 4\n[spacecraft]");
+        .replace("[3.0e6, 10.0e6]", "[1.0e6, 3.0e6]")
+        .replace(
+            "[spacecraft]",
+            "[array]\nsatellites = 4\n[array.breathing]\nspan_m_max = 5e3\n[spacecraft]",
+        );
     let place = Ground(Workplace::new(&pipeline));
     let file = place.downlink();
     let (worth, all) = (worth(&file), packets(&file));
-    let mut passes: Vec<Vec<&Vec<u8>>> = Vec::new();
-    for packet in &all {
-        match passes.last_mut() {
-            Some(pass) if identity(packet).0 != 0x101 => pass.push(packet),
-            _ => passes.push(vec![packet]),
-        }
-    }
+    // Each pass ends with the spacecraft's own counts.
+    let passes: Vec<&[Vec<u8>]> = all.split_inclusive(|packet| identity(packet).0 == 0x105).collect();
     let counts = |pass: usize, apid: u16| {
         let of_kind = passes[pass].iter().filter(|packet| identity(packet).0 == apid);
         let counts: Vec<u64> = of_kind.map(|packet| identity(packet).1).collect();
         counts[0]..counts[counts.len() - 1] + 1
     };
-    // A pass; in another its positions; half of a third, one packet of a fourth; and one that weighs something, but of which
-    // the map takes nothing.
-    let (first, third, fourth) = (counts(2, VISIBILITIES), counts(9, VISIBILITIES), counts(12, VISIBILITIES));
-    let useful = fourth.clone().find(|count| worth[count].weight > 0.0).unwrap();
-    let useless = counts(14, VISIBILITIES).find(|count| worth[count].weight == 0.0).unwrap();
+    // A pass; in another its positions; a fifth of a third; and single packets, of which the map takes something, or
+    // nothing for all that they weigh.
+    let (first, third) = (counts(2, VISIBILITIES), counts(9, VISIBILITIES));
+    // Single packets are told apart where those on either side are of the same channel and pair.
+    let stream = |count: u64| (worth[&count].channel, worth[&count].pair);
+    let is_within = |count: &u64| stream(count - 1) == stream(*count) && stream(count + 1) == stream(*count);
+    let single = |passes: Range<usize>, is_useful: bool| {
+        let mut counts = passes.flat_map(|pass| counts(pass, VISIBILITIES)).filter(is_within);
+        counts.find(|count| (worth[count].weight > 0.0) == is_useful).unwrap()
+    };
+    let (useful, useless) = (single(12..18, true), single(20..26, false));
     let lost: [(u16, Range<u64>); 5] = [
         (POSITIONS, counts(6, POSITIONS)),
         (VISIBILITIES, first),
-        (VISIBILITIES, third.start..third.start + (third.end - third.start) / 2),
+        (VISIBILITIES, third.start..third.start + (third.end - third.start) / 5),
         (VISIBILITIES, useful..useful + 1),
         (VISIBILITIES, useless..useless + 1),
     ];
@@ -134,17 +145,17 @@ fn gaps_stand_in_the_order_of_what_their_recovery_adds() {
         expected.push((u64::from(gap.0), gap.1.start, gain));
     }
     expected.sort_by(|a, b| b.2.total_cmp(&a.2));
-    println!("{told:?}\n{expected:?}");
     assert_eq!(told.len(), expected.len());
     let [most, least] = [expected[0].2, expected[4].2];
     assert!(most > 0.01 && least == 0.0);
     for (told, expected) in told.iter().zip(&expected) {
         assert_eq!((told.0, told.1), (expected.0, expected.1));
-        // A channel and pair is not the same in every pass: the formation breathes.
-        assert!((told.2 - expected.2).abs() < 0.3 * expected.2 + 0.05 * most, "{told:?} {expected:?}");
+        // Estimated from passes half a day away, in which the formation breathes by a few percent; a single packet may be
+        // near the end of a pass, where integrations are shorter.
+        assert!((told.2 - expected.2).abs() < 0.1 * expected.2 + 0.03 * most, "{told:?} {expected:?}");
     }
     // The instrument's channels are named; -0 is 0.
-    assert_eq!(found["channels"][1]["frequency_hz"], 10.0e6);
+    assert_eq!(found["channels"][1]["frequency_hz"], 3.0e6);
     assert!(!succeed(&["gaps", &place.path("state")]).contains("-0.0"));
 }
 

@@ -11,6 +11,9 @@ use crate::units::{ChannelId, Pair};
 /// What sends packets in its turn, pass by pass.
 pub(super) type Stream = (ChannelId, Pair);
 
+/// Passes on either side of a gap that tell how many packets one has.
+const PASSES: usize = 2;
+
 /// What a channel and pair sends: means over packets.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Usual {
@@ -72,8 +75,8 @@ pub(super) struct Schedule {
     entries: Vec<JournalEntry>,
     /// In the order of sending within a pass.
     order: Vec<Stream>,
-    /// Packets of each that a pass usually has.
-    packets: BTreeMap<Stream, u64>,
+    /// Pass by pass, the count of the first packet of each and the number of packets.
+    passes: BTreeMap<Stream, Vec<(u64, u64)>>,
     streams: Streams,
 }
 
@@ -84,8 +87,7 @@ impl Schedule {
         entries.sort_by_key(|entry| entry.count);
         let mut order: Vec<Stream> = Vec::new();
         let mut at = 0;
-        // Packets of each stream, pass by pass.
-        let mut passes: BTreeMap<Stream, Vec<u64>> = BTreeMap::new();
+        let mut passes: BTreeMap<Stream, Vec<(u64, u64)>> = BTreeMap::new();
         let mut before: Option<JournalEntry> = None;
         for entry in &entries {
             let stream = (entry.channel, entry.pair);
@@ -97,18 +99,14 @@ impl Schedule {
                     after
                 }
             };
-            let counts = passes.entry(stream).or_default();
-            match counts.last_mut() {
-                Some(count) if before.is_some_and(|before| same_pass(&before, entry)) => *count += 1,
-                _ => counts.push(1),
+            let passes = passes.entry(stream).or_default();
+            match passes.last_mut() {
+                Some((_, packets)) if before.is_some_and(|before| same_pass(&before, entry)) => *packets += 1,
+                _ => passes.push((entry.count, 1)),
             }
             before = Some(*entry);
         }
-        let median = |(stream, mut counts): (Stream, Vec<u64>)| {
-            counts.sort_unstable();
-            (stream, counts[counts.len() / 2])
-        };
-        Self { order, packets: passes.into_iter().map(median).collect(), streams, entries }
+        Self { order, passes, streams, entries }
     }
 
     pub(super) fn report(&self, kind: Kind, gap: &Range<u64>) -> GapReport {
@@ -117,10 +115,10 @@ impl Schedule {
         let after = self.entries.get(next);
         let place = after.map_or((CucTime(u64::MAX), u64::MAX), JournalEntry::sent);
         let mut lost: Vec<LostStream> = self
-            .fill(gap.end - gap.start, next)
+            .fill(gap, next)
             .into_iter()
             .map(|(stream, packets)| {
-                let usual = self.streams.usual(stream, place, self.packets_of(&stream));
+                let usual = self.streams.usual(stream, place, self.packets_of(&stream, gap.start));
                 let (integration_s, weight) = (usual.integration_s, usual.weight * usual.share());
                 LostStream {
                     packets,
@@ -135,14 +133,19 @@ impl Schedule {
         GapReport::new(kind, gap, between_s, lost)
     }
 
-    /// Packets of a pass.
-    fn packets_of(&self, stream: &Stream) -> u64 {
-        self.packets.get(stream).map_or(1, |packets| (*packets).max(1))
+    /// Packets of a pass about a count: the median of some, as the gap itself may have cut the nearest.
+    fn packets_of(&self, stream: &Stream, count: u64) -> u64 {
+        let all = self.passes.get(stream).map_or(&[][..], Vec::as_slice);
+        let at = all.partition_point(|(first, _)| *first < count);
+        let near = &all[at.saturating_sub(PASSES)..all.len().min(at + PASSES)];
+        let mut packets: Vec<u64> = near.iter().map(|(_, packets)| *packets).collect();
+        packets.sort_unstable();
+        packets.get(packets.len() / 2).copied().unwrap_or(1)
     }
 
-    /// The streams of `missing` packets before the entry `next`, along the schedule.
-    fn fill(&self, missing: u64, next: usize) -> BTreeMap<Stream, u64> {
-        let mut filled = BTreeMap::new();
+    /// The streams of the packets of a gap before the entry `next`, along the schedule.
+    fn fill(&self, gap: &Range<u64>, next: usize) -> BTreeMap<Stream, u64> {
+        let (mut filled, missing) = (BTreeMap::new(), gap.end - gap.start);
         let before = next.checked_sub(1).map(|at| self.entries[at]);
         let after = self.entries.get(next);
         let (mut at, mut sent, mut step) = (0, 0, 1);
@@ -163,7 +166,7 @@ impl Schedule {
             let of_pass = self.entries[next..].iter();
             sent = of_pass.take_while(|entry| (entry.channel, entry.pair) == stream).count() as u64;
         }
-        let usual = |stream: &Stream| self.packets_of(stream);
+        let usual = |stream: &Stream| self.packets_of(stream, gap.start);
         let pass: u64 = self.order.iter().map(usual).sum();
         let mut left = missing;
         while left > 0 && !self.order.is_empty() {

@@ -235,14 +235,42 @@ impl Survey {
         draw_plots("Integration time received", &plots, 1 + usize::from(plots.len() > 3))
     }
 
-    /// The parts of a stretch of time, s, in which there were observations, as the positions tell; all of it, at least
-    /// a second, where they tell of none.
+    /// The parts of a stretch of time, s, in which there were observations: those for which positions came, not by their
+    /// edges alone. Where there are none, all of it, at least a second.
     fn observed(&self, [a, b]: [f64; 2]) -> Vec<[f64; 2]> {
         let (from, to) = (a.min(b), a.max(b));
-        let segments =
-            self.ephemeris.segments().map(|segment| [segment.start.seconds(), segment.end().seconds()]);
-        let within = segments.map(|[start, end]| [start.max(from), end.min(to)]);
-        let parts: Vec<[f64; 2]> = within.filter(|[start, end]| start < end).collect();
+        let segments = self.ephemeris.segments();
+        let segments = segments.map(|segment| [segment.start.seconds(), segment.end().seconds()]);
+        let within = segments.filter(|[start, end]| (from..=to).contains(&(0.5 * (start + end))));
+        let parts: Vec<[f64; 2]> = within.map(|[start, end]| [start.max(from), end.min(to)]).collect();
         if parts.is_empty() { vec![[from, to.max(from + 1.0)]] } else { parts }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frames::EphemerisSegment;
+    use crate::units::MissionTime;
+
+    #[test]
+    fn what_is_missing_was_observed_where_positions_tell() {
+        let mut survey = Survey::default();
+        // Windows of 2400 s in every 9000 s; of the fourth no positions came.
+        for window in [0, 1, 2, 4] {
+            survey.ephemeris.insert(EphemerisSegment {
+                start: MissionTime::from_seconds(9e3 * f64::from(window)),
+                step_ticks: 300_000_000,
+                satellites: 1,
+                positions_m: vec![[0.0; 3]; 9],
+            });
+        }
+        // The second window, of which the first and third came but for their edges; the third, by its last stream and its
+        // own beginning; a part of one; and the fourth, of which nobody knows where it was.
+        assert_eq!(survey.observed([2399.0, 18_001.0]), [[9000.0, 11_400.0]]);
+        assert_eq!(survey.observed([20_400.0, 18_000.0]), [[18_000.0, 20_400.0]]);
+        assert_eq!(survey.observed([18_100.0, 18_900.0]), [[18_100.0, 18_900.0]]);
+        assert_eq!(survey.observed([20_399.0, 36_001.0]), [[20_399.0, 36_001.0]]);
+        assert_eq!(survey.observed([5000.0, 5000.0]), [[5000.0, 5001.0]]);
     }
 }
