@@ -17,3 +17,4 @@ mod noise;
 mod robust;
 mod signal;
 mod states;
+mod store;
