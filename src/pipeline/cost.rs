@@ -55,6 +55,11 @@ pub struct Cost {
     /// Rate that the daughters' samples need on their links to the mother, all together, bit/s; with
     /// samples alone.
     pub samples_bits_per_s: Option<f64>,
+    /// Rate that one daughter's samples need on her link, and the greatest that it has, bit/s; with samples and a limit
+    /// alone.
+    pub link_bits_per_s: Option<[f64; 2]>,
+    /// Keys that were set and that this fidelity has no use for.
+    pub without_effect: Vec<String>,
     /// Rate of the ninth daughter's spectra on the downlink while the array observes, bit/s; with her alone.
     pub ninth_bits_per_s: Option<f64>,
     /// Time on this machine, s, from a measurement of a fraction of a second.
@@ -123,20 +128,37 @@ impl Plan {
             downlink_bytes: self.config.downlink.expansion()
                 * (sent * VISIBILITY_BYTES as f64
                     + self.windows.len() as f64 * 10_000.0
+                    + self.auto_bytes()
                     + self.ninth_bytes()),
             memory_bytes,
             samples_bits_per_s: self.samples_bits_per_s(),
+            link_bits_per_s: self.link_bits_per_s(),
+            without_effect: self.without_effect(),
             ninth_bits_per_s: self.ninth_bits_per_s(),
             predicted_s,
         }
+    }
+
+    /// Time in which the array observes, s.
+    fn observed_s(&self) -> f64 {
+        let length_s = |window: &ObservingWindow| window.end.seconds() - window.start.seconds();
+        self.windows.iter().map(length_s).sum()
+    }
+
+    /// Bytes of the daughters' own powers.
+    fn auto_bytes(&self) -> f64 {
+        let spacecraft = &self.config.spacecraft;
+        let streams = self.array.satellites() * spacecraft.channels_hz.len() * spacecraft.sub_bands;
+        let each_s = spacecraft.autos_s();
+        let powers = if each_s > 0.0 { self.observed_s() / each_s * streams as f64 } else { 0.0 };
+        powers * VISIBILITY_BYTES as f64
     }
 
     /// Bytes of the ninth daughter's spectra, with headers of a packet a channel and window.
     fn ninth_bytes(&self) -> f64 {
         const PACKET_BYTES: f64 = 42.0;
         let Some(rate) = self.ninth_bits_per_s() else { return 0.0 };
-        let length_s = |window: &ObservingWindow| window.end.seconds() - window.start.seconds();
-        let seconds: f64 = self.windows.iter().map(length_s).sum();
+        let seconds = self.observed_s();
         let packets = self.config.spacecraft.ninth.channels * self.windows.len();
         seconds * rate / 8.0 + PACKET_BYTES * packets as f64
     }
@@ -211,6 +233,17 @@ impl fmt::Display for Cost {
         writeln!(f, "memory           {:.2} GB", self.memory_bytes / 1e9)?;
         if let Some(rate) = self.samples_bits_per_s {
             writeln!(f, "samples          {:.3} Mbit/s from all daughters", rate / 1e6)?;
+        }
+        if let Some([needed, limit]) = self.link_bits_per_s {
+            let (needed_k, limit_k) = (needed / 1e3, limit / 1e3);
+            write!(f, "links            {needed_k:.3} kbit/s needed by a daughter, {limit_k:.3} there")?;
+            let short =
+                "; the rest waits in her buffer, and what has no room or no time after a window is dropped";
+            writeln!(f, "{}", if needed > limit { short } else { "" })?;
+        }
+        if !self.without_effect.is_empty() {
+            let keys = self.without_effect.join(", ");
+            writeln!(f, "without effect   {keys}: used with spacecraft.fidelity = \"samples\" alone")?;
         }
         if let Some(rate) = self.ninth_bits_per_s {
             writeln!(f, "ninth daughter   {:.3} kbit/s of spectra while observing", rate / 1e3)?;

@@ -12,6 +12,7 @@ mod delays;
 mod disturbances;
 mod integration;
 mod late;
+mod links;
 mod ninth;
 mod noise;
 mod robust;
