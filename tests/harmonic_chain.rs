@@ -6,7 +6,7 @@ use std::path::Path;
 
 use lunarray::array::Array;
 use lunarray::array::harmonic::{HarmonicModel, ModelSettings, PairState, PatternGeometry};
-use lunarray::array::response::{Directions, PairGeometry, sky_sums};
+use lunarray::array::response::{Directions, PairGeometry, SingleGeometry, sky_powers, sky_sums};
 use lunarray::downlink::DownlinkReader;
 use lunarray::frames::{AntennaResponse, GroundFrame, VisibilityBlock};
 use lunarray::pipeline::{ConfigSource, Plan, simulate};
@@ -73,12 +73,12 @@ fn blocks(file: &Path) -> Vec<VisibilityBlock> {
 struct Sample {
     geometry: Vec<PairGeometry>,
     value: Vec<Complex64>,
-    zero_spacing_k_sr: Vec<f64>,
+    noise_k_sr: Vec<f64>,
 }
 
 fn sample(array: &Array, blocks: &[VisibilityBlock], every: usize) -> Sample {
     let all = blocks.iter().flat_map(|block| (0..block.len()).map(move |k| (block, k)));
-    let mut found = Sample { geometry: Vec::new(), value: Vec::new(), zero_spacing_k_sr: Vec::new() };
+    let mut found = Sample { geometry: Vec::new(), value: Vec::new(), noise_k_sr: Vec::new() };
     for (block, k) in all.step_by(every) {
         let t_s = block.middle_s(k);
         found.geometry.push(PairGeometry {
@@ -90,20 +90,20 @@ fn sample(array: &Array, blocks: &[VisibilityBlock], every: usize) -> Sample {
         });
         let value = block.value_k_sr[k];
         found.value.push(Complex64::new(value.re.into(), value.im.into()));
-        // weight = 2 dnu dt / T_sys^2
+        // weight = 2 dnu dt / (P_i P_j)
         let dt_s = 1e-6 * f64::from(block.duration_ticks[k]);
-        found.zero_spacing_k_sr.push((2.0 * 8_000.0 * dt_s / f64::from(block.weight[k])).sqrt());
+        found.noise_k_sr.push((2.0 * 8_000.0 * dt_s / f64::from(block.weight[k])).sqrt());
     }
     found
 }
 
 /// Sums over the pixels of a much finer map of the same coefficients, some rings at a time. The Moon's limb cuts
 /// some 14,000 pixels of 2.5e-7 sr at random, which leaves 1e-5 of the sky's temperature.
-fn pixel_sums(alm: &Alm, frame: Frame, pairs: &[PairGeometry]) -> Vec<(Complex64, f64)> {
+fn pixel_sums(alm: &Alm, frame: Frame, pairs: &[PairGeometry]) -> Vec<Complex64> {
     const NSIDE: usize = 2048;
     let map = synthesis(alm, NSIDE).unwrap();
     let rotation = frame.to_ecliptic();
-    let mut totals = vec![(Complex64::ZERO, 0.0); pairs.len()];
+    let mut totals = vec![Complex64::ZERO; pairs.len()];
     let rings: Vec<usize> = (1..4 * NSIDE).collect();
     for rings in rings.chunks(128) {
         let (mut directions, mut values) = (Vec::new(), Vec::new());
@@ -118,11 +118,29 @@ fn pixel_sums(alm: &Alm, frame: Frame, pairs: &[PairGeometry]) -> Vec<(Complex64
         let directions = Directions::from(directions.as_slice());
         let sums = sky_sums(pairs, &directions, &values, pixel_area_sr(NSIDE)).unwrap();
         for (total, sum) in totals.iter_mut().zip(sums) {
-            total.0 += sum.visibility_k_sr;
-            total.1 += sum.zero_spacing_k_sr;
+            *total += sum.visibility_k_sr;
         }
     }
     totals
+}
+
+/// Geometric means of what the two daughters of each pair hear by themselves, K sr. The Moon's limb cuts some 2000 pixels of
+/// 4e-6 sr, which leaves 1e-5.
+fn pixel_powers(alm: &Alm, frame: Frame, pairs: &[PairGeometry]) -> Vec<f64> {
+    const NSIDE: usize = 512;
+    let map = SkyMap::new(frame, synthesis(alm, NSIDE).unwrap()).unwrap();
+    let directions = Directions::from(map.directions_ecliptic().as_slice());
+    let values: Vec<f32> = map.values().iter().map(|&value| value as f32).collect();
+    let single = |pair: &PairGeometry, r_m| SingleGeometry {
+        r_m,
+        normal_hat: [0.0, 0.0, 1.0],
+        moon_radius_m: pair.moon_radius_m,
+        response: pair.response,
+    };
+    let singles: Vec<SingleGeometry> =
+        pairs.iter().flat_map(|pair| [pair.r_i_m, pair.r_j_m].map(|r_m| single(pair, r_m))).collect();
+    let powers = sky_powers(&singles, &directions, &values, pixel_area_sr(NSIDE)).unwrap();
+    powers.chunks(2).map(|own| (own[0] * own[1]).sqrt()).collect()
 }
 
 #[test]
@@ -140,15 +158,56 @@ fn a_galactic_map_comes_down_as_its_direct_sums() {
     let sample = sample(&plan.array, &blocks, count / 48);
     let expected = pixel_sums(&sky(), Frame::Galactic, &sample.geometry);
     let (mut error, mut power) = (0.0, 0.0);
-    for ((found, noise), (value, zero)) in sample.value.iter().zip(&sample.zero_spacing_k_sr).zip(&expected) {
+    for (found, value) in sample.value.iter().zip(&expected) {
         error += (found - value).norm_sqr();
         power += value.norm_sqr();
-        assert!((noise / zero - 1.0).abs() < 1e-3, "{noise} {zero}");
+    }
+    let powers = pixel_powers(&sky(), Frame::Galactic, &sample.geometry);
+    for (noise, power) in sample.noise_k_sr.iter().zip(&powers) {
+        // Powers are predicted every ninth of a radian, which degrees from l = 20 on are too fine for. Of each of them this
+        // sky has some 9e3 K, of which a visible half keeps 5 / l^1.5 sr: 6e-4 of a power, 2.7e-3 of twenty. The next test
+        // has a smooth sky.
+        assert!((noise / power - 1.0).abs() < 4.0 * 2.7e-3, "{noise} {power}");
     }
     let relative = f64::sqrt(error / power);
     // 3e-5, which falls with finer pixels as their limb's error does.
     println!("{count} visibilities, {} compared: {relative:.2e}", sample.value.len());
     assert!(relative < 1e-4, "{relative:e}");
+}
+
+#[test]
+fn own_powers_are_of_each_daughters_own_place() {
+    // A mean, and degrees one to three nearly as strong: a power changes by percents while the array goes by.
+    let mut alm = Alm::zeros(3);
+    *alm.get_mut(0, 0) = Complex64::new(1e5, 0.0);
+    for (l, m, value) in
+        [(1, 1, Complex64::new(3e4, 1e4)), (2, 1, Complex64::new(-1e4, 2e4)), (3, 2, Complex64::I * 2e4)]
+    {
+        *alm.get_mut(l, m) = value;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("smooth.fits");
+    let map = SkyMap::new(Frame::Ecliptic, synthesis(&alm, 32).unwrap()).unwrap();
+    write_map(&path, &map, &WriteOptions::default()).unwrap();
+    let sets = ["spacecraft.auto_powers=true", "spacecraft.auto_integration_s=25.0", "sky.l_max=8"];
+    let plan = plan(path.to_str().unwrap(), &sets);
+    let downlink = folder.path().join("down.ccsds");
+    simulate(&plan, &downlink, &Cancel::new(), &mut |_| {}).unwrap();
+    let mut own = blocks(&downlink);
+    own.retain(|block| block.pair.i == block.pair.j);
+    let count: usize = own.iter().map(VisibilityBlock::len).sum();
+    // A place and its power are those of a pair of one daughter with herself.
+    let sample = sample(&plan.array, &own, count / 64);
+    let powers = pixel_powers(&alm, Frame::Ecliptic, &sample.geometry);
+    for ((value, noise), power) in sample.value.iter().zip(&sample.noise_k_sr).zip(&powers) {
+        assert_eq!(value.im, 0.0);
+        // The limb, 1e-5; a cubic's 3/128 (l h)^4 of degree three, 3e-4 of its tenth; f32 and a sky read from 32-bit numbers.
+        assert!((value.re / power - 1.0).abs() < 1e-4, "{value} {power}");
+        // n / P^2 is half of what a pair with these powers weighs.
+        assert!((noise / 2.0_f64.sqrt() / value.re - 1.0).abs() < 1e-5, "{noise} {value}");
+    }
+    let (least, most) = powers.iter().fold((f64::INFINITY, 0.0_f64), |(a, b), p| (a.min(*p), b.max(*p)));
+    assert!(powers.len() >= 64 && most > 1.3 * least, "{least} {most}");
 }
 
 /// Smeared visibilities are means over the phase that is swept.

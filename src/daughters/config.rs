@@ -94,9 +94,10 @@ pub struct DaughtersError {
 }
 
 impl DaughtersConfig {
-    /// Everything that is wrong with the section for an array of `satellites`; empty if it is good.
+    /// Everything that is wrong with the section for an array of `satellites` and channels of a width; empty if it is
+    /// good.
     #[must_use]
-    pub fn problems(&self, satellites: usize) -> Vec<DaughtersError> {
+    pub fn problems(&self, satellites: usize, channel_width_hz: f64) -> Vec<DaughtersError> {
         let mut found = Vec::new();
         let mut require = |key, value: f64, good: bool, expected| {
             if !(good && value.is_finite()) {
@@ -139,13 +140,15 @@ impl DaughtersConfig {
         let depth = d.interference_depth_m;
         let good = depth > 0.0 || d.interference_k_sr == 0.0;
         require("disturbances.interference_depth_m", depth, good, "a positive length, m");
-        for (key, value) in [
+        for (key, offset_hz) in [
             ("disturbances.interference_offset_hz", d.interference_offset_hz),
             ("disturbances.calibration_offset_hz", d.calibration_offset_hz),
-            ("disturbances.calibration_phase_rad", d.calibration_phase_rad),
         ] {
-            require(key, value, true, "a finite number");
+            let inside = offset_hz.abs() <= 0.5 * channel_width_hz;
+            require(key, offset_hz, inside, "at most half of spacecraft.channel_width_hz either way");
         }
+        let phase_rad = d.calibration_phase_rad;
+        require("disturbances.calibration_phase_rad", phase_rad, true, "a finite number");
         found
     }
 

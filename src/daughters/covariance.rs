@@ -293,7 +293,6 @@ impl Plan {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mother::Prediction;
     use crate::units::vector::Vec3;
 
     /// A point source: V = exp(-2 pi i (nu / c) n . r_ij) at 20 MHz.
@@ -307,10 +306,9 @@ mod tests {
     }
 
     impl VisibilityModel for Point {
-        fn predict(&mut self, positions: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError> {
+        fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
             for (out, at) in out.iter_mut().zip(positions) {
-                let visibility_k_sr = fringe(self.0, FREQUENCY_HZ, at.r_i_m, at.r_j_m);
-                *out = Prediction { visibility_k_sr, zero_spacing_k_sr: 1.0 };
+                *out = fringe(self.0, FREQUENCY_HZ, at.r_i_m, at.r_j_m);
             }
             Ok(())
         }

@@ -7,7 +7,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use serde::Serialize;
 
 use super::config::{DaughtersConfig, DropPolicy};
-use crate::frames::{SampleBlock, SpaceFrame};
+use crate::array::Array;
+use crate::frames::{ObservingWindow, SampleBlock, SpaceFrame};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{MissionTime, TICKS_PER_SECOND};
 
@@ -18,7 +19,7 @@ pub struct LinkCounts {
     pub sent: u64,
     /// Bits sent.
     pub bits: u64,
-    /// Blocks dropped because a buffer was full.
+    /// Blocks dropped because a buffer was full, or because there was no time to send them before the next window.
     pub dropped: u64,
     /// Their samples.
     pub dropped_samples: u64,
@@ -39,9 +40,15 @@ impl LinkCounts {
 }
 
 /// Sends blocks at a limited rate out of a bounded buffer, one of each a daughter. A block that does not fit
-/// is dropped by the policy and counted; a window's end waits until all buffers are empty.
+/// is dropped by the policy and counted.
+///
+/// After a window the links go on until one orbit has passed since it began: the next one begins about then. What has
+/// not left by then is dropped by the policy and counted. The window's end travels behind what leaves.
 pub struct SampleLink {
     rate_bits_per_s: f64,
+    /// Time that a window's samples have to leave, from its start, s.
+    orbit_s: f64,
+    window: Option<ObservingWindow>,
     capacity_bits: u64,
     policy: DropPolicy,
     buffers: Vec<Buffer>,
@@ -59,11 +66,14 @@ struct Buffer {
 }
 
 impl SampleLink {
-    /// The links of `daughters`; what they count can be read through `counts`.
+    /// The links of an array's daughters; what they count can be read through `counts`.
     #[must_use]
-    pub fn new(config: &DaughtersConfig, daughters: usize, counts: Arc<Mutex<LinkCounts>>) -> Self {
+    pub fn new(config: &DaughtersConfig, array: &Array, counts: Arc<Mutex<LinkCounts>>) -> Self {
+        let daughters = array.satellites();
         Self {
             rate_bits_per_s: config.link_bits_per_s_max,
+            orbit_s: array.orbital_period_s(),
+            window: None,
             capacity_bits: config.link_buffer_bytes * 8,
             policy: config.link_drop,
             buffers: (0..daughters).map(|_| Buffer::default()).collect(),
@@ -72,12 +82,15 @@ impl SampleLink {
     }
 
     /// Takes blocks that came together; what they let leave leaves together.
-    fn take(&mut self, blocks: Vec<SampleBlock>, out: &mut Outlet<SpaceFrame>) {
+    fn take(&mut self, mut blocks: Vec<SampleBlock>, out: &mut Outlet<SpaceFrame>) {
         let counts = Arc::clone(&self.counts);
         let mut counts = counts.lock().unwrap_or_else(PoisonError::into_inner);
         let sent = if self.rate_bits_per_s <= 0.0 {
             blocks
         } else {
+            // Another channel is the first in line each time, so that a buffer that is full costs all of them the same.
+            let first = blocks.first().map_or(0, |block| block.number) % blocks.len().max(1) as u64;
+            blocks.rotate_left(first as usize);
             let mut sent = Vec::new();
             for block in blocks {
                 self.queue(block, &mut counts, &mut sent);
@@ -114,14 +127,50 @@ impl SampleLink {
         }
         counts.waiting_bits_max = counts.waiting_bits_max.max(buffer.bits);
     }
+
+    /// Empties the buffers after a window: what there is time for leaves in the order of block numbers, as the daughters
+    /// send side by side, and the rest is dropped.
+    fn empty(&mut self, out: &mut Outlet<SpaceFrame>) {
+        let until = self
+            .window
+            .take()
+            .map(|window| MissionTime::from_seconds(window.start.seconds() + self.orbit_s).max(window.end));
+        let counts = Arc::clone(&self.counts);
+        let mut counts = counts.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut sent = Vec::new();
+        for buffer in &mut self.buffers {
+            let mut buffer = std::mem::take(buffer);
+            let until = until.or(buffer.now).unwrap_or_default();
+            if self.policy == DropPolicy::Oldest {
+                let budget = buffer.budget(until, self.rate_bits_per_s);
+                while buffer.bits as f64 > budget
+                    && let Some(samples) = buffer.drop_oldest()
+                {
+                    counts.count_dropped(samples);
+                }
+            }
+            buffer.work_until(until, self.rate_bits_per_s, &mut sent);
+            for block in &buffer.waiting {
+                counts.count_dropped(block.samples.len() as u64);
+            }
+        }
+        counts.count_sent(&sent);
+        drop(counts);
+        sent.sort_by_key(|block| block.number);
+        let mut rest = sent.into_iter().peekable();
+        while let Some(first) = rest.next() {
+            let number = first.number;
+            let same = std::iter::from_fn(|| rest.next_if(|block| block.number == number));
+            out.push(SpaceFrame::Samples(std::iter::once(first).chain(same).collect()));
+        }
+    }
 }
 
 impl Buffer {
     /// Adds the blocks that leave by `time` to `sent`.
     fn work_until(&mut self, time: MissionTime, rate_bits_per_s: f64, sent: &mut Vec<SampleBlock>) {
-        let since = self.now.replace(time).unwrap_or(time);
-        let ticks = (time.0 - since.0).max(0);
-        let mut budget = self.sent_bits + rate_bits_per_s * ticks as f64 / TICKS_PER_SECOND as f64;
+        let mut budget = self.budget(time, rate_bits_per_s);
+        self.now = Some(time);
         while let Some(first) = self.waiting.front() {
             let bits = first.samples.bits();
             if bits as f64 > budget {
@@ -133,6 +182,12 @@ impl Buffer {
         }
         // An idle link saves nothing up.
         self.sent_bits = if self.waiting.is_empty() { 0.0 } else { budget };
+    }
+
+    /// Bits that leave by `time`, with those of the first block that have left already.
+    fn budget(&self, time: MissionTime, rate_bits_per_s: f64) -> f64 {
+        let ticks = (time.0 - self.now.unwrap_or(time).0).max(0);
+        self.sent_bits + rate_bits_per_s * ticks as f64 / TICKS_PER_SECOND as f64
     }
 
     /// Samples of the block that was dropped.
@@ -152,25 +207,22 @@ impl Stage for SampleLink {
     fn step(&mut self, frame: SpaceFrame, out: &mut Outlet<SpaceFrame>) -> Result<(), Infallible> {
         match frame {
             SpaceFrame::Samples(blocks) => self.take(blocks, out),
-            SpaceFrame::WindowStart(_) => out.push(frame),
+            SpaceFrame::WindowStart(window) => {
+                // A window whose end was lost ends where the next begins.
+                self.empty(out);
+                self.window = Some(window);
+                out.push(frame);
+            }
             SpaceFrame::WindowEnd(_) => {
-                self.finish(out)?;
+                self.empty(out);
                 out.push(frame);
             }
         }
         Ok(())
     }
 
-    /// What waits is sent.
     fn finish(&mut self, out: &mut Outlet<SpaceFrame>) -> Result<(), Infallible> {
-        let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
-        for buffer in &mut self.buffers {
-            let left: Vec<SampleBlock> = std::mem::take(buffer).waiting.into();
-            if !left.is_empty() {
-                counts.count_sent(&left);
-                out.push(SpaceFrame::Samples(left));
-            }
-        }
+        self.empty(out);
         Ok(())
     }
 
@@ -182,6 +234,7 @@ impl Stage for SampleLink {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::array::ArrayConfig;
     use crate::frames::Samples;
     use crate::units::ChannelId;
 
@@ -192,7 +245,6 @@ mod tests {
             daughter: 0,
             number,
             time: MissionTime(100_000 * number as i64),
-            clock_offset_s: 0.0,
             saturated: 0,
             samples: Samples::Codes { bits: 8, step: 1.0, re: vec![0; 1000], im: vec![0; 1000] },
         }
@@ -206,15 +258,18 @@ mod tests {
             ..DaughtersConfig::default()
         };
         let counts = Arc::default();
-        let mut link = SampleLink::new(&config, 1, Arc::clone(&counts));
+        let array = Array::new(&ArrayConfig::default()).unwrap();
+        let mut link = SampleLink::new(&config, &array, Arc::clone(&counts));
         let mut out = Outlet::collect();
+        let window = ObservingWindow { index: 0, start: MissionTime(0), end: MissionTime(1_200_000) };
+        link.step(SpaceFrame::WindowStart(window), &mut out).unwrap();
         for number in 0..12 {
             link.step(SpaceFrame::Samples(vec![block(number)]), &mut out).unwrap();
         }
         link.finish(&mut out).unwrap();
         let numbers = |frame: SpaceFrame| match frame {
-            SpaceFrame::Samples(blocks) => blocks.into_iter().map(|block| block.number),
-            other => panic!("{other:?}"),
+            SpaceFrame::Samples(blocks) => blocks.into_iter().map(|block| block.number).collect(),
+            _ => Vec::new(),
         };
         let counts = *counts.lock().unwrap();
         (out.into_vec().into_iter().flat_map(numbers).collect(), counts)
@@ -243,5 +298,19 @@ mod tests {
             assert!(counts.waiting_bits_max <= 4096 * 8);
             assert_eq!(sent, expected, "{policy:?}");
         }
+    }
+
+    #[test]
+    fn after_a_window_only_what_there_is_time_for_leaves() {
+        // An orbit of 8248.68 s, of which the first block has all: 82 kbit, five blocks of 16 kbit.
+        for (policy, expected) in
+            [(DropPolicy::Newest, vec![0, 1, 2, 3, 4]), (DropPolicy::Oldest, vec![0, 8, 9, 10, 11])]
+        {
+            let (sent, counts) = numbers(10.0, 1 << 20, policy);
+            assert_eq!((counts.sent, counts.dropped, counts.dropped_samples), (5, 7, 7_000));
+            assert_eq!(sent, expected, "{policy:?}");
+        }
+        // A block takes all of an orbit and more.
+        assert_eq!(numbers(1.0, 1 << 20, DropPolicy::Newest).1.dropped, 12);
     }
 }

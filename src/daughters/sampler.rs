@@ -309,7 +309,6 @@ impl ChannelWork<'_> {
             daughter: daughter as u8,
             number: (first / config.block_samples) as u64,
             time,
-            clock_offset_s: config.disturbances.clock_offset_s(daughter, time.seconds()),
             saturated,
             samples,
         }

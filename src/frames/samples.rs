@@ -64,9 +64,6 @@ pub struct SampleBlock {
     pub number: u64,
     /// Time tag of the first sample, by the mission's time.
     pub time: MissionTime,
-    /// Clock state: by how much the first sample was taken later than its time tag says, s, as the mother measures
-    /// on the link. Nothing is corrected by it.
-    pub clock_offset_s: f64,
     /// Real and imaginary parts beyond the quantiser's range.
     pub saturated: u32,
     /// The samples.

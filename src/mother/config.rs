@@ -4,9 +4,10 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::choice::ModelChoice;
-use super::correlator::{Division, SUB_BANDS_MAX};
+use super::correlator::{Division, SUB_BANDS_MAX, dump_samples, shortest_integration_s};
 use super::ninth::NinthConfig;
-use crate::array::IntegrationRule;
+use super::schedule::Schedule;
+use crate::array::{Array, IntegrationRule};
 use crate::frames::{AntennaResponse, Channel};
 use crate::units::PerChannel;
 use crate::units::constants::YEAR_S;
@@ -64,8 +65,11 @@ pub struct SpacecraftConfig {
     /// Ecliptic longitude and latitude, deg, towards which samples are delayed before they are correlated; nothing
     /// for no delays.
     pub delay_centre_deg: Vec<f64>,
-    /// Time over which the powers of the daughters' samples are integrated and sent down, s; 0 to leave them out.
+    /// Time over which the powers of the daughters' samples are integrated and sent down, s, in whole blocks; 0 to leave
+    /// them out.
     pub auto_integration_s: f64,
+    /// Whether such powers come down with fidelity "visibilities", too; samples have them anyway.
+    pub auto_powers: bool,
     /// Numbers that a block of samples may be ahead of one that the mother waits for.
     pub wait_blocks: u64,
     /// Capacity of the onboard store, bytes.
@@ -93,10 +97,10 @@ pub enum Fidelity {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum StoreDrop {
-    /// What comes.
+    /// What was observed last, of all channels and pairs alike.
     #[default]
     Newest,
-    /// What has been there longest.
+    /// What was observed first, likewise.
     Oldest,
     /// What adds least to the map a byte: the blocks of least weight a visibility, in terms of what a second of their
     /// channel weighs. Those are the long baselines, whose integrations are short.
@@ -146,6 +150,8 @@ impl Default for SpacecraftConfig {
             sub_bands: 1,
             delay_centre_deg: Vec::new(),
             auto_integration_s: 1.0,
+            // One a second over years would be several times as many as visibilities.
+            auto_powers: false,
             wait_blocks: 16,
             store_bytes_max: 4 << 30,
             store_drop: StoreDrop::default(),
@@ -211,6 +217,18 @@ pub enum SpacecraftError {
          spacecraft.fidelity = \"visibilities\", which are of one frequency, or averages over the whole channel"
     )]
     Division,
+    /// Integrations shorter than the shortest sum of the correlator.
+    #[error(
+        "spacecraft.motion_wavelengths_max and spacecraft.integration_s_max leave integrations of {shortest_s:.3e} s, but \
+         the correlator sums {dump_s:.3e} s at once: expected longer ones, or baselines kept short by \
+         spacecraft.baseline_wavelengths_max"
+    )]
+    Dump {
+        /// The shortest integration, s.
+        shortest_s: f64,
+        /// The shortest sum, s.
+        dump_s: f64,
+    },
     /// A direction that cannot be.
     #[error(
         "spacecraft.delay_centre_deg = {0:?}: expected ecliptic longitude and latitude, -90 to 90 degrees, or []"
@@ -246,6 +264,36 @@ impl SpacecraftConfig {
     pub fn channels(&self) -> Vec<Channel> {
         let width_hz = self.channel_width_hz;
         self.channels_hz.iter().map(|&frequency_hz| Channel { frequency_hz, width_hz }).collect()
+    }
+
+    /// Length of the integrations of the daughters' own powers, s; 0 if there are none.
+    #[must_use]
+    pub fn autos_s(&self) -> f64 {
+        if self.auto_powers || self.fidelity == Fidelity::Samples { self.auto_integration_s } else { 0.0 }
+    }
+
+    /// One schedule a channel.
+    #[must_use]
+    pub fn schedules(&self) -> Vec<Schedule> {
+        let schedule = |(channel, &frequency_hz): (usize, &f64)| Schedule {
+            rule: self.rule(),
+            frequency_hz,
+            baseline_wavelengths_max: self.baseline_wavelengths_max.get(channel).unwrap_or(0.0),
+            every_nth: self.every_nth_integration.get(channel).unwrap_or(1),
+            every_nth_window: self.every_nth_window,
+        };
+        self.channels_hz.iter().enumerate().map(schedule).collect()
+    }
+
+    /// What is wrong with integrations of samples in an array, which are whole sums of the correlator.
+    #[must_use]
+    pub fn dump_problem(&self, array: &Array) -> Option<SpacecraftError> {
+        let schedules = self.schedules();
+        let shortest_s = shortest_integration_s(array, &schedules);
+        let width_hz = self.channel_width_hz;
+        let dump_s = dump_samples(array, &schedules, width_hz, self.sub_bands) as f64 / width_hz;
+        let short = self.fidelity == Fidelity::Samples && shortest_s < dump_s;
+        short.then_some(SpacecraftError::Dump { shortest_s, dump_s })
     }
 
     /// Delays and sub-bands of samples.

@@ -2,7 +2,7 @@
 
 use num_complex::Complex64;
 
-use super::model::{DaughterPosition, ModelError, PairPosition, Prediction, VisibilityModel};
+use super::model::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
 use crate::array::response::{
     Comb, Directions, PairGeometry, SingleGeometry, comb_sums, sky_powers, sky_sums,
 };
@@ -61,13 +61,12 @@ impl DirectSum {
 }
 
 impl VisibilityModel for DirectSum {
-    fn predict(&mut self, positions: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError> {
+    fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
         let pairs = self.pairs(positions)?;
         // Lengths agree by construction, so there is always an answer.
         let sums = sky_sums(&pairs, &self.directions, &self.values, self.area_sr).unwrap_or_default();
         for (out, sum) in out.iter_mut().zip(sums) {
-            *out =
-                Prediction { visibility_k_sr: sum.visibility_k_sr, zero_spacing_k_sr: sum.zero_spacing_k_sr };
+            *out = sum.visibility_k_sr;
         }
         Ok(())
     }

@@ -1,12 +1,11 @@
 //! Visibilities of a band-limited sky through spherical harmonics.
 
-use std::f64::consts::TAU;
 use std::sync::Arc;
 
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::model::{DaughterPosition, ModelError, PairPosition, Prediction, VisibilityModel};
+use super::model::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
 use crate::array::harmonic::{
     GeometryLimits, GeometryRefusal, HarmonicError, HarmonicModel, ModelSettings, NominalOrbit,
     PairOrientation, PairState, PatternGeometry, RotationTable,
@@ -18,9 +17,9 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 /// Visibilities at once: some twenty windows of the fiducial array at 10 MHz. Twice as many are no faster.
 const BATCH: usize = 100_000;
 
-/// Greatest degree of the sky for the system temperature: the visible sky's own coefficients fall as
+/// Greatest degree of the sky for powers of single daughters: the visible sky's own coefficients fall as
 /// l^-1.5, so that what is left out is 1e-4 of it.
-const ZERO_SPACING_L_MAX: usize = 96;
+const POWERS_L_MAX: usize = 96;
 
 /// Positions that one task turns into states.
 const POSITIONS_PER_TASK: usize = 1024;
@@ -44,13 +43,12 @@ pub struct HarmonicSetup {
 
 /// A sky given by its harmonic coefficients, seen by an array on one circle.
 ///
-/// Rms error 1e-5 of the rms visibility of the same coefficients. The zero-spacing sum leaves out
-/// what changes from pair to pair but for the visible solid angle, and is good to 1e-3.
+/// Rms error 1e-5 of the rms visibility of the same coefficients.
 pub struct HarmonicSum {
     setup: HarmonicSetup,
     orbit: NominalOrbit,
     model: HarmonicModel,
-    zero_spacing: HarmonicModel,
+    powers: HarmonicModel,
 }
 
 impl HarmonicSum {
@@ -73,7 +71,7 @@ impl HarmonicSum {
             response: setup.response,
         };
         let settings = |u_max| ModelSettings::new(geometry, setup.inclination_rad, u_max);
-        let smooth = truncated(&sky, ZERO_SPACING_L_MAX);
+        let smooth = truncated(&sky, POWERS_L_MAX);
         Ok(Self {
             setup,
             orbit: NominalOrbit {
@@ -81,7 +79,7 @@ impl HarmonicSum {
                 radius_m: setup.orbit_radius_m,
                 limits: GeometryLimits::default(),
             },
-            zero_spacing: HarmonicModel::new(smooth, settings(0.0)).map_err(refused)?,
+            powers: HarmonicModel::new(smooth, settings(0.0)).map_err(refused)?,
             model: HarmonicModel::with_rotation(sky, settings(setup.baseline_wavelengths_max), rotation)
                 .map_err(refused)?,
         })
@@ -99,15 +97,6 @@ impl HarmonicSum {
                 Ok((PairState { span_rad: position.span_rad, ..pair.state }, pair.reversed))
             })
             .collect()
-    }
-
-    /// Share of the sky that a single daughter sees which both of a pair see: the arc d between them takes
-    /// `2 d R_moon / r` from the visible `2 pi (1 + cos a)`.
-    fn seen_by_both(&self, baseline_wavelengths: f64) -> f64 {
-        let sin_limb = self.setup.moon_radius_m / self.setup.orbit_radius_m;
-        let baseline_m = baseline_wavelengths * SPEED_OF_LIGHT_M_S / self.setup.frequency_hz;
-        let arc = 2.0 * (0.5 * baseline_m / self.setup.orbit_radius_m).min(1.0).asin();
-        1.0 - 2.0 * arc * sin_limb / (TAU * (1.0 + (1.0 - sin_limb * sin_limb).sqrt()))
     }
 }
 
@@ -130,25 +119,15 @@ impl VisibilityModel for HarmonicSum {
         BATCH
     }
 
-    fn predict(&mut self, positions: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError> {
+    fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
         let refused = |refusal| ModelError::Geometry { frequency_hz: self.setup.frequency_hz, refusal };
-        let (mut states, reversed): (Vec<PairState>, Vec<bool>) =
+        let (states, reversed): (Vec<PairState>, Vec<bool>) =
             self.states(positions).map_err(refused)?.into_iter().unzip();
-        let mut values = vec![Complex64::ZERO; states.len()];
-        self.model.visibilities(&states, &mut values).map_err(|source| harmonic(&self.setup, source))?;
-        for ((out, value), reversed) in out.iter_mut().zip(&values).zip(reversed) {
-            out.visibility_k_sr = if reversed { value.conj() } else { *value };
-        }
-        let shares: Vec<f64> =
-            states.iter().map(|state| self.seen_by_both(state.baseline_wavelengths)).collect();
-        for state in &mut states {
-            state.baseline_wavelengths = 0.0;
-        }
-        self.zero_spacing
-            .visibilities(&states, &mut values)
-            .map_err(|source| harmonic(&self.setup, source))?;
-        for ((out, value), share) in out.iter_mut().zip(values).zip(shares) {
-            out.zero_spacing_k_sr = value.re * share;
+        self.model.visibilities(&states, out).map_err(|source| harmonic(&self.setup, source))?;
+        for (out, reversed) in out.iter_mut().zip(reversed) {
+            if reversed {
+                *out = out.conj();
+            }
         }
         Ok(())
     }
@@ -163,9 +142,7 @@ impl VisibilityModel for HarmonicSum {
         let states: Result<Vec<PairState>, GeometryRefusal> = daughters.iter().map(state).collect();
         let states = states.map_err(refused)?;
         let mut values = vec![Complex64::ZERO; states.len()];
-        self.zero_spacing
-            .visibilities(&states, &mut values)
-            .map_err(|source| harmonic(&self.setup, source))?;
+        self.powers.visibilities(&states, &mut values).map_err(|source| harmonic(&self.setup, source))?;
         for (out, value) in out.iter_mut().zip(values) {
             *out = value.re;
         }

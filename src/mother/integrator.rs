@@ -3,11 +3,13 @@
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
-use num_complex::Complex32;
-use rand_distr::{Distribution, StandardNormal};
+use num_complex::{Complex32, Complex64};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Gamma, StandardNormal};
 use rayon::prelude::*;
 
-use super::model::{ModelError, PairPosition, Prediction, VisibilityModel};
+use super::model::{ModelError, PairPosition, VisibilityModel};
+use super::powers::SkyPowers;
 use super::schedule::{Integration, Schedule};
 use crate::array::{Array, segments_for};
 use crate::frames::{Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, VisibilityBlock};
@@ -25,8 +27,9 @@ const WAITING_WINDOWS_MAX: usize = 64;
 /// Integrates all pairs and channels over each window.
 ///
 /// Emits, window by window: the instrument description, the ephemeris, the visibilities channel by
-/// channel and pair by pair, and a housekeeping frame that closes the window. Windows wait until there are as
-/// many visibilities as the channels' models like to predict at once, which depends on the windows alone.
+/// channel and pair by pair, the daughters' own powers if they are wanted, and a housekeeping frame that closes the
+/// window. Windows wait until there are as many visibilities as the channels' models like to predict at once, which
+/// depends on the windows alone.
 pub struct Integrator {
     array: Arc<Array>,
     models: Vec<Box<dyn VisibilityModel>>,
@@ -44,6 +47,8 @@ pub struct MeasurementOptions {
     pub noise: NoiseModel,
     /// Whether visibilities are averages over their integrations, or of the instants in their middle.
     pub smear_integrations: bool,
+    /// Time over which the daughters' own powers are integrated, s; 0 to leave them out.
+    pub auto_integration_s: f64,
 }
 
 /// A window whose visibilities are still to be predicted.
@@ -59,6 +64,14 @@ struct Scheduled {
     integrations: Vec<Integration>,
 }
 
+/// What all pairs of a window see in a channel.
+#[derive(Clone, Copy)]
+struct Sight<'a> {
+    window: ObservingWindow,
+    channel: ChannelId,
+    powers: &'a SkyPowers,
+}
+
 /// Thermal noise of integrated visibilities.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NoiseModel {
@@ -69,11 +82,21 @@ pub struct NoiseModel {
 }
 
 impl NoiseModel {
-    /// Standard deviation of the real and of the imaginary part, K sr:
-    /// `T_sys / sqrt(2 dnu dt)` with `T_sys = T_rec / zeta + Int T S A dn` (the paper, Eq. 12).
+    /// Standard deviation of the real and of the imaginary part for the sky's powers `Int T S A dn` at the two daughters,
+    /// K sr: `sqrt(P_i P_j / (2 dnu dt))` with `P = T_rec / zeta + Int T S A dn` (the paper, Eq. 12, with the two
+    /// daughters' own system temperatures).
     #[must_use]
-    pub fn sigma_k_sr(&self, zero_spacing_k_sr: f64, width_hz: f64, dt_s: f64) -> f64 {
-        (self.receiver_noise_k_sr + zero_spacing_k_sr) / (2.0 * width_hz * dt_s).sqrt()
+    pub fn sigma_k_sr(&self, powers_k_sr: [f64; 2], width_hz: f64, dt_s: f64) -> f64 {
+        let [p_i, p_j] = powers_k_sr.map(|power| self.receiver_noise_k_sr + power);
+        (p_i * p_j / (2.0 * width_hz * dt_s)).sqrt()
+    }
+
+    /// Noise of a pair, or of a daughter by herself, in a channel and window.
+    fn stream(&self, window: ObservingWindow, channel: ChannelId, pair: Pair) -> Option<ChaCha8Rng> {
+        let identity = u64::from(channel.0) << 32 | u64::from(pair.i) << 8 | u64::from(pair.j);
+        let stream =
+            |seed| random_stream(seed, StreamKind::VisibilityNoise, [identity, window.start.0 as u64]);
+        self.seed.map(stream)
     }
 }
 
@@ -119,23 +142,33 @@ impl Integrator {
     /// Predicts, measures and emits all windows that wait.
     fn measure_waiting(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
         let waiting = std::mem::take(&mut self.waiting);
+        let windows: Vec<ObservingWindow> = waiting.iter().map(|waiting| waiting.window).collect();
         // By channel, then by window.
         let mut blocks: Vec<std::vec::IntoIter<Vec<VisibilityBlock>>> = Vec::new();
+        let mut powers: Vec<Vec<SkyPowers>> = Vec::new();
         for channel in 0..self.schedules.len() {
-            blocks.push(self.channel_blocks(&waiting, channel)?.into_iter());
+            let own = SkyPowers::predict(self.models[channel].as_mut(), &self.array, &windows)?;
+            blocks.push(self.channel_blocks(&waiting, channel, &own)?.into_iter());
+            powers.push(own);
             if out.is_closed() {
                 return Ok(());
             }
         }
-        for Waiting { window, .. } in waiting {
+        for (k, window) in windows.into_iter().enumerate() {
             out.push(GroundFrame::Instrument(self.instrument.clone()));
             for segment in segments_for(&self.array, window.start, window.end, EPHEMERIS_STEP_S) {
                 out.push(GroundFrame::Ephemeris(segment));
             }
-            for block in blocks.iter_mut().flat_map(|windows| windows.next().unwrap_or_default()) {
-                self.sampled += block.len() as u64;
+            let visibilities = blocks.iter_mut().flat_map(|windows| windows.next().unwrap_or_default());
+            let autos = powers.iter().zip(0..).flat_map(|(powers, channel)| {
+                self.autos(Sight { window, channel: ChannelId(channel), powers: &powers[k] })
+            });
+            let mut sampled = 0;
+            for block in visibilities.chain(autos) {
+                sampled += block.len() as u64;
                 out.push(GroundFrame::Visibilities(block));
             }
+            self.sampled += sampled;
             let (time, sampled) = (window.end, self.sampled);
             out.push(GroundFrame::Housekeeping(Housekeeping { time, sampled, dropped: 0 }));
             if out.is_closed() {
@@ -150,15 +183,20 @@ impl Integrator {
         &mut self,
         waiting: &[Waiting],
         channel: usize,
+        powers: &[SkyPowers],
     ) -> Result<Vec<Vec<VisibilityBlock>>, ModelError> {
-        let scheduled: Vec<(ObservingWindow, &Scheduled)> = waiting
+        let scheduled: Vec<(Sight, &Scheduled)> = waiting
             .iter()
-            .flat_map(|waiting| waiting.channels[channel].iter().map(|pair| (waiting.window, pair)))
+            .zip(powers)
+            .flat_map(|(waiting, powers)| {
+                let sight = Sight { window: waiting.window, channel: ChannelId(channel as u16), powers };
+                waiting.channels[channel].iter().map(move |pair| (sight, pair))
+            })
             .collect();
         let positions: Vec<Vec<PairPosition>> =
-            scheduled.par_iter().map(|(window, pair)| self.positions(*window, pair)).collect();
+            scheduled.par_iter().map(|(sight, pair)| self.positions(sight.window, pair)).collect();
         let positions = positions.concat();
-        let mut predictions = vec![Prediction::default(); positions.len()];
+        let mut predictions = vec![Complex64::ZERO; positions.len()];
         self.models[channel].predict(&positions, &mut predictions)?;
         let mut rest = &predictions[..];
         let mut parts = Vec::with_capacity(scheduled.len());
@@ -167,9 +205,8 @@ impl Integrator {
             parts.push(part);
             rest = after;
         }
-        let measure = |((window, pair), part): (&(ObservingWindow, &Scheduled), &&[Prediction])| {
-            self.measure(*window, ChannelId(channel as u16), pair, part)
-        };
+        let measure =
+            |((sight, pair), part): (&(Sight, &Scheduled), &&[Complex64])| self.measure(*sight, pair, part);
         let blocks: Vec<VisibilityBlock> = scheduled.par_iter().zip(&parts).map(measure).collect();
         let mut blocks = blocks.into_iter();
         let of_window = |waiting: &Waiting| blocks.by_ref().take(waiting.channels[channel].len()).collect();
@@ -196,22 +233,21 @@ impl Integrator {
     /// Adds noise, weights and time tags to what the model predicts.
     fn measure(
         &self,
-        window: ObservingWindow,
-        channel: ChannelId,
+        Sight { window, channel, powers }: Sight,
         scheduled: &Scheduled,
-        predictions: &[Prediction],
+        predictions: &[Complex64],
     ) -> VisibilityBlock {
         let (pair, noise_model) = (scheduled.pair, self.options.noise);
         let width_hz = self.instrument.channels[usize::from(channel.0)].width_hz;
-        let identity = u64::from(channel.0) << 32 | u64::from(pair.i) << 8 | u64::from(pair.j);
-        let mut noise = noise_model
-            .seed
-            .map(|seed| random_stream(seed, StreamKind::VisibilityNoise, [identity, window.start.0 as u64]));
+        let mut noise = noise_model.stream(window, channel, pair);
         let mut block = VisibilityBlock { channel, pair, start: window.start, ..VisibilityBlock::default() };
         for (integration, prediction) in scheduled.integrations.iter().zip(predictions) {
             let dt_s = f64::from(integration.duration_ticks) / TICKS_PER_SECOND as f64;
-            let sigma = noise_model.sigma_k_sr(prediction.zero_spacing_k_sr, width_hz, dt_s);
-            let mut value = prediction.visibility_k_sr;
+            let from = window.start.plus_ticks(i64::from(integration.offset_ticks));
+            let middle_s = from.seconds() + 0.5 * dt_s;
+            let own = [pair.i, pair.j].map(|n| powers.at(&self.array, n.into(), middle_s));
+            let sigma = noise_model.sigma_k_sr(own, width_hz, dt_s);
+            let mut value = *prediction;
             if let Some(stream) = &mut noise {
                 let draw: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(stream));
                 value.re += sigma * draw[0];
@@ -225,6 +261,52 @@ impl Integrator {
         }
         block
     }
+
+    /// The daughters' own powers in a window, if they are wanted: integrations back to back, the last cut at the window's
+    /// end.
+    fn autos(&self, Sight { window, channel, powers }: Sight) -> Vec<VisibilityBlock> {
+        let step = (self.options.auto_integration_s * TICKS_PER_SECOND as f64) as u32;
+        if step == 0 {
+            return Vec::new();
+        }
+        let noise_model = self.options.noise;
+        let width_hz = self.instrument.channels[usize::from(channel.0)].width_hz;
+        let length = (window.end.0 - window.start.0).clamp(0, i64::from(u32::MAX)) as u32;
+        let block = |n: u8| {
+            let pair = Pair { i: n, j: n };
+            let mut noise = noise_model.stream(window, channel, pair);
+            let mut block =
+                VisibilityBlock { channel, pair, start: window.start, ..VisibilityBlock::default() };
+            for offset in (0..length).step_by(step as usize) {
+                let duration = step.min(length - offset);
+                let dt_s = f64::from(duration) / TICKS_PER_SECOND as f64;
+                let middle_s = window.start.plus_ticks(offset.into()).seconds() + 0.5 * dt_s;
+                let expected_k_sr =
+                    noise_model.receiver_noise_k_sr + powers.at(&self.array, n.into(), middle_s);
+                let samples = width_hz * dt_s;
+                // What a window's end leaves may be less than one, of which there is no power.
+                if samples < 1.0 {
+                    continue;
+                }
+                let power = noise
+                    .as_mut()
+                    .map_or(expected_k_sr, |stream| expected_k_sr * mean_square(samples, stream));
+                block.offset_ticks.push(offset);
+                block.duration_ticks.push(duration);
+                block.value_k_sr.push(Complex32::new(power as f32, 0.0));
+                block.weight.push((samples / (power * power)) as f32);
+                block.flags.push(Flags::GOOD);
+            }
+            block
+        };
+        (0..self.array.satellites() as u8).into_par_iter().map(block).collect()
+    }
+}
+
+/// Mean of |x|^2 over so many samples of a complex Gaussian of power one.
+fn mean_square(samples: f64, stream: &mut impl rand::Rng) -> f64 {
+    // There is one for any positive shape and scale.
+    Gamma::new(samples, samples.recip()).map_or(1.0, |gamma| gamma.sample(stream))
 }
 
 impl Waiting {

@@ -16,6 +16,7 @@ mod integrator;
 mod model;
 mod ninth;
 mod observer;
+mod powers;
 mod schedule;
 mod store;
 
@@ -25,7 +26,7 @@ pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, Spa
 pub use direct::DirectSum;
 pub use harmonic::{HarmonicSetup, HarmonicSum};
 pub use integrator::{Integrator, MeasurementOptions, NoiseModel};
-pub use model::{DaughterPosition, ModelError, PairPosition, Prediction, VisibilityModel};
+pub use model::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
 pub use ninth::{NINTH_BAND_HZ, Ninth, NinthConfig, NinthSetup, NinthSky};
 pub use observer::Observer;
 pub use schedule::{Integration, Schedule};

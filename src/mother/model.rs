@@ -28,15 +28,6 @@ pub struct DaughterPosition {
     pub normal_hat: Vec3,
 }
 
-/// A visibility without noise.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Prediction {
-    /// V_ij, K sr.
-    pub visibility_k_sr: Complex64,
-    /// `Int T S_i S_j A dn`, K sr: the sky's part of the system temperature.
-    pub zero_spacing_k_sr: f64,
-}
-
 /// Why visibilities cannot be predicted.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
@@ -88,12 +79,12 @@ pub trait VisibilityModel: Send + Sync {
         1
     }
 
-    /// Predicts one visibility for each position; `out` has the length of `positions`. Fastest for
-    /// consecutive integrations of one pair after another.
+    /// Predicts one visibility V_ij (K sr) without noise for each position; `out` has the length of `positions`. Fastest
+    /// for consecutive integrations of one pair after another.
     ///
     /// # Errors
     /// [`ModelError`], for positions that the model does not cover.
-    fn predict(&mut self, positions: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError>;
+    fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError>;
 
     /// Predicts the power `Int T A S dn` (K sr) that each of the daughters hears by herself; `out` has the length of
     /// `daughters`.
@@ -118,12 +109,7 @@ pub trait VisibilityModel: Send + Sync {
         let factors = (0..comb.count).map(|k| 1.0 + comb.first + comb.step * k as f64);
         let apart: Vec<PairPosition> =
             positions.iter().flat_map(|pair| factors.clone().map(|factor| pair.stretched(factor))).collect();
-        let mut predictions = vec![Prediction::default(); apart.len()];
-        self.predict(&apart, &mut predictions)?;
-        for (out, prediction) in out.iter_mut().zip(predictions) {
-            *out = prediction.visibility_k_sr;
-        }
-        Ok(())
+        self.predict(&apart, out)
     }
 }
 

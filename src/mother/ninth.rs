@@ -197,7 +197,8 @@ pub struct NinthSetup {
 ///
 /// A power is that of sky and receiver in the middle of an integration, with noise of P / sqrt(dnu dt) (the radiometer
 /// equation of one receiver); its weight is dnu dt / P^2 with the power that was found. Windows are divided
-/// into integrations from their start, the last one cut at the end.
+/// into integrations from their start, the last one cut at the end; what is left there with less than 1e4 samples is added
+/// to the one before it, or left out if there is none.
 pub struct Ninth {
     setup: NinthSetup,
     spectrometer: Spectrometer,
@@ -221,8 +222,13 @@ impl Ninth {
         let config = &self.setup.config;
         let length = (window.end.0 - window.start.0).clamp(0, i64::from(u32::MAX)) as u32;
         let step = ((config.integration_s * TICKS_PER_SECOND as f64) as u32).max(1);
-        let offsets: Vec<u32> = (0..length).step_by(step as usize).collect();
-        let durations: Vec<u32> = offsets.iter().map(|offset| step.min(length - offset)).collect();
+        let mut offsets: Vec<u32> = (0..length).step_by(step as usize).collect();
+        let mut durations: Vec<u32> = offsets.iter().map(|offset| step.min(length - offset)).collect();
+        let samples = |duration: u32| self.spectrometer.width_hz * f64::from(duration) * 1e-6;
+        if let Some(rest) = durations.pop_if(|duration| samples(*duration) < SAMPLES_MIN) {
+            offsets.pop();
+            durations.last_mut().into_iter().for_each(|last| *last += rest);
+        }
         let place = |(offset, duration): (&u32, &u32)| {
             let middle = f64::from(*offset) + 0.5 * f64::from(*duration);
             let t_s = window.start.seconds() + middle / TICKS_PER_SECOND as f64;

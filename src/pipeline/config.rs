@@ -240,14 +240,20 @@ impl Config {
             found.push(Box::new(ConfigError::Name(self.name.clone())));
         }
         let array = self.array.problems();
-        if array.is_empty()
-            && let Err(problem) = Array::new(&self.array)
-        {
-            found.push(Box::new(problem));
+        let spacecraft = self.spacecraft.problems();
+        if array.is_empty() {
+            match Array::new(&self.array) {
+                Ok(array) if spacecraft.is_empty() => {
+                    found.extend(boxed(self.spacecraft.dump_problem(&array).into_iter().collect()));
+                }
+                Ok(_) => {}
+                Err(problem) => found.push(Box::new(problem)),
+            }
         }
         found.extend(boxed(array));
-        found.extend(boxed(self.daughters.problems(self.array.satellites)));
-        found.extend(boxed(self.spacecraft.problems()));
+        let width_hz = self.spacecraft.channel_width_hz;
+        found.extend(boxed(self.daughters.problems(self.array.satellites, width_hz)));
+        found.extend(boxed(spacecraft));
         found.extend(boxed(self.downlink.problems()));
         let (space, ground) = (self.spacecraft.sub_bands, self.calibration.sub_bands);
         if space != ground {

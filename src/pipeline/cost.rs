@@ -56,6 +56,11 @@ pub struct Cost {
     /// Rate that the daughters' samples need on their links to the mother, all together, bit/s; with
     /// samples alone.
     pub samples_bits_per_s: Option<f64>,
+    /// Rate that one daughter's samples need on her link, and the greatest that it has, bit/s; with samples and a limit
+    /// alone.
+    pub link_bits_per_s: Option<[f64; 2]>,
+    /// Keys that were set and that this fidelity has no use for.
+    pub without_effect: Vec<String>,
     /// Rate of the ninth daughter's spectra on the downlink while the array observes, bit/s; with her alone.
     pub ninth_bits_per_s: Option<f64>,
     /// Time to draw, quantise, send and correlate the samples, s, from a run of a few seconds of mission time; with
@@ -134,6 +139,8 @@ impl Plan {
                     + self.ninth_bytes()),
             memory_bytes,
             samples_bits_per_s: self.samples_bits_per_s(),
+            link_bits_per_s: self.link_bits_per_s(),
+            without_effect: self.without_effect(),
             ninth_bits_per_s: self.ninth_bits_per_s(),
             sampling_s,
             predicted_s,
@@ -157,11 +164,10 @@ impl Plan {
     /// Bytes of the daughters' own powers.
     fn auto_bytes(&self) -> f64 {
         let spacecraft = &self.config.spacecraft;
-        if spacecraft.fidelity != Fidelity::Samples || spacecraft.auto_integration_s == 0.0 {
-            return 0.0;
-        }
-        let series = self.array.satellites() * spacecraft.channels_hz.len() * spacecraft.sub_bands;
-        VISIBILITY_BYTES as f64 * series as f64 * self.observing_s() / spacecraft.auto_integration_s
+        let streams = self.array.satellites() * spacecraft.channels_hz.len() * spacecraft.sub_bands;
+        let each_s = spacecraft.autos_s();
+        let powers = if each_s > 0.0 { self.observing_s() / each_s * streams as f64 } else { 0.0 };
+        powers * VISIBILITY_BYTES as f64
     }
 
     /// Bytes of the ninth daughter's spectra, with headers of a packet a channel and window.
@@ -245,6 +251,17 @@ impl fmt::Display for Cost {
         writeln!(f, "memory           {:.2} GB", self.memory_bytes / 1e9)?;
         if let Some(rate) = self.samples_bits_per_s {
             writeln!(f, "samples          {:.3} Mbit/s from all daughters", rate / 1e6)?;
+        }
+        if let Some([needed, limit]) = self.link_bits_per_s {
+            let (needed_k, limit_k) = (needed / 1e3, limit / 1e3);
+            write!(f, "links            {needed_k:.3} kbit/s needed by a daughter, {limit_k:.3} there")?;
+            let short =
+                "; the rest waits in her buffer, and what has no room or no time after a window is dropped";
+            writeln!(f, "{}", if needed > limit { short } else { "" })?;
+        }
+        if !self.without_effect.is_empty() {
+            let keys = self.without_effect.join(", ");
+            writeln!(f, "without effect   {keys}: used with spacecraft.fidelity = \"samples\" alone")?;
         }
         if let Some(rate) = self.ninth_bits_per_s {
             writeln!(f, "ninth daughter   {:.3} kbit/s of spectra while observing", rate / 1e3)?;

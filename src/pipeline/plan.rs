@@ -5,8 +5,9 @@ use std::sync::Arc;
 use super::config::{Config, Problems};
 use super::error::PipelineError;
 use crate::array::Array;
+use crate::daughters::DaughtersConfig;
 use crate::frames::{Instrument, ObservingWindow};
-use crate::mother::{Fidelity, Observer, Schedule};
+use crate::mother::{Fidelity, Observer, Schedule, SpacecraftConfig};
 use crate::units::{MissionTime, all_pairs};
 
 /// A configuration that has been checked, with what follows from it.
@@ -44,14 +45,7 @@ impl Plan {
             configuration_hash: config.space_hash(),
             spectrometer: spacecraft.ninth.spectrometer(),
         };
-        let schedule = |(channel, &frequency_hz): (usize, &f64)| Schedule {
-            rule: spacecraft.rule(),
-            frequency_hz,
-            baseline_wavelengths_max: spacecraft.baseline_wavelengths_max.get(channel).unwrap_or(0.0),
-            every_nth: spacecraft.every_nth_integration.get(channel).unwrap_or(1),
-            every_nth_window: spacecraft.every_nth_window,
-        };
-        let schedules = spacecraft.channels_hz.iter().enumerate().map(schedule).collect();
+        let schedules = spacecraft.schedules();
         let mut windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.every_nth_window);
         if windows.is_empty() {
             return Err(PipelineError::NoWindow {
@@ -82,6 +76,38 @@ impl Plan {
         let (count, channels) = (self.array.satellites(), spacecraft.channels_hz.len());
         (spacecraft.fidelity == Fidelity::Samples)
             .then(|| daughters.rate_bits_per_s(count, channels, spacecraft.channel_width_hz))
+    }
+
+    /// Rate that one daughter's samples need on her link, and the greatest that it has, bit/s; `None` without samples
+    /// or limit.
+    #[must_use]
+    pub fn link_bits_per_s(&self) -> Option<[f64; 2]> {
+        let needed = self.samples_bits_per_s()? / self.array.satellites() as f64;
+        let limit = self.config.daughters.link_bits_per_s_max;
+        (limit > 0.0).then_some([needed, limit])
+    }
+
+    /// Keys of samples that are not as by default while there are no samples.
+    #[must_use]
+    pub fn without_effect(&self) -> Vec<String> {
+        let Config { spacecraft, daughters, .. } = &self.config;
+        let mut found = Vec::new();
+        if spacecraft.fidelity == Fidelity::Samples {
+            return found;
+        }
+        // Both always have a TOML form: the reference file's test relies on it too.
+        let table = |section| toml::Table::try_from(section).unwrap_or_default();
+        changed_keys("daughters", &table(daughters), &table(&DaughtersConfig::default()), &mut found);
+        let usual = SpacecraftConfig::default();
+        let unused_s = !spacecraft.auto_powers && spacecraft.auto_integration_s != usual.auto_integration_s;
+        for (key, set) in
+            [("auto_integration_s", unused_s), ("wait_blocks", spacecraft.wait_blocks != usual.wait_blocks)]
+        {
+            if set {
+                found.push(format!("spacecraft.{key}"));
+            }
+        }
+        found
     }
 
     /// Rate of the ninth daughter's spectra while the array observes, bit/s; `None` without her.
@@ -121,6 +147,18 @@ impl Plan {
             expected
         };
         self.schedules.iter().map(expected).collect()
+    }
+}
+
+/// Keys of a table whose values are not the usual ones, with their sections.
+fn changed_keys(prefix: &str, table: &toml::Table, usual: &toml::Table, found: &mut Vec<String>) {
+    for (key, value) in table {
+        let path = format!("{prefix}.{key}");
+        match (value.as_table(), usual.get(key).and_then(toml::Value::as_table)) {
+            (Some(table), Some(usual)) => changed_keys(&path, table, usual, found),
+            _ if usual.get(key) != Some(value) => found.push(path),
+            _ => {}
+        }
     }
 }
 

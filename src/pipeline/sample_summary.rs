@@ -62,7 +62,7 @@ impl SampleSummary {
         let ledger = Ledger::new();
         ledger.sampled(sampler.samples);
         ledger.accumulated(blocks.used_samples);
-        ledger.lost("link", "buffer full", link.dropped_samples);
+        ledger.lost("link", "no room or no time", link.dropped_samples);
         ledger.lost("correlate", "late", blocks.late_samples);
         ledger.lost("correlate", "malformed", blocks.malformed_samples);
         ledger.lost("correlate", "outside any window", correlator.stray_samples);

@@ -47,7 +47,7 @@ pub fn sample_stages(
     };
     let daughters = &config.daughters;
     let sampler = Sampler::new(scene, daughters.clone(), windows.clone(), Arc::clone(&counts.sampler));
-    let link = SampleLink::new(daughters, array.satellites(), Arc::clone(&counts.link));
+    let link = SampleLink::new(daughters, array, Arc::clone(&counts.link));
     let division = config.spacecraft.division();
     // What comes down are sub-bands, each a channel of its own.
     let channels = division.divided(&instrument.channels);
@@ -61,7 +61,7 @@ pub fn sample_stages(
         schedules: instrument.channels.iter().enumerate().map(of_band).collect(),
         instrument,
         division,
-        auto_integration_s: config.spacecraft.auto_integration_s,
+        auto_integration_s: config.spacecraft.autos_s(),
         block_samples: daughters.block_samples,
         wait_blocks: config.spacecraft.wait_blocks,
     };

@@ -77,7 +77,11 @@ pub fn add(
         seed: config.spacecraft.thermal_noise.then_some(config.seed),
         receiver_noise_k_sr: config.spacecraft.receiver_noise_k_sr,
     };
-    let options = MeasurementOptions { noise, smear_integrations: config.spacecraft.smear_integrations };
+    let options = MeasurementOptions {
+        noise,
+        smear_integrations: config.spacecraft.smear_integrations,
+        auto_integration_s: config.spacecraft.autos_s(),
+    };
     let integrator =
         Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options);
     // A window waiting is nothing; a window's visibilities are.

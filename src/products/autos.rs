@@ -28,7 +28,7 @@ pub struct AutoSummary {
     pub width_hz: f64,
     /// Number of integrations.
     pub count: usize,
-    /// Weighted mean, K sr.
+    /// Mean over all samples, K sr.
     pub mean_k_sr: f64,
     /// Its standard deviation by the integrations' own noise, K sr.
     pub sigma_k_sr: f64,
@@ -53,17 +53,22 @@ pub fn summarise(powers: &[AutoPower]) -> Vec<AutoSummary> {
 
 fn figures(own: &[&AutoPower]) -> Option<AutoSummary> {
     let first = own.first()?;
-    let weight = |power: &AutoPower| power.sigma_k_sr.powi(-2);
-    let total: f64 = own.iter().map(|power| weight(power)).sum();
-    let mean_k_sr = own.iter().map(|power| weight(power) * power.power_k_sr).sum::<f64>() / total;
-    let square = |power: &&AutoPower| ((power.power_k_sr - mean_k_sr) / power.sigma_k_sr).powi(2);
+    // The number of samples, of which a power's own noise knows nothing: the inverse square of sigma, which goes with the
+    // power that was found, gives more to those found too small.
+    let samples = |power: &AutoPower| (power.power_k_sr / power.sigma_k_sr).powi(2);
+    let total: f64 = own.iter().map(|power| samples(power)).sum();
+    if total <= 0.0 {
+        return None;
+    }
+    let mean_k_sr = own.iter().map(|power| samples(power) * power.power_k_sr).sum::<f64>() / total;
+    let square = |power: &&AutoPower| (power.power_k_sr / mean_k_sr - 1.0).powi(2) * samples(power);
     Some(AutoSummary {
         daughter: u32::from(first.daughter) + 1,
         frequency_hz: first.frequency_hz,
         width_hz: first.width_hz,
         count: own.len(),
         mean_k_sr,
-        sigma_k_sr: total.sqrt().recip(),
+        sigma_k_sr: mean_k_sr / total.sqrt(),
         chi_square: own.iter().map(square).sum::<f64>() / own.len().saturating_sub(1).max(1) as f64,
     })
 }

@@ -5,10 +5,13 @@ use std::path::Path;
 
 use lunarray::array::ArrayConfig;
 use lunarray::calibration::VanVleck;
-use lunarray::frames::{Flags, VisibilityBlock};
+use lunarray::frames::{AutoPower, Flags, VisibilityBlock};
 use lunarray::mother::correlator::Division;
+use lunarray::products::summarise;
 use lunarray::sky::fits::{WriteOptions, write_map};
 use lunarray::sky::{Frame, SkyMap};
+use lunarray::units::{StreamKind, random_stream};
+use rand_distr::{Distribution, Exp1};
 
 use crate::craft::{Spacecraft, WIDTH_HZ, block_by_block, constant};
 
@@ -57,6 +60,38 @@ fn powers_are_those_of_sky_and_receiver_with_their_own_noise() {
         let chi = squares / count;
         assert!(bits == 2 || (chi - 1.0).abs() < 4.0 * (2.0 / count).sqrt(), "{bands}: {chi}");
     }
+}
+
+#[test]
+fn means_of_powers_are_of_all_samples_alike_however_few_an_integration_has() {
+    // A second in a band of 16 Hz, and every third integration cut to half of that.
+    let (count, mut samples, power_k_sr) = (30_000_u32, 0.0, 3.0);
+    let mut rng = random_stream(5, StreamKind::Spectrometer, [0, 0]);
+    let mut power = |k: u32| {
+        let n = if k.is_multiple_of(3) { 8 } else { 16 };
+        samples += f64::from(n);
+        // |x|^2 of a complex Gaussian; its power's noise is told by the power that was found, as the mother does.
+        let sum: f64 = (0..n).map(|_| -> f64 { Exp1.sample(&mut rng) }).sum();
+        let found_k_sr = power_k_sr * sum / f64::from(n);
+        AutoPower {
+            daughter: 0,
+            frequency_hz: 1e6,
+            width_hz: 16.0,
+            time_s: f64::from(k),
+            power_k_sr: found_k_sr,
+            sigma_k_sr: found_k_sr / f64::from(n).sqrt(),
+        }
+    };
+    let powers: Vec<AutoPower> = (0..count).map(&mut power).collect();
+    let summaries = summarise(&powers);
+    let [own] = &summaries[..] else { panic!("{summaries:?}") };
+    let sigma_k_sr = power_k_sr / samples.sqrt();
+    assert!((own.mean_k_sr - power_k_sr).abs() < 4.0 * sigma_k_sr, "{own:?}");
+    // The mean's own error.
+    assert!((own.sigma_k_sr / sigma_k_sr - 1.0).abs() < 4.0 / samples.sqrt(), "{own:?}");
+    // The mean of n such squares has a kurtosis of 3 + 6 / n.
+    let error = ((2.0 + 6.0 / 8.0) / f64::from(count)).sqrt();
+    assert!((own.chi_square - 1.0).abs() < 4.0 * error, "{own:?}");
 }
 
 #[test]

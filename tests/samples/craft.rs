@@ -10,7 +10,7 @@ use lunarray::frames::{
     VisibilityBlock,
 };
 use lunarray::mother::correlator::{Correlator, CorrelatorCounts, CorrelatorSetup, Division};
-use lunarray::mother::{DaughterPosition, ModelError, PairPosition, Prediction, Schedule, VisibilityModel};
+use lunarray::mother::{DaughterPosition, ModelError, PairPosition, Schedule, VisibilityModel};
 use lunarray::runtime::{Flow, Outlet, Source, Stage};
 use lunarray::units::MissionTime;
 use lunarray::units::constants::SPEED_OF_LIGHT_M_S;
@@ -25,8 +25,8 @@ pub struct Constant {
 }
 
 impl VisibilityModel for Constant {
-    fn predict(&mut self, _: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError> {
-        out.fill(Prediction { visibility_k_sr: Complex64::new(self.cross, 0.0), zero_spacing_k_sr: 1.0 });
+    fn predict(&mut self, _: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
+        out.fill(Complex64::new(self.cross, 0.0));
         Ok(())
     }
 
@@ -47,10 +47,9 @@ pub fn fringe(n_hat: Vec3, frequency_hz: f64, r_i_m: Vec3, r_j_m: Vec3) -> Compl
 }
 
 impl VisibilityModel for Point {
-    fn predict(&mut self, positions: &[PairPosition], out: &mut [Prediction]) -> Result<(), ModelError> {
+    fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
         for (out, at) in out.iter_mut().zip(positions) {
-            let visibility_k_sr = fringe(self.n_hat, self.frequency_hz, at.r_i_m, at.r_j_m);
-            *out = Prediction { visibility_k_sr, zero_spacing_k_sr: 1.0 };
+            *out = fringe(self.n_hat, self.frequency_hz, at.r_i_m, at.r_j_m);
         }
         Ok(())
     }

@@ -6,7 +6,7 @@ use lunarray::array::ArrayConfig;
 use lunarray::calibration::{
     AntennaGains, Calibration, ChannelGains, GainSolution, GainsFile, Interpolation,
 };
-use lunarray::daughters::Disturbances;
+use lunarray::daughters::{DaughtersConfig, Disturbances};
 use lunarray::frames::{PlacedVisibilities, VisibilityBlock};
 use lunarray::mother::correlator::Division;
 use lunarray::units::constants::SPEED_OF_LIGHT_M_S;
@@ -14,7 +14,7 @@ use lunarray::units::vector::{dot, sub};
 use lunarray::units::{ChannelId, all_pairs};
 use num_complex::Complex64;
 
-use crate::craft::{Spacecraft, WIDTH_HZ, blocks, constant, stream};
+use crate::craft::{Spacecraft, WIDTH_HZ, constant, stream};
 use crate::delays::expected;
 
 /// Pairs of time, value and weight of one pair and channel.
@@ -129,14 +129,7 @@ fn late_clocks_turn_each_frequency_by_its_own_phase() {
     };
     craft.rule.duration_s_max = 0.25;
     craft.division = Division { sub_bands: bands, delay_centre: None };
-    let frames = craft.sample(22).0;
-    for block in blocks(&frames) {
-        let n = usize::from(block.daughter);
-        let expected_s = late_us[n] * 1e-6 + drift[n] * (block.time.seconds() - start_s);
-        // Of two numbers of 1e-4 one is taken from the other.
-        assert!((block.clock_offset_s - expected_s).abs() < 1e-15, "{}", block.clock_offset_s);
-    }
-    let blocks = craft.correlate(frames).0;
+    let blocks = craft.run(22);
     for pair in all_pairs(8) {
         let late_s = |t_s: f64| {
             let of = |n: usize| late_us[n] * 1e-6 + drift[n] * (t_s - start_s);
@@ -245,5 +238,22 @@ fn the_earths_leak_is_at_the_limb_and_at_its_frequency() {
         let (found, _) = ratio(&early, fringe);
         // A hundred times the noise; a motion of lambda / 8 costs up to 2.6 %, a block's power 4 %.
         assert!((found - 1.0).norm() < 0.06, "{pair}: {found}");
+    }
+}
+
+#[test]
+fn tones_outside_the_channel_are_refused() {
+    for (offset_hz, refused) in [(3999.0, false), (-4000.0, false), (4001.0, true), (-9e3, true)] {
+        let tones = |calibration_offset_hz, interference_offset_hz| DaughtersConfig {
+            disturbances: Disturbances {
+                calibration_offset_hz,
+                interference_offset_hz,
+                ..Disturbances::default()
+            },
+            ..DaughtersConfig::default()
+        };
+        for config in [tones(offset_hz, 0.0), tones(0.0, offset_hz)] {
+            assert_eq!(!config.problems(8, WIDTH_HZ).is_empty(), refused, "{offset_hz}");
+        }
     }
 }

@@ -1,10 +1,13 @@
 //! Lengths and weights of integrations.
 
-use lunarray::array::ArrayConfig;
+use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{Flags, SampleBlock, Samples, SpaceFrame};
 use lunarray::units::constants::SPEED_OF_LIGHT_M_S;
 use lunarray::units::vector::{norm, sub};
 use lunarray::units::{ChannelId, all_pairs};
+
+use lunarray::mother::correlator::Division;
+use lunarray::mother::{Fidelity, SpacecraftConfig, SpacecraftError};
 
 use crate::craft::{Spacecraft, WIDTH_HZ, block_by_block, constant};
 
@@ -110,4 +113,87 @@ fn weights_add_up_to_the_samples_that_arrived() {
         }
     }
     assert!(flagged > 10);
+}
+
+#[test]
+fn the_first_weights_of_a_window_are_as_good_as_those_that_follow() {
+    for (bands, block_samples) in [(64, 1024), (64, 256), (1, 256)] {
+        let mut craft = Spacecraft::new(ArrayConfig::default(), vec![1e6], constant(0.0), 16.384);
+        craft.division = Division { sub_bands: bands, delay_centre: None };
+        craft.daughters.block_samples = block_samples;
+        craft.rule.duration_s_max = 0.25;
+        let blocks = craft.run(51);
+        let (mut sum, mut count, mut worst) = (0.0, 0.0, 0.0_f64);
+        for block in &blocks {
+            for k in 0..block.len() {
+                // Powers are one, so a weight is twice the number of samples.
+                let samples = f64::from(block.duration_ticks[k]) * 1e-6 * WIDTH_HZ / bands as f64;
+                let found = f64::from(block.weight[k]) / (2.0 * samples);
+                worst = worst.max((found - 1.0).abs());
+                if block.offset_ticks[k] == 0 {
+                    sum += found;
+                    count += 1.0;
+                }
+            }
+        }
+        assert_eq!(count, 28.0 * bands as f64);
+        // Powers of 1024 samples are good to a thirty-second part; there are 8 of each band, and a weight has two of them.
+        // In the mean inverse powers are 1/1024 too large. Later ones are of 10 s, 1250 samples and more.
+        let (mean, error) = (sum / count, 1.0 / 32.0);
+        let expected = 1.0 + 2.0 / 1024.0;
+        let common = 2.0 * error / (8.0 * bands as f64).sqrt();
+        assert!((mean - expected).abs() < 4.0 * common, "{bands} bands, {block_samples}: {mean}");
+        // 1792 products at a time, at some ten times that are not the same: five sigma.
+        assert!(worst < 5.0 * error * 2.0_f64.sqrt() + 0.02, "{bands} bands, {block_samples}: {worst}");
+    }
+}
+
+#[test]
+fn integrations_shorter_than_the_correlators_sums_are_refused() {
+    let array = Array::new(&ArrayConfig::default()).unwrap();
+    let config = |frequency_hz: f64, motion: f64, limit: f64, sub_bands: usize| SpacecraftConfig {
+        fidelity: Fidelity::Samples,
+        channels_hz: vec![frequency_hz],
+        motion_wavelengths_max: motion,
+        baseline_wavelengths_max: lunarray::units::PerChannel::All(limit),
+        sub_bands,
+        ..SpacecraftConfig::default()
+    };
+    // Daughters 100 km apart, of 1551.7 m/s on a circle of 2037.1 km, pass at 76.2 m/s: a thousandth of 10 m takes 0.131 ms,
+    // an eighth of it 16.4 ms.
+    let speed_m_s = std::f64::consts::TAU / 8248.68 * 2.0 * 2037.1e3 * (100.0_f64 / 2.0 / 2037.1).sin();
+    let dt_s = |motion: f64| motion * SPEED_OF_LIGHT_M_S / 30e6 / speed_m_s;
+    let problem = config(30e6, 1e-3, 0.0, 1).dump_problem(&array);
+    let Some(SpacecraftError::Dump { shortest_s, dump_s }) = &problem else { panic!("{problem:?}") };
+    // The node's motion adds 1e-4 to speeds.
+    assert!((shortest_s / dt_s(1e-3) - 1.0).abs() < 1e-3, "{shortest_s}");
+    assert_eq!(*dump_s, 16.0 / WIDTH_HZ);
+    let said = problem.unwrap().to_string();
+    assert!(said.contains("1.31") && said.contains("2.000e-3 s"), "{said}");
+    for (config, refused) in [
+        (config(30e6, 0.125, 0.0, 1), false),
+        (config(30e6, 0.125, 0.0, 64), false),
+        // 64 samples, one of each sub-band, are 8 ms.
+        (config(30e6, 0.05, 0.0, 64), true),
+        (config(30e6, 0.05, 0.0, 1), false),
+        // 10 wavelengths of 10 m move at a thousandth of the speed of 10000.
+        (config(30e6, 1e-3, 10.0, 1), false),
+        (SpacecraftConfig { integration_s_max: 1.9e-3, ..config(1e6, 0.125, 0.0, 1) }, true),
+        (SpacecraftConfig { fidelity: Fidelity::Visibilities, ..config(30e6, 1e-3, 0.0, 1) }, false),
+    ] {
+        assert_eq!(config.dump_problem(&array).is_some(), refused, "{config:?}");
+    }
+    let set = |text: &str| text.to_owned();
+    let source = lunarray::pipeline::ConfigSource {
+        overrides: vec![
+            set("spacecraft.fidelity=samples"),
+            set("spacecraft.channels_hz=[30e6]"),
+            set("spacecraft.motion_wavelengths_max=0.001"),
+            set("spacecraft.baseline_wavelengths_max=0.0"),
+            set("spacecraft.every_nth_integration=1"),
+        ],
+        ..lunarray::pipeline::ConfigSource::default()
+    };
+    let said = source.load().unwrap_err().to_string();
+    assert!(said.contains("the correlator sums 2.000e-3 s at once"), "{said}");
 }

@@ -135,6 +135,19 @@ fn a_uniform_sky_is_its_temperature_times_the_solid_angle_that_the_moon_leaves()
 }
 
 #[test]
+fn what_is_left_of_a_window_is_not_an_integration_of_a_few_samples() {
+    // 300 kHz: 1e4 samples are 33 ms. Of 5.03 s the last 30 ms go with the half second before them.
+    for (seconds, count, last) in [(5.03, 10, 530_000), (5.04, 11, 40_000), (0.03, 0, 0)] {
+        for block in uniform(Some(9), AntennaResponse::Isotropic, seconds) {
+            assert_eq!(block.len(), count, "{seconds}");
+            assert_eq!(block.duration_ticks.last().copied().unwrap_or(0), last, "{seconds}");
+            let ticks: u32 = block.duration_ticks.iter().sum();
+            assert!(count == 0 || f64::from(ticks) == (seconds * 1e6_f64).round());
+        }
+    }
+}
+
+#[test]
 fn noise_is_that_of_the_radiometer_equation() {
     let with = uniform(Some(3), AntennaResponse::Isotropic, 40.0);
     let without = uniform(None, AntennaResponse::Isotropic, 40.0);

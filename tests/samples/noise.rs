@@ -1,9 +1,17 @@
 //! Noise of correlations, of perfect samples and of quantised ones.
 
+use std::collections::HashMap;
 use std::f64::consts::FRAC_2_PI;
+use std::path::Path;
 
 use lunarray::array::ArrayConfig;
 use lunarray::calibration::VanVleck;
+use lunarray::downlink::DownlinkReader;
+use lunarray::frames::{GroundFrame, VisibilityBlock};
+use lunarray::sky::fits::{WriteOptions, write_map};
+use lunarray::sky::generated::{GeneratedSky, generate};
+use lunarray::sky::{Frame, SkyMap};
+use lunarray::units::Pair;
 
 use crate::craft::{Spacecraft, WIDTH_HZ, constant, frequencies, moments, values};
 
@@ -138,5 +146,140 @@ fn van_vleck_returns_the_amplitude_of_weak_and_strong_correlations() {
                 "{bits} bits, {cross}: {found} +- {error}"
             );
         }
+    }
+}
+
+/// What comes down at 10 MHz from two windows of a minute each, with `sky` in them.
+fn come_down(sky: &Path, fidelity: &str, seed: u64) -> Vec<VisibilityBlock> {
+    const PIPELINE: &str = r#"
+        name = "noise"
+        [spacecraft]
+        channels_hz = [1.0e7]
+        duration_s = 17e3
+        window_s_max = 60.0
+        model = "direct"
+        auto_integration_s = 1.024
+        auto_powers = true
+        [map]
+        nside = 4
+    "#;
+    let folder = tempfile::tempdir().unwrap();
+    let (pipeline, out) = (folder.path().join("noise.toml"), folder.path().join("downlink.ccsds"));
+    std::fs::write(&pipeline, PIPELINE).unwrap();
+    let sets = [
+        format!("spacecraft.fidelity={fidelity}"),
+        format!("seed={seed}"),
+        format!("sky.file={:?}", sky.to_str().unwrap()),
+    ];
+    let mut command = assert_cmd::Command::cargo_bin("lunarray").unwrap();
+    command.args(["simulate", pipeline.to_str().unwrap(), "--out", out.to_str().unwrap()]);
+    let done = command.args(sets.iter().flat_map(|set| ["--set", set])).output().unwrap();
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let (mut reader, mut found) = (DownlinkReader::open(&out).unwrap(), Vec::new());
+    while let Some(frame) = reader.next_frame().unwrap() {
+        if let GroundFrame::Visibilities(block) = frame {
+            found.push(block);
+        }
+    }
+    found
+}
+
+/// Weight a second of each pair.
+fn weights(blocks: &[VisibilityBlock]) -> HashMap<Pair, f64> {
+    let mut sums: HashMap<Pair, [f64; 2]> = HashMap::new();
+    for block in blocks {
+        let [weights, seconds] = sums.entry(block.pair).or_default();
+        *weights += block.weight.iter().map(|w| f64::from(*w)).sum::<f64>();
+        *seconds += block.duration_ticks.iter().map(|ticks| f64::from(*ticks) * 1e-6).sum::<f64>();
+    }
+    sums.into_iter().map(|(pair, [weights, seconds])| (pair, weights / seconds)).collect()
+}
+
+/// Mean square of the differences of two runs, in units of what their weights say, and the number of parts.
+fn chi_square(first: &[VisibilityBlock], second: &[VisibilityBlock]) -> (f64, f64) {
+    let (mut sum, mut count) = (0.0, 0.0);
+    assert_eq!(first.len(), second.len());
+    for (first, second) in first.iter().zip(second) {
+        assert_eq!((first.pair, &first.offset_ticks), (second.pair, &second.offset_ticks));
+        for k in 0..first.len() {
+            let variance = f64::from(first.weight[k].recip() + second.weight[k].recip());
+            sum += f64::from((first.value_k_sr[k] - second.value_k_sr[k]).norm_sqr()) / variance;
+            count += 2.0;
+        }
+    }
+    (sum / count, count)
+}
+
+type Runs = [Vec<VisibilityBlock>; 2];
+
+/// Visibilities of pairs, and the daughters' own powers in the order of daughters.
+fn split(runs: Runs) -> (Runs, Runs) {
+    let parts = runs.map(|run| run.into_iter().partition::<Vec<_>, _>(|block| block.pair.i != block.pair.j));
+    let [(first, mut first_own), (second, mut second_own)] = parts;
+    for own in [&mut first_own, &mut second_own] {
+        own.sort_by_key(|block| (block.start, block.pair.i));
+    }
+    ([first, second], [first_own, second_own])
+}
+
+/// Holds powers of two seeds of samples to those of visibilities: shapes, means, noise and weights.
+fn check_powers(powers: &[Runs]) {
+    let [samples, visibilities] = powers else { panic!("two fidelities") };
+    for runs in powers {
+        assert_eq!((runs[0].len(), runs[1].len()), (16, 16));
+        // Visibilities have noise in each of two parts; powers in one.
+        let (found, parts) = chi_square(&runs[0], &runs[1]);
+        let (found, count) = (2.0 * found, 0.5 * parts);
+        // A weight goes with the power that was found, good to 1/8192 in the square: nothing here.
+        assert!((found - 1.0).abs() < 4.0 * (2.0 / count).sqrt(), "{found} of {count}");
+    }
+    for (sampled, drawn) in samples[0].iter().zip(&visibilities[0]) {
+        assert_eq!((sampled.channel, sampled.pair, sampled.start), (drawn.channel, drawn.pair, drawn.start));
+        assert_eq!(sampled.offset_ticks, drawn.offset_ticks);
+        assert_eq!((&sampled.duration_ticks, &sampled.flags), (&drawn.duration_ticks, &drawn.flags));
+        let seconds = |block: &VisibilityBlock, k: usize| f64::from(block.duration_ticks[k]) * 1e-6;
+        for block in [sampled, drawn] {
+            for k in 0..block.len() {
+                let (power, samples) = (f64::from(block.value_k_sr[k].re), seconds(block, k) * WIDTH_HZ);
+                assert_eq!(block.value_k_sr[k].im, 0.0);
+                assert!((f64::from(block.weight[k]) * power * power / samples - 1.0).abs() < 1e-5);
+            }
+        }
+        let mean = |block: &VisibilityBlock| {
+            let of = |k: usize| seconds(block, k) * f64::from(block.value_k_sr[k].re);
+            (0..block.len()).map(of).sum::<f64>() / 60.0
+        };
+        // Both have the noise of a minute. Samples are of eight bits: a thousandth of a power at most.
+        let error = (2.0 / (60.0 * WIDTH_HZ)).sqrt();
+        let ratio = mean(sampled) / mean(drawn);
+        assert!((ratio - 1.0).abs() < 4.0 * error + 1e-3, "{}: {ratio} +- {error}", sampled.pair);
+    }
+}
+
+#[test]
+fn weights_and_noise_are_the_same_in_both_fidelities() {
+    let folder = tempfile::tempdir().unwrap();
+    let sky = folder.path().join("sky.fits");
+    let map = SkyMap::new(Frame::Ecliptic, generate(&GeneratedSky::default(), 1e7, 32, 1).unwrap()).unwrap();
+    write_map(&sky, &map, &WriteOptions::default()).unwrap();
+    let of = |fidelity: &&str| [1, 2].map(|seed| come_down(&sky, fidelity, seed));
+    let (runs, powers): (Vec<_>, Vec<_>) = ["samples", "visibilities"].iter().map(of).map(split).unzip();
+    check_powers(&powers);
+    let [samples, visibilities] = [&runs[0], &runs[1]].map(|[first, _]| weights(first));
+    assert_eq!(samples.len(), 28);
+    for (pair, expected) in &visibilities {
+        let ratio = samples[pair] / expected;
+        // Two powers of two minutes of samples. A weight is of those before it, as far as they go back: integrations of the
+        // windows' first seconds share one power, so that a sixth of the samples counts twice.
+        let error = (2.0 / (2.0 * 60.0 * WIDTH_HZ) * 1.5_f64).sqrt();
+        // In the mean inverse powers of 1024 samples and more are up to 2e-3 too large, for the first seconds.
+        assert!((ratio - 1.0).abs() < 4.0 * error + 1e-3, "{pair}: {ratio} +- {error}");
+    }
+    for [first, second] in &runs {
+        let (found, count) = chi_square(first, second);
+        // As above; pairs share daughters, but not their noise; weights follow powers that are good to half a percent.
+        let error = ((2.0 + 3.0 / 400.0) / count).sqrt();
+        eprintln!("chi square {found:.4} +- {error:.4} of {count} parts");
+        assert!(count > 2e4 && (found - 1.0).abs() < 4.0 * error + 5e-3, "{found} +- {error}");
     }
 }

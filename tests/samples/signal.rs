@@ -2,7 +2,7 @@
 
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{AntennaResponse, VisibilityBlock};
-use lunarray::mother::{DirectSum, PairPosition, Prediction, VisibilityModel};
+use lunarray::mother::{DirectSum, PairPosition, VisibilityModel};
 use lunarray::sky::SkyMap;
 use lunarray::sky::fits::{ReadOptions, read_map};
 use lunarray::units::all_pairs;
@@ -19,9 +19,9 @@ fn a_point_source_has_the_visibilities_of_the_model() {
     let sky = point(n_hat);
     let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies_hz, sky, 30.0);
     craft.receiver_noise_k_sr = 1.0;
-    let blocks = craft.run(3);
     let (mut squares, mut count) = (0.0, 0.0);
-    for channel in 0..3 {
+    let runs = [3, 4, 5].map(|seed| craft.run(seed));
+    for (blocks, channel) in runs.iter().flat_map(|blocks| [0, 1, 2].map(|channel| (blocks, channel))) {
         for pair in all_pairs(8) {
             let (mut product, mut power, mut weight) = (Complex64::ZERO, 0.0, 0.0);
             for block in blocks.iter().filter(|b| b.pair == pair && usize::from(b.channel.0) == channel) {
@@ -50,10 +50,12 @@ fn a_point_source_has_the_visibilities_of_the_model() {
         }
     }
     // The source's own noise: half of the power is common to all, so that parts differ; on the mean they have
-    // P_i P_j / (2 n), and neighbouring pairs share it: fewer independent ones than counted.
+    // P_i P_j / (2 n). A quarter of a square is the source's own, the same for all pairs, and half of it is of the source
+    // with one daughter's receiver, the same for seven: in 30 s and three channels, counting how integrations overlap, that
+    // leaves 1.3 % of the mean, of three runs 0.75 %.
     let mean = squares / count;
     eprintln!("{count} parts, mean square {mean:.4}");
-    assert!((mean - 1.0).abs() < 0.02, "{mean}");
+    assert!((mean - 1.0).abs() < 4.0 * 0.0075, "{mean}");
 }
 
 /// What a model expects of integrations: means over four instants of each and 16 frequencies of the channel.
@@ -79,13 +81,13 @@ fn expectations(
         }
     }
     let mut expected = vec![Complex64::ZERO; positions.len() / 4];
-    let mut predicted = vec![Prediction::default(); positions.len()];
+    let mut predicted = vec![Complex64::ZERO; positions.len()];
     // Frequencies over the channel as channels of their own.
     for k in 0..16 {
         let at_hz = frequency_hz + WIDTH_HZ * ((f64::from(k) + 0.5) / 16.0 - 0.5);
         model(at_hz).predict(&positions, &mut predicted).unwrap();
         for (sum, four) in expected.iter_mut().zip(predicted.chunks_exact(4)) {
-            *sum += four.iter().map(|p| p.visibility_k_sr).sum::<Complex64>() / 64.0;
+            *sum += four.iter().sum::<Complex64>() / 64.0;
         }
     }
     expected

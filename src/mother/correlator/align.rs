@@ -208,7 +208,6 @@ mod tests {
             daughter,
             number,
             time: MissionTime(5_000 + 32_000 * number as i64),
-            clock_offset_s: 0.0,
             saturated: 0,
             samples: Samples::Float { re: vec![0.0; length], im: vec![0.0; length] },
         }

@@ -7,10 +7,10 @@ use crate::array::{Array, integration_time_s};
 use crate::frames::{Flags, ObservingWindow, VisibilityBlock};
 use crate::mother::Schedule;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
-use crate::units::vector::{norm, sub};
+use crate::units::vector::{norm, scale, sub};
 use crate::units::{ChannelId, Pair, TICKS_PER_SECOND, all_pairs};
 
-/// Visibilities of one pair and channel that are held before they are handed on.
+/// Visibilities of one pair and channel that are held before they are handed on, once powers are settled.
 const HELD_MAX: usize = 2048;
 
 /// Weight of a visibility without samples, which is flagged: the downlink takes none that is not positive.
@@ -58,6 +58,8 @@ pub struct GroupIntegrator {
     dumps: u64,
     now: u64,
     pairs: Vec<PairLanes>,
+    /// Whether powers are known; until then weights stand for powers of one, and all visibilities are held.
+    settled: bool,
 }
 
 /// One pair in all channels of a group.
@@ -89,7 +91,7 @@ impl GroupIntegrator {
     ) -> Self {
         let pairs = all_pairs(array.satellites()).into_iter().map(PairLanes::new).collect();
         let schedules = schedules[..schedules.len().min(LANES)].to_vec();
-        let mut own = Self { first_channel, schedules, rule, window, dumps, now: 0, pairs };
+        let mut own = Self { first_channel, schedules, rule, window, dumps, now: 0, pairs, settled: false };
         for at in 0..own.pairs.len() {
             for lane in 0..own.schedules.len() {
                 own.pairs[at].number[lane] = window.index / own.schedules[lane].every_nth_window.max(1);
@@ -99,7 +101,23 @@ impl GroupIntegrator {
         own
     }
 
-    /// Adds a dump; `powers` are those of daughters by lane, K sr, by which products are weighted.
+    /// Says that `powers`, of daughters by lane, K sr, are now good enough to weigh products by; what is held gets its
+    /// weights.
+    pub fn settle(&mut self, powers: &[[f64; LANES]]) {
+        if std::mem::replace(&mut self.settled, true) {
+            return;
+        }
+        for own in &mut self.pairs {
+            for (lane, held) in own.held.iter_mut().enumerate() {
+                let power = power_of(own.pair, powers, lane);
+                for weight in &mut held.weight {
+                    *weight = weight_of(f64::from(*weight) / power);
+                }
+            }
+        }
+    }
+
+    /// Adds a dump; `powers` are those of daughters by lane, K sr, by which products are weighted once they are settled.
     pub fn add(
         &mut self,
         sums: &Sums,
@@ -138,6 +156,11 @@ impl GroupIntegrator {
                 if self.pairs[at].from[lane] < self.now {
                     self.close(at, lane, powers, out);
                 }
+            }
+        }
+        self.settle(powers);
+        for lane in 0..self.schedules.len() {
+            for at in 0..self.pairs.len() {
                 let held = std::mem::take(&mut self.pairs[at].held[lane]);
                 if !held.is_empty() {
                     out.push(held);
@@ -153,11 +176,7 @@ impl GroupIntegrator {
         let own = &mut self.pairs[at];
         let (i, j) = (array.state(own.pair.i.into(), t_s), array.state(own.pair.j.into(), t_s));
         let dt_s = integration_time_s(schedule.rule, schedule.frequency_hz, i.velocity_m_s, j.velocity_m_s);
-        let longest_m = match schedule.baseline_wavelengths_max {
-            0.0 => f64::INFINITY,
-            limit => limit * SPEED_OF_LIGHT_M_S / schedule.frequency_hz,
-        };
-        let near_enough = norm(sub(i.position_m, j.position_m)) < longest_m;
+        let near_enough = norm(sub(i.position_m, j.position_m)) < longest_m(&schedule);
         own.keep[lane] = near_enough && own.number[lane].is_multiple_of(schedule.every_nth.max(1));
         own.number[lane] += 1;
         own.from[lane] = now;
@@ -184,19 +203,29 @@ impl GroupIntegrator {
         if own.saturated[lane] {
             flags.0 |= Flags::SATURATED.0;
         }
-        let power = powers[usize::from(own.pair.i)][lane] * powers[usize::from(own.pair.j)][lane];
-        // Variance of the mean of products of independent samples, in one part: P_i P_j / (2 n).
-        let weight = (2.0 * used / power) as f32;
+        let power = if self.settled { power_of(own.pair, powers, lane) } else { 1.0 };
         let mean = |sum: f64| if used > 0.0 { (sum / used) as f32 } else { 0.0 };
         block.offset_ticks.push(rule.ticks(from));
         block.duration_ticks.push(rule.ticks(self.now) - rule.ticks(from));
         block.value_k_sr.push(Complex32::new(mean(own.re[lane]), mean(own.im[lane])));
-        block.weight.push(if weight.is_finite() { weight.max(NO_WEIGHT) } else { NO_WEIGHT });
+        // Variance of the mean of products of independent samples, in one part: P_i P_j / (2 n).
+        block.weight.push(weight_of(2.0 * used / power));
         block.flags.push(flags);
-        if block.len() >= HELD_MAX {
+        if self.settled && block.len() >= HELD_MAX {
             out.push(std::mem::take(block));
         }
     }
+}
+
+/// Product of a pair's powers, (K sr)^2.
+fn power_of(pair: Pair, powers: &[[f64; LANES]], lane: usize) -> f64 {
+    powers[usize::from(pair.i)][lane] * powers[usize::from(pair.j)][lane]
+}
+
+/// A weight as it goes down.
+fn weight_of(weight: f64) -> f32 {
+    let weight = weight as f32;
+    if weight.is_finite() { weight.max(NO_WEIGHT) } else { NO_WEIGHT }
 }
 
 impl PairLanes {
@@ -217,21 +246,37 @@ impl PairLanes {
     }
 }
 
-/// Samples of a dump that is short against the shortest integration of any channel: an eighth of it or less,
-/// but no less than a slice, so that rounding to dumps shortens integrations by an eighth at most.
+/// The shortest integration of any pair that is correlated, in any channel, s.
 #[must_use]
-pub fn dump_samples(array: &Array, schedules: &[Schedule], width_hz: f64) -> usize {
+pub fn shortest_integration_s(array: &Array, schedules: &[Schedule]) -> f64 {
     let last = array.satellites() - 1;
-    // Breathing changes lengths: the longest chord is that of a period's start.
+    // Breathing changes lengths: the longest chord is that of a period's start. Speeds go with chords.
     let (first, last) = (array.state(0, 0.0), array.state(last, 0.0));
-    let shortest_s = schedules
-        .iter()
-        .map(|schedule| {
-            integration_time_s(schedule.rule, schedule.frequency_hz, first.velocity_m_s, last.velocity_m_s)
-        })
-        .fold(f64::INFINITY, f64::min);
-    let most = (shortest_s * width_hz / 8.0) as usize;
-    [64, 32].into_iter().find(|&samples| samples <= most).unwrap_or(super::kernel::SLICE)
+    let chord_m = norm(sub(first.position_m, last.position_m));
+    let shortest_s = |schedule: &Schedule| {
+        let part = (longest_m(schedule) / chord_m).min(1.0);
+        let (v_i, v_j) = (scale(part, first.velocity_m_s), scale(part, last.velocity_m_s));
+        integration_time_s(schedule.rule, schedule.frequency_hz, v_i, v_j)
+    };
+    schedules.iter().map(shortest_s).fold(f64::INFINITY, f64::min)
+}
+
+/// Length of the longest baseline that a schedule lets pass, m.
+fn longest_m(schedule: &Schedule) -> f64 {
+    match schedule.baseline_wavelengths_max {
+        0.0 => f64::INFINITY,
+        limit => limit * SPEED_OF_LIGHT_M_S / schedule.frequency_hz,
+    }
+}
+
+/// Samples of a dump that is short against the shortest integration of any channel: an eighth of it or less,
+/// but no less than a slice, so that rounding to dumps shortens integrations by an eighth at most; and no less than one
+/// of each sub-band.
+#[must_use]
+pub fn dump_samples(array: &Array, schedules: &[Schedule], rate_hz: f64, sub_bands: usize) -> usize {
+    let most = (shortest_integration_s(array, schedules) * rate_hz / 8.0) as usize;
+    let samples = [64, 32].into_iter().find(|&samples| samples <= most);
+    samples.unwrap_or(super::kernel::SLICE).max(sub_bands)
 }
 
 /// Seconds of the longest time that offsets in ticks can tell apart in a window.

@@ -14,6 +14,6 @@ mod spectra;
 mod stage;
 
 pub use align::{Aligner, AlignerCounts, Row, Streams};
-pub use integrate::{DumpRule, GroupIntegrator, Presence, dump_samples};
+pub use integrate::{DumpRule, GroupIntegrator, Presence, dump_samples, shortest_integration_s};
 pub use spectra::{Division, SUB_BANDS_MAX};
 pub use stage::{Correlator, CorrelatorCounts, CorrelatorSetup};

@@ -26,8 +26,11 @@ const SATURATED_MAX: f64 = 0.2;
 /// length, 2 degrees of fringe.
 pub(super) const COMPLETE_MIN: f64 = 0.9;
 
-/// Time in which the power that weights are made of is averaged, s.
+/// Time in which the power that weights are made of is averaged, s; before, it is the mean of all there was.
 const POWER_TIME_S: f64 = 10.0;
+
+/// Samples of a window from which powers are good enough for weights, which are 2 / n too large in the mean then.
+const POWER_SAMPLES_MIN: u64 = 1024;
 
 /// What the mother's stage is made for.
 #[derive(Clone)]
@@ -98,6 +101,10 @@ struct Group {
     packed: Packed,
     /// By daughter: power of each lane, K sr; 0 before the first block.
     powers: Vec<[f64; LANES]>,
+    /// By daughter and lane: samples that have come so far.
+    seen: Vec<[u64; LANES]>,
+    /// Samples that the window has had.
+    samples: u64,
 }
 
 impl Correlator {
@@ -106,7 +113,7 @@ impl Correlator {
     pub fn new(setup: CorrelatorSetup, counts: Arc<Mutex<CorrelatorCounts>>) -> Self {
         let width_hz = setup.instrument.channels.first().map_or(1.0, |channel| channel.width_hz);
         let bands = setup.division.sub_bands.max(1);
-        let dump = dump_samples(&setup.array, &setup.schedules, width_hz * bands as f64).max(bands);
+        let dump = dump_samples(&setup.array, &setup.schedules, width_hz * bands as f64, bands);
         let rule = DumpRule { dump_samples: dump / bands, width_hz, complete_min: COMPLETE_MIN };
         let divider = (setup.division != Division::NONE).then(|| Divider::new(setup.division));
         lock(&counts).autos = vec![vec![(0.0, 0); setup.array.satellites()]; setup.schedules.len()];
@@ -146,6 +153,8 @@ impl Correlator {
             }),
             packed: Packed::new(streams.daughters),
             powers: vec![[0.0; LANES]; streams.daughters],
+            seen: vec![[0; LANES]; streams.daughters],
+            samples: 0,
         };
         let groups = setup.schedules.chunks(LANES).enumerate().map(group).collect();
         self.running = Some(Running { window, aligner, groups, held: None });
@@ -272,12 +281,19 @@ impl Correlator {
                 if count == 0 {
                     continue;
                 }
-                let (power, measured) = (&mut group.powers[daughter][lane], sum / count as f64);
-                *power = if *power > 0.0 { *power + following * (measured - *power) } else { measured };
+                let (power, seen) = (&mut group.powers[daughter][lane], &mut group.seen[daughter][lane]);
+                *seen += count;
+                let share = following.max(count as f64 / *seen as f64);
+                *power += share * (sum / count as f64 - *power);
                 let own = &mut counts.autos[group.first + lane][daughter];
                 own.0 += sum;
                 own.1 += count;
             }
+        }
+        drop(counts);
+        group.samples += powers.samples;
+        if group.samples >= POWER_SAMPLES_MIN {
+            group.integrator.settle(&group.powers);
         }
     }
 

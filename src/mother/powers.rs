@@ -1,0 +1,80 @@
+//! The powers that the daughters hear over a window, of which their noise is made.
+
+use super::model::{DaughterPosition, ModelError, VisibilityModel};
+use crate::array::Array;
+use crate::frames::ObservingWindow;
+use crate::units::TICKS_PER_SECOND;
+
+/// Distance of instants for which powers are predicted, s: a ninth of a radian of the orbit. A cubic does not follow what
+/// is finer than l = 20, of which the half of the sky that the Moon leaves free keeps some l^-1.5: 5e-4 of a power under a
+/// sky with as much in each degree to l = 40 as in its mean, far less under one that is smoother.
+const STEP_S: f64 = 150.0;
+
+/// Instants on either side of a time of which one takes the cubic.
+const BEYOND: f64 = 1.0;
+
+/// `Int T A S dn` (K sr) along a window's stretch of the orbit.
+///
+/// All daughters follow each other on one circle, so that one table serves them all: what one hears, one who trails her by an
+/// arc hears so much later.
+pub(super) struct SkyPowers {
+    /// Time of the table's first power, s.
+    from_s: f64,
+    table: Vec<f64>,
+}
+
+impl SkyPowers {
+    /// Powers under a model, in each of some windows.
+    ///
+    /// # Errors
+    /// [`ModelError`], for places that the model does not cover.
+    pub fn predict(
+        model: &mut dyn VisibilityModel,
+        array: &Array,
+        windows: &[ObservingWindow],
+    ) -> Result<Vec<Self>, ModelError> {
+        // Arcs are greatest at the start of a period.
+        let lags_s = (0..array.satellites()).map(|n| lag_s(array, n, 0.0));
+        let longest_s = lags_s.fold(0.0, f64::max);
+        let spans = windows.iter().map(|window| {
+            let from_s = window.start.seconds() - longest_s - BEYOND * STEP_S;
+            let length_s = (window.end.0 - window.start.0) as f64 / TICKS_PER_SECOND as f64;
+            let steps = ((length_s + longest_s) / STEP_S).ceil() + 2.0 * BEYOND;
+            (from_s, steps as usize + 1)
+        });
+        let spans: Vec<(f64, usize)> = spans.collect();
+        let place = |t_s: f64| DaughterPosition {
+            r_m: array.trailing_m(0.0, t_s),
+            normal_hat: array.orbit_normal_hat(t_s),
+        };
+        let instants =
+            spans.iter().flat_map(|&(from_s, count)| (0..count).map(move |k| from_s + STEP_S * k as f64));
+        let places: Vec<DaughterPosition> = instants.map(place).collect();
+        let mut powers = vec![0.0; places.len()];
+        model.predict_powers(&places, &mut powers)?;
+        let mut powers = powers.into_iter();
+        let of = |(from_s, count)| Self { from_s, table: powers.by_ref().take(count).collect() };
+        Ok(spans.into_iter().map(of).collect())
+    }
+
+    /// The power of daughter `n` at a time of the window, K sr.
+    pub fn at(&self, array: &Array, n: usize, t_s: f64) -> f64 {
+        let x = (t_s - lag_s(array, n, t_s) - self.from_s) / STEP_S;
+        // Four of the table, whatever the time.
+        let first = (x.floor() - BEYOND).clamp(0.0, self.table.len().saturating_sub(4) as f64) as usize;
+        let x = x - first as f64;
+        let nodes = self.table.iter().skip(first).take(4).enumerate();
+        nodes
+            .map(|(k, power)| {
+                let others = (0..4).filter(|m| *m != k);
+                power * others.map(|m| (x - m as f64) / (k as f64 - m as f64)).product::<f64>()
+            })
+            .sum()
+    }
+}
+
+/// Time in which the array moves along the arc by which a daughter trails, s.
+fn lag_s(array: &Array, n: usize, t_s: f64) -> f64 {
+    let speed_m_s = std::f64::consts::TAU * array.orbit_radius_m() / array.orbital_period_s();
+    array.formation().arc_m(n, t_s).0 / speed_m_s
+}
