@@ -196,7 +196,13 @@ fn an_interrupt_leaves_maps_of_the_data_so_far() {
         .stderr(std::process::Stdio::null())
         .spawn()
         .unwrap();
-    std::thread::sleep(Duration::from_secs(4));
+    // Until there is more of the downlink than queues hold, so that some of it is in the sums, however busy the machine.
+    let (since, partial) = (Instant::now(), Path::new(&out).join("downlink.ccsds.partial"));
+    while std::fs::metadata(&partial).map_or(0, |found| found.len()) < 4 << 20 {
+        assert!(since.elapsed() < Duration::from_secs(300), "no four megabytes in five minutes");
+        assert!(child.try_wait().unwrap().is_none(), "it has ended by itself");
+        std::thread::sleep(Duration::from_millis(50));
+    }
     let id = child.id().to_string();
     assert!(std::process::Command::new("kill").args(["-INT", &id]).status().unwrap().success());
     let since = Instant::now();
@@ -228,7 +234,7 @@ fn a_run_without_a_map_fails_and_says_why() {
     // Weights above the limit: nothing is taken, and the ledger says so.
     let refused =
         fail(&[&none[..], &["--set", "map.weight_max=1e-30", "--set", "map.snapshot_every_s=0"]].concat());
-    assert!(refused.contains("no visibility could be used"), "{refused}");
+    assert!(refused.contains("no pair's visibility could be used"), "{refused}");
     assert!(refused.contains("weight above map.weight_max"), "{refused}");
 }
 

@@ -56,7 +56,7 @@ pub enum PipelineError {
     State(#[from] super::state::StateError),
     /// Nothing to make a map of.
     #[error(
-        "no visibility could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",
+        "no pair's visibility could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",
         summary.display()
     )]
     NoMap {

@@ -39,7 +39,9 @@ fn lunarray(folder: &Path, command: &str, sets: &[&str]) -> String {
         run.args(["--out", folder.to_str().unwrap()]);
     }
     let done = run.output().unwrap();
-    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    // A link that loses too much leaves no map: then the run fails, with its accounts.
+    let said = String::from_utf8_lossy(&done.stderr);
+    assert!(done.status.success() || said.contains("so there is no map"), "{said}");
     String::from_utf8(done.stdout).unwrap()
 }
 
