@@ -6,11 +6,11 @@ use std::time::Instant;
 
 use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup, memory};
 use lunarray::accumulation::{NormalEngine, NormalSums};
-use lunarray::array::harmonic::{
-    GeometryLimits, HarmonicModel, ModelSettings, NominalOrbit, PairState, PatternGeometry,
-};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows};
 use lunarray::frames::{AntennaResponse, ObservingWindow, PlacedVisibilities};
+use lunarray::response::harmonic::{
+    GeometryLimits, HarmonicModel, ModelSettings, NominalOrbit, PairState, PatternGeometry,
+};
 use lunarray::sky::harmonics::Alm;
 use lunarray::units::all_pairs;
 use lunarray::units::constants::SPEED_OF_LIGHT_M_S;

@@ -6,9 +6,9 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use lunarray::array::response::{Directions, PairGeometry, PixelMethod, RowMaker, exact, sky_sums};
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::AntennaResponse;
+use lunarray::response::pixel::{Directions, PairGeometry, PixelMethod, RowMaker, exact, sky_sums};
 use lunarray::sky::healpix::{pixel_area_sr, pixel_directions};
 
 /// Pixel-fringes a second and core that the kernels are to make at least.

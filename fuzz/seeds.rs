@@ -6,8 +6,6 @@ use std::path::Path;
 
 use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup};
 use lunarray::accumulation::{NormalEngine, PixelEngine, PixelSetup};
-use lunarray::array::harmonic::NominalOrbit;
-use lunarray::array::response::PixelMethod;
 use lunarray::array::{Array, ArrayConfig, segments_for};
 use lunarray::downlink::cadu::{DATA_BYTES, randomize};
 use lunarray::downlink::{DownlinkConfig, Format, HEADER_BYTES, PacketHeader, TRAILER_BYTES, Transmission};
@@ -17,6 +15,8 @@ use lunarray::frames::{
 };
 use lunarray::pipeline::state::Keeper;
 use lunarray::pipeline::{Config, ConfigSource};
+use lunarray::response::harmonic::NominalOrbit;
+use lunarray::response::pixel::PixelMethod;
 use lunarray::runtime::{Outlet, Stage};
 use lunarray::sky::Frame;
 use lunarray::sky::fits::{Column, Ordering, Precision, WriteOptions, write_columns};

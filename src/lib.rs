@@ -21,6 +21,8 @@ pub mod sky;
 
 pub mod array;
 
+pub mod response;
+
 pub mod daughters;
 
 pub mod mother;

@@ -9,9 +9,9 @@
 mod common;
 
 use lunarray::accumulation::{MapConfig, NormalEngine, PixelEngine, PixelSetup, automatic_weight_max};
-use lunarray::array::response::{Directions, PairGeometry, PixelMethod, sky_sums};
 use lunarray::array::{Array, ArrayConfig, IntegrationRule, ObservingWindows, integration_time_s};
 use lunarray::frames::{AntennaResponse, ObservingWindow, PlacedVisibilities};
+use lunarray::response::pixel::{Directions, PairGeometry, PixelMethod, sky_sums};
 use lunarray::sky::fits::{ReadOptions, read_map};
 use lunarray::sky::generated::{GeneratedSky, generate};
 use lunarray::sky::healpix::pixel_area_sr;

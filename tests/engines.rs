@@ -5,10 +5,10 @@
 use faer::{Mat, Side};
 use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
 use lunarray::accumulation::{NormalEngine, NormalSums, PixelEngine, PixelSetup};
-use lunarray::array::harmonic::GeometryLimits;
-use lunarray::array::response::{Directions, PairGeometry, PixelMethod, sky_sums};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::response::harmonic::GeometryLimits;
+use lunarray::response::pixel::{Directions, PairGeometry, PixelMethod, sky_sums};
 use lunarray::runtime::Cancel;
 use lunarray::sky::generated::{GeneratedSky, generate};
 use lunarray::sky::healpix::pixel_area_sr;

@@ -6,10 +6,10 @@ use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup, orbit_of};
 use lunarray::accumulation::{
     AccumulationError, NormalEngine, NormalSums, PixelEngine, PixelSetup, Refusal, automatic_weight_max,
 };
-use lunarray::array::harmonic::GeometryLimits;
-use lunarray::array::response::{PairGeometry, PixelMethod, RowMaker};
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::response::harmonic::GeometryLimits;
+use lunarray::response::pixel::{PairGeometry, PixelMethod, RowMaker};
 use lunarray::sky::healpix::pixel_area_sr;
 use lunarray::units::{Pair, StreamKind, random_stream};
 use num_complex::Complex64;

@@ -5,11 +5,11 @@ use std::f64::consts::{PI, TAU};
 use std::path::Path;
 
 use lunarray::array::Array;
-use lunarray::array::harmonic::{HarmonicModel, ModelSettings, PairState, PatternGeometry};
-use lunarray::array::response::{Directions, PairGeometry, SingleGeometry, sky_powers, sky_sums};
 use lunarray::downlink::DownlinkReader;
 use lunarray::frames::{AntennaResponse, GroundFrame, VisibilityBlock};
 use lunarray::pipeline::{ConfigSource, Plan, simulate};
+use lunarray::response::harmonic::{HarmonicModel, ModelSettings, PairState, PatternGeometry};
+use lunarray::response::pixel::{Directions, PairGeometry, SingleGeometry, sky_powers, sky_sums};
 use lunarray::runtime::Cancel;
 use lunarray::sky::fits::{WriteOptions, write_map};
 

@@ -3,10 +3,10 @@
 
 use std::f64::consts::{PI, TAU};
 
-use lunarray::array::harmonic::{
+use lunarray::frames::AntennaResponse;
+use lunarray::response::harmonic::{
     GeometryLimits, HarmonicModel, ModelSettings, NominalOrbit, PairOrientation, PairState, PatternGeometry,
 };
-use lunarray::frames::AntennaResponse;
 use lunarray::sky::harmonics::Alm;
 use lunarray::units::constants::MOON_RADIUS_M;
 use lunarray::units::vector::Vec3;

@@ -3,9 +3,9 @@
 
 use std::f64::consts::{PI, TAU};
 
-use lunarray::array::harmonic::{HarmonicModel, ModelSettings, PairState, PatternGeometry};
 use lunarray::array::hidden_by_moon;
 use lunarray::frames::AntennaResponse;
+use lunarray::response::harmonic::{HarmonicModel, ModelSettings, PairState, PatternGeometry};
 use lunarray::sky::harmonics::Alm;
 use lunarray::units::constants::MOON_RADIUS_M;
 use lunarray::units::vector::{Vec3, add, cross, dot, scale};

@@ -5,8 +5,8 @@ mod common;
 
 use std::path::Path;
 
-use lunarray::array::harmonic::{NodeGrid, PatternGeometry, PatternTable};
 use lunarray::frames::AntennaResponse;
+use lunarray::response::harmonic::{NodeGrid, PatternGeometry, PatternTable};
 use lunarray::sky::harmonics::wigner_d;
 use lunarray::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
 use serde::Deserialize;

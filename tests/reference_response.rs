@@ -3,9 +3,9 @@
 
 mod common;
 
-use lunarray::array::response::{Directions, PairGeometry, PixelMethod, RowMaker, exact, sky_sums};
 use lunarray::array::{Array, ArrayConfig, hidden_by_moon};
 use lunarray::frames::AntennaResponse;
+use lunarray::response::pixel::{Directions, PairGeometry, PixelMethod, RowMaker, exact, sky_sums};
 use lunarray::sky::healpix;
 use lunarray::units::vector::{Vec3, dot, scale, unit};
 use serde_json::Value;

@@ -4,9 +4,9 @@
 mod common;
 
 use lunarray::accumulation::{NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums};
-use lunarray::array::response::PixelMethod;
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::response::pixel::PixelMethod;
 use lunarray::solve::{W_MAX_EXACT, largest_eigenvalue, solve_pixels, spectrum};
 use lunarray::units::Pair;
 use num_complex::Complex64;

@@ -11,7 +11,7 @@ use super::error::AccumulationError;
 use super::exact::ExactTiles;
 use super::pixel::{ExactSums, PixelEngine, PixelSetup};
 use super::scale::Totals;
-use crate::array::response::PixelMethod;
+use crate::response::pixel::PixelMethod;
 use crate::sky::healpix::{is_valid_nside, pixel_count};
 
 const MAGIC: &[u8; 8] = b"LNRPIX02";
@@ -103,8 +103,8 @@ fn setup_of(head: &Head) -> Result<PixelSetup, AccumulationError> {
 mod tests {
     use num_complex::Complex64;
 
-    use super::super::{NormalEngine, NormalSums};
     use super::*;
+    use crate::accumulation::{NormalEngine, NormalSums};
     use crate::array::{Array, ArrayConfig};
     use crate::frames::{AntennaResponse, PlacedVisibilities};
     use crate::units::Pair;

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::harmonic::L_MAX;
-use crate::array::harmonic::GeometryLimits;
-use crate::array::response::PixelMethod;
+use crate::response::harmonic::GeometryLimits;
+use crate::response::pixel::PixelMethod;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
 use crate::units::PerChannel;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;

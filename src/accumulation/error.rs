@@ -3,7 +3,7 @@
 use thiserror::Error;
 
 use super::config::MapConfigError;
-use crate::array::response::ResponseError;
+use crate::response::pixel::ResponseError;
 use crate::units::ChannelId;
 
 /// Why visibilities could not be summed.

@@ -29,8 +29,8 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::array::harmonic::GeometryRefusal;
 use crate::frames::PlacedVisibilities;
+use crate::response::harmonic::GeometryRefusal;
 
 /// What an engine or its sums hold.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, bincode::Encode, bincode::Decode)]

@@ -3,20 +3,19 @@
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::checkpoint;
 use super::error::AccumulationError;
 use super::exact::{BLOCK, ExactTiles, Panels, SCALES_MAX, WEIGHT_QUANTA, add_scaled, round_factors};
 use super::noise::companion_noise;
 use super::scale::{Scale, Totals};
 use super::tiles::{Columns, SymmetricTiles};
-use super::{Added, Direction, NormalEngine, NormalSums, Refusal, SumCounts};
-use crate::array::harmonic::GeometryRefusal;
-use crate::array::response::{PairGeometry, PixelMethod, RowMaker};
+use super::{Added, Direction, NormalEngine, NormalSums, Refusal, SumCounts, checkpoint};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
+use crate::response::harmonic::GeometryRefusal;
+use crate::response::pixel::{PairGeometry, PixelMethod, RowMaker};
 use crate::sky::healpix::{pixel_area_sr, pixel_count};
 use crate::units::vector::{Vec3, norm};
 
-/// Elements between the rows of B in a block, beyond their length; see [`super::tiles`] on strides.
+/// Elements between the rows of B in a block, beyond their length; see [`crate::accumulation::tiles`] on strides.
 const PADDING: usize = 16;
 
 /// Factors of the greatest weight: a row of B times the root of its weight, in units of the scale's.

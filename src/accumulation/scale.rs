@@ -62,13 +62,13 @@ impl Scale {
         value: num_complex::Complex64,
         weight: f64,
         weight_max: f64,
-    ) -> Result<(), super::Refusal> {
+    ) -> Result<(), crate::accumulation::Refusal> {
         if !(value.re.is_finite() && value.im.is_finite() && weight > 0.0 && weight.is_finite()) {
-            return Err(super::Refusal::NotFinite);
+            return Err(crate::accumulation::Refusal::NotFinite);
         }
         let signal = value.re.abs().max(value.im.abs()) * weight.sqrt();
         if weight > weight_max || signal > SIGNAL_TO_NOISE_MAX {
-            return Err(super::Refusal::OutOfRange);
+            return Err(crate::accumulation::Refusal::OutOfRange);
         }
         Ok(())
     }

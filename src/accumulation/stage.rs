@@ -8,8 +8,8 @@ use super::{
     AccumulationError, Added, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine, PixelSetup,
     PixelSums, Refusal, SumCounts, automatic_weight_max,
 };
-use crate::array::harmonic::GeometryRefusal;
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities};
+use crate::response::harmonic::GeometryRefusal;
 use crate::runtime::{Ledger, Outlet, Stage, Units};
 use crate::units::ChannelId;
 use crate::units::vector::{norm, sub};

@@ -13,9 +13,6 @@ mod placing;
 mod stretch;
 mod windows;
 
-pub mod harmonic;
-pub mod response;
-
 pub use config::{ArrayConfig, ArrayError, BreathingConfig, NodeMotion};
 pub use ephemeris::{Ephemeris, Insertion, segments_for};
 pub use formation::Formation;

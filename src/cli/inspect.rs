@@ -7,8 +7,8 @@ use serde::Serialize;
 
 use super::{CommandResult, Outcome, print_json_line, print_text};
 use crate::accumulation::harmonic::{GeometryCoverage, GeometrySurvey};
-use crate::array::harmonic::GeometryLimits;
 use crate::downlink::Contents;
+use crate::response::harmonic::GeometryLimits;
 
 /// Show what a downlink file holds, and what is wrong with it.
 ///

@@ -8,8 +8,8 @@ use serde::Serialize;
 
 use super::{ArrayArgs, CommandError, CommandResult, Outcome, print_json_line, print_text, time_s};
 use crate::array::Array;
-use crate::array::response::{PairGeometry, exact};
 use crate::mother::BAND_HZ;
+use crate::response::pixel::{PairGeometry, exact};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::Pair;

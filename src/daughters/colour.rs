@@ -268,8 +268,8 @@ impl Tiled for Colour<'_> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::repair::factor;
     use super::*;
+    use crate::daughters::repair::factor;
 
     #[test]
     fn factors_multiply_to_the_matrix() {

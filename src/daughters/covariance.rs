@@ -2,7 +2,7 @@
 //!
 //! A visibility is a smooth function of time and of the frequency's offset from the channel's centre: its
 //! phase sweeps at most `2 pi |v| nu T / c` in a time T and `2 pi |b| dnu / c` over the channel. Both are
-//! interpolated from equally spaced nodes, as many as that sweep asks for ([`super::nodes`]).
+//! interpolated from equally spaced nodes, as many as that sweep asks for ([`crate::daughters::nodes`]).
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -12,9 +12,9 @@ use num_complex::Complex64;
 use super::epochs::{COLUMNS, EPOCHS, combine, time_matrix};
 use super::nodes::{Basis, node, nodes_for};
 use crate::array::Array;
-use crate::array::response::Comb;
 use crate::frames::Channel;
-use crate::mother::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
+use crate::response::model::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
+use crate::response::pixel::Comb;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
 use crate::units::{Pair, all_pairs};

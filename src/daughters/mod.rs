@@ -1,7 +1,7 @@
 //! The daughters: sampling of up to 30 channels, level control, quantisers, clocks, and the link to the mother.
 //!
 //! A channel of complex samples at its own width (8 kHz) is drawn for all daughters at once, with the
-//! covariance that a [`crate::mother::VisibilityModel`] gives over the channel as the array moves, and noise
+//! covariance that a [`crate::response::model::VisibilityModel`] gives over the channel as the array moves, and noise
 //! of the receivers: [`Covariances`], [`Synthesis`]. Each daughter then does to its samples what it does
 //! wrong ([`Disturbances`]), sets its level and quantises ([`Quantiser`]), and sends blocks over its link
 //! ([`SampleLink`]). All of it is noise with a seed: [`Sampler`] gives the same samples whatever the threads.

@@ -3,7 +3,7 @@
 use multiversion::multiversion;
 
 use super::colour::{PIVOT_MIN, TILE, Tile, element};
-use crate::array::response::kernel::fused;
+use crate::response::pixel::kernel::fused;
 
 /// Changes of a correlation that are counted; smaller ones are rounding.
 const CHANGE_COUNTED: f32 = 1e-5;
@@ -33,7 +33,7 @@ impl Repairs {
     }
 }
 
-/// As [`super::colour::Factor`], where C may lack something to be a covariance.
+/// As [`crate::daughters::colour::Factor`], where C may lack something to be a covariance.
 ///
 /// Rounding and interpolation can make C a little less than a covariance. A daughter then has less power left than
 /// its correlation with another asks for; the correlation is made as small as the power that is left. Powers
@@ -113,8 +113,8 @@ fn shrink(
 
 #[cfg(test)]
 mod tests {
-    use super::super::colour::{Factor, on_tile};
     use super::*;
+    use crate::daughters::colour::{Factor, on_tile};
 
     #[test]
     fn what_is_no_covariance_keeps_its_powers_and_loses_correlation() {

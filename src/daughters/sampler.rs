@@ -12,7 +12,7 @@ use super::repair::Repairs;
 use super::synthesis::{Draft, DrawKey, HOP, Planes, Response, Synthesis};
 use crate::array::Array;
 use crate::frames::{Channel, ObservingWindow, SampleBlock, SpaceFrame};
-use crate::mother::{ModelError, VisibilityModel};
+use crate::response::model::{ModelError, VisibilityModel};
 use crate::runtime::{Flow, Outlet, Source, Units};
 use crate::units::{ChannelId, MissionTime, TICKS_PER_SECOND};
 

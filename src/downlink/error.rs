@@ -92,7 +92,7 @@ pub enum DownlinkError {
     },
     /// A socket.
     #[error(transparent)]
-    Socket(#[from] super::socket::SocketError),
+    Socket(#[from] crate::downlink::socket::SocketError),
     /// A downlink that was to be damaged and already is.
     #[error(
         "at byte {offset}: no sound frame or packet; expected a whole downlink, as `lunarray simulate` writes it"

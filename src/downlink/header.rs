@@ -112,7 +112,7 @@ impl PacketHeader {
     }
 
     /// First byte of every packet: the APIDs have their upper three bits in common.
-    pub(super) const FIRST_BYTE: u8 = ((IDENTIFICATION | super::kind::APID_BASE) >> 8) as u8;
+    pub(super) const FIRST_BYTE: u8 = ((IDENTIFICATION | crate::downlink::kind::APID_BASE) >> 8) as u8;
 }
 
 /// CRC-16 as CCSDS has it (0x1021, start 0xFFFF, not reflected) of the bytes before the check.

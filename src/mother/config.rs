@@ -3,12 +3,12 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use super::choice::ModelChoice;
 use super::correlator::{Division, SUB_BANDS_MAX, dump_samples, shortest_integration_s};
 use super::ninth::NinthConfig;
 use super::schedule::Schedule;
 use crate::array::{Array, IntegrationRule};
 use crate::frames::{AntennaResponse, Channel};
+use crate::response::model::ModelChoice;
 use crate::units::PerChannel;
 use crate::units::constants::YEAR_S;
 

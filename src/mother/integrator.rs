@@ -8,11 +8,11 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Gamma, StandardNormal};
 use rayon::prelude::*;
 
-use super::model::{ModelError, PairPosition, VisibilityModel};
 use super::powers::SkyPowers;
 use super::schedule::{Integration, Schedule};
 use crate::array::{Array, segments_for};
 use crate::frames::{Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, VisibilityBlock};
+use crate::response::model::{ModelError, PairPosition, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{ChannelId, Pair, StreamKind, TICKS_PER_SECOND, all_pairs, random_stream};
 

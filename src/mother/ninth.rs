@@ -7,10 +7,10 @@ use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
 use super::config::SpacecraftError;
-use super::direct::DirectSum;
-use super::model::{DaughterPosition, ModelError, VisibilityModel};
 use crate::array::Array;
 use crate::frames::{Flags, GroundFrame, Housekeeping, ObservingWindow, Spectrometer, VisibilityBlock};
+use crate::response::model::DirectSum;
+use crate::response::model::{DaughterPosition, ModelError, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{ChannelId, Pair, StreamKind, TICKS_PER_SECOND, random_stream};
 
@@ -103,7 +103,7 @@ impl NinthConfig {
         if !self.on {
             return 0.0;
         }
-        8.0 * super::VISIBILITY_BYTES as f64 * self.channels as f64 / self.integration_s
+        8.0 * crate::mother::VISIBILITY_BYTES as f64 * self.channels as f64 / self.integration_s
     }
 }
 

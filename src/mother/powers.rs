@@ -1,8 +1,8 @@
 //! The powers that the daughters hear over a window, of which their noise is made.
 
-use super::model::{DaughterPosition, ModelError, VisibilityModel};
 use crate::array::Array;
 use crate::frames::ObservingWindow;
+use crate::response::model::{DaughterPosition, ModelError, VisibilityModel};
 use crate::units::TICKS_PER_SECOND;
 
 /// Distance of instants for which powers are predicted, s: a ninth of a radian of the orbit. A cubic does not follow what

@@ -8,9 +8,10 @@ use serde::Serialize;
 use super::bench::sampling_cost;
 use super::engine_cost::EngineCost;
 use super::plan::Plan;
-use crate::array::response::{Directions, PairGeometry, sky_sums};
 use crate::frames::ObservingWindow;
-use crate::mother::{Fidelity, ModelKind, ModelPlan, VISIBILITY_BYTES};
+use crate::mother::{Fidelity, VISIBILITY_BYTES};
+use crate::response::model::{ModelKind, ModelPlan};
+use crate::response::pixel::{Directions, PairGeometry, sky_sums};
 use crate::sky::healpix::{pixel_area_sr, pixel_count, pixel_directions};
 
 /// Greatest nside on which fringes are timed.

@@ -32,7 +32,7 @@ pub enum PipelineError {
     SkyConfig(#[from] crate::sky::SkyConfigError),
     /// A model of visibilities cannot be.
     #[error(transparent)]
-    Model(#[from] crate::mother::ModelError),
+    Model(#[from] crate::response::model::ModelError),
     /// A map file.
     #[error(transparent)]
     Fits(#[from] FitsError),
@@ -53,7 +53,7 @@ pub enum PipelineError {
     Products(#[from] crate::products::ProductsError),
     /// The state of the ground cannot be kept.
     #[error(transparent)]
-    State(#[from] super::state::StateError),
+    State(#[from] crate::pipeline::state::StateError),
     /// Nothing to make a map of.
     #[error(
         "no pair's visibility could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",

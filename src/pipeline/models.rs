@@ -6,10 +6,11 @@ use std::sync::Arc;
 use super::error::PipelineError;
 use super::plan::Plan;
 use crate::array::Array;
-use crate::array::harmonic::RotationTable;
-use crate::mother::{
-    BandAverage, DirectSum, Fidelity, HarmonicSetup, HarmonicSum, Load, ModelChoice, ModelKind, ModelPlan,
-    Schedule, VisibilityModel,
+use crate::mother::{Fidelity, Schedule};
+use crate::response::harmonic::RotationTable;
+use crate::response::model::{
+    BandAverage, DirectSum, HarmonicSetup, HarmonicSum, Load, ModelChoice, ModelKind, ModelPlan,
+    VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
@@ -22,7 +23,7 @@ impl Plan {
     pub fn model_plans(&self, nsides: &[usize]) -> Vec<ModelPlan> {
         let spacecraft = &self.config.spacecraft;
         let plan = |((schedule, expected), &sky_nside): ((&Schedule, _), &usize)| {
-            let expected: super::Expected = expected;
+            let expected: crate::pipeline::Expected = expected;
             let longest = longest_baseline_wavelengths(&self.array, schedule);
             let (frequencies, stretch) = match spacecraft.smear_bandwidth {
                 true => {

@@ -26,7 +26,7 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// The plan of a configuration that [`super::ConfigSource::load`] has checked.
+    /// The plan of a configuration that [`crate::pipeline::ConfigSource::load`] has checked.
     ///
     /// # Errors
     /// An array that cannot be, or that never observes.
@@ -66,7 +66,7 @@ impl Plan {
     /// What is wrong with the files that the configuration names; reads them.
     #[must_use]
     pub fn file_problems(&self) -> Problems {
-        super::space::file_problems(self)
+        crate::pipeline::space::file_problems(self)
     }
 
     /// Rate that the daughters' samples need on their links, bit/s; `None` without samples.

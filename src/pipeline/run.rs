@@ -6,12 +6,12 @@ use std::time::Duration;
 
 use super::config::Config;
 use super::error::PipelineError;
-use super::ground::{self, GroundOutcome, Receiving, WAIT_BYTES};
+use super::ground::{GroundOutcome, Receiving, WAIT_BYTES};
 use super::plan::Plan;
 use super::sample_summary::SampleSummary;
 use super::sampling::SampleCounts;
-use super::space;
 use super::summary::{Segment, Summary};
+use super::{ground, space};
 use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
 use crate::downlink::socket::{Listening, SocketError, SocketSink, SocketSource};

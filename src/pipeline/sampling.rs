@@ -8,7 +8,8 @@ use super::sample_summary::SampleSummary;
 use crate::daughters::{LinkCounts, SampleLink, Sampler, SamplerCounts, Scene};
 use crate::frames::{Channel, GroundFrame, Instrument};
 use crate::mother::correlator::{Correlator, CorrelatorCounts, CorrelatorSetup};
-use crate::mother::{Fidelity, Schedule, VisibilityModel};
+use crate::mother::{Fidelity, Schedule};
+use crate::response::model::VisibilityModel;
 use crate::runtime::{Graph, Link};
 
 /// What the stages of sample fidelity count while they run.

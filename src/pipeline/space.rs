@@ -9,9 +9,10 @@ use super::sampling::{SampleCounts, samples};
 use crate::downlink::Transmitter;
 use crate::frames::GroundFrame;
 use crate::mother::{
-    DirectSum, Fidelity, Integrator, MeasurementOptions, Ninth, NinthSetup, NinthSky, NoiseModel, Observer,
-    PacedLink, Store,
+    Fidelity, Integrator, MeasurementOptions, Ninth, NinthSetup, NinthSky, NoiseModel, Observer, PacedLink,
+    Store,
 };
+use crate::response::model::DirectSum;
 use crate::runtime::{Graph, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::generated::generate;
@@ -67,7 +68,7 @@ pub fn add(
 ) -> Result<Link<Vec<u8>>, PipelineError> {
     let Plan { config, array, instrument, schedules, windows } = plan;
     let capacity = config.runtime.queue_capacity;
-    let models = super::models::build(plan, skies)?;
+    let models = crate::pipeline::models::build(plan, skies)?;
     if config.spacecraft.fidelity == Fidelity::Samples {
         let frames = samples(graph, plan, models, counts);
         let frames = add_ninth(graph, plan, skies, frames)?;

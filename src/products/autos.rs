@@ -122,7 +122,7 @@ fn table(powers: &[AutoPower]) -> String {
 fn draw(
     powers: &[AutoPower],
     summaries: &[AutoSummary],
-) -> Result<super::pictures::Picture, super::pictures::PictureError> {
+) -> Result<crate::products::pictures::Picture, crate::products::pictures::PictureError> {
     let mut spectra: BTreeMap<u32, Vec<(f64, f64)>> = BTreeMap::new();
     for own in summaries {
         spectra.entry(own.daughter).or_default().push((own.frequency_hz / 1e6, own.mean_k_sr));

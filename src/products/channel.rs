@@ -308,7 +308,7 @@ pub fn draw_relative_error(
     title: &str,
     subtitle: &str,
     comparison: &Comparison,
-) -> Result<super::pictures::Picture, super::pictures::PictureError> {
+) -> Result<crate::products::pictures::Picture, crate::products::pictures::PictureError> {
     let values = comparison.relative_error_map.values();
     let panel = MapPanel {
         values,
@@ -326,7 +326,7 @@ pub fn draw_relative_error(
 pub fn draw_comparison(
     title: &str,
     comparison: &Comparison,
-) -> Result<super::pictures::Picture, super::pictures::PictureError> {
+) -> Result<crate::products::pictures::Picture, crate::products::pictures::PictureError> {
     let curve = |label: &str, values: &[f64], dashed: bool| Curve {
         label: label.to_owned(),
         points: comparison.l.iter().map(|&l| l as f64).zip(values.iter().copied()).collect(),

@@ -32,7 +32,7 @@ pub enum ProductsError {
     Map(#[from] MapError),
     /// A picture.
     #[error(transparent)]
-    Picture(#[from] super::pictures::PictureError),
+    Picture(#[from] crate::products::pictures::PictureError),
     /// A map file.
     #[error(transparent)]
     Fits(#[from] FitsError),

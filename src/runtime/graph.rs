@@ -11,7 +11,8 @@ use super::metrics::{Counters, Metrics};
 use super::outlet::{Outlet, Queue, Stamped};
 use super::report::Report;
 use super::stage::{Sink, Source, Stage};
-use super::supervisor::{self, Limits};
+use super::supervisor;
+use super::supervisor::Limits;
 use super::worker::{Inlet, SinkWorker, SourceWorker, StageWorker, Worker};
 
 /// The output of a source or stage that nothing takes yet.

@@ -57,5 +57,5 @@ pub enum MapError {
     },
     /// A transform of the map failed.
     #[error(transparent)]
-    Harmonics(#[from] super::harmonics::HarmonicsError),
+    Harmonics(#[from] crate::sky::harmonics::HarmonicsError),
 }

@@ -33,7 +33,7 @@ impl Bilinear {
     /// # Errors
     /// [`MapError::Nside`].
     pub fn new(nside: usize) -> Result<Self, MapError> {
-        super::map::check_nside(nside)?;
+        crate::sky::map::check_nside(nside)?;
         let with_colatitude = |k| {
             let ring = ring(nside, k);
             (ring, ring.sin_theta.atan2(ring.z))

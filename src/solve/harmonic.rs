@@ -42,7 +42,7 @@ pub struct HarmonicSolution {
 
 /// Solves by conjugate gradients, preconditioned by the blocks of BtN^-1B that keep m.
 ///
-/// As [`super::solve_pixels`] with `T` among the functions of degree up to `l_max`; R is epsilon times the largest
+/// As [`crate::solve::solve_pixels`] with `T` among the functions of degree up to `l_max`; R is epsilon times the largest
 /// eigenvalue times the identity of orthonormal harmonics, which is that of equal pixels up to their area.
 /// `start` is an earlier solution's [`HarmonicSolution::unknowns`].
 ///

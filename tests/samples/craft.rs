@@ -9,8 +9,9 @@ use lunarray::frames::{
     AntennaResponse, Channel, GroundFrame, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame,
     VisibilityBlock,
 };
+use lunarray::mother::Schedule;
 use lunarray::mother::correlator::{Correlator, CorrelatorCounts, CorrelatorSetup, Division};
-use lunarray::mother::{DaughterPosition, ModelError, PairPosition, Schedule, VisibilityModel};
+use lunarray::response::model::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
 use lunarray::runtime::{Flow, Outlet, Source, Stage};
 use lunarray::units::MissionTime;
 use lunarray::units::constants::SPEED_OF_LIGHT_M_S;

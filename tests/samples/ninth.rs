@@ -8,9 +8,8 @@ use lunarray::array::{Array, ArrayConfig, ObservingWindows};
 use lunarray::frames::{
     AntennaResponse, Channel, GroundFrame, Housekeeping, Instrument, ObservingWindow, VisibilityBlock,
 };
-use lunarray::mother::{
-    DaughterPosition, DirectSum, Ninth, NinthConfig, NinthSetup, NinthSky, VisibilityModel,
-};
+use lunarray::mother::{Ninth, NinthConfig, NinthSetup, NinthSky};
+use lunarray::response::model::{DaughterPosition, DirectSum, VisibilityModel};
 use lunarray::runtime::{Outlet, Stage};
 use lunarray::sky::fits::{ReadOptions, WriteOptions, read_map, write_map};
 use lunarray::sky::generated::{GeneratedSky, generate};

@@ -2,7 +2,7 @@
 
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{AntennaResponse, VisibilityBlock};
-use lunarray::mother::{DirectSum, PairPosition, VisibilityModel};
+use lunarray::response::model::{DirectSum, PairPosition, VisibilityModel};
 use lunarray::sky::SkyMap;
 use lunarray::sky::fits::{ReadOptions, read_map};
 use lunarray::units::all_pairs;

@@ -7,8 +7,8 @@ use rayon::prelude::*;
 use super::HarmonicSetup;
 use super::grid::{Grids, NODES};
 use super::tori::Tori;
-use crate::array::harmonic::degrees;
-use crate::array::harmonic::filter::FilteredPatterns;
+use crate::response::harmonic::degrees;
+use crate::response::harmonic::filter::FilteredPatterns;
 use crate::sky::harmonics::WignerTable;
 
 /// For each m the matrix over l = m, m + 2, .. and that over l = m + 1, m + 3, ..: nothing couples even and odd

@@ -13,7 +13,7 @@ use super::{HarmonicEngine, HarmonicSetup};
 use crate::accumulation::AccumulationError;
 use crate::accumulation::checked::{Checked, RESPONSES, Summed, number_of, refused};
 use crate::accumulation::scale::Totals;
-use crate::array::harmonic::{GeometryLimits, NominalOrbit};
+use crate::response::harmonic::{GeometryLimits, NominalOrbit};
 
 const MAGIC: &[u8; 8] = b"LNRHRM03";
 

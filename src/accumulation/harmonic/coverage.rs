@@ -7,8 +7,8 @@ use serde::Serialize;
 
 use super::orbit_of;
 use crate::array::Ephemeris;
-use crate::array::harmonic::{GeometryLimits, GeometryRefusal, NominalOrbit, PairOrientation};
 use crate::frames::{GroundFrame, Instrument};
+use crate::response::harmonic::{GeometryLimits, GeometryRefusal, NominalOrbit, PairOrientation};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 /// The circle that pairs are on, and those that are not.

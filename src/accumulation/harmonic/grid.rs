@@ -2,10 +2,10 @@
 
 use std::f64::consts::TAU;
 
-use crate::array::harmonic::NodeGrid;
-use crate::array::harmonic::filter::FilteredPatterns;
-use crate::array::harmonic::kernel::{Kernel, LANES};
-use crate::array::harmonic::sizes::fft_length;
+use crate::response::harmonic::NodeGrid;
+use crate::response::harmonic::filter::FilteredPatterns;
+use crate::response::harmonic::kernel::{Kernel, LANES};
+use crate::response::harmonic::sizes::fft_length;
 
 /// Nodes in u, a wavelength; a pattern's band of |n_y| <= 1 needs 2.
 const NODES_PER_WAVELENGTH: f64 = 3.0;

@@ -1,7 +1,7 @@
 //! The harmonic engine: sums on tori, from which BtN^-1B acts on harmonic coefficients.
 //!
 //! On a common circular orbit every row of B is one rotation of a pattern that depends on the baseline's length
-//! alone (see [`mod@crate::array::harmonic`]). A row at baseline u is interpolated from nodes u_k by a compact
+//! alone (see [`mod@crate::response::harmonic`]). A row at baseline u is interpolated from nodes u_k by a compact
 //! kernel, `B = sum_k kappa(u_k - u) B_k`, so
 //!
 //! ```text
@@ -39,15 +39,15 @@ pub use grid::SPREAD_MULTIPLY_ADDS;
 pub use setup::{ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, application_size, memory, orbit_of};
 pub use sums::{HarmonicSums, coefficients, unknowns};
 
-use self::exact::{ExactTori, Quanta};
-use self::grid::Grids;
-use self::operator::Operator;
-use self::spread::Pending;
+use super::harmonic::exact::{ExactTori, Quanta};
+use super::harmonic::grid::Grids;
+use super::harmonic::operator::Operator;
+use super::harmonic::spread::Pending;
 use super::noise::companion_noise;
 use super::scale::{Scale, Totals};
 use super::{AccumulationError, Added, Direction, NormalEngine, Refusal, SumCounts};
-use crate::array::harmonic::PairOrientation;
 use crate::frames::PlacedVisibilities;
+use crate::response::harmonic::PairOrientation;
 
 /// Visibilities that are spread together: enough to keep all cores busy over the nodes, little memory.
 const BATCH: usize = 16_384;

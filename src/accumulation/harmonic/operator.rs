@@ -12,9 +12,9 @@ use rustfft::{Fft, FftPlanner};
 
 use super::grid::{Grids, NODE_GROUP, NODES};
 use super::tori::{Node, Tori};
-use crate::array::harmonic::filter::FilteredPatterns;
-use crate::array::harmonic::rotation::{RotationTable, orders};
-use crate::array::harmonic::{PatternGeometry, PatternTable, degrees};
+use crate::response::harmonic::filter::FilteredPatterns;
+use crate::response::harmonic::rotation::{RotationTable, orders};
+use crate::response::harmonic::{PatternGeometry, PatternTable, degrees};
 use crate::sky::harmonics::Alm;
 
 /// Alphas of a block: columns of its matrix products, halved.

@@ -3,8 +3,8 @@
 use super::grid::Grids;
 use super::operator::Operator;
 use crate::accumulation::AccumulationError;
-use crate::array::harmonic::{GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry, degrees};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
+use crate::response::harmonic::{GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry, degrees};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 /// What distinguishes one harmonic engine from another.

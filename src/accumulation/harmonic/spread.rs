@@ -5,7 +5,7 @@ use pulp::{Arch, Simd, WithSimd};
 use super::exact::{BIAS, ExactNode, Integers, Quanta, Row, TERM_MAX, biases};
 use super::grid::{Grids, NODES};
 use crate::accumulation::Direction;
-use crate::array::harmonic::kernel::LANES;
+use crate::response::harmonic::kernel::LANES;
 
 /// A visibility as it waits to be spread; one that is to be taken out has a negative weight and negative sides.
 #[derive(Clone, Copy, Debug, PartialEq)]

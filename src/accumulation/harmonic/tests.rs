@@ -2,11 +2,11 @@ use num_complex::Complex64;
 
 use super::*;
 use crate::accumulation::NormalSums;
-use crate::array::harmonic::{
-    GeometryLimits, GeometryRefusal, HarmonicModel, ModelSettings, NominalOrbit, PairState, PatternGeometry,
-};
 use crate::array::{Array, ArrayConfig};
 use crate::frames::AntennaResponse;
+use crate::response::harmonic::{
+    GeometryLimits, GeometryRefusal, HarmonicModel, ModelSettings, NominalOrbit, PairState, PatternGeometry,
+};
 use crate::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
 use crate::units::{Pair, all_pairs};
 

@@ -3,17 +3,17 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::super::config::Format;
-use super::super::counters::ReceptionCounters;
-use super::super::cuc::CucTime;
-use super::super::header::PacketHeader;
-use super::super::kind::Kind;
-use super::super::receiver::Event;
 use super::{
     ChannelSummary, Contents, DamagedEntry, EphemerisSummary, FaultEntry, GapEntry, GarbageEntry,
     HousekeepingSummary, InstrumentSummary, LISTED_MAX, Listing, PairSummary, Span, VisibilityCounts,
     tai_text,
 };
+use crate::downlink::config::Format;
+use crate::downlink::counters::ReceptionCounters;
+use crate::downlink::cuc::CucTime;
+use crate::downlink::header::PacketHeader;
+use crate::downlink::kind::Kind;
+use crate::downlink::receiver::Event;
 use crate::frames::{
     AntennaResponse, EphemerisSegment, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
 };
@@ -164,7 +164,7 @@ impl Survey {
             |(entry, time): (DamagedEntry, CucTime)| DamagedEntry { time_s: mission_s(time), ..entry };
         let packets = Kind::ALL.map(|kind| {
             let (counts, seen) = (reception.kind(kind), self.seen[kind.index()]);
-            super::KindSummary {
+            crate::downlink::contents::KindSummary {
                 kind,
                 apid: kind.apid(),
                 packets: counts.packets,

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use super::super::counters::ReceptionCounters;
 use super::{Contents, Listing, VisibilityCounts};
+use crate::downlink::counters::ReceptionCounters;
 
 /// Columns of channels side by side.
 const CHANNELS_A_ROW: usize = 6;

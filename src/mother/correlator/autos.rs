@@ -99,7 +99,7 @@ impl AutoIntegrator {
                     continue;
                 }
                 let mut flags = Flags::GOOD;
-                if (count as f64) < super::stage::COMPLETE_MIN * self.samples as f64 {
+                if (count as f64) < crate::mother::correlator::stage::COMPLETE_MIN * self.samples as f64 {
                     flags.0 |= Flags::INCOMPLETE.0;
                 }
                 if saturated {

@@ -320,8 +320,8 @@ mod x86 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::kernel::no_sums;
     use super::*;
+    use crate::mother::correlator::kernel::no_sums;
 
     /// All codes there are, but for one channel of daughter 1.
     fn codes(daughter: usize) -> Codes {

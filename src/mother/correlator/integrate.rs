@@ -276,7 +276,7 @@ fn longest_m(schedule: &Schedule) -> f64 {
 pub fn dump_samples(array: &Array, schedules: &[Schedule], rate_hz: f64, sub_bands: usize) -> usize {
     let most = (shortest_integration_s(array, schedules) * rate_hz / 8.0) as usize;
     let samples = [64, 32].into_iter().find(|&samples| samples <= most);
-    samples.unwrap_or(super::kernel::SLICE).max(sub_bands)
+    samples.unwrap_or(crate::mother::correlator::kernel::SLICE).max(sub_bands)
 }
 
 /// Seconds of the longest time that offsets in ticks can tell apart in a window.

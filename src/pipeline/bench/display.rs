@@ -97,8 +97,9 @@ fn core_seconds(value: Option<f64>) -> String {
 
 fn write_run(f: &mut fmt::Formatter<'_>, run: &ChainRun) -> fmt::Result {
     writeln!(f, "{}", run.report)?;
-    let depths =
-        |queue: &super::QueueDepths| format!("{} {}/{}/{}", queue.stage, queue.p10, queue.p50, queue.p90);
+    let depths = |queue: &crate::pipeline::bench::QueueDepths| {
+        format!("{} {}/{}/{}", queue.stage, queue.p10, queue.p50, queue.p90)
+    };
     let queues: Vec<String> = run.queues.iter().map(depths).collect();
     writeln!(f, "queued over {} looks, p10/p50/p90: {}", run.times_s.len(), queues.join(", "))
 }

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::PoisonError;
 
 use super::error::StateError;
-use super::file::{self, HeadView};
+use super::file;
+use super::file::HeadView;
 use super::folder::{StateFolder, checkpoints};
 use super::journal::{Journal, OtherLine, digest};
 use super::settings::{compare, settings_of};

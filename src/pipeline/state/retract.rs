@@ -248,9 +248,10 @@ impl Keeper {
                 Some(GroundFrame::Housekeeping(report)) => self.calibrator.forget_report(&report),
                 Some(GroundFrame::Ephemeris(segment)) if line.segment.is_some() => {
                     let others = keys.iter().collect::<BTreeSet<_>>();
-                    let brought = |(key, other): (&(Kind, Sent), &super::journal::OtherLine)| {
-                        other.segment == line.segment && !others.contains(key)
-                    };
+                    let brought =
+                        |(key, other): (&(Kind, Sent), &crate::pipeline::state::journal::OtherLine)| {
+                            other.segment == line.segment && !others.contains(key)
+                        };
                     if !self.journal.others.iter().any(brought) {
                         self.calibrator.forget_segment(segment.start);
                     }

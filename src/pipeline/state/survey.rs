@@ -4,7 +4,8 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use super::error::StateError;
-use super::file::{self, Head};
+use super::file;
+use super::file::Head;
 use super::folder::{checkpoints, note};
 use super::gaps::{Gaps, Positions, Reading, Received, find_gaps};
 use super::journal::JournalEntry;

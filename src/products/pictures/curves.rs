@@ -2,9 +2,10 @@
 
 use super::canvas::{Canvas, Colour, FAINT, INK, Rect, Stroke, WHITE};
 use super::error::PictureError;
-use super::labels::{self, Ticks};
+use super::labels::Ticks;
 use super::png_file::Picture;
-use super::text::{self, Align, Style};
+use super::text::{Align, Style};
+use super::{labels, text};
 
 /// Colours that colour-blind readers can tell apart (Okabe & Ito 2008).
 const COLOURS: [Colour; 7] = [

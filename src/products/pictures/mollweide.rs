@@ -7,7 +7,8 @@ use rayon::prelude::*;
 use super::canvas::{Canvas, Colour, FAINT, INK, Rect, Stroke, WHITE};
 use super::projection::{Parallel, forward};
 use super::scale::{Scale, is_seen};
-use super::text::{self, Align, Style};
+use super::text;
+use super::text::{Align, Style};
 use crate::sky::healpix::{Ring, pixel_of, ring};
 use crate::units::vector::{Vec3, dot};
 

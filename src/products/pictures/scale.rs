@@ -2,7 +2,8 @@
 
 use super::canvas::Colour;
 use super::error::PictureError;
-use super::labels::{self, Ticks};
+use super::labels;
+use super::labels::Ticks;
 use crate::sky::is_unseen;
 
 /// How values spread over a scale.

@@ -2,10 +2,11 @@
 
 use super::canvas::{Canvas, FAINT, INK, Rect, Stroke};
 use super::error::PictureError;
-use super::mollweide::{self, Field, View};
+use super::mollweide::{Field, View};
 use super::png_file::Picture;
 use super::scale::Scale;
-use super::text::{self, Align, Style};
+use super::text::{Align, Style};
+use super::{mollweide, text};
 use crate::sky::healpix::nside_of;
 
 /// One map of a page.

@@ -115,7 +115,7 @@ impl ColumnLayout {
             scale: real("TSCAL", 1.0),
             zero: real("TZERO", 0.0),
             null: header.get(&format!("TNULL{number}")).and_then(|value| match value {
-                super::CardValue::Integer(null) => Some(*null),
+                crate::sky::fits::CardValue::Integer(null) => Some(*null),
                 _ => None,
             }),
         })

@@ -189,7 +189,7 @@ fn shell_path(cos: f64, radius: f64) -> f64 {
 }
 
 fn place(longitude_deg: f64, latitude_deg: f64) -> Vec3 {
-    unit(super::direction_of(longitude_deg.to_radians(), latitude_deg.to_radians()))
+    unit(crate::sky::generated::direction_of(longitude_deg.to_radians(), latitude_deg.to_radians()))
 }
 
 #[cfg(test)]

@@ -165,7 +165,7 @@ impl Galaxy {
             .map(|node| {
                 let latitude = node_latitude(node / LONGITUDES);
                 let longitude = PI * (node % LONGITUDES) as f64 / (LONGITUDES - 1) as f64;
-                transfer(super::direction_of(longitude, latitude), &edges, &scales)
+                transfer(crate::sky::generated::direction_of(longitude, latitude), &edges, &scales)
             })
             .collect();
         Self {
@@ -278,7 +278,7 @@ mod tests {
         for k in 0..400_u32 {
             let longitude = f64::from(k) * 2.399_963;
             let latitude = (2.0 * (f64::from(k) + 0.5) / 400.0 - 1.0).asin();
-            let direction = super::super::direction_of(longitude, latitude);
+            let direction = crate::sky::generated::direction_of(longitude, latitude);
             let cloud = 1.7 * f64::from(k).sin();
             let scales = [galaxy.opacity_scale * galaxy.opacity_factor(cloud); CLOUDS];
             let ray = transfer(direction, &edges, &scales);
@@ -293,7 +293,7 @@ mod tests {
 
     #[test]
     fn thin_gas_lets_everything_through_and_thick_gas_little() {
-        let direction = super::super::direction_of(0.3, 0.0);
+        let direction = crate::sky::generated::direction_of(0.3, 0.0);
         let clear = Galaxy::new(1e12, 0.0).sight(direction, 0.0);
         let scale = (1e12_f64 / REFERENCE_HZ).powf(-SYNCHROTRON_INDEX);
         assert!((clear.synchrotron_k / (scale * clear.unabsorbed_reference_k) - 1.0).abs() < 3e-3);

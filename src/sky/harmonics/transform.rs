@@ -108,7 +108,7 @@ impl Transform {
 
     /// The transpose of synthesis times the pixel area: sum over pixels of map conj(Y_lm) 4 pi / N_pix.
     ///
-    /// This is the plain quadrature for a_lm; see [`super::analysis`] for the coefficients themselves.
+    /// This is the plain quadrature for a_lm; see [`crate::sky::harmonics::analysis`] for the coefficients themselves.
     ///
     /// # Errors
     /// [`HarmonicsError::Pixels`] unless `map` has the transform's `nside`.

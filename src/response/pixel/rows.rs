@@ -7,9 +7,9 @@ use multiversion::multiversion;
 use super::average::{Means, block_means};
 use super::blocks::{BlockClass, BlockSet, GROUP, Group};
 use super::edge::cut_mean;
-use super::exact::{self, child_directions};
+use super::exact::child_directions;
 use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused};
-use super::{CHILDREN, Directions, PairGeometry, PixelMethod, ResponseError};
+use super::{CHILDREN, Directions, PairGeometry, PixelMethod, ResponseError, exact};
 use crate::sky::healpix;
 use crate::units::vector::{Vec3, norm};
 

@@ -263,8 +263,8 @@ mod tests {
     use std::f64::consts::{PI, TAU};
 
     use super::*;
-    use crate::array::harmonic::runs::wrap;
     use crate::array::{Array, ArrayConfig};
+    use crate::response::harmonic::runs::wrap;
     use crate::units::all_pairs;
 
     const RADIUS_M: f64 = 2_037_100.0;

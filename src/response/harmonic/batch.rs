@@ -5,14 +5,13 @@ use std::f64::consts::{FRAC_PI_2, TAU};
 use num_complex::{Complex32, Complex64};
 use rayon::prelude::*;
 
-use super::PairState;
 use super::blocked::{BLOCK_NODES, PATTERN_LANES};
-use super::chebyshev;
 use super::forward::{ALPHAS_MAX, AlphaPart, Group, ORDER_LANES, OrderBlock, RunPlan, project};
 use super::kernel::LANES;
 use super::model::{ALPHA_TOLERANCE, HarmonicModel, TERMS};
 use super::rotation::orders;
 use super::runs::Run;
+use super::{PairState, chebyshev};
 
 /// Alphas of the grid for which the sky is turned at once.
 pub(super) const ALPHA_BLOCK: usize = 64;

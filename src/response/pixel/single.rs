@@ -34,7 +34,7 @@ impl SingleGeometry {
     }
 }
 
-/// `Int T A S dn` of each satellite, K sr, for a sky (K) at `directions`, `area_sr` each; as [`super::sky_sums`] in
+/// `Int T A S dn` of each satellite, K sr, for a sky (K) at `directions`, `area_sr` each; as [`crate::response::pixel::sky_sums`] in
 /// accuracy and threads.
 ///
 /// # Errors
@@ -52,7 +52,7 @@ pub fn sky_powers(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::array::response::{PairGeometry, sky_sums};
+    use crate::response::pixel::{PairGeometry, sky_sums};
     use crate::sky::healpix::{pixel_area_sr, pixel_directions};
     use crate::units::vector::{cross, scale, unit};
     use std::f64::consts::PI;

@@ -5,12 +5,12 @@ use std::sync::Arc;
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::model::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
-use crate::array::harmonic::{
+use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
+use crate::frames::AntennaResponse;
+use crate::response::harmonic::{
     GeometryLimits, GeometryRefusal, HarmonicError, HarmonicModel, ModelSettings, NominalOrbit,
     PairOrientation, PairState, PatternGeometry, RotationTable,
 };
-use crate::frames::AntennaResponse;
 use crate::sky::harmonics::Alm;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
@@ -154,7 +154,7 @@ impl VisibilityModel for HarmonicSum {
 mod tests {
     use super::*;
     use crate::array::{Array, ArrayConfig};
-    use crate::mother::DirectSum;
+    use crate::response::model::DirectSum;
     use crate::sky::healpix::pixel_directions;
     use crate::sky::{Frame, SkyMap};
     use std::f64::consts::PI;

@@ -24,7 +24,7 @@ const LANES: usize = 16;
 /// Visibilities (K sr) of a sky (K) at `directions`, `area_sr` each, at the frequencies of `comb`: those of one pair
 /// after another. The Moon hides what it hides at any frequency.
 ///
-/// As [`super::sky_sums`] in layout and accuracy, but that a fringe loses 1e-7 with each frequency. Runs on the
+/// As [`crate::response::pixel::sky_sums`] in layout and accuracy, but that a fringe loses 1e-7 with each frequency. Runs on the
 /// thread that calls.
 ///
 /// # Errors
@@ -148,9 +148,9 @@ impl Fringes {
 
 #[cfg(test)]
 mod tests {
-    use super::super::exact;
     use super::*;
     use crate::frames::AntennaResponse;
+    use crate::response::pixel::exact;
     use crate::sky::healpix::{pixel_area_sr, pixel_directions};
 
     #[test]

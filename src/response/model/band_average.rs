@@ -4,8 +4,8 @@ use std::f64::consts::{E, PI};
 
 use num_complex::Complex64;
 
-use super::model::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
-use crate::array::harmonic::quadrature::GaussLegendre;
+use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
+use crate::response::harmonic::quadrature::GaussLegendre;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
 
@@ -100,7 +100,7 @@ mod tests {
     use super::*;
     use crate::array::{Array, ArrayConfig};
     use crate::frames::AntennaResponse;
-    use crate::mother::DirectSum;
+    use crate::response::model::DirectSum;
     use crate::sky::healpix::{pixel_area_sr, pixel_directions};
     use crate::sky::{Frame, SkyMap};
     use crate::units::vector::dot;

@@ -2,11 +2,11 @@
 
 use num_complex::Complex64;
 
-use super::model::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
-use crate::array::response::{
+use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
+use crate::frames::AntennaResponse;
+use crate::response::pixel::{
     Comb, Directions, PairGeometry, SingleGeometry, comb_sums, sky_powers, sky_sums,
 };
-use crate::frames::AntennaResponse;
 use crate::sky::SkyMap;
 use crate::sky::healpix::pixel_area_sr;
 

@@ -1,10 +1,20 @@
 //! What the array would measure without noise.
 
+mod band_average;
+mod choice;
+mod direct;
+mod harmonic;
+
+pub use band_average::BandAverage;
+pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
+pub use direct::DirectSum;
+pub use harmonic::{HarmonicSetup, HarmonicSum};
+
 use num_complex::Complex64;
 use thiserror::Error;
 
-use crate::array::harmonic::{GeometryRefusal, HarmonicError};
-use crate::array::response::Comb;
+use super::harmonic::{GeometryRefusal, HarmonicError};
+use super::pixel::Comb;
 use crate::array::stretched;
 use crate::units::vector::Vec3;
 

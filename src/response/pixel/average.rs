@@ -1,7 +1,7 @@
 //! Averages of a fringe over blocks of children in closed form.
 //!
 //! Over a block the phase is `2 pi u . c + alpha x + beta y` plus a small quadratic (see
-//! [`super::blocks`]). The mean of exp(-i alpha x) over m children is the Dirichlet kernel
+//! [`crate::response::pixel::blocks`]). The mean of exp(-i alpha x) over m children is the Dirichlet kernel
 //! `sin(alpha/2) / (m sin(alpha/2m)) = S(t) / S(t/m)`, t = alpha/2, S(t) = sin t / t. The quadratic is
 //! taken to first order, which needs the means of x and x^2 as well: with P(t) = S'(t) / t,
 //! `<x e> = (i/2) t P` and `<(x^2 - 1/12) e> = S/6 + P/2`.
@@ -31,7 +31,7 @@ impl Default for Means {
 }
 
 /// Means of A S_i S_j exp(-2 pi i u . n) over blocks of `children`^2 children. Blocks that a limb may
-/// cut are marked and left to [`super::edge`]; returns whether there is any.
+/// cut are marked and left to [`crate::response::pixel::edge`]; returns whether there is any.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 pub(super) fn block_means(pair: &Prepared, children: usize, group: &Group, means: &mut Means) -> bool {
     const FMA: bool =
