@@ -7,13 +7,13 @@ use std::path::Path;
 use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup};
 use lunarray::accumulation::{NormalEngine, PixelEngine, PixelSetup};
 use lunarray::array::{Array, ArrayConfig, segments_for};
-use lunarray::downlink::cadu::{DATA_BYTES, randomize};
+use lunarray::downlink::wire::cadu::{DATA_BYTES, randomize};
 use lunarray::downlink::{DownlinkConfig, Format, HEADER_BYTES, PacketHeader, TRAILER_BYTES, Transmission};
 use lunarray::frames::{
     AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, PlacedVisibilities,
     VisibilityBlock,
 };
-use lunarray::pipeline::state::Keeper;
+use lunarray::ground::archive::Keeper;
 use lunarray::pipeline::{Config, ConfigSource};
 use lunarray::response::harmonic::NominalOrbit;
 use lunarray::response::pixel::PixelMethod;

@@ -33,6 +33,8 @@ pub mod calibration;
 
 pub mod accumulation;
 
+pub mod ground;
+
 pub mod solve;
 
 pub mod products;
@@ -40,5 +42,7 @@ pub mod products;
 pub mod runtime;
 
 pub mod pipeline;
+
+pub mod bench;
 
 pub mod cli;

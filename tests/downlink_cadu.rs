@@ -4,9 +4,9 @@
 mod common;
 
 use common::downlink::{mission, packets_of, transmit};
-use lunarray::downlink::cadu::{
-    CaduReceiver, DATA_BYTES, FrameCounters, HOUSEKEEPING, INTERLEAVES, ReedSolomon, SCIENCE, SYNC_MARKER,
-    randomize,
+use lunarray::downlink::receive::cadu::{CaduReceiver, FrameCounters};
+use lunarray::downlink::wire::cadu::{
+    DATA_BYTES, HOUSEKEEPING, INTERLEAVES, ReedSolomon, SCIENCE, SYNC_MARKER, randomize,
 };
 use lunarray::downlink::{DownlinkConfig, Format};
 use lunarray::units::{StreamKind, random_stream};

@@ -10,16 +10,16 @@ use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 use lunarray::accumulation::{Accumulator, MapConfig};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows, segments_for};
 use lunarray::calibration::{CalibrationConfig, Calibrator};
-use lunarray::downlink::cadu::INTERLEAVES;
 use lunarray::downlink::link::{LinkConfig, LinkSimulator, PacketRange, Truth};
+use lunarray::downlink::wire::cadu::INTERLEAVES;
 use lunarray::downlink::{
-    Collector, Decoder, Delivery, DownlinkConfig, Event, Format, Intake, Kind, Reception, ReceptionCounters,
-    Transmission,
+    Decoder, DownlinkConfig, Event, Format, Intake, Kind, ReceptionCounters, Transmission,
 };
 use lunarray::frames::{
     AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, PlacedFrame,
     VisibilityBlock,
 };
+use lunarray::ground::{Collector, Delivery, Reception};
 use lunarray::mother::{PacedLink, SpacecraftConfig, Store, StoreDrop};
 use lunarray::runtime::{Ledger, LedgerReport, Outlet, Stage};
 use lunarray::units::{ChannelId, all_pairs};

@@ -6,8 +6,8 @@ mod common;
 use std::collections::{BTreeMap, BTreeSet};
 
 use common::downlink::{mission, packets_of, transmit};
-use lunarray::downlink::cadu::FrameCounters;
 use lunarray::downlink::link::{Fate, LinkConfig, LinkSimulator, PacketRange, Truth};
+use lunarray::downlink::receive::cadu::FrameCounters;
 use lunarray::downlink::{Decoder, DownlinkConfig, Event, Format, Intake, PacketHeader, ReceptionCounters};
 use lunarray::frames::GroundFrame;
 use proptest::prelude::*;

@@ -4,7 +4,7 @@
 use std::sync::LazyLock;
 
 use libfuzzer_sys::fuzz_target;
-use lunarray::downlink::cadu::{CaduEncoder, ReedSolomon};
+use lunarray::downlink::wire::cadu::{CaduEncoder, ReedSolomon};
 use lunarray::downlink::{Decoder, Event, Intake};
 
 static PASS: LazyLock<Vec<u8>> = LazyLock::new(|| {

@@ -7,7 +7,7 @@ use crc_fast::CrcAlgorithm::{Crc32Iscsi, Crc64Nvme};
 use libfuzzer_sys::fuzz_target;
 use lunarray::accumulation::harmonic::HarmonicEngine;
 use lunarray::accumulation::{EngineKind, MapConfig, NormalEngine, PixelEngine};
-use lunarray::pipeline::state::Survey;
+use lunarray::ground::archive::Survey;
 
 static MAPS: LazyLock<[MapConfig; 2]> = LazyLock::new(|| {
     let of = |engine| MapConfig { engine, ..MapConfig::default() };

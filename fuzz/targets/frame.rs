@@ -3,7 +3,8 @@
 
 use libfuzzer_sys::fuzz_target;
 use lunarray::downlink::Receiver;
-use lunarray::downlink::cadu::{CaduReceiver, DATA_BYTES, ReedSolomon, SYNC_MARKER, randomize};
+use lunarray::downlink::receive::cadu::CaduReceiver;
+use lunarray::downlink::wire::cadu::{DATA_BYTES, ReedSolomon, SYNC_MARKER, randomize};
 
 fuzz_target!(|data: &[u8]| {
     let code = ReedSolomon::new(1).expect("depth 1");

@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::{CommandResult, Outcome, print_json_line, print_text};
-use crate::pipeline::{BENCH_STAGES, BenchSettings, ConfigSource, Plan, bench, bench_config, use_threads};
+use crate::bench::{BENCH_STAGES, BenchSettings, bench_config};
+use crate::pipeline::{ConfigSource, Plan, use_threads};
 
 /// Measure each stage of the sampled spacecraft alone, and the chain from samples to received visibilities.
 ///
@@ -49,7 +50,7 @@ pub(super) fn execute(args: &BenchArgs) -> CommandResult {
     let plan = Plan::new(config)?;
     use_threads(&plan.config.runtime)?;
     let settings = BenchSettings { stage: args.stage.clone(), runs: args.runs.into(), growth: args.growth };
-    let measured = bench(&plan, &settings)?;
+    let measured = crate::bench::bench(&plan, &settings)?;
     if args.json {
         print_json_line(&measured)?;
     } else {

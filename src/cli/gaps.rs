@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::{CommandResult, Outcome, print_json_line, print_text};
 use crate::downlink::Kind;
-use crate::pipeline::state::{GapReport, Gaps, RestartReport, Survey};
+use crate::ground::archive::{GapReport, Gaps, RestartReport, Survey};
 
 /// List packets that are missing, and what they would add to the map.
 ///

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::{CommandResult, Outcome, print_text};
-use crate::pipeline::state::Keeper;
+use crate::ground::archive::Keeper;
 use crate::pipeline::{ConfigSource, use_threads};
 
 /// Put the states of several grounds together.

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::CommandError;
-use crate::downlink::socket::ListenStatus;
+use crate::downlink::transport::socket::ListenStatus;
 use crate::pipeline::Watched;
 use crate::runtime::Cancel;
 use crate::solve::Solving;

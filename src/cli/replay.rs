@@ -7,9 +7,9 @@ use crossbeam_channel::{Receiver, bounded};
 
 use super::progress::{Progress, cancel_on_interrupt};
 use super::{CommandError, CommandResult, Outcome, not_negative_s, print_json_line, print_text};
-use crate::downlink::socket::{SocketError, SocketSource, TcpUrl, Until};
+use crate::downlink::transport::socket::{SocketError, SocketSource, TcpUrl, Until};
 use crate::downlink::{FileSource, Pace, Paced, Steps};
-use crate::pipeline::state::Keeper;
+use crate::ground::archive::Keeper;
 use crate::pipeline::{
     Config, ConfigSource, GroundSource, PipelineError, READ, Receiving, Summary, WAIT_BYTES, replay,
     use_threads,

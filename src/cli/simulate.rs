@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::progress::{Progress, cancel_on_interrupt};
 use super::{CommandResult, Outcome, PipelineArgs, not_negative_s, print_json_line, print_text, tell_notes};
-use crate::downlink::socket::{SendOptions, SocketSink, TcpUrl};
+use crate::downlink::transport::socket::{SendOptions, SocketSink, TcpUrl};
 use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, use_threads};
 
 /// Simulate the space segment, to a downlink file or to a ground that listens.

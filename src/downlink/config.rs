@@ -2,29 +2,19 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::cadu::{CaduEncoder, INTERLEAVES, ReedSolomon};
 use super::error::DownlinkError;
-use super::header::{HEADER_BYTES, PACKET_BYTES_MAX, TRAILER_BYTES};
 use super::link::LinkConfig;
-use super::payload::{VISIBILITY_BYTES, visibilities_in};
-use super::socket::ListenConfig;
+use super::transport::socket::ListenConfig;
+use super::wire::Format;
+use super::wire::cadu::{CaduEncoder, INTERLEAVES, ReedSolomon};
+use super::wire::payload::{VISIBILITY_BYTES, visibilities_in};
+use super::wire::{HEADER_BYTES, PACKET_BYTES_MAX, TRAILER_BYTES};
 
 /// Least packet that holds headers and more than one record of any kind.
 const PACKET_BYTES_MIN: usize = 256;
 
 /// Most frames of idle data before a pass: a megabyte.
 const IDLE_FRAMES_MAX: u32 = 1_000;
-
-/// What a downlink is made of.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Format {
-    /// Space packets, one after the other.
-    #[default]
-    Packets,
-    /// Packets in coded transfer frames (CADU).
-    Cadu,
-}
 
 /// The `[downlink]` section.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use super::payload::PayloadFault;
+use super::wire::payload::PayloadFault;
 
 /// Why a downlink cannot be written or read.
 #[derive(Debug, Error)]
@@ -92,7 +92,7 @@ pub enum DownlinkError {
     },
     /// A socket.
     #[error(transparent)]
-    Socket(#[from] crate::downlink::socket::SocketError),
+    Socket(#[from] crate::downlink::transport::socket::SocketError),
     /// A downlink that was to be damaged and already is.
     #[error(
         "at byte {offset}: no sound frame or packet; expected a whole downlink, as `lunarray simulate` writes it"
@@ -154,7 +154,25 @@ pub enum DownlinkError {
 
 impl DownlinkError {
     /// The error with the file that it is about.
-    pub(super) fn at(self, path: &std::path::Path) -> Self {
+    pub(crate) fn at(self, path: &std::path::Path) -> Self {
         Self::At { path: path.to_owned(), source: Box::new(self) }
     }
+}
+
+/// An error for a file of so many bytes if there was no packet in it.
+pub(crate) fn require_packets(path: &std::path::Path, bytes: u64, packets: u64) -> Result<(), DownlinkError> {
+    match (bytes, packets) {
+        (0, _) => Err(DownlinkError::Empty { path: path.to_owned() }),
+        (_, 0) => Err(DownlinkError::Foreign { path: path.to_owned(), bytes }),
+        _ => Ok(()),
+    }
+}
+
+/// An error of the operating system on a file.
+pub(crate) fn io_error(
+    path: &std::path::Path,
+    action: &'static str,
+) -> impl FnOnce(io::Error) -> DownlinkError {
+    let path = path.to_owned();
+    move |source| DownlinkError::Io { path, action, source }
 }

@@ -8,7 +8,7 @@
 //! | space packet, time code | CCSDS 133.0-B, 301.0-B | [`Packetizer`], [`Receiver`] |
 //! | transfer frame, Reed-Solomon, randomizer, sync marker | CCSDS 732.0-B, 131.0-B | [`cadu`] |
 //! | either of the two | | [`Intake`] |
-//! | every packet once, in order, across files and sessions | | [`Collector`] |
+//! | every packet once, in order, across files and sessions | | [`crate::ground::Collector`] |
 //! | file | | [`DownlinkWriter`], [`DownlinkReader`], [`Contents`] |
 //! | socket | | [`socket`] |
 //!
@@ -42,48 +42,25 @@
 //! The header has a check of its own so that a damaged packet can still be told from noise, and its loss
 //! given a kind, a time and a count.
 
-pub mod cadu;
-mod collector;
 mod config;
-pub mod contents;
-mod counters;
-mod cuc;
-mod decoder;
-mod error;
-mod file;
-mod header;
-mod intake;
-mod kind;
+pub(crate) mod error;
 pub mod link;
-mod pace;
-mod packetizer;
-mod payload;
-mod receiver;
-mod reception;
-mod sequence;
-pub mod socket;
-mod stages;
-mod taken;
-mod transmission;
-mod waiting;
+pub mod receive;
+pub mod transport;
+pub mod wire;
 
-pub use collector::{Collector, CollectorState, CollectorView, Delivery, Placed};
-pub use config::{DownlinkConfig, Format};
-pub use contents::Contents;
-pub use counters::{FaultCounts, KindCounts, ReceptionCounters};
-pub use cuc::CucTime;
-pub use decoder::{Decoder, DecoderState};
+pub use config::DownlinkConfig;
 pub use error::DownlinkError;
-pub use file::{DownlinkReader, DownlinkWriter};
-pub use header::{FORMAT_VERSION, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, Segment, TRAILER_BYTES};
-pub use intake::Intake;
-pub use kind::{APID_BASE, Kind};
-pub use pace::{Pace, Paced, Steps};
-pub use packetizer::Packetizer;
-pub use payload::{NODES_MIN, PayloadFault};
-pub use receiver::{Event, Packet, Receiver};
-pub use reception::Reception;
-pub use stages::{FileSource, Recorder, Transmitter};
-pub use taken::{Era, Taken};
-pub use transmission::Transmission;
-pub use waiting::{Waiting, WaitingPacket};
+pub use link::LinkConfig;
+pub use receive::contents::{self, Contents};
+pub use receive::{
+    Decoder, DecoderState, Era, Event, FaultCounts, Intake, KindCounts, Packet, Receiver, ReceptionCounters,
+    Taken,
+};
+pub use transport::{
+    DownlinkReader, DownlinkWriter, FileSource, Pace, Paced, Recorder, Steps, Transmitter, socket,
+};
+pub use wire::{
+    APID_BASE, CucTime, FORMAT_VERSION, Format, HEADER_BYTES, Kind, NODES_MIN, PACKET_BYTES_MAX,
+    PacketHeader, Packetizer, PayloadFault, Segment, TRAILER_BYTES, Transmission, cadu,
+};

@@ -9,8 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::config::SpacecraftError;
 use crate::array::Array;
 use crate::frames::{Flags, GroundFrame, Housekeeping, ObservingWindow, Spectrometer, VisibilityBlock};
-use crate::response::model::DirectSum;
-use crate::response::model::{DaughterPosition, ModelError, VisibilityModel};
+use crate::response::model::{DaughterPosition, DirectSum, ModelError, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{ChannelId, Pair, StreamKind, TICKS_PER_SECOND, random_stream};
 

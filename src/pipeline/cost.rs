@@ -5,9 +5,9 @@ use std::time::Instant;
 
 use serde::Serialize;
 
-use super::bench::sampling_cost;
 use super::engine_cost::EngineCost;
 use super::plan::Plan;
+use crate::bench::sampling_cost;
 use crate::frames::ObservingWindow;
 use crate::mother::{Fidelity, VISIBILITY_BYTES};
 use crate::response::model::{ModelKind, ModelPlan};

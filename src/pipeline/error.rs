@@ -53,7 +53,7 @@ pub enum PipelineError {
     Products(#[from] crate::products::ProductsError),
     /// The state of the ground cannot be kept.
     #[error(transparent)]
-    State(#[from] crate::pipeline::state::StateError),
+    State(#[from] crate::ground::archive::StateError),
     /// Nothing to make a map of.
     #[error(
         "no pair's visibility could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",

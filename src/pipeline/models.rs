@@ -87,7 +87,7 @@ fn longest_baseline_wavelengths(array: &Array, schedule: &Schedule) -> f64 {
 ///
 /// # Errors
 /// A sky whose coefficients cannot be found; a model that cannot be.
-pub(super) fn build(plan: &Plan, skies: &[SkyMap]) -> Result<Vec<Box<dyn VisibilityModel>>, PipelineError> {
+pub(crate) fn build(plan: &Plan, skies: &[SkyMap]) -> Result<Vec<Box<dyn VisibilityModel>>, PipelineError> {
     let nsides: Vec<usize> = skies.iter().map(SkyMap::nside).collect();
     let array = &plan.array;
     let mut rotations: HashMap<usize, Arc<RotationTable<f32>>> = HashMap::new();

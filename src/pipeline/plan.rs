@@ -66,7 +66,7 @@ impl Plan {
     /// What is wrong with the files that the configuration names; reads them.
     #[must_use]
     pub fn file_problems(&self) -> Problems {
-        crate::pipeline::space::file_problems(self)
+        crate::pipeline::space_segment::file_problems(self)
     }
 
     /// Rate that the daughters' samples need on their links, bit/s; `None` without samples.

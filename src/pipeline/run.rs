@@ -6,15 +6,15 @@ use std::time::Duration;
 
 use super::config::Config;
 use super::error::PipelineError;
-use super::ground::{GroundOutcome, Receiving, WAIT_BYTES};
+use super::ground_segment::{GroundOutcome, Receiving, WAIT_BYTES};
 use super::plan::Plan;
 use super::sample_summary::SampleSummary;
 use super::sampling::SampleCounts;
 use super::summary::{Segment, Summary};
-use super::{ground, space};
+use super::{ground_segment, space_segment};
 use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
-use crate::downlink::socket::{Listening, SocketError, SocketSink, SocketSource};
+use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
 use crate::products::{ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
@@ -89,10 +89,10 @@ pub fn downlink_file(format: Format) -> &'static str {
 /// The first failure of any stage; a ledger that does not close; no visibility for any map.
 pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Result<Summary, PipelineError> {
     make_folder(out)?;
-    let skies = space::skies(plan)?;
+    let skies = space_segment::skies(plan)?;
     let mut graph = Graph::new();
     let counts = SampleCounts::default();
-    let bytes = space::add(&mut graph, plan, &skies, &counts)?;
+    let bytes = space_segment::add(&mut graph, plan, &skies, &counts)?;
     let file = out.join(downlink_file(plan.config.downlink.format));
     let bytes = add_link(&mut graph, bytes, &plan.config, &file)?;
     let recorder = Recorder::create(&file)?;
@@ -106,7 +106,8 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     drop(skies);
     let solving = SolveWatch::new(cancel.clone());
     let receiving = Receiving::Once { wait_bytes: WAIT_BYTES };
-    let outcome = ground::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()), receiving)?;
+    let outcome =
+        ground_segment::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()), receiving)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: None };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
     conclude(Segment::Whole, &plan.config, out, report, (outcome, None, counts.close(plan)?))
@@ -126,10 +127,10 @@ pub fn simulate(
     if plan.config.downlink.link.is_on() && file.is_none() {
         return Err(DownlinkError::from(SocketError::TruthNowhere).into());
     }
-    let skies = space::skies(plan)?;
+    let skies = space_segment::skies(plan)?;
     let mut graph = Graph::new();
     let counts = SampleCounts::default();
-    let mut bytes = space::add(&mut graph, plan, &skies, &counts)?;
+    let mut bytes = space_segment::add(&mut graph, plan, &skies, &counts)?;
     drop(skies);
     if let Some(file) = &file {
         bytes = add_link(&mut graph, bytes, &plan.config, file)?;
@@ -169,7 +170,7 @@ pub fn replay<S: GroundSource + 'static>(
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
     let solving = SolveWatch::new(cancel.clone());
     let watching = (Truth::unknown(), solving.clone());
-    let outcome = ground::add(&mut graph, bytes, config, out, watching, receiving)?;
+    let outcome = ground_segment::add(&mut graph, bytes, config, out, watching, receiving)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone() };
     let report = start(graph, &config.runtime, cancel, (watched, watch))?;
     conclude(Segment::Ground, config, out, report, (outcome, listening, None))

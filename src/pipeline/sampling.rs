@@ -25,7 +25,7 @@ pub struct SampleCounts {
 
 impl SampleCounts {
     /// The account of samples of a plan's run; `None` without samples.
-    pub(super) fn close(&self, plan: &Plan) -> Result<Option<SampleSummary>, PipelineError> {
+    pub(crate) fn close(&self, plan: &Plan) -> Result<Option<SampleSummary>, PipelineError> {
         let sampled = plan.config.spacecraft.fidelity == Fidelity::Samples;
         Ok(sampled.then(|| SampleSummary::close(self)).transpose()?)
     }
@@ -70,7 +70,7 @@ pub fn sample_stages(
 }
 
 /// Adds them to `graph`.
-pub(super) fn samples(
+pub(crate) fn samples(
     graph: &mut Graph,
     plan: &Plan,
     models: Vec<Box<dyn VisibilityModel>>,

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::config::Config;
 use super::sample_summary::SampleSummary;
 use crate::downlink::ReceptionCounters;
-use crate::downlink::socket::ListenAccount;
+use crate::downlink::transport::socket::ListenAccount;
 use crate::files::write_atomically;
 use crate::products::{ChannelSummary, ProductsError};
 use crate::runtime::{LedgerReport, Report};

@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 
 use common::downlink::{mission, packets_of, transmit};
 use common::workplace::{SMALL, Workplace, fail, succeed};
-use lunarray::downlink::socket::{ListenConfig, SocketSource, Until};
+use lunarray::downlink::transport::socket::{ListenConfig, SocketSource, Until};
 use lunarray::downlink::{
     CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PACKET_BYTES_MAX, PacketHeader, Segment,
 };

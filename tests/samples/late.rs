@@ -1,7 +1,8 @@
 //! Blocks that come late, through the whole chain.
 
-use lunarray::downlink::{Reception, Transmitter};
+use lunarray::downlink::Transmitter;
 use lunarray::frames::{GroundFrame, SampleBlock, Samples, SpaceFrame};
+use lunarray::ground::Reception;
 use lunarray::mother::Store;
 use lunarray::pipeline::{ConfigSource, Plan, SampleCounts, sample_stages};
 use lunarray::runtime::{Flow, Outlet, Source, Stage};

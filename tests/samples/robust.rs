@@ -4,8 +4,9 @@ use std::path::Path;
 use std::sync::mpsc;
 use std::time::Duration;
 
-use lunarray::downlink::{FileSource, Reception, Recorder, Transmitter};
+use lunarray::downlink::{FileSource, Recorder, Transmitter};
 use lunarray::frames::{GroundFrame, SpaceFrame};
+use lunarray::ground::Reception;
 use lunarray::mother::Store;
 use lunarray::pipeline::{ConfigSource, Plan, SampleCounts, sample_stages};
 use lunarray::runtime::{Cancel, Flow, Graph, Outlet, RuntimeError, Source, Stage};

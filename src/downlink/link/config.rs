@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::downlink::config::Format;
 use crate::downlink::error::DownlinkError;
+use crate::downlink::wire::Format;
 
 /// Greatest distance of a reordered frame, and most frames that a second station repeats.
 const FRAMES_MAX: u64 = 1 << 20;

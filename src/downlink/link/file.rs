@@ -7,11 +7,10 @@ use std::path::{Path, PathBuf};
 use super::config::LinkConfig;
 use super::simulator::LinkSimulator;
 use super::truth::Truth;
-use crate::downlink::cadu::ReedSolomon;
 use crate::downlink::config::DownlinkConfig;
-use crate::downlink::error::DownlinkError;
-use crate::downlink::file::{io_error, require_packets};
-use crate::downlink::intake::Intake;
+use crate::downlink::error::{DownlinkError, io_error, require_packets};
+use crate::downlink::receive::Intake;
+use crate::downlink::wire::cadu::ReedSolomon;
 use crate::files::{AtomicFile, Unfinished, write_atomically};
 use crate::runtime::{Outlet, Stage, Units};
 

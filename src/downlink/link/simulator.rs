@@ -8,9 +8,9 @@ use super::noise::Noise;
 use super::truth::{Fate, Truth, list_packet};
 use super::units::{Pass, Splitter};
 use super::writer::BitWriter;
-use crate::downlink::cadu::{ERRORS_MAX, MARKER_ERRORS_MAX, ReedSolomon, SYNC_MARKER_BYTES};
-use crate::downlink::config::Format;
 use crate::downlink::error::DownlinkError;
+use crate::downlink::wire::Format;
+use crate::downlink::wire::cadu::{ERRORS_MAX, MARKER_ERRORS_MAX, ReedSolomon, SYNC_MARKER_BYTES};
 use crate::units::{StreamKind, random_stream};
 
 /// A unit on its way to the ground.

@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use serde::{Deserialize, Serialize};
 
 use super::config::LinkConfig;
-use crate::downlink::config::Format;
+use crate::downlink::wire::Format;
 
 /// Why a frame cannot be recovered on the ground. Of several copies the one that got furthest counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]

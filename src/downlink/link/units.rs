@@ -2,14 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use crate::downlink::cadu::{
+use crate::downlink::error::DownlinkError;
+use crate::downlink::wire::cadu::{
     FRAME_HEADER_BYTES, FrameHeader, HOUSEKEEPING, IDLE, ReedSolomon, SYNC_MARKER, SYNC_MARKER_BYTES,
     randomize,
 };
-use crate::downlink::error::DownlinkError;
-use crate::downlink::header::{HEADER_BYTES, PacketHeader, TRAILER_BYTES};
-use crate::downlink::kind::Kind;
-use crate::downlink::payload::{decode_housekeeping, visibilities_in};
+use crate::downlink::wire::payload::{decode_housekeeping, visibilities_in};
+use crate::downlink::wire::{HEADER_BYTES, Kind, PacketHeader, TRAILER_BYTES};
 use crate::frames::Housekeeping;
 
 /// Octets of a space packet's primary header.

@@ -1,0 +1,186 @@
+//! The chain as a graph, and its packets through the ground segment, with queues watched.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+
+use crate::accumulation::Snapshot;
+use crate::downlink::Transmitter;
+use crate::frames::GroundFrame;
+use crate::mother::Store;
+use crate::pipeline::config::Config;
+use crate::pipeline::error::PipelineError;
+use crate::pipeline::ground_segment::{GroundOutcome, WAIT_BYTES, add_sums, reception};
+use crate::pipeline::models;
+use crate::pipeline::plan::Plan;
+use crate::pipeline::sampling::{SampleCounts, sample_stages};
+use crate::runtime::{Cancel, Flow, Graph, Metrics, Outlet, Report, Sink, Source, StageProgress, Units};
+use crate::sky::SkyMap;
+
+/// Time between two looks at the queues.
+const LOOK_EVERY: Duration = Duration::from_millis(5);
+/// Looks that are kept.
+const LOOKS_MAX: usize = 512;
+
+/// One run of a chain of stages.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ChainRun {
+    /// Shares of time, latencies since the source, rates.
+    pub report: Report,
+    /// When queues were looked at, s since the start.
+    pub times_s: Vec<f64>,
+    /// The queue before each stage but the source.
+    pub queues: Vec<QueueDepths>,
+}
+
+/// Items in the queue before a stage, as time went on: a value each time that was looked.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct QueueDepths {
+    /// Stage.
+    pub stage: String,
+    /// Exceeded nine times of ten.
+    pub p10: u64,
+    /// Median.
+    pub p50: u64,
+    /// Exceeded one time of ten.
+    pub p90: u64,
+    /// All of them.
+    pub series: Vec<u64>,
+}
+
+/// Runs the chain from samples to received visibilities.
+pub(super) fn run(plan: &Plan, skies: &[SkyMap]) -> Result<ChainRun, PipelineError> {
+    let capacity = plan.config.runtime.queue_capacity;
+    let (sampler, link, correlator) =
+        sample_stages(plan, models::build(plan, skies)?, &SampleCounts::default());
+    let mut graph = Graph::new();
+    let samples = graph.source("sample", capacity, sampler);
+    let samples = graph.stage("link", capacity, samples, link);
+    let visibilities = graph.stage("correlate", capacity, samples, correlator);
+    let passes = graph.stage("store", capacity, visibilities, Store::new(&plan.config.spacecraft, None));
+    let packets = graph.stage("transmit", capacity, passes, Transmitter::new(&plan.config.downlink)?);
+    let received = graph.stage("receive", capacity, packets, reception(WAIT_BYTES, Arc::default()));
+    graph.sink("drop", received, Forget(0));
+    watched(graph, plan.config.runtime.shutdown_s)
+}
+
+/// Runs packets through the ground segment, up to the sums.
+pub(super) fn run_ground(config: &Config, packets: &[Vec<u8>]) -> Result<ChainRun, PipelineError> {
+    let mut graph = Graph::new();
+    // Taken from the end.
+    let packets = Packets(packets.iter().rev().cloned().collect());
+    let bytes = graph.source("packets", config.runtime.queue_capacity, packets);
+    let sums = add_sums(&mut graph, bytes, config, &GroundOutcome::default(), WAIT_BYTES)?;
+    graph.sink("drop", sums, Drop);
+    watched(graph, config.runtime.shutdown_s)
+}
+
+/// Runs a chain, and looks at its queues while it runs.
+fn watched(graph: Graph, shutdown_s: f64) -> Result<ChainRun, PipelineError> {
+    let (metrics, done) = (graph.metrics(), AtomicBool::new(false));
+    let since = Instant::now();
+    let (report, mut looks) = std::thread::scope(|scope| {
+        let watcher = scope.spawn(|| {
+            let mut looks = Looks { step: 1, times_s: Vec::new(), depths: Vec::new() };
+            let mut tick = 0_usize;
+            while !done.load(Ordering::Relaxed) {
+                if tick.is_multiple_of(looks.step) {
+                    looks.add(since.elapsed().as_secs_f64(), &metrics);
+                }
+                tick += 1;
+                std::thread::sleep(LOOK_EVERY);
+            }
+            looks
+        });
+        let report = graph.run(&Cancel::new(), Duration::from_secs_f64(shutdown_s));
+        done.store(true, Ordering::Relaxed);
+        (report, watcher.join().unwrap_or_default())
+    });
+    let report = report?;
+    let queued = report.stages.iter().filter(|stage| stage.queue.is_some());
+    let queues = queued.enumerate().map(|(k, stage)| {
+        let series: Vec<u64> = looks.depths.iter_mut().map(|depths| std::mem::take(&mut depths[k])).collect();
+        let mut sorted = series.clone();
+        sorted.sort_unstable();
+        let at = |part: f64| sorted.get(((sorted.len() as f64 - 1.0) * part) as usize).copied().unwrap_or(0);
+        QueueDepths { stage: stage.name.clone(), p10: at(0.1), p50: at(0.5), p90: at(0.9), series }
+    });
+    Ok(ChainRun { queues: queues.collect(), times_s: looks.times_s, report })
+}
+
+/// Looks at all queues.
+#[derive(Default)]
+struct Looks {
+    /// Ticks from one look to the next.
+    step: usize,
+    times_s: Vec<f64>,
+    /// By look and stage, but for the source.
+    depths: Vec<Vec<u64>>,
+}
+
+impl Looks {
+    fn add(&mut self, time_s: f64, metrics: &Metrics) {
+        let stages = metrics.snapshot();
+        // The chain is in order, so that a queue holds what one stage gave and the next did not take. Counters move while
+        // they are read.
+        let depth = |pair: &[StageProgress]| pair[0].items_out.saturating_sub(pair[1].items_in);
+        self.times_s.push(time_s);
+        self.depths.push(stages.windows(2).map(depth).collect());
+        if self.times_s.len() >= LOOKS_MAX {
+            // Every other one, so that a long run fits as well.
+            let mut keep = (0..LOOKS_MAX).map(|k| k % 2 == 0);
+            self.times_s.retain(|_| keep.next().unwrap_or(false));
+            let mut keep = (0..LOOKS_MAX).map(|k| k % 2 == 0);
+            self.depths.retain(|_| keep.next().unwrap_or(false));
+            self.step *= 2;
+        }
+    }
+}
+
+/// Gives packets that are in memory.
+struct Packets(Vec<Vec<u8>>);
+
+impl Source for Packets {
+    type Out = Vec<u8>;
+    type Error = Infallible;
+
+    fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, Infallible> {
+        let Some(packet) = self.0.pop() else { return Ok(Flow::Done) };
+        out.push(packet);
+        Ok(Flow::Continue)
+    }
+}
+
+/// Forgets sums.
+struct Drop;
+
+impl Sink for Drop {
+    type In = Snapshot;
+    type Error = Infallible;
+
+    fn take(&mut self, _: Snapshot) -> Result<(), Infallible> {
+        Ok(())
+    }
+}
+
+/// Counts visibilities and forgets them.
+struct Forget(u64);
+
+impl Sink for Forget {
+    type In = GroundFrame;
+    type Error = Infallible;
+
+    fn take(&mut self, input: GroundFrame) -> Result<(), Infallible> {
+        if let GroundFrame::Visibilities(block) = input {
+            self.0 += block.len() as u64;
+        }
+        Ok(())
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.0, "visibilities")
+    }
+}

@@ -1,0 +1,353 @@
+//! How fast the stages of sample fidelity are, each alone and all in a chain.
+
+mod chain;
+mod display;
+mod growth;
+
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Instant;
+
+use serde::Serialize;
+
+use crate::downlink::Transmitter;
+use crate::frames::{GroundFrame, ObservingWindow, Samples, SpaceFrame};
+use crate::mother::Fidelity;
+use crate::pipeline::config::Config;
+use crate::pipeline::error::PipelineError;
+use crate::pipeline::ground_segment::{WAIT_BYTES, reception};
+use crate::pipeline::plan::Plan;
+use crate::pipeline::sampling::{SampleCounts, sample_stages};
+use crate::pipeline::{models, space_segment};
+use crate::runtime::{Flow, Outlet, Report, Source, Stage};
+use crate::sky::SkyMap;
+
+pub use chain::{ChainRun, QueueDepths};
+pub use growth::GrowthRow;
+
+/// Stages that can be measured alone, and the chain of them.
+pub const BENCH_STAGES: [&str; 6] = ["sample", "link", "correlate", "transmit", "receive", "chain"];
+
+/// Samples a second of the design: eight daughters, 30 channels of 8 kHz.
+const DESIGN_SAMPLES_PER_S: f64 = 8.0 * 30.0 * 8000.0;
+
+/// What is measured.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BenchSettings {
+    /// One of [`BENCH_STAGES`]; `None` for all.
+    pub stage: Option<String>,
+    /// Runs of each.
+    pub runs: usize,
+    /// Whether the chain is also run with other numbers of channels and daughters, and other blocks.
+    pub growth: bool,
+}
+
+/// The rate of one stage over several runs.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Rate {
+    /// Stage.
+    pub stage: &'static str,
+    /// Complex samples a second, median over runs.
+    pub samples_per_s: f64,
+    /// The slowest run and the fastest.
+    pub samples_per_s_range: [f64; 2],
+    /// Visibilities a second that the stage makes or passes; 0 if none.
+    pub visibilities_per_s: f64,
+    /// Bytes a second that the stage passes: samples on the links, packets on the downlink.
+    pub bytes_per_s: f64,
+    /// Median rate over that of eight daughters with 30 channels of 8 kHz.
+    pub times_real_time: f64,
+    /// Seconds of processor time for one second of the mission, median over runs: what does not depend on who else works
+    /// on the machine. `None` where the system does not tell.
+    pub core_s_per_mission_s: Option<f64>,
+}
+
+/// The machine.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Machine {
+    /// Processor, as the system names it.
+    pub processor: String,
+    /// Worker threads.
+    pub threads: usize,
+}
+
+/// All that was measured.
+#[derive(Clone, Debug, Serialize)]
+pub struct Bench {
+    /// The machine.
+    pub machine: Machine,
+    /// Mission time of one run, s.
+    pub mission_s: f64,
+    /// Number of channels.
+    pub channels: usize,
+    /// Number of daughters.
+    pub daughters: usize,
+    /// Bits of a part of a sample.
+    pub bits: u32,
+    /// Samples of a block.
+    pub block_samples: usize,
+    /// Pixels of the sky, all summed for each prediction.
+    pub sky_pixels: usize,
+    /// Stage by stage.
+    pub rates: Vec<Rate>,
+    /// The last run of the chain: shares of time, latencies since sampling, queues.
+    pub chain: Option<ChainRun>,
+    /// The last run of its packets through the ground segment, up to the sums: latencies since the packet.
+    pub ground: Option<ChainRun>,
+    /// The stage that worked most of the chain's time.
+    pub saturates_first: Option<String>,
+    /// The chain at other sizes; empty unless asked for.
+    pub growth: Vec<GrowthRow>,
+}
+
+/// The pipeline that is measured when none is named: the design's 30 channels, 8 bits, a small sky.
+#[must_use]
+pub fn bench_config() -> Config {
+    let mut config = Config { name: "bench".to_owned(), ..Config::default() };
+    config.sky.nside = 8;
+    config.spacecraft.fidelity = Fidelity::Samples;
+    config.spacecraft.channels_hz = (1..=30).map(|k| 1e6 * f64::from(k)).collect();
+    config.spacecraft.duration_s = 3e4;
+    config.spacecraft.window_s_max = 16.0;
+    config
+}
+
+/// Everything that is made of one window, kept so that each stage can be fed alone.
+struct Material {
+    samples: Vec<SpaceFrame>,
+    visibilities: Vec<GroundFrame>,
+    packets: Vec<Vec<u8>>,
+    sample_count: f64,
+    visibility_count: f64,
+    packet_bytes: f64,
+    sample_bytes: f64,
+}
+
+/// Measures a plan's first window in sample fidelity; what waits between stages is kept in memory.
+///
+/// # Errors
+/// A sky or downlink that cannot be; a chain that fails.
+pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineError> {
+    let plan = Plan { windows: plan.windows.iter().take(1).copied().collect(), ..plan.clone() };
+    let skies = space_segment::skies(&plan)?;
+    let sky_pixels = skies.first().map_or(0, |sky| sky.values().len());
+    let config = &plan.config;
+    let material = material(&plan, &skies)?;
+    let wanted = |stage: &str| settings.stage.as_deref().is_none_or(|only| only == stage);
+    let mission_s = seconds_of(&plan);
+    let mut rates = Vec::new();
+    let (mut chain, mut ground) = (None, None);
+    for stage in BENCH_STAGES.into_iter().filter(|stage| wanted(stage)) {
+        let (mut seconds, mut core_seconds) = (Vec::new(), Vec::new());
+        for _ in 0..settings.runs.max(1) {
+            let spent = if stage == "chain" {
+                let (spent, run) = timed(|| chain::run(&plan, &skies));
+                chain = Some(run?);
+                spent
+            } else {
+                time_stage(&plan, &skies, &material, stage)?
+            };
+            seconds.push(spent.seconds);
+            core_seconds.extend(spent.core_seconds);
+        }
+        let spent_s = (!core_seconds.is_empty()).then(|| median(&mut core_seconds) / mission_s);
+        rates.push(material.rate(stage, seconds, spent_s));
+        if stage == "chain" {
+            ground = Some(chain::run_ground(config, &material.packets)?);
+        }
+    }
+    let growth = if settings.growth { growth::rows(&plan, &skies, settings.runs)? } else { Vec::new() };
+    let busiest = |report: &Report| {
+        let stages = report.stages.iter();
+        stages.max_by(|a, b| a.working.total_s.total_cmp(&b.working.total_s)).map(|s| s.name.clone())
+    };
+    Ok(Bench {
+        machine: Machine { processor: processor(), threads: rayon::current_num_threads() },
+        mission_s,
+        channels: plan.instrument.channels.len(),
+        daughters: plan.array.satellites(),
+        bits: config.daughters.bits,
+        block_samples: config.daughters.block_samples,
+        sky_pixels,
+        rates,
+        saturates_first: chain.as_ref().and_then(|chain: &ChainRun| busiest(&chain.report)),
+        chain,
+        ground,
+        growth,
+    })
+}
+
+/// What the chain of samples takes on this machine, s: before the first sample, and for each second of mission time. Runs
+/// it for two and for six seconds of the first window.
+///
+/// # Errors
+/// As [`bench`].
+pub(super) fn sampling_cost(plan: &Plan) -> Result<[f64; 2], PipelineError> {
+    let skies = space_segment::skies(plan)?;
+    let run = |ticks: i64| -> Result<[f64; 2], PipelineError> {
+        let cut = |window: &ObservingWindow| ObservingWindow {
+            end: window.end.min(window.start.plus_ticks(ticks)),
+            ..*window
+        };
+        let plan = Plan { windows: plan.windows.iter().take(1).map(cut).collect(), ..plan.clone() };
+        let (spent, run) = timed(|| chain::run(&plan, &skies));
+        run.map(|_| [seconds_of(&plan), spent.seconds])
+    };
+    let ([short_s, first_s], [long_s, second_s]) = (run(2_000_000)?, run(6_000_000)?);
+    let rate = ((second_s - first_s) / (long_s - short_s).max(0.1)).max(0.0);
+    Ok([(first_s - rate * short_s).max(0.0), rate])
+}
+
+/// Mission time of a plan's windows, s.
+fn seconds_of(plan: &Plan) -> f64 {
+    plan.windows.iter().map(|window| (window.end.0 - window.start.0) as f64 * 1e-6).sum()
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// Processor time of all threads of this process, s, to a hundredth. Linux counts it in ticks of 10 ms for programs to
+/// read, whatever its own clock (proc(5), fields 14 and 15 of stat).
+fn core_seconds_used() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // The name, in parentheses, may hold spaces.
+    let mut fields = text.rsplit_once(')')?.1.split_whitespace().skip(11);
+    let mut ticks = || fields.next()?.parse::<f64>().ok();
+    Some((ticks()? + ticks()?) / 100.0)
+}
+
+fn source<S: Source>(mut source: S) -> Result<Vec<S::Out>, S::Error> {
+    let mut out = Outlet::collect();
+    while source.next(&mut out)? == Flow::Continue {}
+    Ok(out.into_vec())
+}
+
+fn stage<S: Stage>(mut stage: S, input: Vec<S::In>) -> Result<Vec<S::Out>, S::Error> {
+    let mut out = Outlet::collect();
+    for item in input {
+        stage.step(item, &mut out)?;
+    }
+    stage.finish(&mut out)?;
+    Ok(out.into_vec())
+}
+
+fn never<T>(result: Result<T, Infallible>) -> T {
+    match result {
+        Ok(value) => value,
+        Err(never) => match never {},
+    }
+}
+
+fn material(plan: &Plan, skies: &[SkyMap]) -> Result<Material, PipelineError> {
+    let (sampler, _, correlator) = sample_stages(plan, models::build(plan, skies)?, &SampleCounts::default());
+    let samples = source(sampler)?;
+    let visibilities = never(stage(correlator, samples.clone()));
+    let packets = stage(Transmitter::new(&plan.config.downlink)?, visibilities.clone())?;
+    let count = |frame: &GroundFrame| match frame {
+        GroundFrame::Visibilities(block) => block.len() as f64,
+        _ => 0.0,
+    };
+    Ok(Material {
+        sample_count: samples_of(&samples).map(|samples| samples.len() as f64).sum(),
+        sample_bytes: samples_of(&samples).map(|samples| samples.bits() as f64 / 8.0).sum(),
+        visibility_count: visibilities.iter().map(count).sum(),
+        packet_bytes: packets.iter().map(|packet| packet.len() as f64).sum(),
+        samples,
+        visibilities,
+        packets,
+    })
+}
+
+fn samples_of(frames: &[SpaceFrame]) -> impl Iterator<Item = &Samples> {
+    let blocks = frames.iter().flat_map(|frame| match frame {
+        SpaceFrame::Samples(blocks) => blocks.as_slice(),
+        _ => &[],
+    });
+    blocks.map(|block| &block.samples)
+}
+
+/// What one run of a stage alone takes.
+fn time_stage(
+    plan: &Plan,
+    skies: &[SkyMap],
+    material: &Material,
+    name: &str,
+) -> Result<Spent, PipelineError> {
+    let (sampler, link, correlator) =
+        sample_stages(plan, models::build(plan, skies)?, &SampleCounts::default());
+    // Input is copied before the clock starts, and output dropped after it has stopped.
+    Ok(match name {
+        "sample" => {
+            let (spent, sampled) = timed(|| source(sampler));
+            sampled?;
+            spent
+        }
+        "link" => {
+            let input = material.samples.clone();
+            timed(|| never(stage(link, input))).0
+        }
+        "correlate" => {
+            let input = material.samples.clone();
+            timed(|| never(stage(correlator, input))).0
+        }
+        "transmit" => {
+            let (input, transmitter) =
+                (material.visibilities.clone(), Transmitter::new(&plan.config.downlink)?);
+            let (spent, sent) = timed(|| stage(transmitter, input));
+            sent?;
+            spent
+        }
+        _ => {
+            let (input, reception) = (material.packets.clone(), reception(WAIT_BYTES, Arc::default()));
+            let (spent, received) = timed(|| stage(reception, input));
+            received?;
+            spent
+        }
+    })
+}
+
+/// Time that some work took.
+struct Spent {
+    seconds: f64,
+    /// Processor time of the whole process, s; `None` where the system does not tell.
+    core_seconds: Option<f64>,
+}
+
+fn timed<T>(work: impl FnOnce() -> T) -> (Spent, T) {
+    let (before_s, since) = (core_seconds_used(), Instant::now());
+    let value = work();
+    let seconds = since.elapsed().as_secs_f64();
+    let core_seconds = core_seconds_used().zip(before_s).map(|(after_s, before_s)| after_s - before_s);
+    (Spent { seconds, core_seconds }, value)
+}
+
+impl Material {
+    fn rate(&self, stage: &'static str, mut seconds: Vec<f64>, core_s_per_mission_s: Option<f64>) -> Rate {
+        let median_s = median(&mut seconds);
+        let (least_s, most_s) = (seconds[0], seconds[seconds.len() - 1]);
+        let bytes = match stage {
+            "transmit" | "receive" => self.packet_bytes,
+            _ => self.sample_bytes,
+        };
+        let visibilities = if matches!(stage, "sample" | "link") { 0.0 } else { self.visibility_count };
+        let samples_per_s = self.sample_count / median_s;
+        Rate {
+            stage,
+            samples_per_s,
+            samples_per_s_range: [self.sample_count / most_s, self.sample_count / least_s],
+            visibilities_per_s: visibilities / median_s,
+            bytes_per_s: bytes / median_s,
+            times_real_time: samples_per_s / DESIGN_SAMPLES_PER_S,
+            core_s_per_mission_s,
+        }
+    }
+}
+
+/// The processor's name where the system tells it.
+fn processor() -> String {
+    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let named = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
+    named.map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
+}

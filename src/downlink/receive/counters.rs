@@ -1,0 +1,242 @@
+//! What the ground has received, lost and refused.
+
+use serde::Serialize;
+
+use super::cadu::FrameCounters;
+use crate::downlink::wire::Kind;
+use crate::downlink::wire::payload::PayloadFault;
+
+/// Packets of one kind.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
+pub struct KindCounts {
+    /// Good packets, duplicates left out.
+    pub packets: u64,
+    /// Bytes of those.
+    pub bytes: u64,
+    /// Packets whose headers hold but whose body does not.
+    pub damaged: u64,
+    /// Packets that had been here before.
+    pub duplicates: u64,
+    /// Gaps in the packet count.
+    pub gaps: u64,
+    /// Packets in those gaps.
+    pub missing: u64,
+    /// Packets that have filled a gap, or the place of a damaged one, afterwards.
+    pub late: u64,
+    /// Times that the spacecraft has begun to count anew.
+    pub restarts: u64,
+    /// Packets of payloads that could not be put together, for want of a segment.
+    pub orphans: u64,
+}
+
+/// Payloads that were refused although their packets' checks held, by reason.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
+pub struct FaultCounts {
+    /// Unknown format version.
+    pub version: u64,
+    /// Malformed record.
+    pub record: u64,
+    /// Length other than the record asks for.
+    pub length: u64,
+    /// Value out of range.
+    pub value: u64,
+    /// Times that do not increase.
+    pub order: u64,
+}
+
+impl FaultCounts {
+    pub(crate) fn add(&mut self, fault: &PayloadFault) {
+        *match fault {
+            PayloadFault::Version { .. } => &mut self.version,
+            PayloadFault::Record { .. } => &mut self.record,
+            PayloadFault::Length { .. } => &mut self.length,
+            PayloadFault::Value { .. } => &mut self.value,
+            PayloadFault::Order => &mut self.order,
+        } += 1;
+    }
+
+    /// All of them.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        self.version + self.record + self.length + self.value + self.order
+    }
+}
+
+/// The account of a reception.
+///
+/// `bytes = bytes_garbage + bytes_truncated + bytes_damaged + bytes_duplicate +` those of the kinds'
+/// packets. Visibilities in good packets are `decoded + bad_value + refused + before_instrument + foreign`.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
+pub struct ReceptionCounters {
+    /// Coded frames, if packets came in such; all other counts are of what was recovered from them.
+    pub frames: Option<FrameCounters>,
+    /// Bytes received; of coded frames, those of packets.
+    pub bytes: u64,
+    /// Bytes that belong to no packet.
+    pub bytes_garbage: u64,
+    /// Stretches of those.
+    pub garbage_stretches: u64,
+    /// Bytes of unfinished packets at the end of a stream.
+    pub bytes_truncated: u64,
+    /// Bytes of damaged packets.
+    pub bytes_damaged: u64,
+    /// Bytes of packets that had been here before.
+    pub bytes_duplicate: u64,
+    /// Instrument descriptions.
+    pub instrument: KindCounts,
+    /// Satellite positions.
+    pub ephemeris: KindCounts,
+    /// Visibilities.
+    pub visibilities: KindCounts,
+    /// Calibration: reserved, counted and skipped.
+    pub calibration: KindCounts,
+    /// The spacecraft's own counts.
+    pub housekeeping: KindCounts,
+    /// Payloads refused.
+    pub faults: FaultCounts,
+    /// Instrument descriptions that contradict the first.
+    pub instruments_contradictory: u64,
+    /// Payloads other than instrument descriptions that followed a contradictory one, and were refused.
+    pub payloads_foreign: u64,
+    /// Payloads that came before any instrument description and could not be understood.
+    pub payloads_before_instrument: u64,
+    /// Visibilities handed on.
+    pub visibilities_decoded: u64,
+    /// Visibilities dropped because they are not finite, or of weight or duration zero.
+    pub visibilities_bad_value: u64,
+    /// Visibilities in refused payloads.
+    pub visibilities_refused: u64,
+    /// Visibilities that came before any instrument description.
+    pub visibilities_before_instrument: u64,
+    /// Visibilities that followed a contradictory instrument description.
+    pub visibilities_foreign: u64,
+}
+
+impl ReceptionCounters {
+    /// Counts of one kind.
+    #[must_use]
+    pub fn kind(&self, kind: Kind) -> &KindCounts {
+        match kind {
+            Kind::Instrument => &self.instrument,
+            Kind::Ephemeris => &self.ephemeris,
+            Kind::Visibilities => &self.visibilities,
+            Kind::Calibration => &self.calibration,
+            Kind::Housekeeping => &self.housekeeping,
+        }
+    }
+
+    pub(crate) fn kind_mut(&mut self, kind: Kind) -> &mut KindCounts {
+        match kind {
+            Kind::Instrument => &mut self.instrument,
+            Kind::Ephemeris => &mut self.ephemeris,
+            Kind::Visibilities => &mut self.visibilities,
+            Kind::Calibration => &mut self.calibration,
+            Kind::Housekeeping => &mut self.housekeeping,
+        }
+    }
+
+    /// Adds the account of packets and payloads of another decoder; not that of bytes between them.
+    pub(crate) fn add(&mut self, other: &Self) {
+        self.combine(other, u64::saturating_add);
+    }
+
+    /// The inverse of [`ReceptionCounters::add`].
+    pub(crate) fn subtract(&mut self, other: &Self) {
+        self.combine(other, u64::saturating_sub);
+    }
+
+    fn combine(&mut self, other: &Self, with: fn(u64, u64) -> u64) {
+        let combine = |ours: &mut u64, theirs: u64| *ours = with(*ours, theirs);
+        combine(&mut self.bytes, other.bytes);
+        for kind in Kind::ALL {
+            let (ours, theirs) = (self.kind_mut(kind), other.kind(kind));
+            combine(&mut ours.packets, theirs.packets);
+            combine(&mut ours.bytes, theirs.bytes);
+            combine(&mut ours.orphans, theirs.orphans);
+        }
+        let FaultCounts { version, record, length, value, order } = other.faults;
+        combine(&mut self.faults.version, version);
+        combine(&mut self.faults.record, record);
+        combine(&mut self.faults.length, length);
+        combine(&mut self.faults.value, value);
+        combine(&mut self.faults.order, order);
+        combine(&mut self.instruments_contradictory, other.instruments_contradictory);
+        combine(&mut self.payloads_foreign, other.payloads_foreign);
+        combine(&mut self.payloads_before_instrument, other.payloads_before_instrument);
+        combine(&mut self.visibilities_decoded, other.visibilities_decoded);
+        combine(&mut self.visibilities_bad_value, other.visibilities_bad_value);
+        combine(&mut self.visibilities_refused, other.visibilities_refused);
+        combine(&mut self.visibilities_before_instrument, other.visibilities_before_instrument);
+        combine(&mut self.visibilities_foreign, other.visibilities_foreign);
+    }
+
+    /// Adds what a stream held besides sound packets: garbage, damage, a cut end, and the account of its frames.
+    pub(crate) fn add_stream(&mut self, other: &Self) {
+        self.bytes += other.bytes_garbage + other.bytes_truncated + other.bytes_damaged;
+        self.bytes_garbage += other.bytes_garbage;
+        self.garbage_stretches += other.garbage_stretches;
+        self.bytes_truncated += other.bytes_truncated;
+        self.bytes_damaged += other.bytes_damaged;
+        for kind in Kind::ALL {
+            self.kind_mut(kind).damaged += other.kind(kind).damaged;
+        }
+        if let Some(frames) = &other.frames {
+            self.frames.get_or_insert_default().add(frames);
+        }
+    }
+
+    /// What is to be said of restarts of the spacecraft's counts, if there were any.
+    pub(crate) fn restarts_text(&self) -> Option<String> {
+        let kinds = Kind::ALL.into_iter().filter(|kind| self.kind(*kind).restarts > 0);
+        let times: Vec<String> = kinds.map(|kind| format!("{kind} {}", self.kind(kind).restarts)).collect();
+        (!times.is_empty()).then(|| {
+            format!(
+                "the spacecraft began to count anew (times: {}): what she sent last before that is not known to be missing",
+                times.join(", ")
+            )
+        })
+    }
+
+    /// Good packets of all kinds.
+    #[must_use]
+    pub fn packets(&self) -> u64 {
+        Kind::ALL.iter().map(|kind| self.kind(*kind).packets).sum()
+    }
+}
+
+impl std::fmt::Display for ReceptionCounters {
+    /// A line for each kind of packet, and one for everything that was wrong.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        if let Some(frames) = &self.frames {
+            writeln!(f, "{frames}")?;
+        }
+        for kind in Kind::ALL {
+            let counts = self.kind(kind);
+            if *counts != KindCounts::default() {
+                let KindCounts { packets, bytes, damaged, duplicates, missing, .. } = counts;
+                let name = format!("{kind:?}").to_lowercase();
+                write!(f, "{name:<14} {packets:>10} packets {bytes:>14} bytes")?;
+                writeln!(f, "  {missing} missing, {damaged} damaged, {duplicates} duplicate")?;
+            }
+        }
+        if let Some(restarts) = self.restarts_text() {
+            writeln!(f, "{restarts}")?;
+        }
+        if self.payloads_before_instrument > 0 {
+            let (payloads, visibilities) =
+                (self.payloads_before_instrument, self.visibilities_before_instrument);
+            writeln!(
+                f,
+                "{payloads} payloads with {visibilities} visibilities before any instrument description"
+            )?;
+        }
+        write!(
+            f,
+            "{} bytes between packets, {} in a cut end, {} payloads refused, {} visibilities of bad value",
+            self.bytes_garbage,
+            self.bytes_truncated,
+            self.faults.total(),
+            self.visibilities_bad_value
+        )
+    }
+}

@@ -1,0 +1,294 @@
+//! Packets to frames.
+
+use super::{Event, Packet, ReceptionCounters};
+use crate::downlink::wire::payload::{
+    PayloadFault, count_visibilities, decode_ephemeris, decode_housekeeping, decode_instrument,
+    decode_visibilities,
+};
+use crate::downlink::wire::{CucTime, FORMAT_VERSION, Kind, PacketHeader, Segment};
+use crate::frames::{GroundFrame, Instrument};
+
+/// Greatest payload that is put together from segments; a window's ephemeris is a thousandth of it.
+const PAYLOAD_BYTES_MAX: usize = 1 << 24;
+
+/// A payload of which not all segments have come.
+#[derive(Clone, Debug)]
+struct Partial {
+    next: u64,
+    time: CucTime,
+    bytes: Vec<u8>,
+}
+
+/// What an instrument description says, compared with what is known.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
+enum Standing {
+    #[default]
+    Unknown,
+    Known,
+    /// The latest description contradicts the first: what follows it belongs to another array.
+    Contradicted,
+}
+
+/// What a decoder has learnt and counted, for another to go on with; segments of unfinished payloads left out.
+#[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
+pub struct DecoderState {
+    instrument: Option<Instrument>,
+    standing: Standing,
+    counters: ReceptionCounters,
+}
+
+impl DecoderState {
+    /// The account.
+    #[must_use]
+    pub fn counters(&self) -> &ReceptionCounters {
+        &self.counters
+    }
+}
+
+/// Makes frames of packets and keeps the account.
+///
+/// The first instrument description holds. Identical repeats are passed over; after one that contradicts it
+/// all frames are refused until the first comes again.
+#[derive(Debug, Default)]
+pub struct Decoder {
+    instrument: Option<Instrument>,
+    standing: Standing,
+    partial: [Option<Partial>; Kind::ALL.len()],
+    counters: ReceptionCounters,
+    fault: Option<(u64, PayloadFault)>,
+}
+
+impl Decoder {
+    /// A decoder that knows nothing yet.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// What it knows.
+    #[must_use]
+    pub fn state(&self) -> DecoderState {
+        let Self { instrument, standing, counters, .. } = self;
+        DecoderState { instrument: instrument.clone(), standing: *standing, counters: counters.clone() }
+    }
+
+    /// A decoder that knows what another knew.
+    #[must_use]
+    pub fn resume(state: DecoderState) -> Self {
+        let DecoderState { instrument, standing, counters } = state;
+        Self { instrument, standing, counters, ..Self::new() }
+    }
+
+    /// A decoder that knows the same and has counted nothing.
+    pub(crate) fn uncounted(&self) -> Self {
+        Self { instrument: self.instrument.clone(), standing: self.standing, ..Self::new() }
+    }
+
+    /// Takes what another has counted off its account.
+    pub(crate) fn uncount(&mut self, counters: &ReceptionCounters) {
+        self.counters.subtract(counters);
+    }
+
+    /// Takes what another has learnt and counted. Whether both are of one instrument; if not, nothing changes.
+    pub fn absorb(&mut self, other: DecoderState) -> bool {
+        let DecoderState { instrument, standing, counters, .. } = other;
+        match (&self.instrument, instrument) {
+            (Some(ours), Some(theirs)) if *ours != theirs => return false,
+            (None, Some(theirs)) => (self.instrument, self.standing) = (Some(theirs), standing),
+            _ => {}
+        }
+        self.counters.add(&counters);
+        true
+    }
+
+    /// Whether this is the payload of another instrument's description than the one that holds.
+    #[must_use]
+    pub fn contradicts(&self, payload: &[u8]) -> bool {
+        let known = self.instrument.as_ref();
+        known.is_some_and(|known| decode_instrument(payload).is_ok_and(|found| found != *known))
+    }
+
+    /// Takes an event into the account; gives the frame that it completes.
+    pub fn accept(&mut self, event: &Event<'_>) -> Option<GroundFrame> {
+        let counters = &mut self.counters;
+        match *event {
+            Event::Packet(packet) => return self.take_packet(packet),
+            Event::Duplicate { header, .. } => {
+                counters.bytes += header.bytes as u64;
+                counters.bytes_duplicate += header.bytes as u64;
+                counters.kind_mut(header.kind).duplicates += 1;
+            }
+            Event::Damaged { header, bytes, .. } => {
+                counters.bytes += bytes;
+                counters.bytes_damaged += bytes;
+                counters.kind_mut(header.kind).damaged += 1;
+            }
+            Event::Gap { header, expected, .. } => {
+                let counts = counters.kind_mut(header.kind);
+                counts.gaps += 1;
+                counts.missing += header.count - expected;
+            }
+            Event::Restart { header, .. } => counters.kind_mut(header.kind).restarts += 1,
+            Event::Garbage { bytes, .. } => {
+                counters.bytes += bytes;
+                counters.bytes_garbage += bytes;
+                counters.garbage_stretches += 1;
+            }
+            Event::Truncated { bytes, .. } => {
+                counters.bytes += bytes;
+                counters.bytes_truncated += bytes;
+            }
+        }
+        None
+    }
+
+    /// Says that the stream is at its end: payloads that lack a segment are given up. Another stream may follow.
+    pub fn finish(&mut self) {
+        for kind in Kind::ALL {
+            self.give_up(kind);
+        }
+    }
+
+    /// The account so far.
+    #[must_use]
+    pub fn counters(&self) -> &ReceptionCounters {
+        &self.counters
+    }
+
+    /// The instrument description that holds.
+    #[must_use]
+    pub fn instrument(&self) -> Option<&Instrument> {
+        self.instrument.as_ref()
+    }
+
+    /// The payload that was refused last: place of its last packet, and why. Said once.
+    pub fn take_fault(&mut self) -> Option<(u64, PayloadFault)> {
+        self.fault.take()
+    }
+
+    fn take_packet(&mut self, packet: Packet<'_>) -> Option<GroundFrame> {
+        let PacketHeader { kind, segment, version, bytes, .. } = packet.header;
+        self.counters.bytes += bytes as u64;
+        let counts = self.counters.kind_mut(kind);
+        counts.packets += 1;
+        counts.bytes += bytes as u64;
+        counts.late += u64::from(packet.late);
+        if version != FORMAT_VERSION {
+            return self.refuse(packet, PayloadFault::Version { found: version, expected: FORMAT_VERSION });
+        }
+        if segment == Segment::Whole {
+            self.give_up(kind);
+            return self.take_payload(packet, packet.payload);
+        }
+        let whole = self.assemble(packet)?;
+        self.take_payload(packet, &whole)
+    }
+
+    /// Adds a segment; gives the payload if it is the last.
+    fn assemble(&mut self, packet: Packet<'_>) -> Option<Vec<u8>> {
+        let PacketHeader { kind, segment, count, time, .. } = packet.header;
+        if segment == Segment::First {
+            self.give_up(kind);
+            let bytes = packet.payload.to_vec();
+            self.partial[kind.index()] = Some(Partial { next: count + 1, time, bytes });
+            return None;
+        }
+        let fits = |partial: &Partial| {
+            partial.next == count
+                && partial.time == time
+                && partial.bytes.len() + packet.payload.len() <= PAYLOAD_BYTES_MAX
+        };
+        let Some(mut partial) = self.partial[kind.index()].take_if(|partial| fits(partial)) else {
+            self.give_up(kind);
+            self.counters.kind_mut(kind).orphans += 1;
+            return None;
+        };
+        partial.bytes.extend_from_slice(packet.payload);
+        partial.next += 1;
+        if segment == Segment::Last {
+            return Some(partial.bytes);
+        }
+        self.partial[kind.index()] = Some(partial);
+        None
+    }
+
+    /// Counts the segments of a payload that will not be completed.
+    fn give_up(&mut self, kind: Kind) {
+        if self.partial[kind.index()].take().is_some() {
+            self.counters.kind_mut(kind).orphans += 1;
+        }
+    }
+
+    fn take_payload(&mut self, packet: Packet<'_>, payload: &[u8]) -> Option<GroundFrame> {
+        let kind = packet.header.kind;
+        let decoded = match kind {
+            Kind::Instrument => decode_instrument(payload).map(|found| self.take_instrument(found)),
+            _ if self.standing != Standing::Known => {
+                self.set_aside(kind, payload);
+                return None;
+            }
+            Kind::Ephemeris => self.take_ephemeris(payload).map(Some),
+            Kind::Visibilities => self.take_visibilities(payload).map(Some),
+            Kind::Housekeeping => {
+                decode_housekeeping(payload).map(|counts| Some(GroundFrame::Housekeeping(counts)))
+            }
+            Kind::Calibration => return None,
+        };
+        decoded.unwrap_or_else(|fault| {
+            if kind == Kind::Visibilities {
+                self.counters.visibilities_refused += count_visibilities(payload);
+            }
+            self.refuse(packet, fault)
+        })
+    }
+
+    fn take_instrument(&mut self, found: Instrument) -> Option<GroundFrame> {
+        let first = match &self.instrument {
+            None => true,
+            Some(known) if *known == found => false,
+            Some(_) => {
+                self.standing = Standing::Contradicted;
+                self.counters.instruments_contradictory += 1;
+                return None;
+            }
+        };
+        self.standing = Standing::Known;
+        if !first {
+            return None;
+        }
+        self.instrument = Some(found.clone());
+        Some(GroundFrame::Instrument(found))
+    }
+
+    fn take_ephemeris(&self, payload: &[u8]) -> Result<GroundFrame, PayloadFault> {
+        let instrument = self.instrument.as_ref().ok_or(PayloadFault::Record { what: "instrument" })?;
+        decode_ephemeris(payload, instrument).map(GroundFrame::Ephemeris)
+    }
+
+    fn take_visibilities(&mut self, payload: &[u8]) -> Result<GroundFrame, PayloadFault> {
+        let instrument = self.instrument.as_ref().ok_or(PayloadFault::Record { what: "instrument" })?;
+        let (block, bad) = decode_visibilities(payload, instrument)?;
+        self.counters.visibilities_bad_value += bad;
+        self.counters.visibilities_decoded += block.len() as u64;
+        Ok(GroundFrame::Visibilities(block))
+    }
+
+    /// Counts a payload that cannot be understood for want of its instrument description.
+    fn set_aside(&mut self, kind: Kind, payload: &[u8]) {
+        let visibilities = if kind == Kind::Visibilities { count_visibilities(payload) } else { 0 };
+        let counters = &mut self.counters;
+        if self.standing == Standing::Unknown {
+            counters.payloads_before_instrument += 1;
+            counters.visibilities_before_instrument += visibilities;
+        } else {
+            counters.payloads_foreign += 1;
+            counters.visibilities_foreign += visibilities;
+        }
+    }
+
+    fn refuse(&mut self, packet: Packet<'_>, fault: PayloadFault) -> Option<GroundFrame> {
+        self.counters.faults.add(&fault);
+        self.fault = Some((packet.offset, fault));
+        None
+    }
+}

@@ -1,0 +1,77 @@
+//! Packets to CADUs: the spacecraft's end of the coded link.
+
+use super::framer::{Framer, PACKET_HEADER_BYTES};
+use super::reed_solomon::ReedSolomon;
+use super::{HOUSEKEEPING, IDLE, SCIENCE, SYNC_MARKER, SYNC_MARKER_BYTES, randomize};
+use crate::downlink::wire::Kind;
+
+/// Puts packets into frames and codes those.
+#[derive(Debug)]
+pub struct CaduEncoder {
+    code: ReedSolomon,
+    idle_frames: u32,
+    science: Framer,
+    housekeeping: Framer,
+    idle: Framer,
+    in_pass: bool,
+}
+
+impl CaduEncoder {
+    /// An encoder whose counts begin with 0; each pass begins with `idle_frames` of idle data.
+    #[must_use]
+    pub fn new(code: ReedSolomon, spacecraft: u8, idle_frames: u32) -> Self {
+        let framer = |channel| Framer::new(spacecraft, channel, code.data_bytes());
+        Self {
+            code,
+            idle_frames,
+            science: framer(SCIENCE),
+            housekeeping: framer(HOUSEKEEPING),
+            idle: framer(IDLE),
+            in_pass: false,
+        }
+    }
+
+    /// Octets of a CADU.
+    #[must_use]
+    pub fn cadu_bytes(&self) -> usize {
+        SYNC_MARKER_BYTES + self.code.block_bytes()
+    }
+
+    /// Appends the CADUs that whole packets fill. Bytes that are no whole packet are left out.
+    pub fn encode(&mut self, packets: &[u8], out: &mut Vec<u8>) {
+        let code = self.code;
+        if !std::mem::replace(&mut self.in_pass, true) {
+            for _ in 0..self.idle_frames {
+                self.idle.idle(|frame| code_frame(code, frame, out));
+            }
+        }
+        let mut rest = packets;
+        while let Some(header) = rest.first_chunk::<PACKET_HEADER_BYTES>() {
+            let bytes = PACKET_HEADER_BYTES + 1 + usize::from(u16::from_be_bytes([header[4], header[5]]));
+            let Some((packet, after)) = rest.split_at_checked(bytes) else { return };
+            rest = after;
+            let apid = u16::from_be_bytes([header[0], header[1]]) & 0x7FF;
+            let of_housekeeping = apid == Kind::Housekeeping.apid();
+            let framer = if of_housekeeping { &mut self.housekeeping } else { &mut self.science };
+            framer.add(packet, |frame| code_frame(code, frame, out));
+        }
+    }
+
+    /// Ends a pass: appends what is in hand, filled up with idle packets; science before housekeeping.
+    pub fn flush(&mut self, out: &mut Vec<u8>) {
+        let code = self.code;
+        self.science.flush(|frame| code_frame(code, frame, out));
+        self.housekeeping.flush(|frame| code_frame(code, frame, out));
+        self.in_pass = false;
+    }
+}
+
+/// Appends the CADU of a frame.
+fn code_frame(code: ReedSolomon, frame: &[u8], out: &mut Vec<u8>) {
+    out.extend_from_slice(&SYNC_MARKER.to_be_bytes());
+    let start = out.len();
+    out.extend_from_slice(frame);
+    out.resize(start + code.block_bytes(), 0);
+    code.encode(&mut out[start..]);
+    randomize(&mut out[start..]);
+}

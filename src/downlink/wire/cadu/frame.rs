@@ -1,0 +1,88 @@
+//! Headers of AOS transfer frames (CCSDS 732.0-B, section 4.1).
+
+/// Octets of a frame's primary header.
+pub const FRAME_HEADER_BYTES: usize = 6;
+
+/// Octets before the packets: the primary header and the header of the packet zone.
+pub(crate) const ZONE_START: usize = FRAME_HEADER_BYTES + 2;
+
+/// Virtual channel of instrument, ephemeris and visibilities.
+pub const SCIENCE: u8 = 1;
+/// Virtual channel of the spacecraft's own counts.
+pub const HOUSEKEEPING: u8 = 2;
+/// Virtual channel of frames of idle data alone: all ones, as the standard has it.
+pub const IDLE: u8 = 0x3F;
+
+/// First header pointer of a zone in which no packet begins.
+pub(crate) const NO_HEADER: u16 = 0x7FF;
+/// First header pointer of a zone of idle data.
+pub(crate) const IDLE_ZONE: u16 = 0x7FE;
+
+const VERSION: u8 = 0b01;
+const CYCLE_USED: u8 = 0x40;
+
+/// A frame's primary header.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FrameHeader {
+    /// Spacecraft identifier.
+    pub spacecraft: u8,
+    /// Virtual channel, 6 bits.
+    pub channel: u8,
+    /// Frames of this virtual channel sent before this one, of so many bits as `count_bits` says.
+    pub count: u32,
+    /// 24, or 28 where the count cycle is used, as here.
+    pub count_bits: u32,
+}
+
+impl FrameHeader {
+    /// The header as it is sent.
+    #[must_use]
+    pub fn to_bytes(self) -> [u8; FRAME_HEADER_BYTES] {
+        let identification =
+            u16::from(VERSION) << 14 | u16::from(self.spacecraft) << 6 | u16::from(self.channel);
+        let [id_0, id_1] = identification.to_be_bytes();
+        let [cycle, c0, c1, c2] = self.count.to_be_bytes();
+        let signaling = if self.count_bits > 24 { CYCLE_USED | (cycle & 0x0F) } else { 0 };
+        [id_0, id_1, c0, c1, c2, signaling]
+    }
+
+    /// The header that `bytes` begin with; `None` for another version of frame.
+    #[must_use]
+    pub fn parse(bytes: &[u8]) -> Option<Self> {
+        let &[id_0, id_1, c0, c1, c2, signaling] = bytes.first_chunk()?;
+        let identification = u16::from_be_bytes([id_0, id_1]);
+        if identification >> 14 != u16::from(VERSION) {
+            return None;
+        }
+        let used = signaling & CYCLE_USED != 0;
+        let cycle = if used { signaling & 0x0F } else { 0 };
+        Some(Self {
+            spacecraft: (identification >> 6) as u8,
+            channel: (identification & 0x3F) as u8,
+            count: u32::from_be_bytes([cycle, c0, c1, c2]),
+            count_bits: if used { 28 } else { 24 },
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fields_stand_where_the_standard_puts_them() {
+        let header = FrameHeader { spacecraft: 0xA5, channel: 0x2A, count: 0xB12_3456, count_bits: 28 };
+        // 01 10100101 101010 | 12 34 56 | replay 0, usage 1, spare 00, cycle 1011.
+        assert_eq!(header.to_bytes(), [0b0110_1001, 0b0110_1010, 0x12, 0x34, 0x56, 0x4B]);
+        assert_eq!(FrameHeader::parse(&header.to_bytes()), Some(header));
+    }
+
+    #[test]
+    fn without_the_cycle_the_count_has_24_bits() {
+        let header = FrameHeader { spacecraft: 1, channel: 2, count: 0xFF_FFFF, count_bits: 24 };
+        assert_eq!(header.to_bytes()[5], 0);
+        assert_eq!(FrameHeader::parse(&header.to_bytes()), Some(header));
+        assert_eq!(FrameHeader::parse(&[0x20, 0, 0, 0, 0, 0]), None);
+        assert_eq!(FrameHeader::parse(&[0x40]), None);
+    }
+}

@@ -1,0 +1,345 @@
+//! The Reed-Solomon code (255, 223) with interleaving and the dual basis (CCSDS 131.0-B, section 4).
+//!
+//! Octets of a block belong to codewords in turn; 223 of each codeword are data and 32 are parity, the
+//! remainder of the data times x^32 by g(x) = prod (x - a^(11 j)), j = 112..=143. Up to 16 wrong octets of a codeword
+//! are corrected.
+//!
+//! The remainder is linear in the data, also in the dual basis, so it is taken by tables, four octets at a time
+//! (as CRCs are by slicing). A received codeword is clean if the remainder of its data is its parity; only
+//! otherwise are syndromes needed, and they follow from the difference of the two alone.
+
+use std::sync::LazyLock;
+
+use multiversion::multiversion;
+
+use super::field::{FIELD, ORDER};
+use super::locator::{Errors, locate};
+
+/// Octets of a codeword.
+pub const CODEWORD_BYTES: usize = 255;
+/// Octets of parity in a codeword.
+pub const PARITY_BYTES: usize = 32;
+/// Octets of data in a codeword.
+pub const DATA_BYTES: usize = CODEWORD_BYTES - PARITY_BYTES;
+/// Wrong octets of a codeword that can be corrected.
+pub const ERRORS_MAX: usize = PARITY_BYTES / 2;
+/// Codewords that may be interleaved.
+pub const INTERLEAVES: [usize; 6] = [1, 2, 3, 4, 5, 8];
+
+/// Exponents of the generator's roots: 11 times 112 to 143.
+pub(crate) const ROOT_STEP: usize = 11;
+pub(crate) const ROOT_FIRST: usize = 112;
+
+/// Octets that the tables take at a time.
+const SLICE: usize = 4;
+/// Slices of a codeword's data; the first lacks its first octet.
+const SLICES: usize = DATA_BYTES.div_ceil(SLICE);
+
+/// 32 octets, the first sent in the upper bits of the first word.
+type Parity = [u32; PARITY_BYTES / 4];
+
+/// By place, half and value.
+type SyndromeTables = [[[[u8; PARITY_BYTES]; 16]; 2]; PARITY_BYTES];
+
+/// A codeword with more wrong octets than can be corrected.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Uncorrectable;
+
+/// Remainders, in the dual basis, of an octet by its value and its place in a slice.
+static REMAINDERS: LazyLock<Box<[[Parity; 256]; SLICE]>> = LazyLock::new(remainder_tables);
+
+/// Syndromes, in the conventional basis, of half an octet of a difference (dual basis) by its place,
+/// half (upper first) and value.
+static SYNDROMES: LazyLock<Box<SyndromeTables>> = LazyLock::new(syndrome_tables);
+
+/// The code with so many codewords interleaved.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ReedSolomon {
+    interleave: usize,
+}
+
+impl ReedSolomon {
+    /// The code at a depth; `None` for one that the standard does not have, see [`INTERLEAVES`].
+    #[must_use]
+    pub fn new(interleave: usize) -> Option<Self> {
+        INTERLEAVES.contains(&interleave).then_some(Self { interleave })
+    }
+
+    /// Codewords interleaved.
+    #[must_use]
+    pub fn interleave(self) -> usize {
+        self.interleave
+    }
+
+    /// Octets of data in a block.
+    #[must_use]
+    pub fn data_bytes(self) -> usize {
+        DATA_BYTES * self.interleave
+    }
+
+    /// Octets of a block.
+    #[must_use]
+    pub fn block_bytes(self) -> usize {
+        CODEWORD_BYTES * self.interleave
+    }
+
+    /// Fills in the parity of a block, which is [`ReedSolomon::block_bytes`] long and begins with its data.
+    pub fn encode(self, block: &mut [u8]) {
+        let found = self.remainders(block);
+        for (at, row) in block[self.data_bytes()..].chunks_exact_mut(self.interleave).enumerate() {
+            for (octet, parity) in row.iter_mut().zip(&found) {
+                *octet = octet_of(parity, at);
+            }
+        }
+    }
+
+    /// Corrects a block, which is [`ReedSolomon::block_bytes`] long; returns the octets corrected.
+    ///
+    /// # Errors
+    /// A codeword with more errors than can be corrected; the block is then partly corrected at most.
+    pub fn decode(self, block: &mut [u8]) -> Result<usize, Uncorrectable> {
+        let mut found = self.remainders(block);
+        let mut wrong = 0;
+        for (at, row) in block[self.data_bytes()..].chunks_exact(self.interleave).enumerate() {
+            for (octet, parity) in row.iter().zip(&mut found) {
+                parity[at / 4] ^= u32::from(*octet) << (24 - 8 * (at % 4));
+            }
+        }
+        for (codeword, difference) in found.iter().enumerate().take(self.interleave) {
+            if *difference == Parity::default() {
+                continue;
+            }
+            let Errors { count, places, values } = locate(&syndromes(difference)).ok_or(Uncorrectable)?;
+            wrong += count;
+            for (place, value) in places.iter().zip(values).take(count) {
+                let at = usize::from(*place) * self.interleave + codeword;
+                block[at] ^= FIELD.to_dual[usize::from(value)];
+            }
+        }
+        Ok(wrong)
+    }
+
+    /// Remainder of the data of each codeword.
+    fn remainders(self, block: &[u8]) -> [Parity; 8] {
+        let mut found = [Parity::default(); 8];
+        let data = &block[..self.data_bytes()];
+        // Depths known to the compiler let it work on all codewords at once, in registers.
+        match self.interleave {
+            1 => divide::<1>(data, &REMAINDERS, &mut found),
+            2 => divide::<2>(data, &REMAINDERS, &mut found),
+            3 => divide::<3>(data, &REMAINDERS, &mut found),
+            4 => divide::<4>(data, &REMAINDERS, &mut found),
+            5 => divide::<5>(data, &REMAINDERS, &mut found),
+            _ => divide::<8>(data, &REMAINDERS, &mut found),
+        }
+        found
+    }
+}
+
+/// Octet `at` of a parity.
+fn octet_of(parity: &Parity, at: usize) -> u8 {
+    (parity[at / 4] >> (24 - 8 * (at % 4))) as u8
+}
+
+#[multiversion(targets("x86_64+avx2"))]
+fn divide<const I: usize>(data: &[u8], tables: &[[Parity; 256]; SLICE], out: &mut [Parity; 8]) {
+    let mut registers = [Parity::default(); I];
+    let (first, rest) = data.split_at((DATA_BYTES - SLICE * (SLICES - 1)) * I);
+    for (c, register) in registers.iter_mut().enumerate() {
+        let word = u32::from(first[c]) << 16 | u32::from(first[I + c]) << 8 | u32::from(first[2 * I + c]);
+        *register = advance(register, word, tables);
+    }
+    for slice in rest.chunks_exact(SLICE * I) {
+        for (c, register) in registers.iter_mut().enumerate() {
+            let word = u32::from_be_bytes([slice[c], slice[I + c], slice[2 * I + c], slice[3 * I + c]]);
+            *register = advance(register, word, tables);
+        }
+    }
+    out[..I].copy_from_slice(&registers);
+}
+
+/// The register after four more octets.
+#[inline(always)]
+fn advance(register: &Parity, word: u32, tables: &[[Parity; 256]; SLICE]) -> Parity {
+    let fed = (register[0] ^ word).to_be_bytes();
+    let [a, b, c, d] = [0, 1, 2, 3].map(|k| &tables[k][usize::from(fed[k])]);
+    let mut next = [0; PARITY_BYTES / 4];
+    for k in 0..PARITY_BYTES / 4 {
+        let shifted = if k + 1 < PARITY_BYTES / 4 { register[k + 1] } else { 0 };
+        next[k] = shifted ^ a[k] ^ b[k] ^ c[k] ^ d[k];
+    }
+    next
+}
+
+/// Syndromes S_j, j = 112..=143, of a difference between parities.
+fn syndromes(difference: &Parity) -> [u8; PARITY_BYTES] {
+    let tables = &*SYNDROMES;
+    let mut sum = [0; PARITY_BYTES];
+    for (at, [upper, lower]) in tables.iter().enumerate() {
+        let octet = octet_of(difference, at);
+        let (a, b) = (&upper[usize::from(octet >> 4)], &lower[usize::from(octet & 15)]);
+        for k in 0..PARITY_BYTES {
+            sum[k] ^= a[k] ^ b[k];
+        }
+    }
+    sum
+}
+
+/// Coefficients of the generator without its leading one, the highest first.
+fn generator() -> [u8; PARITY_BYTES] {
+    let mut g = [0_u8; PARITY_BYTES + 1];
+    g[0] = 1; // By rising powers while it grows.
+    for j in 0..PARITY_BYTES {
+        let root = FIELD.power(ROOT_STEP * (ROOT_FIRST + j));
+        for k in (0..=j + 1).rev() {
+            let lower = if k > 0 { g[k - 1] } else { 0 };
+            g[k] = lower ^ FIELD.multiply(g[k], root);
+        }
+    }
+    std::array::from_fn(|k| g[PARITY_BYTES - 1 - k])
+}
+
+fn remainder_tables() -> Box<[[Parity; 256]; SLICE]> {
+    let generator = generator();
+    let mut tables = Box::new([[Parity::default(); 256]; SLICE]);
+    // x^32 mod g, then x^33 and so on: the last octet of a slice stands lowest.
+    let mut remainder = generator;
+    for table in tables.iter_mut().rev() {
+        for (value, row) in table.iter_mut().enumerate() {
+            let symbol = FIELD.to_conventional[value];
+            for (at, coefficient) in remainder.iter().enumerate() {
+                let octet = FIELD.to_dual[usize::from(FIELD.multiply(symbol, *coefficient))];
+                row[at / 4] |= u32::from(octet) << (24 - 8 * (at % 4));
+            }
+        }
+        let lead = remainder[0];
+        remainder.rotate_left(1);
+        remainder[PARITY_BYTES - 1] = 0;
+        for (coefficient, g) in remainder.iter_mut().zip(generator) {
+            *coefficient ^= FIELD.multiply(lead, g);
+        }
+    }
+    tables
+}
+
+fn syndrome_tables() -> Box<SyndromeTables> {
+    let mut tables = Box::new([[[[0; PARITY_BYTES]; 16]; 2]; PARITY_BYTES]);
+    for (at, halves) in tables.iter_mut().enumerate() {
+        let power = PARITY_BYTES - 1 - at;
+        for (half, rows) in halves.iter_mut().enumerate() {
+            for (value, row) in rows.iter_mut().enumerate() {
+                let symbol = FIELD.to_conventional[value << (4 - 4 * half)];
+                for (j, syndrome) in row.iter_mut().enumerate() {
+                    let root = ROOT_STEP * (ROOT_FIRST + j) % ORDER;
+                    *syndrome = FIELD.multiply(symbol, FIELD.power(root * power));
+                }
+            }
+        }
+    }
+    tables
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng, RngExt};
+
+    use super::*;
+    use crate::units::{StreamKind, random_stream};
+
+    /// Parity that libfec 1.0 (Debian, encode_rs_ccsds) makes of two blocks of data, octet i being i, and 7 i^2 + 13.
+    const LIBFEC: [[u8; PARITY_BYTES]; 2] = [
+        [
+            0x4F, 0xFB, 0x92, 0xDD, 0x55, 0x7E, 0xC6, 0x7F, 0x27, 0xFB, 0x89, 0x82, 0xCF, 0x58, 0xF8, 0xFD,
+            0x02, 0x8A, 0xD1, 0x17, 0xFC, 0xEF, 0x6B, 0x27, 0x93, 0xD0, 0x41, 0x88, 0x26, 0x57, 0x86, 0x51,
+        ],
+        [
+            0xF6, 0xFA, 0xAD, 0x48, 0x7B, 0x71, 0xB6, 0x3F, 0x6F, 0x00, 0x9F, 0x11, 0xD1, 0x1F, 0x30, 0x3E,
+            0xBB, 0x29, 0xEB, 0x59, 0x3A, 0x4C, 0xD9, 0x59, 0xBB, 0x81, 0x66, 0xB0, 0x22, 0xA9, 0xCB, 0x33,
+        ],
+    ];
+
+    fn random_block(code: ReedSolomon, seed: u64) -> Vec<u8> {
+        let mut block = vec![0; code.block_bytes()];
+        random_stream(seed, StreamKind::Probe, [0, 0]).fill_bytes(&mut block);
+        code.encode(&mut block);
+        block
+    }
+
+    #[test]
+    fn parity_is_that_of_libfec() {
+        let code = ReedSolomon::new(1).unwrap();
+        let data: [fn(usize) -> usize; 2] = [|i| i, |i| 7 * i * i + 13];
+        for (octet, parity) in data.into_iter().zip(LIBFEC) {
+            let mut block: Vec<u8> = (0..CODEWORD_BYTES).map(|i| octet(i) as u8).collect();
+            code.encode(&mut block);
+            assert_eq!(block[DATA_BYTES..], parity);
+        }
+    }
+
+    #[test]
+    fn the_generator_is_its_own_mirror() {
+        // 131.0-B, 4.3.3: its coefficients are symmetric; those by libfec begin with a^0, a^249, a^59, a^66.
+        let g = generator();
+        for (at, power) in [(0, 249), (1, 59), (2, 66), (30, 249), (31, 0)] {
+            assert_eq!(g[at], FIELD.power(power), "{at}");
+        }
+        assert!((0..31).all(|k| g[k] == g[30 - k]));
+    }
+
+    #[test]
+    fn interleaved_codewords_are_those_of_depth_one() {
+        let single = ReedSolomon::new(1).unwrap();
+        for depth in INTERLEAVES {
+            let block = random_block(ReedSolomon::new(depth).unwrap(), depth as u64);
+            for codeword in 0..depth {
+                let mut own: Vec<u8> = block.iter().skip(codeword).step_by(depth).copied().collect();
+                let sent = own.clone();
+                own[DATA_BYTES..].fill(0);
+                single.encode(&mut own);
+                assert_eq!(own, sent);
+            }
+        }
+    }
+
+    #[test]
+    fn sixteen_errors_of_each_codeword_are_corrected() {
+        let mut random = random_stream(1, StreamKind::Probe, [1, 0]);
+        for trial in 0..400 {
+            let depth = INTERLEAVES[trial % INTERLEAVES.len()];
+            let code = ReedSolomon::new(depth).unwrap();
+            let sent = random_block(code, trial as u64);
+            let mut block = sent.clone();
+            let mut wrong = 0;
+            for codeword in 0..depth {
+                let count = if trial < 12 { ERRORS_MAX } else { random.random_range(0..=ERRORS_MAX) };
+                let places = rand::seq::index::sample(&mut random, CODEWORD_BYTES, count);
+                wrong += count;
+                for place in places {
+                    block[place * depth + codeword] ^= random.random_range(1..=255_u8);
+                }
+            }
+            assert_eq!(code.decode(&mut block), Ok(wrong));
+            assert!(block == sent);
+        }
+    }
+
+    #[test]
+    fn seventeen_errors_are_refused_and_never_taken_for_fewer() {
+        let mut random = random_stream(2, StreamKind::Probe, [2, 0]);
+        let code = ReedSolomon::new(1).unwrap();
+        for trial in 0..2_000 {
+            let mut block = random_block(code, trial);
+            let count = 17 + trial as usize % 20;
+            for place in rand::seq::index::sample(&mut random, CODEWORD_BYTES, count) {
+                block[place] ^= random.random_range(1..=255_u8);
+            }
+            // A wrong correction has a probability below 1/16! = 5e-14.
+            assert_eq!(code.decode(&mut block), Err(Uncorrectable), "{count}");
+        }
+    }
+
+    #[test]
+    fn depths_that_the_standard_lacks_are_refused() {
+        assert!([0, 6, 7, 9, 255].into_iter().all(|depth| ReedSolomon::new(depth).is_none()));
+    }
+}

@@ -1,0 +1,207 @@
+//! Frames to packets: the spacecraft's end.
+
+use super::payload::{
+    check_visibilities, encode_ephemeris, encode_housekeeping, encode_instrument, encode_visibilities,
+    visibilities_in,
+};
+use super::{
+    COUNT_MAX, CucTime, FORMAT_VERSION, HEADER_BYTES, Kind, PacketHeader, Segment, TRAILER_BYTES,
+    packet_check,
+};
+use crate::downlink::config::DownlinkConfig;
+use crate::downlink::error::DownlinkError;
+use crate::frames::{EphemerisSegment, GroundFrame, Instrument, VisibilityBlock};
+use crate::units::MissionTime;
+
+/// Ephemeris segments that are repeated: those of one window, parted at the formation's turnarounds.
+const REPEATED_SEGMENTS_MAX: usize = 8;
+
+/// Makes packets of frames.
+///
+/// A visibility block becomes packets that stand each for itself, so that a lost one costs its own
+/// visibilities only; other payloads are segmented when they exceed a packet. The instrument description
+/// and the latest ephemeris segments are repeated now and then.
+#[derive(Debug)]
+pub struct Packetizer {
+    packet_bytes_max: usize,
+    repeat_bytes: u64,
+    instrument: Option<Instrument>,
+    /// The segments sent since the last frame of another kind.
+    ephemeris: Vec<EphemerisSegment>,
+    ephemeris_is_open: bool,
+    bytes_since_repeat: u64,
+    /// Latest time of anything sampled so far.
+    now: Option<MissionTime>,
+    counts: [u64; Kind::ALL.len()],
+    payload: Vec<u8>,
+}
+
+impl Packetizer {
+    /// A packetizer whose counts begin with 0.
+    ///
+    /// # Errors
+    /// The first of [`DownlinkConfig::problems`].
+    pub fn new(config: &DownlinkConfig) -> Result<Self, DownlinkError> {
+        if let Some(problem) = config.problems().into_iter().next() {
+            return Err(problem);
+        }
+        Ok(Self {
+            packet_bytes_max: config.packet_bytes_max,
+            repeat_bytes: config.repeat_bytes,
+            instrument: None,
+            ephemeris: Vec::new(),
+            ephemeris_is_open: false,
+            bytes_since_repeat: 0,
+            now: None,
+            counts: [0; Kind::ALL.len()],
+            payload: Vec::new(),
+        })
+    }
+
+    /// Appends the packets of a frame to `out`; on an error `out` is as it was.
+    ///
+    /// # Errors
+    /// [`DownlinkError::NoInstrument`] unless an instrument description came first; [`DownlinkError::Frame`] for
+    /// a frame that the ground would refuse; [`DownlinkError::Time`] for a time outside 1958-2094.
+    pub fn encode(&mut self, frame: &GroundFrame, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
+        let (start, counts, now) = (out.len(), self.counts, self.now);
+        let result = self.repeat(out).and_then(|()| self.send(frame, out));
+        if result.is_err() {
+            out.truncate(start);
+            (self.counts, self.now) = (counts, now);
+        }
+        self.bytes_since_repeat += (out.len() - start) as u64;
+        result
+    }
+
+    /// Sends instrument and ephemeris again if it is time for that.
+    fn repeat(&mut self, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
+        if self.bytes_since_repeat < self.repeat_bytes {
+            return Ok(());
+        }
+        self.bytes_since_repeat = 0;
+        if let Some(instrument) = self.instrument.clone() {
+            self.send_instrument(&instrument, out)?;
+        }
+        let ephemeris = std::mem::take(&mut self.ephemeris);
+        let sent = ephemeris.iter().try_for_each(|segment| self.send_ephemeris(segment, out));
+        self.ephemeris = ephemeris;
+        sent
+    }
+
+    fn send(&mut self, frame: &GroundFrame, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
+        match frame {
+            GroundFrame::Instrument(instrument) => {
+                let previous = self.instrument.replace(instrument.clone());
+                self.send_instrument(instrument, out).inspect_err(|_| self.instrument = previous)
+            }
+            GroundFrame::Ephemeris(segment) => {
+                self.send_ephemeris(segment, out)?;
+                self.remember(segment);
+                Ok(())
+            }
+            GroundFrame::Visibilities(block) => {
+                self.ephemeris_is_open = false;
+                self.send_visibilities(block, out)
+            }
+            GroundFrame::Housekeeping(counts) => {
+                self.ephemeris_is_open = false;
+                self.payload.clear();
+                encode_housekeeping(counts, &mut self.payload)?;
+                let now = self.advance(counts.time);
+                self.send_payload(Kind::Housekeeping, now, out)
+            }
+        }
+    }
+
+    fn send_instrument(&mut self, instrument: &Instrument, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
+        self.payload.clear();
+        encode_instrument(instrument, &mut self.payload)?;
+        self.send_payload(Kind::Instrument, self.now.unwrap_or_default(), out)
+    }
+
+    fn send_ephemeris(&mut self, segment: &EphemerisSegment, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
+        let instrument = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?;
+        self.payload.clear();
+        encode_ephemeris(segment, instrument, &mut self.payload)?;
+        // Positions are known ahead: they do not move the clock on.
+        let now = *self.now.get_or_insert(segment.start);
+        self.send_payload(Kind::Ephemeris, now, out)
+    }
+
+    fn remember(&mut self, segment: &EphemerisSegment) {
+        if !std::mem::replace(&mut self.ephemeris_is_open, true) {
+            self.ephemeris.clear();
+        }
+        if self.ephemeris.len() < REPEATED_SEGMENTS_MAX {
+            self.ephemeris.push(segment.clone());
+        }
+    }
+
+    fn send_visibilities(&mut self, block: &VisibilityBlock, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
+        let instrument = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?;
+        check_visibilities(block, instrument)?;
+        let each = visibilities_in(self.packet_bytes_max - HEADER_BYTES - TRAILER_BYTES);
+        for first in (0..block.len()).step_by(each) {
+            let range = first..block.len().min(first + each);
+            let last = range.end - 1;
+            let end = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);
+            let now = self.advance(block.start.plus_ticks(end));
+            let time = self.code(now)?;
+            let start = out.len();
+            out.resize(start + HEADER_BYTES, 0);
+            encode_visibilities(block, range, out)?;
+            self.seal(Kind::Visibilities, Segment::Whole, time, start, out);
+        }
+        Ok(())
+    }
+
+    /// Sends `self.payload` in as many segments as it needs.
+    fn send_payload(
+        &mut self,
+        kind: Kind,
+        time: MissionTime,
+        out: &mut Vec<u8>,
+    ) -> Result<(), DownlinkError> {
+        let time = self.code(time)?;
+        let payload = std::mem::take(&mut self.payload);
+        let each = self.packet_bytes_max - HEADER_BYTES - TRAILER_BYTES;
+        let segments = payload.len().div_ceil(each);
+        for (k, part) in payload.chunks(each).enumerate() {
+            let segment = match (k == 0, k + 1 == segments) {
+                (true, true) => Segment::Whole,
+                (true, false) => Segment::First,
+                (false, true) => Segment::Last,
+                (false, false) => Segment::Continuation,
+            };
+            let start = out.len();
+            out.resize(start + HEADER_BYTES, 0);
+            out.extend_from_slice(part);
+            self.seal(kind, segment, time, start, out);
+        }
+        self.payload = payload;
+        Ok(())
+    }
+
+    /// Fills in the headers of the packet that begins at `start` and appends its check.
+    fn seal(&mut self, kind: Kind, segment: Segment, time: CucTime, start: usize, out: &mut Vec<u8>) {
+        let bytes = out.len() - start + TRAILER_BYTES;
+        let count = &mut self.counts[kind.index()];
+        let header = PacketHeader { kind, segment, count: *count, time, version: FORMAT_VERSION, bytes };
+        *count = (*count + 1) & COUNT_MAX;
+        out[start..start + HEADER_BYTES].copy_from_slice(&header.to_bytes());
+        let check = packet_check(&out[start..]);
+        out.extend_from_slice(&check);
+    }
+
+    /// Moves the clock on to `time`, never back; packets are made at what it shows.
+    fn advance(&mut self, time: MissionTime) -> MissionTime {
+        *self.now.insert(self.now.map_or(time, |now| now.max(time)))
+    }
+
+    fn code(&self, time: MissionTime) -> Result<CucTime, DownlinkError> {
+        let epoch_tai_s = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?.epoch_tai_s;
+        let error = || DownlinkError::Time { epoch_tai_s, time_s: time.seconds() };
+        CucTime::new(epoch_tai_s, time).ok_or_else(error)
+    }
+}

@@ -1,0 +1,179 @@
+//! The instrument description.
+//!
+//! Record: `name` (u64 length, UTF-8), `epoch_tai_s` f64, `moon_radius_m` f64, `satellites` u8, `response` u8,
+//! `seed` u64, `configuration_hash` u64, `channels` u16. Arrays: `frequency_hz` and `width_hz`, f64, one pair a channel.
+//! With a spectrometer three more f64: its lowest frequency, the width of its channels (Hz), and their number.
+
+use bincode::{Decode, Encode};
+
+use super::arrays::{Arrays, put_f64};
+use super::{PayloadFault, put_record, require, require_length, take_record};
+use crate::frames::{AntennaResponse, Channel, Instrument, Spectrometer};
+use crate::units::MAX_SATELLITES;
+
+const NAME_BYTES_MAX: usize = 256;
+/// The whole band in channels of 8 kHz is 3738 of them.
+const CHANNELS_MAX: usize = 4096;
+/// Bytes of a spectrometer behind the channels.
+const SPECTROMETER_BYTES: usize = 24;
+/// Where a spectrometer may listen, Hz.
+const SPECTRUM_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=1e9;
+/// The band of the mission, Hz.
+const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=30e6;
+
+#[derive(Encode, Decode)]
+struct Record {
+    name: String,
+    epoch_tai_s: f64,
+    moon_radius_m: f64,
+    satellites: u8,
+    response: u8,
+    seed: u64,
+    configuration_hash: u64,
+    channels: u16,
+}
+
+pub(crate) fn encode(instrument: &Instrument, out: &mut Vec<u8>) -> Result<(), PayloadFault> {
+    check(instrument)?;
+    let record = Record {
+        name: instrument.name.clone(),
+        epoch_tai_s: instrument.epoch_tai_s,
+        moon_radius_m: instrument.moon_radius_m,
+        satellites: instrument.satellites,
+        response: match instrument.response {
+            AntennaResponse::Isotropic => 0,
+            AntennaResponse::DipoleNormal => 1,
+        },
+        seed: instrument.seed,
+        configuration_hash: instrument.configuration_hash,
+        channels: instrument.channels.len() as u16,
+    };
+    put_record("instrument", record, out)?;
+    for channel in &instrument.channels {
+        put_f64([channel.frequency_hz, channel.width_hz].iter(), out);
+    }
+    if let Some(Spectrometer { low_hz, width_hz, channels }) = instrument.spectrometer {
+        put_f64([low_hz, width_hz, f64::from(channels)].iter(), out);
+    }
+    Ok(())
+}
+
+pub(crate) fn decode(bytes: &[u8]) -> Result<Instrument, PayloadFault> {
+    let (record, rest) = take_record::<Record>("instrument", bytes)?;
+    let channels = usize::from(record.channels);
+    let more = if rest.len() == 16 * channels + SPECTROMETER_BYTES { SPECTROMETER_BYTES } else { 0 };
+    require_length("instrument channels", 16 * channels + more, rest.len())?;
+    let mut arrays = Arrays(rest);
+    let mut numbers = arrays.f64(2 * channels + more / 8);
+    let channel = |_| Some(Channel { frequency_hz: numbers.next()?, width_hz: numbers.next()? });
+    let channels: Vec<Channel> = (0..channels).map_while(channel).collect();
+    let spectrometer = match [numbers.next(), numbers.next(), numbers.next()] {
+        [Some(low_hz), Some(width_hz), Some(channels)] => {
+            let whole = channels.fract() == 0.0 && (1.0..=CHANNELS_MAX as f64).contains(&channels);
+            require(whole, "channels of the spectrometer", channels, "1 to 4096")?;
+            Some(Spectrometer { low_hz, width_hz, channels: channels as u16 })
+        }
+        _ => None,
+    };
+    let instrument = Instrument {
+        name: record.name,
+        epoch_tai_s: record.epoch_tai_s,
+        moon_radius_m: record.moon_radius_m,
+        satellites: record.satellites,
+        channels,
+        response: match record.response {
+            0 => AntennaResponse::Isotropic,
+            1 => AntennaResponse::DipoleNormal,
+            other => {
+                require(false, "antenna response", f64::from(other), "0 (isotropic) or 1 (dipole)")?;
+                AntennaResponse::Isotropic
+            }
+        },
+        seed: record.seed,
+        configuration_hash: record.configuration_hash,
+        spectrometer,
+    };
+    check(&instrument)?;
+    Ok(instrument)
+}
+
+fn check(instrument: &Instrument) -> Result<(), PayloadFault> {
+    let Instrument { epoch_tai_s, moon_radius_m, satellites, .. } = *instrument;
+    let (name, channels) = (instrument.name.len(), instrument.channels.len());
+    require(name <= NAME_BYTES_MAX, "instrument name (bytes)", name as f64, "at most 256")?;
+    require(
+        (0.0..f64::from(u32::MAX)).contains(&epoch_tai_s),
+        "epoch_tai_s",
+        epoch_tai_s,
+        "TAI seconds since 1958, before 2094",
+    )?;
+    require((1e3..=1e8).contains(&moon_radius_m), "moon_radius_m", moon_radius_m, "1e3 to 1e8 m")?;
+    let daughters = (2..=MAX_SATELLITES).contains(&usize::from(satellites));
+    require(daughters, "satellites", f64::from(satellites), "2 to 64")?;
+    require((1..=CHANNELS_MAX).contains(&channels), "channels", channels as f64, "1 to 4096")?;
+    for channel in &instrument.channels {
+        let Channel { frequency_hz, width_hz } = *channel;
+        require(FREQUENCY_HZ.contains(&frequency_hz), "frequency_hz", frequency_hz, "0.1e6 to 30e6")?;
+        let narrow = width_hz > 0.0 && width_hz < 2.0 * frequency_hz;
+        require(narrow, "width_hz", width_hz, "positive, less than twice the frequency")?;
+    }
+    instrument.spectrometer.map_or(Ok(()), |spectrometer| check_spectrometer(spectrometer, channels))
+}
+
+fn check_spectrometer(spectrometer: Spectrometer, before: usize) -> Result<(), PayloadFault> {
+    let Spectrometer { low_hz, width_hz, channels } = spectrometer;
+    let all = before + usize::from(channels);
+    require(
+        channels > 0 && all <= CHANNELS_MAX,
+        "channels with the spectrometer's",
+        all as f64,
+        "up to 4096",
+    )?;
+    require(SPECTRUM_HZ.contains(&low_hz), "spectrometer's low_hz", low_hz, "0.1e6 to 1e9")?;
+    let high_hz = low_hz + width_hz * f64::from(channels);
+    let fits = width_hz > 0.0 && SPECTRUM_HZ.contains(&high_hz);
+    require(fits, "spectrometer's width_hz", width_hz, "positive, with all channels below 1e9 Hz")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_spectrometer_comes_down_and_a_bad_one_is_refused() {
+        let spectrometer = Some(Spectrometer { low_hz: 30e6, width_hz: 1e6, channels: 90 });
+        let instrument = Instrument {
+            name: "nine".to_owned(),
+            epoch_tai_s: 1e9,
+            moon_radius_m: 1.7e6,
+            satellites: 8,
+            channels: vec![Channel { frequency_hz: 1e6, width_hz: 8e3 }; 3],
+            response: AntennaResponse::Isotropic,
+            seed: 1,
+            configuration_hash: 2,
+            spectrometer,
+        };
+        let mut bytes = Vec::new();
+        encode(&instrument, &mut bytes).unwrap();
+        assert_eq!(decode(&bytes).unwrap(), instrument);
+        // Without its last numbers it is the description of before.
+        let plain = Instrument { spectrometer: None, ..instrument.clone() };
+        assert_eq!(decode(&bytes[..bytes.len() - SPECTROMETER_BYTES]).unwrap(), plain);
+        assert!(decode(&bytes[..bytes.len() - 8]).is_err());
+        let at = bytes.len() - SPECTROMETER_BYTES;
+        for (place, value) in [
+            (0, f64::NAN),
+            (0, 0.0),
+            (1, -1.0),
+            (1, f64::INFINITY),
+            (2, 0.5),
+            (2, 0.0),
+            (2, 4094.0),
+            (2, 1e300),
+        ] {
+            let mut bad = bytes.clone();
+            bad[at + 8 * place..][..8].copy_from_slice(&value.to_le_bytes());
+            assert!(decode(&bad).is_err(), "{place} {value}");
+        }
+    }
+}

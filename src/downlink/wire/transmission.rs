@@ -1,0 +1,47 @@
+//! Frames to the bytes of a downlink: the spacecraft's end, whatever the format.
+
+use super::Packetizer;
+use super::cadu::CaduEncoder;
+use crate::downlink::config::DownlinkConfig;
+use crate::downlink::error::DownlinkError;
+use crate::frames::GroundFrame;
+
+/// Makes packets of frames, and CADUs of those if the configuration says so.
+#[derive(Debug)]
+pub struct Transmission {
+    packetizer: Packetizer,
+    encoder: Option<CaduEncoder>,
+    packets: Vec<u8>,
+}
+
+impl Transmission {
+    /// A transmission at the start of a mission.
+    ///
+    /// # Errors
+    /// The first of [`DownlinkConfig::problems`].
+    pub fn new(config: &DownlinkConfig) -> Result<Self, DownlinkError> {
+        Ok(Self { packetizer: Packetizer::new(config)?, encoder: config.encoder(), packets: Vec::new() })
+    }
+
+    /// Appends what a frame adds to the downlink. Housekeeping ends a pass.
+    ///
+    /// # Errors
+    /// Those of [`Packetizer::encode`].
+    pub fn send(&mut self, frame: &GroundFrame, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
+        let Some(encoder) = &mut self.encoder else { return self.packetizer.encode(frame, out) };
+        self.packets.clear();
+        self.packetizer.encode(frame, &mut self.packets)?;
+        encoder.encode(&self.packets, out);
+        if matches!(frame, GroundFrame::Housekeeping(_)) {
+            encoder.flush(out);
+        }
+        Ok(())
+    }
+
+    /// Appends what is still in hand.
+    pub fn finish(&mut self, out: &mut Vec<u8>) {
+        if let Some(encoder) = &mut self.encoder {
+            encoder.flush(out);
+        }
+    }
+}

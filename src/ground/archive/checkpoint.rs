@@ -1,0 +1,406 @@
+//! Checkpoints, written and read.
+
+use std::fs::File;
+use std::io::{BufReader, BufWriter, Read, Seek, SeekFrom, Write};
+use std::path::Path;
+
+use bincode::enc::write::SizeWriter;
+use bincode::error::{DecodeError, EncodeError};
+use bincode::{Decode, Encode};
+use crc_fast::{CrcAlgorithm, Digest};
+
+use super::error::StateError;
+use super::journal::Journal;
+use crate::accumulation::AccumulatorState;
+use crate::calibration::{AutoTable, CalibratorState};
+use crate::ground::{CollectorState, CollectorView};
+use crate::runtime::LedgerReport;
+
+const MAGIC: &[u8; 8] = b"LNRSTA04";
+/// Beginning of the magic in every version.
+const ANY_VERSION: &[u8; 6] = b"LNRSTA";
+const VERSION: &str = "a checkpoint of the ground's state, version 04; earlier versions do not know at which times \
+                       packets were made: replay their files into a new folder";
+/// Bytes of magic, length of the head, and checksum.
+const FIXED_BYTES: u64 = 24;
+
+/// Bytes read at a time.
+const PIECE_BYTES: u64 = 1 << 20;
+
+/// Most memory that a decoded head may take for each of its bytes on disk: the hungriest of what it is made of, a line
+/// on a packet of positions, takes 80 bytes for at least 9.
+const MEMORY_A_BYTE: usize = 16;
+
+/// A checkpoint without its engines.
+#[derive(Clone, Debug, PartialEq, Decode)]
+pub(super) struct Head {
+    /// Keys and values of the settings that shape sums.
+    pub(super) settings: Vec<(String, String)>,
+    pub(super) collector: CollectorState,
+    pub(super) calibrator: CalibratorState,
+    pub(super) powers: AutoTable,
+    pub(super) accumulator: AccumulatorState,
+    pub(super) ledger: LedgerReport,
+    pub(super) journal: Journal,
+}
+
+/// A [`Head`] to be written: field by field the same, without copies of what is large.
+#[derive(Encode)]
+pub(super) struct HeadView<'a> {
+    pub(super) settings: &'a Vec<(String, String)>,
+    pub(super) collector: CollectorView<'a>,
+    pub(super) calibrator: CalibratorState,
+    pub(super) powers: &'a AutoTable,
+    pub(super) accumulator: AccumulatorState,
+    pub(super) ledger: LedgerReport,
+    pub(super) journal: &'a Journal,
+}
+
+/// Sums up what is written.
+struct Summed<'a, W> {
+    inner: &'a mut W,
+    crc: Digest,
+}
+
+impl<W: Write> Write for Summed<'_, W> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        let written = self.inner.write(bytes)?;
+        self.crc.update(&bytes[..written]);
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.inner.flush()
+    }
+}
+
+/// Writes a checkpoint whose engines `engines` writes.
+pub(super) fn write(
+    out: &mut impl Write,
+    path: &Path,
+    head: &HeadView<'_>,
+    engines: impl FnOnce(&mut dyn Write) -> Result<(), StateError>,
+) -> Result<(), StateError> {
+    let failed = || StateError::io(path, "write");
+    let damaged = |found: String| StateError::Damaged {
+        path: path.to_owned(),
+        found,
+        expected: "a state that can be written",
+    };
+    let config = bincode::config::standard();
+    let mut size = SizeWriter::default();
+    let refused = |error: EncodeError| damaged(error.to_string());
+    bincode::encode_into_writer(head, &mut size, config).map_err(refused)?;
+    let mut summed = Summed { inner: out, crc: Digest::new(CrcAlgorithm::Crc64Nvme) };
+    summed.write_all(MAGIC).map_err(failed())?;
+    summed.write_all(&(size.bytes_written as u64).to_le_bytes()).map_err(failed())?;
+    // Many small pieces.
+    let mut pieces = BufWriter::with_capacity(1 << 16, &mut summed);
+    bincode::encode_into_std_write(head, &mut pieces, config).map_err(|error| match error {
+        EncodeError::Io { inner, .. } => failed()(inner),
+        other => refused(other),
+    })?;
+    pieces.flush().map_err(failed())?;
+    drop(pieces);
+    engines(&mut summed)?;
+    let crc = summed.crc.finalize();
+    out.write_all(&crc.to_le_bytes()).map_err(failed())
+}
+
+/// Whether a file begins as a checkpoint of any version does.
+pub(super) fn is_checkpoint(path: &Path) -> Result<bool, StateError> {
+    let mut magic = Vec::new();
+    let file = File::open(path).map_err(StateError::io(path, "open the file"))?;
+    file.take(MAGIC.len() as u64).read_to_end(&mut magic).map_err(StateError::io(path, "read"))?;
+    Ok(magic.len() == MAGIC.len() && magic.starts_with(ANY_VERSION))
+}
+
+/// Reads a checkpoint; `rest` makes something of the head and the engines.
+pub(super) fn read<T>(
+    path: &Path,
+    rest: impl FnOnce(Head, &mut dyn Read) -> Result<T, StateError>,
+) -> Result<T, StateError> {
+    read_from(&mut File::open(path).map_err(StateError::io(path, "read"))?, path, rest)
+}
+
+/// Reads a checkpoint from anything; messages call it `path`.
+///
+/// The checksum is compared before anything is believed.
+pub(super) fn read_from<T>(
+    from: &mut (impl Read + Seek),
+    path: &Path,
+    rest: impl FnOnce(Head, &mut dyn Read) -> Result<T, StateError>,
+) -> Result<T, StateError> {
+    let failed = || StateError::io(path, "read");
+    let damaged = |found: String, expected| StateError::Damaged { path: path.to_owned(), found, expected };
+    let bytes = checked_length(from, path)?;
+    from.rewind().map_err(failed())?;
+    let mut from = BufReader::with_capacity(bytes.min(PIECE_BYTES) as usize, from);
+    let mut fixed = [0; 16];
+    from.read_exact(&mut fixed).map_err(failed())?;
+    let (magic, length) = fixed.split_at(8);
+    if magic != MAGIC {
+        return Err(damaged(format!("{magic:02x?}"), VERSION));
+    }
+    let length = length.first_chunk().map_or(0, |length| u64::from_le_bytes(*length));
+    if length > bytes - FIXED_BYTES {
+        return Err(damaged(format!("a head of {length} bytes"), "one that the file has room for"));
+    }
+    let mut head = vec![0; length as usize];
+    from.read_exact(&mut head).map_err(failed())?;
+    let (head, used) = decode(&head).map_err(|error| damaged(error.to_string(), "a head"))?;
+    if used as u64 != length {
+        return Err(damaged("bytes behind the head".into(), "none"));
+    }
+    if !head.collector.is_sound() {
+        return Err(damaged("packets that cannot have come".into(), "those that a ground has taken"));
+    }
+    let mut engines = from.take(bytes - FIXED_BYTES - length);
+    let found = rest(head, &mut engines)?;
+    match engines.limit() {
+        0 => Ok(found),
+        left => Err(damaged(format!("{left} bytes behind the engines"), "none")),
+    }
+}
+
+/// A head, and the bytes of it. Lengths that a forger claims are held against a limit, before memory is reserved, that
+/// follows from the bytes that are there: the least of some that the decoder knows, at most four times as much.
+fn decode(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
+    let most = bytes.len().saturating_mul(MEMORY_A_BYTE);
+    match usize::BITS - most.leading_zeros() {
+        0..=20 => decode_within::<{ 1 << 20 }>(bytes),
+        21..=22 => decode_within::<{ 1 << 22 }>(bytes),
+        23..=24 => decode_within::<{ 1 << 24 }>(bytes),
+        25..=26 => decode_within::<{ 1 << 26 }>(bytes),
+        27..=28 => decode_within::<{ 1 << 28 }>(bytes),
+        29..=30 => decode_within::<{ 1 << 30 }>(bytes),
+        31..=32 => decode_within::<{ 1 << 32 }>(bytes),
+        33..=34 => decode_within::<{ 1 << 34 }>(bytes),
+        _ => decode_within::<{ 1 << 36 }>(bytes),
+    }
+}
+
+fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
+    bincode::decode_from_slice(bytes, bincode::config::standard().with_limit::<LIMIT>())
+}
+
+/// Length of a checkpoint whose checksum holds.
+fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, StateError> {
+    let failed = || StateError::io(path, "read");
+    let damaged = |found: String, expected| StateError::Damaged { path: path.to_owned(), found, expected };
+    let bytes = from.seek(SeekFrom::End(0)).map_err(failed())?;
+    if bytes < FIXED_BYTES {
+        return Err(damaged(format!("{bytes} bytes"), "at least 24"));
+    }
+    from.rewind().map_err(failed())?;
+    let mut body = from.by_ref().take(bytes - 8);
+    let mut crc = Digest::new(CrcAlgorithm::Crc64Nvme);
+    let mut chunk = vec![0; bytes.min(PIECE_BYTES) as usize];
+    loop {
+        match body.read(&mut chunk).map_err(failed())? {
+            0 => break,
+            read => crc.update(&chunk[..read]),
+        }
+    }
+    let mut stored = [0; 8];
+    from.read_exact(&mut stored).map_err(failed())?;
+    let found = crc.finalize();
+    if found != u64::from_le_bytes(stored) {
+        return Err(damaged(format!("checksum {found:016x}"), "the checksum that it was written with"));
+    }
+    Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::ops::Range;
+
+    use num_complex::Complex32;
+
+    use super::*;
+    use crate::accumulation::Accumulator;
+    use crate::calibration::{Calibrator, Identity};
+    use crate::downlink::{
+        CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PacketHeader, Segment, Transmission,
+    };
+    use crate::frames::{
+        AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock,
+    };
+    use crate::ground::Collector;
+    use crate::runtime::{Ledger, Outlet, Stage};
+    use crate::units::MissionTime;
+
+    /// Every part of a head has something in it.
+    fn with_head<T>(take: impl FnOnce(&HeadView<'_>) -> T) -> T {
+        let channels = vec![Channel { frequency_hz: 3e6, width_hz: 8e3 }];
+        let instrument = Instrument {
+            name: "test".to_owned(),
+            epoch_tai_s: 2e9,
+            moon_radius_m: 1_737_100.0,
+            satellites: 8,
+            channels,
+            response: AntennaResponse::Isotropic,
+            seed: 7,
+            configuration_hash: 1,
+            spectrometer: None,
+        };
+        let own = VisibilityBlock {
+            offset_ticks: vec![0],
+            duration_ticks: vec![10],
+            value_k_sr: vec![Complex32::new(3.0, 0.0)],
+            weight: vec![1.0],
+            flags: vec![Flags::GOOD],
+            ..VisibilityBlock::default()
+        };
+        let frames = [
+            GroundFrame::Instrument(instrument.clone()),
+            GroundFrame::Visibilities(own),
+            GroundFrame::Housekeeping(Housekeeping { time: MissionTime(5), sampled: 9, dropped: 1 }),
+        ];
+        let ledger = Ledger::new();
+        ledger.flagged("far", 4);
+        let mut accumulator = Accumulator::new(Default::default(), ledger.clone());
+        let mut calibrator =
+            Calibrator::new(Box::new(Identity), ledger.clone()).with_autos(Default::default());
+        let mut collector = Collector::new(1000);
+        let mut transmission = Transmission::new(&DownlinkConfig::default()).unwrap();
+        let mut bytes = Vec::new();
+        for frame in frames {
+            transmission.send(&frame, &mut bytes).unwrap();
+            calibrator.step(frame, &mut Outlet::collect()).unwrap();
+        }
+        accumulator.step(PlacedFrame::Instrument(instrument), &mut Outlet::collect()).unwrap();
+        collector.push(&bytes);
+        collector.finish();
+        while collector.next_delivery(&|_| true).unwrap().is_some() {}
+        let (kind, segment, time) = (Kind::Visibilities, Segment::Whole, CucTime(3));
+        let header = PacketHeader { kind, segment, count: 3, time, version: FORMAT_VERSION, bytes: 60 };
+        let mut journal = Journal::default();
+        journal.keep(header, 1, None, (2, 3, Some([1.0, 2.0])), &ledger.report());
+        let settings = vec![("map.nside".to_owned(), "4".to_owned())];
+        take(&HeadView {
+            settings: &settings,
+            collector: collector.view(),
+            calibrator: calibrator.state(),
+            powers: calibrator.powers(),
+            accumulator: accumulator.state(),
+            ledger: ledger.report(),
+            journal: &journal,
+        })
+    }
+
+    fn written(head: &HeadView<'_>) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        let engines =
+            |out: &mut dyn Write| out.write_all(b"engines").map_err(StateError::io(Path::new("x"), "write"));
+        write(&mut bytes, Path::new("x"), head, engines).unwrap();
+        bytes
+    }
+
+    fn read_back(bytes: &[u8]) -> Result<Head, StateError> {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), bytes).unwrap();
+        read(file.path(), |head, engines| {
+            std::io::copy(engines, &mut std::io::sink()).map_err(StateError::io(file.path(), "read"))?;
+            Ok(head)
+        })
+    }
+
+    /// Where each field stands, in the order in which they are written.
+    fn fields(head: &HeadView<'_>, bytes: usize) -> Vec<(&'static str, Range<usize>)> {
+        let length = |size: Result<Vec<u8>, EncodeError>| size.unwrap().len();
+        let config = bincode::config::standard();
+        let lengths = [
+            ("magic", 8),
+            ("length", 8),
+            ("settings", length(bincode::encode_to_vec(head.settings, config))),
+            ("collector", length(bincode::encode_to_vec(&head.collector, config))),
+            ("calibrator", length(bincode::encode_to_vec(&head.calibrator, config))),
+            ("powers", length(bincode::encode_to_vec(head.powers, config))),
+            ("accumulator", length(bincode::encode_to_vec(&head.accumulator, config))),
+            ("ledger", length(bincode::encode_to_vec(&head.ledger, config))),
+            ("journal", length(bincode::encode_to_vec(head.journal, config))),
+            ("engines", 7),
+            ("checksum", 8),
+        ];
+        let mut at = 0;
+        let mut place = |(name, length): (&'static str, usize)| {
+            at += length;
+            (name, at - length..at)
+        };
+        let found: Vec<_> = lengths.map(&mut place).to_vec();
+        assert_eq!(at, bytes);
+        found
+    }
+
+    #[test]
+    fn damage_in_any_field_is_found() {
+        with_head(|head| {
+            let good = written(head);
+            assert_eq!(read_back(&good).unwrap().settings, *head.settings);
+            for (name, range) in fields(head, good.len()) {
+                assert!(!range.is_empty());
+                for at in range {
+                    let mut bad = good.clone();
+                    bad[at] ^= 0x11;
+                    assert!(matches!(read_back(&bad), Err(StateError::Damaged { .. })), "{name}, byte {at}");
+                }
+            }
+        });
+    }
+
+    #[test]
+    fn forged_fields_are_errors_or_read_in_bounded_memory() {
+        with_head(|head| {
+            let good = written(head);
+            for (_, range) in fields(head, good.len()) {
+                for at in range.filter(|at| *at < good.len() - 8) {
+                    // Lengths grow by most where 0xFD announces eight bytes of one.
+                    for forged in [0xFD, 0xFC, 0x00] {
+                        let mut bad = good.clone();
+                        bad[at] = forged;
+                        let body = bad.len() - 8;
+                        let crc = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &bad[..body]);
+                        bad[body..].copy_from_slice(&crc.to_le_bytes());
+                        // A checksum that holds: no panic, whatever it says.
+                        let _ = read_back(&bad);
+                    }
+                }
+            }
+        });
+    }
+
+    #[test]
+    fn announced_lengths_reserve_no_more_than_the_bytes_there_allow() {
+        // A list of settings that announces as many as 4 GiB of memory hold, in heads of 60 bytes and of a megabyte;
+        // the same that they really may be is read on, to where the bytes end.
+        let settings = size_of::<(String, String)>() as u64;
+        for (bytes, limit) in [(60, 1 << 20), (1 << 20, 1 << 26)] {
+            for (announced, is_refused) in [
+                ((1_u64 << 32) / settings, true),
+                (limit / settings + 1, true),
+                (limit / settings - 1, false),
+            ] {
+                let mut forged = vec![0xFD];
+                forged.extend(announced.to_le_bytes());
+                forged.resize(bytes, 1);
+                let error = decode(&forged).unwrap_err();
+                let refused = matches!(error, DecodeError::LimitExceeded);
+                assert_eq!(refused, is_refused, "{bytes}, {announced}: {error}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        with_head(|head| {
+            let found = read_back(&written(head)).unwrap();
+            assert_eq!(found.journal, *head.journal);
+            assert_eq!((found.ledger, found.calibrator), (head.ledger.clone(), head.calibrator.clone()));
+            assert_eq!(found.accumulator, head.accumulator);
+            assert!(found.powers == *head.powers && found.powers != AutoTable::default());
+            let again = Collector::resume(found.collector);
+            assert_eq!(again.view(), head.collector);
+        });
+    }
+}

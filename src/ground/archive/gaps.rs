@@ -1,0 +1,381 @@
+//! What is missing, in packets and in what they would add to the map.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+use serde::Serialize;
+
+use super::journal::JournalEntry;
+use super::packet_order::{Schedule, Stream, Streams};
+use crate::downlink::{CucTime, Era, Kind, Taken};
+use crate::units::MissionTime;
+
+/// Packets of the same channel and pair on either side of one that tell what the map would take of it.
+const NEAR: u64 = 4;
+
+/// What has been received, as far as gaps are found from it.
+#[derive(Clone, Debug, Default)]
+pub struct Received {
+    /// Every packet of visibilities that could be read, in the order of sending.
+    pub readings: Vec<Reading>,
+    /// Every packet of positions that could be read, in the order of sending.
+    pub positions: Vec<Positions>,
+    /// Packets by kind.
+    pub taken: Vec<(Kind, Taken)>,
+    /// Frequencies of the instrument's channels, Hz.
+    pub frequencies_hz: Vec<f64>,
+}
+
+/// A packet of visibilities.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Reading {
+    /// What it held.
+    pub entry: JournalEntry,
+    /// Whether its positions have not come.
+    pub waits: bool,
+    /// Share of those of its visibilities that could be placed which the map has taken; `None` if that is not known.
+    pub share: Option<f64>,
+}
+
+/// A packet of positions.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Positions {
+    /// Count of the packet.
+    pub count: u64,
+    /// Time at which the packet was made.
+    pub made: CucTime,
+    /// First and last instant of the positions.
+    pub span: [MissionTime; 2],
+}
+
+/// A restart of the spacecraft's counts.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct RestartReport {
+    /// Kind.
+    pub kind: Kind,
+    /// Application process identifier.
+    pub apid: u16,
+    /// Count of the last packet before it that came. What was sent behind that one is not known.
+    pub last: u64,
+}
+
+/// What the missing packets of one channel and pair held, estimated; or packets that came and wait for the missing ones.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct LostStream {
+    /// Channel, from 0.
+    pub channel: u16,
+    /// Pair, as in "1-2".
+    pub pair: String,
+    /// Packets.
+    pub packets: u64,
+    /// Integration time in them, s.
+    pub integration_s: f64,
+    /// Sum of weights in them that the map would take, (K sr)^-2.
+    pub weight: f64,
+}
+
+/// A stretch of missing packets, to be asked for again.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct GapReport {
+    /// Kind.
+    pub kind: Kind,
+    /// Application process identifier.
+    pub apid: u16,
+    /// Count of the first missing packet.
+    pub from: u64,
+    /// Count of the last missing packet.
+    pub to: u64,
+    /// Mission time of the last visibility before it and the first behind it, s, where there are such.
+    pub between_s: [Option<f64>; 2],
+    /// Integration time in it, s, over all channels and pairs.
+    pub integration_s: f64,
+    /// What it would add: its weight over that in the map of the same channel, summed over channels; 1 for a channel of
+    /// which the map has nothing.
+    pub gain: f64,
+    /// By channel and pair: of visibilities what is missing, of positions what waits for them.
+    pub lost: Vec<LostStream>,
+}
+
+/// What has been received of one channel; of pairs of two daughters.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct ChannelCoverage {
+    /// Channel, from 0.
+    pub channel: u16,
+    /// Its frequency, Hz, once the instrument is known.
+    pub frequency_hz: Option<f64>,
+    /// Packets received.
+    pub packets: u64,
+    /// Integration time received, s, over all pairs.
+    pub integration_s: f64,
+    /// Weight in the map, (K sr)^-2.
+    pub weight: f64,
+    /// Integration time missing, s.
+    pub missing_integration_s: f64,
+    /// Weight missing, (K sr)^-2.
+    pub missing_weight: f64,
+}
+
+/// All that is missing.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Gaps {
+    /// The instrument's channels, whether anything came of them or not.
+    pub channels: Vec<ChannelCoverage>,
+    /// Gaps: the one whose recovery adds most first.
+    pub gaps: Vec<GapReport>,
+    /// Restarts of the spacecraft's counts.
+    pub restarts: Vec<RestartReport>,
+}
+
+/// Finds what is missing between the packets that came.
+///
+/// Every pass sends channel after channel and pair after pair, each in as many packets as it takes. The order and the
+/// usual number of packets are learnt from what was received; a gap is filled along them from the packet before
+/// it, with packets as the same channel and pair has sent about that time, of which the map takes as much as of those. Missing positions are worth what waits between the positions on either side. What was sent after the last
+/// packet that came is not known to be missing.
+#[must_use]
+pub fn find_gaps(received: &Received) -> Gaps {
+    let mut found = Gaps::default();
+    for (kind, taken) in &received.taken {
+        let eras = taken.eras();
+        for (k, era) in eras.iter().enumerate() {
+            let until = eras.get(k + 1).map(|era| era.from);
+            if until.is_some() {
+                let (kind, apid, last) = (*kind, kind.apid(), era.end.saturating_sub(1));
+                found.restarts.push(RestartReport { kind, apid, last });
+            }
+            let in_era = |made: CucTime| made >= era.from && until.is_none_or(|until| made < until);
+            found.gaps.extend(gaps_of_era(received, *kind, era, &in_era));
+        }
+    }
+    let mut channels = coverage(received);
+    for gap in &mut found.gaps {
+        let mut weights: BTreeMap<u16, f64> = BTreeMap::new();
+        for lost in &gap.lost {
+            let Some(coverage) = channels.get_mut(&lost.channel) else { continue };
+            if gap.kind == Kind::Visibilities {
+                coverage.missing_integration_s += lost.integration_s;
+                coverage.missing_weight += lost.weight;
+            }
+            *weights.entry(lost.channel).or_default() += lost.weight;
+        }
+        for (channel, weight) in weights.into_iter().filter(|(_, weight)| *weight > 0.0) {
+            let in_map = channels.get(&channel).map_or(0.0, |coverage| coverage.weight);
+            gap.gain += if in_map > 0.0 { weight / in_map } else { 1.0 };
+        }
+    }
+    found.gaps.sort_by(|a, b| b.gain.total_cmp(&a.gain).then((a.kind, a.from).cmp(&(b.kind, b.from))));
+    found.channels = channels.into_values().collect();
+    found
+}
+
+fn gaps_of_era(
+    received: &Received,
+    kind: Kind,
+    era: &Era,
+    in_era: &dyn Fn(CucTime) -> bool,
+) -> Vec<GapReport> {
+    if era.missing.is_empty() {
+        return Vec::new();
+    }
+    let visibilities = received.readings.iter().filter(|reading| in_era(reading.entry.made));
+    let schedule = Schedule::learn(match kind {
+        Kind::Visibilities => visibilities.copied().collect(),
+        _ => Vec::new(),
+    });
+    let mut positions: Vec<Positions> = match kind {
+        Kind::Ephemeris => received.positions.iter().filter(|known| in_era(known.made)).copied().collect(),
+        _ => Vec::new(),
+    };
+    positions.sort_by_key(|known| known.count);
+    let report = |gap: &Range<u64>| match kind {
+        Kind::Ephemeris => positions_missing(&received.readings, &positions, gap),
+        _ => schedule.report(kind, gap),
+    };
+    era.missing.iter().map(report).collect()
+}
+
+/// The instrument's channels, and what came of them.
+fn coverage(received: &Received) -> BTreeMap<u16, ChannelCoverage> {
+    let frequencies = received.frequencies_hz.iter().zip(0..);
+    let mut channels: BTreeMap<u16, ChannelCoverage> = frequencies
+        .map(|(&hz, channel)| {
+            (channel, ChannelCoverage { channel, frequency_hz: Some(hz), ..ChannelCoverage::default() })
+        })
+        .collect();
+    for Reading { entry, waits, share } in received.readings.iter().filter(|reading| !reading.is_own()) {
+        let channel = entry.channel.0;
+        let new = || ChannelCoverage { channel, ..ChannelCoverage::default() };
+        let coverage = channels.entry(channel).or_insert_with(new);
+        coverage.packets += 1;
+        coverage.integration_s += entry.integration_s;
+        coverage.weight += if *waits { 0.0 } else { entry.weight * share.unwrap_or(1.0) };
+    }
+    channels
+}
+
+/// What waits for the positions in missing packets: between those of the last packet before that came and the next
+/// ones that came.
+fn positions_missing(readings: &[Reading], positions: &[Positions], gap: &Range<u64>) -> GapReport {
+    let next = positions.partition_point(|known| known.count < gap.start);
+    let before = next.checked_sub(1).map(|at| positions[at].span);
+    // What follows may be a repeat of what came before.
+    let mut behind = positions[next..].iter().map(|known| known.span);
+    let after = behind.find(|[start, _]| before.is_none_or(|[from, _]| *start > from));
+    let waits = |reading: &&Reading| {
+        let entry = &reading.entry;
+        reading.waits
+            && before.is_none_or(|[from, _]| entry.end > from)
+            && after.is_none_or(|[from, _]| entry.start < from)
+    };
+    let streams = Streams::of(readings.iter().filter(|reading| reading.share.is_some()).copied());
+    let mut lost: BTreeMap<Stream, LostStream> = BTreeMap::new();
+    for reading in readings.iter().filter(waits) {
+        let stream = reading.stream();
+        let sum = lost.entry(stream).or_insert_with(|| LostStream::nothing(stream));
+        sum.packets += 1;
+        sum.integration_s += reading.entry.integration_s;
+        sum.weight += reading.entry.weight * streams.usual(stream, reading.entry.sent(), NEAR).share();
+    }
+    let between_s = [before.map(|[_, end]| end.seconds()), after.map(|[start, _]| start.seconds())];
+    GapReport::new(Kind::Ephemeris, gap, between_s, lost.into_values().collect())
+}
+
+impl Reading {
+    pub(super) fn stream(&self) -> Stream {
+        (self.entry.channel, self.entry.pair)
+    }
+
+    /// Whether it holds a daughter's own powers, which are in no map.
+    fn is_own(&self) -> bool {
+        self.entry.pair.i == self.entry.pair.j
+    }
+}
+
+impl LostStream {
+    pub(super) fn nothing((channel, pair): Stream) -> Self {
+        Self { channel: channel.0, pair: pair.to_string(), packets: 0, integration_s: 0.0, weight: 0.0 }
+    }
+}
+
+impl GapReport {
+    pub(super) fn new(
+        kind: Kind,
+        gap: &Range<u64>,
+        between_s: [Option<f64>; 2],
+        lost: Vec<LostStream>,
+    ) -> Self {
+        // An empty sum of floats is -0.
+        let integration_s = lost.iter().map(|lost| lost.integration_s).sum::<f64>() + 0.0;
+        let (from, to, apid) = (gap.start, gap.end - 1, kind.apid());
+        Self { kind, apid, from, to, between_s, integration_s, gain: 0.0, lost }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::downlink::CucTime;
+    use crate::units::{ChannelId, Pair};
+
+    const PASSES: u64 = 6;
+    const STREAMS: u64 = 6;
+
+    /// Six passes of two channels and three pairs; channel 1 sends three packets a pass and pair, channel 0 one.
+    fn journal() -> Vec<JournalEntry> {
+        let mut entries = Vec::new();
+        for pass in 0..PASSES {
+            for stream in 0..STREAMS {
+                let channel = (stream / 3) as u16;
+                for part in 0..1 + 2 * u64::from(channel) {
+                    let start_s = 9000.0 * pass as f64 + 600.0 * part as f64;
+                    entries.push(JournalEntry {
+                        count: entries.len() as u64,
+                        made: CucTime((1 + pass) << 24),
+                        channel: ChannelId(channel),
+                        pair: Pair { i: 0, j: 1 + (stream % 3) as u8 },
+                        start: MissionTime::from_seconds(start_s),
+                        end: MissionTime::from_seconds(start_s + 600.0),
+                        visibilities: 100,
+                        integration_s: 500.0,
+                        weight: 1.0 + f64::from(channel),
+                    });
+                }
+            }
+        }
+        entries
+    }
+
+    fn read(entry: JournalEntry) -> Reading {
+        Reading { entry, waits: false, share: Some(1.0) }
+    }
+
+    /// What is found when packets are left out, and what they held by channel and pair.
+    fn without(lost: &[Range<u64>]) -> (Gaps, BTreeMap<(u16, String), f64>) {
+        let mut taken = Taken::default();
+        let mut held = BTreeMap::new();
+        let mut kept = Vec::new();
+        for entry in journal() {
+            if lost.iter().any(|range| range.contains(&entry.count)) {
+                *held.entry((entry.channel.0, entry.pair.to_string())).or_default() += entry.integration_s;
+            } else {
+                taken.take(entry.count, entry.made);
+                kept.push(entry);
+            }
+        }
+        let readings = kept.into_iter().map(read).collect();
+        let taken = vec![(Kind::Visibilities, taken)];
+        (find_gaps(&Received { readings, taken, ..Received::default() }), held)
+    }
+
+    #[test]
+    fn a_gap_is_told_by_channel_and_pair() {
+        // In one pair; over the ends of several; a whole pass; the first packets of all.
+        for gap in [14..15, 20..22, 2..5, 18..25, 24..36, 0..2, 33..40] {
+            let (found, held) = without(std::slice::from_ref(&gap));
+            assert_eq!(found.gaps.len(), 1);
+            let report = &found.gaps[0];
+            assert_eq!((report.apid, report.from, report.to), (0x103, gap.start, gap.end - 1));
+            let told: BTreeMap<_, _> = report
+                .lost
+                .iter()
+                .map(|lost| ((lost.channel, lost.pair.clone()), lost.integration_s))
+                .collect();
+            assert_eq!(told, held, "{gap:?}");
+        }
+    }
+
+    #[test]
+    fn a_gap_of_any_length_is_told_at_once() {
+        // As many whole passes as fit 2^46 packets, of 12 each, and four packets: one of each pair of channel 0, and the
+        // first of channel 1, pair by pair behind the six passes that came.
+        let entries = journal();
+        let last = entries.len() as u64;
+        let missing = ((1 << 46) - last - 5) / 12 * 12 + 4;
+        let far = JournalEntry { count: last + missing, start: MissionTime::from_seconds(1e9), ..entries[0] };
+        let far = JournalEntry { end: MissionTime::from_seconds(1e9 + 600.0), ..far };
+        let schedule = Schedule::learn([entries, vec![far]].concat().into_iter().map(read).collect());
+        let report = schedule.report(Kind::Visibilities, &(last..last + missing));
+        let packets: Vec<u64> = report.lost.iter().map(|lost| lost.packets).collect();
+        let passes = missing / 12;
+        let [one, three] = [passes + 1, 3 * passes];
+        assert_eq!(packets, [one, one, one, three + 1, three, three]);
+    }
+
+    #[test]
+    fn the_gap_that_adds_most_comes_first() {
+        // Three packets of channel 0, of 18 in all; two of channel 1, of 54.
+        let (found, _) = without(&[15..17, 36..39]);
+        assert_eq!((found.gaps[0].from, found.gaps[1].from), (36, 15));
+        assert!((found.gaps[0].gain - 3.0 / 15.0).abs() < 1e-12, "{}", found.gaps[0].gain);
+        assert!((found.gaps[1].gain - 2.0 / 52.0).abs() < 1e-12);
+        assert_eq!(found.channels[0].missing_integration_s, 1500.0);
+        assert_eq!(found.channels[1].missing_weight, 4.0);
+    }
+
+    #[test]
+    fn nothing_missing_and_nothing_received() {
+        assert!(without(&[]).0.gaps.is_empty());
+        let taken = vec![(Kind::Visibilities, Taken::default())];
+        assert_eq!(find_gaps(&Received { taken, ..Received::default() }), Gaps::default());
+    }
+}
