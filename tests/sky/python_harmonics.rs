@@ -1,7 +1,6 @@
 //! Spherical harmonics against healpy.
-#![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests are tests.
 
-mod common;
+use crate::common;
 
 use std::fs;
 use std::path::Path;

@@ -1,6 +1,5 @@
 //! Sums hold what was put in and nothing of how it came: in any order, in any calls, over any engines merged in any
 //! way, on any number of threads, and with anything put in and taken out again, a checkpoint has the same bytes.
-#![allow(clippy::unwrap_used)] // A test fails by panicking.
 
 use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup, orbit_of};
 use lunarray::accumulation::{

@@ -1,8 +1,7 @@
 //! The paper's map, at a quarter of its resolution and a twentieth of its orbits, through the command and the harmonic
 //! engine; the sky is the published one, and so is what to expect.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
-mod common;
+use crate::common;
 
 use std::path::Path;
 

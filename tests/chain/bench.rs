@@ -1,5 +1,4 @@
 //! `lunarray bench`: every stage is measured, in units that fit each other, on a machine that is named.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
 use assert_cmd::Command;
 use serde_json::Value;

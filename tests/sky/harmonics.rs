@@ -1,5 +1,4 @@
 //! Properties of the spherical harmonic transforms.
-#![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests are tests.
 
 use std::f64::consts::PI;
 

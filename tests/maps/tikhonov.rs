@@ -1,7 +1,6 @@
 //! Normal equations, solutions and traces against values computed by independent code.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
-mod common;
+use crate::common;
 
 use lunarray::accumulation::{NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums};
 use lunarray::array::{Array, ArrayConfig};

@@ -2,7 +2,6 @@
 //! visibility is accounted for, on the ground as in the link's truth.
 //!
 //! A few dozen cases; `PROPTEST_CASES` asks for more.
-#![allow(clippy::unwrap_used)] // Also in the helpers.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, LazyLock, Mutex, PoisonError};

@@ -1,5 +1,4 @@
 //! What small departures from the nominal orbit cost when the nearest rotation stands in for them.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
 use std::f64::consts::{PI, TAU};
 

@@ -1,7 +1,6 @@
 //! The coded link: what goes into frames comes out of them, whatever happens to the bits.
-#![allow(clippy::unwrap_used)] // Also in the helpers.
 
-mod common;
+use crate::common;
 
 use common::downlink::{mission, packets_of, transmit};
 use lunarray::downlink::receive::cadu::{CaduReceiver, FrameCounters};

@@ -4,9 +4,8 @@
 //! No noise is added, so what rho_l lacks is the instrument's and the method's: coverage, regularisation and
 //! the way rows of B are taken over pixels. The sky is used at its own resolution (nside 64, its own pixel
 //! centres), four times as fine as the map, so that small scales have the chance to alias.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
-mod common;
+use crate::common;
 
 use lunarray::accumulation::{MapConfig, NormalEngine, PixelEngine, PixelSetup, automatic_weight_max};
 use lunarray::array::{Array, ArrayConfig, IntegrationRule, ObservingWindows, integration_time_s};

@@ -1,7 +1,6 @@
 //! Rows of B and visibilities against independent values.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
-mod common;
+use crate::common;
 
 use lunarray::array::{Array, ArrayConfig, hidden_by_moon};
 use lunarray::frames::AntennaResponse;

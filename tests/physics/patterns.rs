@@ -1,7 +1,6 @@
 //! The harmonic engine's ingredients against values computed by independent code.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
-mod common;
+use crate::common;
 
 use std::path::Path;
 

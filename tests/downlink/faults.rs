@@ -1,5 +1,4 @@
 //! What the ground makes of a downlink, sound or damaged.
-#![allow(clippy::unwrap_used)] // Also in the helpers.
 
 use std::collections::BTreeSet;
 

@@ -1,7 +1,6 @@
 //! Other people's CCSDS decoders read our packets.
-#![allow(clippy::unwrap_used)] // Also in the helpers.
 
-mod common;
+use crate::common;
 
 use std::process::Command;
 

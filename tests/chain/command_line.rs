@@ -1,7 +1,6 @@
 //! The commands as a user gives them: answers, and messages for what is wrong.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
-mod common;
+use crate::common;
 
 use std::path::Path;
 

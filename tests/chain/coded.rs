@@ -1,7 +1,6 @@
 //! Coded downlinks through the commands: the same maps, and ledgers that close whatever the link did.
-#![allow(clippy::unwrap_used)] // Also in the helpers.
 
-mod common;
+use crate::common;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

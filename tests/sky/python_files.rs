@@ -1,7 +1,6 @@
 //! Map files against healpy, both ways, and the published maps.
-#![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests are tests.
 
-mod common;
+use crate::common;
 
 use std::ffi::OsStr;
 use std::fs;

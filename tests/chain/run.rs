@@ -1,8 +1,7 @@
 //! The whole chain through the command: space and ground apart give what they give together, and
 //! nothing but the seed and the configuration changes a byte.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
-mod common;
+use crate::common;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -1,7 +1,5 @@
 //! Map files: round trips, and what hostile files do.
 
-#![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests are tests.
-
 use std::fs;
 use std::io::Cursor;
 

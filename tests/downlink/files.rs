@@ -1,5 +1,4 @@
 //! Downlink files: written, cut short, damaged, looked through.
-#![allow(clippy::unwrap_used)] // Also in the helpers.
 
 use std::fs;
 use std::path::Path;

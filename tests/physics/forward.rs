@@ -1,5 +1,4 @@
 //! The forward operator against sums over directions that share none of its code.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
 use std::f64::consts::{PI, TAU};
 

@@ -1,7 +1,6 @@
 //! The array in motion against values computed by independent code.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
-mod common;
+use crate::common;
 
 use lunarray::array::{Array, ArrayConfig, Formation, IntegrationRule, ObservingWindows, integration_time_s};
 use lunarray::units::vector::{norm, sub};

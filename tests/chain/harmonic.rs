@@ -1,5 +1,4 @@
 //! The space segment with the harmonic model, from a map file to downlink bytes, against direct sums.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
 use std::f64::consts::{PI, TAU};
 use std::path::Path;

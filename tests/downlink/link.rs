@@ -1,7 +1,6 @@
 //! The ground is held to the truth of a simulated link: what can be recovered is, and nothing else arrives.
-#![allow(clippy::unwrap_used)] // Also in the helpers.
 
-mod common;
+use crate::common;
 
 use std::collections::{BTreeMap, BTreeSet};
 

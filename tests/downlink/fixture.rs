@@ -1,5 +1,4 @@
 //! Packets of format version 1, made by other code, read back. As long as this passes, old files can be read.
-#![allow(clippy::unwrap_used)] // Also in the helpers.
 
 use std::path::Path;
 

@@ -1,6 +1,5 @@
 //! The two engines, pixels and harmonics, on the same data; and what is estimated without a matrix against what a
 //! matrix gives.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
 use faer::{Mat, Side};
 use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
