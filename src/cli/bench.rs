@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::{CommandResult, Outcome, print_json_line, print_text};
+use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::bench::{BENCH_STAGES, BenchSettings, bench_config};
 use crate::pipeline::{ConfigSource, Plan, use_threads};
 
@@ -56,5 +56,5 @@ pub(super) fn execute(args: &BenchArgs) -> CommandResult {
     } else {
         print_text(&measured.to_string())?;
     }
-    Ok(Outcome::Done)
+    Ok(Completion::Done)
 }

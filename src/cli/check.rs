@@ -2,7 +2,8 @@
 
 use clap::Args;
 
-use super::{CommandResult, Outcome, PipelineArgs, print_json_line, print_text, tell_notes};
+use super::arguments::PipelineArgs;
+use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
 use crate::pipeline::{ConfigError, Plan};
 
 /// Check a pipeline and say what it will cost, without running it.
@@ -21,7 +22,7 @@ pub(super) struct CheckArgs {
 pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let source = args.pipeline.source();
     let config = source.load()?;
-    tell_notes(&config);
+    print_config_notes(&config);
     let plan = Plan::new(config)?;
     let problems = plan.file_problems();
     if !problems.is_empty() {
@@ -33,5 +34,5 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     } else {
         print_text(&format!("{}: no problems\n\n{cost}", source.origin()))?;
     }
-    Ok(Outcome::Done)
+    Ok(Completion::Done)
 }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::{CommandError, CommandResult, Outcome, print_json_line, print_text};
+use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
 use crate::products::{draw_comparison, draw_relative_error};
 use crate::sky::fits::{ReadOptions, read_whole_map_file};
 use crate::sky::{Comparison, Frame, SkyMap, compare};
@@ -67,12 +67,12 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     let wanted = !args.no_plot && (args.plot.is_some() || !args.json);
     let pictures = if wanted { draw(args, &comparison)? } else { Vec::new() };
     if args.json {
-        return Ok(Outcome::Done);
+        return Ok(Completion::Done);
     }
     for picture in pictures {
         print_text(&format!("{}", picture.display()))?;
     }
-    Ok(Outcome::Done)
+    Ok(Completion::Done)
 }
 
 /// A map in K, and its frequency, Hz, if the file tells. A file that does not say its frame is taken to be ecliptic, as

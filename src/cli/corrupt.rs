@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::{CommandResult, Outcome, print_json_line, print_text};
+use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::downlink::link::{LinkConfig, corrupt, truth_path};
 
 /// Damage a downlink file as a link would, and tell the truth about it.
@@ -95,5 +95,5 @@ pub(super) fn execute(args: &CorruptArgs) -> CommandResult {
             place.display()
         ))?;
     }
-    Ok(Outcome::Done)
+    Ok(Completion::Done)
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::{CommandResult, Outcome, print_json_line, print_text};
+use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::downlink::Kind;
 use crate::ground::archive::{GapReport, Gaps, RestartReport, Survey};
 
@@ -35,9 +35,7 @@ pub(super) struct GapsArgs {
 
 pub(super) fn execute(args: &GapsArgs) -> CommandResult {
     let survey = Survey::of(&args.path)?;
-    for note in survey.notes() {
-        eprintln!("note: {note}");
-    }
+    print_notes(survey.notes());
     let gaps = survey.gaps();
     if let Some(path) = &args.picture {
         survey.picture(&gaps)?.write(path)?;
@@ -47,7 +45,7 @@ pub(super) fn execute(args: &GapsArgs) -> CommandResult {
     } else {
         print_text(table(&gaps, args.most).trim_end())?;
     }
-    Ok(Outcome::Done)
+    Ok(Completion::Done)
 }
 
 fn table(gaps: &Gaps, most: usize) -> String {

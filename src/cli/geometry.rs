@@ -3,7 +3,8 @@
 use clap::Args;
 use serde::Serialize;
 
-use super::{ArrayArgs, CommandResult, Outcome, print_json_line, print_text, tell_notes, time_s};
+use super::arguments::{ArrayArgs, time_s};
+use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
 use crate::array::{Array, integration_time_s};
 use crate::mother::BAND_HZ;
 use crate::units::all_pairs;
@@ -29,16 +30,16 @@ pub(super) struct GeometryArgs {
 }
 
 #[derive(Serialize)]
-struct Geometry {
+struct GeometryReport {
     t_s: f64,
     observing: bool,
     earth_hat: Vec3,
     satellites_m: Vec<Vec3>,
-    pairs: Vec<PairGeometry>,
+    pairs: Vec<PairReport>,
 }
 
 #[derive(Serialize)]
-struct PairGeometry {
+struct PairReport {
     pair: String,
     baseline_m: Vec3,
     length_m: f64,
@@ -52,7 +53,7 @@ pub(super) fn execute(args: &GeometryArgs) -> CommandResult {
         );
     }
     let config = args.array.source().load()?;
-    tell_notes(&config);
+    print_config_notes(&config);
     let array = Array::new(&config.array)?;
     for &t_s in &args.at_s {
         let rule = config.spacecraft.rule();
@@ -60,14 +61,14 @@ pub(super) fn execute(args: &GeometryArgs) -> CommandResult {
         let pairs = all_pairs(array.satellites()).into_iter().map(|pair| {
             let (i, j) = (states[usize::from(pair.i)], states[usize::from(pair.j)]);
             let baseline_m = sub(i.position_m, j.position_m);
-            PairGeometry {
+            PairReport {
                 pair: pair.to_string(),
                 baseline_m,
                 length_m: norm(baseline_m),
                 dt_s: integration_time_s(rule, args.freq_hz, i.velocity_m_s, j.velocity_m_s),
             }
         });
-        let geometry = Geometry {
+        let geometry = GeometryReport {
             t_s,
             observing: array.observing(t_s),
             earth_hat: array.earth_hat(t_s),
@@ -80,10 +81,10 @@ pub(super) fn execute(args: &GeometryArgs) -> CommandResult {
             print_text(&table(&geometry))?;
         }
     }
-    Ok(Outcome::Done)
+    Ok(Completion::Done)
 }
 
-fn table(geometry: &Geometry) -> String {
+fn table(geometry: &GeometryReport) -> String {
     use std::fmt::Write;
     let mut text = String::new();
     let state = if geometry.observing { "observing (Earth hidden)" } else { "Earth in sight" };

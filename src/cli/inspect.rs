@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::{CommandResult, Outcome, print_json_line, print_text};
+use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::accumulation::harmonic::{GeometryCoverage, GeometrySurvey};
 use crate::downlink::Contents;
 use crate::response::harmonic::GeometryLimits;
@@ -43,5 +43,5 @@ pub(super) fn execute(args: &InspectArgs) -> CommandResult {
     } else {
         print_text(&format!("{contents}\n\n{geometry}"))?;
     }
-    Ok(Outcome::Done)
+    Ok(Completion::Done)
 }

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::{CommandResult, Outcome, print_text};
+use super::arguments::StateMapArgs;
+use super::output::{CommandResult, Completion, print_notes, print_text};
 use crate::ground::archive::Keeper;
-use crate::pipeline::{ConfigSource, use_threads};
+use crate::pipeline::use_threads;
 
 /// Put the states of several grounds together.
 ///
@@ -22,27 +23,20 @@ pub(super) struct MergeArgs {
     /// Folder for the new state.
     #[arg(short, long, value_name = "STATE")]
     out: PathBuf,
-    /// The map file that the states were made with; the embedded quicklook's settings if not given.
-    #[arg(long, value_name = "MAP.toml")]
-    map: Option<PathBuf>,
-    /// Replace one setting, for example --set map.nside=8; may be given again.
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    overrides: Vec<String>,
+    #[command(flatten)]
+    map: StateMapArgs,
 }
 
 pub(super) fn execute(args: &MergeArgs) -> CommandResult {
-    let source = ConfigSource { file: args.map.clone(), overrides: args.overrides.clone(), seed: None };
-    let config = source.load_ground()?;
+    let config = args.map.source().load_ground()?;
     use_threads(&config.runtime)?;
     let whole = Keeper::merge(&args.out, &args.states, &config)?;
-    for note in whole.notes() {
-        eprintln!("note: {note}");
-    }
+    print_notes(whole.notes());
     let (packets, out) = (whole.packets(), args.out.display());
     let (states, are) = match args.states.len() {
         1 => ("1 state".to_owned(), "is"),
         number => (format!("{number} states"), "are together"),
     };
     print_text(&format!("{states} with {packets} packets of visibilities {are} in {out}"))?;
-    Ok(Outcome::Done)
+    Ok(Completion::Done)
 }

@@ -6,7 +6,8 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::{ArrayArgs, CommandError, CommandResult, Outcome, print_json_line, print_text, time_s};
+use super::arguments::{ArrayArgs, time_s};
+use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
 use crate::array::Array;
 use crate::mother::BAND_HZ;
 use crate::response::pixel::{PairGeometry, exact};
@@ -43,7 +44,7 @@ pub(super) struct PredictArgs {
 }
 
 #[derive(Clone, Copy)]
-struct Request {
+struct VisibilityQuery {
     t_s: f64,
     pair: Pair,
     freq_hz: f64,
@@ -65,9 +66,9 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
     let map = read_whole_map(&args.sky, &ReadOptions::default())?;
     let directions = map.directions_ecliptic();
     let area_sr = pixel_area_sr(map.nside());
-    let answer = |request: Request| -> Result<(), CommandError> {
-        check(&array, request)?;
-        let Request { t_s, pair, freq_hz } = request;
+    let answer = |query: VisibilityQuery| -> Result<(), CommandError> {
+        check(&array, query)?;
+        let VisibilityQuery { t_s, pair, freq_hz } = query;
         let geometry = PairGeometry {
             r_i_m: array.position_m(pair.i.into(), t_s),
             r_j_m: array.position_m(pair.j.into(), t_s),
@@ -87,8 +88,8 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
         ))
     };
     if let (Some(t_s), Some(pair), Some(freq_hz)) = (args.at_s, args.pair, args.freq_hz) {
-        answer(Request { t_s, pair, freq_hz })?;
-        return Ok(Outcome::Done);
+        answer(VisibilityQuery { t_s, pair, freq_hz })?;
+        return Ok(Completion::Done);
     }
     let mut lines = std::io::stdin().lock().lines();
     let header = lines.next().transpose()?.unwrap_or_default();
@@ -98,14 +99,14 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
     for (number, line) in lines.enumerate() {
         let line = line?;
         if !line.trim().is_empty() {
-            let request = parse(&line).and_then(|request| check(&array, request).map(|()| request));
-            answer(request.map_err(|error| format!("standard input, line {}: {error}", number + 2))?)?;
+            let query = parse(&line).and_then(|query| check(&array, query).map(|()| query));
+            answer(query.map_err(|error| format!("standard input, line {}: {error}", number + 2))?)?;
         }
     }
-    Ok(Outcome::Done)
+    Ok(Completion::Done)
 }
 
-fn parse(line: &str) -> Result<Request, String> {
+fn parse(line: &str) -> Result<VisibilityQuery, String> {
     let fields: Vec<&str> = line.split(',').map(str::trim).collect();
     let [t_s, i, j, freq_hz] = fields[..] else {
         return Err(format!("found {} fields, expected the four t_s,i,j,freq_hz", fields.len()));
@@ -117,11 +118,11 @@ fn parse(line: &str) -> Result<Request, String> {
         text.parse::<usize>().map_err(|_| format!("{name} = `{text}`: expected a satellite's number"))
     };
     let pair = Pair::from_one_based(satellite("i", i)?, satellite("j", j)?).map_err(|e| e.to_string())?;
-    Ok(Request { t_s: number("t_s", t_s)?, pair, freq_hz: number("freq_hz", freq_hz)? })
+    Ok(VisibilityQuery { t_s: number("t_s", t_s)?, pair, freq_hz: number("freq_hz", freq_hz)? })
 }
 
-fn check(array: &Array, request: Request) -> Result<(), String> {
-    let Request { t_s, pair, freq_hz } = request;
+fn check(array: &Array, query: VisibilityQuery) -> Result<(), String> {
+    let VisibilityQuery { t_s, pair, freq_hz } = query;
     if !(-1e9..=1e9).contains(&t_s) {
         return Err(format!("t_s = {t_s}: expected seconds, -1e9 to 1e9"));
     }

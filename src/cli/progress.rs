@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::CommandError;
+use super::output::CommandError;
 use crate::downlink::transport::socket::ListenStatus;
 use crate::pipeline::Watched;
 use crate::runtime::Cancel;
@@ -43,7 +43,7 @@ impl Progress {
     pub(super) fn watch(watched: Watched, stage: &'static str, total: u64) -> Self {
         let (stop, stopped) = channel();
         let thread = std::thread::spawn(move || {
-            let mut shown = Shown::new(total);
+            let mut shown = ProgressView::new(total);
             let wait = if shown.bar.is_some() { POLL } else { LINE_EVERY };
             while stopped.recv_timeout(wait).is_err_and(|e| e == std::sync::mpsc::RecvTimeoutError::Timeout) {
                 shown.show(&watched, stage);
@@ -66,7 +66,7 @@ impl Drop for Progress {
     }
 }
 
-struct Shown {
+struct ProgressView {
     bar: Option<ProgressBar>,
     total: u64,
     /// Bytes of all senders at the last look, and when that was.
@@ -76,7 +76,7 @@ struct Shown {
     solution: Option<(u64, Instant, f64)>,
 }
 
-impl Shown {
+impl ProgressView {
     fn new(total: u64) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
             let template = if total > 0 {

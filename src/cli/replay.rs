@@ -5,8 +5,9 @@ use std::path::PathBuf;
 use clap::{ArgGroup, Args};
 use crossbeam_channel::{Receiver, bounded};
 
+use super::arguments::not_negative_s;
+use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
 use super::progress::{Progress, cancel_on_interrupt};
-use super::{CommandError, CommandResult, Outcome, not_negative_s, print_json_line, print_text};
 use crate::downlink::transport::socket::{SocketError, SocketSource, TcpUrl, Until};
 use crate::downlink::{FileSource, Pace, Paced, Steps};
 use crate::ground::archive::Keeper;
@@ -72,7 +73,7 @@ pub(super) struct ReplayArgs {
     /// Replay step by step, a pass or so much mission time each (a number with s, h or d): each line of standard
     /// input is a step, its end ends the replay.
     #[arg(long, value_name = "pass|TIME", value_parser = step)]
-    step: Option<Step>,
+    step: Option<StepLength>,
     /// Mission time between snapshot maps: a number with s, h or d, such as 7d; 0 for a final map alone.
     #[arg(long, value_name = "TIME", value_parser = not_negative_s)]
     snapshot_every: Option<f64>,
@@ -90,7 +91,7 @@ struct Speed(Option<f64>);
 
 /// Mission time of a step, s; `None` for a pass.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Step(Option<f64>);
+struct StepLength(Option<f64>);
 
 fn speed(text: &str) -> Result<Speed, String> {
     match (text.trim(), text.trim().parse::<f64>()) {
@@ -100,11 +101,11 @@ fn speed(text: &str) -> Result<Speed, String> {
     }
 }
 
-fn step(text: &str) -> Result<Step, String> {
+fn step(text: &str) -> Result<StepLength, String> {
     match text.trim() {
-        "pass" => Ok(Step(None)),
+        "pass" => Ok(StepLength(None)),
         text => match not_negative_s(text) {
-            Ok(every_s) if every_s > 0.0 => Ok(Step(Some(every_s))),
+            Ok(every_s) if every_s > 0.0 => Ok(StepLength(Some(every_s))),
             _ => Err("expected pass, or a number above 0 with s, h or d, such as 1d".into()),
         },
     }
@@ -124,9 +125,7 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
         }
         None => None,
     };
-    for note in keeper.iter().flat_map(Keeper::notes) {
-        eprintln!("note: {note}");
-    }
+    print_notes(keeper.iter().flat_map(Keeper::notes));
     let summary = match &args.listen {
         Some(url) => from_senders(args, url, &config, keeper)?,
         None => from_files(args, &config, keeper)?,
@@ -136,7 +135,7 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     } else {
         print_text(&format!("{summary}\nProducts are in {}", args.out.display()))?;
     }
-    Ok(if summary.cancelled { Outcome::Interrupted } else { Outcome::Done })
+    Ok(Completion::of(summary.cancelled))
 }
 
 fn from_senders(
@@ -174,7 +173,7 @@ fn from_files(args: &ReplayArgs, config: &Config, keeper: Option<Keeper>) -> Res
         None => Receiving::Once { wait_bytes: args.wait_bytes.unwrap_or(WAIT_BYTES) },
     };
     let pace = match (args.step, args.speed) {
-        (Some(Step(every_s)), _) => {
+        (Some(StepLength(every_s)), _) => {
             let tell = Box::new(|note: &str| eprintln!("{note}"));
             Pace::Steps(Steps { every_s, go: lines_of_input(), tell })
         }
@@ -220,8 +219,8 @@ mod tests {
     fn paces_are_read() {
         assert_eq!(speed("max"), Ok(Speed(None)));
         assert_eq!(speed("1000"), Ok(Speed(Some(1000.0))));
-        assert_eq!(step("pass"), Ok(Step(None)));
-        assert_eq!(step("1d"), Ok(Step(Some(DAY_S))));
+        assert_eq!(step("pass"), Ok(StepLength(None)));
+        assert_eq!(step("1d"), Ok(StepLength(Some(DAY_S))));
         assert!(["0", "-1", "inf", "NaN", "fast"].iter().all(|text| speed(text).is_err()));
         assert!(["0", "-1d", "file.ccsds", ""].iter().all(|text| step(text).is_err()));
     }

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::{CommandResult, Outcome, print_json_line, print_text};
+use super::arguments::StateMapArgs;
+use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::ground::archive::Keeper;
-use crate::pipeline::{ConfigSource, use_threads};
+use crate::pipeline::use_threads;
 use crate::units::MissionTime;
 
 /// Take the packets of files out of a state again.
@@ -31,20 +32,15 @@ pub(super) struct RetractArgs {
     /// Take out visibilities alone, and only packets that end at this mission time, s, or before.
     #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
     to_s: Option<f64>,
-    /// The map file that the state was made with; the embedded quicklook's settings if not given.
-    #[arg(long, value_name = "MAP.toml")]
-    map: Option<PathBuf>,
-    /// Replace one setting, for example --set map.nside=8; may be given again.
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    overrides: Vec<String>,
+    #[command(flatten)]
+    map: StateMapArgs,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
 }
 
 pub(super) fn execute(args: &RetractArgs) -> CommandResult {
-    let source = ConfigSource { file: args.map.clone(), overrides: args.overrides.clone(), seed: None };
-    let config = source.load_ground()?;
+    let config = args.map.source().load_ground()?;
     use_threads(&config.runtime)?;
     let ticks = |s: Option<f64>, otherwise: i64| s.map_or(MissionTime(otherwise), MissionTime::from_seconds);
     let span = match (args.from_s, args.to_s) {
@@ -52,9 +48,7 @@ pub(super) fn execute(args: &RetractArgs) -> CommandResult {
         (from_s, to_s) => Some([ticks(from_s, i64::MIN), ticks(to_s, i64::MAX)]),
     };
     let (keeper, found) = Keeper::retract(&args.state, &args.files, span, &config)?;
-    for note in keeper.notes() {
-        eprintln!("note: {note}");
-    }
+    print_notes(keeper.notes());
     for refused in &found.named {
         eprintln!(
             "note: the packet of {} with count {} stays: {}",
@@ -63,7 +57,7 @@ pub(super) fn execute(args: &RetractArgs) -> CommandResult {
     }
     if args.json {
         print_json_line(&found)?;
-        return Ok(Outcome::Done);
+        return Ok(Completion::Done);
     }
     let mut text = format!(
         "{} packets are taken out of {}, {} of which waited; {} of their {} visibilities were in the sums",
@@ -83,5 +77,5 @@ pub(super) fn execute(args: &RetractArgs) -> CommandResult {
         }
     }
     print_text(&text)?;
-    Ok(Outcome::Done)
+    Ok(Completion::Done)
 }

@@ -4,8 +4,9 @@ use std::path::PathBuf;
 
 use clap::Args;
 
+use super::arguments::PipelineArgs;
+use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
 use super::progress::{Progress, cancel_on_interrupt};
-use super::{CommandResult, Outcome, PipelineArgs, print_json_line, print_text, tell_notes};
 use crate::pipeline::{INTEGRATE, Plan, run, use_threads};
 
 /// Run the whole chain: sky, spacecraft, downlink, ground, maps.
@@ -28,7 +29,7 @@ pub(super) struct RunArgs {
 
 pub(super) fn execute(args: &RunArgs) -> CommandResult {
     let config = args.pipeline.source().load()?;
-    tell_notes(&config);
+    print_config_notes(&config);
     let plan = Plan::new(config)?;
     use_threads(&plan.config.runtime)?;
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
@@ -44,5 +45,5 @@ pub(super) fn execute(args: &RunArgs) -> CommandResult {
     } else {
         print_text(&format!("{summary}\nProducts are in {}", out.display()))?;
     }
-    Ok(if summary.cancelled { Outcome::Interrupted } else { Outcome::Done })
+    Ok(Completion::of(summary.cancelled))
 }

@@ -5,8 +5,9 @@ use std::sync::atomic::Ordering;
 
 use clap::Args;
 
+use super::arguments::{PipelineArgs, not_negative_s};
+use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
 use super::progress::{Progress, cancel_on_interrupt};
-use super::{CommandResult, Outcome, PipelineArgs, not_negative_s, print_json_line, print_text, tell_notes};
 use crate::downlink::transport::socket::{SendOptions, SocketSink, TcpUrl};
 use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, use_threads};
 
@@ -46,7 +47,7 @@ fn rate(text: &str) -> Result<f64, String> {
 
 pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let config = args.pipeline.source().load()?;
-    tell_notes(&config);
+    print_config_notes(&config);
     let plan = Plan::new(config)?;
     use_threads(&plan.config.runtime)?;
     let cancel = cancel_on_interrupt()?;
@@ -73,5 +74,5 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     } else {
         print_text(&format!("{report}\n{}", places.join("\n")))?;
     }
-    Ok(if report.cancelled { Outcome::Interrupted } else { Outcome::Done })
+    Ok(Completion::of(report.cancelled))
 }

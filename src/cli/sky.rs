@@ -4,10 +4,10 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::{CommandResult, Outcome, print_text};
+use super::output::{CommandResult, Completion, print_text};
 use crate::mother::{BAND_HZ, NINTH_BAND_HZ};
 use crate::pipeline::{Config, ConfigSource};
-use crate::products::pictures::{MapPanel, Palette, Scale, Stretch, View, draw_map};
+use crate::products::pictures::{ColourScale, MapPanel, Palette, Scaling, View, draw_map};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::generated::generate;
 use crate::sky::{Frame, GENERATED_NSIDE_MAX, SkyMap};
@@ -66,11 +66,11 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
         let panel = MapPanel {
             values: map.values(),
             caption: title,
-            scale: Scale::robust(map.values(), Stretch::Log, Palette::default()),
+            scale: ColourScale::robust(map.values(), Scaling::Log, Palette::default()),
             unit: "K".to_owned(),
         };
         draw_map(&panel, &format!("seed {seed}, nside {nside}"), &View::default())?.write(&picture)?;
         print_text(&format!("{}: picture", picture.display()))?;
     }
-    Ok(Outcome::Done)
+    Ok(Completion::Done)
 }

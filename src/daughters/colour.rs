@@ -1,63 +1,10 @@
-//! From independent noise to noise of a given covariance, many frequencies at a time.
+//! Colouring: from independent noise to noise of a given covariance, many frequencies at a time.
 
-use pulp::{Arch, Simd, WithSimd};
+use pulp::Simd;
 
+use super::bins::HALF;
 use super::covariance::Covariances;
-
-/// Frequencies that are worked on together on one side of the channel's centre: a register of the widest kind.
-pub(super) const HALF: usize = 16;
-/// Frequencies that are worked on together: `HALF` below the centre, and those that mirror them.
-pub(super) const TILE: usize = 2 * HALF;
-
-/// Smallest pivot of a covariance, as a part of its diagonal: below lies the rounding of `f32`.
-pub(super) const PIVOT_MIN: f32 = 1e-6;
-
-/// Matrices of one tile of frequencies: lower triangles, row after row, `TILE` values an element.
-#[derive(Clone, Debug)]
-pub(super) struct Tile {
-    pub re: Vec<[f32; TILE]>,
-    pub im: Vec<[f32; TILE]>,
-}
-
-/// Place of element (i, j), i >= j, of a lower triangle.
-pub(super) fn element(i: usize, j: usize) -> usize {
-    i * (i + 1) / 2 + j
-}
-
-impl Tile {
-    pub(super) fn new(order: usize) -> Self {
-        let elements = element(order, 0);
-        Self { re: vec![[0.0; TILE]; elements], im: vec![[0.0; TILE]; elements] }
-    }
-}
-
-/// Work on the frequencies of a tile.
-pub(super) trait Tiled {
-    type Output;
-    /// Does it; `P` registers hold one side.
-    fn run<S: Simd, const P: usize>(self, simd: S) -> Self::Output;
-}
-
-/// Does `work` with the widest registers that there are.
-pub(super) fn on_tile<W: Tiled>(arch: Arch, work: W) -> W::Output {
-    arch.dispatch(Widest(work))
-}
-
-struct Widest<W>(W);
-
-impl<W: Tiled> WithSimd for Widest<W> {
-    type Output = W::Output;
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) -> W::Output {
-        match S::F32_LANES {
-            16 => self.0.run::<S, 1>(simd),
-            8 => self.0.run::<S, 2>(simd),
-            4 => self.0.run::<S, 4>(simd),
-            _ => self.0.run::<S, HALF>(simd),
-        }
-    }
-}
+use super::tile::{PIVOT_MIN, TILE, Tile, TileKernel, element};
 
 /// Puts the covariances of one group of bins and their mirrors into a tile.
 pub(super) struct Expand<'a> {
@@ -67,7 +14,7 @@ pub(super) struct Expand<'a> {
     pub(super) tile: &'a mut Tile,
 }
 
-impl Tiled for Expand<'_> {
+impl TileKernel for Expand<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -124,7 +71,7 @@ pub(super) struct Factor<'a> {
     pub(super) order: usize,
 }
 
-impl Tiled for Factor<'_> {
+impl TileKernel for Factor<'_> {
     type Output = bool;
 
     #[inline(always)]
@@ -145,25 +92,25 @@ impl Tiled for Factor<'_> {
 
 /// An element at all frequencies, side by side. Both sides at a time keep more sums going than an addition takes
 /// cycles.
-type Lanes<S, const P: usize> = [[<S as Simd>::f32s; P]; 2];
+type TileRegisters<S, const P: usize> = [[<S as Simd>::f32s; P]; 2];
 
 #[inline(always)]
-fn lanes<S: Simd, const P: usize>(element: &[f32; TILE]) -> Lanes<S, P> {
+fn registers<S: Simd, const P: usize>(element: &[f32; TILE]) -> TileRegisters<S, P> {
     let element = S::as_simd_f32s(element).0;
     std::array::from_fn(|side| std::array::from_fn(|p| element[side * P + p]))
 }
 
 #[inline(always)]
-fn set<S: Simd, const P: usize>(element: &mut [f32; TILE], values: Lanes<S, P>) {
+fn set<S: Simd, const P: usize>(element: &mut [f32; TILE], values: TileRegisters<S, P>) {
     S::as_mut_simd_f32s(element).0.copy_from_slice(values.as_flattened());
 }
 
 /// What a daughter has left of its power becomes its own amplitude; gives one over it. The imaginary part on the
 /// diagonal, which is none, keeps the power.
 #[inline(always)]
-fn pivot<S: Simd, const P: usize>(simd: S, tile: &mut Tile, j: usize) -> Lanes<S, P> {
+fn pivot<S: Simd, const P: usize>(simd: S, tile: &mut Tile, j: usize) -> TileRegisters<S, P> {
     let at = element(j, j);
-    let (mut left, mut power) = (lanes::<S, P>(&tile.re[at]), lanes::<S, P>(&tile.im[at]));
+    let (mut left, mut power) = (registers::<S, P>(&tile.re[at]), registers::<S, P>(&tile.im[at]));
     if j == 0 {
         power = left;
     }
@@ -188,10 +135,10 @@ fn row<S: Simd, const P: usize>(
     simd: S,
     tile: &mut Tile,
     [i, j]: [usize; 2],
-    inverse: Lanes<S, P>,
-) -> Lanes<S, P> {
+    inverse: TileRegisters<S, P>,
+) -> TileRegisters<S, P> {
     let (at, own) = (element(i, j), element(i, i));
-    let (mut re, mut im) = (lanes::<S, P>(&tile.re[at]), lanes::<S, P>(&tile.im[at]));
+    let (mut re, mut im) = (registers::<S, P>(&tile.re[at]), registers::<S, P>(&tile.im[at]));
     for k in 0..j {
         let (a, b) = (element(i, k), element(j, k));
         let (a_re, a_im) = (S::as_simd_f32s(&tile.re[a]).0, S::as_simd_f32s(&tile.im[a]).0);
@@ -207,7 +154,7 @@ fn row<S: Simd, const P: usize>(
             }
         }
     }
-    let mut left = lanes::<S, P>(&tile.re[own]);
+    let mut left = registers::<S, P>(&tile.re[own]);
     if j == 0 {
         // The power, for the pivot.
         set::<S, P>(&mut tile.im[own], left);
@@ -228,7 +175,7 @@ fn row<S: Simd, const P: usize>(
 }
 
 /// `x_i = sum over j <= i of L_ij z_j`: the factor of one group of bins times independent noise, daughter by daughter.
-pub(super) struct Colour<'a> {
+pub(super) struct ApplyFactor<'a> {
     pub(super) tile: &'a Tile,
     /// By daughter, `stride` apart.
     pub(super) noise: [&'a [[f32; TILE]]; 2],
@@ -236,7 +183,7 @@ pub(super) struct Colour<'a> {
     pub(super) x: &'a mut [[[f32; TILE]; 2]],
 }
 
-impl Tiled for Colour<'_> {
+impl TileKernel for ApplyFactor<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -269,7 +216,10 @@ impl Tiled for Colour<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use pulp::Arch;
+
     use crate::daughters::repair::factor;
+    use crate::daughters::tile::on_tile;
 
     #[test]
     fn factors_multiply_to_the_matrix() {
@@ -334,7 +284,7 @@ mod tests {
         let z_re = vec![[1.0; TILE]; ORDER];
         let z_im: Vec<[f32; TILE]> = (0..ORDER).map(|j| [j as f32; TILE]).collect();
         let mut x = vec![[[0.0; TILE]; 2]; ORDER];
-        let colour = Colour { tile: &tile, noise: [&z_re, &z_im], stride: 1, x: &mut x };
+        let colour = ApplyFactor { tile: &tile, noise: [&z_re, &z_im], stride: 1, x: &mut x };
         on_tile(Arch::new(), colour);
         for (i, x) in x.iter().enumerate() {
             for (t, (re, im)) in x[0].iter().zip(&x[1]).enumerate() {

@@ -63,15 +63,15 @@ pub struct Covariances {
 }
 
 /// Tables by what they are made for.
-type Shared<K, T> = Mutex<HashMap<K, Arc<T>>>;
+type TableCache<K, T> = Mutex<HashMap<K, Arc<T>>>;
 
 /// Interpolations over time and over the channel, which channels and stretches have in common.
 #[derive(Debug, Default)]
 pub struct Tables {
     /// By numbers of instants and of epochs.
-    times: Shared<(usize, usize), [f32]>,
+    times: TableCache<(usize, usize), [f32]>,
     /// By number of nodes.
-    bases: Shared<usize, Basis>,
+    bases: TableCache<usize, Basis>,
 }
 
 /// Most tables that are kept: some 100 kB each.
@@ -90,7 +90,7 @@ impl Tables {
 
 /// The table of `key`, made if it is not there. Two threads may both make one; they are equal.
 fn shared<K: Copy + Eq + std::hash::Hash, T: ?Sized>(
-    tables: &Shared<K, T>,
+    tables: &TableCache<K, T>,
     key: K,
     make: impl FnOnce() -> Arc<T>,
 ) -> Arc<T> {
@@ -108,7 +108,7 @@ fn shared<K: Copy + Eq + std::hash::Hash, T: ?Sized>(
 }
 
 /// Where a model of one channel is asked.
-pub struct Request<'a> {
+pub struct CovarianceRequest<'a> {
     /// The array.
     pub array: &'a Array,
     /// The channel's frequency and width.
@@ -126,7 +126,10 @@ impl Covariances {
     ///
     /// # Errors
     /// [`ModelError`], for positions that the model does not cover.
-    pub fn predict(model: &mut dyn VisibilityModel, request: &Request<'_>) -> Result<Self, ModelError> {
+    pub fn predict(
+        model: &mut dyn VisibilityModel,
+        request: &CovarianceRequest<'_>,
+    ) -> Result<Self, ModelError> {
         let mut own = Self::default();
         own.predict_again(model, request)?;
         Ok(own)
@@ -139,13 +142,13 @@ impl Covariances {
     pub fn predict_again(
         &mut self,
         model: &mut dyn VisibilityModel,
-        request: &Request<'_>,
+        request: &CovarianceRequest<'_>,
     ) -> Result<(), ModelError> {
         self.daughters = request.array.satellites();
         self.stride = self.daughters.next_multiple_of(COLUMNS);
         let mut plans = Vec::new();
         for pair in all_pairs(self.daughters) {
-            let plan = Plan::new(request, pair, self.stride);
+            let plan = PairGrid::new(request, pair, self.stride);
             self.stride += plan.width();
             plans.push(plan);
         }
@@ -165,9 +168,9 @@ impl Covariances {
     fn predict_powers(
         &mut self,
         model: &mut dyn VisibilityModel,
-        request: &Request<'_>,
+        request: &CovarianceRequest<'_>,
     ) -> Result<(), ModelError> {
-        let steady = Plan::steady();
+        let steady = PairGrid::steady();
         let mut positions = Vec::with_capacity(self.daughters * steady.instants);
         for t_s in steady.instants_s(request.epochs) {
             let normal_hat = request.array.orbit_normal_hat(t_s);
@@ -214,7 +217,7 @@ impl Covariances {
 }
 
 /// Where one pair is predicted.
-struct Plan {
+struct PairGrid {
     pair: Pair,
     instants: usize,
     /// Nodes over the channel.
@@ -223,8 +226,8 @@ struct Plan {
     at: usize,
 }
 
-impl Plan {
-    fn new(request: &Request<'_>, pair: Pair, at: usize) -> Self {
+impl PairGrid {
+    fn new(request: &CovarianceRequest<'_>, pair: Pair, at: usize) -> Self {
         let Epochs { start_s, step_s, count } = request.epochs;
         let half_s = 0.5 * step_s * (count + 1) as f64;
         let middle_s = start_s + half_s - step_s;
@@ -263,7 +266,7 @@ impl Plan {
     fn coefficients(
         &self,
         model: &mut dyn VisibilityModel,
-        request: &Request<'_>,
+        request: &CovarianceRequest<'_>,
     ) -> Result<(Arc<Basis>, Vec<f32>), ModelError> {
         let place = |n: u8, t_s| request.array.position_m(n.into(), t_s);
         let position = |t_s| PairPosition {
@@ -325,7 +328,7 @@ mod tests {
         // Along the track of the array where it is, so that delays are as long as they get.
         let (from_s, step_s, count) = (5000.0, 8e-3, 257);
         let n_hat = crate::units::vector::unit(sub(array.position_m(0, from_s), array.position_m(7, from_s)));
-        let request = Request {
+        let request = CovarianceRequest {
             array: &array,
             channel: Channel { frequency_hz: FREQUENCY_HZ, width_hz: 8e3 },
             receiver_noise_k_sr: 0.5,

@@ -59,7 +59,7 @@ impl Disturbances {
 
 /// A stretch of samples of one daughter to which tones are added.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Stretch<'a> {
+pub(super) struct BlockTones<'a> {
     pub disturbances: &'a Disturbances,
     pub array: &'a Array,
     pub daughter: usize,
@@ -72,7 +72,7 @@ pub(super) struct Stretch<'a> {
     pub seed: u64,
 }
 
-impl Stretch<'_> {
+impl BlockTones<'_> {
     /// Adds the calibration tone and the Earth's leak. Both pass the daughter's own gain and clock.
     pub(super) fn add_tones(&self, re: &mut [f32], im: &mut [f32]) {
         let d = self.disturbances;

@@ -1,6 +1,6 @@
-//! Interpolation over time: from the instants that a model is asked for to the epochs at which samples are drawn.
+//! BandInterpolation over time: from the instants that a model is asked for to the epochs at which samples are drawn.
 
-use super::nodes::Interpolation;
+use super::nodes::BandInterpolation;
 use crate::response::pixel::kernel::fused;
 
 /// Epochs and values that are interpolated together.
@@ -12,7 +12,7 @@ pub(super) const COLUMNS: usize = 8;
 pub(super) fn time_matrix(instants: usize, count: usize) -> Vec<f32> {
     // Variance of a density cos^2 of half width 1, halved.
     let flattening = 0.5 * (1.0 / 3.0 - 2.0 / std::f64::consts::PI.powi(2));
-    let interpolation = Interpolation::new(instants);
+    let interpolation = BandInterpolation::new(instants);
     let step = 2.0 / (count + 1) as f64;
     let mut weights = vec![0.0; (count + 2) * instants];
     for (k, row) in weights.chunks_exact_mut(instants).enumerate() {

@@ -1,4 +1,4 @@
-//! Interpolation of functions of limited bandwidth from equally spaced nodes.
+//! BandInterpolation of functions of limited bandwidth from equally spaced nodes.
 //!
 //! A function of -1 <= x <= 1 whose phase sweeps +-z is a mean of `exp(i s x)` with `|s| <= z`. Its value at x is
 //! estimated by the weights w that minimise the mean over s of `|exp(i s x) - sum_k w_k exp(i s x_k)|^2`:
@@ -6,8 +6,7 @@
 //! held by adding 1e-9 to its diagonal, which keeps weights below 10. `ceil(z) + 5` nodes leave 1e-3 of the
 //! function at most, at the ends of the interval and of the band, and 2e-4 rms; a constant is exact.
 
-use super::colour::HALF;
-use super::synthesis::{BINS, bin_offset};
+use super::bins::{BINS, HALF, bin_offset};
 
 /// Added to the diagonal.
 const RIDGE: f64 = 1e-9;
@@ -38,13 +37,13 @@ pub(super) fn node(k: usize, nodes: usize) -> f64 {
 }
 
 /// Weights of equally spaced nodes.
-pub(super) struct Interpolation {
+pub(super) struct BandInterpolation {
     nodes: usize,
     /// Cholesky factor of G, rows of its lower triangle.
     factor: Vec<Vec<f64>>,
 }
 
-impl Interpolation {
+impl BandInterpolation {
     /// For as many nodes, two at least.
     pub(super) fn new(nodes: usize) -> Self {
         let mut factor: Vec<Vec<f64>> = Vec::with_capacity(nodes);
@@ -98,9 +97,9 @@ pub(super) struct Basis {
 }
 
 impl Basis {
-    /// Interpolation from `nodes`, two at least.
+    /// BandInterpolation from `nodes`, two at least.
     pub(super) fn new(nodes: usize) -> Self {
-        let interpolation = Interpolation::new(nodes);
+        let interpolation = BandInterpolation::new(nodes);
         let mut rows = vec![[0.0; HALF]; GROUPS * nodes];
         let mut weights = vec![0.0; nodes];
         for bin in 0..BINS / 2 {
@@ -138,7 +137,7 @@ impl Basis {
     #[cfg(test)]
     pub(super) fn value(&self, coefficients: &[f32], x: f64) -> f64 {
         let mut weights = vec![0.0; self.nodes];
-        Interpolation::new(self.nodes).weights(x, &mut weights);
+        BandInterpolation::new(self.nodes).weights(x, &mut weights);
         functions(&weights).zip(coefficients).map(|(value, c)| value * f64::from(*c)).sum()
     }
 }
@@ -159,7 +158,7 @@ mod tests {
     fn a_phase_is_interpolated_as_documented() {
         for z in [0.05, 0.3, 1.0, 1.7, 3.2, 8.4, 14.9, 29.0, 57.3] {
             let nodes = nodes_for(z);
-            let interpolation = Interpolation::new(nodes);
+            let interpolation = BandInterpolation::new(nodes);
             let mut weights = vec![0.0; nodes];
             let (mut worst, mut squares, mut count) = (0.0_f64, 0.0, 0.0);
             for x in (0..=40).map(|k| f64::from(k) / 20.0 - 1.0) {
@@ -198,7 +197,7 @@ mod tests {
                 let (even, odd) = (sum(even, c_even), sum(odd, c_odd));
                 for (found, bin) in [(even + odd, bin), (even - odd, BINS - 1 - bin)] {
                     let mut weights = vec![0.0; nodes];
-                    Interpolation::new(nodes).weights(2.0 * bin_offset(bin), &mut weights);
+                    BandInterpolation::new(nodes).weights(2.0 * bin_offset(bin), &mut weights);
                     let expected: f64 = weights.iter().enumerate().map(|(k, w)| w * value(k)).sum();
                     // f32 sums of up to 60.
                     assert!((found - expected).abs() < 2e-4, "{nodes} {bin}: {found} {expected}");

@@ -2,7 +2,7 @@
 
 use multiversion::multiversion;
 
-use super::colour::{PIVOT_MIN, TILE, Tile, element};
+use super::tile::{PIVOT_MIN, TILE, Tile, element};
 use crate::response::pixel::kernel::fused;
 
 /// Changes of a correlation that are counted; smaller ones are rounding.
@@ -114,7 +114,8 @@ fn shrink(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::daughters::colour::{Factor, on_tile};
+    use crate::daughters::colour::Factor;
+    use crate::daughters::tile::on_tile;
 
     #[test]
     fn what_is_no_covariance_keeps_its_powers_and_loses_correlation() {

@@ -4,12 +4,13 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 
+use super::bins::HOP;
 use super::config::DaughtersConfig;
-use super::covariance::{Covariances, Epochs, Request, Tables};
-use super::disturbances::Stretch;
+use super::covariance::{CovarianceRequest, Covariances, Epochs, Tables};
+use super::disturbances::BlockTones;
 use super::quantiser::Quantiser;
 use super::repair::Repairs;
-use super::synthesis::{Draft, DrawKey, HOP, Planes, Response, Synthesis};
+use super::synthesis::{Draft, DrawKey, Planes, Response, SampleSynthesis};
 use crate::array::Array;
 use crate::frames::{Channel, ObservingWindow, SampleBlock, SpaceFrame};
 use crate::response::model::{ModelError, VisibilityModel};
@@ -52,8 +53,8 @@ pub struct Sampler {
     scene: Scene,
     config: DaughtersConfig,
     windows: std::vec::IntoIter<ObservingWindow>,
-    current: Option<Progress>,
-    synthesis: Synthesis,
+    current: Option<WindowProgress>,
+    synthesis: SampleSynthesis,
     tables: Tables,
     /// Room to work in that no thread has at the moment.
     spare: Mutex<Vec<Room>>,
@@ -71,7 +72,7 @@ struct Room {
 type Made = Vec<(Vec<SampleBlock>, Repairs)>;
 
 /// How far a window has been sampled.
-struct Progress {
+struct WindowProgress {
     window: ObservingWindow,
     /// Samples that the window has.
     samples: usize,
@@ -98,14 +99,14 @@ impl Sampler {
             config,
             windows,
             current: None,
-            synthesis: Synthesis::new(),
+            synthesis: SampleSynthesis::new(),
             tables: Tables::default(),
             spare: Mutex::default(),
             counts,
         }
     }
 
-    fn begin(&self, mut window: ObservingWindow) -> Progress {
+    fn begin(&self, mut window: ObservingWindow) -> WindowProgress {
         let width_hz = self.width_hz();
         let length_s = (window.end.0 - window.start.0) as f64 / TICKS_PER_SECOND as f64;
         let samples = (length_s * width_hz) as usize / HOP * HOP;
@@ -113,7 +114,7 @@ impl Sampler {
         let block_s = self.config.block_samples as f64 / width_hz;
         let quantiser = Quantiser::new(self.config.bits, block_s, self.config.level_time_constant_s);
         let quantisers = vec![vec![quantiser; self.scene.array.satellites()]; self.scene.channels.len()];
-        Progress { window, samples, done: 0, ready: None, quantisers }
+        WindowProgress { window, samples, done: 0, ready: None, quantisers }
     }
 
     fn width_hz(&self) -> f64 {
@@ -125,7 +126,11 @@ impl Sampler {
     }
 
     /// Makes the next stretch of the current window, and hands on the one before.
-    fn stretch(&mut self, progress: &mut Progress, out: &mut Outlet<SpaceFrame>) -> Result<(), ModelError> {
+    fn stretch(
+        &mut self,
+        progress: &mut WindowProgress,
+        out: &mut Outlet<SpaceFrame>,
+    ) -> Result<(), ModelError> {
         let ready = progress.ready.take();
         // Models are taken out, so that threads may have one each.
         let mut models = std::mem::take(&mut self.scene.models);
@@ -147,7 +152,7 @@ impl Sampler {
     fn make(
         &self,
         models: &mut [Box<dyn VisibilityModel>],
-        progress: &mut Progress,
+        progress: &mut WindowProgress,
     ) -> Result<Made, ModelError> {
         let samples = CHUNK_SAMPLES.max(self.config.block_samples).min(progress.samples - progress.done);
         let (window, first) = (progress.window, progress.done);
@@ -230,7 +235,7 @@ impl ChannelWork<'_> {
         quantisers: &mut [Quantiser],
     ) -> Result<(Vec<SampleBlock>, Repairs), ModelError> {
         let Self { sampler, .. } = self;
-        let request = Request {
+        let request = CovarianceRequest {
             array: &sampler.scene.array,
             channel: sampler.scene.channels[usize::from(self.id.0)],
             receiver_noise_k_sr: sampler.scene.receiver_noise_k_sr,
@@ -292,7 +297,7 @@ impl ChannelWork<'_> {
         let first = self.first + made - re.len();
         let time = self.sampler.time(self.window.start, first);
         if config.disturbances.has_tones() {
-            let stretch = Stretch {
+            let stretch = BlockTones {
                 disturbances: &config.disturbances,
                 array: &scene.array,
                 daughter,

@@ -20,20 +20,18 @@ use rustfft::{Fft, FftPlanner};
 use multiversion::multiversion;
 use pulp::Arch;
 
-use super::colour::{Colour, Expand, Factor, HALF, TILE, Tile, on_tile};
+use super::bins::{BINS, HALF, HOP, bin_offset};
+use super::colour::{ApplyFactor, Expand, Factor};
 use super::covariance::Covariances;
 use super::normal::{Bytes, CHUNK, fill_complex_normal};
 use super::repair::{Repairs, factor};
+use super::tile::{TILE, Tile, on_tile};
 use crate::units::{StreamKind, random_stream};
 
-/// Frequencies over the channel.
-pub const BINS: usize = 128;
-/// Samples from one epoch to the next.
-pub const HOP: usize = BINS / 2;
 const TILES: usize = BINS / TILE;
 
 /// What does not change from channel to channel.
-pub struct Synthesis {
+pub struct SampleSynthesis {
     arch: Arch,
     fft: Arc<dyn Fft<f32>>,
     /// The window, the turning of the lowest frequency and the transform's scale.
@@ -76,13 +74,13 @@ pub struct DrawKey {
     pub ticks: i64,
 }
 
-impl Default for Synthesis {
+impl Default for SampleSynthesis {
     fn default() -> Self {
         Self::new()
     }
 }
 
-impl Synthesis {
+impl SampleSynthesis {
     /// The tables.
     #[must_use]
     pub fn new() -> Self {
@@ -133,7 +131,7 @@ impl Synthesis {
             repairs.absorb(self.factor(covariances, epoch, group, draft));
             let Draft { tile, coloured, spectra, noise: [re, im], .. } = draft;
             let noise = [&re[group..], &im[group..]];
-            on_tile(self.arch, Colour { tile, noise, stride: TILES, x: coloured });
+            on_tile(self.arch, ApplyFactor { tile, noise, stride: TILES, x: coloured });
             for (spectrum, coloured) in spectra.chunks_exact_mut(BINS).zip(coloured) {
                 spread(coloured, group, spectrum);
             }
@@ -202,9 +200,4 @@ impl Response {
             *value *= Complex32::new(factor.re as f32, factor.im as f32);
         }
     }
-}
-
-/// Frequency of a bin from the channel's centre, in widths of the channel.
-pub(super) fn bin_offset(bin: usize) -> f64 {
-    (bin as f64 + 0.5) / BINS as f64 - 0.5
 }

@@ -18,6 +18,9 @@ pub const CHANNELS_MAX: usize = 30;
 /// Lowest and highest channel frequency, Hz: the mission's band.
 pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 
+/// Bytes that one visibility takes in the store and on the link.
+pub const VISIBILITY_BYTES: u64 = 21;
+
 /// Narrowest channel of samples, Hz: those made together, 2^14, take half a minute, in which the array moves by some
 /// degrees; what narrower ones would need grows with the third power of that time.
 const SAMPLES_WIDTH_HZ_MIN: f64 = 500.0;

@@ -20,9 +20,9 @@ use crate::units::{ChannelId, Pair, StreamKind, TICKS_PER_SECOND, all_pairs, ran
 pub(super) const EPHEMERIS_STEP_S: f64 = 60.0;
 
 /// Visibilities of all channels after which no model gets more at once; bounds memory to some 200 MB.
-const WAITING_VISIBILITIES_MAX: usize = 1_000_000;
+const QUEUED_VISIBILITIES_MAX: usize = 1_000_000;
 /// Windows after which no model gets more at once.
-const WAITING_WINDOWS_MAX: usize = 64;
+const QUEUED_WINDOWS_MAX: usize = 64;
 
 /// Integrates all pairs and channels over each window.
 ///
@@ -36,7 +36,7 @@ pub struct Integrator {
     instrument: Instrument,
     schedules: Vec<Schedule>,
     options: MeasurementOptions,
-    waiting: Vec<Waiting>,
+    queued: Vec<QueuedWindow>,
     sampled: u64,
 }
 
@@ -52,7 +52,7 @@ pub struct MeasurementOptions {
 }
 
 /// A window whose visibilities are still to be predicted.
-struct Waiting {
+struct QueuedWindow {
     window: ObservingWindow,
     /// By channel, the pairs that have integrations.
     channels: Vec<Vec<Scheduled>>,
@@ -66,7 +66,7 @@ struct Scheduled {
 
 /// What all pairs of a window see in a channel.
 #[derive(Clone, Copy)]
-struct Sight<'a> {
+struct WindowChannel<'a> {
     window: ObservingWindow,
     channel: ChannelId,
     powers: &'a SkyPowers,
@@ -110,11 +110,11 @@ impl Integrator {
         schedules: Vec<Schedule>,
         options: MeasurementOptions,
     ) -> Self {
-        Self { array, models, instrument, schedules, options, waiting: Vec::new(), sampled: 0 }
+        Self { array, models, instrument, schedules, options, queued: Vec::new(), sampled: 0 }
     }
 
     /// The integrations of every channel and pair in a window.
-    fn schedule(&self, window: ObservingWindow) -> Waiting {
+    fn schedule(&self, window: ObservingWindow) -> QueuedWindow {
         let pairs = all_pairs(self.array.satellites());
         let channel = |schedule: &Schedule| {
             let scheduled = |&pair: &Pair| Scheduled {
@@ -124,31 +124,31 @@ impl Integrator {
             let all: Vec<Scheduled> = pairs.par_iter().map(scheduled).collect();
             all.into_iter().filter(|pair| !pair.integrations.is_empty()).collect()
         };
-        Waiting { window, channels: self.schedules.iter().map(channel).collect() }
+        QueuedWindow { window, channels: self.schedules.iter().map(channel).collect() }
     }
 
     /// Whether what waits is enough to be predicted.
-    fn enough_waits(&self) -> bool {
+    fn batch_is_full(&self) -> bool {
         let counts: Vec<usize> = (0..self.schedules.len())
-            .map(|channel| self.waiting.iter().map(|waiting| waiting.visibilities(channel)).sum())
+            .map(|channel| self.queued.iter().map(|queued| queued.visibilities(channel)).sum())
             .collect();
-        self.waiting.len() >= WAITING_WINDOWS_MAX
-            || counts.iter().sum::<usize>() >= WAITING_VISIBILITIES_MAX
+        self.queued.len() >= QUEUED_WINDOWS_MAX
+            || counts.iter().sum::<usize>() >= QUEUED_VISIBILITIES_MAX
             || counts.iter().zip(&self.models).all(|(&count, model)| count >= model.batch())
             // Nothing to predict: what waits is only told.
             || counts.iter().all(|&count| count == 0)
     }
 
     /// Predicts, measures and emits all windows that wait.
-    fn measure_waiting(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
-        let waiting = std::mem::take(&mut self.waiting);
-        let windows: Vec<ObservingWindow> = waiting.iter().map(|waiting| waiting.window).collect();
+    fn measure_queue(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
+        let queued = std::mem::take(&mut self.queued);
+        let windows: Vec<ObservingWindow> = queued.iter().map(|queued| queued.window).collect();
         // By channel, then by window.
         let mut blocks: Vec<std::vec::IntoIter<Vec<VisibilityBlock>>> = Vec::new();
         let mut powers: Vec<Vec<SkyPowers>> = Vec::new();
         for channel in 0..self.schedules.len() {
             let own = SkyPowers::predict(self.models[channel].as_mut(), &self.array, &windows)?;
-            blocks.push(self.channel_blocks(&waiting, channel, &own)?.into_iter());
+            blocks.push(self.channel_blocks(&queued, channel, &own)?.into_iter());
             powers.push(own);
             if out.is_closed() {
                 return Ok(());
@@ -161,7 +161,7 @@ impl Integrator {
             }
             let visibilities = blocks.iter_mut().flat_map(|windows| windows.next().unwrap_or_default());
             let autos = powers.iter().zip(0..).flat_map(|(powers, channel)| {
-                self.autos(Sight { window, channel: ChannelId(channel), powers: &powers[k] })
+                self.autos(WindowChannel { window, channel: ChannelId(channel), powers: &powers[k] })
             });
             let mut sampled = 0;
             for block in visibilities.chain(autos) {
@@ -181,16 +181,17 @@ impl Integrator {
     /// The measurements of one channel, window by window and pair by pair.
     fn channel_blocks(
         &mut self,
-        waiting: &[Waiting],
+        queued: &[QueuedWindow],
         channel: usize,
         powers: &[SkyPowers],
     ) -> Result<Vec<Vec<VisibilityBlock>>, ModelError> {
-        let scheduled: Vec<(Sight, &Scheduled)> = waiting
+        let scheduled: Vec<(WindowChannel, &Scheduled)> = queued
             .iter()
             .zip(powers)
-            .flat_map(|(waiting, powers)| {
-                let sight = Sight { window: waiting.window, channel: ChannelId(channel as u16), powers };
-                waiting.channels[channel].iter().map(move |pair| (sight, pair))
+            .flat_map(|(queued, powers)| {
+                let sight =
+                    WindowChannel { window: queued.window, channel: ChannelId(channel as u16), powers };
+                queued.channels[channel].iter().map(move |pair| (sight, pair))
             })
             .collect();
         let positions: Vec<Vec<PairPosition>> =
@@ -205,12 +206,14 @@ impl Integrator {
             parts.push(part);
             rest = after;
         }
-        let measure =
-            |((sight, pair), part): (&(Sight, &Scheduled), &&[Complex64])| self.measure(*sight, pair, part);
+        let measure = |((sight, pair), part): (&(WindowChannel, &Scheduled), &&[Complex64])| {
+            self.measure(*sight, pair, part)
+        };
         let blocks: Vec<VisibilityBlock> = scheduled.par_iter().zip(&parts).map(measure).collect();
         let mut blocks = blocks.into_iter();
-        let of_window = |waiting: &Waiting| blocks.by_ref().take(waiting.channels[channel].len()).collect();
-        Ok(waiting.iter().map(of_window).collect())
+        let of_window =
+            |queued: &QueuedWindow| blocks.by_ref().take(queued.channels[channel].len()).collect();
+        Ok(queued.iter().map(of_window).collect())
     }
 
     /// Where a pair is in the middle of each of its integrations.
@@ -233,7 +236,7 @@ impl Integrator {
     /// Adds noise, weights and time tags to what the model predicts.
     fn measure(
         &self,
-        Sight { window, channel, powers }: Sight,
+        WindowChannel { window, channel, powers }: WindowChannel,
         scheduled: &Scheduled,
         predictions: &[Complex64],
     ) -> VisibilityBlock {
@@ -264,7 +267,7 @@ impl Integrator {
 
     /// The daughters' own powers in a window, if they are wanted: integrations back to back, the last cut at the window's
     /// end.
-    fn autos(&self, Sight { window, channel, powers }: Sight) -> Vec<VisibilityBlock> {
+    fn autos(&self, WindowChannel { window, channel, powers }: WindowChannel) -> Vec<VisibilityBlock> {
         let step = (self.options.auto_integration_s * TICKS_PER_SECOND as f64) as u32;
         if step == 0 {
             return Vec::new();
@@ -309,7 +312,7 @@ fn mean_square(samples: f64, stream: &mut impl rand::Rng) -> f64 {
     Gamma::new(samples, samples.recip()).map_or(1.0, |gamma| gamma.sample(stream))
 }
 
-impl Waiting {
+impl QueuedWindow {
     /// Integrations of one channel.
     fn visibilities(&self, channel: usize) -> usize {
         self.channels[channel].iter().map(|pair| pair.integrations.len()).sum()
@@ -323,12 +326,12 @@ impl Stage for Integrator {
 
     fn step(&mut self, window: ObservingWindow, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
         let scheduled = self.schedule(window);
-        self.waiting.push(scheduled);
-        if self.enough_waits() { self.measure_waiting(out) } else { Ok(()) }
+        self.queued.push(scheduled);
+        if self.batch_is_full() { self.measure_queue(out) } else { Ok(()) }
     }
 
     fn finish(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
-        self.measure_waiting(out)
+        self.measure_queue(out)
     }
 
     fn units(&self) -> Units {

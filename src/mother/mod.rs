@@ -15,9 +15,11 @@ mod powers;
 mod schedule;
 mod store;
 
-pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, SpacecraftError, StoreDrop};
+pub use config::{
+    Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, SpacecraftError, StoreDrop, VISIBILITY_BYTES,
+};
 pub use integrator::{Integrator, MeasurementOptions, NoiseModel};
 pub use ninth::{NINTH_BAND_HZ, Ninth, NinthConfig, NinthSetup, NinthSky};
 pub use observer::Observer;
 pub use schedule::{Integration, Schedule};
-pub use store::{PacedLink, Store, VISIBILITY_BYTES};
+pub use store::{PacedLink, Store};

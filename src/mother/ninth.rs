@@ -6,7 +6,7 @@ use num_complex::Complex32;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::config::SpacecraftError;
+use super::config::{SpacecraftError, VISIBILITY_BYTES};
 use crate::array::Array;
 use crate::frames::{Flags, GroundFrame, Housekeeping, ObservingWindow, Spectrometer, VisibilityBlock};
 use crate::response::model::{DaughterPosition, DirectSum, ModelError, VisibilityModel};
@@ -102,7 +102,7 @@ impl NinthConfig {
         if !self.on {
             return 0.0;
         }
-        8.0 * crate::mother::VISIBILITY_BYTES as f64 * self.channels as f64 / self.integration_s
+        8.0 * VISIBILITY_BYTES as f64 * self.channels as f64 / self.integration_s
     }
 }
 

@@ -5,13 +5,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::convert::Infallible;
 use std::sync::Arc;
 
-use super::config::{SpacecraftConfig, StoreDrop};
+use super::config::{SpacecraftConfig, StoreDrop, VISIBILITY_BYTES};
 use crate::array::{Array, earth_in_sight_s};
 use crate::frames::{GroundFrame, Housekeeping, VisibilityBlock};
 use crate::runtime::{Outlet, Stage, Units};
-
-/// Bytes that one visibility takes in the store and on the link.
-pub const VISIBILITY_BYTES: u64 = 21;
 
 /// A link that sends no more than so much while the Earth is in sight.
 #[derive(Clone, Debug)]

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use super::config::ProductsConfig;
 use super::error::ProductsError;
 use super::pictures::{
-    Axis, Bars, Curve, MapPanel, Palette, Plot, Sampling, Scale, Sheet, Stretch, View, draw_map, draw_plots,
-    draw_sheet,
+    Axis, Bars, ColourScale, Curve, MapPanel, Palette, Plot, Sampling, Scaling, Sheet, View, draw_map,
+    draw_plots, draw_sheet,
 };
 use super::provenance::Provenance;
 use super::summary::{ChannelSummary, SnapshotSummary};
@@ -28,7 +28,7 @@ pub(super) struct ChannelFolder {
     frequency_hz: f64,
     truth: Option<SkyMap>,
     /// Some of the maps so far, for the sheet.
-    shown: Shown,
+    shown: SheetMaps,
     snapshots: Vec<SnapshotSummary>,
     files: Vec<String>,
     summary: Option<ChannelSummary>,
@@ -54,7 +54,7 @@ impl ChannelFolder {
             name,
             frequency_hz,
             truth: truth.cloned(),
-            shown: Shown::default(),
+            shown: SheetMaps::default(),
             snapshots: Vec::new(),
             files: Vec::new(),
             summary: None,
@@ -171,12 +171,12 @@ impl ChannelFolder {
     }
 
     /// The scale that map and input share: what the input fills, or the map itself without one.
-    fn scale(&self, map_k: &[f64]) -> Scale {
+    fn scale(&self, map_k: &[f64]) -> ColourScale {
         let reference = self.truth.as_ref().map_or(map_k, SkyMap::values);
-        Scale::robust(reference, Stretch::Log, Palette::default())
+        ColourScale::robust(reference, Scaling::Log, Palette::default())
     }
 
-    fn panel<'a>(&self, values: &'a [f64], caption: &str, scale: Scale) -> MapPanel<'a> {
+    fn panel<'a>(&self, values: &'a [f64], caption: &str, scale: ColourScale) -> MapPanel<'a> {
         MapPanel { values, caption: caption.to_owned(), scale, unit: "K".to_owned() }
     }
 
@@ -219,7 +219,7 @@ impl ChannelFolder {
     }
 
     /// Maps on the way, side by side.
-    fn draw_sheet(&mut self, last: &Solution, scale: Scale) -> Result<(), ProductsError> {
+    fn draw_sheet(&mut self, last: &Solution, scale: ColourScale) -> Result<(), ProductsError> {
         let caption = caption(last);
         let shown = self.shown.spread((&last.map_k, &caption));
         let panels: Vec<MapPanel<'_>> = shown.map(|(map, caption)| self.panel(map, caption, scale)).collect();
@@ -239,7 +239,7 @@ impl ChannelFolder {
 
 /// Maps on the way: the first, and every so many after it, as many as leave a choice for the sheet.
 #[derive(Default)]
-struct Shown {
+struct SheetMaps {
     /// With their captions.
     maps: Vec<(Vec<f64>, String)>,
     /// Maps that came.
@@ -248,7 +248,7 @@ struct Shown {
     halvings: u32,
 }
 
-impl Shown {
+impl SheetMaps {
     /// Keeps a map, or not.
     fn take(&mut self, map: &[f64], caption: &str) {
         let is_kept = |came: usize, halvings: u32| came.is_multiple_of(1 << halvings);
@@ -313,7 +313,7 @@ pub fn draw_relative_error(
     let panel = MapPanel {
         values,
         caption: title.to_owned(),
-        scale: Scale::symmetric(values),
+        scale: ColourScale::symmetric(values),
         unit: "(map - truth) / truth".to_owned(),
     };
     draw_map(&panel, subtitle, &view())
@@ -372,7 +372,7 @@ mod tests {
     #[test]
     fn the_sheet_goes_from_the_first_map_to_the_last_in_bounded_memory() {
         for count in [1, 2, 5, 6, 7, 12, 13, 24, 25, 100, 471] {
-            let mut shown = Shown::default();
+            let mut shown = SheetMaps::default();
             for k in 0..count {
                 shown.take(&[k as f64], &k.to_string());
                 assert!(shown.maps.len() <= 2 * SHEET_MAPS_MAX);

@@ -41,7 +41,7 @@ impl AlignerCounts {
 
 /// Blocks of one number: those that came, channel by channel, a daughter after another.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Row {
+pub struct BlockRow {
     /// Number of the blocks.
     pub number: u64,
     /// Samples of each.
@@ -52,7 +52,7 @@ pub struct Row {
 
 /// The shape of a window's streams.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Streams {
+pub struct StreamShape {
     /// Number of daughters.
     pub daughters: usize,
     /// Number of channels.
@@ -69,25 +69,25 @@ pub struct Streams {
 /// come that are `wait_blocks` ahead; memory is bounded by that.
 #[derive(Debug)]
 pub struct Aligner {
-    streams: Streams,
+    streams: StreamShape,
     window: ObservingWindow,
     /// Samples of the window.
     samples: u64,
     next: u64,
-    waiting: BTreeMap<u64, Waiting>,
+    waiting: BTreeMap<u64, PartialRow>,
     counts: AlignerCounts,
 }
 
 #[derive(Debug)]
-struct Waiting {
-    row: Row,
+struct PartialRow {
+    row: BlockRow,
     present: usize,
 }
 
 impl Aligner {
     /// An aligner of `window`.
     #[must_use]
-    pub fn new(streams: Streams, window: ObservingWindow) -> Self {
+    pub fn new(streams: StreamShape, window: ObservingWindow) -> Self {
         let length_s = (window.end.0 - window.start.0) as f64 * 1e-6;
         let samples = (length_s * streams.width_hz).round().max(0.0) as u64;
         let (waiting, counts) = (BTreeMap::new(), AlignerCounts::default());
@@ -107,7 +107,7 @@ impl Aligner {
     }
 
     /// Takes a block; gives the rows that are now complete or no longer waited for.
-    pub fn put(&mut self, block: SampleBlock) -> Vec<Row> {
+    pub fn put(&mut self, block: SampleBlock) -> Vec<BlockRow> {
         let number = block.number;
         let (length, samples) = (self.length(number), block.samples.len() as u64);
         if length == 0 || !self.is_well_formed(&block, length) {
@@ -125,9 +125,11 @@ impl Aligner {
         while number >= self.next + self.streams.wait_blocks {
             rows.push(self.release());
         }
-        let Streams { daughters, channels, .. } = self.streams;
-        let waiting =
-            self.waiting.entry(number).or_insert_with(|| Waiting::new(number, length, daughters * channels));
+        let StreamShape { daughters, channels, .. } = self.streams;
+        let waiting = self
+            .waiting
+            .entry(number)
+            .or_insert_with(|| PartialRow::new(number, length, daughters * channels));
         let slot =
             &mut waiting.row.blocks[usize::from(block.channel.0) * daughters + usize::from(block.daughter)];
         if slot.is_some() {
@@ -143,7 +145,7 @@ impl Aligner {
     }
 
     /// The rows up to `end_samples` of the window, after its last block.
-    pub fn finish(&mut self, end_samples: u64) -> Vec<Row> {
+    pub fn finish(&mut self, end_samples: u64) -> Vec<BlockRow> {
         let mut rows = Vec::new();
         while self.next * (self.streams.block_samples as u64) < end_samples.min(self.samples) {
             rows.push(self.release());
@@ -151,12 +153,12 @@ impl Aligner {
         rows
     }
 
-    fn release(&mut self) -> Row {
+    fn release(&mut self) -> BlockRow {
         let number = self.next;
         self.next += 1;
         let count = self.streams.daughters * self.streams.channels;
         let length = self.length(number);
-        let waiting = self.waiting.remove(&number).unwrap_or_else(|| Waiting::new(number, length, count));
+        let waiting = self.waiting.remove(&number).unwrap_or_else(|| PartialRow::new(number, length, count));
         self.counts.used += waiting.present as u64;
         self.counts.used_samples += (waiting.present * waiting.row.samples) as u64;
         self.counts.missing += (count - waiting.present) as u64;
@@ -180,9 +182,9 @@ impl Aligner {
     }
 }
 
-impl Waiting {
+impl PartialRow {
     fn new(number: u64, samples: usize, count: usize) -> Self {
-        Self { row: Row { number, samples, blocks: vec![None; count] }, present: 0 }
+        Self { row: BlockRow { number, samples, blocks: vec![None; count] }, present: 0 }
     }
 }
 
@@ -192,8 +194,8 @@ mod tests {
     use crate::frames::Samples;
     use crate::units::{ChannelId, MissionTime};
 
-    const STREAMS: Streams =
-        Streams { daughters: 2, channels: 1, block_samples: 256, width_hz: 8e3, wait_blocks: 2 };
+    const STREAMS: StreamShape =
+        StreamShape { daughters: 2, channels: 1, block_samples: 256, width_hz: 8e3, wait_blocks: 2 };
 
     /// Two and a half blocks of 32 ms.
     fn aligner() -> Aligner {
@@ -213,7 +215,7 @@ mod tests {
         }
     }
 
-    fn shape(rows: &[Row]) -> Vec<(u64, usize, Vec<bool>)> {
+    fn shape(rows: &[BlockRow]) -> Vec<(u64, usize, Vec<bool>)> {
         rows.iter()
             .map(|row| (row.number, row.samples, row.blocks.iter().map(Option::is_some).collect()))
             .collect()

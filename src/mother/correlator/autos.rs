@@ -2,6 +2,7 @@
 
 use num_complex::Complex32;
 
+use super::integrate::COMPLETE_MIN;
 use super::kernel::LANES;
 use crate::frames::{Flags, ObservingWindow, VisibilityBlock};
 use crate::units::{ChannelId, Pair};
@@ -12,7 +13,7 @@ const HELD_MAX: usize = 256;
 /// What a row of blocks says of powers, by daughter and lane.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RowPowers {
-    /// Sums of |x|^2, K sr, and the number of samples in them.
+    /// ProductSums of |x|^2, K sr, and the number of samples in them.
     pub sums: Vec<[(f64, u64); LANES]>,
     /// Samples that there should have been.
     pub samples: u64,
@@ -99,7 +100,7 @@ impl AutoIntegrator {
                     continue;
                 }
                 let mut flags = Flags::GOOD;
-                if (count as f64) < crate::mother::correlator::stage::COMPLETE_MIN * self.samples as f64 {
+                if (count as f64) < COMPLETE_MIN * self.samples as f64 {
                     flags.0 |= Flags::INCOMPLETE.0;
                 }
                 if saturated {

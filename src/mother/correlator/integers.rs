@@ -7,7 +7,7 @@
 
 use pulp::Arch;
 
-use super::kernel::{LANES, SLICE, Sums, product};
+use super::kernel::{LANES, ProductSums, SLICE, product};
 
 /// Parts of eight channels: real, imaginary, and so on.
 type Half = [i16; 16];
@@ -83,24 +83,24 @@ impl Levels {
     }
 
     /// Adds the products of the slice to `sums`.
-    pub fn correlate(&self, arch: Arch, sums: &mut Sums) {
+    pub fn correlate(&self, arch: Arch, sums: &mut ProductSums) {
         match arch {
             #[cfg(target_arch = "x86_64")]
             Arch::V3(simd) => simd.vectorize(
                 #[inline(always)]
-                || self.run(x86::Pairs(simd), sums),
+                || self.run(x86::Avx2Pairs(simd), sums),
             ),
             #[cfg(target_arch = "x86_64")]
             Arch::V4(simd) => simd.vectorize(
                 #[inline(always)]
-                || self.run(x86::Pairs(*simd), sums),
+                || self.run(x86::Avx2Pairs(*simd), sums),
             ),
-            _ => self.run(plain::Pairs, sums),
+            _ => self.run(plain::PlainPairs, sums),
         }
     }
 
     #[inline(always)]
-    fn run<M: Machine>(&self, machine: M, sums: &mut Sums) {
+    fn run<M: PairMultiply>(&self, machine: M, sums: &mut ProductSums) {
         for half in 0..2 {
             for j in (0..self.daughters).step_by(2) {
                 self.diagonal(machine, [j, half], sums);
@@ -113,7 +113,7 @@ impl Levels {
 
     /// Two daughters by two others.
     #[inline(always)]
-    fn tile<M: Machine>(&self, machine: M, [i, j, half]: [usize; 3], sums: &mut Sums) {
+    fn tile<M: PairMultiply>(&self, machine: M, [i, j, half]: [usize; 3], sums: &mut ProductSums) {
         let mut own = [[machine.zero(); 2]; 4];
         for sample in self.data.chunks_exact(self.daughters) {
             let (a, b) = (&sample[i..i + 2], &sample[j..j + 2]);
@@ -130,7 +130,7 @@ impl Levels {
 
     /// Two daughters by themselves.
     #[inline(always)]
-    fn diagonal<M: Machine>(&self, machine: M, [j, half]: [usize; 2], sums: &mut Sums) {
+    fn diagonal<M: PairMultiply>(&self, machine: M, [j, half]: [usize; 2], sums: &mut ProductSums) {
         let mut own = [machine.zero(); 4];
         for sample in self.data.chunks_exact(self.daughters) {
             let (a, b) = (&sample[j], &sample[j + 1]);
@@ -146,7 +146,13 @@ impl Levels {
 
     /// Adds a product's sums in steps of both daughters.
     #[inline(always)]
-    fn hand_over<M: Machine>(&self, machine: M, [i, j, half]: [usize; 3], own: [M::Sum; 2], sums: &mut Sums) {
+    fn hand_over<M: PairMultiply>(
+        &self,
+        machine: M,
+        [i, j, half]: [usize; 3],
+        own: [M::Output; 2],
+        sums: &mut ProductSums,
+    ) {
         let steps = [i, j].map(|n| &self.half_steps[n].as_chunks::<EIGHT>().0[half]);
         for (own, sums) in own.into_iter().zip(&mut sums[product(i, j)]) {
             machine.hand_over(own, steps, &mut sums.as_chunks_mut::<EIGHT>().0[half]);
@@ -155,19 +161,19 @@ impl Levels {
 }
 
 /// Multiply-adds of pairs.
-trait Machine: Copy {
-    /// Sums of eight channels.
-    type Sum: Copy;
-    fn zero(self) -> Self::Sum;
+trait PairMultiply: Copy {
+    /// ProductSums of eight channels.
+    type Output: Copy;
+    fn zero(self) -> Self::Output;
     /// Adds the products of both parts.
-    fn add(self, a: &Half, b: &Half, sum: Self::Sum) -> Self::Sum;
+    fn add(self, a: &Half, b: &Half, sum: Self::Output) -> Self::Output;
     /// `out += sum x steps`.
-    fn hand_over(self, sum: Self::Sum, steps: [&[f32; EIGHT]; 2], out: &mut [f32; EIGHT]);
+    fn hand_over(self, sum: Self::Output, steps: [&[f32; EIGHT]; 2], out: &mut [f32; EIGHT]);
 }
 
 /// Any machine.
 mod plain {
-    use super::{Codes, EIGHT, Half, LANES, Machine, Sample};
+    use super::{Codes, EIGHT, Half, LANES, PairMultiply, Sample};
 
     pub(super) fn put(codes: &Codes, rows: &mut [Sample], stride: usize) {
         for (k, row) in rows.iter_mut().step_by(stride).enumerate() {
@@ -182,18 +188,18 @@ mod plain {
     }
 
     #[derive(Clone, Copy)]
-    pub(super) struct Pairs;
+    pub(super) struct PlainPairs;
 
-    impl Machine for Pairs {
-        type Sum = [i32; EIGHT];
+    impl PairMultiply for PlainPairs {
+        type Output = [i32; EIGHT];
 
         #[inline(always)]
-        fn zero(self) -> Self::Sum {
+        fn zero(self) -> Self::Output {
             [0; EIGHT]
         }
 
         #[inline(always)]
-        fn add(self, a: &Half, b: &Half, mut sum: Self::Sum) -> Self::Sum {
+        fn add(self, a: &Half, b: &Half, mut sum: Self::Output) -> Self::Output {
             for (k, sum) in sum.iter_mut().enumerate() {
                 let term = |at: usize| i32::from(a[at]) * i32::from(b[at]);
                 *sum += term(2 * k) + term(2 * k + 1);
@@ -202,7 +208,7 @@ mod plain {
         }
 
         #[inline(always)]
-        fn hand_over(self, sum: Self::Sum, [a, b]: [&[f32; EIGHT]; 2], out: &mut [f32; EIGHT]) {
+        fn hand_over(self, sum: Self::Output, [a, b]: [&[f32; EIGHT]; 2], out: &mut [f32; EIGHT]) {
             for k in 0..EIGHT {
                 out[k] += sum[k] as f32 * (a[k] * b[k]);
             }
@@ -218,7 +224,7 @@ mod x86 {
     use pulp::cast;
     use pulp::x86::V3;
 
-    use super::{Codes, EIGHT, Half, LANES, Machine, SLICE, Sample};
+    use super::{Codes, EIGHT, Half, LANES, PairMultiply, SLICE, Sample};
 
     /// Channels in the order in which unpacking leaves them in theirs: the first eight in the lower half of a register.
     const ORDER: [usize; LANES] = [0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15];
@@ -292,10 +298,10 @@ mod x86 {
     }
 
     #[derive(Clone, Copy)]
-    pub(super) struct Pairs(pub(super) V3);
+    pub(super) struct Avx2Pairs(pub(super) V3);
 
-    impl Machine for Pairs {
-        type Sum = __m256i;
+    impl PairMultiply for Avx2Pairs {
+        type Output = __m256i;
 
         #[inline(always)]
         fn zero(self) -> __m256i {

@@ -2,7 +2,7 @@
 
 use num_complex::Complex32;
 
-use super::kernel::{LANES, Sums, product};
+use super::kernel::{LANES, ProductSums, product};
 use crate::array::{Array, integration_time_s};
 use crate::frames::{Flags, ObservingWindow, VisibilityBlock};
 use crate::mother::Schedule;
@@ -15,6 +15,10 @@ const HELD_MAX: usize = 2048;
 
 /// Weight of a visibility without samples, which is flagged: the downlink takes none that is not positive.
 const NO_WEIGHT: f32 = f32::MIN_POSITIVE;
+
+/// An integration with a smaller fraction of its samples is flagged as incomplete: its effective middle may then be off
+/// by a twentieth of its length, 2 degrees of fringe.
+pub(super) const COMPLETE_MIN: f64 = 0.9;
 
 /// How dumps become integrations.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -120,7 +124,7 @@ impl GroupIntegrator {
     /// Adds a dump; `powers` are those of daughters by lane, K sr, by which products are weighted once they are settled.
     pub fn add(
         &mut self,
-        sums: &Sums,
+        sums: &ProductSums,
         presence: &Presence,
         powers: &[[f64; LANES]],
         array: &Array,

@@ -153,18 +153,18 @@ fn weave(from: &[f32; SLICE * LANES], to: &mut [f32; SLICE * LANES]) {
     }
 }
 
-/// Sums over a dump: by product, real and imaginary parts of `x_i conj(x_j)`, a value a channel.
-pub type Sums = Vec<[[f32; LANES]; 2]>;
+/// ProductSums over a dump: by product, real and imaginary parts of `x_i conj(x_j)`, a value a channel.
+pub type ProductSums = Vec<[[f32; LANES]; 2]>;
 
-/// Sums of zero for `daughters`, an odd number of them filled up.
+/// ProductSums of zero for `daughters`, an odd number of them filled up.
 #[must_use]
-pub fn no_sums(daughters: usize) -> Sums {
+pub fn no_sums(daughters: usize) -> ProductSums {
     let even = daughters.next_multiple_of(2);
     vec![[[0.0; LANES]; 2]; product(0, even)]
 }
 
 /// Adds the products of a slice to `sums`.
-pub fn correlate(arch: Arch, packed: &Packed, sums: &mut Sums) {
+pub fn correlate(arch: Arch, packed: &Packed, sums: &mut ProductSums) {
     if packed.quantised {
         return packed.levels.correlate(arch, sums);
     }
@@ -173,7 +173,7 @@ pub fn correlate(arch: Arch, packed: &Packed, sums: &mut Sums) {
 
 struct Correlate<'a> {
     packed: &'a Packed,
-    sums: &'a mut Sums,
+    sums: &'a mut ProductSums,
 }
 
 impl WithSimd for Correlate<'_> {
@@ -242,7 +242,7 @@ fn tile<S: Simd, const PARTS: usize>(
     data: &[S::f32s],
     groups: usize,
     [i, j, part]: [usize; 3],
-    sums: &mut Sums,
+    sums: &mut ProductSums,
 ) {
     let mut own = [[simd.splat_f32s(0.0); 2]; 4];
     for sample in data.chunks_exact(groups * PLANES * PARTS) {
@@ -264,7 +264,7 @@ fn diagonal<S: Simd, const PARTS: usize>(
     data: &[S::f32s],
     groups: usize,
     [j, part]: [usize; 2],
-    sums: &mut Sums,
+    sums: &mut ProductSums,
 ) {
     let zero = simd.splat_f32s(0.0);
     let (mut first, mut second, mut cross) = (zero, zero, [zero; 2]);

@@ -13,7 +13,7 @@ pub mod kernel;
 mod spectra;
 mod stage;
 
-pub use align::{Aligner, AlignerCounts, Row, Streams};
+pub use align::{Aligner, AlignerCounts, BlockRow, StreamShape};
 pub use integrate::{DumpRule, GroupIntegrator, Presence, dump_samples, shortest_integration_s};
 pub use spectra::{Division, SUB_BANDS_MAX};
 pub use stage::{Correlator, CorrelatorCounts, CorrelatorSetup};

@@ -23,8 +23,8 @@ use multiversion::multiversion;
 use num_complex::{Complex32, Complex64};
 use rustfft::{Fft, FftPlanner};
 
-use super::align::Row;
-use super::kernel::{LANES, Sums};
+use super::align::BlockRow;
+use super::kernel::{LANES, ProductSums};
 use crate::array::Array;
 use crate::frames::{Channel, SampleBlock, Samples};
 use crate::response::pixel::kernel::fused;
@@ -141,7 +141,13 @@ impl Divider {
     /// Spectra of the blocks of `row` of so many `daughters`, read later by their delays; what is then missing at the
     /// end stands in the blocks of the `next` row. Frames with missing samples are zeros.
     #[must_use]
-    pub fn divide(&self, row: &Row, next: Option<&Row>, daughters: usize, delays: Delays) -> Spectra {
+    pub fn divide(
+        &self,
+        row: &BlockRow,
+        next: Option<&BlockRow>,
+        daughters: usize,
+        delays: Delays,
+    ) -> Spectra {
         let (bands, streams) = (self.division.sub_bands, delays.streams.len());
         let frames = row.samples / bands;
         let groups = (row.blocks.len() / daughters * bands).div_ceil(LANES);
@@ -251,7 +257,7 @@ impl Spectra {
         self.planes[(group * self.frames + frame) * length..][..length].as_chunks().0
     }
 
-    /// Sums of |X|^2 over the row and their number, by daughter and lane.
+    /// ProductSums of |X|^2 over the row and their number, by daughter and lane.
     pub fn powers(&self, group: usize) -> Vec<[(f64, u64); LANES]> {
         let mut sums = vec![[(0.0, 0); LANES]; self.daughters];
         for frame in 0..self.frames {
@@ -274,7 +280,7 @@ impl Spectra {
         &self,
         group: usize,
         frames: std::ops::Range<usize>,
-        sums: &mut Sums,
+        sums: &mut ProductSums,
     ) -> Vec<[u32; LANES]> {
         for frame in frames.clone() {
             multiply(self.frame(group, frame), &self.delays.pairs, sums);
@@ -290,7 +296,7 @@ impl Spectra {
 
 /// Adds `x_i conj(x_j)` of pairs of streams, planes of real and imaginary parts, to `sums`.
 #[multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn multiply(streams: &[[[f32; LANES]; 2]], pairs: &[[usize; 2]], sums: &mut Sums) {
+fn multiply(streams: &[[[f32; LANES]; 2]], pairs: &[[usize; 2]], sums: &mut ProductSums) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     for (&[i, j], [re, im]) in pairs.iter().zip(sums) {

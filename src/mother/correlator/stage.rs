@@ -5,9 +5,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use pulp::Arch;
 
-use super::align::{Aligner, AlignerCounts, Row, Streams};
+use super::align::{Aligner, AlignerCounts, BlockRow, StreamShape};
 use super::autos::{AutoIntegrator, RowPowers};
-use super::integrate::{DumpRule, GroupIntegrator, Presence, WINDOW_S_MAX, dump_samples};
+use super::integrate::{COMPLETE_MIN, DumpRule, GroupIntegrator, Presence, WINDOW_S_MAX, dump_samples};
 use super::kernel::{LANES, Packed, SLICE, correlate, no_sums};
 use super::spectra::{Divider, Division, Spectra};
 use crate::array::{Array, segments_for};
@@ -21,10 +21,6 @@ use crate::units::MissionTime;
 
 /// Part of a block's values out of range at which its visibilities are flagged. Two bits lose 5 % by design.
 const SATURATED_MAX: f64 = 0.2;
-
-/// Part of an integration's samples without which it is flagged: its middle may then be off by a twentieth of its
-/// length, 2 degrees of fringe.
-pub(super) const COMPLETE_MIN: f64 = 0.9;
 
 /// Time in which the power that weights are made of is averaged, s; before, it is the mean of all there was.
 const POWER_TIME_S: f64 = 10.0;
@@ -62,7 +58,7 @@ pub struct CorrelatorCounts {
     pub stray_samples: u64,
     /// Visibilities made.
     pub visibilities: u64,
-    /// Sums of |x|^2 (K sr) and samples, by channel or sub-band and daughter: the auto-correlations.
+    /// ProductSums of |x|^2 (K sr) and samples, by channel or sub-band and daughter: the auto-correlations.
     pub autos: Vec<Vec<(f64, u64)>>,
 }
 
@@ -88,12 +84,12 @@ pub struct Correlator {
 struct Running {
     window: ObservingWindow,
     aligner: Aligner,
-    groups: Vec<Group>,
+    groups: Vec<ChannelGroup>,
     /// A row that waits for the one after it, which has its delayed samples.
-    held: Option<Row>,
+    held: Option<BlockRow>,
 }
 
-struct Group {
+struct ChannelGroup {
     first: usize,
     integrator: GroupIntegrator,
     /// If the daughters' own powers are wanted.
@@ -135,7 +131,7 @@ impl Correlator {
         for segment in segments_for(&setup.array, window.start, window.end, EPHEMERIS_STEP_S) {
             out.push(GroundFrame::Ephemeris(segment));
         }
-        let streams = Streams {
+        let streams = StreamShape {
             daughters: setup.array.satellites(),
             channels: setup.schedules.len() / setup.division.sub_bands,
             block_samples: setup.block_samples,
@@ -144,7 +140,7 @@ impl Correlator {
         };
         let aligner = Aligner::new(streams, window);
         let dumps = aligner.samples() / (rule.dump_samples * setup.division.sub_bands) as u64;
-        let group = |(k, schedules): (usize, &[Schedule])| Group {
+        let group = |(k, schedules): (usize, &[Schedule])| ChannelGroup {
             first: k * LANES,
             integrator: GroupIntegrator::new(k * LANES, schedules, *rule, &setup.array, (window, dumps)),
             autos: (setup.auto_integration_s > 0.0).then(|| {
@@ -161,7 +157,7 @@ impl Correlator {
     }
 
     /// Takes the next row of a window; with delays, the row before it is what is worked on.
-    fn take(&mut self, running: &mut Running, row: Row, out: &mut Outlet<GroundFrame>) {
+    fn take(&mut self, running: &mut Running, row: BlockRow, out: &mut Outlet<GroundFrame>) {
         if self.setup.division.delay_centre.is_none() {
             self.process(running, &row, None, out);
         } else if let Some(held) = running.held.replace(row) {
@@ -174,8 +170,8 @@ impl Correlator {
     fn process(
         &mut self,
         running: &mut Running,
-        row: &Row,
-        next: Option<&Row>,
+        row: &BlockRow,
+        next: Option<&BlockRow>,
         out: &mut Outlet<GroundFrame>,
     ) {
         let mut made = Vec::new();
@@ -196,7 +192,7 @@ impl Correlator {
         self.hand_on(made, out);
     }
 
-    fn process_group(&self, group: &mut Group, row: &Row, made: &mut Vec<VisibilityBlock>) {
+    fn process_group(&self, group: &mut ChannelGroup, row: &BlockRow, made: &mut Vec<VisibilityBlock>) {
         let daughters = self.setup.array.satellites();
         let channels = LANES.min(self.setup.schedules.len() - group.first);
         let first = group.first;
@@ -239,8 +235,8 @@ impl Correlator {
     /// The same with the spectra of a row, of which this is group `index`.
     fn process_spectra(
         &self,
-        group: &mut Group,
-        row: &Row,
+        group: &mut ChannelGroup,
+        row: &BlockRow,
         (spectra, index): (&Spectra, usize),
         made: &mut Vec<VisibilityBlock>,
     ) {
@@ -267,7 +263,13 @@ impl Correlator {
     }
 
     /// Follows the powers of a group with those of a row, integrates and counts them.
-    fn follow(&self, group: &mut Group, row: &Row, powers: &RowPowers, made: &mut Vec<VisibilityBlock>) {
+    fn follow(
+        &self,
+        group: &mut ChannelGroup,
+        row: &BlockRow,
+        powers: &RowPowers,
+        made: &mut Vec<VisibilityBlock>,
+    ) {
         if let Some(autos) = &mut group.autos {
             let samples = row.number * self.setup.block_samples as u64 + row.samples as u64;
             let ticks = crate::daughters::sample_ticks(samples, self.rate_hz()) as u32;

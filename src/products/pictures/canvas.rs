@@ -127,7 +127,7 @@ impl Canvas {
         let ((left, right), (top, bottom)) = (bounds(0, 2), bounds(1, 3));
         let (columns, rows) = (self.columns(left, right), self.rows(top, bottom));
         // The whole line's coverage first, so that pieces join without seams and alpha counts once.
-        let mut coverage = Coverage {
+        let mut coverage = StrokeCoverage {
             values: vec![0.0; columns.len() * rows.len()],
             columns: columns.clone(),
             rows: rows.clone(),
@@ -151,13 +151,13 @@ impl Canvas {
 }
 
 /// How much of each pixel of a part of the page a line covers.
-struct Coverage {
+struct StrokeCoverage {
     values: Vec<f32>,
     columns: Range<usize>,
     rows: Range<usize>,
 }
 
-impl Coverage {
+impl StrokeCoverage {
     fn add(&mut self, [x0, y0, x1, y1]: [f64; 4], width: f64) {
         let reach = 0.5 * width + 1.0;
         let (dx, dy) = (x1 - x0, y1 - y0);

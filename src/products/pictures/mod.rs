@@ -18,7 +18,7 @@ pub use curves::{Axis, Curve, Plot, draw_plots};
 pub use error::PictureError;
 pub use mollweide::{Sampling, View};
 pub use png_file::Picture;
-pub use scale::{Palette, Scale, Stretch};
+pub use scale::{ColourScale, Palette, Scaling};
 pub use sheet::{Bars, MapPanel, Sheet, draw_map, draw_sheet};
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::canvas::{Canvas, Colour, FAINT, INK, Rect, Stroke, WHITE};
 use super::projection::{Parallel, forward};
-use super::scale::{Scale, is_seen};
+use super::scale::{ColourScale, is_seen};
 use super::text;
 use super::text::{Align, Style};
 use crate::sky::healpix::{Ring, pixel_of, ring};
@@ -55,12 +55,12 @@ impl Default for View {
 
 /// A map with its geometry: `values` in RING order.
 #[derive(Clone, Copy)]
-pub(super) struct Field<'a> {
+pub(super) struct MapField<'a> {
     pub values: &'a [f64],
     pub nside: usize,
 }
 
-impl Field<'_> {
+impl MapField<'_> {
     /// Linear between the two rings around a direction and between two pixels on each.
     fn interpolated(&self, direction: Vec3) -> f64 {
         let nearest = self.values[pixel_of(self.nside, direction)];
@@ -114,7 +114,7 @@ fn neighbours(ring: &Ring, longitude: f64) -> ([usize; 2], f64) {
 }
 
 /// Draws a map into the greatest ellipse of a rectangle.
-pub(super) fn draw(canvas: &mut Canvas, area: Rect, field: Field<'_>, scale: &Scale, view: &View) {
+pub(super) fn draw(canvas: &mut Canvas, area: Rect, field: MapField<'_>, scale: &ColourScale, view: &View) {
     let ellipse = Ellipse::within(area);
     paint(canvas, &ellipse, field, scale, view);
     let centre = view.centre_deg.to_radians();
@@ -155,14 +155,14 @@ impl Ellipse {
 
 /// Colours of directions of a map.
 struct Painter<'a> {
-    field: Field<'a>,
-    scale: &'a Scale,
+    field: MapField<'a>,
+    scale: &'a ColourScale,
     /// Colour of each pixel, if pixels are shown.
     pixels: Option<Vec<Colour>>,
 }
 
 impl<'a> Painter<'a> {
-    fn new(field: Field<'a>, scale: &'a Scale, sampling: Sampling) -> Self {
+    fn new(field: MapField<'a>, scale: &'a ColourScale, sampling: Sampling) -> Self {
         let pixels = match sampling {
             Sampling::Pixels => Some(field.values.par_iter().map(|v| scale.colour(*v)).collect()),
             Sampling::Interpolated => None,
@@ -183,7 +183,7 @@ impl<'a> Painter<'a> {
     }
 }
 
-fn paint(canvas: &mut Canvas, ellipse: &Ellipse, field: Field<'_>, scale: &Scale, view: &View) {
+fn paint(canvas: &mut Canvas, ellipse: &Ellipse, field: MapField<'_>, scale: &ColourScale, view: &View) {
     let painter = Painter::new(field, scale, view.sampling);
     let first_row = (ellipse.y - ellipse.half_height).floor().max(0.0) as usize;
     let rows = (2.0 * ellipse.half_height).ceil() as usize + 1;
@@ -244,7 +244,7 @@ fn graticule(centre: f64) -> Vec<Vec<(f64, f64)>> {
 }
 
 /// Degrees beside the parallels and along the equator.
-fn label(canvas: &mut Canvas, ellipse: &Ellipse, scale: &Scale, centre: f64) {
+fn label(canvas: &mut Canvas, ellipse: &Ellipse, scale: &ColourScale, centre: f64) {
     let size = (ellipse.half_height / 19.0).clamp(10.0, 20.0);
     let outside = Style::new(size, FAINT);
     for parallel in [-60.0_f64, -30.0, 0.0, 30.0, 60.0] {
@@ -287,7 +287,7 @@ mod tests {
         for nside in [1, 2, 8, 16] {
             let directions = pixel_directions(nside);
             let values: Vec<f64> = directions.iter().map(|d| d[2] + 0.3 * d[0]).collect();
-            let field = Field { values: &values, nside };
+            let field = MapField { values: &values, nside };
             for (d, v) in directions.iter().zip(&values) {
                 assert!((field.interpolated(*d) - v).abs() < 1e-9, "{nside}");
             }
@@ -299,7 +299,7 @@ mod tests {
         let nside = 4;
         let mut values = vec![2.0; pixel_count(nside)];
         values[50] = f64::NAN;
-        let field = Field { values: &values, nside };
+        let field = MapField { values: &values, nside };
         let directions = pixel_directions(nside);
         assert!(field.interpolated(directions[50]).is_nan());
         for k in 0..1000_u32 {

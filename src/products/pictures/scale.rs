@@ -8,7 +8,7 @@ use crate::sky::is_unseen;
 
 /// How values spread over a scale.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Stretch {
+pub enum Scaling {
     /// Evenly.
     #[default]
     Linear,
@@ -33,22 +33,22 @@ pub(super) const UNSEEN: Colour = [160, 160, 160];
 
 /// A colour scale; several maps may share one.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Scale {
+pub struct ColourScale {
     low: f64,
     high: f64,
-    stretch: Stretch,
+    stretch: Scaling,
     palette: Palette,
 }
 
-impl Scale {
+impl ColourScale {
     /// A scale between given limits.
     ///
     /// # Errors
     /// [`PictureError::Limits`] unless both are finite, `low < high` and, for logarithms, `low > 0`.
-    pub fn new(low: f64, high: f64, stretch: Stretch, palette: Palette) -> Result<Self, PictureError> {
+    pub fn new(low: f64, high: f64, stretch: Scaling, palette: Palette) -> Result<Self, PictureError> {
         let (positive, name, more) = match stretch {
-            Stretch::Linear => (true, "linear", ""),
-            Stretch::Log => (low > 0.0, "logarithmic", " and low > 0"),
+            Scaling::Linear => (true, "linear", ""),
+            Scaling::Log => (low > 0.0, "logarithmic", " and low > 0"),
         };
         if !(low < high && (high - low).is_finite() && positive) {
             return Err(PictureError::Limits { low, high, stretch: name, more });
@@ -61,8 +61,8 @@ impl Scale {
     /// Always a valid scale: constant or missing values get a little room around them, and
     /// a logarithmic one starts at the least positive value if need be.
     #[must_use]
-    pub fn robust(values: &[f64], stretch: Stretch, palette: Palette) -> Self {
-        let usable = |v: &f64| is_seen(*v) && (stretch == Stretch::Linear || *v > 0.0);
+    pub fn robust(values: &[f64], stretch: Scaling, palette: Palette) -> Self {
+        let usable = |v: &f64| is_seen(*v) && (stretch == Scaling::Linear || *v > 0.0);
         let (low, high) = percentiles(values.iter().copied().filter(usable).collect(), 0.5, 99.5);
         Self::widened(low, high, stretch, palette)
     }
@@ -73,19 +73,19 @@ impl Scale {
         let sizes = values.iter().copied().filter(|v| is_seen(*v)).map(f64::abs).collect();
         let (_, reach) = percentiles(sizes, 0.0, 99.0);
         let reach = if reach > 0.0 { reach.clamp(1e-300, 1e300) } else { 1.0 };
-        Self { low: -reach, high: reach, stretch: Stretch::Linear, palette: Palette::Diverging }
+        Self { low: -reach, high: reach, stretch: Scaling::Linear, palette: Palette::Diverging }
     }
 
-    fn widened(low: f64, high: f64, stretch: Stretch, palette: Palette) -> Self {
+    fn widened(low: f64, high: f64, stretch: Scaling, palette: Palette) -> Self {
         let (low, high) = (low.clamp(-1e300, 1e300), high.clamp(-1e300, 1e300));
         let enough = 1e-9 * low.abs().max(high.abs());
         let (low, high) = match stretch {
             _ if high - low > enough => (low, high),
-            Stretch::Linear => {
+            Scaling::Linear => {
                 let room = if low == 0.0 { 1.0 } else { 0.1 * low.abs() };
                 (low - room, low + room)
             }
-            Stretch::Log => (low / 1.2, low * 1.2),
+            Scaling::Log => (low / 1.2, low * 1.2),
         };
         Self { low, high, stretch, palette }
     }
@@ -105,9 +105,9 @@ impl Scale {
     /// Place of a value on the scale, 0 to 1 within the limits.
     pub(super) fn place(&self, value: f64) -> f64 {
         match self.stretch {
-            Stretch::Linear => (value - self.low) / (self.high - self.low),
-            Stretch::Log if value > 0.0 => (value / self.low).ln() / (self.high / self.low).ln(),
-            Stretch::Log => f64::NEG_INFINITY,
+            Scaling::Linear => (value - self.low) / (self.high - self.low),
+            Scaling::Log if value > 0.0 => (value / self.low).ln() / (self.high / self.low).ln(),
+            Scaling::Log => f64::NEG_INFINITY,
         }
     }
 
@@ -135,8 +135,8 @@ impl Scale {
     /// Round values along the scale.
     pub(super) fn ticks(&self, wanted: usize) -> Ticks {
         match self.stretch {
-            Stretch::Linear => labels::linear(self.low, self.high, wanted),
-            Stretch::Log => labels::logarithmic(self.low, self.high, wanted),
+            Scaling::Linear => labels::linear(self.low, self.high, wanted),
+            Scaling::Log => labels::logarithmic(self.low, self.high, wanted),
         }
     }
 }

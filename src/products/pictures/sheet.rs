@@ -2,9 +2,9 @@
 
 use super::canvas::{Canvas, FAINT, INK, Rect, Stroke};
 use super::error::PictureError;
-use super::mollweide::{Field, View};
+use super::mollweide::{MapField, View};
 use super::png_file::Picture;
-use super::scale::Scale;
+use super::scale::ColourScale;
 use super::text::{Align, Style};
 use super::{mollweide, text};
 use crate::sky::healpix::nside_of;
@@ -17,7 +17,7 @@ pub struct MapPanel<'a> {
     /// Line above the map.
     pub caption: String,
     /// Colours.
-    pub scale: Scale,
+    pub scale: ColourScale,
     /// Unit of the values, written at the colour bar.
     pub unit: String,
 }
@@ -90,7 +90,7 @@ pub fn draw_sheet(panels: &[MapPanel<'_>], sheet: &Sheet) -> Result<Picture, Pic
         .map(|(panel, p)| {
             let nside =
                 nside_of(p.values.len()).ok_or(PictureError::PixelCount { panel, pixels: p.values.len() })?;
-            Ok(Field { values: p.values, nside })
+            Ok(MapField { values: p.values, nside })
         })
         .collect::<Result<Vec<_>, PictureError>>()?;
     if panels.is_empty() || panels.len() > 256 {

@@ -14,7 +14,7 @@ fn bare() -> Sheet {
     }
 }
 
-fn panel(values: &[f64], scale: Scale) -> MapPanel<'_> {
+fn panel(values: &[f64], scale: ColourScale) -> MapPanel<'_> {
     MapPanel { values, caption: String::new(), scale, unit: "K".to_owned() }
 }
 
@@ -23,7 +23,7 @@ fn longitude_grows_to_the_left_and_latitude_upwards() {
     // One map bright in the east, one in the north.
     for (axis, bright, dark) in [(1, (0.3, 0.5), (0.7, 0.5)), (2, (0.5, 0.3), (0.5, 0.7))] {
         let values: Vec<f64> = pixel_directions(16).iter().map(|d| d[axis]).collect();
-        let scale = Scale::new(-1.0, 1.0, Stretch::Linear, Palette::Inferno).unwrap();
+        let scale = ColourScale::new(-1.0, 1.0, Scaling::Linear, Palette::Inferno).unwrap();
         let picture = draw_sheet(&[panel(&values, scale)], &bare()).unwrap();
         // The map fills the page's width but for the margins; its middle is near the page's.
         let map_height = 0.445 * 800.0;
@@ -38,7 +38,7 @@ fn longitude_grows_to_the_left_and_latitude_upwards() {
 #[test]
 fn a_rotation_turns_the_view() {
     let values: Vec<f64> = pixel_directions(16).iter().map(|d| d[0]).collect();
-    let scale = Scale::new(-1.0, 1.0, Stretch::Linear, Palette::Inferno).unwrap();
+    let scale = ColourScale::new(-1.0, 1.0, Scaling::Linear, Palette::Inferno).unwrap();
     // The frame drawn has its pole where the map has its x axis.
     let turned = View { rotation: [[0., 0., 1.], [1., 0., 0.], [0., 1., 0.]], ..bare().view };
     let picture = draw_sheet(&[panel(&values, scale)], &Sheet { view: turned, ..bare() }).unwrap();
@@ -49,7 +49,7 @@ fn a_rotation_turns_the_view() {
 
 #[test]
 fn unseen_pixels_are_grey() {
-    let scale = Scale::new(0.0, 1.0, Stretch::Linear, Palette::Inferno).unwrap();
+    let scale = ColourScale::new(0.0, 1.0, Scaling::Linear, Palette::Inferno).unwrap();
     for value in [f64::NAN, -1.6375e30, f64::from(-1.6375e30_f32), f64::INFINITY] {
         let values = vec![value; pixel_count(2)];
         for sampling in [Sampling::Pixels, Sampling::Interpolated] {
@@ -63,34 +63,37 @@ fn unseen_pixels_are_grey() {
 #[test]
 fn scales_suit_what_they_are_made_from() {
     let ramp: Vec<f64> = (0..=1000).map(f64::from).collect();
-    let scale = Scale::robust(&ramp, Stretch::Linear, Palette::Inferno);
+    let scale = ColourScale::robust(&ramp, Scaling::Linear, Palette::Inferno);
     assert_eq!((scale.low(), scale.high()), (5.0, 995.0));
     let outlier: Vec<f64> = ramp.iter().copied().chain([f64::NAN, -1.6375e30]).collect();
-    assert_eq!(Scale::robust(&outlier, Stretch::Linear, Palette::Inferno), scale);
-    let errors = Scale::symmetric(&[-3.0, 1.0, 2.0, f64::NAN]);
+    assert_eq!(ColourScale::robust(&outlier, Scaling::Linear, Palette::Inferno), scale);
+    let errors = ColourScale::symmetric(&[-3.0, 1.0, 2.0, f64::NAN]);
     assert!(errors.low() == -errors.high() && errors.high() > 2.9);
     for hostile in [&[][..], &[0.0; 3], &[f64::NAN], &[-5.0, -5.0], &[1e308, -1e308, 5e-324]] {
-        for stretch in [Stretch::Linear, Stretch::Log] {
-            let scale = Scale::robust(hostile, stretch, Palette::Viridis);
-            let valid = Scale::new(scale.low(), scale.high(), stretch, Palette::Viridis);
+        for stretch in [Scaling::Linear, Scaling::Log] {
+            let scale = ColourScale::robust(hostile, stretch, Palette::Viridis);
+            let valid = ColourScale::new(scale.low(), scale.high(), stretch, Palette::Viridis);
             assert!(valid.is_ok(), "{hostile:?} {stretch:?} {scale:?}");
         }
-        let scale = Scale::symmetric(hostile);
+        let scale = ColourScale::symmetric(hostile);
         assert!(scale.low() < scale.high());
     }
     for (low, high, stretch) in [
-        (1.0, 1.0, Stretch::Linear),
-        (f64::NAN, 1.0, Stretch::Linear),
-        (0.0, 1.0, Stretch::Log),
-        (-1.0, f64::INFINITY, Stretch::Linear),
+        (1.0, 1.0, Scaling::Linear),
+        (f64::NAN, 1.0, Scaling::Linear),
+        (0.0, 1.0, Scaling::Log),
+        (-1.0, f64::INFINITY, Scaling::Linear),
     ] {
-        assert!(matches!(Scale::new(low, high, stretch, Palette::Inferno), Err(PictureError::Limits { .. })));
+        assert!(matches!(
+            ColourScale::new(low, high, stretch, Palette::Inferno),
+            Err(PictureError::Limits { .. })
+        ));
     }
 }
 
 #[test]
 fn what_is_no_page_is_refused() {
-    let scale = Scale::new(0.0, 1.0, Stretch::Linear, Palette::Inferno).unwrap();
+    let scale = ColourScale::new(0.0, 1.0, Scaling::Linear, Palette::Inferno).unwrap();
     let values = vec![0.5; 13];
     assert!(matches!(
         draw_sheet(&[panel(&values, scale)], &bare()),
@@ -131,7 +134,7 @@ fn files_hold_the_picture_and_its_texts_and_appear_whole() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("map.png");
     let values: Vec<f64> = pixel_directions(4).iter().map(|d| d[0]).collect();
-    let map = panel(&values, Scale::symmetric(&values));
+    let map = panel(&values, ColourScale::symmetric(&values));
     let picture =
         draw_map(&MapPanel { caption: "δT at 10 MHz".to_owned(), ..map }, "a line", &View::default())
             .unwrap()

@@ -1,0 +1,110 @@
+//! Arguments that several commands share.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use crate::pipeline::ConfigSource;
+use crate::units::constants::DAY_S;
+
+/// A pipeline file, and settings that replace some of its own.
+#[derive(Debug, Args)]
+pub(super) struct PipelineArgs {
+    /// Pipeline file (TOML); the embedded quicklook if none is given.
+    #[arg(value_name = "PIPELINE.toml")]
+    pipeline: Option<PathBuf>,
+    /// Seed of all random numbers of the space segment, in place of the file's.
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Replace one setting, for example --set map.nside=32; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+    /// Downlink format, in place of the file's: plain space packets, or coded transfer frames (CADUs).
+    #[arg(long, value_name = "packets|cadu")]
+    format: Option<String>,
+}
+
+/// An array, for commands that need nothing else of a pipeline.
+#[derive(Debug, Args)]
+pub(super) struct ArrayArgs {
+    /// Pipeline file (TOML) that describes the array; the paper's fiducial array if none is given.
+    #[arg(long, value_name = "PIPELINE.toml")]
+    pipeline: Option<PathBuf>,
+    /// Replace one setting, for example --set array.inclination_deg=60; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+}
+
+/// The map file of an existing state.
+#[derive(Debug, Args)]
+pub(super) struct StateMapArgs {
+    /// Map file (TOML) with which the state was made; the embedded quicklook's settings if none is given.
+    #[arg(long, value_name = "MAP.toml")]
+    map: Option<PathBuf>,
+    /// Replace one setting, for example --set map.nside=8; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+}
+
+impl ArrayArgs {
+    pub(super) fn source(&self) -> ConfigSource {
+        ConfigSource { file: self.pipeline.clone(), overrides: self.overrides.clone(), seed: None }
+    }
+}
+
+impl StateMapArgs {
+    pub(super) fn source(&self) -> ConfigSource {
+        ConfigSource { file: self.map.clone(), overrides: self.overrides.clone(), seed: None }
+    }
+}
+
+impl PipelineArgs {
+    pub(super) fn source(&self) -> ConfigSource {
+        let Self { pipeline, seed, overrides, format } = self;
+        let format = format.iter().map(|format| format!("downlink.format={format:?}"));
+        let overrides = overrides.iter().cloned().chain(format).collect();
+        ConfigSource { file: pipeline.clone(), overrides, seed: *seed }
+    }
+}
+
+/// Seconds from a time such as `7d`, `12h`, `90s` or `90`; at most 1e9 s either way.
+pub(super) fn time_s(text: &str) -> Result<f64, String> {
+    let text = text.trim();
+    let (number, unit_s) = match text.strip_suffix(['s', 'h', 'd']) {
+        Some(number) if text.ends_with('d') => (number, DAY_S),
+        Some(number) if text.ends_with('h') => (number, 3600.0),
+        Some(number) => (number, 1.0),
+        None => (text, 1.0),
+    };
+    match number.trim().parse::<f64>() {
+        Ok(value) if (value * unit_s).abs() <= 1e9 => Ok(value * unit_s),
+        _ => Err("expected a number with s, h or d, such as 90s or 7d, at most 1e9 s".into()),
+    }
+}
+
+/// As [`time_s`], but not negative.
+pub(super) fn not_negative_s(text: &str) -> Result<f64, String> {
+    match time_s(text)? {
+        value if value >= 0.0 => Ok(value),
+        _ => Err("expected a time that is not negative".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_have_units() {
+        for (text, expected_s) in
+            [("7d", 604_800.0), ("1.5 h", 5400.0), ("90s", 90.0), ("90", 90.0), ("0", 0.0)]
+        {
+            assert_eq!((time_s(text), not_negative_s(text)), (Ok(expected_s), Ok(expected_s)));
+        }
+        assert_eq!(time_s("-1d"), Ok(-86_400.0));
+        assert!(not_negative_s("-1d").is_err());
+        for text in ["", "d", "infd", "7w", "NaN", "1e9d"] {
+            assert!(time_s(text).is_err() && not_negative_s(text).is_err(), "{text}");
+        }
+    }
+}
