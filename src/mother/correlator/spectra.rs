@@ -27,7 +27,7 @@ use super::align::Row;
 use super::kernel::{LANES, Sums};
 use crate::array::Array;
 use crate::frames::{Channel, SampleBlock, Samples};
-use crate::response::pixel::kernel::fused;
+use crate::units::arithmetic::fused;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, dot};
 
