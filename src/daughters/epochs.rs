@@ -1,7 +1,7 @@
-//! BandInterpolation over time: from the instants that a model is asked for to the epochs at which samples are drawn.
+//! Interpolation over time: from the instants that a model is asked for to the epochs at which samples are drawn.
 
 use super::nodes::BandInterpolation;
-use crate::response::pixel::kernel::fused;
+use crate::units::arithmetic::fused;
 
 /// Epochs and values that are interpolated together.
 pub(super) const EPOCHS: usize = 4;

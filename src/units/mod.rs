@@ -1,7 +1,8 @@
-//! Identifiers, mission time, constants, three-vectors and keyed random streams.
+//! Identifiers, mission time, constants, three-vectors, keyed random streams, and arithmetic for vectorised loops.
 //!
 //! Uses nothing else of the crate.
 
+pub(crate) mod arithmetic;
 pub mod constants;
 mod ids;
 mod per_channel;

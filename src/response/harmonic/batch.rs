@@ -12,6 +12,7 @@ use super::model::{ALPHA_TOLERANCE, HarmonicModel, TERMS};
 use super::rotation::orders;
 use super::runs::Run;
 use super::{PairState, chebyshev};
+use crate::units::arithmetic::sinc;
 
 /// Alphas of the grid for which the sky is turned at once.
 pub(super) const ALPHA_BLOCK: usize = 64;
@@ -264,9 +265,4 @@ impl HarmonicModel {
             })
             .collect()
     }
-}
-
-/// sin(x) / x.
-fn sinc(x: f64) -> f64 {
-    if x.abs() < 1e-8 { 1.0 } else { x.sin() / x }
 }
