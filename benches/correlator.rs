@@ -1,10 +1,9 @@
-//! The correlator's kernel against the machine's multiply-adds and against matrix products of libraries.
+//! Speed of the correlator's kernel, compared with the machine's peak and with matrix products of libraries.
 //!
-//! `cargo bench --bench correlator`. One thread. Everything is measured in turns in the same run, and the best
-//! of many short rounds is taken. Operations are those that the products ask for: 4 multiply-adds for a pair, 2 for
-//! a daughter with itself. `LUNARRAY_PYTHON` names a Python with numpy; it and its
-//! BLAS then multiply the same blocks as complex64.
-#![allow(clippy::unwrap_used)] // A program for people at a terminal.
+//! `cargo bench --bench correlator`. One thread. The candidates take turns in the same run, and the best of many short
+//! rounds counts. Operations are those that the products need: 4 multiply-adds per pair, 2 per auto-correlation.
+//! `LUNARRAY_PYTHON` names a Python with numpy; numpy and its BLAS then multiply the same blocks as complex64.
+#![allow(clippy::unwrap_used)] // An interactive program.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -16,16 +15,18 @@ use num_complex::Complex32;
 use pulp::{Arch, Simd, WithSimd};
 
 const DAUGHTERS: usize = 8;
-/// Samples of one channel in a round.
+/// Samples per channel in a round.
 const SAMPLES: usize = 1 << 10;
+/// Multiply-adds that the products of one slice need: 4 per pair, 2 per auto-correlation.
+const MULTIPLY_ADDS: usize = (DAUGHTERS * (DAUGHTERS - 1) / 2 * 4 + DAUGHTERS * 2) * SLICE * LANES;
 /// Rounds, of which the best counts.
 const ROUNDS: usize = 150;
 
-/// Multiply-adds that depend on nothing but registers.
+/// Multiply-adds on registers only.
 struct Peak(usize);
 
 impl WithSimd for Peak {
-    /// Multiply-adds done, and a value that depends on all.
+    /// Number of multiply-adds, and a value that depends on all of them.
     type Output = (usize, f32);
 
     #[inline(always)]
@@ -43,7 +44,8 @@ impl WithSimd for Peak {
     }
 }
 
-/// Multiply-adds of pairs of 16 bits into 32, by the best that the kernel could use, and a value that depends on all.
+/// Pairwise multiply-adds of 16-bit integers into 32 bits, with the best instructions that the kernel could use: their
+/// number, and a value that depends on all of them.
 #[cfg(target_arch = "x86_64")]
 fn integer_peak(arch: Arch, rounds: usize) -> Option<(usize, i32)> {
     use pulp::x86::V3;
@@ -81,7 +83,7 @@ fn integer_peak(_: Arch, _: usize) -> Option<(usize, i32)> {
     None
 }
 
-/// Seconds for the products of all channels' blocks: numpy's product, and BLAS's rank-k update.
+/// Measures the products of all channels' blocks, s: numpy's product and the rank-k update of BLAS.
 const PYTHON: &str = r#"
 import sys, time, glob, os, ctypes
 import numpy
@@ -113,10 +115,10 @@ for library in glob.glob(os.path.join(folder, "libscipy_openblas64_*")):
     assert abs(numpy.triu(out[0]) - expected).max() < 1e-3 * abs(expected).max()
 "#;
 
-/// Names of peers, with their multiply-adds a second.
+/// Names of the peers, with their multiply-adds per second.
 fn peers(threads: usize, operations: f64) -> Vec<(String, f64)> {
     let Some(python) = std::env::var_os("LUNARRAY_PYTHON") else {
-        println!("skipped: numpy and BLAS, for LUNARRAY_PYTHON is not set");
+        println!("skipped numpy and BLAS: LUNARRAY_PYTHON is not set");
         return Vec::new();
     };
     let mut command = std::process::Command::new(python);
@@ -144,7 +146,7 @@ fn main() {
     let blocks: Vec<Samples> = (0..DAUGHTERS * LANES)
         .map(|n| Samples::Codes { bits: 8, step: 0.1, re: codes(n), im: codes(n + 1000) })
         .collect();
-    // The library's form of the same: a matrix of daughters by samples for each channel.
+    // The same data for the library: a matrix of daughters by samples for each channel.
     let level = |code: i8| (f32::from(code) + 0.5) * 0.1;
     let matrix = |lane: usize| -> Vec<Complex32> {
         let mut matrix = vec![Complex32::ZERO; DAUGHTERS * SAMPLES];
@@ -162,10 +164,10 @@ fn main() {
     for daughter in 0..DAUGHTERS {
         packed.put_all(daughter, |lane| Some(&blocks[lane * DAUGHTERS + daughter]), 0);
     }
-    let operations = (Packed::multiply_adds(DAUGHTERS) * slices) as f64;
+    let operations = (MULTIPLY_ADDS * slices) as f64;
     let [mut peak, mut float_peak, mut kernel, mut packing] = [0.0_f64; 4];
     let mut library = [0.0_f64; 3];
-    // Samples between two results of the library: a whole block, a dump, and a short one.
+    // Samples per product of the library: a whole block, a dump, and a short one.
     let depths = [SAMPLES, 64, 16];
     for _ in 0..ROUNDS {
         let mut done = 0;
@@ -204,10 +206,10 @@ fn main() {
             *library = library.max(operations / spent);
         }
     }
-    // Where whole numbers have no instructions of their own, the kernel is a plain loop.
+    // Without pairwise integer instructions the kernel is a plain loop.
     let peak = if peak > 0.0 { peak } else { float_peak };
-    println!("multiply-adds a second of one core, codes of 8 bits");
-    println!("peak of pairs of 16 bits              {peak:8.2e}  (of f32: {float_peak:8.2e})");
+    println!("multiply-adds per second on one core, 8-bit codes");
+    println!("peak of 16-bit pairs                  {peak:8.2e}  (of f32: {float_peak:8.2e})");
     println!(
         "kernel                                {kernel:8.2e}  {:5.1} % of the peak",
         100.0 * kernel / peak
@@ -232,5 +234,5 @@ fn main() {
         }
     }
     let samples = packing / operations * (SAMPLES * DAUGHTERS * LANES) as f64;
-    println!("samples a second with unpacking       {samples:8.2e}");
+    println!("samples per second with unpacking     {samples:8.2e}");
 }

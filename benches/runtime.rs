@@ -1,8 +1,8 @@
-//! What the runner costs: items a second through chains of stages that do nothing, and the ratio to
+//! Overhead of the runtime: items per second through chains of stages that do nothing, and the ratio to
 //! bare threads around the same channels in the same run.
 //!
-//! `cargo bench --bench runtime`. Runner and bare threads alternate, and the best of each counts, so
-//! that other load on the machine touches both alike.
+//! `cargo bench --bench runtime`. Runtime and bare threads alternate, and the best of each counts, so that other
+//! load on the machine affects both alike.
 
 use std::convert::Infallible;
 use std::error::Error;
@@ -54,7 +54,7 @@ impl Sink for Ignore {
     }
 }
 
-/// `count` items through `hops` queues of `capacity`, by the runner.
+/// Time for `count` items through `hops` queues of `capacity`, with the runtime.
 fn graph(count: u64, hops: usize, capacity: usize) -> Result<Duration, Box<dyn Error>> {
     let since = Instant::now();
     let mut graph = Graph::new();
@@ -68,7 +68,7 @@ fn graph(count: u64, hops: usize, capacity: usize) -> Result<Duration, Box<dyn E
     Ok(since.elapsed())
 }
 
-/// The same by bare threads.
+/// As [`graph`], with bare threads.
 fn bare(count: u64, hops: usize, capacity: usize) -> Result<Duration, Box<dyn Error>> {
     let since = Instant::now();
     let received = thread::scope(|scope| {
@@ -88,7 +88,7 @@ fn bare(count: u64, hops: usize, capacity: usize) -> Result<Duration, Box<dyn Er
 fn main() -> Result<(), Box<dyn Error>> {
     const ITEMS: u64 = 200_000;
     const ROUNDS: usize = 5;
-    println!("hops  capacity  runner M items/s/hop  bare M items/s/hop  ratio  ns an item and hop more");
+    println!("hops  capacity  graph M items/s/hop   bare M items/s/hop  ratio  added ns per item, hop");
     for (hops, capacity) in [(1, 16), (1, 1024), (3, 16), (3, 1024), (7, 64)] {
         let (mut with, mut without) = (Duration::MAX, Duration::MAX);
         for _ in 0..ROUNDS {

@@ -1,4 +1,4 @@
-//! `lunarray bench`: how fast the chain is on this machine.
+//! `lunarray bench`: measure the speed of the chain on this machine.
 
 use std::path::PathBuf;
 
@@ -8,33 +8,34 @@ use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::bench::{BENCH_STAGES, BenchSettings, bench_config};
 use crate::pipeline::{ConfigSource, Plan, use_threads};
 
-/// Measure each stage of the sampled spacecraft alone, and the chain from samples to received visibilities.
+/// Measure the speed of each stage of sample fidelity, and of the chain from samples to received visibilities.
 ///
-/// Without a pipeline, 16 s of the design are measured: 30 channels, eight daughters, 8 bits, over a generated
-/// sky of nside 8. Prints samples, visibilities and bytes a second, the ratio to real time of the design, the
-/// spread over runs, processor time, latencies from sample to packet and from packet to sums, queues and the stage that
+/// Without a pipeline file it measures 16 s of the design: 30 channels, eight daughters, 8 bits, with a generated sky of
+/// nside 8. Prints samples, visibilities and bytes per second, the ratio to real time of the design, the spread over
+/// runs, processor time, latencies from sample to packet and from packet to sums, queue depths, and the stage that
 /// saturates first.
 ///
-/// Every run begins with nothing prepared: what sampling and the chain take is with their first tables, and with the
-/// predictions of a sky that they sum for themselves.
+/// Every run starts cold: its times include the first tables of the sampler and the predictions of the sky.
+///
+/// Example: lunarray bench --stage correlate --runs 9
 #[derive(Debug, Args)]
 pub(super) struct BenchArgs {
-    /// Pipeline file (TOML); its first window is measured, of spacecraft.window_s_max at best.
+    /// Pipeline file (TOML); measures its first window, at most spacecraft.window_s_max long.
     #[arg(value_name = "PIPELINE.toml")]
     pipeline: Option<PathBuf>,
-    /// Replace one setting of the pipeline file, for example --set daughters.bits=2; may be given again.
+    /// Replace one setting of the pipeline file, for example --set daughters.bits=2; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE", requires = "pipeline")]
     overrides: Vec<String>,
-    /// Measure one stage only.
+    /// Measure only this stage.
     #[arg(long, value_parser = BENCH_STAGES)]
     stage: Option<String>,
-    /// Runs of each stage.
+    /// Number of runs of each stage.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..=1000))]
     runs: u16,
-    /// Run the chain at other sizes as well: channels, daughters, blocks.
+    /// Also run the chain with other numbers of channels and daughters, and other block sizes.
     #[arg(long)]
     growth: bool,
-    /// One JSON object instead of a table; with the queues' depths as they changed.
+    /// Print one JSON object instead of tables; includes the queue depths over time.
     #[arg(long)]
     json: bool,
 }

@@ -1,4 +1,4 @@
-//! `lunarray check`: every error at once, then the cost.
+//! `lunarray check`: validate a pipeline and estimate its cost.
 
 use clap::Args;
 
@@ -6,15 +6,17 @@ use super::arguments::PipelineArgs;
 use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
 use crate::pipeline::{ConfigError, Plan};
 
-/// Check a pipeline and say what it will cost, without running it.
+/// Check a pipeline and estimate its cost, without running it.
 ///
-/// Lists everything that is wrong with the file at once; then visibilities by channel, downlink bytes,
-/// memory, operations, and a time predicted from a measurement of a fraction of a second.
+/// Lists all problems of the file at once. If there are none, prints the number of visibilities by channel, downlink
+/// bytes, memory, operations and an estimated run time.
+///
+/// Example: lunarray check pipelines/reference.toml --set map.nside=32
 #[derive(Debug, Args)]
 pub(super) struct CheckArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
-    /// One JSON object instead of a table.
+    /// Print one JSON object instead of a table.
     #[arg(long)]
     json: bool,
 }

@@ -1,4 +1,4 @@
-//! `lunarray compare`: a map against the truth.
+//! `lunarray compare`: compare a map with the truth.
 
 use std::path::{Path, PathBuf};
 
@@ -11,10 +11,12 @@ use crate::sky::{Comparison, Frame, SkyMap, compare};
 
 /// Compare a map with the truth, degree by degree.
 ///
-/// Both are HEALPix FITS maps in K; they are brought to ecliptic axes and to the coarser of their
-/// resolutions. rho_l = C_l^X / sqrt(C_l^in C_l^re) says how much of the truth's structure at degree l
-/// the map has, whatever its scale; with a noise-only map, SNR_l = C_l^X / sqrt(C_l^in C_l^ns). Draws
-/// the curves, and the relative error (map - truth) / truth over the sky.
+/// Both are HEALPix FITS maps in K; they are converted to ecliptic axes and to the coarser of the two resolutions.
+/// rho_l = C_l^X / sqrt(C_l^in C_l^re) is the correlation of map and truth at degree l, whatever the scale of the map;
+/// with a noise-only map, SNR_l = C_l^X / sqrt(C_l^in C_l^ns). Draws these curves, and the relative error
+/// (map - truth) / truth over the sky.
+///
+/// Example: lunarray compare map.fits input.fits --noise noise.fits
 #[derive(Debug, Args)]
 pub(super) struct CompareArgs {
     /// Map (FITS).
@@ -26,21 +28,21 @@ pub(super) struct CompareArgs {
     /// Noise-only map (FITS), for SNR_l.
     #[arg(long, value_name = "NOISE.fits")]
     noise: Option<PathBuf>,
-    /// Leave the degrees beyond L out of the truth, instead of averaging it over the map's pixels: for maps of
-    /// harmonics up to L.
+    /// Limit the truth to degrees up to L instead of averaging it over the map's pixels; for maps of harmonics up to
+    /// degree L.
     #[arg(long, value_name = "L")]
     band_limit: Option<usize>,
-    /// Greatest degree; 3 nside - 1 if not given.
+    /// Maximum degree; 3 nside - 1 if not given.
     #[arg(long)]
     l_max: Option<usize>,
-    /// Picture of the curves (PNG); MAP-spectra.png if not given, none with --json. The relative error
-    /// goes beside it, with -error before the ending.
+    /// Picture of the curves (PNG); MAP-spectra.png if not given, none with --json. The picture of the relative error
+    /// goes beside it, with -error before the extension.
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
     /// Draw no pictures.
     #[arg(long, conflicts_with = "plot")]
     no_plot: bool,
-    /// One JSON object: l, cl_map, cl_truth, cl_cross, rho and, with noise, snr as arrays.
+    /// Print one JSON object: l, cl_map, cl_truth, cl_cross, rho and, with noise, snr as arrays.
     #[arg(long)]
     json: bool,
 }
@@ -51,7 +53,7 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     if let (Some(map_hz), Some(truth_hz)) = (map_hz, truth_hz)
         && (map_hz - truth_hz).abs() > 1e-6 * truth_hz
     {
-        eprintln!("note: the map is of {map_hz} Hz, the truth of {truth_hz} Hz (FREQ)");
+        eprintln!("note: the map is at {map_hz} Hz, the truth at {truth_hz} Hz (FREQ)");
     }
     if let Some(l_max) = args.band_limit {
         truth = truth.band_limited(map.nside(), l_max)?;
@@ -63,7 +65,7 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     } else {
         print_text(&table(&comparison))?;
     }
-    // Programs read; they get pictures if they ask.
+    // With --json, pictures are drawn only on request.
     let wanted = !args.no_plot && (args.plot.is_some() || !args.json);
     let pictures = if wanted { draw(args, &comparison)? } else { Vec::new() };
     if args.json {
@@ -75,8 +77,8 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     Ok(Completion::Done)
 }
 
-/// A map in K, and its frequency, Hz, if the file tells. A file that does not say its frame is taken to be ecliptic, as
-/// all maps of this program are.
+/// Reads a map in K, and its frequency, Hz, if the file has one. A file without a frame is taken to be ecliptic, like all
+/// maps of this program.
 fn read(path: impl AsRef<Path>) -> Result<(SkyMap, Option<f64>), CommandError> {
     let options = ReadOptions { frame_if_missing: Some(Frame::Ecliptic), ..ReadOptions::default() };
     let file = read_whole_map_file(path.as_ref(), &options)?;

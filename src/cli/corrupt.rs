@@ -1,4 +1,4 @@
-//! `lunarray corrupt`: what a link would make of a downlink.
+//! `lunarray corrupt`: apply the faults of a link to a downlink file.
 
 use std::path::PathBuf;
 
@@ -7,63 +7,65 @@ use clap::Args;
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::downlink::link::{LinkConfig, corrupt, truth_path};
 
-/// Damage a downlink file as a link would, and tell the truth about it.
+/// Damage a downlink file as a faulty link would, and record what was damaged.
 ///
-/// Takes a sound file of either format, pass by pass. "Frame" is a coded frame, or a packet where packets are sent
-/// plain. All faults are off unless asked for; the same seed gives the same bytes. FILE.truth.json, beside
-/// the new file, holds what cannot be recovered any more: frames by virtual channel and count, packets by APID
-/// and count (of 46 bits; the sequence count is its lower 14), and why.
+/// Reads an intact file of either format, pass by pass. "Frame" means a coded frame, or a packet in a file of plain
+/// packets. All faults are off by default; the same seed gives the same bytes. FILE.truth.json, beside the new file,
+/// lists what cannot be recovered and why: frames by virtual channel and count, packets by APID and 46-bit count (the
+/// sequence count is its lower 14 bits).
+///
+/// Example: lunarray corrupt sky.cadu --out bad.cadu --frame-loss 0.01 --seed 3
 #[derive(Debug, Args)]
 pub(super) struct CorruptArgs {
-    /// Sound downlink file.
+    /// Intact downlink file.
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// File to write.
+    /// Damaged file to write.
     #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
     /// Seed of all faults.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Probability that a bit is wrong.
+    /// Bit error probability.
     #[arg(long, default_value_t = 0.0)]
     bit_error_rate: f64,
-    /// Mean distance of bursts, bits; 0 for none.
+    /// Mean distance between error bursts, bits; 0 for none.
     #[arg(long, default_value_t = 0.0)]
     burst_every_bits: f64,
-    /// Mean length of bursts, bits.
+    /// Mean length of an error burst, bits.
     #[arg(long, default_value_t = 0.0)]
     burst_bits: f64,
-    /// Probability that a bit of a burst is wrong.
+    /// Bit error probability within a burst.
     #[arg(long, default_value_t = 0.5)]
     burst_bit_error_rate: f64,
-    /// Probability that a frame does not arrive.
+    /// Probability that a frame is lost.
     #[arg(long, default_value_t = 0.0)]
     frame_loss: f64,
-    /// Probability that a pass does not arrive.
+    /// Probability that a whole pass is lost.
     #[arg(long, default_value_t = 0.0)]
     pass_loss: f64,
-    /// Probability that a pass is cut off somewhere.
+    /// Probability that a pass is cut short.
     #[arg(long, default_value_t = 0.0)]
     pass_cut: f64,
-    /// Probability that a frame arrives twice.
+    /// Probability that a frame is duplicated.
     #[arg(long, default_value_t = 0.0)]
     duplicate: f64,
-    /// Probability that a frame arrives later than it should.
+    /// Probability that a frame is delayed.
     #[arg(long, default_value_t = 0.0)]
     reorder: f64,
-    /// Greatest number of frames that it then comes too late by.
+    /// Maximum delay of a delayed frame, frames.
     #[arg(long, default_value_t = 16)]
     reorder_frames: u64,
-    /// Probability that a pass arrives after the one that follows it.
+    /// Probability that a pass is swapped with the next one.
     #[arg(long, default_value_t = 0.0)]
     pass_swap: f64,
     /// Probability that a coded frame loses or gains a bit.
     #[arg(long, default_value_t = 0.0)]
     bit_slip: f64,
-    /// Frames at the end of each pass that a second station hears too, with faults of its own.
+    /// Number of frames at the end of each pass that a second station also receives, with faults of its own.
     #[arg(long, default_value_t = 0)]
     second_station_frames: u64,
-    /// Print the truth as one JSON object instead of a few lines.
+    /// Print the record of the damage as one JSON object instead of a summary.
     #[arg(long)]
     json: bool,
 }
@@ -90,7 +92,7 @@ pub(super) fn execute(args: &CorruptArgs) -> CommandResult {
     } else {
         let place = truth_path(&args.out);
         print_text(&format!(
-            "{truth}\nThe downlink is in {}, the truth in {}",
+            "{truth}\nWrote the downlink to {} and the record of its damage to {}",
             args.out.display(),
             place.display()
         ))?;

@@ -1,4 +1,4 @@
-//! `lunarray gaps`: what is missing, and what it is worth.
+//! `lunarray gaps`: list missing packets by their value for the map.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -9,26 +9,28 @@ use super::output::{CommandResult, Completion, print_json_line, print_notes, pri
 use crate::downlink::Kind;
 use crate::ground::archive::{GapReport, Gaps, RestartReport, Survey};
 
-/// List packets that are missing, and what they would add to the map.
+/// List missing packets, and what they would add to the map.
 ///
-/// Takes a folder of `lunarray replay --state`, one of its checkpoints, or a downlink file. Gaps stand in the order of
-/// what their recovery would add: their weight over that in the map of the same channel, summed over channels. The range
-/// of packet counts is what to ask the spacecraft for (the sequence count is its lower 14 bits). What a gap held
-/// is estimated from the order in which channels and pairs are sent and the packets that did arrive, and, for a state, from
-/// how much of those its map has taken; missing positions are worth the visibilities that wait for them. What
-/// was sent after the last packet that arrived, or before a restart of the counts, is not known to be missing.
+/// Reads a state folder of `lunarray replay --state`, one of its checkpoints, or a downlink file. Gaps are sorted by what
+/// their recovery would add: their weight relative to that in the map of the same channel, summed over channels. Request
+/// the given range of packet counts from the spacecraft (the sequence count is its lower 14 bits). The content of a gap
+/// is estimated from the order of channels and pairs in the downlink and from the packets that arrived, and, for a
+/// state, from the fraction of those that entered the map. Missing positions count as the visibilities that need them.
+/// Packets sent after the last one received, or before a restart of the counts, cannot be recognised as missing.
+///
+/// Example: lunarray gaps state/ --most 5 --picture coverage.png
 #[derive(Debug, Args)]
 pub(super) struct GapsArgs {
-    /// State, checkpoint or downlink file.
+    /// State folder, checkpoint or downlink file.
     #[arg(value_name = "STATE|FILE")]
     path: PathBuf,
-    /// Gaps shown, at most; --json has all.
+    /// Maximum number of gaps shown; --json lists all.
     #[arg(long, default_value_t = 20)]
     most: usize,
-    /// Write a picture of integration time over mission time, channel by channel.
+    /// Write a picture (PNG) of integration time over mission time, channel by channel.
     #[arg(long, value_name = "FILE.png")]
     picture: Option<PathBuf>,
-    /// Print one JSON object.
+    /// Print one JSON object instead of tables.
     #[arg(long)]
     json: bool,
 }
@@ -50,7 +52,7 @@ pub(super) fn execute(args: &GapsArgs) -> CommandResult {
 
 fn table(gaps: &Gaps, most: usize) -> String {
     let mut text = String::new();
-    // Writing to a string does not fail.
+    // Writing to a String cannot fail.
     let _ = writeln!(text, "channel        MHz     packets  received, h  missing, h  missing weight");
     for channel in &gaps.channels {
         let all = channel.weight + channel.missing_weight;
@@ -68,12 +70,13 @@ fn table(gaps: &Gaps, most: usize) -> String {
         text.push('\n');
     }
     for RestartReport { kind, apid, last } in &gaps.restarts {
-        let _ =
-            write!(text, "{apid:#05x}: the spacecraft began to count anew behind packet {last} of {kind}; ");
-        text.push_str("what she sent between is not known\n");
+        let _ = writeln!(
+            text,
+            "{apid:#05x}: the spacecraft began to count anew after packet {last} of {kind}; losses there are unknown"
+        );
     }
     if gaps.gaps.is_empty() {
-        text.push_str("\nNothing is missing between the packets that arrived.");
+        text.push_str("\nNo packets are missing between those received.");
         return text;
     }
     let _ = writeln!(text, "\n APID        from          to  lost, h   adds %  lost by channel and pair");
@@ -85,17 +88,17 @@ fn table(gaps: &Gaps, most: usize) -> String {
         text.push('\n');
     }
     if gaps.gaps.len() > most {
-        let _ = writeln!(text, "and {} more; see --most and --json", gaps.gaps.len() - most);
+        let _ = writeln!(text, "and {} more (see --most and --json)", gaps.gaps.len() - most);
     }
     text
 }
 
-/// The greatest losses of a gap.
+/// The largest losses of a gap.
 fn streams(gap: &GapReport) -> String {
     const SHOWN: usize = 3;
     let kind = match gap.kind {
         Kind::Visibilities => String::new(),
-        Kind::Ephemeris if !gap.lost.is_empty() => format!("{}, for which wait ", gap.kind),
+        Kind::Ephemeris if !gap.lost.is_empty() => format!("{}, needed by ", gap.kind),
         kind => return kind.to_string(),
     };
     let mut lost: Vec<_> = gap.lost.iter().collect();

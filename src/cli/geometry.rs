@@ -1,4 +1,4 @@
-//! `lunarray geometry`: where everything is.
+//! `lunarray geometry`: positions and baselines.
 
 use clap::Args;
 use serde::Serialize;
@@ -10,19 +10,21 @@ use crate::mother::BAND_HZ;
 use crate::units::all_pairs;
 use crate::units::vector::{Vec3, norm, sub};
 
-/// Show where the satellites are, what they see, and how long each pair integrates.
+/// Print satellite positions, whether the array observes, and the integration time of each pair.
 ///
-/// Positions are Moon-centred in ecliptic axes (x to ecliptic longitude 0, z to the north ecliptic
-/// pole), m. A pair's baseline is r_i - r_j; it is observed while the Moon hides the Earth.
+/// Positions are Moon-centred on ecliptic axes (x to ecliptic longitude 0, z to the north ecliptic pole), m. The baseline
+/// of a pair is r_i - r_j. The array observes while the Moon hides the Earth.
+///
+/// Example: lunarray geometry --at 0 12h 7d --freq-hz 3e6
 #[derive(Debug, Args)]
 pub(super) struct GeometryArgs {
-    /// Times since the mission epoch: numbers of seconds, or with s, h or d, such as 7d.
+    /// Times since the mission epoch: numbers with an optional unit s, h or d, such as 7d.
     #[arg(long = "at", value_name = "TIME", num_args = 1.., required = true, allow_negative_numbers = true, value_parser = time_s)]
     at_s: Vec<f64>,
-    /// Frequency for which integration times are given, Hz.
+    /// Frequency for the integration times, Hz.
     #[arg(long, default_value_t = 10e6)]
     freq_hz: f64,
-    /// One JSON object a line: t_s, observing, earth_hat, satellites_m, pairs.
+    /// Print one JSON object per line: t_s, observing, earth_hat, satellites_m, pairs.
     #[arg(long)]
     json: bool,
     #[command(flatten)]

@@ -1,4 +1,4 @@
-//! `lunarray inspect`: what is in a downlink file.
+//! `lunarray inspect`: show the contents of a downlink file.
 
 use std::path::PathBuf;
 
@@ -10,27 +10,29 @@ use crate::accumulation::harmonic::{GeometryCoverage, GeometrySurvey};
 use crate::downlink::Contents;
 use crate::response::harmonic::GeometryLimits;
 
-/// Show what a downlink file holds, and what is wrong with it.
+/// Show the contents of a downlink file, and its defects.
 ///
-/// Span, instrument, channels; packets and bytes by kind; visibilities by baseline and channel; gaps in
-/// the packet counts, bad checksums, bytes between packets; how many visibilities are on one circle, as the
-/// harmonic engine needs them, and why others are not.
+/// Prints time span, instrument and channels; packets and bytes by kind; visibilities by baseline and channel; gaps in
+/// the packet counts, bad checksums and bytes between packets; and how many visibilities have the circular geometry
+/// that the harmonic engine needs, with the reasons why others do not.
+///
+/// Example: lunarray inspect out/quicklook/downlink.ccsds
 #[derive(Debug, Args)]
 pub(super) struct InspectArgs {
     /// Downlink file.
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// One JSON object instead of tables.
+    /// Print one JSON object instead of tables.
     #[arg(long)]
     json: bool,
 }
 
-/// What programs read.
+/// The JSON output.
 #[derive(Serialize)]
 struct Inspection<'a> {
     #[serde(flatten)]
     contents: &'a Contents,
-    /// What the harmonic engine covers.
+    /// Visibilities that the harmonic engine covers.
     geometry: &'a GeometryCoverage,
 }
 

@@ -1,4 +1,4 @@
-//! `lunarray merge`: several states to one.
+//! `lunarray merge`: merge several states into one.
 
 use std::path::PathBuf;
 
@@ -9,18 +9,20 @@ use super::output::{CommandResult, Completion, print_notes, print_text};
 use crate::ground::archive::Keeper;
 use crate::pipeline::use_threads;
 
-/// Put the states of several grounds together.
+/// Merge the states of several ground segments.
 ///
-/// Takes folders of `lunarray replay --state` that were summed with the same settings and hold different packets, such
-/// as those of passes received at different stations, and leaves a state in a new folder, to be gone on with. States
-/// that hold the same visibilities are refused: replay the files of one into the other, which takes
-/// every packet once. Sums are exact: they are the same in whatever order states are put together.
+/// Reads state folders of `lunarray replay --state` that were made with the same settings from different packets, for
+/// example from passes received at different stations, and writes a merged state to a new folder, which later replays
+/// can continue. States that share visibilities are refused: replay the files of one into the other instead, which
+/// applies every packet once. Sums are exact: the order of the states does not matter.
+///
+/// Example: lunarray merge station-a/ station-b/ --out both/
 #[derive(Debug, Args)]
 pub(super) struct MergeArgs {
-    /// States.
+    /// State folders to merge.
     #[arg(required = true, num_args = 1.., value_name = "STATE")]
     states: Vec<PathBuf>,
-    /// Folder for the new state.
+    /// New folder for the merged state.
     #[arg(short, long, value_name = "STATE")]
     out: PathBuf,
     #[command(flatten)]
@@ -33,10 +35,10 @@ pub(super) fn execute(args: &MergeArgs) -> CommandResult {
     let whole = Keeper::merge(&args.out, &args.states, &config)?;
     print_notes(whole.notes());
     let (packets, out) = (whole.packets(), args.out.display());
-    let (states, are) = match args.states.len() {
-        1 => ("1 state".to_owned(), "is"),
-        number => (format!("{number} states"), "are together"),
+    let states = match args.states.len() {
+        1 => "1 state".to_owned(),
+        number => format!("{number} states"),
     };
-    print_text(&format!("{states} with {packets} packets of visibilities {are} in {out}"))?;
+    print_text(&format!("Merged {states} with {packets} packets of visibilities into {out}"))?;
     Ok(Completion::Done)
 }

@@ -27,13 +27,13 @@ use clap::{Parser, Subcommand};
 
 use output::{Completion, print_error};
 
-/// From a sky, through a lunar-orbit interferometer and its downlink, to a map.
+/// Simulate a lunar-orbit radio interferometer, and map the sky from its downlink.
 ///
-/// Below 30 MHz the ionosphere hides the sky. Eight small satellites that circle the Moon correlate
-/// their signals while the Moon hides the Earth, and send visibilities down when it is in sight again;
-/// lunarray simulates them, takes their downlink files, and turns them into maps of the whole sky.
+/// Below 30 MHz the ionosphere hides the sky. Eight small satellites in lunar orbit correlate their signals while the
+/// Moon hides the Earth, and send visibilities down when the Earth is in sight again. lunarray simulates the satellites,
+/// receives their downlink, and makes maps of the whole sky.
 ///
-/// Start with `lunarray run`: it needs no file and leaves maps in out/quicklook/.
+/// Start with `lunarray run`: it needs no input file and writes maps to out/quicklook/.
 #[derive(Debug, Parser)]
 #[command(name = "lunarray", version, propagate_version = true, max_term_width = 100)]
 struct Cli {

@@ -1,4 +1,4 @@
-//! `lunarray predict`: model visibilities, one by one.
+//! `lunarray predict`: predict single visibilities.
 
 use std::io::BufRead;
 use std::path::PathBuf;
@@ -15,13 +15,15 @@ use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::Pair;
 
-/// Predict visibilities of a sky map by direct sum over its own pixels.
+/// Predict visibilities of a sky map by a direct sum over its pixels.
 ///
-/// V_ij = sum over pixels of T A S_i S_j exp(-2 pi i (nu/c) n . (r_i - r_j)) dOmega, K sr, in double
-/// precision: each pixel counts at its centre, seen or hidden by the Moon as its centre is. A map in
-/// Galactic or equatorial coordinates is not resampled; its pixel centres are turned.
+/// V_ij = sum over pixels of T A S_i S_j exp(-2 pi i (nu/c) n . (r_i - r_j)) dOmega, K sr, in double precision. A pixel
+/// is evaluated at its centre, and counts if the Moon does not hide its centre. A map in Galactic or equatorial
+/// coordinates is not resampled; its pixel centres are rotated.
 ///
-/// Without --at, rows `t_s,i,j,freq_hz` are read from standard input as CSV with that header.
+/// Without --at, reads rows `t_s,i,j,freq_hz` from standard input, as CSV with that header.
+///
+/// Example: lunarray predict --sky sky.fits --at 2h --pair 1-2 --freq-hz 10e6
 #[derive(Debug, Args)]
 pub(super) struct PredictArgs {
     /// HEALPix map, K (FITS).
@@ -30,13 +32,13 @@ pub(super) struct PredictArgs {
     /// Frequency, Hz.
     #[arg(long, requires = "at_s")]
     freq_hz: Option<f64>,
-    /// Time since the mission epoch: a number of seconds, or with s, h or d, such as 7d.
+    /// Time since the mission epoch: a number with an optional unit s, h or d, such as 7d.
     #[arg(long = "at", value_name = "TIME", requires_all = ["freq_hz", "pair"], value_parser = time_s)]
     at_s: Option<f64>,
     /// Pair of satellites, such as 1-2.
     #[arg(long, requires = "at_s")]
     pair: Option<Pair>,
-    /// One JSON object a line: t_s, i, j, freq_hz, re, im (K sr).
+    /// Print one JSON object per line: t_s, i, j, freq_hz, re, im (K sr).
     #[arg(long)]
     json: bool,
     #[command(flatten)]
@@ -109,7 +111,7 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
 fn parse(line: &str) -> Result<VisibilityQuery, String> {
     let fields: Vec<&str> = line.split(',').map(str::trim).collect();
     let [t_s, i, j, freq_hz] = fields[..] else {
-        return Err(format!("found {} fields, expected the four t_s,i,j,freq_hz", fields.len()));
+        return Err(format!("found {} fields, expected t_s,i,j,freq_hz", fields.len()));
     };
     let number = |name: &str, text: &str| {
         text.parse::<f64>().map_err(|_| format!("{name} = `{text}`: expected a number"))

@@ -1,4 +1,4 @@
-//! Progress of long work: a bar on a terminal, plain lines otherwise; and Ctrl-C.
+//! Progress of long runs: a bar on a terminal, plain lines otherwise; and Ctrl-C.
 
 use std::io::IsTerminal;
 use std::sync::mpsc::{Sender, channel};
@@ -13,12 +13,12 @@ use crate::pipeline::Watched;
 use crate::runtime::Cancel;
 use crate::solve::Solving;
 
-/// Time between looks at the counters on a terminal.
+/// Refresh interval on a terminal.
 const POLL: Duration = Duration::from_millis(200);
-/// Time between lines where there is no terminal.
+/// Interval between lines without a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(10);
 
-/// A token that the first Ctrl-C (or SIGTERM) cancels; a second one ends the process at once.
+/// A token that the first Ctrl-C (or SIGTERM) cancels; a second one ends the process immediately.
 pub(super) fn cancel_on_interrupt() -> Result<Cancel, CommandError> {
     let cancel = Cancel::new();
     let token = cancel.clone();
@@ -26,20 +26,20 @@ pub(super) fn cancel_on_interrupt() -> Result<Cancel, CommandError> {
         if token.is_cancelled() {
             std::process::exit(130);
         }
-        eprintln!("\ninterrupted: finishing with the data so far (again to stop at once)");
+        eprintln!("\ninterrupted: finishing with the data so far (interrupt again to stop immediately)");
         token.cancel();
     })?;
     Ok(cancel)
 }
 
-/// Watches a running graph until dropped.
+/// Shows the progress of a running graph until dropped.
 pub(super) struct Progress {
     stop: Sender<()>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Progress {
-    /// Shows how far stage `stage` is, of `total` items taken or given; `total` 0 if that is unknown.
+    /// Starts to show the progress of `stage` through `total` items; 0 if the total is unknown.
     pub(super) fn watch(watched: Watched, stage: &'static str, total: u64) -> Self {
         let (stop, stopped) = channel();
         let thread = std::thread::spawn(move || {
@@ -58,7 +58,7 @@ impl Progress {
 
 impl Drop for Progress {
     fn drop(&mut self) {
-        // The thread may have ended already; then there is nobody to tell.
+        // The thread may have ended already; then the message is not needed.
         let _ = self.stop.send(());
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
@@ -69,10 +69,10 @@ impl Drop for Progress {
 struct ProgressView {
     bar: Option<ProgressBar>,
     total: u64,
-    /// Bytes of all senders at the last look, and when that was.
+    /// Bytes received from all senders at the last refresh, and its time.
     received: (u64, Instant),
     since: Instant,
-    /// The solution on view: its number, when it was first seen, and its residual then.
+    /// The solution being shown: its number, when it was first shown, and its residual then.
     solution: Option<(u64, Instant, f64)>,
 }
 
@@ -91,7 +91,7 @@ impl ProgressView {
         Self { bar, total, received: (0, now), since: now, solution: None }
     }
 
-    /// What is being solved, and how long it will take if the residual goes on falling as it has.
+    /// The state of the solver, with the time left if the residual keeps falling at the same rate.
     fn solution(&mut self, solving: &Solving) -> String {
         let Solving { number, what, iteration, residual, target } = solving;
         let (_, since, first) = match self.solution {
@@ -105,16 +105,16 @@ impl ProgressView {
         } else {
             String::new()
         };
-        format!("{what}: step {iteration}, residual {residual:.1e} of {target:.0e}{left}")
+        format!("{what}: iteration {iteration}, residual {residual:.1e} of {target:.0e}{left}")
     }
 
-    /// Who sends, how fast, and what waits.
+    /// The number of senders, their rate and the backlog.
     fn senders(&mut self, status: &ListenStatus) -> String {
         let ((before, since), bytes) = (self.received, status.bytes());
         self.received = (bytes, Instant::now());
         let rate = (bytes - before) as f64 / since.elapsed().as_secs_f64().max(1e-3);
         format!(
-            "{} senders, {:.2} MB/s, {:.2} MB waiting",
+            "{} senders, {:.2} MB/s, {:.2} MB queued",
             status.open(),
             1e-6 * rate,
             1e-6 * status.backlog_bytes() as f64

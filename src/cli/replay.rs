@@ -1,4 +1,4 @@
-//! `lunarray replay`: the ground segment alone.
+//! `lunarray replay`: run the ground segment on downlink files or live senders.
 
 use std::path::PathBuf;
 
@@ -17,67 +17,69 @@ use crate::pipeline::{
 };
 use crate::runtime::Cancel;
 
-/// Bytes of visibilities that wait for positions where several senders are listened to and nothing is kept.
+/// Capacity of the hold buffer when listening without a state, bytes.
 const WAIT_BYTES_LIVE: u64 = 1 << 20;
 
-/// Make maps from downlink files, or from stations that send, alone.
+/// Make maps from downlink files, or from stations that send live.
 ///
-/// Takes everything from the downlink: instrument, positions, visibilities. Lost, damaged and unusable
-/// data is counted in the ledger. A map file is a pipeline file of which only the sections calibration,
-/// map, products, runtime and downlink.listen are used, so the file that made a simulation serves as it is;
-/// replaying it gives, bit for bit, the maps that `lunarray run` gives.
+/// Everything comes from the downlink: instrument, positions, visibilities. Lost, damaged and unusable data are counted
+/// in the ledger. A map file is a pipeline file of which only the sections calibration, map, products, runtime and
+/// downlink.listen are used, so the file of a simulation can be used unchanged; the maps are then bit for bit those of
+/// `lunarray run`.
+///
+/// Example: lunarray replay pass-*.ccsds --map map.toml --out maps/ --state state/
 #[derive(Debug, Args)]
 #[command(group(ArgGroup::new("live").args(["follow", "listen"])))]
 #[command(group(ArgGroup::new("pace").args(["speed", "step"])))]
 pub(super) struct ReplayArgs {
-    /// Downlink files, in the order of time.
+    /// Downlink files in the order of time.
     #[arg(required_unless_present_any = ["state", "listen"], value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// How to make the maps; the defaults of pipelines/reference.toml if not given.
+    /// Map file (TOML): settings of the ground segment; the defaults of pipelines/reference.toml if not given.
     #[arg(long, value_name = "MAP.toml")]
     map: Option<PathBuf>,
-    /// Folder for the products.
+    /// Output folder for the products.
     #[arg(short, long, value_name = "DIR")]
     out: PathBuf,
-    /// Folder in which everything received is kept: every packet is applied once, in this session and all later
-    /// ones, however often and in whatever order it comes. Ended at any moment, give the same command again.
+    /// State folder that keeps everything received: every packet is applied once, in this session and all later ones,
+    /// however often and in whatever order it arrives. To resume after an interruption, repeat the command.
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
-    /// Visibilities between two checkpoints of the state; there is one at the end in any case.
+    /// Number of visibilities between two checkpoints of the state; the end always writes one.
     #[arg(long, value_name = "NUMBER", default_value_t = 1_000_000, requires = "state")]
     checkpoint_every: u64,
-    /// Bytes of visibilities that may wait for their positions; beyond it, those sent first are flagged for want of them:
-    /// 256 MiB, 1 MiB when listening without a state; an old state keeps its own.
+    /// Capacity of the hold buffer for visibilities without positions, bytes; when it is full, the oldest are flagged.
+    /// Default 256 MiB, or 1 MiB when listening without a state; an existing state keeps its own.
     #[arg(long, value_name = "BYTES")]
     wait_bytes: Option<u64>,
-    /// Read on in the last FILE as it grows, until Ctrl-C, which leaves maps of the data so far.
+    /// Follow the last FILE as it grows, until Ctrl-C, which leaves maps of the data so far.
     #[arg(long, requires = "files")]
     follow: bool,
-    /// Take the downlink from senders that connect here, instead of files, until Ctrl-C; port 0 chooses one.
-    /// Standard error says `listening on tcp://HOST:PORT`.
+    /// Receive the downlink from senders that connect to this address, instead of files, until Ctrl-C. Port 0 chooses
+    /// a free port; standard error prints `listening on tcp://HOST:PORT`.
     #[arg(long, value_name = "tcp://HOST:PORT", conflicts_with_all = ["files", "pace"])]
     listen: Option<TcpUrl>,
-    /// Listen on an address that other machines can reach. Whoever connects can add to the maps.
+    /// Allow an address that other machines can reach. Anyone who connects can add data to the maps.
     #[arg(long, requires = "listen")]
     allow_remote: bool,
-    /// End after so many connections that gave packets have been closed; 0 for never.
+    /// End after this number of connections that delivered packets have closed; 0 for never.
     #[arg(long, value_name = "NUMBER", default_value_t = 0, requires = "listen")]
     connections: u64,
-    /// Time without growth after which a followed file is taken to be whole, or without a sound packet from anyone
-    /// after which listening ends: a number with s, h or d, such as 90s; 0 for never.
+    /// End after this time without growth of the followed file, or without a valid packet from any sender: a number with
+    /// an optional unit s, h or d, such as 90s; 0 for never.
     #[arg(long, value_name = "TIME", default_value_t = 0.0, requires = "live", value_parser = not_negative_s)]
     idle_s: f64,
-    /// How many times as fast as it was sent a FILE is replayed, by the times of its packets: a number, or max.
+    /// Speed of the replay relative to real time, by the time tags of the packets: a number, or max.
     #[arg(long, value_name = "max|NUMBER", default_value = "max", value_parser = speed)]
     speed: Speed,
-    /// Replay step by step, a pass or so much mission time each (a number with s, h or d): each line of standard
-    /// input is a step, its end ends the replay.
+    /// Replay step by step: a pass, or this much mission time (a number with an optional unit s, h or d), for each line of
+    /// standard input; the end of the input ends the replay.
     #[arg(long, value_name = "pass|TIME", value_parser = step)]
     step: Option<StepLength>,
-    /// Mission time between snapshot maps: a number with s, h or d, such as 7d; 0 for a final map alone.
+    /// Mission time between snapshot maps: a number with an optional unit s, h or d, such as 7d; 0 for the final map only.
     #[arg(long, value_name = "TIME", value_parser = not_negative_s)]
     snapshot_every: Option<f64>,
-    /// Replace one setting, for example --set map.nside=8; may be given again.
+    /// Replace one setting, for example --set map.nside=8; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
     /// Print the summary as one JSON object instead of tables.
@@ -85,7 +87,7 @@ pub(super) struct ReplayArgs {
     json: bool,
 }
 
-/// How fast to replay; `None` for as fast as possible.
+/// Speed relative to real time; `None` for as fast as possible.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Speed(Option<f64>);
 
@@ -97,7 +99,7 @@ fn speed(text: &str) -> Result<Speed, String> {
     match (text.trim(), text.trim().parse::<f64>()) {
         ("max", _) => Ok(Speed(None)),
         (_, Ok(times)) if (1e-3..=1e12).contains(&times) => Ok(Speed(Some(times))),
-        _ => Err("expected max, or a number of times real time from 0.001 to 1e12".into()),
+        _ => Err("expected max, or a factor relative to real time from 0.001 to 1e12".into()),
     }
 }
 
@@ -196,10 +198,10 @@ fn watched<S: GroundSource + 'static>(
     })
 }
 
-/// A message for each line of standard input, until its end.
+/// A channel with one message for each line of standard input, until its end.
 fn lines_of_input() -> Receiver<()> {
     let (say, go) = bounded(0);
-    // The thread ends with the input or the process: nothing else can end its reading.
+    // The thread ends with the input or the process; nothing else can interrupt its read.
     std::thread::spawn(move || {
         for line in std::io::stdin().lines() {
             if line.is_err() || say.send(()).is_err() {
@@ -216,7 +218,7 @@ mod tests {
     use crate::units::constants::DAY_S;
 
     #[test]
-    fn paces_are_read() {
+    fn speeds_and_steps_are_parsed() {
         assert_eq!(speed("max"), Ok(Speed(None)));
         assert_eq!(speed("1000"), Ok(Speed(Some(1000.0))));
         assert_eq!(step("pass"), Ok(StepLength(None)));

@@ -1,4 +1,4 @@
-//! `lunarray retract`: a bad file out of a state again.
+//! `lunarray retract`: remove the packets of bad files from a state.
 
 use std::path::PathBuf;
 
@@ -10,31 +10,32 @@ use crate::ground::archive::Keeper;
 use crate::pipeline::use_threads;
 use crate::units::MissionTime;
 
-/// Take the packets of files out of a state again.
+/// Remove the packets of files from a state.
 ///
-/// Every packet of the files that is in the state is taken out of the sums, the accounts and the set of packets that
-/// have come, as if it had never come; a good copy can be replayed later, and until then it is missing in `lunarray
-/// gaps` and lost in the ledger. Packets that are not in the state are counted. A packet that differs from the one that
-/// was applied, as a good copy of a bad one does, stays, and is named: subtracting something else would spoil
-/// the sums. Positions that other visibilities were placed by stay too. Ended at any moment, the folder holds the old
-/// state or the new one.
+/// Every packet of the files that is in the state is removed from the sums, the counters and the received set, as if it
+/// had never arrived. A good copy can be replayed later; until then the packet is a gap in `lunarray gaps` and lost in the
+/// ledger. Packets that are not in the state are counted. A packet that differs from the one applied, like a good copy of
+/// a bad packet, is not removed but listed, because subtracting other values would corrupt the sums. Positions that other
+/// visibilities depend on stay too. If interrupted, the folder holds either the old state or the new one.
+///
+/// Example: lunarray retract bad-pass.ccsds --state state/
 #[derive(Debug, Args)]
 pub(super) struct RetractArgs {
-    /// Downlink files.
+    /// Downlink files whose packets are removed.
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// The state, a folder of `lunarray replay --state`.
+    /// State folder of `lunarray replay --state`.
     #[arg(long, value_name = "DIR")]
     state: PathBuf,
-    /// Take out visibilities alone, and only packets that begin at this mission time, s, or later.
+    /// Remove only packets of visibilities that begin at this mission time, s, or later.
     #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
     from_s: Option<f64>,
-    /// Take out visibilities alone, and only packets that end at this mission time, s, or before.
+    /// Remove only packets of visibilities that end at this mission time, s, or earlier.
     #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
     to_s: Option<f64>,
     #[command(flatten)]
     map: StateMapArgs,
-    /// Print one JSON object.
+    /// Print one JSON object instead of text.
     #[arg(long)]
     json: bool,
 }
@@ -50,17 +51,14 @@ pub(super) fn execute(args: &RetractArgs) -> CommandResult {
     let (keeper, found) = Keeper::retract(&args.state, &args.files, span, &config)?;
     print_notes(keeper.notes());
     for refused in &found.named {
-        eprintln!(
-            "note: the packet of {} with count {} stays: {}",
-            refused.kind, refused.count, refused.reason
-        );
+        eprintln!("note: packet {} of {} was not removed: {}", refused.count, refused.kind, refused.reason);
     }
     if args.json {
         print_json_line(&found)?;
         return Ok(Completion::Done);
     }
     let mut text = format!(
-        "{} packets are taken out of {}, {} of which waited; {} of their {} visibilities were in the sums",
+        "Removed {} packets from {}; {} of them were in the hold buffer; {} of their {} visibilities were in the sums",
         found.packets,
         args.state.display(),
         found.waited,
@@ -68,9 +66,9 @@ pub(super) fn execute(args: &RetractArgs) -> CommandResult {
         found.visibilities,
     );
     for (count, what) in [
-        (found.absent, "packets were not in it"),
-        (found.kept, "packets of positions or of parts of payloads stay, for what others need them"),
-        (found.refused, "packets stay, for taking them out would take out something else"),
+        (found.absent, "packets were not in the state"),
+        (found.kept, "packets of positions or of partial payloads stay, because other packets need them"),
+        (found.refused, "packets stay, because they differ from those applied"),
     ] {
         if count > 0 {
             text.push_str(&format!("\n{count} {what}"));

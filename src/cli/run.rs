@@ -1,4 +1,4 @@
-//! `lunarray run`: the whole chain in one process.
+//! `lunarray run`: run the whole chain in one process.
 
 use std::path::PathBuf;
 
@@ -9,17 +9,19 @@ use super::output::{CommandResult, Completion, print_config_notes, print_json_li
 use super::progress::{Progress, cancel_on_interrupt};
 use crate::pipeline::{INTEGRATE, Plan, run, use_threads};
 
-/// Run the whole chain: sky, spacecraft, downlink, ground, maps.
+/// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
 ///
-/// Without a pipeline file it runs the embedded quicklook: three channels over one precession of the
-/// orbit, in about a minute. Leaves, by channel, maps that sharpen as data arrives, the final map and a
-/// noise-only map as HEALPix FITS, pictures of map, input and error, and the downlink file; and
-/// summary.json. Ctrl-C ends it early with maps of the data so far.
+/// Without a pipeline file it runs the embedded quicklook: three channels over one precession period of the orbit, in
+/// about a minute. Writes, for each channel, snapshots as data arrive, the final map and a noise-only map (HEALPix FITS),
+/// and pictures of map, input and error; and the downlink file and summary.json. Ctrl-C ends it early, with maps of the
+/// data so far.
+///
+/// Example: lunarray run pipelines/reference.toml --set map.nside=16 --out out/coarse
 #[derive(Debug, Args)]
 pub(super) struct RunArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
-    /// Folder for the products; out/NAME if not given.
+    /// Output folder for the products; out/NAME if not given.
     #[arg(short, long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Print the summary as one JSON object instead of tables.

@@ -1,4 +1,4 @@
-//! `lunarray simulate`: the space segment alone.
+//! `lunarray simulate`: run the space segment alone.
 
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -11,11 +11,13 @@ use super::progress::{Progress, cancel_on_interrupt};
 use crate::downlink::transport::socket::{SendOptions, SocketSink, TcpUrl};
 use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, use_threads};
 
-/// Simulate the space segment, to a downlink file or to a ground that listens.
+/// Simulate the space segment, and write its downlink to a file or send it to a listening ground segment.
 ///
-/// The downlink holds CCSDS space packets with the instrument description, the ephemeris and the
-/// visibilities: all that `lunarray replay` needs. A file bears its name once it is complete; until then it
-/// ends in .partial. Ctrl-C ends it after the window in hand and leaves a valid file.
+/// The downlink holds CCSDS space packets with the instrument description, the ephemeris and the visibilities: all that
+/// `lunarray replay` needs. An incomplete file has the extension .partial. Ctrl-C ends the simulation after the current
+/// window and leaves a valid file.
+///
+/// Example: lunarray simulate pipelines/reference.toml --out sky.ccsds
 #[derive(Debug, Args)]
 pub(super) struct SimulateArgs {
     #[command(flatten)]
@@ -23,14 +25,14 @@ pub(super) struct SimulateArgs {
     /// Downlink file to write.
     #[arg(short, long, value_name = "FILE", required_unless_present = "send")]
     out: Option<PathBuf>,
-    /// Send the downlink to this place as it is made, as `lunarray replay --listen` takes it: a slow ground slows the
-    /// spacecraft.
+    /// Send the downlink to this address, where `lunarray replay --listen` listens, as it is made. A slow receiver slows
+    /// the simulation.
     #[arg(long, value_name = "tcp://HOST:PORT")]
     send: Option<TcpUrl>,
-    /// How long to try to connect, s.
+    /// Connection timeout, s.
     #[arg(long, value_name = "SECONDS", default_value_t = 10.0, requires = "send", value_parser = not_negative_s)]
     connect_s: f64,
-    /// Bytes a second to send at most; 0 for as many as the ground takes.
+    /// Maximum rate, bytes/s; 0 for no limit.
     #[arg(long, value_name = "NUMBER", default_value_t = 0.0, requires = "send", value_parser = rate)]
     bytes_per_s: f64,
     /// Print stages and throughput as one JSON object instead of a table.
@@ -41,7 +43,7 @@ pub(super) struct SimulateArgs {
 fn rate(text: &str) -> Result<f64, String> {
     match text.trim().parse::<f64>() {
         Ok(value) if value == 0.0 || (1.0..=1e12).contains(&value) => Ok(value),
-        _ => Err("expected 1 to 1e12 bytes a second, or 0 for no limit".into()),
+        _ => Err("expected 1 to 1e12 bytes/s, or 0 for no limit".into()),
     }
 }
 
@@ -62,11 +64,11 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     })?;
     drop(progress);
     let mut places: Vec<String> =
-        args.out.iter().map(|out| format!("The downlink is in {}", out.display())).collect();
+        args.out.iter().map(|out| format!("Wrote the downlink to {}", out.display())).collect();
     if let (Some(url), Some(confirmed)) = (&args.send, confirmed) {
         places.push(match confirmed.load(Ordering::Relaxed) {
-            0 => format!("The downlink was sent to {url}, which did not say how much of it it took"),
-            bytes => format!("{url} took all {bytes} bytes"),
+            0 => format!("Sent the downlink to {url}, which confirmed no bytes"),
+            bytes => format!("{url} confirmed all {bytes} bytes"),
         });
     }
     if args.json {

@@ -1,4 +1,4 @@
-//! `lunarray sky`: the generated sky.
+//! `lunarray sky`: write the generated sky.
 
 use std::path::PathBuf;
 
@@ -14,12 +14,14 @@ use crate::sky::{Frame, GENERATED_NSIDE_MAX, SkyMap};
 
 /// Write the generated sky as a HEALPix FITS map, and a picture of it.
 ///
-/// Diffuse Galactic emission with free-free absorption, small-scale fluctuations and point sources,
-/// in K and ecliptic coordinates: the sky of `lunarray run` with the same pipeline file, seed and settings. The same seed
-/// gives the same sky at every frequency and nside.
+/// Diffuse Galactic emission with free-free absorption, small-scale fluctuations and point sources, in K and ecliptic
+/// coordinates: the sky that `lunarray run` observes with the same pipeline file, seed and settings. The same seed gives
+/// the same sky at every frequency and nside.
+///
+/// Example: lunarray sky --freq-hz 10e6 --out sky.fits
 #[derive(Debug, Args)]
 pub(super) struct SkyArgs {
-    /// Pipeline file (TOML) whose seed and sky.generated are meant; the embedded quicklook if none is named.
+    /// Pipeline file (TOML) with seed and sky.generated; the embedded quicklook if none is given.
     #[arg(value_name = "PIPELINE.toml")]
     pipeline: Option<PathBuf>,
     /// Frequency, Hz: 0.1 MHz to 120 MHz.
@@ -28,16 +30,16 @@ pub(super) struct SkyArgs {
     /// HEALPix nside: a power of two up to 1024.
     #[arg(long, default_value_t = 64)]
     nside: usize,
-    /// Map to write (FITS); a picture of it goes beside it with the ending .png.
+    /// Map to write (FITS); its picture goes beside it with the extension .png.
     #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
-    /// Seed of the fluctuations and sources, in place of the file's.
+    /// Seed of fluctuations and sources, in place of the file's.
     #[arg(long)]
     seed: Option<u64>,
-    /// Replace one setting, for example --set sky.generated.point_sources=false; may be given again.
+    /// Replace one setting, for example --set sky.generated.point_sources=false; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
-    /// Leave the picture out.
+    /// Draw no picture.
     #[arg(long)]
     no_picture: bool,
 }

@@ -6,7 +6,7 @@ use super::bins::HALF;
 use super::covariance::Covariances;
 use super::tile::{PIVOT_MIN, TILE, Tile, TileKernel, element};
 
-/// Puts the covariances of one group of bins and their mirrors into a tile.
+/// Evaluates the covariances of one group of bins and its mirror image into a tile.
 pub(super) struct Expand<'a> {
     pub(super) covariances: &'a Covariances,
     pub(super) epoch: usize,
@@ -45,7 +45,7 @@ impl TileKernel for Expand<'_> {
     }
 }
 
-/// Sums of `coefficient x row`, for the coefficients of both parts.
+/// Sums of `coefficient x row`, for the real and the imaginary coefficients.
 #[inline(always)]
 fn functions<S: Simd, const P: usize>(
     simd: S,
@@ -64,8 +64,8 @@ fn functions<S: Simd, const P: usize>(
     [sums_re, sums_im]
 }
 
-/// Replaces covariances C by L with C = L L*, for `order` daughters, where C is a covariance but for rounding; says
-/// whether it was. If not, the tile is of no use.
+/// Replaces covariances C of `order` daughters by their Cholesky factors L, C = L L*. Returns whether every C is
+/// positive semidefinite; if not, the tile's contents are undefined.
 pub(super) struct Factor<'a> {
     pub(super) tile: &'a mut Tile,
     pub(super) order: usize,
@@ -90,8 +90,8 @@ impl TileKernel for Factor<'_> {
     }
 }
 
-/// An element at all frequencies, side by side. Both sides at a time keep more sums going than an addition takes
-/// cycles.
+/// An element at all frequencies, in registers. Processing both sides together keeps enough sums in flight to hide the
+/// latency of additions.
 type TileRegisters<S, const P: usize> = [[<S as Simd>::f32s; P]; 2];
 
 #[inline(always)]
@@ -105,8 +105,8 @@ fn set<S: Simd, const P: usize>(element: &mut [f32; TILE], values: TileRegisters
     S::as_mut_simd_f32s(element).0.copy_from_slice(values.as_flattened());
 }
 
-/// What a daughter has left of its power becomes its own amplitude; gives one over it. The imaginary part on the
-/// diagonal, which is none, keeps the power.
+/// Turns what is left of a daughter's power into the pivot, and returns its inverse. The imaginary part of the diagonal,
+/// which is zero, stores the original power.
 #[inline(always)]
 fn pivot<S: Simd, const P: usize>(simd: S, tile: &mut Tile, j: usize) -> TileRegisters<S, P> {
     let at = element(j, j);
@@ -117,7 +117,7 @@ fn pivot<S: Simd, const P: usize>(simd: S, tile: &mut Tile, j: usize) -> TileReg
     let mut inverse = left;
     for side in 0..2 {
         for p in 0..P {
-            // No power at all is a daughter that hears nothing.
+            // A daughter without signal has no power at all.
             let least = simd.mul_f32s(simd.splat_f32s(PIVOT_MIN), power[side][p]);
             let least = simd.max_f32s(least, simd.splat_f32s(f32::MIN_POSITIVE));
             left[side][p] = simd.sqrt_f32s(simd.max_f32s(left[side][p], least));
@@ -129,7 +129,7 @@ fn pivot<S: Simd, const P: usize>(simd: S, tile: &mut Tile, j: usize) -> TileReg
     inverse
 }
 
-/// Element (i, j), from those before it; gives what daughter i has left of its power.
+/// Computes element (i, j) from those before it, and returns what is left of daughter i's power.
 #[inline(always)]
 fn row<S: Simd, const P: usize>(
     simd: S,
@@ -137,7 +137,7 @@ fn row<S: Simd, const P: usize>(
     [i, j]: [usize; 2],
     inverse: TileRegisters<S, P>,
 ) -> TileRegisters<S, P> {
-    let (at, own) = (element(i, j), element(i, i));
+    let (at, diagonal) = (element(i, j), element(i, i));
     let (mut re, mut im) = (registers::<S, P>(&tile.re[at]), registers::<S, P>(&tile.im[at]));
     for k in 0..j {
         let (a, b) = (element(i, k), element(j, k));
@@ -154,10 +154,10 @@ fn row<S: Simd, const P: usize>(
             }
         }
     }
-    let mut left = registers::<S, P>(&tile.re[own]);
+    let mut left = registers::<S, P>(&tile.re[diagonal]);
     if j == 0 {
-        // The power, for the pivot.
-        set::<S, P>(&mut tile.im[own], left);
+        // Store the power for the pivot.
+        set::<S, P>(&mut tile.im[diagonal], left);
     }
     for side in 0..2 {
         for p in 0..P {
@@ -170,14 +170,14 @@ fn row<S: Simd, const P: usize>(
     }
     set::<S, P>(&mut tile.re[at], re);
     set::<S, P>(&mut tile.im[at], im);
-    set::<S, P>(&mut tile.re[own], left);
+    set::<S, P>(&mut tile.re[diagonal], left);
     left
 }
 
-/// `x_i = sum over j <= i of L_ij z_j`: the factor of one group of bins times independent noise, daughter by daughter.
+/// Colours noise: `x_i = sum over j <= i of L_ij z_j`, the factor of one group of bins times independent noise.
 pub(super) struct ApplyFactor<'a> {
     pub(super) tile: &'a Tile,
-    /// By daughter, `stride` apart.
+    /// Independent noise by daughter, `stride` apart.
     pub(super) noise: [&'a [[f32; TILE]]; 2],
     pub(super) stride: usize,
     pub(super) x: &'a mut [[[f32; TILE]; 2]],
@@ -223,7 +223,7 @@ mod tests {
 
     #[test]
     fn factors_multiply_to_the_matrix() {
-        // C = M M* + 0.1, M of small whole numbers that differ from frequency to frequency.
+        // C = M M* + 0.1, with M of small integers that differ between frequencies.
         const ORDER: usize = 5;
         let m = |i: usize, k: usize, t: usize| {
             let value = |seed: usize| ((seed * 7919 + t * 31) % 13) as f32 - 6.0;
@@ -272,7 +272,7 @@ mod tests {
 
     #[test]
     fn noise_is_coloured_daughter_by_daughter() {
-        // L_ij = i + 2 j + i j k, z_j = 1 + j i, for any frequency t scaled by t.
+        // L_ij = t (i + 2 j) + i j sqrt(-1), z_j = 1 + j sqrt(-1), at frequency t.
         const ORDER: usize = 3;
         let mut tile = Tile::new(ORDER);
         for i in 0..ORDER {

@@ -1,69 +1,69 @@
-//! What can be chosen about sampling, the daughters' faults and their link to the mother.
+//! Configuration of sampling, of the daughters' instrumental errors and of their links.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Bits that stand for samples that are not quantised.
+/// Number of bits that means "not quantised": samples stay floats.
 pub const FLOAT_BITS: u32 = 32;
 
-/// The `[daughters]` section; used by sample fidelity alone.
+/// The `[daughters]` section; only sample fidelity uses it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DaughtersConfig {
-    /// Bits of the real and of the imaginary part: 1, 2, 4, 8, or 32 for floats.
+    /// Bits per real or imaginary part: 1, 2, 4, 8, or 32 for floats.
     pub bits: u32,
-    /// Time in which the level control follows the power, s.
+    /// Time constant of the level control, s.
     pub level_time_constant_s: f64,
-    /// Samples in a block.
+    /// Samples per block.
     pub block_samples: usize,
-    /// Greatest rate of the link from one daughter to the mother, bit/s; 0 for no limit.
+    /// Maximum rate of one daughter's link to the mother, bit/s; 0 for no limit.
     pub link_bits_per_s_max: f64,
-    /// Buffer of one daughter before the link, bytes.
+    /// Size of one daughter's transmit buffer, bytes.
     pub link_buffer_bytes: u64,
-    /// What is dropped when the buffer is full.
+    /// Which blocks a full buffer drops.
     pub link_drop: DropPolicy,
-    /// What is wrong with the daughters; nothing by default.
+    /// Instrumental errors and artificial signals; none by default.
     pub disturbances: Disturbances,
 }
 
-/// What a full buffer drops.
+/// Which blocks a full buffer drops.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum DropPolicy {
-    /// The block that comes.
+    /// The arriving block.
     #[default]
     Newest,
-    /// Those that have waited longest.
+    /// The blocks queued longest.
     Oldest,
 }
 
-/// Faults and artificial signals. Lists have one value a daughter; an empty list is none of it.
+/// Instrumental errors and artificial signals. A list has one value per daughter; an empty list means no error.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Disturbances {
-    /// Amplitude gain less one.
+    /// Relative error of the amplitude gain: gain minus one.
     pub gain_error: Vec<f64>,
-    /// Its drift, 1/s since the epoch.
+    /// Drift of the gain error since the epoch, 1/s.
     pub gain_drift_per_s: Vec<f64>,
-    /// Phase, rad.
+    /// Phase error, rad.
     pub phase_rad: Vec<f64>,
-    /// Its drift, rad/s since the epoch.
+    /// Drift of the phase error since the epoch, rad/s.
     pub phase_drift_rad_per_s: Vec<f64>,
-    /// Clock offset, s: positive samples too late.
+    /// Clock offset, s; a positive offset samples too late.
     pub clock_offset_s: Vec<f64>,
-    /// Its drift, s/s since the epoch.
+    /// Drift of the clock offset since the epoch, s/s.
     pub clock_drift: Vec<f64>,
-    /// Power of the Earth's narrow-band leak at the limb, K sr; 0 for none.
+    /// Power of the Earth's narrow-band interference at the limb, K sr; 0 for none.
     pub interference_k_sr: f64,
-    /// Its frequency, Hz from the channel's centre.
+    /// Frequency of the interference relative to the channel's centre, Hz.
     pub interference_offset_hz: f64,
-    /// Depth behind the limb over which its power falls by e, m.
+    /// Depth behind the limb over which the interference falls by a factor e, m.
     pub interference_depth_m: f64,
-    /// Power of the calibration tone, K sr, equal and in phase at all daughters; 0 for none.
+    /// Power of the calibration tone, K sr; equal and in phase at all daughters; 0 for none.
     pub calibration_k_sr: f64,
-    /// Its frequency, Hz from the channel's centre.
+    /// Frequency of the tone relative to the channel's centre, Hz.
     pub calibration_offset_hz: f64,
-    /// Its phase at the start of a window, rad.
+    /// Phase of the tone at the start of a window, rad.
     pub calibration_phase_rad: f64,
 }
 
@@ -81,7 +81,7 @@ impl Default for DaughtersConfig {
     }
 }
 
-/// A setting of the daughters that cannot be.
+/// An invalid setting of the daughters.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[error("daughters.{key} = {value}: expected {expected}")]
 pub struct DaughtersError {
@@ -94,8 +94,7 @@ pub struct DaughtersError {
 }
 
 impl DaughtersConfig {
-    /// Everything that is wrong with the section for an array of `satellites` and channels of a width; empty if it is
-    /// good.
+    /// All problems of the section for an array of `satellites` and channels of the given width; empty if it is valid.
     #[must_use]
     pub fn problems(&self, satellites: usize, channel_width_hz: f64) -> Vec<DaughtersError> {
         let mut found = Vec::new();
@@ -126,7 +125,7 @@ impl DaughtersConfig {
             ("disturbances.clock_drift", &d.clock_drift),
         ] {
             let count = list.len();
-            require(key, count as f64, count == 0 || count == satellites, "no value or one a daughter");
+            require(key, count as f64, count == 0 || count == satellites, "no value, or one per daughter");
             for &value in list {
                 require(key, value, true, "finite numbers");
             }
@@ -152,7 +151,7 @@ impl DaughtersConfig {
         found
     }
 
-    /// Rate that the samples of all daughters need, bit/s: daughters x channels x width x 2 x bits.
+    /// Data rate of the samples of all daughters, bit/s: daughters x channels x width x 2 x bits.
     #[must_use]
     pub fn rate_bits_per_s(&self, satellites: usize, channels: usize, width_hz: f64) -> f64 {
         (satellites * channels) as f64 * width_hz * 2.0 * f64::from(self.bits)

@@ -1,8 +1,8 @@
-//! What the daughters' samples have in common, as it changes with frequency and time.
+//! The covariance of the daughters' samples as a function of frequency and time.
 //!
 //! A visibility is a smooth function of time and of the frequency's offset from the channel's centre: its
 //! phase sweeps at most `2 pi |v| nu T / c` in a time T and `2 pi |b| dnu / c` over the channel. Both are
-//! interpolated from equally spaced nodes, as many as that sweep asks for ([`crate::daughters::nodes`]).
+//! interpolated from equally spaced nodes, as many as that sweep needs ([`crate::daughters::nodes`]).
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -19,66 +19,66 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
 use crate::units::{Pair, all_pairs};
 
-/// Equally spaced instants at which covariances are wanted.
+/// Equally spaced instants at which covariances are needed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Epochs {
-    /// The first, s.
+    /// Time of the first epoch, s.
     pub start_s: f64,
-    /// Their distance, s.
+    /// Spacing of epochs, s.
     pub step_s: f64,
-    /// Their number.
+    /// Number of epochs.
     pub count: usize,
 }
 
-/// Where visibilities V_ji of one pair are, expanded over the channel.
+/// Where the visibilities V_ji of one pair are stored, as an expansion over the channel.
 pub(super) struct PairSeries {
     pub(super) pair: Pair,
-    /// The functions of frequency.
+    /// Basis functions of frequency.
     pub(super) basis: Arc<Basis>,
-    /// Place of the first coefficient in an epoch.
+    /// Index of the first coefficient within an epoch.
     at: usize,
 }
 
 impl PairSeries {
-    /// Coefficients of the real and of the imaginary part in what belongs to an epoch.
+    /// Coefficients of the real and of the imaginary part, from the values of an epoch.
     pub(super) fn of<'a>(&self, epoch: &'a [f32]) -> (&'a [f32], &'a [f32]) {
         let nodes = self.basis.nodes();
         epoch[self.at..][..2 * nodes].split_at(nodes)
     }
 }
 
-/// The covariance of all daughters in one channel, over frequency and some epochs.
+/// The covariance of all daughters in one channel, over frequency and a range of epochs.
 ///
-/// Values are sharpened for the daughters' blending of epochs: with weights cos^2 the blend of two epochs
-/// `h` apart flattens a second derivative by (1/3 - 2/pi^2) h^2 / 2, which is taken off beforehand.
+/// Values are corrected for the blending of epochs in the synthesis: with weights cos^2 the blend of two epochs
+/// `h` apart flattens a second derivative by (1/3 - 2/pi^2) h^2 / 2, which is subtracted beforehand.
 #[derive(Default)]
 pub struct Covariances {
     daughters: usize,
     series: Vec<PairSeries>,
-    /// Values of an epoch, a multiple of `COLUMNS`.
+    /// Number of values per epoch, a multiple of `COLUMNS`.
     stride: usize,
-    /// K sr; by epoch, as they are read: the power of each daughter, receiver included; of each pair, coefficients of the
-    /// real part, then of the imaginary part.
+    /// By epoch, K sr: the power of each daughter, receiver included; then, for each pair, the coefficients of the real
+    /// part followed by those of the imaginary part.
     values: Vec<f32>,
 }
 
-/// Tables by what they are made for.
+/// Tables by key.
 type TableCache<K, T> = Mutex<HashMap<K, Arc<T>>>;
 
-/// Interpolations over time and over the channel, which channels and stretches have in common.
+/// Interpolation tables over time and over the channel, shared by all channels and chunks.
 #[derive(Debug, Default)]
 pub struct Tables {
-    /// By numbers of instants and of epochs.
+    /// Keyed by the numbers of instants and of epochs.
     times: TableCache<(usize, usize), [f32]>,
-    /// By number of nodes.
+    /// Keyed by the number of nodes.
     bases: TableCache<usize, Basis>,
 }
 
-/// Most tables that are kept: some 100 kB each.
+/// Maximum number of tables kept; each takes some 100 kB.
 const TABLES_MAX: usize = 256;
 
 impl Tables {
-    /// Weights of `instants` nodes at `count` epochs and up to the next multiple of `EPOCHS`.
+    /// Weights of `instants` nodes at `count` epochs, padded to a multiple of `EPOCHS`.
     fn times(&self, instants: usize, count: usize) -> Arc<[f32]> {
         shared(&self.times, (instants, count), || time_matrix(instants, count).into())
     }
@@ -88,7 +88,7 @@ impl Tables {
     }
 }
 
-/// The table of `key`, made if it is not there. Two threads may both make one; they are equal.
+/// The table of `key`, made on first use. Two threads may both make it; the results are equal.
 fn shared<K: Copy + Eq + std::hash::Hash, T: ?Sized>(
     tables: &TableCache<K, T>,
     key: K,
@@ -107,7 +107,7 @@ fn shared<K: Copy + Eq + std::hash::Hash, T: ?Sized>(
     table
 }
 
-/// Where a model of one channel is asked.
+/// Which covariances to predict.
 pub struct CovarianceRequest<'a> {
     /// The array.
     pub array: &'a Array,
@@ -115,52 +115,39 @@ pub struct CovarianceRequest<'a> {
     pub channel: Channel,
     /// Receiver noise of each daughter, K sr.
     pub receiver_noise_k_sr: f64,
-    /// When.
+    /// Epochs.
     pub epochs: Epochs,
-    /// Tables to be shared.
+    /// Shared interpolation tables.
     pub tables: &'a Tables,
 }
 
 impl Covariances {
-    /// Asks the model and interpolates to the epochs.
+    /// Evaluates the model and interpolates to the epochs; reuses the memory of an earlier prediction.
     ///
     /// # Errors
     /// [`ModelError`], for positions that the model does not cover.
     pub fn predict(
-        model: &mut dyn VisibilityModel,
-        request: &CovarianceRequest<'_>,
-    ) -> Result<Self, ModelError> {
-        let mut own = Self::default();
-        own.predict_again(model, request)?;
-        Ok(own)
-    }
-
-    /// As [`Covariances::predict`], in the memory of what was predicted before.
-    ///
-    /// # Errors
-    /// As there.
-    pub fn predict_again(
         &mut self,
         model: &mut dyn VisibilityModel,
         request: &CovarianceRequest<'_>,
     ) -> Result<(), ModelError> {
         self.daughters = request.array.satellites();
         self.stride = self.daughters.next_multiple_of(COLUMNS);
-        let mut plans = Vec::new();
+        let mut grids = Vec::new();
         for pair in all_pairs(self.daughters) {
-            let plan = PairGrid::new(request, pair, self.stride);
-            self.stride += plan.width();
-            plans.push(plan);
+            let grid = PairGrid::new(request, pair, self.stride);
+            self.stride += grid.width();
+            grids.push(grid);
         }
-        // All of it is written below.
+        // Every value is overwritten below.
         self.values.resize(request.epochs.count.next_multiple_of(EPOCHS) * self.stride, 0.0);
         self.predict_powers(model, request)?;
         self.series.clear();
-        for plan in &plans {
-            let (basis, known) = plan.coefficients(model, request)?;
-            let matrix = request.tables.times(plan.instants, request.epochs.count);
-            combine(&matrix, &known, plan.width(), (&mut self.values[plan.at..], self.stride));
-            self.series.push(PairSeries { pair: plan.pair, basis, at: plan.at });
+        for grid in &grids {
+            let (basis, known) = grid.coefficients(model, request)?;
+            let matrix = request.tables.times(grid.instants, request.epochs.count);
+            combine(&matrix, &known, grid.width(), &mut self.values[grid.at..], self.stride);
+            self.series.push(PairSeries { pair: grid.pair, basis, at: grid.at });
         }
         Ok(())
     }
@@ -189,7 +176,7 @@ impl Covariances {
             }
         }
         let matrix = request.tables.times(steady.instants, request.epochs.count);
-        combine(&matrix, &known, width, (&mut self.values, self.stride));
+        combine(&matrix, &known, width, &mut self.values, self.stride);
         Ok(())
     }
 
@@ -200,12 +187,12 @@ impl Covariances {
     }
 
     /// Power of a daughter, K sr.
-    #[must_use]
-    pub fn power(&self, daughter: usize, epoch: usize) -> f32 {
+    #[cfg(test)]
+    fn power(&self, daughter: usize, epoch: usize) -> f32 {
         self.epoch(epoch)[daughter]
     }
 
-    /// What belongs to an epoch: powers by daughter, and what series find.
+    /// The values of an epoch: powers by daughter, then the coefficients of the pairs.
     pub(super) fn epoch(&self, epoch: usize) -> &[f32] {
         &self.values[epoch * self.stride..][..self.stride]
     }
@@ -216,13 +203,13 @@ impl Covariances {
     }
 }
 
-/// Where one pair is predicted.
+/// The grid of instants and frequencies at which one pair is predicted.
 struct PairGrid {
     pair: Pair,
     instants: usize,
-    /// Nodes over the channel.
+    /// Number of nodes over the channel.
     nodes: usize,
-    /// Place of its first coefficient in an epoch.
+    /// Index of the first coefficient within an epoch.
     at: usize,
 }
 
@@ -233,7 +220,7 @@ impl PairGrid {
         let middle_s = start_s + half_s - step_s;
         let (i, j) =
             (request.array.state(pair.i.into(), middle_s), request.array.state(pair.j.into(), middle_s));
-        // Speeds and lengths change by less than 1 % in seconds.
+        // Speeds and lengths change by less than 1 % within seconds.
         let per_m = 1.01 * std::f64::consts::TAU / SPEED_OF_LIGHT_M_S;
         let speed_m_s = norm(sub(i.velocity_m_s, j.velocity_m_s));
         let length_m = norm(sub(i.position_m, j.position_m));
@@ -245,24 +232,24 @@ impl PairGrid {
         }
     }
 
-    /// For powers, which change as the Moon's limb moves over the sky.
+    /// The grid for auto-correlations, which change only as the Moon's limb moves over the sky.
     fn steady() -> Self {
         Self { pair: Pair::default(), instants: 6, nodes: 1, at: 0 }
     }
 
-    /// Coefficients of both parts, with zeros up to the next multiple of `COLUMNS`.
+    /// Number of coefficients of both parts, padded to a multiple of `COLUMNS`.
     fn width(&self) -> usize {
         (2 * self.nodes).next_multiple_of(COLUMNS)
     }
 
-    /// Nodes over the epochs and one step on either side, s.
+    /// Times of the nodes, s; they span the epochs and one step on either side.
     fn instants_s(&self, epochs: Epochs) -> impl Iterator<Item = f64> {
         let half_s = 0.5 * epochs.step_s * (epochs.count + 1) as f64;
         let middle_s = epochs.start_s + half_s - epochs.step_s;
         (0..self.instants).map(move |k| middle_s + half_s * node(k, self.instants))
     }
 
-    /// Asks the model at the instants: functions of frequency, and `width` coefficients an instant.
+    /// Evaluates the model at the instants: basis functions of frequency, and `width` coefficients per instant.
     fn coefficients(
         &self,
         model: &mut dyn VisibilityModel,
@@ -285,7 +272,7 @@ impl PairGrid {
         for (row, found) in known.chunks_exact_mut(self.width()).zip(found.chunks_exact(self.nodes)) {
             let (re, rest) = row.split_at_mut(self.nodes);
             let (im, _) = rest.split_at_mut(self.nodes);
-            // Below the diagonal stands V_ji, the conjugate.
+            // The lower triangle holds V_ji, the conjugate.
             basis.coefficients(|k| found[k].re, re);
             basis.coefficients(|k| -found[k].im, im);
         }
@@ -325,7 +312,7 @@ mod tests {
     #[test]
     fn covariances_follow_the_model_over_the_channel_and_between_epochs() {
         let array = Array::new(&crate::array::ArrayConfig::default()).unwrap();
-        // Along the track of the array where it is, so that delays are as long as they get.
+        // A source along the array's track, where delays are longest.
         let (from_s, step_s, count) = (5000.0, 8e-3, 257);
         let n_hat = crate::units::vector::unit(sub(array.position_m(0, from_s), array.position_m(7, from_s)));
         let request = CovarianceRequest {
@@ -335,7 +322,8 @@ mod tests {
             epochs: Epochs { start_s: from_s, step_s, count },
             tables: &Tables::default(),
         };
-        let found = Covariances::predict(&mut Point(n_hat), &request).unwrap();
+        let mut found = Covariances::default();
+        found.predict(&mut Point(n_hat), &request).unwrap();
         assert!((found.power(3, 100) - 1.5).abs() < 1e-5);
         for epoch in [0, 100, 256] {
             let t_s = from_s + step_s * epoch as f64;
@@ -349,7 +337,7 @@ mod tests {
                     let frequency_hz = FREQUENCY_HZ + 4e3 * x;
                     let expected = fringe(n_hat, frequency_hz, i.position_m, j.position_m);
                     let apart = norm(sub(i.velocity_m_s, j.velocity_m_s));
-                    // At most the sharpening, half of 0.1307 (omega h)^2, and twice the interpolations'.
+                    // At most the blending correction, half of 0.1307 (omega h)^2, and twice the error of interpolation.
                     let omega = std::f64::consts::TAU * frequency_hz / SPEED_OF_LIGHT_M_S * apart;
                     let sharpening = 0.5 * 0.1307 * (omega * step_s).powi(2);
                     let off = (value - expected).norm();

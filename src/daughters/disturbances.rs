@@ -1,4 +1,4 @@
-//! What is wrong with the daughters, and what is put in on purpose.
+//! Instrumental errors of the daughters, and artificial signals.
 
 use std::f64::consts::TAU;
 
@@ -13,18 +13,18 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::dot;
 use crate::units::{StreamKind, random_stream};
 
-fn of(list: &[f64], daughter: usize) -> f64 {
+fn value_of(list: &[f64], daughter: usize) -> f64 {
     list.get(daughter).copied().unwrap_or(0.0)
 }
 
 impl Disturbances {
-    /// How far a daughter's clock is off at `t_s`, s: it samples so much later than it believes.
+    /// Offset of a daughter's clock at `t_s`, s: it samples this much later than its time tags say.
     #[must_use]
     pub fn clock_offset_s(&self, daughter: usize, t_s: f64) -> f64 {
-        of(&self.clock_offset_s, daughter) + of(&self.clock_drift, daughter) * t_s
+        value_of(&self.clock_offset_s, daughter) + value_of(&self.clock_drift, daughter) * t_s
     }
 
-    /// Whether gains, phases or clocks are other than ideal.
+    /// Whether any gain, phase or clock is not ideal.
     #[must_use]
     pub fn changes_responses(&self) -> bool {
         [
@@ -39,13 +39,15 @@ impl Disturbances {
         .any(|list| list.iter().any(|value| *value != 0.0))
     }
 
-    /// What a daughter does to its signal at `t_s`.
+    /// A daughter's instrumental response at `t_s`.
     #[must_use]
     pub fn response(&self, daughter: usize, channel: Channel, t_s: f64) -> Response {
-        let amplitude = 1.0 + of(&self.gain_error, daughter) + of(&self.gain_drift_per_s, daughter) * t_s;
-        let phase_rad = of(&self.phase_rad, daughter) + of(&self.phase_drift_rad_per_s, daughter) * t_s;
+        let amplitude =
+            1.0 + value_of(&self.gain_error, daughter) + value_of(&self.gain_drift_per_s, daughter) * t_s;
+        let phase_rad =
+            value_of(&self.phase_rad, daughter) + value_of(&self.phase_drift_rad_per_s, daughter) * t_s;
         let late_s = self.clock_offset_s(daughter, t_s);
-        // Signals turn as exp(-2 pi i nu t).
+        // Signals rotate as exp(-2 pi i nu t).
         let gain = amplitude * Complex64::cis(phase_rad - TAU * (channel.frequency_hz * late_s).fract());
         Response { gain, turns: -channel.width_hz * late_s }
     }
@@ -57,7 +59,7 @@ impl Disturbances {
     }
 }
 
-/// A stretch of samples of one daughter to which tones are added.
+/// The tones in one block of samples of a daughter.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct BlockTones<'a> {
     pub disturbances: &'a Disturbances,
@@ -66,15 +68,15 @@ pub(super) struct BlockTones<'a> {
     pub channel: Channel,
     /// Time of the window's first sample, s.
     pub window_s: f64,
-    /// Number of the stretch's first sample in the window.
+    /// Index of the block's first sample in the window.
     pub first: u64,
     /// Seed of the interference's phase.
     pub seed: u64,
 }
 
 impl BlockTones<'_> {
-    /// Adds the calibration tone and the Earth's leak. Both pass the daughter's own gain and clock.
-    pub(super) fn add_tones(&self, re: &mut [f32], im: &mut [f32]) {
+    /// Adds the calibration tone and the Earth's interference. The daughter's gain and clock affect both.
+    pub(super) fn add_to(&self, re: &mut [f32], im: &mut [f32]) {
         let d = self.disturbances;
         let t_s = self.window_s + self.first as f64 / self.channel.width_hz;
         let response = d.response(self.daughter, self.channel, t_s);
@@ -89,14 +91,14 @@ impl BlockTones<'_> {
         if d.interference_k_sr > 0.0 {
             let depth_m = self.array.earth_depth_of_m(self.daughter, t_s).max(0.0);
             let power = d.interference_k_sr * (-depth_m / d.interference_depth_m).exp();
-            // One phase for all daughters, another for each window.
+            // One phase per window, common to all daughters.
             let identity = [self.channel.frequency_hz.to_bits(), self.window_s.to_bits()];
             let mut rng = random_stream(self.seed, StreamKind::Interference, identity);
             let turns = f64::from(rng.next_u32()) / 2.0_f64.powi(32);
             let offset_hz = d.interference_offset_hz;
             let per_m = (self.channel.frequency_hz + offset_hz) / SPEED_OF_LIGHT_M_S;
             let along_m = |t_s| dot(self.array.earth_hat(t_s), self.array.position_m(self.daughter, t_s));
-            // Motion turns the phase on over the stretch, so that it goes on where the next one begins.
+            // Motion advances the phase over the block, so that it is continuous with the next block.
             let length_s = re.len() as f64 / self.channel.width_hz;
             let moved_m = along_m(t_s + length_s) - along_m(t_s);
             let start = Complex64::from_polar(power.sqrt(), TAU * (turns - per_m * along_m(t_s)).fract());
@@ -104,8 +106,8 @@ impl BlockTones<'_> {
         }
     }
 
-    /// Adds a tone that starts as it would have at the window's first sample; of its two frequencies the second
-    /// counts from the stretch's first.
+    /// Adds a tone with phase `start` at the window's first sample. It has frequency `offset_hz` since then, and
+    /// `shift_hz` more since the block's first sample.
     fn add(&self, start: Complex64, [offset_hz, shift_hz]: [f64; 2], re: &mut [f32], im: &mut [f32]) {
         let turns = offset_hz / self.channel.width_hz;
         let from = Complex64::cis(-TAU * (turns * self.first as f64).fract());

@@ -1,14 +1,14 @@
-//! Interpolation over time: from the instants that a model is asked for to the epochs at which samples are drawn.
+//! Interpolation over time: from the instants of a prediction to the epochs at which samples are drawn.
 
 use super::nodes::BandInterpolation;
 use crate::units::arithmetic::fused;
 
-/// Epochs and values that are interpolated together.
+/// Number of epochs and of values that are interpolated together.
 pub(super) const EPOCHS: usize = 4;
 pub(super) const COLUMNS: usize = 8;
 
-/// Weights of the instants at each epoch, by epoch: interpolation, and sharpening for the blending of epochs. Zeros
-/// for what fills the last `EPOCHS`.
+/// Weights of the instants at each epoch: interpolation, corrected for the blending of epochs. Rows of zeros pad the
+/// matrix to a multiple of `EPOCHS`.
 pub(super) fn time_matrix(instants: usize, count: usize) -> Vec<f32> {
     // Variance of a density cos^2 of half width 1, halved.
     let flattening = 0.5 * (1.0 / 3.0 - 2.0 / std::f64::consts::PI.powi(2));
@@ -27,14 +27,14 @@ pub(super) fn time_matrix(instants: usize, count: usize) -> Vec<f32> {
     matrix
 }
 
-/// `out = weights x rows`: rows of `width`, as many of them as a row of `weights` has values; in `out` they stand `stride`
-/// apart.
+/// `out = weights x rows`. `rows` are `width` values each, one for each column of `weights`; the rows of `out` start
+/// `stride` values apart.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn combine(weights: &[f32], rows: &[f32], width: usize, (out, stride): (&mut [f32], usize)) {
+pub(super) fn combine(weights: &[f32], rows: &[f32], width: usize, out: &mut [f32], stride: usize) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let count = rows.len() / width;
-    // The last row of all may end with its values.
+    // The very last row may lack its padding.
     for (out, weights) in out.chunks_mut(EPOCHS * stride).zip(weights.chunks_exact(EPOCHS * count)) {
         let (first, rest) = weights.split_at(count);
         let (second, rest) = rest.split_at(count);

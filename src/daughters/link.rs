@@ -1,4 +1,4 @@
-//! The link from each daughter to the mother.
+//! The links from the daughters to the mother.
 
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -12,18 +12,18 @@ use crate::frames::{ObservingWindow, SampleBlock, SpaceFrame};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{MissionTime, TICKS_PER_SECOND};
 
-/// What the links have carried and dropped, all daughters together.
+/// Counters of the links, summed over daughters.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct LinkCounts {
     /// Blocks sent.
     pub sent: u64,
     /// Bits sent.
     pub bits: u64,
-    /// Blocks dropped because a buffer was full, or because there was no time to send them before the next window.
+    /// Blocks dropped because a buffer was full, or because the next window began before they were sent.
     pub dropped: u64,
-    /// Their samples.
+    /// Samples of the dropped blocks.
     pub dropped_samples: u64,
-    /// Most bits that waited in one buffer.
+    /// Largest number of bits queued in one buffer.
     pub waiting_bits_max: u64,
 }
 
@@ -39,14 +39,14 @@ impl LinkCounts {
     }
 }
 
-/// Sends blocks at a limited rate out of a bounded buffer, one of each a daughter. A block that does not fit
-/// is dropped by the policy and counted.
+/// Sends blocks at a limited rate; each daughter has a link and a bounded transmit buffer. When a block does not fit, the
+/// drop policy decides which block is dropped and counted.
 ///
-/// After a window the links go on until one orbit has passed since it began: the next one begins about then. What has
-/// not left by then is dropped by the policy and counted. The window's end travels behind what leaves.
+/// After a window the links keep sending until one orbit has passed since its start, which is about when the next one
+/// begins. Blocks still queued then are dropped by the same policy. The frame that ends the window follows the last block.
 pub struct SampleLink {
     rate_bits_per_s: f64,
-    /// Time that a window's samples have to leave, from its start, s.
+    /// Time from a window's start within which its samples must be sent, s.
     orbit_s: f64,
     window: Option<ObservingWindow>,
     capacity_bits: u64,
@@ -57,16 +57,16 @@ pub struct SampleLink {
 
 #[derive(Default)]
 struct Buffer {
-    waiting: VecDeque<SampleBlock>,
+    queue: VecDeque<SampleBlock>,
     bits: u64,
-    /// Bits of the first block that have been sent.
+    /// Bits of the first block that have been sent already.
     sent_bits: f64,
-    /// Time up to which the link has worked.
+    /// Time up to which the link has been simulated.
     now: Option<MissionTime>,
 }
 
 impl SampleLink {
-    /// The links of an array's daughters; what they count can be read through `counts`.
+    /// The links of an array's daughters, which update `counts` as they go.
     #[must_use]
     pub fn new(config: &DaughtersConfig, array: &Array, counts: Arc<Mutex<LinkCounts>>) -> Self {
         let daughters = array.satellites();
@@ -81,14 +81,14 @@ impl SampleLink {
         }
     }
 
-    /// Takes blocks that came together; what they let leave leaves together.
-    fn take(&mut self, mut blocks: Vec<SampleBlock>, out: &mut Outlet<SpaceFrame>) {
+    /// Accepts blocks that arrived together, and sends on together those that leave their buffers.
+    fn accept(&mut self, mut blocks: Vec<SampleBlock>, out: &mut Outlet<SpaceFrame>) {
         let counts = Arc::clone(&self.counts);
         let mut counts = counts.lock().unwrap_or_else(PoisonError::into_inner);
         let sent = if self.rate_bits_per_s <= 0.0 {
             blocks
         } else {
-            // Another channel is the first in line each time, so that a buffer that is full costs all of them the same.
+            // The channels take turns at being first, so that a full buffer costs all of them the same.
             let first = blocks.first().map_or(0, |block| block.number) % blocks.len().max(1) as u64;
             blocks.rotate_left(first as usize);
             let mut sent = Vec::new();
@@ -104,7 +104,7 @@ impl SampleLink {
         }
     }
 
-    /// Puts a block into its daughter's buffer, after what leaves it by then.
+    /// Puts a block into its daughter's buffer, once the blocks that leave before its time are sent.
     fn queue(&mut self, block: SampleBlock, counts: &mut LinkCounts, sent: &mut Vec<SampleBlock>) {
         let (bits, samples) = (block.samples.bits(), block.samples.len() as u64);
         let Some(buffer) = self.buffers.get_mut(usize::from(block.daughter)) else {
@@ -123,14 +123,14 @@ impl SampleLink {
             counts.count_dropped(samples);
         } else {
             buffer.bits += bits;
-            buffer.waiting.push_back(block);
+            buffer.queue.push_back(block);
         }
         counts.waiting_bits_max = counts.waiting_bits_max.max(buffer.bits);
     }
 
-    /// Empties the buffers after a window: what there is time for leaves in the order of block numbers, as the daughters
-    /// send side by side, and the rest is dropped.
-    fn empty(&mut self, out: &mut Outlet<SpaceFrame>) {
+    /// Flushes the buffers after a window: sends what there is time for, in the order of block numbers, as the daughters
+    /// send in parallel, and drops the rest.
+    fn flush(&mut self, out: &mut Outlet<SpaceFrame>) {
         let until = self
             .window
             .take()
@@ -150,7 +150,7 @@ impl SampleLink {
                 }
             }
             buffer.work_until(until, self.rate_bits_per_s, &mut sent);
-            for block in &buffer.waiting {
+            for block in &buffer.queue {
                 counts.count_dropped(block.samples.len() as u64);
             }
         }
@@ -171,29 +171,29 @@ impl Buffer {
     fn work_until(&mut self, time: MissionTime, rate_bits_per_s: f64, sent: &mut Vec<SampleBlock>) {
         let mut budget = self.budget(time, rate_bits_per_s);
         self.now = Some(time);
-        while let Some(first) = self.waiting.front() {
+        while let Some(first) = self.queue.front() {
             let bits = first.samples.bits();
             if bits as f64 > budget {
                 break;
             }
             budget -= bits as f64;
             self.bits -= bits;
-            sent.extend(self.waiting.pop_front());
+            sent.extend(self.queue.pop_front());
         }
-        // An idle link saves nothing up.
-        self.sent_bits = if self.waiting.is_empty() { 0.0 } else { budget };
+        // An idle link accumulates no credit.
+        self.sent_bits = if self.queue.is_empty() { 0.0 } else { budget };
     }
 
-    /// Bits that leave by `time`, with those of the first block that have left already.
+    /// Bits that can be sent by `time`, including those of the first block that were sent already.
     fn budget(&self, time: MissionTime, rate_bits_per_s: f64) -> f64 {
         let ticks = (time.0 - self.now.unwrap_or(time).0).max(0);
         self.sent_bits + rate_bits_per_s * ticks as f64 / TICKS_PER_SECOND as f64
     }
 
-    /// Samples of the block that was dropped.
+    /// Drops the oldest block that is not being sent; returns its number of samples.
     fn drop_oldest(&mut self) -> Option<u64> {
-        // The first is on its way already.
-        let oldest = self.waiting.remove(1)?;
+        // The first block is being sent.
+        let oldest = self.queue.remove(1)?;
         self.bits -= oldest.samples.bits();
         Some(oldest.samples.len() as u64)
     }
@@ -206,15 +206,15 @@ impl Stage for SampleLink {
 
     fn step(&mut self, frame: SpaceFrame, out: &mut Outlet<SpaceFrame>) -> Result<(), Infallible> {
         match frame {
-            SpaceFrame::Samples(blocks) => self.take(blocks, out),
+            SpaceFrame::Samples(blocks) => self.accept(blocks, out),
             SpaceFrame::WindowStart(window) => {
-                // A window whose end was lost ends where the next begins.
-                self.empty(out);
+                // A window whose end was lost ends where the next one begins.
+                self.flush(out);
                 self.window = Some(window);
                 out.push(frame);
             }
             SpaceFrame::WindowEnd(_) => {
-                self.empty(out);
+                self.flush(out);
                 out.push(frame);
             }
         }
@@ -222,7 +222,7 @@ impl Stage for SampleLink {
     }
 
     fn finish(&mut self, out: &mut Outlet<SpaceFrame>) -> Result<(), Infallible> {
-        self.empty(out);
+        self.flush(out);
         Ok(())
     }
 
@@ -302,7 +302,7 @@ mod tests {
 
     #[test]
     fn after_a_window_only_what_there_is_time_for_leaves() {
-        // An orbit of 8248.68 s, of which the first block has all: 82 kbit, five blocks of 16 kbit.
+        // An orbit lasts 8248.68 s, all of it after the first block: 82 kbit, five blocks of 16 kbit.
         for (policy, expected) in
             [(DropPolicy::Newest, vec![0, 1, 2, 3, 4]), (DropPolicy::Oldest, vec![0, 8, 9, 10, 11])]
         {
@@ -310,7 +310,7 @@ mod tests {
             assert_eq!((counts.sent, counts.dropped, counts.dropped_samples), (5, 7, 7_000));
             assert_eq!(sent, expected, "{policy:?}");
         }
-        // A block takes all of an orbit and more.
+        // One block takes longer than an orbit.
         assert_eq!(numbers(1.0, 1 << 20, DropPolicy::Newest).1.dropped, 12);
     }
 }

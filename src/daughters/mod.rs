@@ -1,10 +1,12 @@
-//! The daughters: sampling of up to 30 channels, level control, quantisers, clocks, and the link to the mother.
+//! The daughters: the sample-level simulation of the receiving satellites, up to their link to the mother.
 //!
-//! A channel of complex samples at its own width (8 kHz) is drawn for all daughters at once, with the
-//! covariance that a [`crate::response::model::VisibilityModel`] gives over the channel as the array moves, and noise
-//! of the receivers: [`Covariances`], [`SampleSynthesis`]. Each daughter then does to its samples what it does
-//! wrong ([`Disturbances`]), sets its level and quantises ([`Quantiser`]), and sends blocks over its link
-//! ([`SampleLink`]). All of it is noise with a seed: [`Sampler`] gives the same samples whatever the threads.
+//! [`Sampler`] is the source. For each channel it draws complex Gaussian samples of all daughters at once, at the
+//! channel's own width (8 kHz). Their covariance is that of a [`crate::response::model::VisibilityModel`] as the array
+//! moves, plus receiver noise (`covariance`, `synthesis`). Each daughter then applies its instrumental errors
+//! ([`Disturbances`]), level control and quantiser. [`SampleLink`] carries the blocks to the mother at a limited rate.
+//!
+//! May use [`crate::frames`], [`crate::array`], [`crate::response`] and [`crate::runtime`]; never the mother.
+//! Samples depend on the seed alone, not on the number of threads or the size of queues.
 
 mod bins;
 mod colour;
@@ -21,12 +23,8 @@ mod sampler;
 mod synthesis;
 mod tile;
 
-pub use bins::{BINS, HOP};
 pub use config::{DaughtersConfig, DaughtersError, Disturbances, DropPolicy, FLOAT_BITS};
-pub use covariance::{CovarianceRequest, Covariances, Epochs, Tables};
 pub use link::{LinkCounts, SampleLink};
-pub use quantiser::Quantiser;
 pub use repair::Repairs;
 pub(crate) use sampler::sample_ticks;
 pub use sampler::{Sampler, SamplerCounts, Scene};
-pub use synthesis::{Draft, DrawKey, Planes, Response, SampleSynthesis};

@@ -1,20 +1,20 @@
-//! BandInterpolation of functions of limited bandwidth from equally spaced nodes.
+//! Interpolation of band-limited functions from equally spaced nodes.
 //!
-//! A function of -1 <= x <= 1 whose phase sweeps +-z is a mean of `exp(i s x)` with `|s| <= z`. Its value at x is
-//! estimated by the weights w that minimise the mean over s of `|exp(i s x) - sum_k w_k exp(i s x_k)|^2`:
-//! `G w = g(x)` with `G_kl = sinc(z (x_k - x_l))` and `g_k = sinc(z (x - x_k))`. Near-singular directions of G are
-//! held by adding 1e-9 to its diagonal, which keeps weights below 10. `ceil(z) + 5` nodes leave 1e-3 of the
-//! function at most, at the ends of the interval and of the band, and 2e-4 rms; a constant is exact.
+//! A function on -1 <= x <= 1 whose phase sweeps +-z is an average of `exp(i s x)` over `|s| <= z`. Its value at x is
+//! estimated with the weights w that minimise the mean over s of `|exp(i s x) - sum_k w_k exp(i s x_k)|^2`:
+//! `G w = g(x)` with `G_kl = sinc(z (x_k - x_l))` and `g_k = sinc(z (x - x_k))`. Adding 1e-9 to the
+//! diagonal regularises G and keeps weights below 10. With `ceil(z) + 5` nodes the error is at most 1e-3 of the
+//! function, at the ends of the interval and of the band, and 2e-4 rms; a constant is exact.
 
 use super::bins::{BINS, HALF, bin_offset};
 
-/// Added to the diagonal.
+/// Regularisation added to the diagonal.
 const RIDGE: f64 = 1e-9;
 
 /// Groups of `HALF` bins on one side of the channel.
 const GROUPS: usize = BINS / 2 / HALF;
 
-/// Sweep of phase +-z that is interpolated from so many nodes.
+/// Largest phase sweep +-z that `nodes` nodes interpolate.
 fn sweep_max(nodes: usize) -> f64 {
     match nodes {
         0..=3 => 0.25,
@@ -24,19 +24,19 @@ fn sweep_max(nodes: usize) -> f64 {
     }
 }
 
-/// Nodes for a phase of +-`z`.
+/// Number of nodes for a phase sweep of +-`z`.
 pub(super) fn nodes_for(z: f64) -> usize {
     let enough = |&nodes: &usize| sweep_max(nodes) >= z;
     let most = z.ceil().max(0.0) as usize + 5;
     [3, 5, 6].into_iter().find(enough).unwrap_or(most)
 }
 
-/// Place of a node.
+/// Position of a node in -1..1.
 pub(super) fn node(k: usize, nodes: usize) -> f64 {
     2.0 * k as f64 / (nodes - 1) as f64 - 1.0
 }
 
-/// Weights of equally spaced nodes.
+/// Interpolation weights of equally spaced nodes.
 pub(super) struct BandInterpolation {
     nodes: usize,
     /// Cholesky factor of G, rows of its lower triangle.
@@ -44,7 +44,7 @@ pub(super) struct BandInterpolation {
 }
 
 impl BandInterpolation {
-    /// For as many nodes, two at least.
+    /// Interpolation from `nodes` nodes, at least two.
     pub(super) fn new(nodes: usize) -> Self {
         let mut factor: Vec<Vec<f64>> = Vec::with_capacity(nodes);
         for i in 0..nodes {
@@ -61,7 +61,7 @@ impl BandInterpolation {
         Self { nodes, factor }
     }
 
-    /// The weights at `x`; their sum is one.
+    /// The weights at `x`; they sum to one.
     pub(super) fn weights(&self, x: f64, weights: &mut [f64]) {
         for (k, weight) in weights.iter_mut().enumerate() {
             *weight = kernel(self.nodes, x - node(k, self.nodes));
@@ -81,23 +81,23 @@ impl BandInterpolation {
     }
 }
 
-/// Mean of `exp(i s d)` over the band of so many nodes.
+/// Mean of `exp(i s d)` over the band of `nodes` nodes.
 fn kernel(nodes: usize, distance: f64) -> f64 {
     let x = sweep_max(nodes) * distance;
     if x.abs() < 1e-4 { 1.0 - x * x / 6.0 } else { x.sin() / x }
 }
 
-/// Functions of frequency over a channel: interpolation from nodes, taken apart into even and odd ones, so that the
-/// bins of one side tell those of the other.
+/// Basis functions of frequency over a channel: interpolation from nodes, split into even and odd functions, so that
+/// the bins below the centre also give those above it.
 #[derive(Debug)]
 pub(super) struct Basis {
     nodes: usize,
-    /// By group of bins: the even functions, then the odd ones.
+    /// By group of bins: even functions, then odd ones.
     rows: Vec<[f32; HALF]>,
 }
 
 impl Basis {
-    /// BandInterpolation from `nodes`, two at least.
+    /// The basis of `nodes` nodes, at least two.
     pub(super) fn new(nodes: usize) -> Self {
         let interpolation = BandInterpolation::new(nodes);
         let mut rows = vec![[0.0; HALF]; GROUPS * nodes];
@@ -111,17 +111,17 @@ impl Basis {
         Self { nodes, rows }
     }
 
-    /// Number of nodes, of functions and of coefficients.
+    /// Number of nodes, which is that of functions and of coefficients.
     pub(super) fn nodes(&self) -> usize {
         self.nodes
     }
 
-    /// Functions at the bins of a group: even ones, odd ones.
+    /// Values at the bins of a group: even functions, odd functions.
     pub(super) fn group(&self, group: usize) -> (&[[f32; HALF]], &[[f32; HALF]]) {
         self.rows[group * self.nodes..][..self.nodes].split_at(self.nodes.div_ceil(2))
     }
 
-    /// Coefficients of the functions, from values at the nodes.
+    /// Computes the coefficients from the values at the nodes.
     pub(super) fn coefficients(&self, value: impl Fn(usize) -> f64, out: &mut [f32]) {
         let (even, odd) = out.split_at_mut(self.nodes.div_ceil(2));
         for (k, even) in even.iter_mut().enumerate() {
@@ -133,7 +133,7 @@ impl Basis {
         }
     }
 
-    /// The sum of functions at any place.
+    /// The expansion at any position.
     #[cfg(test)]
     pub(super) fn value(&self, coefficients: &[f32], x: f64) -> f64 {
         let mut weights = vec![0.0; self.nodes];
@@ -142,7 +142,7 @@ impl Basis {
     }
 }
 
-/// Values of the functions where `weights` hold: even ones, odd ones.
+/// Values of the even and of the odd functions, from interpolation weights.
 fn functions(weights: &[f64]) -> impl Iterator<Item = f64> {
     let last = weights.len() - 1;
     let half = weights.len() / 2;

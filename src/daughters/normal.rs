@@ -5,7 +5,7 @@ use rand::Rng;
 
 use crate::units::arithmetic::{cos_sin_turns, fused, polynomial};
 
-/// Deviates made at a time.
+/// Deviates made at once.
 pub(super) const CHUNK: usize = 64;
 
 /// Random bytes of a chunk.
@@ -13,8 +13,8 @@ pub(super) type Bytes = [[u8; 4]; 2 * CHUNK];
 
 /// Fills `re` and `im` (of equal numbers of chunks) with complex normal deviates of variance one: 1/2 in each part.
 ///
-/// Box and Muller's transform in `f32`: |z| is at most sqrt(33 ln 2) = 4.8 where a normal deviate exceeds
-/// it once in 1e10, and relative errors are below 1e-5.
+/// Box-Muller transform in `f32`: |z| is at most sqrt(33 ln 2) = 4.8, which an exact deviate exceeds once in 1e10;
+/// relative errors are below 1e-5.
 pub(super) fn fill_complex_normal(rng: &mut impl Rng, bytes: &mut Bytes, re: &mut [f32], im: &mut [f32]) {
     let chunks = re.as_chunks_mut::<CHUNK>().0.iter_mut().zip(im.as_chunks_mut::<CHUNK>().0);
     for (re, im) in chunks {
@@ -28,7 +28,7 @@ fn transform(words: &Bytes, x: &mut [f32; CHUNK], y: &mut [f32; CHUNK]) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     for k in 0..CHUNK {
-        // Halves of 32 bits: never 0.
+        // Odd multiples of 2^-33: never 0.
         let uniform =
             (u32::from_le_bytes(words[k]) >> 1) as i32 as f32 * 2.0_f32.powi(-31) + 2.0_f32.powi(-33);
         let radius = minus_ln::<FMA>(uniform).max(0.0).sqrt();
@@ -42,7 +42,7 @@ fn transform(words: &Bytes, x: &mut [f32; CHUNK], y: &mut [f32; CHUNK]) {
 /// -ln(u) for 0 < u <= 1, to 1e-6 of max(1, value).
 ///
 /// u = 2^e m with m in [sqrt(1/2), sqrt(2)); ln m by the series of atanh((m - 1) / (m + 1)), |.| < 0.172,
-/// whose first term left out is below 2e-9.
+/// whose first omitted term is below 2e-9.
 #[inline(always)]
 fn minus_ln<const FMA: bool>(u: f32) -> f32 {
     const SERIES: [f32; 5] = [2.0, 2.0 / 3.0, 2.0 / 5.0, 2.0 / 7.0, 2.0 / 9.0];
@@ -116,7 +116,7 @@ mod tests {
     fn tails_are_as_heavy_as_they_should_be_to_five_deviations() {
         const COUNT: usize = 1 << 20;
         const ROUNDS: usize = 64;
-        // Beyond so many standard deviations on either side: 1 - erf(k / sqrt 2), as published in any table of them.
+        // Two-sided probability beyond k standard deviations: 1 - erf(k / sqrt 2), as tabulated.
         const TAILS: [(f32, f64); 4] =
             [(3.0, 2.699_796e-3), (4.0, 6.334_248e-5), (4.5, 6.795_346e-6), (5.0, 5.733_031e-7)];
         let (mut re, mut im) = (vec![0.0; COUNT], vec![0.0; COUNT]);

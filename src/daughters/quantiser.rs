@@ -1,16 +1,16 @@
-//! Analogue to digital: level control and quantiser.
+//! Analogue-to-digital conversion: level control and quantiser.
 
 use multiversion::multiversion;
 
 use super::config::FLOAT_BITS;
 use crate::frames::Samples;
 
-/// Distance of levels, in standard deviations of a part, at which a Gaussian loses least (Thompson, Moran
-/// & Swenson 2017, Table 8.2 and Eq. 8.84): efficiencies 0.6366, 0.8812, 0.9885. For 8 bits
-/// not the best, 0.0308, but so that 5 standard deviations still fit; efficiency 0.9999.
+/// Spacing of levels, in standard deviations of one part, with the highest efficiency for a Gaussian (Thompson, Moran
+/// & Swenson 2017, Table 8.2 and Eq. 8.84): efficiencies 0.6366, 0.8812, 0.9885 for 1, 2, 4 bits. For 8 bits the
+/// spacing is wider than the optimum, 0.0308, so that 5 standard deviations still fit; efficiency 0.9999.
 fn spacing(bits: u32) -> f64 {
     match bits {
-        // A sign alone: +- one standard deviation, so that the power is kept.
+        // One bit holds the sign: +- one standard deviation preserves the power.
         1 => 2.0,
         2 => 0.9957,
         4 => 0.3352,
@@ -22,9 +22,9 @@ fn spacing(bits: u32) -> f64 {
 #[derive(Clone, Debug)]
 pub struct Quantiser {
     bits: u32,
-    /// Part of the way to the power of a block that the level control goes.
+    /// Fraction of the step towards a block's power that the level control takes.
     following: f64,
-    /// Power by which the level is set, K sr.
+    /// Power estimate that sets the level, K sr.
     power: Option<f64>,
 }
 
@@ -36,8 +36,8 @@ impl Quantiser {
         Self { bits, following: 1.0 - (-block_s / time_constant_s).exp(), power: None }
     }
 
-    /// Quantises a block of samples (sqrt(K sr)), and counts parts out of range. The level is that of the blocks before; the
-    /// first block sets its own.
+    /// Quantises a block of samples (sqrt(K sr)) and counts the parts out of range. Earlier blocks set the level; the first
+    /// block sets its own.
     pub fn quantise(&mut self, re: &[f32], im: &[f32]) -> (Samples, u32) {
         if self.bits == FLOAT_BITS || re.is_empty() {
             return (Samples::Float { re: re.to_vec(), im: im.to_vec() }, 0);
@@ -45,18 +45,18 @@ impl Quantiser {
         let measured = (square(re) + square(im)) / re.len() as f64;
         let power = self.power.unwrap_or(measured);
         self.power = Some(power + self.following * (measured - power));
-        // Silence has no level; any will do.
+        // Silence has no level; any step does.
         let step = (spacing(self.bits) * (0.5 * power).sqrt()).max(f64::from(f32::MIN_POSITIVE)) as f32;
         let half = 1_i32 << (self.bits - 1);
         let (mut re_codes, mut im_codes) = (vec![0; re.len()], vec![0; im.len()]);
         let beyond = encode(re, step, half, &mut re_codes) + encode(im, step, half, &mut im_codes);
-        // A sign has no range.
+        // A sign cannot be out of range.
         let saturated = if self.bits == 1 { 0 } else { beyond };
         (Samples::Codes { bits: self.bits as u8, step, re: re_codes, im: im_codes }, saturated)
     }
 }
 
-/// Sum of squares, in the order of `LANES` sums side by side.
+/// Sum of squares, accumulated in `LANES` interleaved partial sums.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
 fn square(values: &[f32]) -> f64 {
     const LANES: usize = 16;
@@ -73,8 +73,8 @@ fn square(values: &[f32]) -> f64 {
 
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq", "x86_64+avx2", "aarch64+neon"))]
 fn encode(values: &[f32], step: f32, half: i32, codes: &mut [i8]) -> u32 {
-    // Numbers of 256 to 512 have 8 bits of whole numbers before 15 bits of the rest: their bits are the floor. A
-    // conversion asks for more than that, and is not made for many at a time.
+    // The bits of an f32 from 256 to 512 are 8 integer bits above 15 fraction bits, so a shift gives the floor. A
+    // conversion instruction does more, and does not vectorise.
     const UP: f32 = 256.0;
     const REST: u32 = 15;
     let (scale, limit) = (1.0 / step, half as f32);

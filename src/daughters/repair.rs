@@ -1,43 +1,43 @@
-//! What is a little less than a covariance, made one.
+//! Cholesky factors of matrices that are not quite positive semidefinite.
 
 use multiversion::multiversion;
 
 use super::tile::{PIVOT_MIN, TILE, Tile, element};
 use crate::units::arithmetic::fused;
 
-/// Changes of a correlation that are counted; smaller ones are rounding.
+/// Smallest change of a correlation that is counted; smaller ones are rounding.
 const CHANGE_COUNTED: f32 = 1e-5;
 
-/// What had to be done to covariances.
+/// Statistics of the repairs of covariances.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Repairs {
-    /// Correlations looked at.
+    /// Correlations checked.
     pub elements: u64,
-    /// Those made smaller by more than `CHANGE_COUNTED` so that a matrix became a covariance.
+    /// Correlations reduced by more than 1e-5 to make a matrix positive semidefinite.
     pub changed: u64,
-    /// Greatest change, as a part of the two daughters' powers.
+    /// Largest reduction, as a fraction of the geometric mean of the two powers.
     pub change_max: f32,
 }
 
 impl Repairs {
-    /// Of a tile for `order` daughters that needed none.
+    /// The statistics of a tile for `order` daughters that needed no repair.
     pub(super) fn none(order: usize) -> Self {
         Self { elements: (order * (order - 1) / 2 * TILE) as u64, ..Self::default() }
     }
 
-    /// Adds what another part has counted.
-    pub fn absorb(&mut self, other: Self) {
+    /// Adds the statistics of another part.
+    pub fn add(&mut self, other: Self) {
         self.elements += other.elements;
         self.changed += other.changed;
         self.change_max = self.change_max.max(other.change_max);
     }
 }
 
-/// As [`crate::daughters::colour::Factor`], where C may lack something to be a covariance.
+/// As [`crate::daughters::colour::Factor`], for a C that need not be positive semidefinite.
 ///
-/// Rounding and interpolation can make C a little less than a covariance. A daughter then has less power left than
-/// its correlation with another asks for; the correlation is made as small as the power that is left. Powers
-/// stay, and no correlation changes by more than C lacks.
+/// Rounding and interpolation can leave C slightly indefinite. A daughter then has less power left than its correlation
+/// with another needs; that correlation is reduced to fit. Powers do not change, and no correlation changes by more
+/// than C is short of positive semidefinite.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 pub(super) fn factor(tile: &mut Tile, order: usize) -> Repairs {
     const FMA: bool =
@@ -48,7 +48,7 @@ pub(super) fn factor(tile: &mut Tile, order: usize) -> Repairs {
     for j in 0..order {
         let (mut pivot, mut inverse) = ([0.0_f32; TILE], [0.0_f32; TILE]);
         for t in 0..TILE {
-            // No power at all is a daughter that hears nothing.
+            // A daughter without signal has no power at all.
             pivot[t] = left[j][t].max(PIVOT_MIN * powers[j][t]).max(f32::MIN_POSITIVE).sqrt();
             inverse[t] = 1.0 / pivot[t];
         }
@@ -88,7 +88,7 @@ pub(super) fn factor(tile: &mut Tile, order: usize) -> Repairs {
     repairs
 }
 
-/// Makes the elements smaller that took more power than was left; `unit` is a change of one, as a part of the powers.
+/// Reduces the elements that took more power than was left; `unit` converts a change to a fraction of the powers.
 fn shrink(
     [re, im]: [&mut [f32; TILE]; 2],
     left: &mut [f32; TILE],
@@ -118,8 +118,8 @@ mod tests {
     use crate::daughters::tile::on_tile;
 
     #[test]
-    fn what_is_no_covariance_keeps_its_powers_and_loses_correlation() {
-        // Two daughters of power 1 that correlate by 1.01.
+    fn an_indefinite_matrix_keeps_its_powers_and_loses_correlation() {
+        // Two daughters of power 1 with a correlation of 1.01.
         let mut tile = Tile::new(2);
         for t in 0..TILE {
             (tile.re[0][t], tile.re[2][t], tile.re[1][t], tile.im[1][t]) = (1.0, 1.0, 0.0, 1.01);
@@ -130,7 +130,7 @@ mod tests {
         assert!((repairs.change_max - 0.01).abs() < 1e-5, "{}", repairs.change_max);
         assert!((tile.im[1][0] * tile.re[0][0] - 1.0).abs() < 1e-6);
         let power = tile.im[1][0].powi(2) + tile.re[2][0].powi(2);
-        // The least pivot is added.
+        // The smallest pivot is added.
         assert!((power - 1.0).abs() < 2e-6, "{power}");
     }
 }

@@ -1,4 +1,4 @@
-//! The source of the space segment in sample fidelity: windows, as samples of all daughters and channels.
+//! The source of the space segment in sample fidelity: samples of all daughters and channels, window by window.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -17,38 +17,38 @@ use crate::response::model::{ModelError, VisibilityModel};
 use crate::runtime::{Flow, Outlet, Source, Units};
 use crate::units::{ChannelId, MissionTime, TICKS_PER_SECOND};
 
-/// Samples that are made of one prediction: 2 s at 8 kHz. Longer stretches ask for fewer instants of slow fringes, shorter
-/// ones for a shorter sum over instants at each epoch.
+/// Samples made from one prediction: 2 s at 8 kHz. Longer chunks need fewer predictions of slow fringes, shorter ones
+/// a shorter sum over instants at each epoch.
 const CHUNK_SAMPLES: usize = 1 << 14;
 
-/// What the daughters listen to, and where they are.
+/// What the daughters receive, and where they are.
 pub struct Scene {
     /// The array.
     pub array: Arc<Array>,
-    /// The sky, as the array sees it: one model a channel.
+    /// The sky as the array sees it: one model per channel.
     pub models: Vec<Box<dyn VisibilityModel>>,
     /// Channels.
     pub channels: Vec<Channel>,
     /// Receiver noise T_rec / zeta of each daughter, K sr.
     pub receiver_noise_k_sr: f64,
-    /// Seed of all noise.
+    /// Seed of all random numbers.
     pub seed: u64,
 }
 
-/// What sampling has counted.
+/// Counters of the sampler.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct SamplerCounts {
-    /// Complex samples made, of all daughters and channels.
+    /// Complex samples made for all daughters and channels.
     pub samples: u64,
-    /// Parts beyond a quantiser's range.
+    /// Real and imaginary parts out of a quantiser's range.
     pub saturated: u64,
-    /// What was done to covariances.
+    /// Repairs of covariances.
     pub repairs: Repairs,
 }
 
-/// Samples windows, one stretch of all channels and daughters after another. While one is handed on, the next is made.
+/// Samples observing windows in chunks of all channels and daughters. It makes a chunk while it sends the one before.
 ///
-/// Windows are cut to whole hops of 64 samples. The same seed gives the same samples, whatever the threads.
+/// Windows are cut to whole hops of 64 samples. The same seed gives the same samples, whatever the number of threads.
 pub struct Sampler {
     scene: Scene,
     config: DaughtersConfig,
@@ -56,36 +56,36 @@ pub struct Sampler {
     current: Option<WindowProgress>,
     synthesis: SampleSynthesis,
     tables: Tables,
-    /// Room to work in that no thread has at the moment.
-    spare: Mutex<Vec<Room>>,
+    /// Workspaces that no thread uses at the moment.
+    spare: Mutex<Vec<Workspace>>,
     counts: Arc<Mutex<SamplerCounts>>,
 }
 
-/// Room to make the samples of a channel in.
-struct Room {
+/// Memory for the samples of one channel.
+struct Workspace {
     covariances: Covariances,
     draft: Draft,
     planes: Vec<Planes>,
 }
 
-/// Blocks of each channel in one stretch.
-type Made = Vec<(Vec<SampleBlock>, Repairs)>;
+/// Blocks of each channel in one chunk.
+type Chunk = Vec<(Vec<SampleBlock>, Repairs)>;
 
-/// How far a window has been sampled.
+/// Progress through a window.
 struct WindowProgress {
     window: ObservingWindow,
-    /// Samples that the window has.
+    /// Samples in the window.
     samples: usize,
-    /// Samples that were made.
+    /// Samples made so far.
     done: usize,
-    /// What of them was not handed on.
-    ready: Option<Made>,
-    /// By channel and daughter.
+    /// The chunk that is made but not sent.
+    ready: Option<Chunk>,
+    /// Quantisers by channel and daughter.
     quantisers: Vec<Vec<Quantiser>>,
 }
 
 impl Sampler {
-    /// Samples `windows` of a scene; what it counts can be read through `counts`.
+    /// A sampler of `windows` of a scene, which updates `counts` as it goes.
     #[must_use]
     pub fn new(
         scene: Scene,
@@ -125,14 +125,14 @@ impl Sampler {
         start.plus_ticks(sample_ticks(samples as u64, self.width_hz()))
     }
 
-    /// Makes the next stretch of the current window, and hands on the one before.
-    fn stretch(
+    /// Makes the next chunk of the current window and sends the one before.
+    fn advance(
         &mut self,
         progress: &mut WindowProgress,
         out: &mut Outlet<SpaceFrame>,
     ) -> Result<(), ModelError> {
         let ready = progress.ready.take();
-        // Models are taken out, so that threads may have one each.
+        // Models move out of the scene, so that each thread can borrow one.
         let mut models = std::mem::take(&mut self.scene.models);
         let mut made = None;
         let sampler = &*self;
@@ -141,7 +141,7 @@ impl Sampler {
                 scope.spawn(|_| made = Some(sampler.make(&mut models, progress)));
             }
             if let Some(ready) = ready {
-                sampler.hand_on(ready, out);
+                sampler.send(ready, out);
             }
         });
         self.scene.models = models;
@@ -153,7 +153,7 @@ impl Sampler {
         &self,
         models: &mut [Box<dyn VisibilityModel>],
         progress: &mut WindowProgress,
-    ) -> Result<Made, ModelError> {
+    ) -> Result<Chunk, ModelError> {
         let samples = CHUNK_SAMPLES.max(self.config.block_samples).min(progress.samples - progress.done);
         let (window, first) = (progress.window, progress.done);
         let epochs = Epochs {
@@ -169,17 +169,17 @@ impl Sampler {
             };
         let made: Vec<Result<_, ModelError>> = asked.with_max_len(1).map(job).collect();
         progress.done += samples;
-        // The first error in the order of channels, whichever thread was first.
+        // The first error in channel order, whichever thread met one first.
         made.into_iter().collect()
     }
 
-    /// Room that is spare, or new; it goes back to `spare`. What is in it is of no use.
-    fn room(&self) -> Room {
+    /// A spare workspace or a new one; its contents are undefined, and it returns to `spare` after use.
+    fn workspace(&self) -> Workspace {
         let spare = self.spare.lock().unwrap_or_else(PoisonError::into_inner).pop();
         spare.unwrap_or_else(|| {
             let (daughters, samples) = (self.scene.array.satellites(), self.config.block_samples);
             let planes = || [vec![0.0; samples], vec![0.0; samples]];
-            Room {
+            Workspace {
                 covariances: Covariances::default(),
                 draft: self.synthesis.draft(daughters),
                 planes: std::iter::repeat_with(planes).take(daughters).collect(),
@@ -187,13 +187,13 @@ impl Sampler {
         })
     }
 
-    /// Blocks in the order of time, daughter, channel: what a daughter sends of one time travels together, so that
-    /// threads do not wake each other for every block.
-    fn hand_on(&self, made: Made, out: &mut Outlet<SpaceFrame>) {
+    /// Sends blocks in the order of time, daughter, channel. All blocks of a daughter and time travel as one frame, so
+    /// that threads do not wake each other for every block.
+    fn send(&self, chunk: Chunk, out: &mut Outlet<SpaceFrame>) {
         let mut counts = SamplerCounts::default();
-        let mut channels = Vec::with_capacity(made.len());
-        for (blocks, repairs) in made {
-            counts.repairs.absorb(repairs);
+        let mut channels = Vec::with_capacity(chunk.len());
+        for (blocks, repairs) in chunk {
+            counts.repairs.add(repairs);
             for block in &blocks {
                 counts.samples += block.samples.len() as u64;
                 counts.saturated += u64::from(block.saturated);
@@ -203,26 +203,26 @@ impl Sampler {
         let mut all = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
         all.samples += counts.samples;
         all.saturated += counts.saturated;
-        all.repairs.absorb(counts.repairs);
+        all.repairs.add(counts.repairs);
         drop(all);
-        // Each channel's blocks come daughter by daughter.
+        // Each channel's blocks are ordered daughter by daughter.
         while channels.iter().any(|blocks| blocks.len() > 0) {
             out.push(SpaceFrame::Samples(channels.iter_mut().filter_map(Iterator::next).collect()));
         }
     }
 }
 
-/// Ticks that `samples` last.
+/// Duration of `samples`, ticks.
 pub(crate) fn sample_ticks(samples: u64, width_hz: f64) -> i64 {
     (samples as f64 / width_hz * TICKS_PER_SECOND as f64).round() as i64
 }
 
-/// One channel of one stretch.
+/// The work on one channel in one chunk.
 struct ChannelWork<'a> {
     sampler: &'a Sampler,
     id: ChannelId,
     window: ObservingWindow,
-    /// Number of the first sample in the window, a whole number of blocks.
+    /// Index of the first sample in the window, a whole number of blocks.
     first: usize,
     samples: usize,
 }
@@ -242,17 +242,17 @@ impl ChannelWork<'_> {
             epochs,
             tables: &sampler.tables,
         };
-        let mut room = sampler.room();
-        let Room { covariances, draft, planes } = &mut room;
-        covariances.predict_again(model, &request)?;
+        let mut workspace = sampler.workspace();
+        let Workspace { covariances, draft, planes } = &mut workspace;
+        covariances.predict(model, &request)?;
         let daughters = quantisers.len();
         let block_samples = sampler.config.block_samples;
-        // The epoch before the first sample only leaves its second half behind.
+        // The epoch before the first sample contributes its second half only.
         let mut repairs = self.draw(covariances, 0, draft, (planes, 0));
         let mut blocks = Vec::with_capacity(self.samples.div_ceil(block_samples) * daughters);
         for hop in 0..self.samples / HOP {
             let at = hop * HOP % block_samples;
-            repairs.absorb(self.draw(covariances, hop + 1, draft, (planes, at)));
+            repairs.add(self.draw(covariances, hop + 1, draft, (planes, at)));
             let (length, made) = (at + HOP, (hop + 1) * HOP);
             if length == block_samples || made == self.samples {
                 for (daughter, ([re, im], quantiser)) in planes.iter_mut().zip(&mut *quantisers).enumerate() {
@@ -261,7 +261,7 @@ impl ChannelWork<'_> {
                 }
             }
         }
-        sampler.spare.lock().unwrap_or_else(PoisonError::into_inner).push(room);
+        sampler.spare.lock().unwrap_or_else(PoisonError::into_inner).push(workspace);
         Ok((blocks, repairs))
     }
 
@@ -285,7 +285,7 @@ impl ChannelWork<'_> {
         synthesis.draw(covariances, (epoch, key), &responses, draft, planes)
     }
 
-    /// The block of one daughter that ends `made` samples into the stretch.
+    /// The block of one daughter that ends `made` samples into the chunk.
     fn block(
         &self,
         daughter: usize,
@@ -297,7 +297,7 @@ impl ChannelWork<'_> {
         let first = self.first + made - re.len();
         let time = self.sampler.time(self.window.start, first);
         if config.disturbances.has_tones() {
-            let stretch = BlockTones {
+            let tones = BlockTones {
                 disturbances: &config.disturbances,
                 array: &scene.array,
                 daughter,
@@ -306,7 +306,7 @@ impl ChannelWork<'_> {
                 first: first as u64,
                 seed: scene.seed,
             };
-            stretch.add_tones(re, im);
+            tones.add_to(re, im);
         }
         let (samples, saturated) = quantiser.quantise(re, im);
         SampleBlock {
@@ -334,7 +334,7 @@ impl Source for Sampler {
                 progress
             }
         };
-        self.stretch(&mut progress, out)?;
+        self.advance(&mut progress, out)?;
         if progress.ready.is_some() {
             self.current = Some(progress);
         } else {
@@ -343,11 +343,11 @@ impl Source for Sampler {
         Ok(Flow::Continue)
     }
 
-    /// A window that is broken off ends where its samples end.
+    /// An interrupted window ends where its samples end.
     fn finish(&mut self, out: &mut Outlet<SpaceFrame>) -> Result<(), ModelError> {
         if let Some(mut progress) = self.current.take() {
             if let Some(ready) = progress.ready.take() {
-                self.hand_on(ready, out);
+                self.send(ready, out);
             }
             let end = self.time(progress.window.start, progress.done);
             out.push(SpaceFrame::WindowEnd(ObservingWindow { end, ..progress.window }));

@@ -1,15 +1,15 @@
-//! Samples of all daughters in one channel, drawn with the covariance that the model gives.
+//! Draws samples of all daughters in one channel with the covariance of the model.
 //!
-//! Spectra of `BINS` frequencies are drawn every `HOP` samples, coloured with the factor of the covariance at
-//! each frequency, turned into `BINS` samples and blended with their neighbours by windows whose squares
+//! Every `HOP` samples a spectrum of `BINS` frequencies is drawn, coloured with the factor of the covariance at
+//! each frequency, transformed to `BINS` samples and blended with its neighbours by windows whose squares
 //! add to one. Correlations of equal instants are then exactly the blend of the two epochs' means over the
 //! channel; receiver noise is white. Two samples `n` apart lose `1 - cos(pi n / BINS)` of their
-//! correlation: 0.2 % at the longest delay of 333 us. The mean over `BINS` frequencies stands for the
-//! integral over the channel: at a delay tau it exceeds `sinc(pi tau dnu)` by its
-//! `(pi tau dnu / BINS)^2 / 6`th part, 7e-4 at 333 us.
+//! correlation: 0.2 % at the longest delay of 333 us. The mean over `BINS` frequencies replaces the
+//! integral over the channel: at a delay tau it exceeds `sinc(pi tau dnu)` by a relative
+//! `(pi tau dnu / BINS)^2 / 6`, 7e-4 at 333 us.
 //!
-//! Signals turn as exp(-2 pi i nu t), so that the daughter nearer to a source, which is ahead, has the
-//! phase that the sign of V gives it.
+//! Signals rotate as exp(-2 pi i nu t), so that the daughter nearer to a source, which receives the wave first, has the
+//! phase that the sign convention of V gives it.
 
 use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
@@ -30,27 +30,27 @@ use crate::units::{StreamKind, random_stream};
 
 const TILES: usize = BINS / TILE;
 
-/// What does not change from channel to channel.
+/// The tables of the synthesis, common to all channels.
 pub struct SampleSynthesis {
     arch: Arch,
     fft: Arc<dyn Fft<f32>>,
-    /// The window, the turning of the lowest frequency and the transform's scale.
+    /// Product of the window, the shift to the lowest frequency and the transform's scale.
     window: [[f32; BINS]; 2],
 }
 
-/// What a daughter does to its own signal at one epoch.
+/// A daughter's instrumental response at one epoch.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Response {
     /// Gain at the channel's centre.
     pub gain: Complex64,
-    /// Turns of phase from one end of the channel to the other.
+    /// Phase change across the channel, turns.
     pub turns: f64,
 }
 
 /// Samples of one daughter: real parts, imaginary parts.
 pub type Planes = [Vec<f32>; 2];
 
-/// Room to make samples of all daughters in, and what is left from one epoch to the next.
+/// Memory for the samples of all daughters, and the overlap from one epoch to the next.
 pub struct Draft {
     daughters: usize,
     bytes: Bytes,
@@ -59,7 +59,7 @@ pub struct Draft {
     coloured: Vec<[[f32; TILE]; 2]>,
     spectra: Vec<Complex32>,
     scratch: Vec<Complex32>,
-    /// Second halves of the segments before.
+    /// Second halves of the previous segments.
     tails: Vec<[[f32; HOP]; 2]>,
 }
 
@@ -81,7 +81,7 @@ impl Default for SampleSynthesis {
 }
 
 impl SampleSynthesis {
-    /// The tables.
+    /// Computes the tables.
     #[must_use]
     pub fn new() -> Self {
         let [mut re, mut im] = [[0.0; BINS]; 2];
@@ -95,7 +95,7 @@ impl SampleSynthesis {
         Self { arch: Arch::new(), fft: FftPlanner::new().plan_fft_forward(BINS), window: [re, im] }
     }
 
-    /// Room for `daughters`.
+    /// Memory for `daughters`.
     #[must_use]
     pub fn draft(&self, daughters: usize) -> Draft {
         Draft {
@@ -110,10 +110,10 @@ impl SampleSynthesis {
         }
     }
 
-    /// Draws the segment of an epoch, and puts the `HOP` samples before the epoch (sqrt(K sr)) into the planes of each
-    /// daughter, from `first` on.
+    /// Draws the segment of an epoch, and writes the `HOP` samples before the epoch (sqrt(K sr)) into the planes of each
+    /// daughter, starting at `first`.
     ///
-    /// `responses` are none, or one a daughter.
+    /// `responses` is empty, or has one response per daughter.
     pub fn draw(
         &self,
         covariances: &Covariances,
@@ -128,7 +128,7 @@ impl SampleSynthesis {
         fill_complex_normal(&mut rng, &mut draft.bytes, re.as_flattened_mut(), im.as_flattened_mut());
         let mut repairs = Repairs::default();
         for group in 0..TILES {
-            repairs.absorb(self.factor(covariances, epoch, group, draft));
+            repairs.add(self.factor(covariances, epoch, group, draft));
             let Draft { tile, coloured, spectra, noise: [re, im], .. } = draft;
             let noise = [&re[group..], &im[group..]];
             on_tile(self.arch, ApplyFactor { tile, noise, stride: TILES, x: coloured });
@@ -147,7 +147,7 @@ impl SampleSynthesis {
         repairs
     }
 
-    /// The factor of the covariances of one group of bins.
+    /// Factorises the covariances of one group of bins.
     fn factor(&self, covariances: &Covariances, epoch: usize, group: usize, draft: &mut Draft) -> Repairs {
         let Draft { daughters, tile, .. } = draft;
         on_tile(self.arch, Expand { covariances, epoch, group, tile });
@@ -159,7 +159,7 @@ impl SampleSynthesis {
     }
 }
 
-/// Puts the signal of a group of bins and their mirrors into its places.
+/// Copies the signal of a group of bins and its mirror image into the spectrum.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
 fn spread([re, im]: &[[f32; TILE]; 2], group: usize, spectrum: &mut [Complex32]) {
     let (below, above) = spectrum.split_at_mut(BINS / 2);
@@ -172,7 +172,7 @@ fn spread([re, im]: &[[f32; TILE]; 2], group: usize, spectrum: &mut [Complex32])
     }
 }
 
-/// The segment's first half and what was left of the one before make samples; its second half is left.
+/// Adds the segment's first half to the previous tail to make samples; its second half becomes the tail.
 #[multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn blend(
     segment: &[Complex32; BINS],

@@ -1,4 +1,4 @@
-//! What can be chosen about the spacecraft.
+//! Configuration of the spacecraft.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -12,24 +12,24 @@ use crate::response::model::ModelChoice;
 use crate::units::PerChannel;
 use crate::units::constants::YEAR_S;
 
-/// Most channels: the mission's own number.
+/// Maximum number of channels, which is the mission's.
 pub const CHANNELS_MAX: usize = 30;
 
 /// Lowest and highest channel frequency, Hz: the mission's band.
 pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 
-/// Bytes that one visibility takes in the store and on the link.
+/// Size of one visibility in the store and on the link, bytes.
 pub const VISIBILITY_BYTES: u64 = 21;
 
-/// Narrowest channel of samples, Hz: those made together, 2^14, take half a minute, in which the array moves by some
-/// degrees; what narrower ones would need grows with the third power of that time.
+/// Narrowest channel in sample fidelity, Hz: one chunk of 2^14 samples lasts half a minute, in which the array moves by
+/// some degrees; the work for a chunk grows with the third power of its duration.
 const SAMPLES_WIDTH_HZ_MIN: f64 = 500.0;
 
-/// The space segment at the level of integrated visibilities.
+/// The `[spacecraft]` section: the space segment.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SpacecraftConfig {
-    /// What is simulated: integrated visibilities, or the samples that they are made of.
+    /// What is simulated: integrated visibilities, or the samples behind them.
     pub fidelity: Fidelity,
     /// Centre frequencies, Hz.
     pub channels_hz: Vec<f64>,
@@ -37,25 +37,25 @@ pub struct SpacecraftConfig {
     pub channel_width_hz: f64,
     /// Length of the mission, s.
     pub duration_s: f64,
-    /// Observe in every n-th window only.
+    /// Observe only every n-th window.
     pub every_nth_window: u64,
-    /// Observe so long only in each window, from its start, s; 0 for all of it.
+    /// Maximum observing time per window, from its start, s; 0 for the whole window.
     pub window_s_max: f64,
-    /// Send down every n-th integration of a window only.
+    /// Send down only every n-th integration of a window.
     pub every_nth_integration: PerChannel<u64>,
     /// Longest integration, s.
     pub integration_s_max: f64,
-    /// Wavelengths that a baseline may move in one integration.
+    /// Maximum motion of a baseline during an integration, wavelengths.
     pub motion_wavelengths_max: f64,
     /// Longest baseline that is correlated, wavelengths; 0 for no limit.
     pub baseline_wavelengths_max: PerChannel<f64>,
-    /// How visibilities are simulated.
+    /// Model that predicts visibilities.
     pub model: ModelChoice,
     /// Whether visibilities are averages over their integrations (motion along the orbit; harmonic model only) or
-    /// of the instants in their middle.
+    /// instantaneous values at their middle.
     pub smear_integrations: bool,
-    /// Whether visibilities are averages over their channel's width, as those of samples are: the integrand times
-    /// `sinc(pi n . r_ij dnu / c)`. Rows of B that the ground makes are of the channel's centre.
+    /// Whether visibilities are averages over the channel's width, as in sample fidelity: the integrand times
+    /// `sinc(pi n . r_ij dnu / c)`. The ground's rows of B are for the channel's centre.
     pub smear_bandwidth: bool,
     /// Whether thermal noise is added. Weights are those of the noise either way.
     pub thermal_noise: bool,
@@ -63,21 +63,20 @@ pub struct SpacecraftConfig {
     pub receiver_noise_k_sr: f64,
     /// Antenna response of the daughters.
     pub antenna: Antenna,
-    /// Sub-bands that each channel of samples is divided into before it is correlated: a power of two, 1 for none.
+    /// Number of sub-bands into which each channel of samples is divided before correlation: a power of two, 1 for none.
     pub sub_bands: usize,
-    /// Ecliptic longitude and latitude, deg, towards which samples are delayed before they are correlated; nothing
-    /// for no delays.
+    /// Ecliptic longitude and latitude, deg, of the delay centre towards which samples are delayed before correlation;
+    /// empty for no delays.
     pub delay_centre_deg: Vec<f64>,
-    /// Time over which the powers of the daughters' samples are integrated and sent down, s, in whole blocks; 0 to leave
-    /// them out.
+    /// Integration time of the auto-correlations, s, rounded to whole blocks; 0 for none.
     pub auto_integration_s: f64,
-    /// Whether such powers come down with fidelity "visibilities", too; samples have them anyway.
+    /// Whether auto-correlations are sent with fidelity "visibilities" too; sample fidelity always sends them.
     pub auto_powers: bool,
-    /// Numbers that a block of samples may be ahead of one that the mother waits for.
+    /// Number of blocks that the mother receives beyond a missing one before it gives it up.
     pub wait_blocks: u64,
     /// Capacity of the onboard store, bytes.
     pub store_bytes_max: u64,
-    /// What a full store drops.
+    /// Which visibilities a full store drops.
     pub store_drop: StoreDrop,
     /// Mission epoch: TAI seconds since 1958-01-01.
     pub epoch_tai_s: f64,
@@ -85,28 +84,28 @@ pub struct SpacecraftConfig {
     pub ninth: NinthConfig,
 }
 
-/// How much of the spacecraft is simulated; what comes down looks the same.
+/// Level of detail of the simulation; the downlink has the same form.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Fidelity {
     /// Integrated visibilities with thermal noise: for years of mission time.
     #[default]
     Visibilities,
-    /// Samples of every daughter, quantised, sent over links and correlated: for minutes to hours.
+    /// Samples of every daughter, quantised, sent over links and correlated: for minutes to hours of mission time.
     Samples,
 }
 
-/// What a full store drops.
+/// Which visibilities a full store drops.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum StoreDrop {
-    /// What was observed last, of all channels and pairs alike.
+    /// The latest ones, of all channels and pairs alike.
     #[default]
     Newest,
-    /// What was observed first, likewise.
+    /// The earliest ones, likewise.
     Oldest,
-    /// What adds least to the map a byte: the blocks of least weight a visibility, in terms of what a second of their
-    /// channel weighs. Those are the long baselines, whose integrations are short.
+    /// The ones that add least to the map per byte: blocks with the lowest weight per visibility, relative to the weight of
+    /// a second of their channel. Those are the long baselines, whose integrations are short.
     LowestValue,
 }
 
@@ -153,7 +152,7 @@ impl Default for SpacecraftConfig {
             sub_bands: 1,
             delay_centre_deg: Vec::new(),
             auto_integration_s: 1.0,
-            // One a second over years would be several times as many as visibilities.
+            // One per second over years would outnumber the visibilities several times.
             auto_powers: false,
             wait_blocks: 16,
             store_bytes_max: 4 << 30,
@@ -262,20 +261,20 @@ pub enum SpacecraftError {
 }
 
 impl SpacecraftConfig {
-    /// The channels, as the instrument description has them.
+    /// The channels for the instrument description.
     #[must_use]
     pub fn channels(&self) -> Vec<Channel> {
         let width_hz = self.channel_width_hz;
         self.channels_hz.iter().map(|&frequency_hz| Channel { frequency_hz, width_hz }).collect()
     }
 
-    /// Length of the integrations of the daughters' own powers, s; 0 if there are none.
+    /// Integration time of the auto-correlations, s; 0 if there are none.
     #[must_use]
     pub fn autos_s(&self) -> f64 {
         if self.auto_powers || self.fidelity == Fidelity::Samples { self.auto_integration_s } else { 0.0 }
     }
 
-    /// One schedule a channel.
+    /// One schedule per channel.
     #[must_use]
     pub fn schedules(&self) -> Vec<Schedule> {
         let schedule = |(channel, &frequency_hz): (usize, &f64)| Schedule {
@@ -299,7 +298,7 @@ impl SpacecraftConfig {
         short.then_some(SpacecraftError::Dump { shortest_s, dump_s })
     }
 
-    /// Delays and sub-bands of samples.
+    /// The delay centre and the sub-bands of sample fidelity.
     #[must_use]
     pub fn division(&self) -> Division {
         let delay_centre = match self.delay_centre_deg[..] {

@@ -1,4 +1,4 @@
-//! The stage that turns observing windows into integrated visibilities.
+//! The stage that simulates the integrated visibilities of observing windows.
 
 use std::f64::consts::TAU;
 use std::sync::Arc;
@@ -16,20 +16,19 @@ use crate::response::model::{ModelError, PairPosition, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{ChannelId, Pair, StreamKind, TICKS_PER_SECOND, all_pairs, random_stream};
 
-/// Greatest distance of tabulated positions, s; interpolation is then good to micrometres.
+/// Largest spacing of tabulated positions, s; interpolation is then accurate to micrometres.
 pub(super) const EPHEMERIS_STEP_S: f64 = 60.0;
 
-/// Visibilities of all channels after which no model gets more at once; bounds memory to some 200 MB.
+/// Queued visibilities of all channels at which they are predicted in any case; bounds memory to some 200 MB.
 const QUEUED_VISIBILITIES_MAX: usize = 1_000_000;
-/// Windows after which no model gets more at once.
+/// Queued windows at which they are predicted in any case.
 const QUEUED_WINDOWS_MAX: usize = 64;
 
 /// Integrates all pairs and channels over each window.
 ///
-/// Emits, window by window: the instrument description, the ephemeris, the visibilities channel by
-/// channel and pair by pair, the daughters' own powers if they are wanted, and a housekeeping frame that closes the
-/// window. Windows wait until there are as many visibilities as the channels' models like to predict at once, which
-/// depends on the windows alone.
+/// Emits for each window: the instrument description, the ephemeris, the visibilities by channel and pair, the
+/// auto-correlations if configured, and a housekeeping frame that closes the window. Windows are queued until the models
+/// have enough visibilities for an efficient batch; this depends on the windows alone.
 pub struct Integrator {
     array: Arc<Array>,
     models: Vec<Box<dyn VisibilityModel>>,
@@ -40,18 +39,18 @@ pub struct Integrator {
     sampled: u64,
 }
 
-/// What is done to a prediction to make a measurement of it.
+/// How a prediction becomes a measurement.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MeasurementOptions {
     /// Thermal noise.
     pub noise: NoiseModel,
-    /// Whether visibilities are averages over their integrations, or of the instants in their middle.
+    /// Whether visibilities are averages over their integrations, or instantaneous values at their middle.
     pub smear_integrations: bool,
-    /// Time over which the daughters' own powers are integrated, s; 0 to leave them out.
+    /// Integration time of the auto-correlations, s; 0 for none.
     pub auto_integration_s: f64,
 }
 
-/// A window whose visibilities are still to be predicted.
+/// A window whose visibilities have not been predicted yet.
 struct QueuedWindow {
     window: ObservingWindow,
     /// By channel, the pairs that have integrations.
@@ -64,7 +63,7 @@ struct Scheduled {
     integrations: Vec<Integration>,
 }
 
-/// What all pairs of a window see in a channel.
+/// One channel of a window, with what all pairs share.
 #[derive(Clone, Copy)]
 struct WindowChannel<'a> {
     window: ObservingWindow,
@@ -75,23 +74,23 @@ struct WindowChannel<'a> {
 /// Thermal noise of integrated visibilities.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NoiseModel {
-    /// Seed of the noise; `None` adds none (weights stay those of the noise).
+    /// Seed of the noise; `None` adds none (weights are those of the noise anyway).
     pub seed: Option<u64>,
     /// Receiver noise T_rec / zeta, K sr.
     pub receiver_noise_k_sr: f64,
 }
 
 impl NoiseModel {
-    /// Standard deviation of the real and of the imaginary part for the sky's powers `Int T S A dn` at the two daughters,
-    /// K sr: `sqrt(P_i P_j / (2 dnu dt))` with `P = T_rec / zeta + Int T S A dn` (the paper, Eq. 12, with the two
-    /// daughters' own system temperatures).
+    /// Standard deviation of the real and of the imaginary part, K sr, for sky powers `Int T S A dn` at the two daughters:
+    /// `sqrt(P_i P_j / (2 dnu dt))` with `P = T_rec / zeta + Int T S A dn` (the paper, Eq. 12, with each daughter's own
+    /// system temperature).
     #[must_use]
     pub fn sigma_k_sr(&self, powers_k_sr: [f64; 2], width_hz: f64, dt_s: f64) -> f64 {
         let [p_i, p_j] = powers_k_sr.map(|power| self.receiver_noise_k_sr + power);
         (p_i * p_j / (2.0 * width_hz * dt_s)).sqrt()
     }
 
-    /// Noise of a pair, or of a daughter by herself, in a channel and window.
+    /// Random stream of the noise of a pair, or of an auto-correlation, in a channel and window.
     fn stream(&self, window: ObservingWindow, channel: ChannelId, pair: Pair) -> Option<ChaCha8Rng> {
         let identity = u64::from(channel.0) << 32 | u64::from(pair.i) << 8 | u64::from(pair.j);
         let stream =
@@ -101,7 +100,7 @@ impl NoiseModel {
 }
 
 impl Integrator {
-    /// An integrator of `schedules` and `models`, one each for every channel of `instrument`.
+    /// An integrator with one schedule and one model per channel of `instrument`.
     #[must_use]
     pub fn new(
         array: Arc<Array>,
@@ -127,7 +126,7 @@ impl Integrator {
         QueuedWindow { window, channels: self.schedules.iter().map(channel).collect() }
     }
 
-    /// Whether what waits is enough to be predicted.
+    /// Whether the queue is large enough to be predicted.
     fn batch_is_full(&self) -> bool {
         let counts: Vec<usize> = (0..self.schedules.len())
             .map(|channel| self.queued.iter().map(|queued| queued.visibilities(channel)).sum())
@@ -135,11 +134,11 @@ impl Integrator {
         self.queued.len() >= QUEUED_WINDOWS_MAX
             || counts.iter().sum::<usize>() >= QUEUED_VISIBILITIES_MAX
             || counts.iter().zip(&self.models).all(|(&count, model)| count >= model.batch())
-            // Nothing to predict: what waits is only told.
+            // Nothing to predict: the windows only need to be reported.
             || counts.iter().all(|&count| count == 0)
     }
 
-    /// Predicts, measures and emits all windows that wait.
+    /// Predicts, measures and emits all queued windows.
     fn measure_queue(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
         let queued = std::mem::take(&mut self.queued);
         let windows: Vec<ObservingWindow> = queued.iter().map(|queued| queued.window).collect();
@@ -147,9 +146,9 @@ impl Integrator {
         let mut blocks: Vec<std::vec::IntoIter<Vec<VisibilityBlock>>> = Vec::new();
         let mut powers: Vec<Vec<SkyPowers>> = Vec::new();
         for channel in 0..self.schedules.len() {
-            let own = SkyPowers::predict(self.models[channel].as_mut(), &self.array, &windows)?;
-            blocks.push(self.channel_blocks(&queued, channel, &own)?.into_iter());
-            powers.push(own);
+            let sky = SkyPowers::predict(self.models[channel].as_mut(), &self.array, &windows)?;
+            blocks.push(self.channel_blocks(&queued, channel, &sky)?.into_iter());
+            powers.push(sky);
             if out.is_closed() {
                 return Ok(());
             }
@@ -189,13 +188,13 @@ impl Integrator {
             .iter()
             .zip(powers)
             .flat_map(|(queued, powers)| {
-                let sight =
+                let context =
                     WindowChannel { window: queued.window, channel: ChannelId(channel as u16), powers };
-                queued.channels[channel].iter().map(move |pair| (sight, pair))
+                queued.channels[channel].iter().map(move |pair| (context, pair))
             })
             .collect();
         let positions: Vec<Vec<PairPosition>> =
-            scheduled.par_iter().map(|(sight, pair)| self.positions(sight.window, pair)).collect();
+            scheduled.par_iter().map(|(context, pair)| self.positions(context.window, pair)).collect();
         let positions = positions.concat();
         let mut predictions = vec![Complex64::ZERO; positions.len()];
         self.models[channel].predict(&positions, &mut predictions)?;
@@ -206,8 +205,8 @@ impl Integrator {
             parts.push(part);
             rest = after;
         }
-        let measure = |((sight, pair), part): (&(WindowChannel, &Scheduled), &&[Complex64])| {
-            self.measure(*sight, pair, part)
+        let measure = |((context, pair), part): (&(WindowChannel, &Scheduled), &&[Complex64])| {
+            self.measure(*context, pair, part)
         };
         let blocks: Vec<VisibilityBlock> = scheduled.par_iter().zip(&parts).map(measure).collect();
         let mut blocks = blocks.into_iter();
@@ -216,7 +215,7 @@ impl Integrator {
         Ok(queued.iter().map(of_window).collect())
     }
 
-    /// Where a pair is in the middle of each of its integrations.
+    /// Positions of a pair at the middle of each of its integrations.
     fn positions(&self, window: ObservingWindow, scheduled: &Scheduled) -> Vec<PairPosition> {
         let Pair { i, j } = scheduled.pair;
         let position = |integration: &Integration| {
@@ -233,7 +232,7 @@ impl Integrator {
         scheduled.integrations.iter().map(position).collect()
     }
 
-    /// Adds noise, weights and time tags to what the model predicts.
+    /// Adds noise, weights and time tags to the model's predictions.
     fn measure(
         &self,
         WindowChannel { window, channel, powers }: WindowChannel,
@@ -265,8 +264,7 @@ impl Integrator {
         block
     }
 
-    /// The daughters' own powers in a window, if they are wanted: integrations back to back, the last cut at the window's
-    /// end.
+    /// Auto-correlations over a window, if configured: contiguous integrations, the last one cut at the window's end.
     fn autos(&self, WindowChannel { window, channel, powers }: WindowChannel) -> Vec<VisibilityBlock> {
         let step = (self.options.auto_integration_s * TICKS_PER_SECOND as f64) as u32;
         if step == 0 {
@@ -287,7 +285,7 @@ impl Integrator {
                 let expected_k_sr =
                     noise_model.receiver_noise_k_sr + powers.at(&self.array, n.into(), middle_s);
                 let samples = width_hz * dt_s;
-                // What a window's end leaves may be less than one, of which there is no power.
+                // The last integration may be shorter than one sample, which has no power.
                 if samples < 1.0 {
                     continue;
                 }
@@ -306,9 +304,9 @@ impl Integrator {
     }
 }
 
-/// Mean of |x|^2 over so many samples of a complex Gaussian of power one.
+/// A random mean of |x|^2 over `samples` samples of a complex Gaussian of unit power.
 fn mean_square(samples: f64, stream: &mut impl rand::Rng) -> f64 {
-    // There is one for any positive shape and scale.
+    // The distribution exists for any positive shape and scale.
     Gamma::new(samples, samples.recip()).map_or(1.0, |gamma| gamma.sample(stream))
 }
 

@@ -1,10 +1,13 @@
-//! The mother: integration of visibilities while the Earth is hidden, and the store that holds them
-//! until it is in sight.
+//! The mother: integration of visibilities while the Moon hides the Earth, and the onboard store that holds them until
+//! the Earth is in sight.
 //!
-//! There are two fidelities, which give the same frames: [`Integrator`] is the spacecraft at the level of
-//! integrated visibilities, what the correlator would put out for a given sky, with thermal noise;
-//! [`correlator`] makes them from the samples of [`crate::daughters`]. [`Ninth`] adds the spectra of one more daughter.
-//! Uses [`crate::frames`], [`crate::array`], [`crate::sky`].
+//! The space segment has two fidelities with the same output frames. [`Integrator`] simulates integrated visibilities:
+//! the prediction of a model plus thermal noise. [`correlator`] computes them from the samples of [`crate::daughters`].
+//! [`Ninth`] adds the spectra of a ninth daughter, [`Store`] buffers the frames until a pass.
+//!
+//! May use [`crate::frames`], [`crate::array`], [`crate::response`], [`crate::daughters`] and [`crate::runtime`].
+//! Only the frames in [`crate::frames`] leave this folder, and only bytes in [`crate::downlink`] reach the ground. The
+//! store drops nothing silently: what it drops is counted in the housekeeping frame.
 
 mod config;
 pub mod correlator;

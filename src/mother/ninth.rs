@@ -1,4 +1,4 @@
-//! The ninth daughter: the spectrum of the whole sky from 30 to 120 MHz, which carries the monopole there.
+//! The ninth daughter: a spectrometer for the whole sky from 30 to 120 MHz, which measures the monopole there.
 
 use std::sync::Arc;
 
@@ -13,10 +13,10 @@ use crate::response::model::{DaughterPosition, DirectSum, ModelError, Visibility
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{ChannelId, Pair, StreamKind, TICKS_PER_SECOND, random_stream};
 
-/// Lowest and highest frequency that a ninth daughter may listen to, Hz.
+/// Lowest and highest frequency that a ninth daughter may observe, Hz.
 pub const NINTH_BAND_HZ: [f64; 2] = [30e6, 120e6];
 
-/// Samples of an integration, width times time, from which a power's noise is Gaussian: its skewness is then 2 %.
+/// Smallest number of samples of an integration (width x time): noise is treated as Gaussian, and its skewness is 2 % then.
 const SAMPLES_MIN: f64 = 1e4;
 
 /// The `[spacecraft.ninth]` section.
@@ -25,17 +25,17 @@ const SAMPLES_MIN: f64 = 1e4;
 pub struct NinthConfig {
     /// Whether there is a ninth daughter.
     pub on: bool,
-    /// Lowest and highest frequency of her spectrum, Hz.
+    /// Lowest and highest frequency of the spectrum, Hz.
     pub band_hz: [f64; 2],
-    /// Channels that the band is divided into.
+    /// Number of channels in the band.
     pub channels: usize,
     /// Length of an integration, s.
     pub integration_s: f64,
     /// Receiver noise T_rec / zeta, as the antenna would see it from the sky, K sr.
     pub receiver_noise_k_sr: f64,
-    /// Arc by which she trails the first daughter on the same circle, m.
+    /// Arc by which it trails the first daughter on the same circle, m.
     pub arc_m: f64,
-    /// Index of temperature over frequency by which a sky from files goes on from its highest channel.
+    /// Spectral index of temperature with which a sky from files is extrapolated above its highest channel.
     pub file_index: f64,
 }
 
@@ -54,17 +54,17 @@ impl Default for NinthConfig {
 }
 
 impl NinthConfig {
-    /// The spectrometer, if there is one, as the instrument description has it.
+    /// The spectrometer for the instrument description, if there is a ninth daughter.
     #[must_use]
     pub fn spectrometer(&self) -> Option<Spectrometer> {
         let [low_hz, high_hz] = self.band_hz;
-        // At most 1024, as has been checked.
+        // At most 1024 in a valid configuration.
         let channels = self.channels as u16;
         let width_hz = (high_hz - low_hz) / f64::from(channels.max(1));
         self.on.then_some(Spectrometer { low_hz, width_hz, channels })
     }
 
-    /// Everything that is wrong with the section; empty if it is good.
+    /// All problems of the section; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<SpacecraftError> {
         let mut found = Vec::new();
@@ -96,7 +96,7 @@ impl NinthConfig {
         found
     }
 
-    /// Rate of her spectra while the array observes, bit/s, without packet headers.
+    /// Data rate of the spectra while the array observes, bit/s, without packet headers.
     #[must_use]
     pub fn bits_per_s(&self) -> f64 {
         if !self.on {
@@ -106,23 +106,23 @@ impl NinthConfig {
     }
 }
 
-/// The sky over a band of frequencies, as one daughter hears it.
+/// The sky over a band of frequencies, as one daughter receives it.
 pub enum NinthSky {
-    /// One map whose temperatures go as a power of frequency.
+    /// One map whose temperatures follow a power law in frequency.
     PowerLaw {
-        /// The map's sums.
+        /// Direct sums over the map.
         model: DirectSum,
-        /// Its frequency, Hz.
+        /// Frequency of the map, Hz.
         frequency_hz: f64,
-        /// The power.
+        /// Spectral index.
         index: f64,
     },
-    /// Maps at some frequencies, Hz, rising; between them the logarithm of power is a polynomial in that of frequency.
+    /// Maps at ascending frequencies, Hz; between them log power is a polynomial in log frequency.
     Maps(Vec<(f64, DirectSum)>),
 }
 
 impl NinthSky {
-    /// Frequencies at which maps tell a smooth spectrum over a band: Chebyshev points in the logarithm.
+    /// Frequencies of maps that determine a smooth spectrum over a band: Chebyshev nodes in log frequency.
     #[must_use]
     pub fn nodes_hz([low_hz, high_hz]: [f64; 2]) -> Vec<f64> {
         const NODES: usize = 6;
@@ -134,10 +134,10 @@ impl NinthSky {
         (0..NODES).map(at).collect()
     }
 
-    /// Powers (K sr) of each place at each frequency.
+    /// Powers (K sr) by position, then by frequency.
     ///
     /// # Errors
-    /// [`ModelError`], for places that a model does not cover.
+    /// [`ModelError`], for positions that a model does not cover.
     pub fn powers(
         &mut self,
         places: &[DaughterPosition],
@@ -169,7 +169,7 @@ impl NinthSky {
     }
 }
 
-/// Weights of values at `nodes` for the polynomial through them at `x`.
+/// Lagrange weights of the values at `nodes` for interpolation at `x`.
 fn lagrange(nodes: &[f64], x: f64) -> Vec<f64> {
     let weight = |k: usize| {
         let others = nodes.iter().enumerate().filter(|(m, _)| *m != k);
@@ -178,45 +178,45 @@ fn lagrange(nodes: &[f64], x: f64) -> Vec<f64> {
     (0..nodes.len()).map(weight).collect()
 }
 
-/// What a ninth daughter is made for.
+/// What [`Ninth`] needs.
 pub struct NinthSetup {
-    /// The array whose orbit she shares.
+    /// The array whose orbit it shares.
     pub array: Arc<Array>,
-    /// Her settings.
+    /// Its settings.
     pub config: NinthConfig,
-    /// What she hears.
+    /// The sky that it receives.
     pub sky: NinthSky,
-    /// Windows in which she observes, in the order of time.
+    /// Windows in which it observes, in the order of time.
     pub windows: Vec<ObservingWindow>,
-    /// Seed of her noise; `None` adds none.
+    /// Seed of its noise; `None` adds none.
     pub seed: Option<u64>,
 }
 
-/// Lets frames pass, and adds the ninth daughter's spectra of each window before the frame that closes it.
+/// Passes frames through, and inserts the ninth daughter's spectra of each window before the frame that closes it.
 ///
-/// A power is that of sky and receiver in the middle of an integration, with noise of P / sqrt(dnu dt) (the radiometer
-/// equation of one receiver); its weight is dnu dt / P^2 with the power that was found. Windows are divided
-/// into integrations from their start, the last one cut at the end; what is left there with less than 1e4 samples is added
-/// to the one before it, or left out if there is none.
+/// A power is that of sky and receiver at the middle of an integration, with noise of P / sqrt(dnu dt) (the radiometer
+/// equation of one receiver); its weight is dnu dt / P^2 with the measured power. Integrations are contiguous from the
+/// start of a window, the last one cut at the end; a remainder of less than 1e4 samples is added to the integration
+/// before it, or omitted if there is none.
 pub struct Ninth {
     setup: NinthSetup,
     spectrometer: Spectrometer,
     windows: std::iter::Peekable<std::vec::IntoIter<ObservingWindow>>,
-    /// Channels and satellites of the instrument, behind which hers count.
-    before: (usize, u8),
+    /// Numbers of channels and of satellites in the instrument; those of the ninth daughter follow them.
+    offset: (usize, u8),
     sampled: u64,
 }
 
 impl Ninth {
-    /// The ninth daughter of a setup; `None` if it has none.
+    /// The ninth daughter of a setup; `None` if the configuration has none.
     #[must_use]
     pub fn new(mut setup: NinthSetup) -> Option<Self> {
         let windows = std::mem::take(&mut setup.windows).into_iter().peekable();
         let spectrometer = setup.config.spectrometer()?;
-        Some(Self { setup, spectrometer, windows, before: (0, 0), sampled: 0 })
+        Some(Self { setup, spectrometer, windows, offset: (0, 0), sampled: 0 })
     }
 
-    /// Her spectra of a window, channel by channel.
+    /// The spectra of a window, channel by channel.
     fn spectra(&mut self, window: ObservingWindow) -> Result<Vec<VisibilityBlock>, ModelError> {
         let config = &self.setup.config;
         let length = (window.end.0 - window.start.0).clamp(0, i64::from(u32::MAX)) as u32;
@@ -238,7 +238,7 @@ impl Ninth {
         let channels: Vec<_> = self.spectrometer.channels().collect();
         let frequencies_hz: Vec<f64> = channels.iter().map(|channel| channel.frequency_hz).collect();
         let powers = self.setup.sky.powers(&places, &frequencies_hz)?;
-        let (first, satellite) = self.before;
+        let (first, satellite) = self.offset;
         let blocks = channels.iter().enumerate().map(|(k, channel)| {
             let mut noise = self
                 .setup
@@ -274,7 +274,7 @@ impl Stage for Ninth {
     fn step(&mut self, frame: GroundFrame, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
         match frame {
             GroundFrame::Instrument(instrument) => {
-                self.before = (instrument.channels.len(), instrument.satellites);
+                self.offset = (instrument.channels.len(), instrument.satellites);
                 out.push(GroundFrame::Instrument(instrument));
             }
             GroundFrame::Housekeeping(report) => {

@@ -1,4 +1,4 @@
-//! The source of the space segment: one observing window after another.
+//! The source of the space segment in visibility fidelity: the observing windows.
 
 use crate::array::{Array, ObservingWindows};
 use crate::frames::ObservingWindow;
@@ -11,13 +11,13 @@ pub struct Observer {
 }
 
 impl Observer {
-    /// Emits `windows`.
+    /// A source of `windows`.
     #[must_use]
     pub fn new(windows: Vec<ObservingWindow>) -> Self {
         Self { windows: windows.into_iter() }
     }
 
-    /// Every `every_nth` window of `array` from the epoch to `duration_s`.
+    /// Every `every_nth`-th window of `array` from the epoch to `duration_s`, in the order of time.
     #[must_use]
     pub fn windows(array: &Array, duration_s: f64, every_nth: u64) -> Vec<ObservingWindow> {
         ObservingWindows::new(array, 0.0, duration_s)

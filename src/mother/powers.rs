@@ -1,39 +1,39 @@
-//! The powers that the daughters hear over a window, of which their noise is made.
+//! Auto-correlations of the sky over a window, which set the noise of each daughter.
 
 use crate::array::Array;
 use crate::frames::ObservingWindow;
 use crate::response::model::{DaughterPosition, ModelError, VisibilityModel};
 use crate::units::TICKS_PER_SECOND;
 
-/// Distance of instants for which powers are predicted, s: a ninth of a radian of the orbit. A cubic does not follow what
-/// is finer than l = 20, of which the half of the sky that the Moon leaves free keeps some l^-1.5: 5e-4 of a power under a
-/// sky with as much in each degree to l = 40 as in its mean, far less under one that is smoother.
+/// Spacing of the instants at which powers are predicted, s: a ninth of a radian of the orbit. Cubic interpolation does
+/// not follow structure beyond l = 20, which the unocculted half of the sky attenuates by some l^-1.5: an error of 5e-4 of
+/// a power for a sky with as much in each degree up to l = 40 as in its mean, and far less for a smoother sky.
 const STEP_S: f64 = 150.0;
 
-/// Instants on either side of a time of which one takes the cubic.
+/// Nodes that cubic interpolation needs beyond either end.
 const BEYOND: f64 = 1.0;
 
-/// `Int T A S dn` (K sr) along a window's stretch of the orbit.
+/// `Int T A S dn` (K sr) along the arc of orbit that a window covers.
 ///
-/// All daughters follow each other on one circle, so that one table serves them all: what one hears, one who trails her by an
-/// arc hears so much later.
+/// All daughters follow each other on one circle, so one table serves them all: a daughter that trails another by an
+/// arc has the same power later.
 pub(super) struct SkyPowers {
-    /// Time of the table's first power, s.
+    /// Time of the table's first value, s.
     from_s: f64,
     table: Vec<f64>,
 }
 
 impl SkyPowers {
-    /// Powers under a model, in each of some windows.
+    /// Predicts the powers of a model over each window.
     ///
     /// # Errors
-    /// [`ModelError`], for places that the model does not cover.
+    /// [`ModelError`], for positions that the model does not cover.
     pub fn predict(
         model: &mut dyn VisibilityModel,
         array: &Array,
         windows: &[ObservingWindow],
     ) -> Result<Vec<Self>, ModelError> {
-        // Arcs are greatest at the start of a period.
+        // Arcs are longest at the start of a breathing period.
         let lags_s = (0..array.satellites()).map(|n| lag_s(array, n, 0.0));
         let longest_s = lags_s.fold(0.0, f64::max);
         let spans = windows.iter().map(|window| {
@@ -60,7 +60,7 @@ impl SkyPowers {
     /// The power of daughter `n` at a time of the window, K sr.
     pub fn at(&self, array: &Array, n: usize, t_s: f64) -> f64 {
         let x = (t_s - lag_s(array, n, t_s) - self.from_s) / STEP_S;
-        // Four of the table, whatever the time.
+        // Four nodes of the table, whatever the time.
         let first = (x.floor() - BEYOND).clamp(0.0, self.table.len().saturating_sub(4) as f64) as usize;
         let x = x - first as f64;
         let nodes = self.table.iter().skip(first).take(4).enumerate();
@@ -73,7 +73,7 @@ impl SkyPowers {
     }
 }
 
-/// Time in which the array moves along the arc by which a daughter trails, s.
+/// Time that the array takes to move along the arc by which a daughter trails, s.
 fn lag_s(array: &Array, n: usize, t_s: f64) -> f64 {
     let speed_m_s = std::f64::consts::TAU * array.orbit_radius_m() / array.orbital_period_s();
     array.formation().arc_m(n, t_s).0 / speed_m_s

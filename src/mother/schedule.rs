@@ -1,4 +1,4 @@
-//! Which integrations a window holds.
+//! The integrations of a window.
 
 use crate::array::{Array, IntegrationRule, integration_time_s};
 use crate::frames::ObservingWindow;
@@ -7,16 +7,16 @@ use crate::units::{Pair, TICKS_PER_SECOND};
 
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// One integration: start after the window's first tick, and length, us.
+/// One integration: start relative to the window's start, and duration, us.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Integration {
     /// Start, us after the window's start.
     pub offset_ticks: u32,
-    /// Length, us.
+    /// Duration, us.
     pub duration_ticks: u32,
 }
 
-/// How the integrations of one channel follow each other in a window.
+/// The rule that divides windows into integrations, for one channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Schedule {
     /// Rule of the adaptive integration.
@@ -25,18 +25,17 @@ pub struct Schedule {
     pub frequency_hz: f64,
     /// Longest baseline, wavelengths; 0 for no limit.
     pub baseline_wavelengths_max: f64,
-    /// Keep every n-th integration.
+    /// Keep only every n-th integration.
     pub every_nth: u64,
-    /// Of how many windows one is observed; so that thinning of both does not keep step.
+    /// Only every n-th window is observed; keeps the two kinds of thinning from running in step.
     pub every_nth_window: u64,
 }
 
 impl Schedule {
-    /// The integrations of `pair` in `window`: back to back from its start, each as long as the
-    /// baseline's speed at its start allows, the last cut at the window's end.
+    /// The integrations of `pair` in `window`: contiguous from its start, each as long as the
+    /// baseline's speed at its start allows, the last one cut at the window's end.
     ///
-    /// Of a thinned schedule the phase of the thinning moves on with the window, so that no part of
-    /// a window is always left out.
+    /// The phase of the thinning changes from window to window, so that no part of a window is always omitted.
     #[must_use]
     pub fn integrations(&self, array: &Array, window: ObservingWindow, pair: Pair) -> Vec<Integration> {
         let length_ticks = (window.end.0 - window.start.0).clamp(0, i64::from(u32::MAX)) as u32;
@@ -67,8 +66,8 @@ impl Schedule {
         found
     }
 
-    /// About how many integrations [`Self::integrations`] gives, and the baseline's length, m; both
-    /// from the window's middle alone.
+    /// Estimated number of integrations that [`Self::integrations`] gives, and the baseline's length, m; both
+    /// evaluated at the window's middle.
     #[must_use]
     pub fn estimate(&self, array: &Array, window: ObservingWindow, pair: Pair) -> (f64, f64) {
         let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
@@ -84,8 +83,8 @@ impl Schedule {
     }
 }
 
-/// Shortest length of a pair's baseline in a window, m. A chord depends on the daughters' arcs alone, which
-/// are linear in time between turnarounds, so it is shortest at an end or where breathing turns.
+/// Shortest length of a pair's baseline in a window, m. A chord depends only on the daughters' arcs, which are linear in
+/// time between turnarounds, so it is shortest at an end of the window or at a turnaround.
 fn shortest_m(array: &Array, window: ObservingWindow, pair: Pair) -> f64 {
     let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
     let length_m =
@@ -93,14 +92,14 @@ fn shortest_m(array: &Array, window: ObservingWindow, pair: Pair) -> f64 {
     let next = |t_s: &f64| Some(array.formation().next_turnaround_s(*t_s)).filter(|turn_s| *turn_s < end_s);
     let instants = std::iter::successors(Some(start_s), next).take(TURNAROUNDS_MAX);
     let shortest = instants.chain([end_s]).map(length_m).fold(f64::INFINITY, f64::min);
-    // Of a formation that turns more often than that, nothing is said.
+    // No bound for a formation with more turnarounds than that.
     if (end_s - start_s) * 2.0 > TURNAROUNDS_MAX as f64 * array.formation().period_s() {
         return 0.0;
     }
     shortest
 }
 
-/// Most turnarounds looked at in a window; the paper's formation has at most one.
+/// Maximum number of turnarounds considered in a window; the paper's formation has at most one.
 const TURNAROUNDS_MAX: usize = 64;
 
 #[cfg(test)]
@@ -161,7 +160,7 @@ mod tests {
         for pair in all_pairs(5) {
             let count = schedule(0.0, 1).integrations(&array, window, pair).len() as f64;
             let (estimate, _) = schedule(0.0, 1).estimate(&array, window, pair);
-            // Whole integrations, and a baseline that changes by less than a percent in a window.
+            // Rounding to whole integrations, and a baseline that changes by less than 1 % in a window.
             assert!((count - estimate).abs() <= 1.0 + 0.01 * count, "{pair}: {count} {estimate}");
         }
     }

@@ -1,4 +1,4 @@
-//! The onboard store: holds data until the Earth is in sight, and sends them down as fast as the link allows.
+//! The onboard store: holds data until the Earth is in sight, and releases them as fast as the link allows.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -10,12 +10,12 @@ use crate::array::{Array, earth_in_sight_s};
 use crate::frames::{GroundFrame, Housekeeping, VisibilityBlock};
 use crate::runtime::{Outlet, Stage, Units};
 
-/// A link that sends no more than so much while the Earth is in sight.
+/// A downlink of limited rate that works while the Earth is in sight.
 #[derive(Clone, Debug)]
 pub struct PacedLink {
-    /// Whose orbit says when that is.
+    /// The array, whose orbit determines when that is.
     pub array: Arc<Array>,
-    /// Bytes of payload a second.
+    /// Payload rate, bytes/s.
     pub bytes_per_s: f64,
 }
 
@@ -28,15 +28,15 @@ struct Held {
     block: VisibilityBlock,
 }
 
-/// Seconds of typical data a byte, as bits of a number that is not negative: they have its order.
+/// Value of a byte, in seconds of typical data: the bits of a non-negative f64, which sort like the number itself.
 type Value = u64;
 
-/// Parts of a block that are dropped at once, so that blocks are not copied for every visibility. Blocks of one window are
-/// cut to the same time but for one.
+/// A block is dropped in steps of one such fraction, so that it is not copied for every visibility. All blocks of a window
+/// are then cut at the same time, to within one step.
 const PARTS: usize = 32;
 
-/// The order in which a full store drops, the least first: values; or times, as windows and ticks, upside down where the
-/// latest go first.
+/// Order in which a full store drops blocks, lowest first: the value, or the time as (window, ticks), inverted if the
+/// latest are dropped first.
 type Rank = (u64, u32);
 
 /// Either end of a block.
@@ -46,39 +46,39 @@ enum End {
     Back,
 }
 
-/// Holds frames while the Earth is hidden, and releases them, the oldest first, in the passes that follow.
+/// Holds frames while the Earth is hidden, and releases them in the passes that follow, oldest first.
 ///
-/// A housekeeping frame closes a window: the Earth is in sight from then on, until the next window begins. What a
-/// pass has no time for stays for the next one, and goes down behind the positions that it needs. When the mission
-/// is over, a last pass empties the store.
+/// A housekeeping frame closes a window: the Earth is in sight from then until the next window begins. What does not fit
+/// in a pass stays for the next one, and is sent after the positions that it needs. At the end of the mission a last
+/// pass empties the store.
 ///
-/// Visibilities beyond the capacity are dropped, which ones [`StoreDrop`] says, and counted in the housekeeping frame
-/// that closes the pass; nothing else is ever dropped.
+/// When the store is full, visibilities are dropped as [`StoreDrop`] says and counted in the housekeeping frame that
+/// closes the pass. Nothing else is ever dropped.
 #[derive(Debug)]
 pub struct Store {
     capacity_bytes: u64,
     drop: StoreDrop,
     link: Option<PacedLink>,
-    /// Number of the window that is being observed.
+    /// Index of the window that is being observed.
     window: u64,
-    /// What the visibilities of a window are sent behind: instrument and positions.
+    /// By window: the instrument and ephemeris frames that precede its visibilities.
     descriptions: BTreeMap<u64, Vec<GroundFrame>>,
-    /// Blocks by their number, in the order in which they came.
+    /// Blocks by arrival number.
     held: BTreeMap<u64, Held>,
-    /// The same by rank; of those of one rank the one that came last first.
+    /// Blocks by rank; within a rank the latest arrival comes first.
     by_rank: BTreeSet<(Rank, Reverse<u64>)>,
     held_bytes: u64,
     blocks: u64,
-    /// Sums of weights and of lengths in seconds of all good visibilities so far, channel by channel.
+    /// By channel: sums of the weights and of the durations, s, of all good visibilities so far.
     typical: BTreeMap<u16, [f64; 2]>,
-    /// Closes the pass that is going on.
+    /// The frame that closes the current pass.
     closing: Option<Housekeeping>,
     kept: u64,
     dropped: u64,
 }
 
 impl Store {
-    /// An empty store before a link; without one all goes down at once.
+    /// An empty store in front of a link; without a link everything is sent at once.
     #[must_use]
     pub fn new(config: &SpacecraftConfig, link: Option<PacedLink>) -> Self {
         Self {
@@ -98,7 +98,7 @@ impl Store {
         }
     }
 
-    /// Takes a block, and drops what is too much then.
+    /// Stores a block, then drops what exceeds the capacity.
     fn put(&mut self, block: VisibilityBlock) {
         let (value, number) = (self.value(&block), self.blocks);
         self.blocks += 1;
@@ -115,8 +115,8 @@ impl Store {
         }
     }
 
-    /// Where a block stands among those to be dropped: by value, or by its own first or last visibility's time, whatever
-    /// the order in which blocks came.
+    /// Rank of a block in the order of dropping: by value, or by the time of its first or last visibility, whatever the
+    /// order of arrival.
     fn rank(&self, window: u64, value: Value, block: &VisibilityBlock) -> Rank {
         let ticks = |offset: Option<&u32>| offset.copied().unwrap_or(0);
         match self.drop {
@@ -126,8 +126,8 @@ impl Store {
         }
     }
 
-    /// Drops up to `count` visibilities of the block that is first to go: as long as none of another goes before them, and
-    /// no less than a part of `PARTS`. How many.
+    /// Drops up to `count` visibilities of the lowest-ranked block: those that rank below all other blocks, but at least
+    /// one `PARTS`-th of the block. Returns the number dropped.
     fn drop_first(&mut self, count: u64) -> Option<u64> {
         let mut order = self.by_rank.iter();
         let (_, Reverse(number)) = *order.next()?;
@@ -135,7 +135,7 @@ impl Store {
         let held = self.held.get(&number)?;
         let offsets = &held.block.offset_ticks;
         let least = offsets.len().div_ceil(PARTS);
-        let (own, end) = match (self.drop, next) {
+        let (below_next, end) = match (self.drop, next) {
             (StoreDrop::Oldest, Some((window, ticks))) if window == held.window => {
                 (offsets.partition_point(|&offset| offset <= ticks), End::Front)
             }
@@ -145,12 +145,12 @@ impl Store {
             (StoreDrop::Oldest, _) => (offsets.len(), End::Front),
             (StoreDrop::Newest | StoreDrop::LowestValue, _) => (offsets.len(), End::Back),
         };
-        let gone = self.take(number, count.min(own.max(least) as u64), end)?;
+        let gone = self.remove(number, count.min(below_next.max(least) as u64), end)?;
         Some(gone.len() as u64)
     }
 
-    /// What a byte of a block is worth: its weight, in terms of what a second of its channel's good data has weighed
-    /// so far. What is flagged is worth nothing.
+    /// Value of a byte of a block: its weight, relative to the mean weight of a second of good data of its channel so far.
+    /// Flagged data have no value.
     fn value(&mut self, block: &VisibilityBlock) -> Value {
         let [weights, seconds] = self.typical.entry(block.channel.0).or_default();
         let mut weight = 0.0;
@@ -160,12 +160,12 @@ impl Store {
         }
         *weights += weight;
         let value = weight * *seconds / (*weights * block.len() as f64);
-        // Nothing good yet is 0 / 0.
+        // 0 / 0 if there are no good data yet.
         if value > 0.0 { value.to_bits() } else { 0 }
     }
 
-    /// Takes so many visibilities out of a block, or all that it has.
-    fn take(&mut self, number: u64, count: u64, end: End) -> Option<VisibilityBlock> {
+    /// Removes `count` visibilities from one end of a block, or the whole block.
+    fn remove(&mut self, number: u64, count: u64, end: End) -> Option<VisibilityBlock> {
         let held = self.held.get_mut(&number)?;
         let length = held.block.len();
         let count = usize::try_from(count).map_or(length, |count| count.min(length));
@@ -188,7 +188,7 @@ impl Store {
         Some(taken)
     }
 
-    /// Sends windows before the one with the number `until`, as many bytes of them as there is time for.
+    /// Sends the windows before window `until`, up to `bytes` bytes.
     fn send(&mut self, until: u64, bytes: Option<u64>, out: &mut Outlet<GroundFrame>) {
         let mut left = bytes.unwrap_or(u64::MAX);
         while let Some(window) = self.descriptions.keys().next().copied().filter(|window| *window < until) {
@@ -201,11 +201,11 @@ impl Store {
                 self.held.first_key_value().filter(|(_, held)| held.window == window)
             {
                 if left < VISIBILITY_BYTES {
-                    // The rest needs them again.
+                    // The rest of the window needs them again.
                     self.descriptions.insert(window, descriptions);
                     return;
                 }
-                let Some(block) = self.take(number, left / VISIBILITY_BYTES, End::Front) else { break };
+                let Some(block) = self.remove(number, left / VISIBILITY_BYTES, End::Front) else { break };
                 left -= VISIBILITY_BYTES * block.len() as u64;
                 out.push(GroundFrame::Visibilities(block));
             }
@@ -215,7 +215,7 @@ impl Store {
         }
     }
 
-    /// Ends the pass that is going on, if one is, at a time; `None` once all is sent.
+    /// Ends the current pass, if there is one, at `time_s`; `None` sends everything.
     fn end_pass(&mut self, time_s: Option<f64>, out: &mut Outlet<GroundFrame>) {
         let Some(report) = self.closing.take() else { return };
         let bytes = self.link.as_ref().zip(time_s).map(|(link, time_s)| {
@@ -228,7 +228,7 @@ impl Store {
     }
 }
 
-/// About what a description takes on the link: 24 bytes a position.
+/// Approximate size of a description on the link: 24 bytes per position.
 fn description_bytes(frame: &GroundFrame) -> u64 {
     match frame {
         GroundFrame::Ephemeris(segment) => 64 + 24 * segment.positions_m.len() as u64,
@@ -251,7 +251,7 @@ impl Stage for Store {
                 }
             }
             GroundFrame::Housekeeping(report) => {
-                // Of a window without data the time in which the Earth was hidden counts as nothing.
+                // After a window without data: the time during which the Earth was hidden does not count.
                 self.end_pass(Some(report.time.seconds()), out);
                 self.closing = Some(report);
                 self.window += 1;
@@ -264,7 +264,7 @@ impl Stage for Store {
         Ok(())
     }
 
-    /// A window that was cut short is sent down as far as it went.
+    /// An interrupted window is sent as far as it was observed.
     fn finish(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), Infallible> {
         self.end_pass(None, out);
         self.send(u64::MAX, None, out);
@@ -300,7 +300,7 @@ mod tests {
         }
     }
 
-    /// Sends windows of two blocks each; what comes out, pass by pass.
+    /// Feeds windows of two blocks each; returns the frames sent, pass by pass.
     fn passes(store: &mut Store, windows: &[ObservingWindow]) -> Vec<Vec<GroundFrame>> {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         let (mut out, mut sampled) = (Outlet::collect(), 0);
@@ -354,10 +354,10 @@ mod tests {
                     .map(description_bytes)
                     .sum();
                 let time_for = (1.5 * sight_s - described as f64) / VISIBILITY_BYTES as f64;
-                // Whole visibilities; the limb's crossing is found to 1e-7 s.
+                // Whole visibilities; the limb crossing is found to 1e-7 s.
                 assert!((sent as f64 - time_for).abs() <= 1.0, "{sent} {time_for}");
             }
-            // Nothing comes before its positions.
+            // No visibility is sent before its positions.
             let mut known = Vec::new();
             for frame in pass {
                 match frame {
@@ -378,9 +378,9 @@ mod tests {
         // Room for one block and a half.
         let room = VISIBILITY_BYTES * COUNT as u64 * 3 / 2;
         for (drop, first, second) in [
-            // The first pair's go on for as long again as the second's.
+            // The first pair's integrations last twice as long as the second's.
             (StoreDrop::Newest, 500, 1_000),
-            // The same time of both: 167 of the first and 333 of the second.
+            // The same time span of both: 167 of the first and 333 of the second.
             (StoreDrop::Oldest, 833, 667),
             // The second pair's integrations are half as long and weigh half as much.
             (StoreDrop::LowestValue, 1_000, 500),
@@ -398,7 +398,7 @@ mod tests {
                 assert_eq!(report.dropped, 500 * (k as u64 + 1));
             }
         }
-        // What has a flag goes first, however long it is.
+        // Flagged data are dropped first, however long.
         let mut store = Store::new(&config(room, StoreDrop::LowestValue), None);
         let mut flagged = block(&windows[0], 1, 200_000);
         flagged.flags.fill(Flags::INTERFERENCE);

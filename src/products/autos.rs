@@ -1,4 +1,4 @@
-//! Powers of the daughters by themselves: a table, figures and a picture.
+//! The products of auto-correlations: a table, statistics and a picture.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -7,73 +7,73 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::error::ProductsError;
-use super::pictures::{Axis, Curve, Plot, draw_plots};
+use super::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
 use crate::files::write_atomically;
 use crate::frames::AutoPower;
 
-/// Frequencies that get a plot of power over time.
+/// Maximum number of frequencies with a plot of power over time.
 const PLOTS_MAX: usize = 8;
 
-/// Points of a curve; more are averaged.
+/// Maximum number of points per curve; more are averaged.
 const POINTS_MAX: usize = 400;
 
-/// The powers of one daughter at one frequency.
+/// Statistics of the auto-correlations of one daughter at one frequency.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct AutoSummary {
     /// Daughter, from 1.
     pub daughter: u32,
     /// Centre frequency of the channel or sub-band, Hz.
     pub frequency_hz: f64,
-    /// Its width, Hz.
+    /// Width of the channel or sub-band, Hz.
     pub width_hz: f64,
     /// Number of integrations.
     pub count: usize,
     /// Mean over all samples, K sr.
     pub mean_k_sr: f64,
-    /// Its standard deviation by the integrations' own noise, K sr.
+    /// Standard deviation of the mean from the noise of the integrations, K sr.
     pub sigma_k_sr: f64,
-    /// Mean square of the departures from the mean, in units of the noise: 1 if nothing but noise changes.
+    /// Mean square deviation from the mean, in units of the noise: 1 if only noise varies.
     pub chi_square: f64,
 }
 
-/// A daughter and a frequency, that sort as they should.
+/// Sort key: frequency, then daughter.
 fn key(power: &AutoPower) -> (u64, u8) {
     (power.frequency_hz.to_bits(), power.daughter)
 }
 
-/// Figures of powers by frequency and daughter.
+/// Statistics of auto-correlations by frequency and daughter.
 #[must_use]
 pub fn summarise(powers: &[AutoPower]) -> Vec<AutoSummary> {
     let mut series: BTreeMap<(u64, u8), Vec<&AutoPower>> = BTreeMap::new();
     for power in powers {
         series.entry(key(power)).or_default().push(power);
     }
-    series.into_values().filter_map(|own| figures(&own)).collect()
+    series.into_values().filter_map(|powers| statistics(&powers)).collect()
 }
 
-fn figures(own: &[&AutoPower]) -> Option<AutoSummary> {
-    let first = own.first()?;
-    // The number of samples, of which a power's own noise knows nothing: the inverse square of sigma, which goes with the
-    // power that was found, gives more to those found too small.
+fn statistics(powers: &[&AutoPower]) -> Option<AutoSummary> {
+    let first = powers.first()?;
+    // Weight by the number of samples: sigma is proportional to the measured power, so weights 1 / sigma^2 would favour
+    // powers that came out too small.
     let samples = |power: &AutoPower| (power.power_k_sr / power.sigma_k_sr).powi(2);
-    let total: f64 = own.iter().map(|power| samples(power)).sum();
+    let total: f64 = powers.iter().map(|power| samples(power)).sum();
     if total <= 0.0 {
         return None;
     }
-    let mean_k_sr = own.iter().map(|power| samples(power) * power.power_k_sr).sum::<f64>() / total;
+    let mean_k_sr = powers.iter().map(|power| samples(power) * power.power_k_sr).sum::<f64>() / total;
     let square = |power: &&AutoPower| (power.power_k_sr / mean_k_sr - 1.0).powi(2) * samples(power);
     Some(AutoSummary {
         daughter: u32::from(first.daughter) + 1,
         frequency_hz: first.frequency_hz,
         width_hz: first.width_hz,
-        count: own.len(),
+        count: powers.len(),
         mean_k_sr,
         sigma_k_sr: mean_k_sr / total.sqrt(),
-        chi_square: own.iter().map(square).sum::<f64>() / own.len().saturating_sub(1).max(1) as f64,
+        chi_square: powers.iter().map(square).sum::<f64>() / powers.len().saturating_sub(1).max(1) as f64,
     })
 }
 
-/// Writes `autos.csv`, `autos.json` and, if asked for, `autos.png` into `folder`; nothing without powers.
+/// Writes `autos.csv`, `autos.json` and, with `pictures`, `autos.png` into `folder`; nothing if there are no powers.
 ///
 /// # Errors
 /// A file that cannot be written.
@@ -85,7 +85,7 @@ pub fn write_autos(
     if powers.is_empty() {
         return Ok(Vec::new());
     }
-    // By frequency, daughter, time: in whatever order they came.
+    // By frequency, daughter, time, whatever the order of arrival.
     powers.sort_unstable_by(|a, b| key(a).cmp(&key(b)).then(a.time_s.total_cmp(&b.time_s)));
     let path = folder.join("autos.csv");
     let write = |path: &Path, bytes: &[u8]| {
@@ -103,13 +103,13 @@ pub fn write_autos(
     Ok(summaries)
 }
 
-/// Comma-separated values, a line an integration.
+/// Comma-separated values, one line per integration.
 fn table(powers: &[AutoPower]) -> String {
     let mut text = String::from("frequency_hz,width_hz,daughter,time_s,power_k_sr,sigma_k_sr\n");
     for power in powers {
         let AutoPower { daughter, frequency_hz, width_hz, time_s, power_k_sr, sigma_k_sr } = power;
         let daughter = u32::from(*daughter) + 1;
-        // A string takes all that is written to it.
+        // Writing to a String cannot fail.
         let _ = writeln!(
             text,
             "{frequency_hz},{width_hz},{daughter},{time_s:.6},{power_k_sr:.7e},{sigma_k_sr:.3e}"
@@ -118,14 +118,11 @@ fn table(powers: &[AutoPower]) -> String {
     text
 }
 
-/// The spectrum of each daughter, and her power over time at some frequencies.
-fn draw(
-    powers: &[AutoPower],
-    summaries: &[AutoSummary],
-) -> Result<crate::products::pictures::Picture, crate::products::pictures::PictureError> {
+/// Draws the spectrum of each daughter, and its power over time at some frequencies.
+fn draw(powers: &[AutoPower], summaries: &[AutoSummary]) -> Result<Picture, PictureError> {
     let mut spectra: BTreeMap<u32, Vec<(f64, f64)>> = BTreeMap::new();
-    for own in summaries {
-        spectra.entry(own.daughter).or_default().push((own.frequency_hz / 1e6, own.mean_k_sr));
+    for summary in summaries {
+        spectra.entry(summary.daughter).or_default().push((summary.frequency_hz / 1e6, summary.mean_k_sr));
     }
     let named = |(daughter, points)| Curve { label: format!("daughter {daughter}"), points, dashed: false };
     let y = Axis { label: "power (K sr)".to_owned(), ..Axis::default() };
@@ -136,7 +133,7 @@ fn draw(
         curves: spectra.into_iter().map(named).collect(),
         levels: Vec::new(),
     }];
-    let mut frequencies: Vec<f64> = summaries.iter().map(|own| own.frequency_hz).collect();
+    let mut frequencies: Vec<f64> = summaries.iter().map(|summary| summary.frequency_hz).collect();
     frequencies.dedup();
     let start_s = powers.iter().map(|power| power.time_s).fold(f64::INFINITY, f64::min);
     for k in 0..frequencies.len().min(PLOTS_MAX) {
@@ -160,7 +157,7 @@ fn draw(
     draw_plots("Powers of the daughters", &plots, 3)
 }
 
-/// Means of as many points as leave `POINTS_MAX`.
+/// Averages adjacent points so that at most `POINTS_MAX` are left.
 fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let mean = |chunk: &[(f64, f64)]| {
         let n = chunk.len() as f64;

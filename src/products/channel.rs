@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use super::config::ProductsConfig;
 use super::error::ProductsError;
 use super::pictures::{
-    Axis, Bars, ColourScale, Curve, MapPanel, Palette, Plot, Sampling, Scaling, Sheet, View, draw_map,
-    draw_plots, draw_sheet,
+    Axis, Bars, ColourScale, Curve, MapPanel, Palette, Picture, PictureError, Plot, Sampling, Scaling, Sheet,
+    View, draw_map, draw_plots, draw_sheet,
 };
 use super::provenance::Provenance;
 use super::summary::{ChannelSummary, SnapshotSummary};
@@ -15,19 +15,19 @@ use crate::sky::{Comparison, Frame, SkyMap, compare};
 use crate::solve::Solution;
 use crate::units::constants::DAY_S;
 
-/// Most maps on the sheet that shows how they sharpen; the first, the last and some between.
+/// Maximum number of maps on the sheet of snapshots: the first, the last and some between.
 const SHEET_MAPS_MAX: usize = 6;
 
-/// A channel's folder and what is known of its maps so far.
+/// A channel's output folder, and the summary of its maps so far.
 pub(super) struct ChannelFolder {
     config: ProductsConfig,
     /// Output folder of the run.
     root: PathBuf,
-    /// Name of the channel's folder in it.
+    /// Name of the channel's folder within `root`.
     name: String,
     frequency_hz: f64,
     truth: Option<SkyMap>,
-    /// Some of the maps so far, for the sheet.
+    /// Snapshots for the sheet.
     shown: SheetMaps,
     snapshots: Vec<SnapshotSummary>,
     files: Vec<String>,
@@ -35,7 +35,7 @@ pub(super) struct ChannelFolder {
 }
 
 impl ChannelFolder {
-    /// Makes the folder `root/3.000MHz`.
+    /// Creates the folder, for example `root/3.000MHz`.
     pub(super) fn open(
         root: &Path,
         config: &ProductsConfig,
@@ -61,7 +61,7 @@ impl ChannelFolder {
         })
     }
 
-    /// Writes what belongs to one solution; all of it if the solution is final.
+    /// Writes the products of one solution; the complete set if the solution is final.
     pub(super) fn publish(
         &mut self,
         solution: &Solution,
@@ -69,7 +69,7 @@ impl ChannelFolder {
     ) -> Result<(), ProductsError> {
         let map = SkyMap::new(Frame::Ecliptic, solution.map_k.clone())?;
         let noise = SkyMap::new(Frame::Ecliptic, solution.noise_k.clone())?;
-        // A map of harmonics has nothing beyond its own degrees.
+        // A map of harmonics has no power beyond its own degrees.
         let l_max = solution.diagnostics.l_max;
         let comparison =
             self.truth.as_ref().map(|truth| compare(&map, truth, Some(&noise), l_max)).transpose()?;
@@ -78,7 +78,7 @@ impl ChannelFolder {
             self.write_map(&format!("snapshot-{:03}.fits", solution.number), &map, provenance, solution)?;
         }
         if self.config.pictures {
-            self.shown.take(&solution.map_k, &caption(solution));
+            self.shown.offer(&solution.map_k, &caption(solution));
             self.draw_snapshot(solution)?;
         }
         if solution.is_final {
@@ -91,7 +91,7 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// The figures, if a final map came.
+    /// The summary, if there was a final map.
     pub(super) fn into_summary(self) -> Option<ChannelSummary> {
         self.summary.map(|summary| ChannelSummary { files: self.files, ..summary })
     }
@@ -129,7 +129,7 @@ impl ChannelFolder {
         }
     }
 
-    /// A path in the channel's folder, noted as written.
+    /// A path in the channel's folder, recorded in the list of files.
     fn file(&mut self, name: &str) -> PathBuf {
         let relative = format!("{}/{name}", self.name);
         let path = self.root.join(&relative);
@@ -170,7 +170,7 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// The scale that map and input share: what the input fills, or the map itself without one.
+    /// The colour scale that map and input share: the range of the input, or of the map if there is no input.
     fn scale(&self, map_k: &[f64]) -> ColourScale {
         let reference = self.truth.as_ref().map_or(map_k, SkyMap::values);
         ColourScale::robust(reference, Scaling::Log, Palette::default())
@@ -186,7 +186,7 @@ impl ChannelFolder {
         let subtitle = format!("{} visibilities", solution.visibilities);
         let panel = self.panel(map, "", self.scale(map));
         let path = self.file(&format!("snapshot-{:03}.png", solution.number));
-        // Half the size of the final picture: there are many.
+        // Half the size of the final picture, because there are many.
         let sheet = Sheet { title, subtitle, width_px: 800, view: view(), ..Sheet::default() };
         Ok(draw_sheet(&[panel], &sheet)?.write(&path)?)
     }
@@ -218,7 +218,7 @@ impl ChannelFolder {
         self.draw_sheet(solution, scale)
     }
 
-    /// Maps on the way, side by side.
+    /// Draws the sheet of snapshots.
     fn draw_sheet(&mut self, last: &Solution, scale: ColourScale) -> Result<(), ProductsError> {
         let caption = caption(last);
         let shown = self.shown.spread((&last.map_k, &caption));
@@ -237,22 +237,22 @@ impl ChannelFolder {
     }
 }
 
-/// Maps on the way: the first, and every so many after it, as many as leave a choice for the sheet.
+/// A bounded selection of snapshots: the first, and every 2^n-th after it.
 #[derive(Default)]
 struct SheetMaps {
-    /// With their captions.
+    /// Maps with their captions.
     maps: Vec<(Vec<f64>, String)>,
-    /// Maps that came.
-    came: usize,
-    /// log2 of how many come for each one that is kept.
+    /// Number of maps offered so far.
+    offered: usize,
+    /// log2 of the number of maps offered per map kept.
     halvings: u32,
 }
 
 impl SheetMaps {
-    /// Keeps a map, or not.
-    fn take(&mut self, map: &[f64], caption: &str) {
-        let is_kept = |came: usize, halvings: u32| came.is_multiple_of(1 << halvings);
-        if is_kept(self.came, self.halvings) && self.maps.len() == 2 * SHEET_MAPS_MAX {
+    /// Offers a map; keeps it or not.
+    fn offer(&mut self, map: &[f64], caption: &str) {
+        let is_kept = |offered: usize, halvings: u32| offered.is_multiple_of(1 << halvings);
+        if is_kept(self.offered, self.halvings) && self.maps.len() == 2 * SHEET_MAPS_MAX {
             let mut is_odd = true;
             self.maps.retain(|_| {
                 is_odd = !is_odd;
@@ -260,15 +260,15 @@ impl SheetMaps {
             });
             self.halvings += 1;
         }
-        if is_kept(self.came, self.halvings) {
+        if is_kept(self.offered, self.halvings) {
             self.maps.push((map.to_vec(), caption.to_owned()));
         }
-        self.came += 1;
+        self.offered += 1;
     }
 
-    /// As many as the sheet takes, in equal steps from the first to `last`, which was taken last.
+    /// The maps for the sheet, in equal steps from the first to `last`, which was offered last.
     fn spread<'a>(&'a self, last: (&'a [f64], &'a str)) -> impl Iterator<Item = (&'a [f64], &'a str)> {
-        let is_last = |k: usize| (k << self.halvings) + 1 == self.came;
+        let is_last = |k: usize| (k << self.halvings) + 1 == self.offered;
         let others = (0..self.maps.len()).filter(|&k| !is_last(k)).count();
         let places = SHEET_MAPS_MAX.min(others + 1);
         (0..places).map(move |place| {
@@ -287,7 +287,7 @@ fn view() -> View {
     View { sampling: Sampling::Interpolated, ..View::default() }
 }
 
-/// rms of (map - truth) over rms of truth.
+/// RMS of (map - truth) divided by RMS of truth.
 fn rms_error_over_rms_truth(map: &[f64], truth: &[f64]) -> f64 {
     let difference: f64 = map.iter().zip(truth).map(|(m, t)| (m - t) * (m - t)).sum();
     let scale: f64 = truth.iter().map(|t| t * t).sum();
@@ -300,15 +300,15 @@ fn mean_rho(rho: &[f64], l_max: usize) -> f64 {
     range.iter().sum::<f64>() / range.len().max(1) as f64
 }
 
-/// (map - truth) / truth over the sky.
+/// Draws (map - truth) / truth over the sky.
 ///
 /// # Errors
-/// None but a page too large, which one map is not.
+/// None in practice: only a page that is too large, which one map is not.
 pub fn draw_relative_error(
     title: &str,
     subtitle: &str,
     comparison: &Comparison,
-) -> Result<crate::products::pictures::Picture, crate::products::pictures::PictureError> {
+) -> Result<Picture, PictureError> {
     let values = comparison.relative_error_map.values();
     let panel = MapPanel {
         values,
@@ -319,14 +319,11 @@ pub fn draw_relative_error(
     draw_map(&panel, subtitle, &view())
 }
 
-/// rho_l, the spectra and SNR_l as curves.
+/// Draws rho_l, the angular power spectra and SNR_l as curves.
 ///
 /// # Errors
-/// None but a page too large, which three plots are not.
-pub fn draw_comparison(
-    title: &str,
-    comparison: &Comparison,
-) -> Result<crate::products::pictures::Picture, crate::products::pictures::PictureError> {
+/// None in practice: only a page that is too large, which three plots are not.
+pub fn draw_comparison(title: &str, comparison: &Comparison) -> Result<Picture, PictureError> {
     let curve = |label: &str, values: &[f64], dashed: bool| Curve {
         label: label.to_owned(),
         points: comparison.l.iter().map(|&l| l as f64).zip(values.iter().copied()).collect(),
@@ -374,7 +371,7 @@ mod tests {
         for count in [1, 2, 5, 6, 7, 12, 13, 24, 25, 100, 471] {
             let mut shown = SheetMaps::default();
             for k in 0..count {
-                shown.take(&[k as f64], &k.to_string());
+                shown.offer(&[k as f64], &k.to_string());
                 assert!(shown.maps.len() <= 2 * SHEET_MAPS_MAX);
             }
             let last = count - 1;
@@ -387,7 +384,7 @@ mod tests {
             for (map, caption) in &sheet {
                 assert_eq!(&map.to_string(), caption);
             }
-            // Whole steps of what is kept, a twelfth to a sixth of all: from a half to twice of equal ones.
+            // Steps are whole multiples of the kept maps, a twelfth to a sixth of all: half to twice the equal step.
             let equal = last as f64 / (sheet.len().max(2) - 1) as f64;
             let steps = sheet.windows(2).map(|two| two[1].0 - two[0].0);
             assert!(

@@ -1,17 +1,17 @@
-//! What can be chosen about products.
+//! Configuration of products.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// What is written beside the final maps.
+/// The `[products]` section: what is written beside the final maps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ProductsConfig {
     /// Whether pictures are drawn.
     pub pictures: bool,
-    /// Whether every snapshot is written as a FITS map too.
+    /// Whether every snapshot is also written as a FITS map.
     pub snapshot_maps: bool,
-    /// FWHM to which the final map is smoothed after its pixels were split, degrees; 0 for none.
+    /// FWHM of the smoothed copy of the final map, which has four times its nside, degrees; 0 for none.
     pub smooth_fwhm_deg: f64,
 }
 
@@ -21,7 +21,7 @@ impl Default for ProductsConfig {
     }
 }
 
-/// A setting of the products that cannot be.
+/// An invalid setting of the products.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[error("products.{key} = {value}: expected {expected}")]
 pub struct ProductsConfigError {
@@ -34,7 +34,7 @@ pub struct ProductsConfigError {
 }
 
 impl ProductsConfig {
-    /// Everything that is wrong with the configuration; empty if it is good.
+    /// All problems of the section; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<ProductsConfigError> {
         let value = self.smooth_fwhm_deg;

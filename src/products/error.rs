@@ -1,4 +1,4 @@
-//! Why a product could not be made.
+//! Errors of products.
 
 use std::path::PathBuf;
 
@@ -16,24 +16,24 @@ pub enum ProductsError {
     Write {
         /// Path.
         path: PathBuf,
-        /// What the system said.
+        /// The system's reason.
         source: std::io::Error,
     },
-    /// Something that has no encoding.
+    /// Data that cannot be encoded.
     #[error("cannot encode {}: {reason}", path.display())]
     Encode {
         /// Path.
         path: PathBuf,
-        /// What the encoder said.
+        /// The encoder's reason.
         reason: String,
     },
-    /// A map.
+    /// An invalid map.
     #[error(transparent)]
     Map(#[from] MapError),
-    /// A picture.
+    /// A picture that cannot be drawn or written.
     #[error(transparent)]
     Picture(#[from] crate::products::pictures::PictureError),
-    /// A map file.
+    /// A map file that cannot be written.
     #[error(transparent)]
     Fits(#[from] FitsError),
 }

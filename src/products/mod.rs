@@ -1,6 +1,10 @@
-//! What a run leaves behind: maps, pictures, figures.
+//! The products of a run: maps, pictures, tables and summaries in an output folder.
 //!
-//! Uses [`crate::solve`] and [`crate::sky`].
+//! [`Publisher`] is the sink that writes every [`crate::solve::Solution`]; [`write_autos`] writes the
+//! auto-correlations. [`pictures`] draws.
+//!
+//! May use [`crate::solve`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give equal bytes, and
+//! every map carries its provenance: configuration hashes, seed, program version and data span.
 
 mod autos;
 mod channel;

@@ -1,18 +1,18 @@
-//! Where a product comes from.
+//! Provenance of the maps.
 
 use crate::frames::Instrument;
 use crate::sky::fits::Card;
 use crate::solve::Solution;
 
-/// What made the maps of a run.
+/// The ground segment's share of the provenance; the rest comes with each solution.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Provenance {
-    /// Hash of the ground's configuration.
+    /// Hash of the ground segment's configuration.
     pub ground_hash: u64,
 }
 
 impl Provenance {
-    /// Header cards of a map. They hold nothing that differs from run to run of the same data.
+    /// FITS header cards of a map. Runs on the same data give the same cards.
     #[must_use]
     pub fn cards(&self, solution: &Solution, what: &str) -> Vec<Card> {
         let Instrument { name, channels, seed, configuration_hash, epoch_tai_s, .. } =

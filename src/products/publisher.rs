@@ -1,4 +1,4 @@
-//! The sink of the ground segment: maps, pictures and figures in a folder.
+//! The sink of the ground segment: writes maps, pictures and summaries into a folder.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -14,7 +14,7 @@ use crate::runtime::{Sink, Units};
 use crate::solve::Solution;
 use crate::units::ChannelId;
 
-/// Writes what the solver makes, channel by channel.
+/// Writes the solver's solutions, channel by channel.
 pub struct Publisher {
     config: ProductsConfig,
     folder: PathBuf,
@@ -26,11 +26,11 @@ pub struct Publisher {
 }
 
 impl Publisher {
-    /// Publishes below `folder`, which is made if it is not there; leaves the figures of all channels in
-    /// `summaries` at the end.
+    /// A publisher to `folder`, which is created if necessary. At the end it stores the summaries of all channels in
+    /// `summaries`.
     ///
     /// # Errors
-    /// A folder that cannot be made.
+    /// A folder that cannot be created.
     pub fn new(
         config: ProductsConfig,
         folder: &Path,
@@ -65,8 +65,8 @@ impl Sink for Publisher {
 
     fn finish(&mut self) -> Result<(), ProductsError> {
         let channels = std::mem::take(&mut self.channels).into_values();
-        let figures: Vec<ChannelSummary> = channels.filter_map(ChannelFolder::into_summary).collect();
-        *self.summaries.lock().unwrap_or_else(PoisonError::into_inner) = figures;
+        let finished: Vec<ChannelSummary> = channels.filter_map(ChannelFolder::into_summary).collect();
+        *self.summaries.lock().unwrap_or_else(PoisonError::into_inner) = finished;
         Ok(())
     }
 

@@ -1,4 +1,4 @@
-//! A channel's maps in figures.
+//! Summary of a channel's maps.
 
 use std::fmt;
 
@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use crate::solve::Diagnostics;
 
-/// One map on the way.
+/// One snapshot.
 #[derive(Clone, Debug, Serialize)]
 pub struct SnapshotSummary {
     /// Number, from 1.
@@ -15,7 +15,7 @@ pub struct SnapshotSummary {
     pub until_s: f64,
     /// Visibilities in it.
     pub visibilities: u64,
-    /// rms of (map - truth) / rms of truth; absent without a truth.
+    /// RMS of (map - truth) / RMS of truth; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rms_error_over_rms_truth: Option<f64>,
     /// Mean of rho_l over 1 <= l <= 2 nside; absent without a truth.
@@ -23,7 +23,7 @@ pub struct SnapshotSummary {
     pub rho_mean: Option<f64>,
 }
 
-/// One channel: its maps and how good they are.
+/// One channel: its maps and their quality.
 #[derive(Clone, Debug, Serialize)]
 pub struct ChannelSummary {
     /// Frequency, Hz.
@@ -34,17 +34,17 @@ pub struct ChannelSummary {
     pub space_hash: String,
     /// nside of the maps.
     pub nside: usize,
-    /// Mission time of the first and the last data, s.
+    /// Mission times of the first and the last data, s.
     pub span_s: [f64; 2],
     /// Visibilities in the final map.
     pub visibilities: u64,
     /// Mean of the final map, K.
     pub mean_k: f64,
-    /// rms of the noise-only companion map, K.
+    /// RMS of the noise-only companion map, K.
     pub noise_rms_k: f64,
-    /// Regularisation, and how the final solution was found.
+    /// Regularisation and solver diagnostics of the final solution.
     pub diagnostics: Diagnostics,
-    /// Maps on the way and the final one.
+    /// The snapshots, including the final map.
     pub snapshots: Vec<SnapshotSummary>,
     /// rho_l of the final map, l = 0, 1, ..; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -11,7 +11,7 @@ fn through_a_socket_the_maps_are_those_of_a_file() {
         let simulate = ["simulate", place.pipeline(), "--format", format, "--out", &file];
         let said = succeed(&[&simulate[..], &["--send", &ground.url]].concat());
         let length = std::fs::metadata(&file).unwrap().len();
-        assert!(said.contains(&format!("took all {length} bytes")), "{said}");
+        assert!(said.contains(&format!("confirmed all {length} bytes")), "{said}");
         let heard = ground.succeed();
         let read = place.replay(&format!("{format}.read"), &file, &[]);
         assert!(place.maps(&format!("{format}.heard")) == place.maps(&format!("{format}.read")), "{format}");
@@ -193,7 +193,7 @@ fn a_sender_waits_for_the_ground_to_start_and_keeps_to_its_rate() {
         let sender = scope.spawn(|| succeed(&args));
         std::thread::sleep(Duration::from_millis(700));
         let ground = place.ground("heard", &["--listen", &url, "--connections", "1"]);
-        assert!(sender.join().unwrap().contains(&format!("took all {length} bytes")));
+        assert!(sender.join().unwrap().contains(&format!("confirmed all {length} bytes")));
         assert!(since.elapsed().as_secs_f64() >= 1.5);
         ground.succeed();
     });

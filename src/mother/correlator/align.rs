@@ -1,33 +1,33 @@
-//! The eight streams, side by side.
+//! Aligns the sample streams of all daughters and channels by block number.
 
 use std::collections::BTreeMap;
 
 use crate::frames::{ObservingWindow, SampleBlock};
 
-/// What was wrong with the blocks that came.
+/// Counters of what happened to the received blocks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct AlignerCounts {
-    /// Blocks that were used.
+    /// Blocks used.
     pub used: u64,
-    /// Blocks that did not come in time.
+    /// Blocks that did not arrive in time.
     pub missing: u64,
-    /// Blocks that came when others had gone on without them.
+    /// Blocks that arrived after their row had been released.
     pub late: u64,
-    /// Blocks that came again.
+    /// Duplicate blocks.
     pub duplicate: u64,
-    /// Blocks with a number, time tag, length or origin that cannot be.
+    /// Blocks with an invalid number, time tag, length or origin.
     pub malformed: u64,
-    /// Samples of the blocks that were used.
+    /// Samples of the used blocks.
     pub used_samples: u64,
-    /// Samples of late ones.
+    /// Samples of the late blocks.
     pub late_samples: u64,
-    /// Samples of malformed ones.
+    /// Samples of the malformed blocks.
     pub malformed_samples: u64,
 }
 
 impl AlignerCounts {
-    /// Adds what another has counted.
-    pub fn absorb(&mut self, other: Self) {
+    /// Adds the counters of another aligner.
+    pub fn add(&mut self, other: Self) {
         self.used += other.used;
         self.missing += other.missing;
         self.late += other.late;
@@ -39,14 +39,14 @@ impl AlignerCounts {
     }
 }
 
-/// Blocks of one number: those that came, channel by channel, a daughter after another.
+/// The blocks of one number, of all channels and daughters.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BlockRow {
     /// Number of the blocks.
     pub number: u64,
-    /// Samples of each.
+    /// Samples per block.
     pub samples: usize,
-    /// The blocks.
+    /// Blocks by channel, then by daughter; `None` if missing.
     pub blocks: Vec<Option<SampleBlock>>,
 }
 
@@ -57,24 +57,24 @@ pub struct StreamShape {
     pub daughters: usize,
     /// Number of channels.
     pub channels: usize,
-    /// Samples of a block, but for the last.
+    /// Samples per block, except the last one.
     pub block_samples: usize,
-    /// Width of a channel, Hz: the rate of samples.
+    /// Width of a channel, Hz, which is the sample rate.
     pub width_hz: f64,
-    /// Numbers that a block may be ahead of one that is waited for.
+    /// Number of blocks that may arrive beyond a missing one before it is given up.
     pub wait_blocks: u64,
 }
 
-/// Brings blocks of the same number together, in the order of numbers. Waits for what is missing until blocks
-/// come that are `wait_blocks` ahead; memory is bounded by that.
+/// Collects blocks of the same number into rows, and releases rows in the order of numbers. A row is released incomplete
+/// when a block arrives that is `wait_blocks` ahead of it, which bounds memory.
 #[derive(Debug)]
 pub struct Aligner {
     streams: StreamShape,
     window: ObservingWindow,
-    /// Samples of the window.
+    /// Number of samples in the window.
     samples: u64,
     next: u64,
-    waiting: BTreeMap<u64, PartialRow>,
+    pending: BTreeMap<u64, PartialRow>,
     counts: AlignerCounts,
 }
 
@@ -90,23 +90,23 @@ impl Aligner {
     pub fn new(streams: StreamShape, window: ObservingWindow) -> Self {
         let length_s = (window.end.0 - window.start.0) as f64 * 1e-6;
         let samples = (length_s * streams.width_hz).round().max(0.0) as u64;
-        let (waiting, counts) = (BTreeMap::new(), AlignerCounts::default());
-        Self { streams, window, samples, next: 0, waiting, counts }
+        let (pending, counts) = (BTreeMap::new(), AlignerCounts::default());
+        Self { streams, window, samples, next: 0, pending, counts }
     }
 
-    /// Samples of the window.
+    /// Number of samples in the window.
     #[must_use]
     pub fn samples(&self) -> u64 {
         self.samples
     }
 
-    /// What was wrong so far.
+    /// The counters so far.
     #[must_use]
     pub fn counts(&self) -> AlignerCounts {
         self.counts
     }
 
-    /// Takes a block; gives the rows that are now complete or no longer waited for.
+    /// Accepts a block; returns the rows that are now complete or given up.
     pub fn put(&mut self, block: SampleBlock) -> Vec<BlockRow> {
         let number = block.number;
         let (length, samples) = (self.length(number), block.samples.len() as u64);
@@ -121,30 +121,30 @@ impl Aligner {
             return Vec::new();
         }
         let mut rows = Vec::new();
-        // Far ahead: what came before is not waited for any longer.
+        // Far ahead: give up incomplete rows before it.
         while number >= self.next + self.streams.wait_blocks {
             rows.push(self.release());
         }
         let StreamShape { daughters, channels, .. } = self.streams;
-        let waiting = self
-            .waiting
+        let partial = self
+            .pending
             .entry(number)
             .or_insert_with(|| PartialRow::new(number, length, daughters * channels));
         let slot =
-            &mut waiting.row.blocks[usize::from(block.channel.0) * daughters + usize::from(block.daughter)];
+            &mut partial.row.blocks[usize::from(block.channel.0) * daughters + usize::from(block.daughter)];
         if slot.is_some() {
             self.counts.duplicate += 1;
             return rows;
         }
         *slot = Some(block);
-        waiting.present += 1;
-        while self.waiting.get(&self.next).is_some_and(|first| first.present == daughters * channels) {
+        partial.present += 1;
+        while self.pending.get(&self.next).is_some_and(|first| first.present == daughters * channels) {
             rows.push(self.release());
         }
         rows
     }
 
-    /// The rows up to `end_samples` of the window, after its last block.
+    /// Releases the remaining rows up to `end_samples` of the window.
     pub fn finish(&mut self, end_samples: u64) -> Vec<BlockRow> {
         let mut rows = Vec::new();
         while self.next * (self.streams.block_samples as u64) < end_samples.min(self.samples) {
@@ -158,14 +158,14 @@ impl Aligner {
         self.next += 1;
         let count = self.streams.daughters * self.streams.channels;
         let length = self.length(number);
-        let waiting = self.waiting.remove(&number).unwrap_or_else(|| PartialRow::new(number, length, count));
-        self.counts.used += waiting.present as u64;
-        self.counts.used_samples += (waiting.present * waiting.row.samples) as u64;
-        self.counts.missing += (count - waiting.present) as u64;
-        waiting.row
+        let partial = self.pending.remove(&number).unwrap_or_else(|| PartialRow::new(number, length, count));
+        self.counts.used += partial.present as u64;
+        self.counts.used_samples += (partial.present * partial.row.samples) as u64;
+        self.counts.missing += (count - partial.present) as u64;
+        partial.row
     }
 
-    /// Samples of a block; 0 beyond the window.
+    /// Number of samples of a block; 0 beyond the window.
     fn length(&self, number: u64) -> usize {
         let whole = self.streams.block_samples as u64;
         let first = number.saturating_mul(whole);
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn blocks_come_together_in_any_order() {
+    fn blocks_are_aligned_in_any_order() {
         let mut aligner = aligner();
         assert!(aligner.put(block(0, 0)).is_empty());
         assert!(aligner.put(block(1, 1)).is_empty());
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_late_again_or_wrong_is_counted_and_not_guessed() {
+    fn missing_late_duplicate_and_malformed_blocks_are_counted_and_not_guessed() {
         let mut aligner = aligner();
         assert!(aligner.put(block(0, 0)).is_empty());
         assert!(aligner.put(block(0, 0)).is_empty());

@@ -1,4 +1,4 @@
-//! Powers of the daughters by themselves: what carries the sky's mean.
+//! Integrates auto-correlations, which carry the sky's mean.
 
 use num_complex::Complex32;
 
@@ -7,24 +7,24 @@ use super::kernel::LANES;
 use crate::frames::{Flags, ObservingWindow, VisibilityBlock};
 use crate::units::{ChannelId, Pair};
 
-/// Powers of one daughter and channel that are held before they are handed on.
+/// Auto-correlations per block of one daughter and channel.
 const HELD_MAX: usize = 256;
 
-/// What a row of blocks says of powers, by daughter and lane.
+/// The powers of a row of blocks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RowPowers {
-    /// ProductSums of |x|^2, K sr, and the number of samples in them.
+    /// By daughter and lane: sum of |x|^2, K sr, and number of samples.
     pub sums: Vec<[(f64, u64); LANES]>,
-    /// Samples that there should have been.
+    /// Expected number of samples.
     pub samples: u64,
-    /// Whether too many of them were out of range.
+    /// By daughter and lane: whether too many samples were out of range.
     pub saturated: Vec<[bool; LANES]>,
 }
 
-/// Integrates powers of up to `LANES` channels over whole rows.
+/// Integrates the auto-correlations of up to `LANES` channels over whole rows.
 ///
-/// A power comes out as the visibility of a daughter with herself: the mean of |x|^2, which for Gaussian samples has
-/// the variance P^2 / n, and so the weight n / P^2.
+/// An auto-correlation is sent as the visibility of a daughter with itself: the mean of |x|^2, which for Gaussian samples
+/// has the variance P^2 / n, and so the weight n / P^2.
 pub struct AutoIntegrator {
     first_channel: usize,
     lanes: usize,
@@ -38,8 +38,7 @@ pub struct AutoIntegrator {
 }
 
 impl AutoIntegrator {
-    /// An integrator of `lanes` channels from `first_channel` on, of `daughters`, over `duration_s` or a row, whichever is
-    /// longer.
+    /// An integrator of `lanes` channels from `first_channel` on, over `duration_s` or one row, whichever is longer.
     #[must_use]
     pub fn new(
         (first_channel, lanes): (usize, usize),
@@ -60,7 +59,7 @@ impl AutoIntegrator {
         }
     }
 
-    /// Adds a row that ends at `until_ticks` of the window.
+    /// Adds a row that ends `until_ticks` after the window's start.
     pub fn add(&mut self, row: &RowPowers, until_ticks: u32, out: &mut Vec<VisibilityBlock>) {
         self.samples += row.samples;
         for (daughter, (sums, saturated)) in row.sums.iter().zip(&row.saturated).enumerate() {
@@ -71,7 +70,7 @@ impl AutoIntegrator {
                 self.saturated[daughter][lane] |= saturated[lane];
             }
         }
-        // A row like this one that would end too late begins the next integration.
+        // If one more such row would exceed the integration time, it begins the next integration.
         let elapsed = f64::from(until_ticks.saturating_sub(self.from_ticks));
         let one_more = elapsed * row.samples as f64 / self.samples.max(1) as f64;
         if elapsed + one_more > f64::from(self.duration_ticks) {
@@ -79,7 +78,7 @@ impl AutoIntegrator {
         }
     }
 
-    /// Ends all integrations where they are, and hands on what is held.
+    /// Ends all integrations and emits all blocks held.
     pub fn finish(&mut self, until_ticks: u32, out: &mut Vec<VisibilityBlock>) {
         if self.samples > 0 {
             self.close(until_ticks, out);
@@ -95,7 +94,7 @@ impl AutoIntegrator {
                 let saturated = std::mem::take(&mut self.saturated[daughter][lane]);
                 let power = sum / count as f64;
                 let weight = (count as f64 / (power * power)) as f32;
-                // Of silence, or of nothing that came, nothing is told.
+                // Without samples or without power there is nothing to send.
                 if !(weight.is_finite() && weight > 0.0) {
                     continue;
                 }

@@ -1,20 +1,20 @@
-//! Products of quantised samples in whole numbers, 16 channels at a time.
+//! Products of quantised samples in integer arithmetic, 16 channels at a time.
 //!
-//! A code `c` stands for `(2 c + 1)` halves of a step. The two parts of a sample lie side by side, so that one
-//! multiply-add of pairs gives `re re' + im im'` of eight channels, and with the parts of one daughter exchanged
-//! (`im`, `-re`) the imaginary part `im re' - re im'` of `x conj(x')`. Levels are below 2^8, their products below
-//! 2^16: the sums of the two products of each of `SLICE` = 2^4 samples are below 2^21 and exact, also in `f32`.
+//! A code `c` represents the level `(2 c + 1)` in units of half a step. The two parts of a sample are adjacent, so that
+//! one pairwise multiply-add gives `re re' + im im'` of eight channels, and, with the parts of one daughter exchanged
+//! (`im`, `-re`), the imaginary part `im re' - re im'` of `x conj(x')`. Levels are below 2^8 and their products below
+//! 2^16, so sums of two products over `SLICE` = 2^4 samples are below 2^21 and exact, even in `f32`.
 
 use pulp::Arch;
 
 use super::kernel::{LANES, ProductSums, SLICE, product};
 
-/// Parts of eight channels: real, imaginary, and so on.
+/// Parts of eight channels, real and imaginary alternating.
 type Half = [i16; 16];
-/// Channels of a half.
+/// Channels in a half register.
 const EIGHT: usize = LANES / 2;
 
-/// A sample of one daughter: both halves, and both with parts exchanged.
+/// A sample of one daughter: both halves of the channels, and both with the parts exchanged.
 #[derive(Clone, Copy, Debug)]
 struct Sample {
     plain: [Half; 2],
@@ -25,31 +25,31 @@ impl Sample {
     const SILENCE: Self = Self { plain: [[0; 16]; 2], turned: [[0; 16]; 2] };
 }
 
-/// A slice of levels of all daughters in the kernel's order: sample, daughter.
+/// A slice of levels of all daughters in the kernel's order: by sample, then by daughter.
 #[derive(Clone, Debug)]
 pub struct Levels {
     daughters: usize,
     data: Vec<Sample>,
-    /// By daughter: half a step of each channel, sqrt(K sr).
+    /// By daughter: half the step of each channel, sqrt(K sr).
     half_steps: Vec<[f32; LANES]>,
 }
 
-/// Codes of one daughter: by channel, a slice of real parts and one of imaginary parts.
+/// A slice of codes of one daughter.
 #[derive(Clone, Copy, Debug)]
 pub struct Codes {
-    /// Parts, by channel.
+    /// Codes by part (real, imaginary), then by channel.
     pub parts: [[[i8; SLICE]; LANES]; 2],
-    /// Distance of levels by channel; 0 where there are no samples, and codes must be 0.
+    /// Step between levels by channel; 0 where samples are missing, and then the codes must be 0.
     pub steps: [f32; LANES],
 }
 
 impl Codes {
-    /// No samples at all.
+    /// No samples.
     pub const NONE: Self = Self { parts: [[[0; SLICE]; LANES]; 2], steps: [0.0; LANES] };
 }
 
 impl Levels {
-    /// Room for `daughters`, without samples.
+    /// Memory for `daughters`, without samples.
     #[must_use]
     pub fn new(daughters: usize) -> Self {
         let daughters = daughters.next_multiple_of(2);
@@ -60,7 +60,7 @@ impl Levels {
         }
     }
 
-    /// Puts the samples of one daughter into their lanes.
+    /// Unpacks the samples of one daughter into their lanes.
     ///
     /// # Panics
     /// If there is no such daughter.
@@ -111,7 +111,7 @@ impl Levels {
         }
     }
 
-    /// Two daughters by two others.
+    /// Products of two daughters with two others.
     #[inline(always)]
     fn tile<M: PairMultiply>(&self, machine: M, [i, j, half]: [usize; 3], sums: &mut ProductSums) {
         let mut own = [[machine.zero(); 2]; 4];
@@ -128,7 +128,7 @@ impl Levels {
         }
     }
 
-    /// Two daughters by themselves.
+    /// Products of two daughters with each other and with themselves.
     #[inline(always)]
     fn diagonal<M: PairMultiply>(&self, machine: M, [j, half]: [usize; 2], sums: &mut ProductSums) {
         let mut own = [machine.zero(); 4];
@@ -144,7 +144,7 @@ impl Levels {
         self.hand_over(machine, [j + 1, j + 1, half], [own[3], machine.zero()], sums);
     }
 
-    /// Adds a product's sums in steps of both daughters.
+    /// Scales the sums of a product by the steps of both daughters and adds them.
     #[inline(always)]
     fn hand_over<M: PairMultiply>(
         &self,
@@ -160,18 +160,18 @@ impl Levels {
     }
 }
 
-/// Multiply-adds of pairs.
+/// Pairwise multiply-adds of one instruction set.
 trait PairMultiply: Copy {
-    /// ProductSums of eight channels.
+    /// Running sums of eight channels.
     type Output: Copy;
     fn zero(self) -> Self::Output;
-    /// Adds the products of both parts.
+    /// Adds the products of adjacent parts.
     fn add(self, a: &Half, b: &Half, sum: Self::Output) -> Self::Output;
     /// `out += sum x steps`.
     fn hand_over(self, sum: Self::Output, steps: [&[f32; EIGHT]; 2], out: &mut [f32; EIGHT]);
 }
 
-/// Any machine.
+/// The portable version.
 mod plain {
     use super::{Codes, EIGHT, Half, LANES, PairMultiply, Sample};
 
@@ -216,7 +216,7 @@ mod plain {
     }
 }
 
-/// x86 with AVX2; where there is more, this is still what is used.
+/// The version for x86 with AVX2; machines with AVX-512 use it too.
 #[cfg(target_arch = "x86_64")]
 mod x86 {
     use std::arch::x86_64::__m256i;
@@ -226,13 +226,13 @@ mod x86 {
 
     use super::{Codes, EIGHT, Half, LANES, PairMultiply, SLICE, Sample};
 
-    /// Channels in the order in which unpacking leaves them in theirs: the first eight in the lower half of a register.
+    /// Order of channels that unpacking turns into ascending order: the first eight end up in the lower half of a register.
     const ORDER: [usize; LANES] = [0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15];
 
     #[inline(always)]
     pub(super) fn put(simd: V3, codes: &Codes, rows: &mut [Sample], stride: usize) {
         let avx2 = simd.avx2;
-        // Lower byte of a level before it is shifted: a half, where there are samples.
+        // Lower byte of a level before the shift: one half, where there are samples.
         let mut there = [[0_i8; 2]; LANES];
         for (there, lane) in there.iter_mut().zip(ORDER) {
             *there = [if codes.steps[lane] > 0.0 { i8::MIN } else { 0 }; 2];
@@ -240,7 +240,7 @@ mod x86 {
         let there: __m256i = cast(there);
         let exchange: __m256i = cast(EXCHANGE);
         let sign: __m256i = cast(SIGN);
-        // Parts side by side; samples of eight channels in each half of a register.
+        // Interleave the parts; each half of a register holds samples of eight channels.
         let [mut early, mut late] = [[cast::<[i8; 32], __m256i>([0; 32]); EIGHT]; 2];
         for k in 0..EIGHT {
             let pair = |part: usize| -> __m256i {
@@ -251,7 +251,7 @@ mod x86 {
             late[k] = avx2._mm256_unpackhi_epi8(re, im);
         }
         for (first, channels) in [(0, early), (SLICE / 2, late)] {
-            let samples = turn(simd, channels);
+            let samples = transpose(simd, channels);
             for (k, sample) in samples.into_iter().enumerate() {
                 let row = &mut rows[(first + k) * stride];
                 let halves =
@@ -267,7 +267,7 @@ mod x86 {
         }
     }
 
-    /// Exchanges neighbouring words.
+    /// Byte shuffle that exchanges adjacent 16-bit words.
     const EXCHANGE: [i8; 32] = {
         let mut bytes = [0; 32];
         let mut k = 0;
@@ -278,12 +278,12 @@ mod x86 {
         bytes
     };
 
-    /// Plus and minus.
+    /// Alternating signs.
     const SIGN: Half = [1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1];
 
-    /// Turns channels of eight samples into samples of eight channels, words in each half of registers.
+    /// Transposes eight channels of samples into eight samples of channels, within each half of the registers.
     #[inline(always)]
-    fn turn(simd: V3, a: [__m256i; EIGHT]) -> [__m256i; EIGHT] {
+    fn transpose(simd: V3, a: [__m256i; EIGHT]) -> [__m256i; EIGHT] {
         let avx2 = simd.avx2;
         let words = |x, y| [avx2._mm256_unpacklo_epi16(x, y), avx2._mm256_unpackhi_epi16(x, y)];
         let doubles = |x, y| [avx2._mm256_unpacklo_epi32(x, y), avx2._mm256_unpackhi_epi32(x, y)];
@@ -329,7 +329,7 @@ mod tests {
     use super::*;
     use crate::mother::correlator::kernel::no_sums;
 
-    /// All codes there are, but for one channel of daughter 1.
+    /// All codes; one channel of daughter 1 is missing.
     fn codes(daughter: usize) -> Codes {
         let mut codes = Codes::NONE;
         for lane in (0..LANES).filter(|lane| (daughter, *lane) != (1, 3)) {

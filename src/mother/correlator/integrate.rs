@@ -1,4 +1,4 @@
-//! From short dumps to integrations as long as each baseline allows.
+//! Integrates short dumps for as long as the motion of each baseline allows.
 
 use num_complex::Complex32;
 
@@ -10,29 +10,29 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, scale, sub};
 use crate::units::{ChannelId, Pair, TICKS_PER_SECOND, all_pairs};
 
-/// Visibilities of one pair and channel that are held before they are handed on, once powers are settled.
+/// Visibilities per block of one pair and channel, once the powers are known.
 const HELD_MAX: usize = 2048;
 
-/// Weight of a visibility without samples, which is flagged: the downlink takes none that is not positive.
+/// Weight of a visibility without samples, which is flagged: the downlink accepts positive weights only.
 const NO_WEIGHT: f32 = f32::MIN_POSITIVE;
 
 /// An integration with a smaller fraction of its samples is flagged as incomplete: its effective middle may then be off
 /// by a twentieth of its length, 2 degrees of fringe.
 pub(super) const COMPLETE_MIN: f64 = 0.9;
 
-/// How dumps become integrations.
+/// How dumps are combined into integrations.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DumpRule {
-    /// Samples of a dump, in each sub-band where there are such.
+    /// Samples per dump; with sub-bands, per sub-band.
     pub dump_samples: usize,
-    /// Width of a channel or sub-band, Hz: the rate of samples.
+    /// Width of a channel or sub-band, Hz, which is the sample rate.
     pub width_hz: f64,
-    /// An integration with a smaller part of its samples is flagged as incomplete.
+    /// An integration with a smaller fraction of its samples is flagged as incomplete.
     pub complete_min: f64,
 }
 
 impl DumpRule {
-    /// Whole dumps that fit into the integration time, at least one.
+    /// Number of whole dumps in the integration time, at least one.
     #[must_use]
     pub fn dumps(&self, dt_s: f64) -> u64 {
         ((dt_s * self.width_hz / self.dump_samples as f64) as u64).max(1)
@@ -43,12 +43,12 @@ impl DumpRule {
     }
 }
 
-/// What the daughters of one group of channels sent of a dump.
+/// Which samples of a dump arrived, for one group of channels.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Presence {
-    /// By product and lane: samples of the dump that both daughters sent.
-    pub there: Vec<[u32; LANES]>,
-    /// By daughter and lane: whether too many of them were out of range.
+    /// By product and lane: number of samples that arrived from both daughters.
+    pub common: Vec<[u32; LANES]>,
+    /// By daughter and lane: whether too many samples were out of range.
     pub saturated: Vec<[bool; LANES]>,
 }
 
@@ -58,23 +58,23 @@ pub struct GroupIntegrator {
     schedules: Vec<Schedule>,
     rule: DumpRule,
     window: ObservingWindow,
-    /// Dumps of the window.
+    /// Number of dumps in the window.
     dumps: u64,
     now: u64,
     pairs: Vec<PairLanes>,
-    /// Whether powers are known; until then weights stand for powers of one, and all visibilities are held.
-    settled: bool,
+    /// Whether the powers are known; until then weights assume unit powers, and all visibilities are held.
+    powers_known: bool,
 }
 
-/// One pair in all channels of a group.
+/// The integrations of one pair in all channels of a group.
 struct PairLanes {
     pair: Pair,
     re: [f64; LANES],
     im: [f64; LANES],
     used: [u32; LANES],
-    /// Dump in which the integration ends.
+    /// Dump at which the integration ends, by lane.
     until: [u64; LANES],
-    /// The earliest of them.
+    /// The earliest end.
     due: u64,
     from: [u64; LANES],
     number: [u64; LANES],
@@ -84,7 +84,7 @@ struct PairLanes {
 }
 
 impl GroupIntegrator {
-    /// Integrators of the channels from `first_channel` on, one a schedule, over `dumps` dumps of a window.
+    /// Integrators of the channels from `first_channel` on, one per schedule, over `dumps` dumps of a window.
     #[must_use]
     pub fn new(
         first_channel: usize,
@@ -95,7 +95,8 @@ impl GroupIntegrator {
     ) -> Self {
         let pairs = all_pairs(array.satellites()).into_iter().map(PairLanes::new).collect();
         let schedules = schedules[..schedules.len().min(LANES)].to_vec();
-        let mut own = Self { first_channel, schedules, rule, window, dumps, now: 0, pairs, settled: false };
+        let mut own =
+            Self { first_channel, schedules, rule, window, dumps, now: 0, pairs, powers_known: false };
         for at in 0..own.pairs.len() {
             for lane in 0..own.schedules.len() {
                 own.pairs[at].number[lane] = window.index / own.schedules[lane].every_nth_window.max(1);
@@ -105,10 +106,10 @@ impl GroupIntegrator {
         own
     }
 
-    /// Says that `powers`, of daughters by lane, K sr, are now good enough to weigh products by; what is held gets its
-    /// weights.
-    pub fn settle(&mut self, powers: &[[f64; LANES]]) {
-        if std::mem::replace(&mut self.settled, true) {
+    /// Declares that `powers` (by daughter and lane, K sr) are accurate enough for weights, and weights the visibilities
+    /// held so far.
+    pub fn set_powers_known(&mut self, powers: &[[f64; LANES]]) {
+        if std::mem::replace(&mut self.powers_known, true) {
             return;
         }
         for own in &mut self.pairs {
@@ -121,7 +122,7 @@ impl GroupIntegrator {
         }
     }
 
-    /// Adds a dump; `powers` are those of daughters by lane, K sr, by which products are weighted once they are settled.
+    /// Adds a dump; `powers` (by daughter and lane, K sr) weight the visibilities once they are known.
     pub fn add(
         &mut self,
         sums: &ProductSums,
@@ -135,7 +136,7 @@ impl GroupIntegrator {
             let pair = &mut self.pairs[at];
             let (i, j) = (usize::from(pair.pair.i), usize::from(pair.pair.j));
             let [re, im] = &sums[product(i, j)];
-            let both = &presence.there[product(i, j)];
+            let both = &presence.common[product(i, j)];
             for lane in 0..LANES {
                 pair.re[lane] += f64::from(re[lane]);
                 pair.im[lane] += f64::from(im[lane]);
@@ -153,7 +154,7 @@ impl GroupIntegrator {
         }
     }
 
-    /// Ends all integrations where they are, and hands on what is held.
+    /// Ends all integrations and emits all blocks held.
     pub fn finish(&mut self, powers: &[[f64; LANES]], out: &mut Vec<VisibilityBlock>) {
         for lane in 0..self.schedules.len() {
             for at in 0..self.pairs.len() {
@@ -162,7 +163,7 @@ impl GroupIntegrator {
                 }
             }
         }
-        self.settle(powers);
+        self.set_powers_known(powers);
         for lane in 0..self.schedules.len() {
             for at in 0..self.pairs.len() {
                 let held = std::mem::take(&mut self.pairs[at].held[lane]);
@@ -173,7 +174,7 @@ impl GroupIntegrator {
         }
     }
 
-    /// Begins an integration at the dump that comes.
+    /// Begins an integration at the next dump.
     fn open(&mut self, at: usize, lane: usize, array: &Array) {
         let (now, schedule) = (self.now, self.schedules[lane]);
         let t_s = self.window.start.plus_ticks(i64::from(self.rule.ticks(now))).seconds();
@@ -207,7 +208,7 @@ impl GroupIntegrator {
         if own.saturated[lane] {
             flags.0 |= Flags::SATURATED.0;
         }
-        let power = if self.settled { power_of(own.pair, powers, lane) } else { 1.0 };
+        let power = if self.powers_known { power_of(own.pair, powers, lane) } else { 1.0 };
         let mean = |sum: f64| if used > 0.0 { (sum / used) as f32 } else { 0.0 };
         block.offset_ticks.push(rule.ticks(from));
         block.duration_ticks.push(rule.ticks(self.now) - rule.ticks(from));
@@ -215,7 +216,7 @@ impl GroupIntegrator {
         // Variance of the mean of products of independent samples, in one part: P_i P_j / (2 n).
         block.weight.push(weight_of(2.0 * used / power));
         block.flags.push(flags);
-        if self.settled && block.len() >= HELD_MAX {
+        if self.powers_known && block.len() >= HELD_MAX {
             out.push(std::mem::take(block));
         }
     }
@@ -226,7 +227,7 @@ fn power_of(pair: Pair, powers: &[[f64; LANES]], lane: usize) -> f64 {
     powers[usize::from(pair.i)][lane] * powers[usize::from(pair.j)][lane]
 }
 
-/// A weight as it goes down.
+/// A weight for the downlink: finite and positive.
 fn weight_of(weight: f64) -> f32 {
     let weight = weight as f32;
     if weight.is_finite() { weight.max(NO_WEIGHT) } else { NO_WEIGHT }
@@ -250,11 +251,11 @@ impl PairLanes {
     }
 }
 
-/// The shortest integration of any pair that is correlated, in any channel, s.
+/// The shortest integration of any correlated pair in any channel, s.
 #[must_use]
 pub fn shortest_integration_s(array: &Array, schedules: &[Schedule]) -> f64 {
     let last = array.satellites() - 1;
-    // Breathing changes lengths: the longest chord is that of a period's start. Speeds go with chords.
+    // Chords are longest at the start of a breathing period, and speeds are proportional to chords.
     let (first, last) = (array.state(0, 0.0), array.state(last, 0.0));
     let chord_m = norm(sub(first.position_m, last.position_m));
     let shortest_s = |schedule: &Schedule| {
@@ -265,7 +266,7 @@ pub fn shortest_integration_s(array: &Array, schedules: &[Schedule]) -> f64 {
     schedules.iter().map(shortest_s).fold(f64::INFINITY, f64::min)
 }
 
-/// Length of the longest baseline that a schedule lets pass, m.
+/// Longest baseline of a schedule, m.
 fn longest_m(schedule: &Schedule) -> f64 {
     match schedule.baseline_wavelengths_max {
         0.0 => f64::INFINITY,
@@ -273,9 +274,8 @@ fn longest_m(schedule: &Schedule) -> f64 {
     }
 }
 
-/// Samples of a dump that is short against the shortest integration of any channel: an eighth of it or less,
-/// but no less than a slice, so that rounding to dumps shortens integrations by an eighth at most; and no less than one
-/// of each sub-band.
+/// Samples per dump: at most an eighth of the shortest integration of any channel, so that rounding to whole dumps
+/// shortens integrations by an eighth at most, but at least one slice and one sample per sub-band.
 #[must_use]
 pub fn dump_samples(array: &Array, schedules: &[Schedule], rate_hz: f64, sub_bands: usize) -> usize {
     let most = (shortest_integration_s(array, schedules) * rate_hz / 8.0) as usize;
@@ -283,5 +283,5 @@ pub fn dump_samples(array: &Array, schedules: &[Schedule], rate_hz: f64, sub_ban
     samples.unwrap_or(crate::mother::correlator::kernel::SLICE).max(sub_bands)
 }
 
-/// Seconds of the longest time that offsets in ticks can tell apart in a window.
+/// Longest window whose offsets fit their ticks, s.
 pub(super) const WINDOW_S_MAX: f64 = u32::MAX as f64 / TICKS_PER_SECOND as f64;

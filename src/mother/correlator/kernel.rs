@@ -1,9 +1,8 @@
-//! Products of all daughters, 16 channels at a time: the hot loop of the mission.
+//! Products of all pairs of daughters, 16 channels at a time: the hot loop of the mission.
 //!
-//! Codes are multiplied in whole numbers (`integers.rs`), which is twice as fast; what is not quantised, here. A
-//! lane of a register is a channel, so nothing is ever summed across lanes. Samples are packed in slices of
-//! `SLICE` that stay in the first-level cache, and each tile of two daughters by two keeps its sums in
-//! registers.
+//! Codes are multiplied as integers (`integers.rs`), which is twice as fast; floats are multiplied here. A lane of a
+//! register is a channel, so nothing is ever summed across lanes. Samples are packed in slices of `SLICE` that stay in
+//! the first-level cache, and each tile of two daughters by two keeps its sums in registers.
 
 use multiversion::multiversion;
 use pulp::{Arch, Simd, WithSimd};
@@ -11,36 +10,36 @@ use pulp::{Arch, Simd, WithSimd};
 use super::integers::{Codes, Levels};
 use crate::frames::Samples;
 
-/// Channels that are worked on together.
+/// Channels that are processed together.
 pub const LANES: usize = 16;
-/// Samples of a slice: 16 kB for eight daughters.
+/// Samples per slice: 16 kB for eight daughters.
 pub const SLICE: usize = 16;
 
-/// Planes of a group: two daughters' real and imaginary parts.
+/// Planes per group: real and imaginary parts of two daughters.
 const PLANES: usize = 4;
 
-/// Place of the product of daughters `i <= j`.
+/// Index of the product of daughters `i <= j`.
 #[must_use]
 pub fn product(i: usize, j: usize) -> usize {
     j * (j + 1) / 2 + i
 }
 
-/// A slice of samples of all daughters in the kernel's order: sample, daughter, part, channel.
+/// A slice of samples of all daughters in the kernel's order: by sample, daughter, part, channel.
 #[derive(Clone, Debug)]
 pub struct Packed {
     arch: Arch,
     /// Groups of two daughters.
     groups: usize,
-    /// What is not quantised, and the values of what is, once anything came that is not.
+    /// Values of all samples, filled once any of them is a float.
     data: Vec<f32>,
     levels: Levels,
-    /// The latest codes of each daughter, from which values can be made.
+    /// The latest codes of each daughter, from which values can be computed.
     codes: Vec<Codes>,
     quantised: bool,
 }
 
 impl Packed {
-    /// Room for `daughters`, filled with zeros.
+    /// Memory for `daughters`, filled with zeros.
     #[must_use]
     pub fn new(daughters: usize) -> Self {
         let groups = daughters.div_ceil(2);
@@ -54,8 +53,8 @@ impl Packed {
         }
     }
 
-    /// Puts `SLICE` samples of one daughter from `first` on into their lanes, a block a channel; zeros for those
-    /// that are not there.
+    /// Packs `SLICE` samples of one daughter, starting at `first`, into their lanes: one block per channel, zeros for
+    /// missing blocks.
     ///
     /// # Panics
     /// If a block has no such samples, or there is no such daughter or lane.
@@ -92,7 +91,7 @@ impl Packed {
             }
         }
         if self.quantised {
-            // From now on everything is a value; so is what came before in this slice.
+            // From now on all samples are packed as values, including those of this slice packed before.
             self.quantised = false;
             for other in (0..self.codes.len()).filter(|&other| other != daughter) {
                 self.put_values(other, [[0.0; SLICE * LANES]; 2]);
@@ -101,17 +100,17 @@ impl Packed {
         self.put_values(daughter, planes);
     }
 
-    /// Puts the values of codes and others into their lanes, those of a channel side by side.
+    /// Packs the values of codes and of floats (`planes`, by channel) into their lanes.
     fn put_values(&mut self, daughter: usize, mut planes: [[f32; SLICE * LANES]; 2]) {
         let codes = &self.codes[daughter];
-        // Of what is not quantised, levels add nothing.
+        // The step of floats is 0, so levels add nothing to them.
         let mut steps = [0.0; SLICE * LANES];
         for (steps, step) in steps.chunks_exact_mut(SLICE).zip(codes.steps) {
             steps.fill(step);
         }
         for (plane, codes) in planes.iter_mut().zip(&codes.parts) {
             let codes = codes.as_flattened();
-            turn(plane, codes.first_chunk().unwrap_or(&[0; SLICE * LANES]), &steps);
+            add_and_transpose(plane, codes.first_chunk().unwrap_or(&[0; SLICE * LANES]), &steps);
         }
         let [re, im] = &planes;
         let [re, im] = [re.as_chunks::<LANES>().0, im.as_chunks::<LANES>().0];
@@ -122,17 +121,15 @@ impl Packed {
             sample[at + LANES..at + 2 * LANES].copy_from_slice(im);
         }
     }
-
-    /// Multiply-adds of one slice that products ask for: 4 for each of two daughters, 2 for each of its own.
-    #[must_use]
-    pub fn multiply_adds(daughters: usize) -> usize {
-        (daughters * (daughters - 1) / 2 * 4 + daughters * 2) * SLICE * LANES
-    }
 }
 
-/// Adds the levels of codes to rows of samples, a lane each, and turns rows into columns.
+/// Adds the levels of codes to rows of samples, one row per lane, and transposes the matrix.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq", "x86_64+avx2", "aarch64+neon"))]
-fn turn(matrix: &mut [f32; SLICE * LANES], codes: &[i8; SLICE * LANES], steps: &[f32; SLICE * LANES]) {
+fn add_and_transpose(
+    matrix: &mut [f32; SLICE * LANES],
+    codes: &[i8; SLICE * LANES],
+    steps: &[f32; SLICE * LANES],
+) {
     for ((value, code), step) in matrix.iter_mut().zip(codes).zip(steps) {
         *value += (f32::from(*code) + 0.5) * step;
     }
@@ -143,7 +140,7 @@ fn turn(matrix: &mut [f32; SLICE * LANES], codes: &[i8; SLICE * LANES], steps: &
     weave(&other, matrix);
 }
 
-/// Puts the elements of one half between those of the other; four times that is a transposition.
+/// Interleaves the two halves; four times that is a transposition.
 #[inline(always)]
 fn weave(from: &[f32; SLICE * LANES], to: &mut [f32; SLICE * LANES]) {
     const HALF: usize = SLICE * LANES / 2;
@@ -153,10 +150,10 @@ fn weave(from: &[f32; SLICE * LANES], to: &mut [f32; SLICE * LANES]) {
     }
 }
 
-/// ProductSums over a dump: by product, real and imaginary parts of `x_i conj(x_j)`, a value a channel.
+/// Sums over a dump: by product, real and imaginary parts of `x_i conj(x_j)`, one value per channel.
 pub type ProductSums = Vec<[[f32; LANES]; 2]>;
 
-/// ProductSums of zero for `daughters`, an odd number of them filled up.
+/// Zero sums for `daughters`, rounded up to an even number.
 #[must_use]
 pub fn no_sums(daughters: usize) -> ProductSums {
     let even = daughters.next_multiple_of(2);
@@ -190,7 +187,7 @@ impl WithSimd for Correlate<'_> {
     }
 }
 
-/// `PARTS` registers hold the channels.
+/// Runs the kernel; `PARTS` registers hold the channels.
 #[inline(always)]
 fn run<S: Simd, const PARTS: usize>(simd: S, work: Correlate<'_>) {
     let groups = work.packed.groups;
@@ -235,7 +232,7 @@ fn load<S: Simd, const PARTS: usize>(sample: &[S::f32s], group: usize, part: usi
     [[group[part], group[PARTS + part]], [group[2 * PARTS + part], group[3 * PARTS + part]]]
 }
 
-/// Two daughters by two others.
+/// Products of two daughters with two others.
 #[inline(always)]
 fn tile<S: Simd, const PARTS: usize>(
     simd: S,
@@ -257,7 +254,7 @@ fn tile<S: Simd, const PARTS: usize>(
     }
 }
 
-/// Two daughters by themselves.
+/// Products of two daughters with each other and with themselves.
 #[inline(always)]
 fn diagonal<S: Simd, const PARTS: usize>(
     simd: S,
@@ -287,7 +284,7 @@ fn diagonal<S: Simd, const PARTS: usize>(
 mod tests {
     use super::*;
 
-    /// Small whole numbers, so that sums are exact; those of one daughter may not be codes.
+    /// Small integers, so that sums are exact; those of one daughter may be floats.
     fn samples(daughter: usize, lane: usize, float: Option<usize>) -> Samples {
         match codes(daughter, lane) {
             Samples::Codes { step, re, im, .. } if float == Some(daughter) => {

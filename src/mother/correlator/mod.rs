@@ -1,9 +1,9 @@
-//! The mother's correlator: eight streams of samples to integrated visibilities.
+//! The mother's correlator: sample streams of all daughters in, integrated visibilities out.
 //!
-//! Blocks of the same number are brought together ([`Aligner`]), delayed and divided into sub-bands if that is asked for
-//! ([`Division`]); all products of daughters are summed over
-//! dumps of a few milliseconds ([`kernel`]); dumps are summed for as long as each baseline's motion allows
-//! ([`GroupIntegrator`]). [`Correlator`] is the stage.
+//! [`Correlator`] is the stage. It aligns blocks of the same number (`align`), applies delays and divides channels into
+//! sub-bands if configured ([`Division`], `spectra`), sums the products of all pairs over dumps of a few milliseconds
+//! ([`kernel`], and `integers` for quantised samples), and sums dumps for as long as the motion of each baseline allows
+//! (`integrate`; `autos` for auto-correlations).
 
 mod align;
 mod autos;
@@ -13,7 +13,8 @@ pub mod kernel;
 mod spectra;
 mod stage;
 
-pub use align::{Aligner, AlignerCounts, BlockRow, StreamShape};
-pub use integrate::{DumpRule, GroupIntegrator, Presence, dump_samples, shortest_integration_s};
-pub use spectra::{Division, SUB_BANDS_MAX};
+pub use align::AlignerCounts;
+pub(super) use integrate::{dump_samples, shortest_integration_s};
+pub use spectra::Division;
+pub(super) use spectra::SUB_BANDS_MAX;
 pub use stage::{Correlator, CorrelatorCounts, CorrelatorSetup};

@@ -1,21 +1,21 @@
-//! Delays and sub-bands: what is done to samples before they are multiplied.
+//! Delays and sub-bands: what happens to samples before correlation.
 //!
-//! Over a channel of width W a source whose waves reach daughter i earlier than j by
-//! `tau = n . (r_i - r_j) / c` keeps the part sinc(pi W tau) of its visibility. At 100 km tau is up to 333 us,
-//! 2.7 samples of 8 kHz, and little is left. Two things bring it back, each by itself or both together:
+//! Over a channel of width W, a source whose wave reaches daughter i earlier than j by
+//! `tau = n . (r_i - r_j) / c` keeps the fraction sinc(pi W tau) of its visibility. At 100 km tau is up to 333 us,
+//! 2.7 samples at 8 kHz, and little is left. Two methods recover it, alone or combined:
 //!
-//! - **Delays** towards a direction n_0, each baseline its own. Daughter i is `n_0 . r_i / c` ahead, so she is read
-//!   `D_i = W max_k n_0 . (r_k - r_i) / c` samples later, in whole samples L_i: those below D_i or those above, whichever
-//!   leaves a pair less than half a sample. It keeps sinc(pi (W tau + L_i - L_j)): of what comes from n_0 at least
-//!   sinc(pi / 2) = 0.64, and less of what comes from elsewhere. There is no delay that is right for all of the sky.
+//! - **Delays** towards a direction n_0, one per baseline. Daughter i receives the wave `n_0 . r_i / c` early, so its
+//!   stream is read `D_i = W max_k n_0 . (r_k - r_i) / c` samples later, rounded to an integer L_i: down or up, such that
+//!   the two streams of a pair differ by less than half a sample. The fraction sinc(pi (W tau + L_i - L_j)) remains: at
+//!   least sinc(pi / 2) = 0.64 of a source at n_0, and less elsewhere. No delay is right for the whole sky.
 //! - **Sub-bands.** Frames of N samples are transformed,
-//!   `X_k = N^(-1/2) sum over n of x(n + L) exp(2 pi i d_k (n + L) / W)` (signals turn as exp(-2 pi i nu t)), with
+//!   `X_k = N^(-1/2) sum over n of x(n + L) exp(2 pi i d_k (n + L) / W)` (signals rotate as exp(-2 pi i nu t)), with
 //!   `d_k / W = (k + 1/2) / N - 1/2`. Products of each X_k are visibilities at its own frequency `nu + d_k`, of width
-//!   W / N, in the same K sr. Because phases count from the same instant whatever the delay L, they are those
-//!   of `nu + d_k`, and what is kept is the overlap of two frames, `1 - |W tau + L_i - L_j| / N`, all over the sky.
+//!   W / N, in the same K sr. Phases count from the same instant whatever the delay L, so they are those of `nu + d_k`,
+//!   and the remaining fraction is the overlap of two frames, `1 - |W tau + L_i - L_j| / N`, all over the sky.
 //!
-//! A sub-band's response is that of N samples, `(sin(pi N x) / (N sin(pi x)))^2` at x = (nu' - nu - d_k) / W: it is not
-//! sharp, and the outermost sub-bands hear each other's rim as the samples' own aliases.
+//! The response of a sub-band is that of N samples, `(sin(pi N x) / (N sin(pi x)))^2` at x = (nu' - nu - d_k) / W: its
+//! edges are not sharp, and the outermost sub-bands alias into each other, as the samples do.
 
 use std::sync::Arc;
 
@@ -31,15 +31,15 @@ use crate::units::arithmetic::fused;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, dot};
 
-/// Most sub-bands: a frame is then as long as the longest dump.
+/// Maximum number of sub-bands: a frame is then as long as the longest dump.
 pub const SUB_BANDS_MAX: usize = 64;
 
-/// What is done before multiplication.
+/// Delays and sub-bands of a correlator.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Division {
-    /// Sub-bands that a channel is divided into; 1 for none, a power of two up to [`SUB_BANDS_MAX`].
+    /// Number of sub-bands per channel: a power of two up to 64; 1 for none.
     pub sub_bands: usize,
-    /// Direction towards which delays are compensated; a unit vector on ecliptic axes.
+    /// Direction towards which delays are compensated, a unit vector on ecliptic axes; `None` for no delays.
     pub delay_centre: Option<Vec3>,
 }
 
@@ -47,12 +47,12 @@ impl Division {
     /// Neither sub-bands nor delays.
     pub const NONE: Self = Self { sub_bands: 1, delay_centre: None };
 
-    /// Frequencies of a channel's sub-bands from its centre, as parts of its width.
+    /// Frequencies of a channel's sub-bands relative to its centre, in channel widths.
     pub fn offsets(self) -> impl Iterator<Item = f64> {
         (0..self.sub_bands).map(move |k| offset(k, self.sub_bands))
     }
 
-    /// The sub-bands of channels, one channel after another.
+    /// The sub-bands of channels, channel by channel.
     #[must_use]
     pub fn divided(self, channels: &[Channel]) -> Vec<Channel> {
         let width = |channel: &Channel| channel.width_hz / self.sub_bands as f64;
@@ -63,7 +63,7 @@ impl Division {
         channels.iter().flat_map(|&channel| bands(channel)).collect()
     }
 
-    /// Delays at `t_s`, in samples of `rate_hz`.
+    /// Delays at `t_s`, in samples at `rate_hz`.
     #[must_use]
     pub fn delays(self, array: &Array, t_s: f64, rate_hz: f64) -> Delays {
         let count = array.satellites();
@@ -84,48 +84,48 @@ impl Division {
     }
 }
 
-/// How streams of samples are delayed, and which of them make pairs.
+/// The delays of sample streams, and the streams that each product multiplies.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Delays {
-    /// Samples by which each stream is read later: one stream a daughter, or one more a daughter with a sample more.
+    /// Delay of each stream, samples: one stream per daughter, or a second one per daughter with one sample more.
     streams: Vec<usize>,
     /// The two streams of each product.
     pairs: Vec<[usize; 2]>,
 }
 
-/// By product of `count` daughters, with themselves too: what `of` says.
+/// The streams of each product of `count` daughters, auto-correlations included, as given by `of`.
 fn pairs(count: usize, of: impl Fn(usize, usize) -> [usize; 2]) -> Vec<[usize; 2]> {
     let of = &of;
     (0..count).flat_map(|j| (0..=j).map(move |i| of(i, j))).collect()
 }
 
-/// Frequency of sub-band `k` of `count` from the channel's centre, as a part of the channel's width.
+/// Frequency of sub-band `k` of `count` relative to the channel's centre, in channel widths.
 fn offset(k: usize, count: usize) -> f64 {
     (k as f64 + 0.5) / count as f64 - 0.5
 }
 
-/// Makes spectra of rows of blocks.
+/// Computes the spectra of rows of blocks.
 pub struct Divider {
     division: Division,
     fft: Arc<dyn Fft<f32>>,
-    /// Turning to the lowest sub-band, and the transform's scale, by place in the frame.
+    /// Shift to the lowest sub-band times the transform's scale, by sample of a frame.
     twiddles: Vec<Complex32>,
 }
 
-/// The spectra of a row in the order of products: group of lanes, frame, stream, part, lane. A lane is a sub-band of
+/// The spectra of a row in the kernel's order: by group of lanes, frame, stream, part, lane. A lane is a sub-band of
 /// a channel.
 pub struct Spectra {
-    /// Frames of the row.
+    /// Number of frames in the row.
     pub frames: usize,
     daughters: usize,
     delays: Delays,
     planes: Vec<[f32; LANES]>,
-    /// By group and stream: frames from the first on whose samples all came, by lane.
-    whole: Vec<[u32; LANES]>,
+    /// By group, stream and lane: number of leading frames whose samples all arrived.
+    complete: Vec<[u32; LANES]>,
 }
 
 impl Divider {
-    /// A divider as `division` says.
+    /// A divider for `division`.
     #[must_use]
     pub fn new(division: Division) -> Self {
         let bands = division.sub_bands;
@@ -138,8 +138,8 @@ impl Divider {
         Self { division, fft: FftPlanner::new().plan_fft_inverse(bands), twiddles }
     }
 
-    /// Spectra of the blocks of `row` of so many `daughters`, read later by their delays; what is then missing at the
-    /// end stands in the blocks of the `next` row. Frames with missing samples are zeros.
+    /// Computes the spectra of `row`, whose streams are read later by their delays and continue in the `next` row. Frames
+    /// with missing samples are zeros.
     #[must_use]
     pub fn divide(
         &self,
@@ -157,7 +157,7 @@ impl Divider {
             daughters,
             delays,
             planes: vec![[0.0; LANES]; groups * frames * streams * 2],
-            whole: vec![[0; LANES]; groups * streams],
+            complete: vec![[0; LANES]; groups * streams],
         };
         let mut samples = Vec::new();
         let mut scratch = vec![Complex32::ZERO; self.fft.get_inplace_scratch_len()];
@@ -174,7 +174,7 @@ impl Divider {
         out
     }
 
-    /// Frames of samples to their spectra.
+    /// Transforms frames of samples to spectra, in place.
     fn transform(&self, samples: &mut [Complex32], restored: &[Complex32], scratch: &mut [Complex32]) {
         let bands = self.division.sub_bands;
         for frame in samples.chunks_exact_mut(bands) {
@@ -186,7 +186,7 @@ impl Divider {
         }
     }
 
-    /// Phases by which spectra of samples read `delay` later are turned back to the frame's instant.
+    /// Phase factors that refer the spectra of samples read `delay` later to the frame's instant.
     fn phases(&self, delay: usize) -> Vec<Complex32> {
         let turned = |offset: f64| {
             let value = Complex64::cis(std::f64::consts::TAU * (offset * delay as f64).fract());
@@ -197,7 +197,7 @@ impl Divider {
     }
 }
 
-/// At most `count` samples of a block from `delay` on, and of the block after it as far as it goes.
+/// Collects up to `count` samples of a block from `delay` on, continued in the block after it if present.
 fn delayed(
     block: &SampleBlock,
     after: Option<&SampleBlock>,
@@ -235,14 +235,14 @@ impl Spectra {
         self.delays.streams.len()
     }
 
-    /// Puts frames of `bands` sub-bands into lanes from `first` on.
+    /// Stores frames of `bands` sub-bands in the lanes from `first` on.
     fn put(&mut self, first: usize, stream: usize, spectra: &[Complex32], bands: usize) {
         let streams = self.streams();
         for k in 0..bands {
             let (group, lane) = ((first + k) / LANES, (first + k) % LANES);
             let base = (group * self.frames * streams + stream) * 2;
             let frames = spectra.chunks_exact(bands);
-            self.whole[group * streams + stream][lane] = frames.len() as u32;
+            self.complete[group * streams + stream][lane] = frames.len() as u32;
             for (frame, value) in frames.enumerate() {
                 let at = base + frame * streams * 2;
                 self.planes[at][lane] = value[k].re;
@@ -251,13 +251,13 @@ impl Spectra {
         }
     }
 
-    /// Planes of one frame of a group: stream, part.
+    /// Planes of one frame of a group: by stream, then by part.
     fn frame(&self, group: usize, frame: usize) -> &[[[f32; LANES]; 2]] {
         let length = self.streams() * 2;
         self.planes[(group * self.frames + frame) * length..][..length].as_chunks().0
     }
 
-    /// ProductSums of |X|^2 over the row and their number, by daughter and lane.
+    /// By daughter and lane: sum of |X|^2 over the row, and number of frames.
     pub fn powers(&self, group: usize) -> Vec<[(f64, u64); LANES]> {
         let mut sums = vec![[(0.0, 0); LANES]; self.daughters];
         for frame in 0..self.frames {
@@ -267,15 +267,15 @@ impl Spectra {
                 }
             }
         }
-        for (sums, whole) in sums.iter_mut().zip(&self.whole[group * self.streams()..]) {
+        for (sums, complete) in sums.iter_mut().zip(&self.complete[group * self.streams()..]) {
             for lane in 0..LANES {
-                sums[lane].1 = u64::from(whole[lane]);
+                sums[lane].1 = u64::from(complete[lane]);
             }
         }
         sums
     }
 
-    /// Adds the products of `frames` to `sums`, and says how many of them each product has, from the first on.
+    /// Adds the products of `frames` to `sums`; returns the number of leading frames that each product has.
     pub fn correlate(
         &self,
         group: usize,
@@ -286,15 +286,17 @@ impl Spectra {
             multiply(self.frame(group, frame), &self.delays.pairs, sums);
         }
         let (first, count) = (frames.start as u32, frames.len() as u32);
-        let whole = &self.whole[group * self.streams()..];
+        let complete = &self.complete[group * self.streams()..];
         let both = |&[i, j]: &[usize; 2]| {
-            std::array::from_fn(|lane| whole[i][lane].min(whole[j][lane]).saturating_sub(first).min(count))
+            std::array::from_fn(|lane| {
+                complete[i][lane].min(complete[j][lane]).saturating_sub(first).min(count)
+            })
         };
         self.delays.pairs.iter().map(both).collect()
     }
 }
 
-/// Adds `x_i conj(x_j)` of pairs of streams, planes of real and imaginary parts, to `sums`.
+/// Adds `x_i conj(x_j)` to `sums`, for pairs of streams with planes of real and imaginary parts.
 #[multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn multiply(streams: &[[[f32; LANES]; 2]], pairs: &[[usize; 2]], sums: &mut ProductSums) {
     const FMA: bool =

@@ -1,4 +1,4 @@
-//! The mother's stage: blocks of samples in, what she sends to the ground out.
+//! The correlator stage: blocks of samples in, frames for the ground out.
 
 use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -19,59 +19,60 @@ use crate::mother::integrator::EPHEMERIS_STEP_S;
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::MissionTime;
 
-/// Part of a block's values out of range at which its visibilities are flagged. Two bits lose 5 % by design.
+/// Fraction of a block's values out of range above which its visibilities are flagged. A 2-bit quantiser clips 5 % by
+/// design.
 const SATURATED_MAX: f64 = 0.2;
 
-/// Time in which the power that weights are made of is averaged, s; before, it is the mean of all there was.
+/// Averaging time of the powers that determine weights, s; until it has passed, the mean of all samples is used.
 const POWER_TIME_S: f64 = 10.0;
 
-/// Samples of a window from which powers are good enough for weights, which are 2 / n too large in the mean then.
+/// Samples of a window after which powers are accurate enough for weights, whose mean bias is then 2 / n.
 const POWER_SAMPLES_MIN: u64 = 1024;
 
-/// What the mother's stage is made for.
+/// What [`Correlator`] needs.
 #[derive(Clone)]
 pub struct CorrelatorSetup {
-    /// Where the daughters are, by navigation.
+    /// The array, which gives the daughters' positions.
     pub array: Arc<Array>,
-    /// What she says of herself.
+    /// The instrument description that it sends.
     pub instrument: Instrument,
-    /// One schedule a channel; with sub-bands one each, as the instrument has them.
+    /// One schedule per channel or sub-band of the instrument.
     pub schedules: Vec<Schedule>,
-    /// Delays, and sub-bands of the daughters' channels.
+    /// Delay centre and sub-bands.
     pub division: Division,
-    /// Time over which the daughters' own powers are integrated, s; 0 to leave them out.
+    /// Integration time of the auto-correlations, s; 0 for none.
     pub auto_integration_s: f64,
-    /// Samples of a block.
+    /// Samples per block.
     pub block_samples: usize,
-    /// Numbers that a block may be ahead of one that is waited for.
+    /// Number of blocks that may arrive beyond a missing one before it is given up.
     pub wait_blocks: u64,
 }
 
-/// What the correlator has counted, and the daughters' own powers.
+/// Counters of the correlator, and the mean auto-correlations.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CorrelatorCounts {
-    /// What became of blocks.
+    /// What happened to blocks.
     pub blocks: AlignerCounts,
     /// Blocks outside any window.
     pub stray: u64,
-    /// Their samples.
+    /// Samples of the stray blocks.
     pub stray_samples: u64,
     /// Visibilities made.
     pub visibilities: u64,
-    /// ProductSums of |x|^2 (K sr) and samples, by channel or sub-band and daughter: the auto-correlations.
+    /// By channel or sub-band and daughter: sum of |x|^2 (K sr) and number of samples.
     pub autos: Vec<Vec<(f64, u64)>>,
 }
 
-/// Aligns the daughters' streams, multiplies all pairs in all channels, and integrates each for as long as the
+/// Aligns the daughters' streams, correlates all pairs in all channels, and integrates each for as long as the
 /// baseline's motion allows.
 ///
 /// Integrations are whole dumps, so they are up to an eighth shorter than the rule allows. A visibility is
-/// the mean over the samples that both daughters sent, its weight `2 n / (P_i P_j)` with their number n
-/// and the daughters' measured powers. It is flagged when less than 0.9 of its samples came.
+/// the mean over the n samples that arrived from both daughters, its weight `2 n / (P_i P_j)` with the measured
+/// auto-correlations P. It is flagged when less than 0.9 of its samples arrived.
 pub struct Correlator {
     setup: CorrelatorSetup,
     rule: DumpRule,
-    /// With delays or sub-bands.
+    /// Present with delays or sub-bands.
     divider: Option<Divider>,
     arch: Arch,
     running: Option<Running>,
@@ -80,31 +81,31 @@ pub struct Correlator {
     samples: u64,
 }
 
-/// A window in work.
+/// The window being correlated.
 struct Running {
     window: ObservingWindow,
     aligner: Aligner,
     groups: Vec<ChannelGroup>,
-    /// A row that waits for the one after it, which has its delayed samples.
+    /// A row held until the next one arrives, which contains its delayed samples.
     held: Option<BlockRow>,
 }
 
 struct ChannelGroup {
     first: usize,
     integrator: GroupIntegrator,
-    /// If the daughters' own powers are wanted.
+    /// Present if auto-correlations are configured.
     autos: Option<AutoIntegrator>,
     packed: Packed,
-    /// By daughter: power of each lane, K sr; 0 before the first block.
+    /// By daughter and lane: running auto-correlation, K sr; 0 before the first block.
     powers: Vec<[f64; LANES]>,
-    /// By daughter and lane: samples that have come so far.
+    /// By daughter and lane: samples received so far.
     seen: Vec<[u64; LANES]>,
-    /// Samples that the window has had.
+    /// Samples of the window so far.
     samples: u64,
 }
 
 impl Correlator {
-    /// A correlator; what it counts can be read through `counts`.
+    /// A correlator, which updates `counts` as it goes.
     #[must_use]
     pub fn new(setup: CorrelatorSetup, counts: Arc<Mutex<CorrelatorCounts>>) -> Self {
         let width_hz = setup.instrument.channels.first().map_or(1.0, |channel| channel.width_hz);
@@ -124,7 +125,7 @@ impl Correlator {
     fn begin(&mut self, mut window: ObservingWindow, out: &mut Outlet<GroundFrame>) {
         let rate_hz = self.rate_hz();
         let Self { setup, rule, .. } = self;
-        // A window is a third of an orbit; anything else is cut to what time tags can say.
+        // A window is a third of an orbit; longer ones are cut to the range of time tags.
         let end = MissionTime::from_seconds(window.start.seconds() + WINDOW_S_MAX);
         window.end = window.end.min(end);
         out.push(GroundFrame::Instrument(setup.instrument.clone()));
@@ -156,8 +157,8 @@ impl Correlator {
         self.running = Some(Running { window, aligner, groups, held: None });
     }
 
-    /// Takes the next row of a window; with delays, the row before it is what is worked on.
-    fn take(&mut self, running: &mut Running, row: BlockRow, out: &mut Outlet<GroundFrame>) {
+    /// Accepts the next row of a window; with delays, processes the row before it.
+    fn accept(&mut self, running: &mut Running, row: BlockRow, out: &mut Outlet<GroundFrame>) {
         if self.setup.division.delay_centre.is_none() {
             self.process(running, &row, None, out);
         } else if let Some(held) = running.held.replace(row) {
@@ -189,7 +190,7 @@ impl Correlator {
             }
         }
         self.samples += row.blocks.iter().flatten().map(|block| block.samples.len() as u64).sum::<u64>();
-        self.hand_on(made, out);
+        self.emit(made, out);
     }
 
     fn process_group(&self, group: &mut ChannelGroup, row: &BlockRow, made: &mut Vec<VisibilityBlock>) {
@@ -200,23 +201,23 @@ impl Correlator {
             row.blocks.get((first + lane) * daughters + daughter)?.as_ref()
         };
         let dump_samples = self.rule.dump_samples;
-        let mut there = vec![[0; LANES]; daughters];
+        let mut present = vec![[0; LANES]; daughters];
         let mut saturated = vec![[false; LANES]; daughters];
         let mut sums = vec![[(0.0, 0); LANES]; daughters];
         for (daughter, sums) in sums.iter_mut().enumerate() {
             for (lane, sum) in sums[..channels].iter_mut().enumerate() {
                 let Some(block) = block(lane, daughter) else { continue };
-                there[daughter][lane] = dump_samples as u32;
+                present[daughter][lane] = dump_samples as u32;
                 saturated[daughter][lane] = is_saturated(block);
                 *sum = (square(&block.samples), row.samples as u64);
             }
         }
         let samples = row.samples as u64;
         let powers = RowPowers { sums, samples, saturated: saturated.clone() };
-        self.follow(group, row, &powers, made);
-        let both = |i: usize, j: usize| std::array::from_fn(|lane| there[i][lane].min(there[j][lane]));
-        let there = (0..daughters).flat_map(|j| (0..=j).map(move |i| both(i, j))).collect();
-        let presence = Presence { there, saturated };
+        self.update_powers(group, row, &powers, made);
+        let both = |i: usize, j: usize| std::array::from_fn(|lane| present[i][lane].min(present[j][lane]));
+        let common = (0..daughters).flat_map(|j| (0..=j).map(move |i| both(i, j))).collect();
+        let presence = Presence { common, saturated };
         for dump in 0..row.samples / dump_samples {
             let mut sums = no_sums(daughters);
             for slice in 0..dump_samples / SLICE {
@@ -232,7 +233,7 @@ impl Correlator {
         }
     }
 
-    /// The same with the spectra of a row, of which this is group `index`.
+    /// As [`Self::process_group`], for group `index` of the spectra of a row.
     fn process_spectra(
         &self,
         group: &mut ChannelGroup,
@@ -252,18 +253,18 @@ impl Correlator {
         }
         let (sums, samples) = (spectra.powers(index), spectra.frames as u64);
         let powers = RowPowers { sums, samples, saturated: saturated.clone() };
-        self.follow(group, row, &powers, made);
+        self.update_powers(group, row, &powers, made);
         let dump = self.rule.dump_samples;
         for number in 0..spectra.frames / dump {
             let mut sums = no_sums(daughters);
-            let there = spectra.correlate(index, number * dump..(number + 1) * dump, &mut sums);
-            let presence = Presence { there, saturated: saturated.clone() };
+            let common = spectra.correlate(index, number * dump..(number + 1) * dump, &mut sums);
+            let presence = Presence { common, saturated: saturated.clone() };
             group.integrator.add(&sums, &presence, &group.powers, &self.setup.array, made);
         }
     }
 
-    /// Follows the powers of a group with those of a row, integrates and counts them.
-    fn follow(
+    /// Updates the running auto-correlations of a group from a row, integrates and counts them.
+    fn update_powers(
         &self,
         group: &mut ChannelGroup,
         row: &BlockRow,
@@ -275,7 +276,7 @@ impl Correlator {
             let ticks = crate::daughters::sample_ticks(samples, self.rate_hz()) as u32;
             autos.add(powers, ticks, made);
         }
-        let following = 1.0 - (-(row.samples as f64) / self.rate_hz() / POWER_TIME_S).exp();
+        let smoothing = 1.0 - (-(row.samples as f64) / self.rate_hz() / POWER_TIME_S).exp();
         let lanes = LANES.min(self.setup.schedules.len() - group.first);
         let mut counts = lock(&self.counts);
         for (daughter, sums) in powers.sums.iter().enumerate() {
@@ -285,7 +286,7 @@ impl Correlator {
                 }
                 let (power, seen) = (&mut group.powers[daughter][lane], &mut group.seen[daughter][lane]);
                 *seen += count;
-                let share = following.max(count as f64 / *seen as f64);
+                let share = smoothing.max(count as f64 / *seen as f64);
                 *power += share * (sum / count as f64 - *power);
                 let own = &mut counts.autos[group.first + lane][daughter];
                 own.0 += sum;
@@ -295,11 +296,11 @@ impl Correlator {
         drop(counts);
         group.samples += powers.samples;
         if group.samples >= POWER_SAMPLES_MIN {
-            group.integrator.settle(&group.powers);
+            group.integrator.set_powers_known(&group.powers);
         }
     }
 
-    fn hand_on(&mut self, made: Vec<VisibilityBlock>, out: &mut Outlet<GroundFrame>) {
+    fn emit(&mut self, made: Vec<VisibilityBlock>, out: &mut Outlet<GroundFrame>) {
         for block in made {
             self.sampled += block.len() as u64;
             out.push(GroundFrame::Visibilities(block));
@@ -311,7 +312,7 @@ impl Correlator {
         let Some(mut running) = self.running.take() else { return };
         let seconds = (end.0 - running.window.start.0) as f64 * 1e-6;
         for row in running.aligner.finish((seconds * self.rate_hz()).round().max(0.0) as u64) {
-            self.take(&mut running, row, out);
+            self.accept(&mut running, row, out);
         }
         if let Some(last) = running.held.take() {
             self.process(&mut running, &last, None, out);
@@ -324,9 +325,9 @@ impl Correlator {
                 autos.finish(ticks as u32, &mut made);
             }
         }
-        self.hand_on(made, out);
+        self.emit(made, out);
         let mut counts = lock(&self.counts);
-        counts.blocks.absorb(running.aligner.counts());
+        counts.blocks.add(running.aligner.counts());
         counts.visibilities = self.sampled;
         drop(counts);
         let (time, sampled) = (end, self.sampled);
@@ -338,7 +339,7 @@ fn lock(counts: &Mutex<CorrelatorCounts>) -> std::sync::MutexGuard<'_, Correlato
     counts.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Whether so many of a block's values were out of range that its visibilities are flagged.
+/// Whether too many of a block's values are out of range.
 fn is_saturated(block: &SampleBlock) -> bool {
     f64::from(block.saturated) > SATURATED_MAX * (2 * block.samples.len()) as f64
 }
@@ -348,7 +349,7 @@ fn square(samples: &Samples) -> f64 {
     match samples {
         Samples::Float { re, im } => re.iter().zip(im).map(|(re, im)| f64::from(re * re + im * im)).sum(),
         Samples::Codes { step, re, im, .. } => {
-            // (c + 1/2)^2 = c (c + 1) + 1/4, in whole numbers.
+            // (c + 1/2)^2 = c (c + 1) + 1/4, in integers.
             let whole: i64 =
                 re.chunks(CODES_AT_ONCE).chain(im.chunks(CODES_AT_ONCE)).map(whole_squares).sum();
             f64::from(*step).powi(2) * (whole as f64 + 0.25 * (re.len() + im.len()) as f64)
@@ -356,7 +357,7 @@ fn square(samples: &Samples) -> f64 {
     }
 }
 
-/// Codes whose squares are summed in 32 bits: 2^14 each at most.
+/// Codes whose squares, at most 2^14 each, are summed in 32 bits.
 const CODES_AT_ONCE: usize = 1 << 16;
 
 /// Sum of c (c + 1).
@@ -382,7 +383,7 @@ impl Stage for Correlator {
     fn step(&mut self, frame: SpaceFrame, out: &mut Outlet<GroundFrame>) -> Result<(), Infallible> {
         match frame {
             SpaceFrame::WindowStart(window) => {
-                // A window whose end was lost ends where the next begins, at the latest.
+                // A window whose end was lost ends where the next one begins, at the latest.
                 self.finish(out)?;
                 self.begin(window, out);
             }
@@ -396,7 +397,7 @@ impl Stage for Correlator {
                 };
                 for block in blocks {
                     for row in running.aligner.put(block) {
-                        self.take(&mut running, row, out);
+                        self.accept(&mut running, row, out);
                     }
                 }
                 self.running = Some(running);

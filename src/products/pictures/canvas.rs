@@ -1,4 +1,4 @@
-//! A page of pixels and the strokes on it.
+//! A raster page with antialiased lines and fills.
 
 use std::ops::Range;
 
@@ -44,7 +44,7 @@ pub(super) struct Stroke {
     pub alpha: f32,
     /// Width, pixels.
     pub width: f64,
-    /// Lengths of dashes and gaps, pixels.
+    /// Length of dashes and of gaps, pixels.
     pub dash: Option<(f64, f64)>,
 }
 
@@ -74,7 +74,7 @@ impl Canvas {
         self.clip = clip.unwrap_or(page);
     }
 
-    /// Whole pixels from `low` to `high` that lie on the page and in the clip, along x.
+    /// Columns of pixels from `low` to `high`, within the page and the clip.
     fn columns(&self, low: f64, high: f64) -> Range<usize> {
         span(low.max(self.clip.x), high.min(self.clip.right()), self.width)
     }
@@ -83,19 +83,19 @@ impl Canvas {
         span(low.max(self.clip.y), high.min(self.clip.bottom()), self.height)
     }
 
-    /// Rows of pixels, to be filled side by side.
+    /// The rows of pixels, for parallel drawing.
     pub fn pixel_rows_mut(&mut self) -> std::slice::ChunksExactMut<'_, [f32; 3]> {
         self.pixels.chunks_exact_mut(self.width.max(1))
     }
 
-    /// Lays `colour` over one pixel.
+    /// Blends `colour` into one pixel.
     pub fn blend(&mut self, x: usize, y: usize, colour: Colour, alpha: f32) {
         if x < self.width && y < self.height {
             mix(&mut self.pixels[y * self.width + x], colour, alpha);
         }
     }
 
-    /// Fills a rectangle, its edges by the part of each pixel that they cover.
+    /// Fills a rectangle; edge pixels by the fraction covered.
     pub fn fill(&mut self, rect: Rect, colour: Colour, alpha: f32) {
         for y in self.rows(rect.y, rect.bottom()) {
             let covered_y = overlap(y, rect.y, rect.bottom());
@@ -126,7 +126,7 @@ impl Canvas {
         }
         let ((left, right), (top, bottom)) = (bounds(0, 2), bounds(1, 3));
         let (columns, rows) = (self.columns(left, right), self.rows(top, bottom));
-        // The whole line's coverage first, so that pieces join without seams and alpha counts once.
+        // Compute the coverage of the whole line first, so that segments join without seams and alpha applies once.
         let mut coverage = StrokeCoverage {
             values: vec![0.0; columns.len() * rows.len()],
             columns: columns.clone(),
@@ -144,13 +144,13 @@ impl Canvas {
         }
     }
 
-    /// The page as bytes, three a pixel.
+    /// The page as bytes, three per pixel.
     pub fn into_rgb(self) -> Vec<u8> {
         self.pixels.into_iter().flat_map(|pixel| pixel.map(|v| v.round().clamp(0.0, 255.0) as u8)).collect()
     }
 }
 
-/// How much of each pixel of a part of the page a line covers.
+/// The fraction of each pixel that a line covers, in a part of the page.
 struct StrokeCoverage {
     values: Vec<f32>,
     columns: Range<usize>,
@@ -166,7 +166,7 @@ impl StrokeCoverage {
             let py = y as f64 + 0.5;
             let (mut low, mut high) = (x0.min(x1), x0.max(x1));
             if dy.abs() > 1.0 {
-                // A steep piece crosses a row over a short stretch only.
+                // A steep segment crosses a row in a few columns only.
                 let (a, b) = (x0 + (py - reach - 1.0 - y0) * dx / dy, x0 + (py + reach + 1.0 - y0) * dx / dy);
                 low = low.max(a.min(b));
                 high = high.min(a.max(b));
@@ -184,9 +184,9 @@ impl StrokeCoverage {
     }
 }
 
-/// The straight pieces of a line, cut into dashes if wanted.
+/// The straight segments of a line, cut into dashes if required.
 fn pieces(points: &[(f64, f64)], dash: Option<(f64, f64)>) -> Vec<[f64; 4]> {
-    // A million pixels off the page is off the page; a scale's pole must not overflow.
+    // Beyond a million pixels a point is off any page; poles of a scale must not overflow.
     let far = |v: f64| !v.is_finite() || v.abs() > 1e6;
     let mut pieces = Vec::new();
     let mut travelled = 0.0;
@@ -214,7 +214,7 @@ fn pieces(points: &[(f64, f64)], dash: Option<(f64, f64)>) -> Vec<[f64; 4]> {
     pieces
 }
 
-/// Whole pixels from `low` to `high` within others.
+/// Pixels from `low` to `high` within a range.
 fn within(low: f64, high: f64, others: &Range<usize>) -> Range<usize> {
     let whole = span(low, high, others.end);
     let first = whole.start.max(others.start);

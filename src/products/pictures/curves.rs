@@ -51,23 +51,23 @@ pub struct Plot {
     pub y: Axis,
     /// Curves, drawn in order.
     pub curves: Vec<Curve>,
-    /// Values on the vertical axis where a thin line runs across.
+    /// Vertical values marked with a thin horizontal line.
     pub levels: Vec<f64>,
 }
 
-/// Width and height of one plot's share of the page, pixels.
+/// Width and height of one plot, pixels.
 const PLOT_PX: (usize, usize) = (900, 520);
 /// Size of text, pixels.
 const FONT: f64 = 19.0;
 
-/// Draws plots on one page, `columns` side by side, below a title (none if empty).
+/// Draws plots on one page in `columns` columns, below a title (none if empty).
 ///
 /// # Errors
-/// [`PictureError::Size`] without plots or with more than fit on a page.
+/// [`PictureError::Size`] without plots, or with too many for a page.
 pub fn draw_plots(title: &str, plots: &[Plot], columns: usize) -> Result<Picture, PictureError> {
     if plots.is_empty() || plots.len() > 64 {
         let value = plots.len();
-        return Err(PictureError::Size { what: "a number of plots of", value, expected: "1 to 64" });
+        return Err(PictureError::Size { what: "number of plots", value, expected: "1 to 64" });
     }
     let columns = columns.clamp(1, plots.len());
     let head = if title.is_empty() { 0 } else { 62 };
@@ -91,7 +91,7 @@ pub fn draw_plots(title: &str, plots: &[Plot], columns: usize) -> Result<Picture
     Ok(Picture::from_canvas(canvas, width, height, title))
 }
 
-/// An axis with its limits settled.
+/// An axis with fixed limits.
 struct Range {
     low: f64,
     high: f64,
@@ -247,7 +247,7 @@ fn write_axes(
     }
 }
 
-/// The names of the curves, in the corner that hides least of them.
+/// Draws the legend in the corner that hides least of the curves.
 fn legend(canvas: &mut Canvas, frame: Rect, plot: &Plot, drawn: &[Vec<(f64, f64)>]) {
     let style = Style::new(0.92 * FONT, INK);
     let named: Vec<(usize, &Curve)> =

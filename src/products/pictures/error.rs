@@ -1,49 +1,51 @@
-//! What can be wrong with a picture.
+//! Errors of pictures.
 
 use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// Why there is no picture.
+/// Why a picture could not be drawn or written.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum PictureError {
     /// The number of values is not that of a HEALPix map.
-    #[error("panel {panel}: {pixels} values are no HEALPix map; expected 12 nside^2, nside a power of two")]
+    #[error(
+        "panel {panel}: {pixels} values are not a HEALPix map; expected 12 nside^2 of them, with nside a power of two"
+    )]
     PixelCount {
         /// Number of the panel, from 0.
         panel: usize,
         /// Number of values found.
         pixels: usize,
     },
-    /// A size that is not drawn.
-    #[error("a picture with {what} {value} is not drawn; expected {expected}")]
+    /// An invalid size or count.
+    #[error("invalid {what} {value}; expected {expected}")]
     Size {
-        /// What is too small or too large.
+        /// Which quantity is invalid.
         what: &'static str,
         /// Value found.
         value: usize,
         /// Range that is accepted.
         expected: &'static str,
     },
-    /// Limits of a scale that leave nothing to draw.
-    #[error("limits {low:e} to {high:e} are no {stretch} scale; expected finite low < high{more}")]
+    /// Invalid limits of a scale.
+    #[error("invalid limits {low:e} to {high:e} of a {scaling} scale; expected finite low < high{more}")]
     Limits {
-        /// Value found for the lower end.
+        /// Lower limit found.
         low: f64,
-        /// Value found for the upper end.
+        /// Upper limit found.
         high: f64,
-        /// The scale.
-        stretch: &'static str,
-        /// What else is expected.
+        /// Scaling: linear or logarithmic.
+        scaling: &'static str,
+        /// Further condition.
         more: &'static str,
     },
-    /// The PNG encoder gave up.
+    /// The PNG encoder failed.
     #[error("{path}: cannot encode the picture")]
     Encode {
         /// File that was to be written.
         path: PathBuf,
-        /// Its reason.
+        /// The encoder's reason.
         source: png::EncodingError,
     },
     /// The file could not be written.

@@ -1,18 +1,18 @@
-//! Ticks at round numbers and how they are written.
+//! Ticks at round numbers, and their labels.
 
 /// Ticks of an axis or a colour bar.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Ticks {
     /// Values with a label.
     pub labelled: Vec<(f64, String)>,
-    /// Values without.
+    /// Values without a label.
     pub minor: Vec<f64>,
     /// Labels are in units of this power of ten.
     pub exponent: i32,
 }
 
 impl Ticks {
-    /// The unit to be written beside the ticks: `K` or `10⁵ K`.
+    /// The unit to print beside the ticks: `K` or `10⁵ K`.
     pub fn unit(&self, unit: &str) -> String {
         match (self.exponent, unit.is_empty()) {
             (0, _) => unit.to_owned(),
@@ -26,7 +26,7 @@ impl Ticks {
 pub(super) fn linear(low: f64, high: f64, wanted: usize) -> Ticks {
     let step = round_step((high - low) / wanted.max(1) as f64);
     let greatest = low.abs().max(high.abs());
-    // Up to 1.5e6 is written in units of 1e5.
+    // Values up to 1.5e6 are labelled in units of 1e5.
     let decade = if greatest > 0.0 { (greatest / 1.5).log10().floor() as i32 } else { 0 };
     let exponent = if (-3..5).contains(&decade) { 0 } else { decade };
     let decimals = (exponent - step.log10().floor() as i32).clamp(0, 12) as usize;
@@ -34,7 +34,7 @@ pub(super) fn linear(low: f64, high: f64, wanted: usize) -> Ticks {
     let labelled = values
         .into_iter()
         .map(|value| {
-            // Zero is zero, not the rounding left of a sum of steps.
+            // Print an exact zero, not the rounding error of a sum of steps.
             let value = if value.abs() < 1e-9 * step { 0.0 } else { value };
             (value, minus(format!("{:.decimals$}", value / 10f64.powi(exponent))))
         })
@@ -81,7 +81,7 @@ pub(super) fn logarithmic(low: f64, high: f64, wanted: usize) -> Ticks {
     Ticks { labelled, minor, exponent }
 }
 
-/// 10 to a power, with raised digits.
+/// A power of ten with superscript digits.
 pub(super) fn power_of_ten(exponent: i32) -> String {
     const RAISED: [char; 10] = ['⁰', '¹', '²', '³', '⁴', '⁵', '⁶', '⁷', '⁸', '⁹'];
     let raise = |c: char| match c.to_digit(10) {
@@ -102,7 +102,7 @@ fn minus(text: String) -> String {
     text.replace('-', "−")
 }
 
-/// The least of 1, 2, 5 times a power of ten that is not below `step`.
+/// The smallest of 1, 2, 5 times a power of ten that is at least `step`.
 fn round_step(step: f64) -> f64 {
     if !(step > 0.0 && step.is_finite()) {
         return 1.0;
@@ -116,7 +116,7 @@ fn minor_parts(step: f64) -> f64 {
     if (1.5..3.0).contains(&lead) { 4.0 } else { 5.0 }
 }
 
-/// Multiples of `step` between `low` and `high`, a thousand at most.
+/// Multiples of `step` between `low` and `high`, at most a thousand.
 fn multiples(low: f64, high: f64, step: f64) -> Vec<f64> {
     let (first, last) = ((low / step - 1e-6).ceil(), (high / step + 1e-6).floor());
     let count = (last - first + 1.0).clamp(0.0, 1000.0) as usize;

@@ -1,7 +1,7 @@
 //! Pictures: sky maps in Mollweide projection, curves, PNG files.
 //!
-//! Everything is drawn here, antialiased, with an embedded font; nothing of the machine's fonts or
-//! libraries shows in the result, so equal data give equal bytes.
+//! Everything is drawn here, antialiased, with an embedded font. The result does not depend on the machine's fonts or
+//! libraries, so equal data give equal bytes. May use [`crate::sky`] and [`crate::files`].
 
 mod canvas;
 mod curves;

@@ -12,29 +12,29 @@ use super::text::{Align, Style};
 use crate::sky::healpix::{Ring, pixel_of, ring};
 use crate::units::vector::{Vec3, dot};
 
-/// Samples of a pixel of the picture along each side.
+/// Samples per pixel of the picture, along each side.
 const SUPERSAMPLING: usize = 3;
 
-/// How a map's values fill its picture.
+/// How a map is sampled for its picture.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Sampling {
-    /// Every pixel in its own colour, as the map is.
+    /// Uniform map pixels: each in its own colour.
     #[default]
     Pixels,
-    /// Values between pixel centres linearly, along rings and across: easier on the eye for coarse maps.
+    /// Linear interpolation between pixel centres along and across rings: smoother for coarse maps.
     Interpolated,
 }
 
-/// From where and how a map is looked at.
+/// The view of a map: coordinate frame, centre and style.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
     /// Rotation from the frame drawn to the map's frame: row `k` is the map's axis `k` in the frame drawn.
     pub rotation: [Vec3; 3],
-    /// Name of the frame drawn, shown in the corner.
+    /// Name of the frame drawn, printed in the corner.
     pub frame: String,
-    /// Longitude in the middle, degrees.
+    /// Longitude of the centre, degrees.
     pub centre_deg: f64,
-    /// Whether pixels show.
+    /// Sampling of the map.
     pub sampling: Sampling,
     /// Whether meridians and parallels are drawn, 60 and 30 degrees apart.
     pub graticule: bool,
@@ -61,7 +61,7 @@ pub(super) struct MapField<'a> {
 }
 
 impl MapField<'_> {
-    /// Linear between the two rings around a direction and between two pixels on each.
+    /// Interpolates linearly between the two rings around a direction and between two pixels on each.
     fn interpolated(&self, direction: Vec3) -> f64 {
         let nearest = self.values[pixel_of(self.nside, direction)];
         if !is_seen(nearest) {
@@ -82,7 +82,7 @@ impl MapField<'_> {
         let (mut sum, mut weights) = (0.0, 0.0);
         for (k, ring_weight) in [(above, 1.0 - weight), (above + 1, weight)] {
             if k == 0 || k > last {
-                // Beyond the first ring lies the pole, the mean of that ring.
+                // Beyond the first ring is the pole, whose value is the mean of that ring.
                 let ring = ring(self.nside, k.clamp(1, last));
                 for value in &self.values[ring.first..ring.first + ring.len] {
                     add(&mut sum, &mut weights, *value, ring_weight / ring.len as f64);
@@ -105,7 +105,7 @@ fn add(sum: &mut f64, weights: &mut f64, value: f64, weight: f64) {
     }
 }
 
-/// The pixels of a ring west and east of a longitude, and how far it lies between them.
+/// The pixels of a ring west and east of a longitude, and its fractional position between them.
 fn neighbours(ring: &Ring, longitude: f64) -> ([usize; 2], f64) {
     let place = ((longitude - ring.phi0_rad) / TAU).rem_euclid(1.0) * ring.len as f64;
     let west = (place.floor() as usize).min(ring.len - 1);
@@ -113,7 +113,7 @@ fn neighbours(ring: &Ring, longitude: f64) -> ([usize; 2], f64) {
     ([ring.first + west, ring.first + east], (place - west as f64).clamp(0.0, 1.0))
 }
 
-/// Draws a map into the greatest ellipse of a rectangle.
+/// Draws a map into the largest ellipse that fits a rectangle.
 pub(super) fn draw(canvas: &mut Canvas, area: Rect, field: MapField<'_>, scale: &ColourScale, view: &View) {
     let ellipse = Ellipse::within(area);
     paint(canvas, &ellipse, field, scale, view);
@@ -153,11 +153,11 @@ impl Ellipse {
     }
 }
 
-/// Colours of directions of a map.
+/// Gives the colour of any direction of a map.
 struct Painter<'a> {
     field: MapField<'a>,
     scale: &'a ColourScale,
-    /// Colour of each pixel, if pixels are shown.
+    /// Colour of each map pixel, with [`Sampling::Pixels`].
     pixels: Option<Vec<Colour>>,
 }
 
@@ -170,7 +170,7 @@ impl<'a> Painter<'a> {
         Self { field, scale, pixels }
     }
 
-    /// Whether one sample stands for a whole pixel of the page.
+    /// Whether one sample per page pixel is enough.
     fn is_smooth(&self) -> bool {
         self.pixels.is_none()
     }
@@ -191,8 +191,8 @@ fn paint(canvas: &mut Canvas, ellipse: &Ellipse, field: MapField<'_>, scale: &Co
     lines.par_iter_mut().for_each(|(y, line)| paint_row(line, *y, ellipse, &painter, view));
 }
 
-/// Paints one row of pixels; each takes the mean colour of its samples, those outside the ellipse
-/// leaving what is there.
+/// Paints one row of pixels; each takes the mean colour of its samples. Samples outside the ellipse keep the
+/// background.
 fn paint_row(line: &mut [[f32; 3]], y: usize, ellipse: &Ellipse, painter: &Painter<'_>, view: &View) {
     let centre = view.centre_deg.to_radians();
     let inside = |k: usize| (k as f64 + 0.5) / SUPERSAMPLING as f64;
@@ -209,7 +209,7 @@ fn paint_row(line: &mut [[f32; 3]], y: usize, ellipse: &Ellipse, painter: &Paint
                 let Some(longitude) = parallel.longitude(right) else { continue };
                 *hits += 1.0;
                 if painter.is_smooth() && *hits > 1.0 {
-                    // Between pixel centres colours change less than from one pixel of the page to the next.
+                    // Interpolated colours vary little within a page pixel.
                     continue;
                 }
                 let (sin, cos) = (longitude + centre).sin_cos();
@@ -243,7 +243,7 @@ fn graticule(centre: f64) -> Vec<Vec<(f64, f64)>> {
     lines
 }
 
-/// Degrees beside the parallels and along the equator.
+/// Labels the parallels at the edge and the meridians along the equator, degrees.
 fn label(canvas: &mut Canvas, ellipse: &Ellipse, scale: &ColourScale, centre: f64) {
     let size = (ellipse.half_height / 19.0).clamp(10.0, 20.0);
     let outside = Style::new(size, FAINT);

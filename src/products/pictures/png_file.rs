@@ -1,4 +1,4 @@
-//! Finished pictures and their files.
+//! Finished pictures, and writing them as PNG files.
 
 use std::path::Path;
 
@@ -6,12 +6,12 @@ use super::canvas::Canvas;
 use super::error::PictureError;
 use crate::files::write_atomically;
 
-/// Greatest side of a picture, pixels.
+/// Maximum side of a picture, pixels.
 const SIDE_MAX: usize = 16_384;
-/// Greatest number of pixels of a picture.
+/// Maximum number of pixels of a picture.
 const PIXELS_MAX: usize = 1 << 27;
 
-/// A finished picture, with what is to be known about it.
+/// A finished picture and its text chunks.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Picture {
     width: usize,
@@ -27,9 +27,9 @@ impl Picture {
         Self { width, height, rgb: canvas.into_rgb(), texts }
     }
 
-    /// Whether a page of this size is drawn.
+    /// Checks the size of a page.
     pub(super) fn check_size(width: usize, height: usize) -> Result<(), PictureError> {
-        for (what, value) in [("a width of", width), ("a height of", height)] {
+        for (what, value) in [("picture width", width), ("picture height", height)] {
             if !(16..=SIDE_MAX).contains(&value) {
                 return Err(PictureError::Size { what, value, expected: "16 to 16384 pixels" });
             }
@@ -37,24 +37,12 @@ impl Picture {
         if width * height > PIXELS_MAX {
             let value = width * height;
             return Err(PictureError::Size {
-                what: "a total of",
+                what: "number of pixels",
                 value,
-                expected: "134217728 pixels at most",
+                expected: "at most 134217728",
             });
         }
         Ok(())
-    }
-
-    /// Adds a text chunk, as `Description` with the provenance of what is shown; NUL bytes, which PNG
-    /// cannot hold, become spaces, and keywords are cut to the 79 Latin letters that PNG allows.
-    #[must_use]
-    pub fn with_text(mut self, keyword: &str, text: &str) -> Self {
-        let keyword: String =
-            keyword.chars().filter(|c| c.is_ascii_graphic() || *c == ' ').take(79).collect();
-        let keyword =
-            if keyword.trim().is_empty() { "Comment".to_owned() } else { keyword.trim().to_owned() };
-        self.texts.push((keyword, text.replace('\0', " ")));
-        self
     }
 
     /// Width, pixels.
@@ -75,11 +63,8 @@ impl Picture {
         &self.rgb
     }
 
-    /// The picture as a PNG file's bytes.
-    ///
-    /// # Errors
-    /// What the encoder reports.
-    pub fn to_png(&self) -> Result<Vec<u8>, png::EncodingError> {
+    /// The picture encoded as PNG.
+    fn to_png(&self) -> Result<Vec<u8>, png::EncodingError> {
         let mut bytes = Vec::new();
         let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
         encoder.set_color(png::ColorType::Rgb);
@@ -94,7 +79,7 @@ impl Picture {
         Ok(bytes)
     }
 
-    /// Writes the picture; the file appears whole or not at all.
+    /// Writes the picture atomically.
     ///
     /// # Errors
     /// [`PictureError::Write`] with the system's reason, [`PictureError::Encode`].

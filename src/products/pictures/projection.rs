@@ -2,8 +2,8 @@
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// Place on the ellipse of half axes 2 (x, to the right) and 1 (y, up) of a longitude, relative to the
-/// middle of the map, and a latitude, rad.
+/// Position (x to the right, y up) on the ellipse with semi-axes 2 and 1, for a longitude relative to the centre of the
+/// map and a latitude, rad.
 pub(super) fn forward(longitude: f64, latitude: f64) -> (f64, f64) {
     // Newton's method on 2 t + sin 2t = pi sin(latitude), with the series at the pole where it is slow.
     let target = PI * latitude.sin();
@@ -29,7 +29,7 @@ pub(super) struct Parallel {
     pub sin_latitude: f64,
     /// Cosine of the latitude.
     pub cos_latitude: f64,
-    /// Half the length of the line over that of the equator's.
+    /// Length of the line relative to the equator's.
     across: f64,
 }
 
@@ -46,7 +46,7 @@ impl Parallel {
         Some(Self { sin_latitude, cos_latitude, across })
     }
 
-    /// Longitude relative to the middle, rad, at `x`; `None` outside the ellipse.
+    /// Longitude relative to the centre, rad, at `x`; `None` outside the ellipse.
     pub fn longitude(&self, x: f64) -> Option<f64> {
         (x.abs() <= 2.0 * self.across && self.across > 0.0).then(|| -PI * x / (2.0 * self.across))
     }

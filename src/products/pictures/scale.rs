@@ -1,4 +1,4 @@
-//! From values to colours.
+//! Colour scales: the mapping from values to colours.
 
 use super::canvas::Colour;
 use super::error::PictureError;
@@ -6,25 +6,23 @@ use super::labels;
 use super::labels::Ticks;
 use crate::sky::is_unseen;
 
-/// How values spread over a scale.
+/// How values map to positions on a scale.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Scaling {
-    /// Evenly.
+    /// Linearly.
     #[default]
     Linear,
-    /// Their logarithms evenly.
+    /// Logarithmically.
     Log,
 }
 
-/// Colours of a scale.
+/// Palette of a scale.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Palette {
-    /// Black over purple and orange to light yellow: brightness.
+    /// Black through purple and orange to light yellow, for intensities.
     #[default]
     Inferno,
-    /// Dark blue over green to yellow.
-    Viridis,
-    /// Blue over white to red: differences.
+    /// Blue through white to red, for differences.
     Diverging,
 }
 
@@ -36,7 +34,7 @@ pub(super) const UNSEEN: Colour = [160, 160, 160];
 pub struct ColourScale {
     low: f64,
     high: f64,
-    stretch: Scaling,
+    scaling: Scaling,
     palette: Palette,
 }
 
@@ -45,41 +43,41 @@ impl ColourScale {
     ///
     /// # Errors
     /// [`PictureError::Limits`] unless both are finite, `low < high` and, for logarithms, `low > 0`.
-    pub fn new(low: f64, high: f64, stretch: Scaling, palette: Palette) -> Result<Self, PictureError> {
-        let (positive, name, more) = match stretch {
+    pub fn new(low: f64, high: f64, scaling: Scaling, palette: Palette) -> Result<Self, PictureError> {
+        let (positive, name, more) = match scaling {
             Scaling::Linear => (true, "linear", ""),
             Scaling::Log => (low > 0.0, "logarithmic", " and low > 0"),
         };
         if !(low < high && (high - low).is_finite() && positive) {
-            return Err(PictureError::Limits { low, high, stretch: name, more });
+            return Err(PictureError::Limits { low, high, scaling: name, more });
         }
-        Ok(Self { low, high, stretch, palette })
+        Ok(Self { low, high, scaling, palette })
     }
 
-    /// A scale that the middle of `values` fills, from their 0.5 to their 99.5 % point, unseen ones left aside.
+    /// A scale from the 0.5 % to the 99.5 % quantile of `values`, without unseen pixels.
     ///
-    /// Always a valid scale: constant or missing values get a little room around them, and
-    /// a logarithmic one starts at the least positive value if need be.
+    /// The scale is always valid: constant or missing values get some room, and a logarithmic scale uses positive
+    /// values only.
     #[must_use]
-    pub fn robust(values: &[f64], stretch: Scaling, palette: Palette) -> Self {
-        let usable = |v: &f64| is_seen(*v) && (stretch == Scaling::Linear || *v > 0.0);
+    pub fn robust(values: &[f64], scaling: Scaling, palette: Palette) -> Self {
+        let usable = |v: &f64| is_seen(*v) && (scaling == Scaling::Linear || *v > 0.0);
         let (low, high) = percentiles(values.iter().copied().filter(usable).collect(), 0.5, 99.5);
-        Self::widened(low, high, stretch, palette)
+        Self::widened(low, high, scaling, palette)
     }
 
-    /// A diverging scale, symmetric about zero, that reaches to the 99 % point of `|values|`.
+    /// A diverging scale, symmetric about zero, up to the 99 % quantile of `|values|`.
     #[must_use]
     pub fn symmetric(values: &[f64]) -> Self {
         let sizes = values.iter().copied().filter(|v| is_seen(*v)).map(f64::abs).collect();
         let (_, reach) = percentiles(sizes, 0.0, 99.0);
         let reach = if reach > 0.0 { reach.clamp(1e-300, 1e300) } else { 1.0 };
-        Self { low: -reach, high: reach, stretch: Scaling::Linear, palette: Palette::Diverging }
+        Self { low: -reach, high: reach, scaling: Scaling::Linear, palette: Palette::Diverging }
     }
 
-    fn widened(low: f64, high: f64, stretch: Scaling, palette: Palette) -> Self {
+    fn widened(low: f64, high: f64, scaling: Scaling, palette: Palette) -> Self {
         let (low, high) = (low.clamp(-1e300, 1e300), high.clamp(-1e300, 1e300));
         let enough = 1e-9 * low.abs().max(high.abs());
-        let (low, high) = match stretch {
+        let (low, high) = match scaling {
             _ if high - low > enough => (low, high),
             Scaling::Linear => {
                 let room = if low == 0.0 { 1.0 } else { 0.1 * low.abs() };
@@ -87,7 +85,7 @@ impl ColourScale {
             }
             Scaling::Log => (low / 1.2, low * 1.2),
         };
-        Self { low, high, stretch, palette }
+        Self { low, high, scaling, palette }
     }
 
     /// Lower limit.
@@ -102,26 +100,25 @@ impl ColourScale {
         self.high
     }
 
-    /// Place of a value on the scale, 0 to 1 within the limits.
+    /// Position of a value on the scale: 0 to 1 within the limits.
     pub(super) fn place(&self, value: f64) -> f64 {
-        match self.stretch {
+        match self.scaling {
             Scaling::Linear => (value - self.low) / (self.high - self.low),
             Scaling::Log if value > 0.0 => (value / self.low).ln() / (self.high / self.low).ln(),
             Scaling::Log => f64::NEG_INFINITY,
         }
     }
 
-    /// Colour of a value; grey if there is none.
+    /// Colour of a value; grey if unseen.
     pub(super) fn colour(&self, value: f64) -> Colour {
         if is_seen(value) { self.colour_at(self.place(value)) } else { UNSEEN }
     }
 
-    /// Colour at a place of the scale.
+    /// Colour at a position of the scale.
     pub(super) fn colour_at(&self, place: f64) -> Colour {
         let place = place.clamp(0.0, 1.0);
         match self.palette {
             Palette::Inferno => colorous::INFERNO.eval_continuous(place),
-            Palette::Viridis => colorous::VIRIDIS.eval_continuous(place),
             Palette::Diverging => colorous::RED_BLUE.eval_continuous(1.0 - place),
         }
         .into_array()
@@ -132,9 +129,9 @@ impl ColourScale {
         self.palette == Palette::Diverging
     }
 
-    /// Round values along the scale.
+    /// Ticks at round values.
     pub(super) fn ticks(&self, wanted: usize) -> Ticks {
-        match self.stretch {
+        match self.scaling {
             Scaling::Linear => labels::linear(self.low, self.high, wanted),
             Scaling::Log => labels::logarithmic(self.low, self.high, wanted),
         }
@@ -146,7 +143,7 @@ pub(super) fn is_seen(value: f64) -> bool {
     value.is_finite() && !is_unseen(value)
 }
 
-/// Two percentiles, linear between values; 1 and 1, which suits any scale, if there are none.
+/// Two percentiles, interpolated linearly; 1 and 1, which suit any scale, without values.
 fn percentiles(mut values: Vec<f64>, low: f64, high: f64) -> (f64, f64) {
     if values.is_empty() {
         return (1.0, 1.0);

@@ -1,4 +1,4 @@
-//! Pages of maps: one alone, or several side by side with captions.
+//! Pages of maps: a single map, or several with captions.
 
 use super::canvas::{Canvas, FAINT, INK, Rect, Stroke};
 use super::error::PictureError;
@@ -12,40 +12,40 @@ use crate::sky::healpix::nside_of;
 /// One map of a page.
 #[derive(Clone, Debug)]
 pub struct MapPanel<'a> {
-    /// Values in RING order, `12 nside^2` of them; NaN and UNSEEN are drawn grey.
+    /// `12 nside^2` values in RING order; NaN and UNSEEN are drawn grey.
     pub values: &'a [f64],
     /// Line above the map.
     pub caption: String,
     /// Colours.
     pub scale: ColourScale,
-    /// Unit of the values, written at the colour bar.
+    /// Unit of the values, printed at the colour bar.
     pub unit: String,
 }
 
-/// Which maps have a colour bar.
+/// Placement of colour bars.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Bars {
-    /// Each its own.
+    /// One per map.
     #[default]
     Each,
-    /// One for the page, that of the first map: all should have the same scale.
+    /// One for the page, with the scale of the first map, which all maps should share.
     Shared,
 }
 
 /// Layout of a page.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sheet {
-    /// Line above everything; none if empty.
+    /// Title of the page; none if empty.
     pub title: String,
-    /// Smaller line below the title; none if empty.
+    /// Subtitle; none if empty.
     pub subtitle: String,
-    /// Maps side by side before the next row begins.
+    /// Maps per row.
     pub columns: usize,
     /// Width of the page, pixels.
     pub width_px: usize,
     /// Colour bars.
     pub bars: Bars,
-    /// How the maps are looked at.
+    /// View of the maps.
     pub view: View,
 }
 
@@ -77,12 +77,11 @@ pub fn draw_map(panel: &MapPanel<'_>, subtitle: &str, view: &View) -> Result<Pic
     draw_sheet(std::slice::from_ref(&panel), &sheet)
 }
 
-/// Draws maps in rows, with captions and colour bars: the film of a map that sharpens, or map, input
-/// and error side by side.
+/// Draws maps in rows, with captions and colour bars: for example successive snapshots of a map.
 ///
 /// # Errors
-/// [`PictureError::PixelCount`] for values that are no map, [`PictureError::Size`] for a page without
-/// panels or of a size that is not drawn.
+/// [`PictureError::PixelCount`] for values that are not a map, [`PictureError::Size`] for a page without
+/// panels or of an invalid size.
 pub fn draw_sheet(panels: &[MapPanel<'_>], sheet: &Sheet) -> Result<Picture, PictureError> {
     let fields = panels
         .iter()
@@ -95,7 +94,7 @@ pub fn draw_sheet(panels: &[MapPanel<'_>], sheet: &Sheet) -> Result<Picture, Pic
         .collect::<Result<Vec<_>, PictureError>>()?;
     if panels.is_empty() || panels.len() > 256 {
         let value = panels.len();
-        return Err(PictureError::Size { what: "a number of maps of", value, expected: "1 to 256" });
+        return Err(PictureError::Size { what: "number of maps", value, expected: "1 to 256" });
     }
     Picture::check_size(sheet.width_px, sheet.width_px)?;
     let layout = Layout::new(panels, sheet);
@@ -136,7 +135,7 @@ pub fn draw_sheet(panels: &[MapPanel<'_>], sheet: &Sheet) -> Result<Picture, Pic
     Ok(Picture::from_canvas(canvas, sheet.width_px, layout.height, &sheet.title))
 }
 
-/// Where everything goes, pixels.
+/// The layout of a page, pixels.
 struct Layout {
     height: usize,
     columns: usize,

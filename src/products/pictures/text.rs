@@ -11,12 +11,12 @@ static REGULAR: LazyLock<FontRef<'static>> =
 static MEDIUM: LazyLock<FontRef<'static>> =
     LazyLock::new(|| parse(include_bytes!("font/Roboto-Medium.subset.ttf")));
 
-#[expect(clippy::expect_used, reason = "the bytes are part of the program; a test reads both fonts")]
+#[expect(clippy::expect_used, reason = "the fonts are embedded, and a test parses both")]
 fn parse(bytes: &'static [u8]) -> FontRef<'static> {
-    FontRef::try_from_slice(bytes).expect("the embedded font is whole")
+    FontRef::try_from_slice(bytes).expect("the embedded font is valid")
 }
 
-/// Where the anchor of a text lies in it, along the writing.
+/// Position of the anchor along the text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Align {
     Start,
@@ -24,7 +24,7 @@ pub(super) enum Align {
     End,
 }
 
-/// How text looks.
+/// Style of a text.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Style {
     /// Height of the font, pixels.
@@ -59,11 +59,11 @@ impl Style {
     }
 }
 
-/// Size of a subscript and how far it stands below, in sizes of the text.
+/// Size of a subscript and its drop below the line, relative to the size of the text.
 const SUBSCRIPT_SIZE: f64 = 0.72;
 const SUBSCRIPT_DROP: f64 = 0.16;
 
-/// Pieces of a text; those in `_{...}` are subscripts.
+/// The runs of a text; `_{...}` marks subscripts.
 fn runs(text: &str) -> Vec<(&str, bool)> {
     let mut runs = Vec::new();
     let mut rest = text;
@@ -84,7 +84,7 @@ fn lowered(style: Style, subscript: bool) -> (Style, f64) {
     }
 }
 
-/// Length of a line of text, pixels; `_{...}` is a subscript.
+/// Length of a line of text, pixels; `_{...}` marks subscripts.
 pub(super) fn length(text: &str, style: Style) -> f64 {
     runs(text)
         .into_iter()
@@ -95,7 +95,7 @@ pub(super) fn length(text: &str, style: Style) -> f64 {
         .sum()
 }
 
-/// Draws a line of text; `anchor` is on the line through the middle of its capitals, `_{...}` is a subscript.
+/// Draws a line of text; `anchor` is at mid-height of its capitals, `_{...}` marks subscripts.
 pub(super) fn draw(canvas: &mut Canvas, text: &str, anchor: (f64, f64), align: Align, style: Style) {
     let back = match align {
         Align::Start => 0.0,
@@ -110,7 +110,7 @@ pub(super) fn draw(canvas: &mut Canvas, text: &str, anchor: (f64, f64), align: A
         let font = style.font();
         for c in run.chars() {
             let id = font.glyph_id(c);
-            // Upwards: along the text is up the page, down the text is to the right.
+            // Upwards: the text runs up the page, and its downward direction points right.
             let origin = if style.upwards {
                 (along, drop)
             } else {
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn the_fonts_hold_what_labels_are_made_of() {
+    fn the_fonts_hold_the_characters_of_labels() {
         let wanted = "ABCxyz 0123456789 +-−×·°%()[]/ ρσνλΩℓ ⁰¹²³⁴⁵⁶⁷⁸⁹⁻ ₀₁₂₉ ≤≥";
         for font in [&*REGULAR, &*MEDIUM] {
             for c in wanted.chars() {
