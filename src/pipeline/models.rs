@@ -9,7 +9,7 @@ use crate::array::Array;
 use crate::mother::{Fidelity, Schedule};
 use crate::response::harmonic::RotationTable;
 use crate::response::model::{
-    BandAverage, DirectSum, HarmonicSetup, HarmonicSum, Load, ModelChoice, ModelKind, ModelPlan,
+    BandAverage, DirectSum, HarmonicSum, HarmonicSumSetup, Load, ModelChoice, ModelKind, ModelPlan,
     VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
@@ -30,7 +30,7 @@ impl Plan {
                     let width_hz = spacecraft.channel_width_hz;
                     let longest_m = longest * SPEED_OF_LIGHT_M_S / schedule.frequency_hz;
                     let frequencies = BandAverage::frequencies(longest_m, width_hz);
-                    (frequencies, BandAverage::stretch(schedule.frequency_hz, width_hz))
+                    (frequencies, BandAverage::baseline_factor(schedule.frequency_hz, width_hz))
                 }
                 false => (1, 1.0),
             };
@@ -100,7 +100,7 @@ pub(crate) fn build(plan: &Plan, skies: &[SkyMap]) -> Result<Vec<Box<dyn Visibil
             continue;
         }
         let alm = coefficients(sky, model.l_max)?;
-        let setup = HarmonicSetup {
+        let setup = HarmonicSumSetup {
             frequency_hz,
             orbit_radius_m: array.orbit_radius_m(),
             inclination_rad: array.inclination_rad(),

@@ -14,11 +14,11 @@
 //! `d^l_{l mu} = sqrt(C(2l, l-mu)) cos^{l+mu}(beta/2) (-sin(beta/2))^{l-mu}` and its mirror images. Upwards it
 //! first grows out of the classically forbidden region and then oscillates, so it is stable; its starting
 //! values lie below the range of f64 (0.5^1000 at l = 1000 and 30 deg), so every lane carries a power of
-//! 2^512 until it comes back into range.
+//! 2^512 until it is back in range.
 
 use super::scaled::{LaneSlices, Scaled, ScaledLanes, advance};
 
-/// What the recurrences at every mu share: `sqrt(l^2 - m^2)`, its inverse, powers of the half angle.
+/// Tables shared by the recurrences at all mu: `sqrt(l^2 - m^2)`, its inverse, powers of the half angle.
 #[derive(Clone, Debug)]
 pub struct WignerTable {
     l_max: usize,
@@ -32,7 +32,7 @@ pub struct WignerTable {
 }
 
 impl WignerTable {
-    /// Tables for `l <= l_max` at the angle `beta_rad` between 0 and pi.
+    /// Builds the tables for `l <= l_max` at the angle `beta_rad` between 0 and pi.
     #[must_use]
     pub fn new(l_max: usize, beta_rad: f64) -> Self {
         let (sin, cos) = (0.5 * beta_rad).sin_cos();
@@ -90,7 +90,7 @@ impl<'a> WignerRows<'a> {
 
     /// The next degree and its values for m = -l ..= l; `None` after `l_max`.
     ///
-    /// Values below 2^-256 come out as zero.
+    /// Values below 2^-256 are given as zero.
     pub fn next_row(&mut self) -> Option<(usize, &[f64])> {
         let l = self.next_l;
         if l > self.table.l_max {
@@ -133,7 +133,7 @@ impl<'a> WignerRows<'a> {
         self.lanes.set(centre - l, self.binomial.product(cos[l - mu]).product(sin[l + mu]));
     }
 
-    /// Takes the orders |m| < l from l - 1 to l.
+    /// Advances the orders |m| < l from l - 1 to l.
     fn step(&mut self, l: usize) {
         let (table, mu, centre) = (self.table, self.mu, self.table.l_max);
         let from = l - 1;
