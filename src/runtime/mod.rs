@@ -34,7 +34,7 @@ pub use cancel::Cancel;
 pub use config::{RuntimeConfig, RuntimeConfigError};
 pub use error::{BoxError, Laggards, Moment, RuntimeError};
 pub use graph::{Graph, Link};
-pub use ledger::{Ledger, LedgerImbalance, LedgerReport, Loss};
+pub use ledger::{Ledger, LedgerImbalance, LedgerReport};
 pub use metrics::{Metrics, StageProgress};
 pub use outlet::Outlet;
 pub use report::{QueueReport, Report, StageReport};

@@ -6,10 +6,12 @@ pub mod constants;
 mod ids;
 mod per_channel;
 mod random;
+mod reason;
 mod time;
 pub mod vector;
 
 pub use ids::{ChannelId, MAX_SATELLITES, Pair, PairError, all_pairs};
 pub use per_channel::PerChannel;
 pub use random::{StreamKind, random_stream};
+pub use reason::Reason;
 pub use time::{MissionTime, TICKS_PER_SECOND};
