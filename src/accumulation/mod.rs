@@ -17,7 +17,7 @@ mod scale;
 mod stage;
 mod tiles;
 
-pub use config::{EngineKind, MapConfig, MapConfigError};
+pub use config::{EngineKind, MapConfig};
 pub use error::AccumulationError;
 pub use pixel::{PixelEngine, PixelSetup, PixelSums};
 pub use scale::automatic_weight_max;

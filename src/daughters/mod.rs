@@ -19,7 +19,7 @@ mod repair;
 mod sampler;
 mod synthesis;
 
-pub use config::{DaughtersConfig, DaughtersError, Disturbances, DropPolicy, FLOAT_BITS};
+pub use config::{DaughtersConfig, Disturbances, DropPolicy, FLOAT_BITS};
 pub use covariance::{Covariances, Epochs, Request, Tables};
 pub use link::{LinkCounts, SampleLink};
 pub use quantiser::Quantiser;

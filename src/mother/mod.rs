@@ -15,7 +15,9 @@ mod powers;
 mod schedule;
 mod store;
 
-pub use config::{Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, SpacecraftError, StoreDrop};
+pub use config::{
+    Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, IntegrationTooShort, SpacecraftConfig, StoreDrop,
+};
 pub use integrator::{Integrator, MeasurementOptions, NoiseModel};
 pub use ninth::{NINTH_BAND_HZ, Ninth, NinthConfig, NinthSetup, NinthSky};
 pub use observer::Observer;

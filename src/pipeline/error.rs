@@ -2,7 +2,7 @@
 
 use thiserror::Error;
 
-use super::config::ConfigError;
+use super::config_source::ConfigError;
 use crate::array::ArrayError;
 use crate::frames::{SampleReason, VisibilityReason};
 use crate::runtime::{LedgerImbalance, RuntimeError};
@@ -28,9 +28,9 @@ pub enum PipelineError {
     /// The sky's coefficients cannot be found.
     #[error("the simulated sky's coefficients: {0}")]
     Coefficients(#[from] crate::sky::harmonics::HarmonicsError),
-    /// A setting of the sky that does not fit its map.
+    /// A value of the configuration that does not fit the files that it names.
     #[error(transparent)]
-    SkyConfig(#[from] crate::sky::SkyConfigError),
+    Invalid(#[from] crate::units::InvalidValue),
     /// A model of visibilities cannot be.
     #[error(transparent)]
     Model(#[from] crate::response::model::ModelError),

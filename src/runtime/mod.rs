@@ -31,7 +31,7 @@ mod worker;
 mod tests;
 
 pub use cancel::Cancel;
-pub use config::{RuntimeConfig, RuntimeConfigError};
+pub use config::RuntimeConfig;
 pub use error::{BoxError, Laggards, Moment, RuntimeError};
 pub use graph::{Graph, Link};
 pub use ledger::{Ledger, LedgerImbalance, LedgerReport};

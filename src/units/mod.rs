@@ -1,7 +1,9 @@
-//! Identifiers, mission time, constants, three-vectors and keyed random streams.
+//! Identifiers, mission time, constants, three-vectors, keyed random streams, reasons of the ledger and checks of
+//! configuration values.
 //!
 //! Uses nothing else of the crate.
 
+mod checks;
 pub mod constants;
 mod ids;
 mod per_channel;
@@ -10,6 +12,7 @@ mod reason;
 mod time;
 pub mod vector;
 
+pub use checks::{Checks, InvalidValue};
 pub use ids::{ChannelId, MAX_SATELLITES, Pair, PairError, all_pairs};
 pub use per_channel::PerChannel;
 pub use random::{StreamKind, random_stream};
