@@ -17,7 +17,9 @@ use lunarray::calibration::{CalibrationConfig, Calibrator};
 use lunarray::downlink::receive::cadu::CaduReceiver;
 use lunarray::downlink::wire::cadu::{CaduEncoder, ReedSolomon, randomize};
 use lunarray::downlink::{DownlinkConfig, DownlinkReader, FileSource, Packetizer, Receiver};
-use lunarray::frames::{AntennaResponse, Channel, Flags, GroundFrame, Instrument, VisibilityBlock};
+use lunarray::frames::{
+    AntennaResponse, Channel, Flags, GroundFrame, Instrument, VisibilityBlock, VisibilityReason,
+};
 use lunarray::ground::Reception;
 use lunarray::runtime::{Cancel, Graph, Ledger, Sink, Units};
 use lunarray::units::{ChannelId, MissionTime, Pair, StreamKind, all_pairs, random_stream};
@@ -279,7 +281,7 @@ fn replay(bytes: &[u8], sent: u64) {
         }
         digest.finalize()
     };
-    let placed = |graph: &mut Graph, ledger: &Ledger| {
+    let placed = |graph: &mut Graph, ledger: &Ledger<VisibilityReason>| {
         let read = graph.source("read", 64, FileSource::open(std::slice::from_ref(&path)).unwrap());
         let frames =
             graph.stage("receive", 64, read, Reception::new(1 << 28, 8192, std::sync::Arc::default()));

@@ -20,5 +20,5 @@ pub use ephemeris::{Ephemeris, Insertion, segments_for};
 pub use formation::Formation;
 pub use integration::{IntegrationRule, integration_time_s};
 pub use orbit::{Array, SatelliteState, hidden_by_moon};
-pub use placing::{FlaggedCounts, PlacingCounts};
+pub use placing::PlacingCounts;
 pub use windows::{ObservingWindows, earth_in_sight_s};

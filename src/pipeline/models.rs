@@ -14,7 +14,7 @@ use crate::response::model::{
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
-use crate::sky::{Frame, SkyConfig, SkyConfigError, SkyMap};
+use crate::sky::{Frame, SkyConfig, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 impl Plan {
@@ -129,10 +129,7 @@ fn averaged(plan: &Plan, model: Box<dyn VisibilityModel>, frequency_hz: f64) -> 
 /// # Errors
 /// More degrees than the map determines; a map with values that are not finite.
 fn coefficients(sky: &SkyMap, l_max: usize) -> Result<Alm, PipelineError> {
-    let most = SkyConfig::l_max_most(sky.nside());
-    if l_max > most {
-        return Err(SkyConfigError::BandLimit { l_max, most }.into());
-    }
+    SkyConfig::check_l_max(l_max, sky.nside())?;
     let options = AnalysisOptions { method: Method::ACCURATE };
     let alm = analysis(sky.values(), l_max, &options)?.alm;
     Ok(match sky.frame() {

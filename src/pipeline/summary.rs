@@ -11,6 +11,7 @@ use super::sample_summary::SampleSummary;
 use crate::downlink::ReceptionCounters;
 use crate::downlink::transport::socket::ListenAccount;
 use crate::files::write_atomically;
+use crate::frames::VisibilityReason;
 use crate::products::{ChannelSummary, ProductsError};
 use crate::runtime::{LedgerReport, Report};
 
@@ -44,7 +45,7 @@ pub struct Summary {
     /// The maps, channel by channel.
     pub channels: Vec<ChannelSummary>,
     /// What became of every visibility.
-    pub ledger: LedgerReport,
+    pub ledger: LedgerReport<VisibilityReason>,
     /// What became of samples; absent without sample fidelity.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples: Option<SampleSummary>,
@@ -64,7 +65,7 @@ impl Summary {
         segment: Segment,
         config: &Config,
         report: Report,
-        ledger: LedgerReport,
+        ledger: LedgerReport<VisibilityReason>,
         reception: ReceptionCounters,
         channels: Vec<ChannelSummary>,
     ) -> Self {

@@ -99,7 +99,7 @@ fn every_visibility_is_read_and_placed() {
                 let (_, counts) = ephemeris.place(&block, frequency_hz);
                 assert_eq!(counts.without_ephemeris, 0);
                 placed += counts.placed;
-                flagged += counts.flagged.total();
+                flagged += counts.flagged.values().sum::<u64>();
             }
             GroundFrame::Housekeeping(counts) => assert_eq!(placed + flagged, counts.sampled),
         }

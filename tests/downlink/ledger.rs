@@ -16,7 +16,7 @@ use lunarray::downlink::{
 };
 use lunarray::frames::{
     AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, PlacedFrame,
-    VisibilityBlock,
+    VisibilityBlock, VisibilityReason,
 };
 use lunarray::ground::{Collector, Delivery, Reception};
 use lunarray::mother::{PacedLink, SpacecraftConfig, Store, StoreDrop};
@@ -145,7 +145,7 @@ fn visibilities_by_packet(sound: &[u8]) -> BTreeMap<u64, Vec<u64>> {
 
 /// What the ground makes of it.
 struct Received {
-    ledger: LedgerReport,
+    ledger: LedgerReport<VisibilityReason>,
     reception: ReceptionCounters,
     /// Numbers of the visibilities that went into the sums, in order.
     summed: Vec<u64>,
@@ -184,10 +184,6 @@ fn receive(arrived: &[u8]) -> Received {
     Received { ledger, reception, summed }
 }
 
-fn lost(ledger: &LedgerReport, stage: &str) -> u64 {
-    ledger.lost.iter().filter(|loss| loss.stage == stage).map(|loss| loss.count).sum()
-}
-
 fn counts_of(ranges: &[PacketRange], kind: Kind) -> BTreeSet<u64> {
     ranges.iter().filter(|range| range.apid == kind.apid()).flat_map(PacketRange::counts).collect()
 }
@@ -219,9 +215,9 @@ fn hold_to_the_truth(sent: &Sent) {
     let flagged = ledger.flagged_total() as u64;
     assert_eq!(ledger.accumulated + flagged + unread, recovered.len() as u64, "{ledger:?}");
     // Each for its reason: every twentieth has a flag, others no positions.
-    let without = |reason: &str| ledger.flagged.get(reason).copied().unwrap_or(0);
-    assert_eq!(flagged, without("interference") + without("no ephemeris"));
-    if unread == 0 && without("no ephemeris") == 0 {
+    let without_ephemeris = ledger.count(VisibilityReason::NoEphemeris);
+    assert_eq!(flagged, ledger.count(VisibilityReason::Interference) + without_ephemeris);
+    if unread == 0 && without_ephemeris == 0 {
         let good: BTreeSet<u64> =
             recovered.iter().copied().filter(|number| number % u64::from(INTEGRATIONS) % 20 != 3).collect();
         assert_eq!(summed, good);
@@ -231,10 +227,10 @@ fn hold_to_the_truth(sent: &Sent) {
     let last_report_came = !reports_lost.contains(&(WINDOWS as u64 - 1));
     if last_report_came && reception.instrument.packets > 0 {
         assert_eq!(ledger.sampled, SAMPLED);
-        assert_eq!(lost(ledger, "store"), truth.visibilities_dropped);
-        assert_eq!(lost(ledger, "downlink"), truth.visibilities_lost);
+        assert_eq!(ledger.count(VisibilityReason::StoreFull), truth.visibilities_dropped);
+        assert_eq!(ledger.count(VisibilityReason::NotReceived), truth.visibilities_lost);
     }
-    assert!(lost(ledger, "store") <= truth.visibilities_dropped);
+    assert!(ledger.count(VisibilityReason::StoreFull) <= truth.visibilities_dropped);
     assert!(ledger.sampled <= SAMPLED);
 }
 

@@ -68,7 +68,7 @@ impl LinkSimulator {
     pub fn new(config: &LinkConfig, seed: u64, code: Option<ReedSolomon>) -> Result<Self, DownlinkError> {
         let format = if code.is_some() { Format::Cadu } else { Format::Packets };
         if let Some(problem) = config.problems(format).into_iter().next() {
-            return Err(problem);
+            return Err(problem.into());
         }
         let truth = Truth { seed, link: config.clone(), format, ..Truth::default() };
         Ok(Self {

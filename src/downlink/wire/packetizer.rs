@@ -43,7 +43,7 @@ impl Packetizer {
     /// The first of [`DownlinkConfig::problems`].
     pub fn new(config: &DownlinkConfig) -> Result<Self, DownlinkError> {
         if let Some(problem) = config.problems().into_iter().next() {
-            return Err(problem);
+            return Err(problem.into());
         }
         Ok(Self {
             packet_bytes_max: config.packet_bytes_max,

@@ -13,6 +13,7 @@ use super::error::StateError;
 use super::journal::Journal;
 use crate::accumulation::AccumulatorState;
 use crate::calibration::{AutoTable, CalibratorState};
+use crate::frames::VisibilityReason;
 use crate::ground::{CollectorState, CollectorView};
 use crate::runtime::LedgerReport;
 
@@ -40,7 +41,7 @@ pub(super) struct Head {
     pub(super) calibrator: CalibratorState,
     pub(super) powers: AutoTable,
     pub(super) accumulator: AccumulatorState,
-    pub(super) ledger: LedgerReport,
+    pub(super) ledger: LedgerReport<VisibilityReason>,
     pub(super) journal: Journal,
 }
 
@@ -52,7 +53,7 @@ pub(super) struct HeadView<'a> {
     pub(super) calibrator: CalibratorState,
     pub(super) powers: &'a AutoTable,
     pub(super) accumulator: AccumulatorState,
-    pub(super) ledger: LedgerReport,
+    pub(super) ledger: LedgerReport<VisibilityReason>,
     pub(super) journal: &'a Journal,
 }
 
@@ -258,7 +259,7 @@ mod tests {
             GroundFrame::Housekeeping(Housekeeping { time: MissionTime(5), sampled: 9, dropped: 1 }),
         ];
         let ledger = Ledger::new();
-        ledger.flagged("far", 4);
+        ledger.left_out(VisibilityReason::BaselineBeyondMap, 4);
         let mut accumulator = Accumulator::new(Default::default(), ledger.clone());
         let mut calibrator =
             Calibrator::new(Box::new(Identity), ledger.clone()).with_autos(Default::default());

@@ -10,9 +10,8 @@ use super::error::StateError;
 use super::folder::checkpoints;
 use super::journal::{Line, Sent, digest};
 use super::keeper::Keeper;
-use crate::calibration::DUPLICATE;
 use crate::downlink::{Event, Intake, Kind, PacketHeader};
-use crate::frames::GroundFrame;
+use crate::frames::{GroundFrame, VisibilityReason};
 use crate::ground::WaitingPacket;
 use crate::pipeline::config::Config;
 use crate::runtime::LedgerReport;
@@ -178,7 +177,7 @@ impl Keeper {
         let header = packet.header;
         let sent = (header.time, header.count);
         let Some(line) = self.journal.visibilities.get(&sent).cloned() else { return Ok(()) };
-        let account = self.account_of(&line);
+        let account = Self::account_of(&line);
         let is_double = account.sampled > 0;
         let block = self.collector.read_again(&packet);
         if let Some(block) = block.filter(|_| !is_double) {
@@ -211,13 +210,13 @@ impl Keeper {
     }
 
     /// What a line has posted to the ledger.
-    fn account_of(&self, line: &Line) -> LedgerReport {
+    fn account_of(line: &Line) -> LedgerReport<VisibilityReason> {
         let mut account =
             LedgerReport { accumulated: u64::from(line.accumulated), ..LedgerReport::default() };
-        for (reason, count) in self.journal.flagged(line) {
-            // Doubles have been posted as sampled a second time.
-            account.sampled += if reason == DUPLICATE { count } else { 0 };
-            account.flagged.insert(reason.to_owned(), count);
+        for &(reason, count) in &line.left_out {
+            // Duplicates have been posted as sampled a second time.
+            account.sampled += if reason == VisibilityReason::Duplicate { u64::from(count) } else { 0 };
+            account.left_out.insert(reason, u64::from(count));
         }
         account
     }

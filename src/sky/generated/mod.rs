@@ -64,7 +64,7 @@ pub fn generate(
 ) -> Result<Vec<f64>, GeneratedSkyError> {
     config::check_request(frequency_hz, nside)?;
     if let Some(problem) = config.problems().into_iter().next() {
-        return Err(problem);
+        return Err(problem.into());
     }
     let fine = nside.max(NSIDE_MIN);
     let diffuse_sky = DiffuseSky::new(config, frequency_hz);
