@@ -4,12 +4,14 @@
 
 pub mod constants;
 mod ids;
+mod interval_set;
 mod per_channel;
 mod random;
 mod time;
 pub mod vector;
 
 pub use ids::{ChannelId, MAX_SATELLITES, Pair, PairError, all_pairs};
+pub use interval_set::IntervalSet;
 pub use per_channel::PerChannel;
 pub use random::{StreamKind, random_stream};
 pub use time::{MissionTime, TICKS_PER_SECOND};
