@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::config::Config;
 use super::sample_summary::SampleSummary;
 use crate::downlink::ReceptionCounters;
-use crate::downlink::transport::socket::ListenAccount;
+use crate::downlink::transport::socket::ListenReport;
 use crate::files::write_atomically;
 use crate::frames::VisibilityReason;
 use crate::products::{ChannelSummary, ProductsError};
@@ -53,7 +53,7 @@ pub struct Summary {
     pub reception: ReceptionCounters,
     /// The senders, if the ground listened.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub listening: Option<ListenAccount>,
+    pub listening: Option<ListenReport>,
     /// Stages: throughput, times, queues.
     pub report: Report,
 }

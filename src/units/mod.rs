@@ -7,6 +7,7 @@ pub(crate) mod arithmetic;
 mod checks;
 pub mod constants;
 mod ids;
+mod interval_set;
 mod per_channel;
 mod random;
 mod reason;
@@ -15,6 +16,7 @@ pub mod vector;
 
 pub use checks::{Checks, InvalidValue};
 pub use ids::{ChannelId, MAX_SATELLITES, Pair, PairError, all_pairs};
+pub use interval_set::IntervalSet;
 pub use per_channel::PerChannel;
 pub use random::{StreamKind, random_stream};
 pub use reason::Reason;

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use lunarray::downlink::{
-    Decoder, DownlinkConfig, DownlinkError, HEADER_BYTES, Kind, PacketHeader, Packetizer, Receiver,
+    Decoder, DownlinkConfig, DownlinkError, HEADER_BYTES, Kind, PacketHeader, PacketReceiver, Packetizer,
     ReceptionCounters, TRAILER_BYTES,
 };
 use lunarray::frames::{
@@ -92,10 +92,10 @@ fn packets(bytes: &[u8]) -> Vec<Vec<u8>> {
 
 /// Frames and account of bytes that come in chunks; the account of bytes must close.
 fn receive(bytes: &[u8], chunk: usize) -> (Vec<GroundFrame>, ReceptionCounters) {
-    let mut receiver = Receiver::new();
+    let mut receiver = PacketReceiver::new();
     let mut decoder = Decoder::new();
     let mut frames = Vec::new();
-    let mut drain = |receiver: &mut Receiver| {
+    let mut drain = |receiver: &mut PacketReceiver| {
         while let Some(event) = receiver.next_event() {
             frames.extend(decoder.accept(&event));
         }

@@ -9,7 +9,7 @@ use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 use lunarray::accumulation::{Accumulator, MapConfig};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows, segments_for};
 use lunarray::calibration::{CalibrationConfig, Calibrator};
-use lunarray::downlink::link::{LinkConfig, LinkSimulator, PacketRange, Truth};
+use lunarray::downlink::link::{LinkConfig, LinkSimulator, LinkTruth, PacketRange};
 use lunarray::downlink::wire::cadu::INTERLEAVES;
 use lunarray::downlink::{
     Decoder, DownlinkConfig, Event, Format, Intake, Kind, ReceptionCounters, Transmission,
@@ -98,7 +98,7 @@ struct Case {
 struct Sent {
     sound: Vec<u8>,
     arrived: Vec<u8>,
-    truth: Truth,
+    truth: LinkTruth,
 }
 
 fn send(case: &Case) -> Sent {

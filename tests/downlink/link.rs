@@ -5,7 +5,7 @@ use crate::common;
 use std::collections::{BTreeMap, BTreeSet};
 
 use common::downlink::{mission, packets_of, transmit};
-use lunarray::downlink::link::{Fate, LinkConfig, LinkSimulator, PacketRange, Truth};
+use lunarray::downlink::link::{FrameFate, LinkConfig, LinkSimulator, LinkTruth, PacketRange};
 use lunarray::downlink::receive::cadu::FrameCounters;
 use lunarray::downlink::{Decoder, DownlinkConfig, Event, Format, Intake, PacketHeader, ReceptionCounters};
 use lunarray::frames::GroundFrame;
@@ -47,7 +47,7 @@ fn config(format: Format) -> DownlinkConfig {
     DownlinkConfig { format, packet_bytes_max: 2_048, ..DownlinkConfig::default() }
 }
 
-fn damage(sound: &[u8], format: Format, link: &LinkConfig, seed: u64, chunk: usize) -> (Vec<u8>, Truth) {
+fn damage(sound: &[u8], format: Format, link: &LinkConfig, seed: u64, chunk: usize) -> (Vec<u8>, LinkTruth) {
     let mut simulator = LinkSimulator::new(link, seed, config(format).code()).unwrap();
     let mut out = Vec::new();
     for part in sound.chunks(chunk) {
@@ -69,11 +69,11 @@ fn sent_names(frames: &[GroundFrame]) -> BTreeSet<Name> {
 }
 
 /// Receives and compares with the truth: each packet that the truth does not call lost arrives, once.
-fn hold_to(truth: &Truth, stream: &[u8], passes: i64) -> Received {
+fn hold_to(truth: &LinkTruth, stream: &[u8], passes: i64) -> Received {
     hold_to_truth(truth, stream, &mission(passes, 1_000))
 }
 
-fn hold_to_truth(truth: &Truth, stream: &[u8], frames: &[GroundFrame]) -> Received {
+fn hold_to_truth(truth: &LinkTruth, stream: &[u8], frames: &[GroundFrame]) -> Received {
     let received = receive(stream);
     let found: BTreeSet<Name> = received.packets.iter().copied().collect();
     assert_eq!(found.len(), received.packets.len(), "a packet came twice");
@@ -111,7 +111,7 @@ fn three_wrong_bits_in_a_thousand_cost_what_the_truth_says() {
     // A codeword of 255 bytes has 6.1 wrong ones on average; more than 16 have a probability of 2e-4, so 1e-3 of the
     // frames have such a codeword: of 3000, three or so.
     assert!(
-        (1..20).contains(&lost) && truth.frames_lost.iter().all(|range| range.fate == Fate::Spoilt),
+        (1..20).contains(&lost) && truth.frames_lost.iter().all(|range| range.fate == FrameFate::Spoilt),
         "{lost}"
     );
     assert_eq!((frames.frames, frames.frames_uncorrectable), (truth.frames_recoverable, lost));

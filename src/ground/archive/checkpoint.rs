@@ -222,7 +222,7 @@ mod tests {
     use crate::accumulation::Accumulator;
     use crate::calibration::{Calibrator, Identity};
     use crate::downlink::{
-        CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PacketHeader, Segment, Transmission,
+        CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PacketHeader, PacketSegment, Transmission,
     };
     use crate::frames::{
         AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock,
@@ -274,7 +274,7 @@ mod tests {
         collector.push(&bytes);
         collector.finish();
         while collector.next_delivery(&|_| true).unwrap().is_some() {}
-        let (kind, segment, time) = (Kind::Visibilities, Segment::Whole, CucTime(3));
+        let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(3));
         let header = PacketHeader { kind, segment, count: 3, time, version: FORMAT_VERSION, bytes: 60 };
         let mut journal = Journal::default();
         journal.keep(header, 1, None, (2, 3, Some([1.0, 2.0])), &ledger.report());

@@ -211,10 +211,10 @@ pub(super) fn digest(placed: &PlacedVisibilities) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::downlink::{FORMAT_VERSION, Segment};
+    use crate::downlink::{FORMAT_VERSION, PacketSegment};
 
     fn header(count: u64) -> PacketHeader {
-        let (kind, segment, time) = (Kind::Visibilities, Segment::Whole, CucTime(7 * count));
+        let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(7 * count));
         PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 }
     }
 

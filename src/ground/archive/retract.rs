@@ -1,7 +1,6 @@
 //! Taking packets out of a state again.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -10,7 +9,8 @@ use super::error::StateError;
 use super::folder::checkpoints;
 use super::journal::{Line, Sent, digest};
 use super::keeper::Keeper;
-use crate::downlink::{Event, Intake, Kind, PacketHeader};
+use crate::downlink::receive::EventReader;
+use crate::downlink::{Event, Kind, PacketHeader};
 use crate::frames::{GroundFrame, VisibilityReason};
 use crate::ground::WaitingPacket;
 use crate::pipeline::config::Config;
@@ -109,25 +109,12 @@ impl Keeper {
     }
 
     fn retract_file(&mut self, path: &Path, found: &mut Found) -> Result<(), StateError> {
-        let mut file = File::open(path).map_err(StateError::io(path, "open the file"))?;
-        let mut intake = Intake::unjudged();
-        let mut packets = 0_u64;
-        loop {
-            let read = intake.fill_from(&mut file).map_err(StateError::io(path, "read"))?;
-            if read == 0 {
-                intake.finish();
-            }
-            while let Some(event) = intake.next_event() {
-                if let Event::Packet(packet) = event {
-                    packets += 1;
-                    self.retract_packet(WaitingPacket::of(&packet), found)?;
-                }
-            }
-            if read == 0 {
-                break;
-            }
-        }
-        if packets == 0 {
+        let mut events = EventReader::open(path)?.unfiltered();
+        events.for_each(|event| match event {
+            Event::Packet(packet) => self.retract_packet(WaitingPacket::of(packet), found),
+            _ => Ok(()),
+        })?;
+        if events.packets() == 0 {
             let (path, found) = (path.to_owned(), "not one packet".into());
             return Err(StateError::Damaged {
                 path,

@@ -27,7 +27,7 @@ pub(super) struct Unit {
 
 /// A packet and the units that it lies in.
 #[derive(Debug)]
-pub(super) struct Span {
+pub(super) struct SentPacket {
     pub(super) apid: u16,
     pub(super) count: u64,
     pub(super) visibilities: u64,
@@ -36,14 +36,14 @@ pub(super) struct Span {
 
 /// What is sent from one window's end to the next one's. Packets never run from one pass into another.
 #[derive(Debug, Default)]
-pub(super) struct Pass {
+pub(super) struct SentPass {
     pub(super) units: Vec<Unit>,
-    pub(super) packets: Vec<Span>,
+    pub(super) packets: Vec<SentPacket>,
     /// The spacecraft's own counts at its end.
     pub(super) report: Option<Housekeeping>,
 }
 
-impl Pass {
+impl SentPass {
     /// Takes a packet that begins with `head`, in all of it if it is a short one.
     fn add(&mut self, head: &[u8], units: Vec<usize>) {
         // Idle packets have other headers than ours.
@@ -55,7 +55,7 @@ impl Pass {
             let payload = head.get(HEADER_BYTES..HEADER_BYTES + payload);
             self.report = payload.and_then(|payload| decode_housekeeping(payload).ok()).or(self.report);
         }
-        self.packets.push(Span { apid: header.kind.apid(), count: header.count, visibilities, units });
+        self.packets.push(SentPacket { apid: header.kind.apid(), count: header.count, visibilities, units });
     }
 }
 
@@ -74,21 +74,21 @@ pub(super) struct Splitter {
     code: Option<ReedSolomon>,
     buffer: Vec<u8>,
     offset: u64,
-    pass: Pass,
+    pass: SentPass,
     open: BTreeMap<u8, Open>,
 }
 
 impl Splitter {
     /// For coded frames, or for plain packets.
     pub(super) fn new(code: Option<ReedSolomon>) -> Self {
-        Self { code, buffer: Vec::new(), offset: 0, pass: Pass::default(), open: BTreeMap::new() }
+        Self { code, buffer: Vec::new(), offset: 0, pass: SentPass::default(), open: BTreeMap::new() }
     }
 
     /// Takes the next bytes; gives each pass that they complete to `done`.
     ///
     /// # Errors
     /// Anything but a sound downlink.
-    pub(super) fn push(&mut self, bytes: &[u8], mut done: impl FnMut(Pass)) -> Result<(), DownlinkError> {
+    pub(super) fn push(&mut self, bytes: &[u8], mut done: impl FnMut(SentPass)) -> Result<(), DownlinkError> {
         self.buffer.extend_from_slice(bytes);
         let buffer = std::mem::take(&mut self.buffer);
         let mut rest = buffer.as_slice();
@@ -112,7 +112,7 @@ impl Splitter {
     ///
     /// # Errors
     /// An unfinished frame or packet.
-    pub(super) fn finish(&mut self) -> Result<Option<Pass>, DownlinkError> {
+    pub(super) fn finish(&mut self) -> Result<Option<SentPass>, DownlinkError> {
         if !self.buffer.is_empty() {
             return Err(self.unsound());
         }

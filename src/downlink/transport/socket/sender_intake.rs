@@ -2,10 +2,10 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::account::Ended;
+use super::report::ConnectionEnd;
 use crate::downlink::receive::cadu::FrameCounters;
 use crate::downlink::receive::{Decoder, Event, Intake, Packet, ReceptionCounters};
-use crate::downlink::wire::{Format, HEADER_BYTES, Kind, Segment, packet_check};
+use crate::downlink::wire::{Format, HEADER_BYTES, Kind, PacketSegment, packet_check};
 use crate::frames::{GroundFrame, Instrument};
 
 /// Segments are kept together up to so many bytes; a window's ephemeris is a hundredth of it.
@@ -30,7 +30,7 @@ impl Mission {
 /// The receiver of one connection. It keeps the account of all that is no packet; packets are for the ground to
 /// count.
 #[derive(Debug)]
-pub(super) struct Line {
+pub(super) struct SenderIntake {
     intake: Intake,
     stream: Decoder,
     /// Follows the descriptions of instruments alone.
@@ -47,10 +47,10 @@ pub(super) struct Line {
     bytes_at_sign: u64,
 }
 
-impl Line {
+impl SenderIntake {
     pub(super) fn new(mission: Mission) -> Self {
         Self {
-            intake: Intake::unjudged(),
+            intake: Intake::unfiltered(),
             stream: Decoder::new(),
             instruments: Decoder::new(),
             mission,
@@ -68,12 +68,12 @@ impl Line {
     /// sound packet or frame.
     ///
     /// # Errors
-    /// [`Ended::OtherInstrument`]: from there on no packet is handed out.
-    pub(super) fn take(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<bool, Ended> {
+    /// [`ConnectionEnd::OtherInstrument`]: from there on no packet is handed out.
+    pub(super) fn take(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<bool, ConnectionEnd> {
         self.intake.push(bytes);
         self.hand_out(out);
         let alive = self.look_for_signs();
-        if self.foreign { Err(Ended::OtherInstrument) } else { Ok(alive) }
+        if self.foreign { Err(ConnectionEnd::OtherInstrument) } else { Ok(alive) }
     }
 
     /// Says that the stream is at its end; appends what is left.
@@ -145,7 +145,7 @@ impl Line {
             }
             append(&packet, &mut self.group);
             self.grouped += 1;
-            let ends = matches!(packet.header.segment, Segment::Whole | Segment::Last);
+            let ends = matches!(packet.header.segment, PacketSegment::Whole | PacketSegment::Last);
             if ends || self.group.len() > GROUP_BYTES_MAX {
                 out.append(&mut self.group);
                 self.packets += std::mem::take(&mut self.grouped);
@@ -218,7 +218,7 @@ mod tests {
     }
 
     /// Everything that a line hands out, piece by piece.
-    fn through(line: &mut Line, bytes: &[u8], piece: usize) -> (Vec<Vec<u8>>, bool) {
+    fn through(line: &mut SenderIntake, bytes: &[u8], piece: usize) -> (Vec<Vec<u8>>, bool) {
         let (mut pieces, mut foreign) = (Vec::new(), false);
         for bytes in bytes.chunks(piece) {
             let mut out = Vec::new();
@@ -236,7 +236,7 @@ mod tests {
         let plain = sent("ours", Format::Packets);
         for format in [Format::Packets, Format::Cadu] {
             for piece in [1, 100, 1 << 16] {
-                let mut line = Line::new(Mission::default());
+                let mut line = SenderIntake::new(Mission::default());
                 let (pieces, foreign) = through(&mut line, &sent("ours", format), piece);
                 assert!(!foreign && pieces.concat() == plain);
                 // The description, the positions and the counts: whatever the pieces, no payload is divided.
@@ -251,13 +251,13 @@ mod tests {
     fn another_instrument_is_refused_from_its_description_on() {
         for format in [Format::Packets, Format::Cadu] {
             let mission = Mission::default();
-            through(&mut Line::new(mission.clone()), &sent("ours", format), 1000);
-            let mut line = Line::new(mission.clone());
+            through(&mut SenderIntake::new(mission.clone()), &sent("ours", format), 1000);
+            let mut line = SenderIntake::new(mission.clone());
             let (pieces, foreign) = through(&mut line, &sent("theirs", format), 1000);
             assert!(foreign && pieces.concat().is_empty());
             assert!(line.packets().0 == 0 && line.packets().1 > 10);
             // Also from a sender that began with the right one.
-            let mut line = Line::new(mission);
+            let mut line = SenderIntake::new(mission);
             let both = [sent("ours", format), sent("theirs", format)].concat();
             let (pieces, foreign) = through(&mut line, &both, 1000);
             assert!(foreign && pieces.concat() == sent("ours", Format::Packets));
@@ -277,7 +277,7 @@ mod tests {
                 bytes[at] ^= octet;
             }
             bytes.truncate(1 + cut.index(bytes.len()));
-            let mut line = Line::new(Mission::default());
+            let mut line = SenderIntake::new(Mission::default());
             let (pieces, _) = through(&mut line, &bytes, piece);
             let account = line.stream();
             let others = account.bytes_garbage + account.bytes_damaged + account.bytes_truncated;

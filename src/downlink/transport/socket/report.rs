@@ -7,15 +7,15 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use serde::Serialize;
 
+use crate::downlink::receive::Listing;
 use crate::downlink::receive::ReceptionCounters;
-use crate::downlink::receive::contents::Listing;
 use crate::downlink::wire::Format;
 
 /// How a connection has ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
-pub enum Ended {
+pub enum ConnectionEnd {
     /// The sender closed it.
     Whole,
     /// It broke.
@@ -36,7 +36,7 @@ pub enum Ended {
     Failed,
 }
 
-impl fmt::Display for Ended {
+impl fmt::Display for ConnectionEnd {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Whole => "the sender closed it",
@@ -64,12 +64,12 @@ pub struct SenderReport {
     /// Sound packets handed to the ground.
     pub packets: u64,
     /// How it ended.
-    pub ended: Ended,
+    pub ended: ConnectionEnd,
 }
 
 /// All connections of a run.
 #[derive(Clone, Debug, Default, Serialize)]
-pub struct ListenAccount {
+pub struct ListenReport {
     /// Where the ground listened.
     pub address: String,
     /// Connections taken.
@@ -85,7 +85,7 @@ pub struct ListenAccount {
     /// Most bytes of packets that waited for the ground.
     pub backlog_bytes_max: u64,
     /// Connections by how they ended.
-    pub ended: BTreeMap<Ended, u64>,
+    pub ended: BTreeMap<ConnectionEnd, u64>,
     /// The first of them.
     pub senders: Listing<SenderReport>,
     /// What else than packets was in the streams; of packets, nothing.
@@ -93,7 +93,7 @@ pub struct ListenAccount {
     pub(super) streams: ReceptionCounters,
 }
 
-impl ListenAccount {
+impl ListenReport {
     /// Adds to the account of a reception what its chain has not seen: all but the packets.
     pub fn complete(&self, reception: &mut ReceptionCounters) {
         reception.add_stream(&self.streams);
@@ -109,7 +109,7 @@ impl ListenAccount {
     }
 }
 
-impl fmt::Display for ListenAccount {
+impl fmt::Display for ListenReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { address, connections, refused, bytes, packets, packets_refused, .. } = self;
         write!(
@@ -167,17 +167,17 @@ impl ListenStatus {
 pub struct Listening {
     /// For looking at on the way.
     pub status: Arc<ListenStatus>,
-    account: Arc<Mutex<ListenAccount>>,
+    account: Arc<Mutex<ListenReport>>,
 }
 
 impl Listening {
     /// The account of the connections that have ended.
     #[must_use]
-    pub fn account(&self) -> ListenAccount {
+    pub fn report(&self) -> ListenReport {
         self.write().clone()
     }
 
-    pub(super) fn write(&self) -> MutexGuard<'_, ListenAccount> {
+    pub(super) fn write(&self) -> MutexGuard<'_, ListenReport> {
         self.account.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -1,36 +1,94 @@
-//! Going through a file, event by event.
+//! Reads a downlink file and gathers its contents.
 
 use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 
-use super::{
-    ChannelSummary, Contents, DamagedEntry, EphemerisSummary, FaultEntry, GapEntry, GarbageEntry,
-    HousekeepingSummary, InstrumentSummary, LISTED_MAX, Listing, PairSummary, Span, VisibilityCounts,
-    tai_text,
+use super::contents::{
+    ChannelContents, Contents, DamagedEntry, EphemerisSummary, FaultEntry, GapEntry, GarbageEntry,
+    HousekeepingSummary, InstrumentSummary, KindSummary, PairSummary, TimeSpan, VisibilityCounts,
 };
-use crate::downlink::receive::{Event, ReceptionCounters};
+use super::tai_text;
+use crate::downlink::error::{DownlinkError, io_error};
+use crate::downlink::receive::{Decoder, Event, EventReader, LISTED_MAX, Listing, ReceptionCounters};
 use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
 use crate::frames::{
     AntennaResponse, EphemerisSegment, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
 };
-use crate::units::{ChannelId, MissionTime, Pair, TICKS_PER_SECOND};
+use crate::units::{ChannelId, IntervalSet, MissionTime, Pair, TICKS_PER_SECOND};
 
 /// TAI - UTC since 2017-01-01 (IERS Bulletin C).
 const LEAP_S: f64 = 37.0;
 
-/// Rows of the table by pair and channel: all 28 pairs in every channel of the band. A file that says more
-/// has its further rows in the sums alone.
+/// Rows of the table by pair and channel: all 28 pairs in every channel of the band. Rows beyond them count in the
+/// sums alone.
 const ROWS_MAX: usize = 1 << 17;
 
-/// Visibilities of one pair in one channel.
+/// Intervals of ephemeris coverage that are kept apart: as many as observing windows in three precession periods.
+/// Beyond them, holes are bridged.
+const COVERED_MAX: usize = 1 << 14;
+
+impl Contents {
+    /// Inspects a file.
+    ///
+    /// # Errors
+    /// The file cannot be read, is empty, or holds no packet at all. Damage is reported in the result.
+    pub fn read(path: &Path) -> Result<Self, DownlinkError> {
+        Self::read_with(path, &mut |_| {})
+    }
+
+    /// Inspects a file and gives every frame to `see`.
+    ///
+    /// # Errors
+    /// Those of [`Contents::read`].
+    pub fn read_with(path: &Path, see: &mut dyn FnMut(&GroundFrame)) -> Result<Self, DownlinkError> {
+        Self::read_from(File::open(path).map_err(io_error(path, "open the file"))?, path, see)
+    }
+
+    /// Inspects any source, which `path` names, and gives every frame to `see`.
+    ///
+    /// # Errors
+    /// Those of [`Contents::read`].
+    pub fn read_from(
+        source: impl Read,
+        path: &Path,
+        see: &mut dyn FnMut(&GroundFrame),
+    ) -> Result<Self, DownlinkError> {
+        let mut events = EventReader::new(source, path);
+        let mut decoder = Decoder::new();
+        let mut inspector = Inspector::default();
+        events.for_each(|event| {
+            inspector.see_event(event);
+            if let Some(frame) = decoder.accept(event) {
+                inspector.see_frame(&frame);
+                see(&frame);
+            }
+            if let Some((offset, fault)) = decoder.take_fault() {
+                inspector.faults.push(FaultEntry { offset, reason: fault.to_string() });
+            }
+            Ok::<(), DownlinkError>(())
+        })?;
+        decoder.finish();
+        events.require_packets()?;
+        let intake = events.intake();
+        let mut reception = ReceptionCounters { frames: intake.frames(), ..decoder.counters().clone() };
+        for kind in Kind::ALL {
+            reception.kind_mut(kind).restarts = intake.restarts(kind);
+        }
+        Ok(inspector.conclude(path, intake.bytes(), &reception))
+    }
+}
+
+/// Running counts of visibilities.
 #[derive(Clone, Copy, Debug, Default)]
-struct Row {
+struct Tally {
     count: u64,
     ticks: u64,
     flagged: u64,
 }
 
-impl Row {
+impl Tally {
     fn add(&mut self, other: Self) {
         self.count += other.count;
         self.ticks += other.ticks;
@@ -43,35 +101,35 @@ impl Row {
     }
 }
 
-/// Packets of one kind.
+/// Extent of the packets of one kind: counts, and the latest creation time.
 #[derive(Clone, Copy, Debug, Default)]
-struct Seen {
+struct KindExtent {
     first: Option<u64>,
     last: Option<u64>,
     time: Option<CucTime>,
 }
 
-/// What has been seen of a file so far.
+/// What has been read of a file so far.
 #[derive(Debug, Default)]
-pub(crate) struct Survey {
+struct Inspector {
     instrument: Option<Instrument>,
     span: Option<[MissionTime; 2]>,
-    rows: BTreeMap<(Pair, ChannelId), Row>,
-    by_channel: BTreeMap<ChannelId, Row>,
-    total: Row,
+    rows: BTreeMap<(Pair, ChannelId), Tally>,
+    by_channel: BTreeMap<ChannelId, Tally>,
+    total: Tally,
     segments: u64,
     nodes: u64,
-    covered: Coverage,
+    covered: EphemerisCoverage,
     housekeeping: Option<Housekeeping>,
-    seen: [Seen; Kind::ALL.len()],
+    seen: [KindExtent; Kind::ALL.len()],
     gaps: Listing<(GapEntry, Option<CucTime>, CucTime)>,
     damaged: Listing<(DamagedEntry, CucTime)>,
     garbage: Listing<GarbageEntry>,
-    pub(crate) faults: Listing<FaultEntry>,
+    faults: Listing<FaultEntry>,
 }
 
-impl Survey {
-    pub(crate) fn see_event(&mut self, event: &Event<'_>) {
+impl Inspector {
+    fn see_event(&mut self, event: &Event<'_>) {
         match *event {
             Event::Packet(packet) => self.see_packet(packet.header),
             Event::Gap { offset, header, expected } => {
@@ -107,7 +165,7 @@ impl Survey {
         seen.time = seen.time.max(Some(header.time));
     }
 
-    pub(crate) fn see_frame(&mut self, frame: &GroundFrame) {
+    fn see_frame(&mut self, frame: &GroundFrame) {
         match frame {
             GroundFrame::Instrument(instrument) => self.instrument = Some(instrument.clone()),
             GroundFrame::Ephemeris(segment) => self.see_segment(segment),
@@ -134,21 +192,21 @@ impl Survey {
         let end = block.start.plus_ticks(i64::from(*last) + i64::from(duration));
         let [from, to] = self.span.unwrap_or([start, end]);
         self.span = Some([from.min(start), to.max(end)]);
-        let row = Row {
+        let tally = Tally {
             count: block.len() as u64,
             ticks: block.duration_ticks.iter().map(|ticks| u64::from(*ticks)).sum(),
             flagged: block.flags.iter().map(|flags| u64::from(!flags.is_good())).sum(),
         };
-        self.total.add(row);
-        self.by_channel.entry(block.channel).or_default().add(row);
+        self.total.add(tally);
+        self.by_channel.entry(block.channel).or_default().add(tally);
         let key = (block.pair, block.channel);
         if self.rows.len() < ROWS_MAX || self.rows.contains_key(&key) {
-            self.rows.entry(key).or_default().add(row);
+            self.rows.entry(key).or_default().add(tally);
         }
     }
 
-    /// What is in the file, now that all of it has been seen.
-    pub(crate) fn conclude(self, path: &Path, bytes: u64, reception: &ReceptionCounters) -> Contents {
+    /// The contents of the file, once all of it has been read.
+    fn conclude(self, path: &Path, bytes: u64, reception: &ReceptionCounters) -> Contents {
         let epoch_tai_s = self.instrument.as_ref().map(|instrument| instrument.epoch_tai_s);
         let mission_s = |time: CucTime| epoch_tai_s.map(|epoch_tai_s| time.tai_s() - epoch_tai_s);
         let place_gap = |(gap, after, before): (GapEntry, Option<CucTime>, CucTime)| GapEntry {
@@ -160,7 +218,7 @@ impl Survey {
             |(entry, time): (DamagedEntry, CucTime)| DamagedEntry { time_s: mission_s(time), ..entry };
         let packets = Kind::ALL.map(|kind| {
             let (counts, seen) = (reception.kind(kind), self.seen[kind.index()]);
-            crate::downlink::receive::contents::KindSummary {
+            KindSummary {
                 kind,
                 apid: kind.apid(),
                 packets: counts.packets,
@@ -169,7 +227,7 @@ impl Survey {
                 last_count: seen.last,
             }
         });
-        let pair = |((pair, channel), row): (&(Pair, ChannelId), &Row)| PairSummary {
+        let pair = |((pair, channel), row): (&(Pair, ChannelId), &Tally)| PairSummary {
             pair: pair.to_string(),
             channel: channel.0,
             visibilities: row.counts(),
@@ -199,11 +257,11 @@ impl Survey {
         }
     }
 
-    fn channels(&self) -> Vec<ChannelSummary> {
+    fn channels(&self) -> Vec<ChannelContents> {
         let channels = self.instrument.iter().flat_map(|instrument| &instrument.channels);
         let summary = |(k, channel): (usize, &crate::frames::Channel)| {
             let row = self.by_channel.get(&ChannelId(k as u16)).copied().unwrap_or_default();
-            ChannelSummary {
+            ChannelContents {
                 channel: k as u16,
                 frequency_hz: channel.frequency_hz,
                 width_hz: channel.width_hz,
@@ -238,10 +296,10 @@ fn instrument_summary(instrument: &Instrument) -> InstrumentSummary {
     }
 }
 
-fn span_of([start, end]: [MissionTime; 2], epoch_tai_s: f64) -> Span {
+fn span_of([start, end]: [MissionTime; 2], epoch_tai_s: f64) -> TimeSpan {
     let (start_s, end_s) = (start.seconds(), end.seconds());
     let tai = |time_s| tai_text(epoch_tai_s + time_s);
-    Span {
+    TimeSpan {
         start_s,
         end_s,
         start_tai: tai(start_s),
@@ -251,47 +309,24 @@ fn span_of([start, end]: [MissionTime; 2], epoch_tai_s: f64) -> Span {
     }
 }
 
-/// Stretches of time, those that touch made one.
+/// The intervals of time that ephemeris segments cover, both ends included; segments a tick apart are joined.
 #[derive(Debug, Default)]
-struct Coverage {
-    /// End of each stretch by its start; apart, at most [`STRETCHES_MAX`].
-    stretches: BTreeMap<MissionTime, MissionTime>,
-}
+struct EphemerisCoverage(IntervalSet<MissionTime>);
 
-/// Stretches that are kept apart: as many windows as three precessions have. Beyond them the nearest to
-/// the new one is stretched over the hole.
-const STRETCHES_MAX: usize = 1 << 14;
-
-impl Coverage {
+impl EphemerisCoverage {
     fn add(&mut self, start: MissionTime, end: MissionTime) {
-        let (mut from, mut to) = (start, end);
-        // Those that begin within it or touch its end, and the one before it if that one reaches it.
-        while let Some((&other_from, &other_to)) =
-            self.stretches.range(..=to.plus_ticks(1)).next_back().filter(|(_, end)| end.plus_ticks(1) >= from)
-        {
-            self.stretches.remove(&other_from);
-            (from, to) = (from.min(other_from), to.max(other_to));
-        }
-        if self.stretches.len() >= STRETCHES_MAX {
-            if let Some((&other_from, _)) = self.stretches.range(..from).next_back() {
-                self.stretches.insert(other_from, to);
-            }
-            return;
-        }
-        self.stretches.insert(from, to);
+        self.0.insert_bridging(start..end.plus_ticks(1), COVERED_MAX);
     }
 
     fn summary(&self, segments: u64, nodes: u64) -> EphemerisSummary {
-        let each = || self.stretches.iter().map(|(start, end)| [start.seconds(), end.seconds()]);
+        let each =
+            || self.0.iter().map(|covered| [covered.start.seconds(), covered.end.plus_ticks(-1).seconds()]);
         EphemerisSummary {
             segments,
             nodes,
             // An empty sum of f64 is -0.
             covered_s: each().fold(0.0, |sum, [start_s, end_s]| sum + (end_s - start_s)),
-            covered: Listing {
-                count: self.stretches.len() as u64,
-                listed: each().take(LISTED_MAX).collect(),
-            },
+            covered: Listing { count: self.0.intervals() as u64, listed: each().take(LISTED_MAX).collect() },
         }
     }
 }
@@ -301,12 +336,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn stretches_that_touch_are_one() {
-        let mut coverage = Coverage::default();
+    fn segments_a_tick_apart_are_joined() {
+        let mut coverage = EphemerisCoverage::default();
         for (start, end) in [(0, 10), (20, 30), (50, 60), (11, 15), (18, 20), (55, 57), (29, 52)] {
             coverage.add(MissionTime(start), MissionTime(end));
         }
-        let stretches: Vec<_> = coverage.stretches.iter().map(|(a, b)| (a.0, b.0)).collect();
-        assert_eq!(stretches, [(0, 15), (18, 60)]);
+        let summary = coverage.summary(7, 70);
+        let ticks = |s: f64| (s * TICKS_PER_SECOND as f64).round() as i64;
+        let covered: Vec<_> = summary.covered.listed.iter().map(|span| span.map(ticks)).collect();
+        assert_eq!(covered, [[0, 15], [18, 60]]);
     }
 }

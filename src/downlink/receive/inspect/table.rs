@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use super::{Contents, Listing, VisibilityCounts};
-use crate::downlink::receive::ReceptionCounters;
+use super::{Contents, VisibilityCounts};
+use crate::downlink::receive::{Listing, ReceptionCounters};
 
 /// Columns of channels side by side.
 const CHANNELS_A_ROW: usize = 6;
