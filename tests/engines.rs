@@ -68,7 +68,7 @@ fn observe(sky: &SkyMap, frequency_hz: f64, baseline_m_max: f64, count: usize) -
     blocks
 }
 
-fn add_all<E: NormalEngine>(mut engine: E, blocks: &[PlacedVisibilities]) -> E::Sums {
+fn add_all<E: NormalEngine>(mut engine: E, blocks: &[PlacedVisibilities]) -> E::Equations {
     for block in blocks {
         let added = engine.add(block).unwrap();
         assert!(added.visibilities == 1 && added.refused.is_empty());
@@ -180,7 +180,7 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
         assert!(found.error < 0.3 * exact, "{found:?} {exact}");
     }
     // The solution against the matrix's.
-    let right = sums.noise_side();
+    let right = sums.noise_right_hand_side();
     let request =
         HarmonicRequest { epsilon, nside: 8, rule: StoppingRule { residual_max: 1e-7, ..RULE }, probes: 0 };
     let solved = solve_harmonics(&sums, request, None, None, (&watch, "test")).unwrap();

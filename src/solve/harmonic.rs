@@ -76,7 +76,7 @@ pub fn solve_harmonics(
         sums.apply(prior, &mut predicted);
         right.iter_mut().zip(predicted).for_each(|(right, predicted)| *right -= predicted);
     }
-    let sides = [("map", right.as_slice()), ("noise map", sums.noise_side())];
+    let sides = [("map", right.as_slice()), ("noise map", sums.noise_right_hand_side())];
     let mut solved = [0, 1].map(|side| match start {
         Some(start) if start[side].len() == right.len() => start[side].clone(),
         _ => vec![0.0; right.len()],

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use super::harmonic::{HarmonicRequest, solve_harmonics};
 use super::{Diagnostics, SolveError, SolveWatch, StoppingRule, solve_pixels};
-use crate::accumulation::{Snapshot, Sums};
+use crate::accumulation::{Snapshot, SnapshotSums};
 use crate::frames::Instrument;
 use crate::runtime::{Outlet, Stage, Units};
 use crate::sky::healpix::pixel_count;
@@ -88,11 +88,11 @@ impl Stage for Solver {
         let prior = self.prior(index, pixel_count(nside));
         let visibilities = sums.counts().visibilities;
         let (map_k, noise_k, diagnostics) = match sums {
-            Sums::Pixel(sums) => {
+            SnapshotSums::Pixel(sums) => {
                 let solved = solve_pixels(sums, epsilon, prior.as_deref())?;
                 (solved.map_k, solved.noise_k, solved.diagnostics)
             }
-            Sums::Harmonic(sums) => {
+            SnapshotSums::Harmonic(sums) => {
                 let probes = if is_final { self.setup.trace_probes } else { 0 };
                 let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes };
                 let frequency_hz = instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
