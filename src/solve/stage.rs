@@ -11,7 +11,7 @@ use crate::runtime::{Outlet, Stage, Units};
 use crate::sky::healpix::pixel_count;
 use crate::units::{ChannelId, PerChannel};
 
-/// A map of one channel and what goes with it.
+/// A map of one channel.
 pub struct Solution {
     /// Instrument.
     pub instrument: Arc<Instrument>,
@@ -19,11 +19,11 @@ pub struct Solution {
     pub channel: ChannelId,
     /// Number of the snapshot in its channel, from 1.
     pub number: u32,
-    /// Whether all data is in it.
+    /// Whether it is from all data.
     pub is_final: bool,
-    /// First and last mission time of the data in it, s.
+    /// First and last mission time of its data, s.
     pub span_s: [f64; 2],
-    /// Visibilities in it.
+    /// Visibilities in the sums.
     pub visibilities: u64,
     /// nside of the maps.
     pub nside: usize,
@@ -31,7 +31,7 @@ pub struct Solution {
     pub map_k: Vec<f64>,
     /// Map of noise alone, made from noise of the data's weights, K.
     pub noise_k: Vec<f64>,
-    /// Regularisation, and how the solution was found.
+    /// Regularisation and convergence.
     pub diagnostics: Diagnostics,
 }
 
@@ -44,15 +44,15 @@ pub struct SolverSetup {
     pub prior_k: PerChannel<f64>,
     /// Prior maps by channel, K, at the map's nside; empty for none.
     pub prior_maps: Vec<Vec<f64>>,
-    /// When the iteration for a harmonic map stops.
+    /// When the iteration of a harmonic map stops.
     pub rule: StoppingRule,
-    /// Random vectors for the traces of a final harmonic map.
+    /// Random probes for the traces of a final harmonic map.
     pub trace_probes: usize,
-    /// Who is told of progress, and may interrupt.
+    /// Receives progress, and may interrupt.
     pub watch: SolveWatch,
 }
 
-/// Solves every snapshot that comes.
+/// Solves every snapshot.
 pub struct Solver {
     setup: SolverSetup,
     solved: u64,
@@ -98,7 +98,7 @@ impl Stage for Solver {
                 let frequency_hz = instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
                 let name = format!("{:.3} MHz", frequency_hz / 1e6);
                 let start = self.last.remove(&channel);
-                let watch = (&self.setup.watch, name.as_str());
+                let watch = self.setup.watch.named(&name);
                 let solved = solve_harmonics(&sums, request, prior.as_deref(), start.as_ref(), watch)?;
                 if !is_final {
                     self.last.insert(channel, solved.unknowns);
