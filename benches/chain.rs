@@ -6,7 +6,7 @@
 
 use std::time::Instant;
 
-use lunarray::accumulation::{Columns, SymmetricTiles};
+use lunarray::accumulation::{ColumnBlock, SymmetricTiles};
 use lunarray::pipeline::{ConfigSource, Plan, run};
 use lunarray::runtime::Cancel;
 use lunarray::sky::healpix::pixel_count;
@@ -21,7 +21,7 @@ fn rank_k_limit(nside: usize) -> f64 {
     let a: Vec<f64> = (0..stride * COLUMNS).map(|k| (k as f64 * 0.37).sin()).collect();
     let mut matrix = SymmetricTiles::zeros(pixels);
     let update = |matrix: &mut SymmetricTiles| {
-        matrix.add_products_f64(Columns { values: &a, columns: COLUMNS, stride });
+        matrix.add_products_f64(ColumnBlock { values: &a, columns: COLUMNS, stride });
     };
     update(&mut matrix);
     let rounds = 10;

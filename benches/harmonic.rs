@@ -210,7 +210,7 @@ fn engine(array: &Array, l_max: usize) {
             for block in blocks {
                 let _ = engine.add(block).expect("one frequency");
             }
-            engine.settle();
+            engine.flush();
             let run = clock.read();
             if pass > 0 {
                 rates.push(of_chunk as f64 / run.0);

@@ -1,220 +1,251 @@
-//! Checkpoints of the pixel engine: versioned, bounded, with a checksum over everything.
+//! Checkpoints of engines: one frame for sums over any basis.
 //!
-//! Layout: magic, length of the head (u32 LE), head (bincode), raw little-endian integers: the matrix's tiles
-//! column by column (i64), both right-hand sides (i128); CRC-32C of all that (u32 LE). Nothing in it depends on how
-//! the data came.
+//! | field | bytes |
+//! |---|---|
+//! | magic, `LNRENGIN` | 8 |
+//! | version, u16 | 2 |
+//! | kind of the basis, u8 | 1 |
+//! | length of the head, u32 | 4 |
+//! | head: setup and totals | at most 4096 |
+//! | integers of the sums | as the basis writes them |
+//! | CRC-32C of all before, u32 | 4 |
+//!
+//! All numbers are little-endian. The bytes depend on the visibilities in the sums alone, not on how they arrived.
+//! Readers reserve memory for data that is there, never for what a head announces.
 
 use std::io::{Read, Write};
 
-use super::checked::{Checked, RESPONSES, Summed, number_of, refused};
+use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
+
 use super::error::AccumulationError;
-use super::exact::ExactTiles;
-use super::pixel::{ExactSums, PixelEngine, PixelSetup};
-use super::scale::Totals;
-use crate::response::pixel::PixelMethod;
-use crate::sky::healpix::{is_valid_nside, pixel_count};
+use crate::frames::AntennaResponse;
 
-const MAGIC: &[u8; 8] = b"LNRPIX02";
-const VERSION: &str =
-    "a pixel engine's checkpoint, version 02; sums of version 01 were not exact: sum the data anew";
+const MAGIC: &[u8; 8] = b"LNRENGIN";
+const VERSION: u16 = 1;
+/// Beginnings of the magics of earlier formats, one for each engine.
+const EARLIER: [&[u8]; 2] = [b"LNRPIX", b"LNRHRM"];
 
-/// Greatest nside that is believed.
-const NSIDE_MAX: u32 = 64;
-
-#[derive(bincode::Encode, bincode::Decode)]
-struct Head {
-    nside: u32,
-    frequency_hz: f64,
-    method: u8,
-    moon_radius_m: f64,
-    response: u8,
-    companion_seed: u64,
-    weight_max: f64,
-    totals: Totals,
+/// What the sums are over. Numbers in checkpoints: never to be renumbered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BasisKind {
+    /// Over pixels.
+    Pixel = 1,
+    /// Over spherical harmonics.
+    Harmonic = 2,
 }
+
+impl BasisKind {
+    fn expected(self) -> &'static str {
+        match self {
+            Self::Pixel => "sums over pixels (kind 1)",
+            Self::Harmonic => "sums over harmonics (kind 2)",
+        }
+    }
+}
+
+/// Greatest head that is read: real ones take some 100 bytes.
+const HEAD_BYTES_MAX: usize = 4096;
+
+const CODEC: Configuration<LittleEndian, Fixint, Limit<HEAD_BYTES_MAX>> =
+    bincode::config::standard().with_little_endian().with_fixed_int_encoding().with_limit::<HEAD_BYTES_MAX>();
 
 /// Numbers of variants on disk: never to be renumbered.
-const METHODS: [PixelMethod; 3] = [PixelMethod::Centre, PixelMethod::Average, PixelMethod::AverageExact];
+pub(super) const RESPONSES: [AntennaResponse; 2] =
+    [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal];
 
-pub(super) fn write(engine: &PixelEngine, out: &mut dyn Write) -> Result<(), AccumulationError> {
-    let mut out = Summed::new(out);
-    let setup = &engine.setup;
-    let head = Head {
-        nside: setup.nside as u32,
-        frequency_hz: setup.frequency_hz,
-        method: number_of(&METHODS, &setup.method),
-        moon_radius_m: setup.moon_radius_m,
-        response: number_of(&RESPONSES, &setup.response),
-        companion_seed: setup.companion_seed,
-        weight_max: setup.weight_max,
-        totals: engine.totals,
-    };
-    out.write(MAGIC)?;
-    out.head(head)?;
-    for column in engine.sums.normal.columns() {
-        out.integers(column, i64::to_le_bytes)?;
-    }
-    out.integers(&engine.sums.right, i128::to_le_bytes)?;
-    out.integers(&engine.sums.noise, i128::to_le_bytes)?;
-    out.finish()?;
-    Ok(())
+pub(super) fn number_of<T: PartialEq>(variants: &[T], variant: &T) -> u8 {
+    variants.iter().position(|v| v == variant).map_or(u8::MAX, |k| k as u8)
 }
 
-pub(super) fn read(from: &mut dyn Read) -> Result<PixelEngine, AccumulationError> {
-    let mut from = Checked::new(from);
-    let mut magic = [0; 8];
-    from.read(&mut magic)?;
-    if &magic != MAGIC {
-        return Err(refused(format!("{magic:02x?}"), VERSION));
-    }
-    let head: Head = from.head()?;
-    let setup = setup_of(&head)?;
-    PixelEngine::of(setup, head.totals, || {
-        // Memory follows the data that is there, not what the head announces: gigabytes for the finest map.
-        let pixels = pixel_count(setup.nside);
-        let normal = ExactTiles::read(pixels, |column| from.integers(column, i64::from_le_bytes))?;
-        let (mut right, mut noise) = (vec![0; pixels], vec![0; pixels]);
-        from.integers(&mut right, i128::from_le_bytes)?;
-        from.integers(&mut noise, i128::from_le_bytes)?;
-        from.finish()?;
-        Ok(ExactSums { normal, right, noise })
-    })
+pub(super) fn refused(found: String, expected: &'static str) -> AccumulationError {
+    AccumulationError::Checkpoint { found, expected }
 }
 
-fn setup_of(head: &Head) -> Result<PixelSetup, AccumulationError> {
-    let nside = head.nside as usize;
-    if !is_valid_nside(nside) || head.nside > NSIDE_MAX {
-        return Err(refused(format!("nside {nside}"), "a power of two up to 64"));
+/// Writes a frame and its checksum.
+pub struct FrameWriter<'a> {
+    inner: &'a mut dyn Write,
+    crc: crc_fast::Digest,
+}
+
+impl<'a> FrameWriter<'a> {
+    /// Begins a frame.
+    pub(super) fn new(
+        inner: &'a mut dyn Write,
+        kind: BasisKind,
+        head: impl bincode::Encode,
+    ) -> Result<Self, AccumulationError> {
+        let mut out = Self { inner, crc: crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi) };
+        let head = bincode::encode_to_vec(head, CODEC)
+            .map_err(|error| refused(error.to_string(), "a head that can be encoded"))?;
+        out.write(MAGIC)?;
+        out.write(&VERSION.to_le_bytes())?;
+        out.write(&[kind as u8])?;
+        out.write(&(head.len() as u32).to_le_bytes())?;
+        out.write(&head)?;
+        Ok(out)
     }
-    let method = METHODS.get(usize::from(head.method)).copied();
-    let response = RESPONSES.get(usize::from(head.response)).copied();
-    Ok(PixelSetup {
-        nside,
-        frequency_hz: head.frequency_hz,
-        method: method.ok_or_else(|| refused(format!("method {}", head.method), "a known method"))?,
-        moon_radius_m: head.moon_radius_m,
-        response: response.ok_or_else(|| refused(format!("response {}", head.response), "a known one"))?,
-        companion_seed: head.companion_seed,
-        weight_max: head.weight_max,
-    })
+
+    pub(super) fn write(&mut self, bytes: &[u8]) -> std::io::Result<()> {
+        self.crc.update(bytes);
+        self.inner.write_all(bytes)
+    }
+
+    /// Integers, little-endian.
+    pub(super) fn integers<T: Copy, const N: usize>(
+        &mut self,
+        values: &[T],
+        to_bytes: impl Fn(T) -> [u8; N],
+    ) -> std::io::Result<()> {
+        for values in values.chunks(1 << 16) {
+            let bytes: Vec<u8> = values.iter().flat_map(|value| to_bytes(*value)).collect();
+            self.write(&bytes)?;
+        }
+        Ok(())
+    }
+
+    /// Ends the frame with its checksum.
+    pub(super) fn finish(self) -> std::io::Result<()> {
+        let crc = self.crc.finalize() as u32;
+        self.inner.write_all(&crc.to_le_bytes())
+    }
+}
+
+/// Reads a frame and compares its checksum.
+pub struct FrameReader<'a> {
+    inner: &'a mut dyn Read,
+    crc: crc_fast::Digest,
+}
+
+impl<'a> FrameReader<'a> {
+    /// Begins to read a frame of this kind; gives its head.
+    pub(super) fn new<H: bincode::Decode<()>>(
+        inner: &'a mut dyn Read,
+        kind: BasisKind,
+    ) -> Result<(Self, H), AccumulationError> {
+        let crc = crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi);
+        let mut from = Self { inner, crc };
+        let magic: [u8; 8] = from.array()?;
+        if EARLIER.iter().any(|earlier| magic.starts_with(earlier)) {
+            let found = format!("an engine of an earlier format ({})", magic.escape_ascii());
+            return Err(refused(found, "an engine's checkpoint, version 1: sum the data again"));
+        }
+        if &magic != MAGIC {
+            return Err(refused(format!("{magic:02x?}"), "an engine's checkpoint"));
+        }
+        let version = u16::from_le_bytes(from.array()?);
+        if version != VERSION {
+            return Err(refused(format!("version {version} of an engine's checkpoint"), "version 1"));
+        }
+        let [found] = from.array()?;
+        if found != kind as u8 {
+            return Err(refused(format!("sums of kind {found}"), kind.expected()));
+        }
+        let head = from.head()?;
+        Ok((from, head))
+    }
+
+    fn array<const N: usize>(&mut self) -> std::io::Result<[u8; N]> {
+        let mut bytes = [0; N];
+        self.read(&mut bytes)?;
+        Ok(bytes)
+    }
+
+    pub(super) fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<()> {
+        self.inner.read_exact(bytes)?;
+        self.crc.update(bytes);
+        Ok(())
+    }
+
+    fn head<H: bincode::Decode<()>>(&mut self) -> Result<H, AccumulationError> {
+        let length = u32::from_le_bytes(self.array()?) as usize;
+        if length > HEAD_BYTES_MAX {
+            return Err(refused(format!("a head of {length} bytes"), "at most 4096"));
+        }
+        let mut bytes = vec![0; length];
+        self.read(&mut bytes)?;
+        match bincode::decode_from_slice(&bytes, CODEC) {
+            Ok((head, used)) if used == length => Ok(head),
+            Ok(_) => Err(refused("bytes behind the head".into(), "none")),
+            Err(error) => Err(refused(error.to_string(), "a head")),
+        }
+    }
+
+    /// Integers, little-endian.
+    pub(super) fn integers<T, const N: usize>(
+        &mut self,
+        values: &mut [T],
+        of_bytes: impl Fn([u8; N]) -> T,
+    ) -> std::io::Result<()> {
+        for values in values.chunks_mut(1 << 16) {
+            let mut bytes = vec![0; N * values.len()];
+            self.read(&mut bytes)?;
+            for (value, bytes) in values.iter_mut().zip(bytes.as_chunks::<N>().0) {
+                *value = of_bytes(*bytes);
+            }
+        }
+        Ok(())
+    }
+
+    /// Compares the checksum.
+    pub(super) fn finish(self) -> Result<(), AccumulationError> {
+        let found = self.crc.finalize() as u32;
+        let mut stored = [0; 4];
+        self.inner.read_exact(&mut stored)?;
+        if found != u32::from_le_bytes(stored) {
+            return Err(refused(format!("checksum {found:08x}"), "the checksum that it was written with"));
+        }
+        Ok(())
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use num_complex::Complex64;
-
     use super::*;
-    use crate::accumulation::{NormalEngine, NormalSums};
-    use crate::array::{Array, ArrayConfig};
-    use crate::frames::{AntennaResponse, PlacedVisibilities};
-    use crate::units::Pair;
+    use crate::accumulation::harmonic::HarmonicEngine;
+    use crate::accumulation::{NormalEngine, PixelEngine};
 
-    fn setup() -> PixelSetup {
-        PixelSetup {
-            nside: 4,
-            frequency_hz: 3e6,
-            method: PixelMethod::Average,
-            moon_radius_m: crate::units::constants::MOON_RADIUS_M,
-            response: AntennaResponse::Isotropic,
-            companion_seed: 3,
-            weight_max: 10.0,
+    /// A frame of some kind, version and magic around nothing.
+    fn frame(magic: &[u8; 8], version: u16, kind: u8) -> Vec<u8> {
+        [magic.as_slice(), &version.to_le_bytes(), &[kind], &[0; 200]].concat()
+    }
+
+    fn refusal<E: NormalEngine>(bytes: &[u8]) -> String {
+        match E::restore(&mut &bytes[..]) {
+            Ok(_) => panic!("restored"),
+            Err(error) => error.to_string(),
         }
     }
 
-    fn visibilities(from_s: f64, count: usize) -> PlacedVisibilities {
-        let array = Array::new(&ArrayConfig::default()).unwrap();
-        let mut placed = PlacedVisibilities {
-            frequency_hz: 3e6,
-            pair: Pair { i: 0, j: 1 },
-            ..PlacedVisibilities::default()
-        };
-        for k in 0..count {
-            let time_s = from_s + 13.0 * k as f64;
-            placed.time_s.push(time_s);
-            placed.r_i_m.push(array.position_m(0, time_s));
-            placed.r_j_m.push(array.position_m(1, time_s));
-            placed.value_k_sr.push(Complex64::new((0.1 * k as f64).sin(), 0.3));
-            placed.weight.push(1.0 + 0.01 * k as f64);
-        }
-        placed
-    }
-
-    fn checkpoint(engine: &mut PixelEngine) -> Vec<u8> {
-        let mut bytes = Vec::new();
-        engine.checkpoint(&mut bytes).unwrap();
-        bytes
-    }
-
     #[test]
-    fn an_engine_goes_on_to_the_same_bits() {
-        let (first, second) = (visibilities(0.0, 200), visibilities(5e6, 171));
-        let mut whole = PixelEngine::new(setup()).unwrap();
-        let mut stopped = PixelEngine::new(setup()).unwrap();
-        let _ = whole.add(&first).unwrap();
-        let _ = whole.add(&second).unwrap();
-        let _ = stopped.add(&first).unwrap();
-        let mut resumed = PixelEngine::restore(&mut checkpoint(&mut stopped).as_slice()).unwrap();
-        let _ = resumed.add(&second).unwrap();
-        assert!(whole.into_sums() == resumed.into_sums());
-    }
-
-    #[test]
-    fn blocks_and_snapshots_do_not_change_a_bit() {
-        let all = visibilities(0.0, 300);
-        let mut whole = PixelEngine::new(setup()).unwrap();
-        let _ = whole.add(&all).unwrap();
-        let mut parts = PixelEngine::new(setup()).unwrap();
-        for k in 0..300 {
-            let one = PlacedVisibilities {
-                time_s: vec![all.time_s[k]],
-                r_i_m: vec![all.r_i_m[k]],
-                r_j_m: vec![all.r_j_m[k]],
-                value_k_sr: vec![all.value_k_sr[k]],
-                weight: vec![all.weight[k]],
-                ..all.clone()
-            };
-            let _ = parts.add(&one).unwrap();
-            if k % 100 == 50 {
-                assert_eq!(parts.sums().counts().visibilities, k as u64 + 1);
+    fn earlier_formats_are_refused_by_name() {
+        for magic in [b"LNRPIX01", b"LNRPIX02", b"LNRHRM02", b"LNRHRM03"] {
+            let name = std::str::from_utf8(magic).unwrap();
+            let bytes = frame(magic, 0, 0);
+            for said in [refusal::<PixelEngine>(&bytes), refusal::<HarmonicEngine>(&bytes)] {
+                assert!(said.contains(name) && said.contains("sum the data again"), "{said}");
             }
         }
-        assert!(whole.into_sums() == parts.into_sums());
     }
 
     #[test]
-    fn merging_is_adding() {
-        let (first, second) = (visibilities(0.0, 100), visibilities(5e6, 150));
-        let engine = |blocks: &[&PlacedVisibilities]| {
-            let mut engine = PixelEngine::new(setup()).unwrap();
-            for block in blocks {
-                let _ = engine.add(block).unwrap();
-            }
-            engine
-        };
-        let mut merged = engine(&[&first]);
-        merged.merge(engine(&[&second])).unwrap();
-        let (merged, whole) = (merged.into_sums(), engine(&[&first, &second]).into_sums());
-        assert_eq!(merged.counts.visibilities, whole.counts.visibilities);
-        let scale = whole.normal.get(0, 0);
-        for k in [0, 17, 191] {
-            // The same 500 terms in another order.
-            assert!((merged.normal.get(k, 3) - whole.normal.get(k, 3)).abs() < 1e-13 * scale);
+    fn other_magics_versions_and_kinds_are_refused() {
+        for (bytes, expected) in [
+            (frame(b"LNRSTA04", VERSION, 1), "expected an engine's checkpoint"),
+            (frame(MAGIC, VERSION + 1, 1), "expected version 1"),
+            (frame(MAGIC, VERSION, 2), "found sums of kind 2, expected sums over pixels"),
+            (frame(MAGIC, VERSION, 3), "found sums of kind 3"),
+        ] {
+            let said = refusal::<PixelEngine>(&bytes);
+            assert!(said.contains(expected), "{said}");
         }
+        let said = refusal::<HarmonicEngine>(&frame(MAGIC, VERSION, 1));
+        assert!(said.contains("found sums of kind 1, expected sums over harmonics"), "{said}");
     }
 
     #[test]
-    fn damage_is_found_wherever_it_is() {
-        let mut engine = PixelEngine::new(setup()).unwrap();
-        let _ = engine.add(&visibilities(0.0, 140)).unwrap();
-        let good = checkpoint(&mut engine);
-        assert!(PixelEngine::restore(&mut good.as_slice()).is_ok());
-        for place in [0, 7, 8, 11, 12, 16, 24, 40, 60, 80, good.len() / 2, good.len() - 5, good.len() - 1] {
-            let mut bad = good.clone();
-            bad[place] ^= 0x10;
-            assert!(PixelEngine::restore(&mut bad.as_slice()).is_err(), "byte {place}");
-        }
-        for length in [0, 5, 11, 50, good.len() / 3, good.len() - 1] {
-            assert!(PixelEngine::restore(&mut &good[..length]).is_err(), "{length} bytes");
-        }
+    fn a_head_is_bounded() {
+        let mut bytes = frame(MAGIC, VERSION, 1);
+        bytes[11..15].copy_from_slice(&4097_u32.to_le_bytes());
+        assert!(refusal::<PixelEngine>(&bytes).contains("a head of 4097 bytes"));
     }
 }

@@ -17,10 +17,10 @@ pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
 /// Greatest nside of maps from the harmonic engine: pixels ten times finer than its greatest degree.
 pub const HARMONIC_ENGINE_NSIDE_MAX: usize = 1024;
 
-/// Degrees of a harmonic map, a nside, if none are given: as many as pixels carry with 1e-6.
+/// Default number of degrees of a harmonic map per nside: as many as pixels represent to 1e-6.
 const DEGREES_PER_NSIDE: f64 = 2.5;
 
-/// What the normal equations are summed over.
+/// The basis of the normal equations.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
@@ -32,15 +32,15 @@ pub enum EngineKind {
     Harmonic,
 }
 
-/// The ground's map making.
+/// Configuration of map making.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MapConfig {
     /// HEALPix nside of the maps.
     pub nside: usize,
-    /// What the normal equations are summed over: `pixel` or `harmonic`.
+    /// Basis of the normal equations: `pixel` or `harmonic`.
     pub engine: EngineKind,
-    /// How rows of B are made by the pixel engine.
+    /// How the pixel engine computes rows of B.
     pub rows: PixelMethod,
     /// Greatest degree of a map from the harmonic engine; 0 for 2.5 nside.
     pub l_max: usize,
@@ -48,26 +48,26 @@ pub struct MapConfig {
     pub baseline_bp_max: f64,
     /// Regularisation epsilon: R = epsilon W_max I.
     pub epsilon: PerChannel<f64>,
-    /// Prior map: one temperature everywhere, K; 0 for none.
+    /// Prior map: a uniform temperature, K; 0 for none.
     pub prior_k: PerChannel<f64>,
-    /// Prior maps: HEALPix FITS files, one a channel, in K; empty for none.
+    /// Prior maps: HEALPix FITS files, one per channel, in K; empty for none.
     pub prior_files: Vec<PathBuf>,
     /// FWHM to which prior maps are smoothed, degrees.
     pub prior_fwhm_deg: f64,
     /// Mission time between snapshot maps, s; 0 for a final map alone.
     pub snapshot_every_s: f64,
-    /// Greatest weight of a visibility that is taken, (K sr)^-2; it sets the resolution of the sums. 0 for 1024 times
+    /// Greatest weight of a visibility that is accepted, (K sr)^-2; it sets the resolution of the sums. 0 for 1024 times
     /// that of 25 s under the mean sky of the channel's frequency.
     pub weight_max: f64,
     /// Seed of the noise-only companion map.
     pub companion_seed: u64,
-    /// Residual at which the harmonic solution ends, relative to the right-hand side, in the preconditioner's norm.
+    /// Residual at which a harmonic solution stops, relative to the right-hand side, in the preconditioner's norm.
     pub residual_max: f64,
-    /// Most iterations of a harmonic solution.
+    /// Iteration limit of a harmonic solution.
     pub iterations_max: usize,
-    /// Random vectors for the traces of the covariances of a final harmonic map; 0 for none.
+    /// Random probes for the traces of the covariances of a final harmonic map; 0 for none.
     pub trace_probes: usize,
-    /// Departures from the common circle that the harmonic engine takes.
+    /// Departures from the common circle that the harmonic engine accepts.
     pub limits: GeometryLimits,
 }
 
@@ -95,7 +95,7 @@ impl Default for MapConfig {
 }
 
 impl MapConfig {
-    /// Everything that is wrong with the configuration; empty if it is good.
+    /// All invalid settings; empty if there are none.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("map");
@@ -148,7 +148,7 @@ impl MapConfig {
         if self.l_max > 0 { self.l_max } else { (DEGREES_PER_NSIDE * self.nside as f64) as usize }
     }
 
-    /// The settings that shape sums, by key; the others only shape what is made of them.
+    /// The settings that determine the sums, by key; the others determine only what is solved from them.
     #[must_use]
     pub fn of_sums(&self) -> Vec<(&'static str, String)> {
         let Self { nside, engine, rows, baseline_bp_max, companion_seed, limits, weight_max, .. } = self;
@@ -178,7 +178,7 @@ impl MapConfig {
         self.baseline_bp_max * SPEED_OF_LIGHT_M_S / frequency_hz / pixel_rad
     }
 
-    /// Settings by channel that do not fit an instrument of `channels` channels.
+    /// Settings by channel that do not match an instrument of `channels` channels.
     #[must_use]
     pub fn misfits(&self, channels: usize) -> Vec<InvalidValue> {
         let files = self.prior_files.len();

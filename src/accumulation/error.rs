@@ -9,11 +9,11 @@ use crate::units::{ChannelId, InvalidValue};
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum AccumulationError {
-    /// Rows of B cannot be made.
+    /// Rows of B cannot be computed.
     #[error(transparent)]
     Response(#[from] ResponseError),
-    /// An engine that cannot be.
-    #[error("engine of a map: {name} = {value}: expected {expected}")]
+    /// A setup out of range.
+    #[error("invalid setup of an engine: {name} = {value}: expected {expected}")]
     Setup {
         /// Quantity.
         name: &'static str,
@@ -22,39 +22,39 @@ pub enum AccumulationError {
         /// Range that is accepted.
         expected: &'static str,
     },
-    /// Data of a channel that the instrument description does not have.
-    #[error("visibilities of channel {0} arrived, which the instrument description does not have")]
+    /// Data of a channel that is not in the instrument description.
+    #[error("visibilities of channel {0}, which is not in the instrument description")]
     UnknownChannel(ChannelId),
-    /// Data to be taken out of sums that are not there.
-    #[error("visibilities of channel {0} are to be taken out, but nothing of it was ever put in")]
+    /// Data to be removed that the sums do not hold.
+    #[error("visibilities of channel {0} are to be removed, but its sums do not hold them")]
     NothingHeld(ChannelId),
     /// Data of another frequency.
-    #[error("a block at {found_hz} Hz was given to an engine for {expected_hz} Hz")]
+    #[error("a block at {found_hz} Hz for an engine at {expected_hz} Hz")]
     Frequency {
         /// The engine's, Hz.
         expected_hz: f64,
         /// The block's, Hz.
         found_hz: f64,
     },
-    /// Settings by channel that do not fit the instrument.
+    /// Settings by channel do not match the instrument.
     #[error("the downlink's channels: {0}")]
     Misfit(#[from] InvalidValue),
-    /// Engines that cannot be merged.
+    /// Engines of different setups.
     #[error("engines of different {what} cannot be merged")]
     Mismatch {
         /// What differs.
         what: &'static str,
     },
-    /// Engines whose sums together would be greater than there is room for, or less than nothing.
+    /// Engines whose combined sums would exceed the range, or fall below nothing.
     #[error(
-        "merged sums would leave the range of an engine: expected more in the first than is taken out, and room for \
-         both at this map.weight_max"
+        "combined sums would leave the range of an engine: expected room for both at this map.weight_max, and no more \
+         removed than held"
     )]
     Range,
-    /// A checkpoint that cannot be read or written.
+    /// A checkpoint could not be read or written.
     #[error("checkpoint: {0}")]
     Io(#[from] std::io::Error),
-    /// A checkpoint that is damaged or foreign.
+    /// A checkpoint is damaged or of another format.
     #[error("checkpoint: found {found}, expected {expected}")]
     Checkpoint {
         /// What was found.

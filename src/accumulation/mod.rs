@@ -1,28 +1,31 @@
 //! Normal equations, summed as data arrives.
 //!
-//! An engine turns placed visibilities into `BtN^-1B` and `BtN^-1V` in whatever form serves it; the
-//! solver asks for no more than their action on a vector. [`PixelEngine`] holds the matrix itself;
-//! [`harmonic::HarmonicEngine`] holds what makes the matrix act on spherical harmonics.
-//! Uses [`crate::frames`], [`mod@crate::array`], [`crate::sky`].
+//! An engine turns placed visibilities into `BtN^-1B` and `BtN^-1V` in a form that serves it; a solver needs no more
+//! than the action of the matrix on a vector. [`PixelEngine`] holds the matrix itself;
+//! [`harmonic::HarmonicEngine`] holds what makes the matrix act on spherical harmonics. Both are one [`ExactEngine`]
+//! over another basis, and share the format of checkpoints. [`Accumulator`] is the stage that keeps an engine for
+//! each channel.
+//!
+//! Sums are integers: their bits depend on the visibilities in them alone. Uses [`crate::frames`],
+//! [`mod@crate::array`], [`crate::response`], [`crate::sky`].
 
-mod checked;
 mod checkpoint;
 mod config;
+mod engine;
 mod error;
-mod exact;
+mod fixed_point;
 pub mod harmonic;
 mod noise;
 mod pixel;
-mod scale;
 mod stage;
-mod tiles;
 
 pub use config::{EngineKind, MapConfig};
+pub use engine::ExactEngine;
 pub use error::AccumulationError;
-pub use pixel::{PixelEngine, PixelSetup, PixelSums};
-pub use scale::automatic_weight_max;
-pub use stage::{Accumulator, AccumulatorState, Snapshot, Sums};
-pub use tiles::{Columns, SymmetricTiles, TILE};
+pub use fixed_point::automatic_weight_max;
+pub(crate) use pixel::add_product;
+pub use pixel::{ColumnBlock, PixelEngine, PixelSetup, PixelSums, SymmetricTiles, TILE};
+pub use stage::{Accumulator, AccumulatorState, Snapshot, SnapshotSums};
 
 use std::collections::BTreeMap;
 
@@ -31,7 +34,7 @@ use serde::Serialize;
 use crate::frames::{PlacedVisibilities, VisibilityReason};
 use crate::response::harmonic::GeometryRefusal;
 
-/// What an engine or its sums hold.
+/// Number and weight of the visibilities in an engine or its sums.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct SumCounts {
     /// Visibilities in the sums.
@@ -40,17 +43,17 @@ pub struct SumCounts {
     pub weight: f64,
 }
 
-/// Why an engine does not take a visibility.
+/// Why an engine refuses a visibility.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum Refusal {
-    /// Its satellites are not where the engine's basis needs them.
+    /// The engine's basis does not cover the positions of its satellites.
     Geometry(GeometryRefusal),
-    /// Its baseline is longer than the engine was made for.
+    /// Its baseline is longer than the engine's limit.
     TooLong,
-    /// Its value or weight cannot be summed.
+    /// Its value or weight is not finite, or its weight is not positive.
     NotFinite,
-    /// Its weight, or its value in units of its noise, is more than the sums have room for.
+    /// Its weight, or its value in units of its noise, exceeds the range of the sums.
     OutOfRange,
     /// The sums have no room for more weight.
     Full,
@@ -79,11 +82,11 @@ impl From<Refusal> for VisibilityReason {
     }
 }
 
-/// What became of the visibilities of one call; the two parts make up the call.
+/// Result of one call: each visibility was either accepted or refused.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 #[must_use]
 pub struct Added {
-    /// Taken into the sums.
+    /// Accepted: now in the sums, or removed from them.
     pub visibilities: u64,
     /// Refused, by reason.
     pub refused: BTreeMap<Refusal, u64>,
@@ -95,88 +98,73 @@ impl Added {
     }
 }
 
-/// Whether visibilities are put in or taken out.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Direction {
-    In,
-    Out,
-}
-
-impl Direction {
-    fn sign(self) -> f64 {
-        match self {
-            Self::In => 1.0,
-            Self::Out => -1.0,
-        }
-    }
-}
-
-/// Takes visibilities of one channel, one block after another.
+/// Sums the visibilities of one channel, block by block.
 ///
 /// Sums are exact: each term is rounded once, by a rule that looks at its own visibility alone, to a multiple of a
 /// quantum that the setup fixes, and the multiples are added as integers. So the sums, and the bytes of a checkpoint,
 /// depend on which visibilities are in them and on nothing else: not on their order, blocks or threads, not on how
-/// engines were merged, nor on what was put in and taken out again.
+/// engines were merged, nor on what was added and removed again.
 pub trait NormalEngine: Send {
     /// The form of the sums.
-    type Sums: NormalSums;
+    type Equations: NormalSums;
 
     /// Adds visibilities.
     ///
     /// # Errors
-    /// A block that is none of this engine's channel. Geometry that the engine does not cover is
-    /// counted as refused instead.
+    /// A block of another frequency. A visibility that the engine does not cover, or has no room for, is counted as
+    /// refused instead.
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 
-    /// Takes out visibilities that were added: the exact inverse of [`NormalEngine::add`].
+    /// Removes visibilities that were added: the exact inverse of [`NormalEngine::add`].
     ///
-    /// What the engine would refuse to add is refused here too, and counted; that the others were ever added is
-    /// for the caller to know.
+    /// A visibility that the engine would not add is refused here too, and counted. The caller has to know that the
+    /// others were added.
     ///
     /// # Errors
-    /// As [`NormalEngine::add`]; or more is to be taken out than there is.
+    /// A block of another frequency; or [`AccumulationError::NothingHeld`] if the engine holds less than is to be
+    /// removed. Nothing changes then.
     fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 
-    /// Adds what waits for company, if anything does; changes no bit of the sums.
-    fn settle(&mut self) {}
+    /// Sums the pending visibilities now instead of with the next batch; the sums get the same bits either way.
+    fn flush(&mut self);
 
-    /// Adds what another engine of the same setup holds.
+    /// Adds the sums of another engine of the same setup.
     ///
     /// # Errors
-    /// [`AccumulationError::Mismatch`] if the setups differ.
+    /// [`AccumulationError::Mismatch`] if the setups differ; [`AccumulationError::Range`] if there is no room for both.
     fn merge(&mut self, other: Self) -> Result<(), AccumulationError>
     where
         Self: Sized;
 
-    /// Takes out what another engine of the same setup holds: the exact inverse of [`NormalEngine::merge`].
+    /// Removes the sums of another engine of the same setup: the exact inverse of [`NormalEngine::merge`].
     ///
     /// # Errors
-    /// [`AccumulationError::Mismatch`] if the setups differ; or more is to be taken out than there is.
+    /// [`AccumulationError::Mismatch`] if the setups differ; [`AccumulationError::Range`] if the engine holds less.
     fn subtract(&mut self, other: Self) -> Result<(), AccumulationError>
     where
         Self: Sized;
 
-    /// What is in the engine.
+    /// Number and weight of the visibilities in the engine.
     fn counts(&self) -> SumCounts;
 
-    /// A copy of the sums of all visibilities so far.
-    fn sums(&mut self) -> Self::Sums;
+    /// The sums of all visibilities so far, as a copy.
+    fn sums(&mut self) -> Self::Equations;
 
     /// The sums of all visibilities, without a copy.
-    fn into_sums(self) -> Self::Sums
+    fn into_sums(self) -> Self::Equations
     where
         Self: Sized;
 
-    /// Writes all that is needed to go on later, with a checksum.
+    /// Writes everything that is needed to resume, with a checksum.
     ///
     /// # Errors
-    /// What the writer says.
+    /// The writer's.
     fn checkpoint(&mut self, out: &mut dyn std::io::Write) -> Result<(), AccumulationError>;
 
-    /// An engine as [`NormalEngine::checkpoint`] wrote it; it goes on to the same bits.
+    /// Reads an engine that [`NormalEngine::checkpoint`] wrote; it resumes to the same bits.
     ///
     /// # Errors
-    /// Data that is damaged, cut short, or of another version.
+    /// Data that is damaged, truncated, or of another format.
     fn restore(from: &mut dyn std::io::Read) -> Result<Self, AccumulationError>
     where
         Self: Sized;
@@ -194,8 +182,8 @@ pub trait NormalSums: Send {
     fn right_hand_side(&self) -> &[f64];
 
     /// `BtN^-1n` for noise n of the data's own weights: the right-hand side of a noise-only map.
-    fn noise_side(&self) -> &[f64];
+    fn noise_right_hand_side(&self) -> &[f64];
 
-    /// What is in the sums.
+    /// Number and weight of the visibilities in the sums.
     fn counts(&self) -> SumCounts;
 }

@@ -1,4 +1,4 @@
-//! The ground stage that sums normal equations, channel by channel.
+//! The ground stage that sums normal equations: an engine for each channel.
 
 use std::io::{Read, Write};
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use crate::runtime::{Ledger, Outlet, Stage, Units};
 use crate::units::ChannelId;
 use crate::units::vector::{norm, sub};
 
-/// The sums of one channel at a moment, for solving on the side.
+/// A copy of the sums of one channel, to be solved while more data arrives.
 pub struct Snapshot {
     /// Instrument.
     pub instrument: Arc<Instrument>,
@@ -21,25 +21,25 @@ pub struct Snapshot {
     pub channel: ChannelId,
     /// Number of the snapshot in its channel, from 1.
     pub number: u32,
-    /// Whether all data is in it.
+    /// Whether it holds all data.
     pub is_final: bool,
     /// First and last mission time of the data in it, s.
     pub span_s: [f64; 2],
-    /// nside of the map that is wanted.
+    /// nside of the map to be made.
     pub nside: usize,
     /// The sums.
-    pub sums: Sums,
+    pub sums: SnapshotSums,
 }
 
 /// Sums of either engine.
-pub enum Sums {
+pub enum SnapshotSums {
     /// Over pixels.
     Pixel(PixelSums),
     /// Over harmonics.
     Harmonic(Box<HarmonicSums>),
 }
 
-impl Sums {
+impl SnapshotSums {
     /// What is in the sums.
     #[must_use]
     pub fn counts(&self) -> SumCounts {
@@ -71,7 +71,7 @@ impl Engine {
         }
     }
 
-    /// Whether nothing is held: then there is nothing to make a map of.
+    /// Whether it holds nothing, so that there is no map to make.
     fn is_empty(&self) -> bool {
         let counts = match self {
             Self::Pixel(engine) => engine.counts(),
@@ -80,39 +80,39 @@ impl Engine {
         counts.visibilities == 0
     }
 
-    fn sums(&mut self) -> Sums {
+    fn sums(&mut self) -> SnapshotSums {
         match self {
-            Self::Pixel(engine) => Sums::Pixel(engine.sums()),
-            Self::Harmonic(engine) => Sums::Harmonic(Box::new(engine.sums())),
+            Self::Pixel(engine) => SnapshotSums::Pixel(engine.sums()),
+            Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.sums())),
         }
     }
 
-    fn into_sums(self) -> Sums {
+    fn into_sums(self) -> SnapshotSums {
         match self {
-            Self::Pixel(engine) => Sums::Pixel(engine.into_sums()),
-            Self::Harmonic(engine) => Sums::Harmonic(Box::new(engine.into_sums())),
+            Self::Pixel(engine) => SnapshotSums::Pixel(engine.into_sums()),
+            Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.into_sums())),
         }
     }
 }
 
-/// What an accumulator holds besides its engines, for another to go on with; its ledger is apart. Snapshots are numbered
-/// anew: when they were taken depends on how the data came.
+/// State of an accumulator besides its engines and ledger, from which another can resume. Snapshots are numbered from 1
+/// again: their times depend on how the data arrived.
 #[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct AccumulatorState {
     instrument: Option<Instrument>,
-    /// First and last time of channels that have an engine.
+    /// First and last mission time of each channel that has an engine, s.
     channels: Vec<Option<[f64; 2]>>,
     accumulated: u64,
 }
 
-/// One channel's engine and what it holds.
+/// The engine of one channel, and the span of its data.
 struct ChannelSums {
     engine: Engine,
     span_s: [f64; 2],
     snapshots: u32,
 }
 
-/// Sums what calibration hands on; emits snapshots at equal steps of mission time, and a last one.
+/// Sums calibrated visibilities; emits snapshots at equal steps of mission time, and a final one.
 pub struct Accumulator {
     config: MapConfig,
     ledger: Ledger<VisibilityReason>,
@@ -120,12 +120,12 @@ pub struct Accumulator {
     channels: Vec<Option<ChannelSums>>,
     next_snapshot_s: Option<f64>,
     accumulated: u64,
-    /// First and last time of what was added last; `None` if nothing was.
+    /// First and last mission time of the block that was added last, s.
     latest_s: Option<[f64; 2]>,
 }
 
 impl Accumulator {
-    /// A stage that posts to `ledger`.
+    /// A stage that reports to `ledger`.
     #[must_use]
     pub fn new(config: MapConfig, ledger: Ledger<VisibilityReason>) -> Self {
         Self {
@@ -139,7 +139,7 @@ impl Accumulator {
         }
     }
 
-    /// What it holds besides its engines.
+    /// Its state besides the engines.
     #[must_use]
     pub fn state(&self) -> AccumulatorState {
         AccumulatorState {
@@ -149,10 +149,10 @@ impl Accumulator {
         }
     }
 
-    /// Writes its engines, one behind the other.
+    /// Writes its engines one after another.
     ///
     /// # Errors
-    /// What the writer says.
+    /// The writer's.
     pub fn write_engines(&mut self, out: &mut dyn Write) -> Result<(), AccumulationError> {
         for sums in self.channels.iter_mut().flatten() {
             match &mut sums.engine {
@@ -163,10 +163,10 @@ impl Accumulator {
         Ok(())
     }
 
-    /// Goes on with what another held, its engines read as [`Accumulator::write_engines`] wrote them.
+    /// Resumes from a state and from engines that [`Accumulator::write_engines`] wrote.
     ///
     /// # Errors
-    /// Engines that are damaged, or of another kind than the configuration asks for.
+    /// Engines that are damaged, or of another kind than configured.
     pub fn resume(self, state: AccumulatorState, from: &mut dyn Read) -> Result<Self, AccumulationError> {
         let AccumulatorState { instrument, channels: kept, accumulated } = state;
         let mut channels = Vec::new();
@@ -256,8 +256,7 @@ impl Accumulator {
         Ok(())
     }
 
-    /// The sums that `placed` belongs to, made if it is the first data; `None` if it does not tell where it was
-    /// measured.
+    /// The sums that `placed` belongs to, created with the first data; `None` if its positions tell no orbit.
     fn sums(&mut self, placed: &PlacedVisibilities) -> Result<Option<&mut ChannelSums>, AccumulationError> {
         let channel = placed.channel;
         let index = usize::from(channel.0);
@@ -275,7 +274,7 @@ impl Accumulator {
         let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
         self.ledger.left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - near.len()) as u64);
         if near.is_empty() {
-            // A channel of which nothing is used has no sums, and no map.
+            // A channel without usable data has no sums, and no map.
             return Ok(());
         }
         let Some(sums) = self.sums(&near)? else {
@@ -295,7 +294,7 @@ impl Accumulator {
         Ok(())
     }
 
-    /// Emits what there is so far, channel by channel.
+    /// Emits a snapshot of each channel.
     fn emit(&mut self, out: &mut Outlet<Snapshot>) {
         let Some(instrument) = &self.instrument else { return };
         for (index, slot) in self.channels.iter_mut().enumerate() {
@@ -331,7 +330,7 @@ impl Accumulator {
     }
 }
 
-/// The engine for the channel of `placed`, its first data.
+/// An engine for the channel of `placed`, which is its first data; `None` if its positions tell no orbit.
 fn engine(
     config: &MapConfig,
     instrument: &Instrument,

@@ -154,9 +154,9 @@ fn transform_s(points: usize) -> f64 {
 /// Time to add, s, the second time: the first makes tables and touches memory.
 fn time_of<E: NormalEngine>(engine: &mut E, placed: &PlacedVisibilities) -> f64 {
     let warmed = engine.add(placed).is_ok();
-    engine.settle();
+    engine.flush();
     let since = Instant::now();
     let added = warmed && engine.add(placed).is_ok();
-    engine.settle();
+    engine.flush();
     if added { since.elapsed().as_secs_f64() } else { f64::NAN }
 }

@@ -4,17 +4,16 @@ use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor::{
     LltParams, LltRegularization, cholesky_in_place, cholesky_in_place_scratch,
 };
-use faer::linalg::matmul::{matmul, triangular};
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
-use faer::{Accum, MatMut, Par, Spec};
+use faer::{Par, Spec};
 use rayon::prelude::*;
 
-use crate::accumulation::{SymmetricTiles, TILE};
+use crate::accumulation::{SymmetricTiles, TILE, add_product};
 
 /// The factor L of `M = L Lt`, in the tiles that held M.
 ///
-/// Right-looking by tiles: a column of tiles is finished, then taken out of the rest. Every tile goes
-/// through the same operations whatever the threads, so the factor has the same bits.
+/// Right-looking by tiles: a column of tiles is finished, then its products are subtracted from the rest.
+/// Every tile undergoes the same operations on any number of threads, so the factor has the same bits.
 #[derive(Clone, Debug)]
 pub struct Cholesky(SymmetricTiles);
 
@@ -23,14 +22,14 @@ pub struct Cholesky(SymmetricTiles);
 pub struct NotPositive(pub usize);
 
 impl Cholesky {
-    /// Factorises a symmetric positive definite matrix, which it uses up.
+    /// Factorises a symmetric positive definite matrix in its own memory.
     ///
     /// # Errors
-    /// [`NotPositive`] with the place of the first pivot that is not positive.
+    /// [`NotPositive`] with the first row of the tile that has no factor.
     pub fn new(mut matrix: SymmetricTiles) -> Result<Self, NotPositive> {
         for step in 0..matrix.along() {
             factor_column(&mut matrix, step)?;
-            take_out(&mut matrix, step);
+            subtract_column(&mut matrix, step);
         }
         Ok(Self(matrix))
     }
@@ -93,10 +92,10 @@ fn factor_column(matrix: &mut SymmetricTiles, step: usize) -> Result<(), NotPosi
 }
 
 /// Subtracts the products of column `step`'s tiles from the tiles to its lower right.
-fn take_out(matrix: &mut SymmetricTiles, step: usize) {
+fn subtract_column(matrix: &mut SymmetricTiles, step: usize) {
     let order = matrix.order();
     let along = matrix.along();
-    // The column is read while others are written: taken out for that time.
+    // The column is read while others are written: moved out for that time.
     let column: Vec<Vec<f64>> =
         (step + 1..along).map(|i| std::mem::take(&mut matrix.tiles_mut()[i * (i + 1) / 2 + step])).collect();
     let size = matrix.rows(step).len();
@@ -107,24 +106,9 @@ fn take_out(matrix: &mut SymmetricTiles, step: usize) {
             return;
         }
         let left = SymmetricTiles::view(&column[i - step - 1], rows_of(i), size);
-        let right = SymmetricTiles::view(&column[j - step - 1], rows_of(j), size).transpose();
-        let tile: MatMut<'_, f64> = SymmetricTiles::view_mut(tile, rows_of(i), rows_of(j));
-        if i == j {
-            use triangular::BlockStructure::{Rectangular, TriangularLower};
-            triangular::matmul(
-                tile,
-                TriangularLower,
-                Accum::Add,
-                left,
-                Rectangular,
-                right,
-                Rectangular,
-                -1.0,
-                Par::Seq,
-            );
-        } else {
-            matmul(tile, Accum::Add, left, right, -1.0, Par::Seq);
-        }
+        let right = SymmetricTiles::view(&column[j - step - 1], rows_of(j), size);
+        let tile = SymmetricTiles::view_mut(tile, rows_of(i), rows_of(j));
+        add_product(tile, -1.0, left, right, i == j);
     });
     for (k, tile) in column.into_iter().enumerate() {
         let i = step + 1 + k;

@@ -1,14 +1,15 @@
 //! Conjugate gradients for `(BtN^-1B + R) x = b`.
 
-use super::watch::Work;
+use super::vectors::{dot, subtract};
+use super::watch::SolveTask;
 use crate::accumulation::NormalSums;
 
 /// When to stop.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StoppingRule {
-    /// Residual, in the norm of the preconditioner and relative to the right-hand side's, below which it ends.
+    /// Greatest residual, relative to the right-hand side, in the preconditioner's norm.
     pub residual_max: f64,
-    /// Most iterations.
+    /// Iteration limit.
     pub iterations_max: usize,
 }
 
@@ -19,7 +20,7 @@ pub struct Convergence {
     pub iterations: usize,
     /// `sqrt(r.Mr / b.Mb)`, M the preconditioner, r the residual, b the right-hand side.
     pub residual: f64,
-    /// Whether the stopping rule was met; if not, the iterations were used up or the run was interrupted.
+    /// Whether the residual was reached; if not, the iteration limit was, or the run was interrupted.
     pub converged: bool,
 }
 
@@ -28,7 +29,7 @@ pub(super) struct System<'a> {
     pub(super) sums: &'a dyn NormalSums,
     /// R = `regularisation` I.
     pub(super) regularisation: f64,
-    /// Replaces a vector by the preconditioner times it.
+    /// Multiplies a vector by the preconditioner, in place.
     pub(super) precondition: &'a dyn Fn(&mut [f64]),
 }
 
@@ -40,28 +41,28 @@ impl System<'_> {
         }
     }
 
-    /// Solves for `right`, from `x` on, in place; what it leaves is the best so far whenever it ends.
+    /// Solves for the right-hand side `b` in place, from the first guess `x`; the best so far is left whenever it ends.
     pub(super) fn solve(
         &self,
-        right: &[f64],
+        b: &[f64],
         x: &mut [f64],
         rule: StoppingRule,
-        work: &Work<'_>,
+        task: &SolveTask<'_>,
     ) -> Convergence {
-        let mut residual = right.to_vec();
+        let mut residual = b.to_vec();
         let mut product = vec![0.0; x.len()];
         let mut iterations = 0;
         if x.iter().any(|x| *x != 0.0) {
             self.apply(x, &mut product);
             iterations += 1;
-            residual.iter_mut().zip(&product).for_each(|(r, p)| *r -= p);
+            subtract(&mut residual, 1.0, &product);
         }
         let preconditioned = |v: &[f64]| {
             let mut z = v.to_vec();
             (self.precondition)(&mut z);
             z
         };
-        let whole = dot(right, &preconditioned(right));
+        let whole = dot(b, &preconditioned(b));
         if whole <= 0.0 {
             return Convergence { iterations, residual: 0.0, converged: true };
         }
@@ -71,18 +72,18 @@ impl System<'_> {
         let relative = |energy: f64| (energy.max(0.0) / whole).sqrt();
         while relative(energy) > rule.residual_max
             && iterations < rule.iterations_max
-            && work.goes_on(iterations, relative(energy))
+            && task.report(iterations, relative(energy))
         {
             self.apply(&direction, &mut product);
             iterations += 1;
             let curvature = dot(&direction, &product);
-            // Rounding has eaten what was left to gain.
+            // Rounding errors dominate: no further gain is possible.
             if curvature.is_nan() || curvature <= 0.0 {
                 break;
             }
             let step = energy / curvature;
             x.iter_mut().zip(&direction).for_each(|(x, d)| *x += step * d);
-            residual.iter_mut().zip(&product).for_each(|(r, p)| *r -= step * p);
+            subtract(&mut residual, step, &product);
             z.copy_from_slice(&residual);
             (self.precondition)(&mut z);
             let next = dot(&residual, &z);
@@ -93,8 +94,4 @@ impl System<'_> {
         let residual = relative(energy);
         Convergence { iterations, residual, converged: residual <= rule.residual_max }
     }
-}
-
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }

@@ -1,4 +1,4 @@
-//! Exact diagnostics of small cases, from all eigenvalues and eigenvectors.
+//! Exact diagnostics of small maps, from all eigenvalues and eigenvectors.
 
 use faer::{Mat, Side};
 
@@ -10,11 +10,11 @@ use crate::accumulation::PixelSums;
 pub struct Spectrum {
     /// Eigenvalues W, K^-2, rising.
     pub eigenvalues: Vec<f64>,
-    /// Eigenvectors Q, one a column.
+    /// Eigenvectors Q, one per column.
     vectors: Mat<f64>,
 }
 
-/// Decomposes the normal matrix. Takes `10 N_pix^3` operations and three matrices of memory: for nside up to 16.
+/// Decomposes the normal matrix. Costs `10 N_pix^3` operations and the memory of three matrices: for nside up to 16.
 ///
 /// # Errors
 /// A matrix with numbers that are not finite.

@@ -1,21 +1,21 @@
-//! Why there is no map.
+//! Errors of solutions.
 
 use thiserror::Error;
 
 use crate::sky::harmonics::HarmonicsError;
 use crate::units::ChannelId;
 
-/// Why there is no map.
+/// Why a solution failed.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum SolveError {
     /// Nothing to solve.
-    #[error("there is no data to make a map of")]
+    #[error("there is no data for a map")]
     NoData,
     /// epsilon is missing for a channel.
     #[error("map.epsilon has no value for channel {0}; expected one value, or one for each channel")]
     NoEpsilon(ChannelId),
-    /// epsilon is not a regularisation.
+    /// epsilon is not positive.
     #[error("epsilon = {0}: expected a number above 0")]
     Epsilon(f64),
     /// A prior of another size.
@@ -36,7 +36,7 @@ pub enum SolveError {
     },
     /// The matrix has no Cholesky factor.
     #[error(
-        "the regularised normal matrix is not positive definite at pixel {pixel}; expected it to be for \
+        "the regularised normal matrix is not positive definite at pixel {pixel}; expected it to be, with \
          epsilon = {epsilon:e}: raise map.epsilon; or lower map.weight_max, if the sky is so bright that all weights are far \
          below it"
     )]
@@ -46,7 +46,7 @@ pub enum SolveError {
         /// Regularisation.
         epsilon: f64,
     },
-    /// A map that has no harmonics, or harmonics that have no map.
+    /// A transform between map and harmonics failed.
     #[error(transparent)]
     Harmonics(#[from] HarmonicsError),
     /// An eigenvalue decomposition that did not converge.

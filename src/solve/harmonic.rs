@@ -1,11 +1,12 @@
 //! The regularised solution over harmonic coefficients.
 
-use super::conjugate_gradients::{StoppingRule, System};
+use super::conjugate_gradients::{Convergence, StoppingRule, System};
 use super::error::SolveError;
 use super::lanczos::{LargestEigenvalue, largest_eigenvalue};
 use super::probing::{Traces, traces};
-use super::tikhonov::Diagnostics;
-use super::watch::SolveWatch;
+use super::tikhonov::{Diagnostics, check_request, subtract_prediction};
+use super::vectors::add;
+use super::watch::NamedWatch;
 use crate::accumulation::NormalSums;
 use crate::accumulation::harmonic::{HarmonicSums, coefficients, unknowns};
 use crate::sky::harmonics::{AnalysisOptions, analysis, synthesis};
@@ -14,7 +15,7 @@ use crate::sky::healpix::{nside_of, pixel_area_sr};
 /// Relative accuracy of W_max: it only scales R.
 const W_MAX_TOLERANCE: f64 = 1e-4;
 
-/// What a harmonic solution is asked for.
+/// Parameters of a harmonic solution.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HarmonicRequest {
     /// epsilon of R = epsilon W_max I.
@@ -23,7 +24,7 @@ pub struct HarmonicRequest {
     pub nside: usize,
     /// When to stop.
     pub rule: StoppingRule,
-    /// Random vectors for the traces of the covariances; 0 for none.
+    /// Random probes for the traces of the covariances; 0 for none.
     pub probes: usize,
 }
 
@@ -47,51 +48,34 @@ pub struct HarmonicSolution {
 /// `start` is an earlier solution's [`HarmonicSolution::unknowns`].
 ///
 /// # Errors
-/// No data, or a prior of a size that is no map's.
+/// No data, or a prior whose size is not a map's.
 pub fn solve_harmonics(
     sums: &HarmonicSums,
     request: HarmonicRequest,
     prior_k: Option<&[f64]>,
     start: Option<&[Vec<f64>; 2]>,
-    (watch, name): (&SolveWatch, &str),
+    watch: NamedWatch<'_>,
 ) -> Result<HarmonicSolution, SolveError> {
-    if sums.counts().visibilities == 0 {
-        return Err(SolveError::NoData);
-    }
-    if request.epsilon.is_nan() || request.epsilon <= 0.0 {
-        return Err(SolveError::Epsilon(request.epsilon));
-    }
+    check_request(sums, request.epsilon)?;
     let l_max = sums.setup().l_max;
     let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
     let LargestEigenvalue { value: w_max, iterations, .. } = {
-        let work = watch.start(format!("{name}: largest eigenvalue"), W_MAX_TOLERANCE);
-        largest_eigenvalue(sums, W_MAX_TOLERANCE, &mut |step, change| work.goes_on(step, change))
+        let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
+        largest_eigenvalue(sums, W_MAX_TOLERANCE, &mut |step, change| task.report(step, change))
     };
     let regularisation = request.epsilon * w_max;
-    let factors = sums.order_blocks().factors(regularisation);
-    let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
     let mut right = sums.right_hand_side().to_vec();
     if let Some(prior) = &prior {
-        let mut predicted = vec![0.0; prior.len()];
-        sums.apply(prior, &mut predicted);
-        right.iter_mut().zip(predicted).for_each(|(right, predicted)| *right -= predicted);
+        subtract_prediction(sums, prior, &mut right);
     }
-    let sides = [("map", right.as_slice()), ("noise map", sums.noise_side())];
-    let mut solved = [0, 1].map(|side| match start {
-        Some(start) if start[side].len() == right.len() => start[side].clone(),
-        _ => vec![0.0; right.len()],
-    });
-    let mut convergence = Vec::new();
-    for ((what, right), x) in sides.into_iter().zip(&mut solved) {
-        let work = watch.start(format!("{name}: {what}"), request.rule.residual_max);
-        convergence.push(system.solve(right, x, request.rule, &work));
-    }
-    let traces = (request.probes > 0).then(|| traces(sums, regularisation, request.probes, (watch, name)));
+    let right_hand_sides = [right.as_slice(), sums.noise_right_hand_side()];
+    let (solved, convergence) = iterate(sums, regularisation, right_hand_sides, start, request.rule, watch);
+    let traces = (request.probes > 0).then(|| traces(sums, regularisation, request.probes, watch));
     let area_sr = pixel_area_sr(request.nside);
     let map = |x: &[f64]| synthesis(&coefficients(x, l_max), request.nside).map_err(SolveError::from);
     let mut whole = solved[0].clone();
     if let Some(prior) = prior {
-        whole.iter_mut().zip(prior).for_each(|(map, prior)| *map += prior);
+        add(&mut whole, &prior);
     }
     Ok(HarmonicSolution {
         map_k: map(&whole)?,
@@ -102,11 +86,34 @@ pub fn solve_harmonics(
             w_max: w_max * area_sr,
             w_max_iterations: iterations,
             l_max: Some(l_max),
-            convergence: convergence.first().copied(),
-            noise_convergence: convergence.get(1).copied(),
+            convergence: Some(convergence[0]),
+            noise_convergence: Some(convergence[1]),
             traces: traces.map(|traces| Traces { sigma_n_k2: traces.sigma_n_k2 / area_sr, ..traces }),
         },
     })
+}
+
+/// Solves for the map and the noise-only map, from an earlier solution of the same size if there is one.
+fn iterate(
+    sums: &HarmonicSums,
+    regularisation: f64,
+    right_hand_sides: [&[f64]; 2],
+    start: Option<&[Vec<f64>; 2]>,
+    rule: StoppingRule,
+    watch: NamedWatch<'_>,
+) -> ([Vec<f64>; 2], [Convergence; 2]) {
+    let factors = sums.order_blocks().factors(regularisation);
+    let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
+    let unknowns = sums.unknowns();
+    let mut solved = [0, 1].map(|which| match start {
+        Some(start) if start[which].len() == unknowns => start[which].clone(),
+        _ => vec![0.0; unknowns],
+    });
+    let convergence = [0, 1].map(|which| {
+        let task = watch.start(["map", "noise map"][which], rule.residual_max);
+        system.solve(right_hand_sides[which], &mut solved[which], rule, &task)
+    });
+    (solved, convergence)
 }
 
 fn prior_unknowns(map: &[f64], l_max: usize) -> Result<Vec<f64>, SolveError> {

@@ -2,10 +2,11 @@
 
 use rand_distr::{Distribution, StandardNormal};
 
+use super::vectors::{dot, norm, subtract};
 use crate::accumulation::NormalSums;
 use crate::units::{StreamKind, random_stream};
 
-/// Most iterations; 20 to 40 are usual.
+/// Iteration limit; 20 to 40 are usual.
 const ITERATIONS_MAX: usize = 200;
 
 /// The largest eigenvalue, and how it was found.
@@ -19,20 +20,20 @@ pub struct LargestEigenvalue {
     pub change: f64,
 }
 
-/// Relative change at which W_max is as exact as f64 sums make it.
+/// Relative change at which W_max is as exact as sums in f64 allow.
 pub const W_MAX_EXACT: f64 = 1e-10;
 
 /// W_max of `BtN^-1B`.
 ///
 /// Lanczos from a fixed random vector with full reorthogonalisation; the Ritz value rises towards W_max,
 /// and the iteration ends when it has twice risen by less than `tolerance` of itself. The error is then of the
-/// same order: it falls by a constant factor an iteration. `goes_on` is told the number of products and the last
-/// change, and ends the iteration early by `false`.
+/// same order: it falls by a constant factor per iteration. `report` receives the number of products and the last
+/// change; it ends the iteration early by returning `false`.
 #[must_use]
 pub fn largest_eigenvalue(
     sums: &dyn NormalSums,
     tolerance: f64,
-    goes_on: &mut dyn FnMut(usize, f64) -> bool,
+    report: &mut dyn FnMut(usize, f64) -> bool,
 ) -> LargestEigenvalue {
     let order = sums.unknowns();
     let mut stream = random_stream(0, StreamKind::Probe, [order as u64, 0]);
@@ -48,7 +49,7 @@ pub fn largest_eigenvalue(
         found.value = value;
         calm = if found.change < tolerance { calm + 1 } else { 0 };
         // An invariant subspace: the Ritz value is exact.
-        if !is_open || !goes_on(found.iterations, found.change) {
+        if !is_open || !report(found.iterations, found.change) {
             break;
         }
     }
@@ -73,14 +74,14 @@ impl Krylov {
         let mut next = vec![0.0; last.len()];
         sums.apply(last, &mut next);
         self.alphas.push(dot(last, &next));
-        // Twice, so that what rounding leaves of the first time goes too.
+        // Twice: the second pass removes what rounding left of the first.
         for _ in 0..2 {
             for vector in &self.basis {
                 let part = dot(vector, &next);
-                next.iter_mut().zip(vector).for_each(|(x, v)| *x -= part * v);
+                subtract(&mut next, part, vector);
             }
         }
-        let beta = dot(&next, &next).sqrt();
+        let beta = norm(&next);
         let largest = self.alphas.iter().fold(0.0_f64, |a, b| a.max(b.abs()));
         if beta.is_nan() || beta <= f64::EPSILON * largest {
             return false;
@@ -91,12 +92,8 @@ impl Krylov {
     }
 }
 
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(x, y)| x * y).sum()
-}
-
 fn normalised(mut vector: Vec<f64>) -> Vec<f64> {
-    let norm = dot(&vector, &vector).sqrt();
+    let norm = norm(&vector);
     vector.iter_mut().for_each(|x| *x /= norm);
     vector
 }

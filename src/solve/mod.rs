@@ -1,7 +1,9 @@
 //! Maps from normal equations: `T = (BtN^-1B + R)^-1 BtN^-1 (V - B T_p) + T_p` with `R = epsilon W_max I`,
 //! W_max the largest eigenvalue of `BtN^-1B` (the paper, Sect. 4).
 //!
-//! Uses [`crate::accumulation`] and [`crate::sky`].
+//! Pixels are solved by Cholesky factorisation, harmonics by preconditioned conjugate gradients. [`Solver`] is the stage
+//! that turns snapshots into maps. Every result has the same bits for any number of threads. Uses
+//! [`crate::accumulation`] and [`crate::sky`].
 
 mod cholesky;
 mod conjugate_gradients;
@@ -12,6 +14,7 @@ mod lanczos;
 mod probing;
 mod stage;
 mod tikhonov;
+mod vectors;
 mod watch;
 
 pub use cholesky::{Cholesky, NotPositive};
@@ -23,4 +26,4 @@ pub use lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
 pub use probing::{Estimate, Traces, effective_beam, noise_variance, regularisation, traces};
 pub use stage::{Solution, Solver, SolverSetup};
 pub use tikhonov::{Diagnostics, PixelSolution, solve_pixels};
-pub use watch::{SolveWatch, Solving};
+pub use watch::{NamedWatch, SolveWatch, Solving};

@@ -1,5 +1,4 @@
-//! What a covariance is like without ever being written down: functions of BtN^-1B through Krylov spaces of
-//! random vectors.
+//! Properties of covariances without their matrices: functions of BtN^-1B from the Krylov spaces of random probes.
 //!
 //! From a vector v, k Lanczos steps give a tridiagonal T with `v.f(A)v = |v|^2 e1.f(T)e1` for all polynomials f up
 //! to degree 2 k - 1, and `f(A)v ~ |v| Q f(T) e1` (Golub & Meurant 2010). Averaged over random v the first is a
@@ -10,25 +9,26 @@ use rand_distr::{Distribution, StandardNormal};
 
 use super::error::SolveError;
 use super::lanczos::{Krylov, W_MAX_EXACT, largest_eigenvalue};
-use super::watch::{SolveWatch, Work};
+use super::vectors::norm;
+use super::watch::{NamedWatch, SolveTask};
 use crate::accumulation::NormalSums;
 use crate::accumulation::harmonic::{HarmonicSums, coefficients, unknowns};
 use crate::sky::harmonics::Transform;
 use crate::units::{StreamKind, random_stream};
 
-/// Most steps from one vector. Steps end earlier when the function asked for has settled.
+/// Most steps from one probe; fewer if the function converges.
 const STEPS_MAX: usize = 120;
-/// Steps between looks at that.
+/// Steps between tests of convergence.
 const STEPS_BETWEEN: usize = 5;
-/// Relative change that counts as settled: a hundredth of what a few random vectors differ by.
-const SETTLED: f64 = 1e-4;
+/// Relative change that counts as converged: a hundredth of the spread of a few random probes.
+const CONVERGED: f64 = 1e-4;
 
-/// A number from random vectors.
+/// An estimate from random probes.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Estimate {
     /// Mean.
     pub value: f64,
-    /// Standard error of the mean; infinite for a single vector.
+    /// Standard error of the mean; infinite for a single probe.
     pub error: f64,
 }
 
@@ -47,24 +47,19 @@ pub struct Traces {
     pub sigma_n_k2: Estimate,
     /// `sum (eps / (W + eps))^2` over the unknowns.
     pub sigma_s: Estimate,
-    /// Random vectors.
+    /// Random probes.
     pub probes: usize,
 }
 
-/// Both traces for R = `regularisation` I, from `probes` random vectors.
+/// Both traces for R = `regularisation` I, from `probes` random probes.
 #[must_use]
-pub fn traces(
-    sums: &dyn NormalSums,
-    regularisation: f64,
-    probes: usize,
-    (watch, name): (&SolveWatch, &str),
-) -> Traces {
+pub fn traces(sums: &dyn NormalSums, regularisation: f64, probes: usize, watch: NamedWatch<'_>) -> Traces {
     let eps = regularisation;
     let (mut thermal, mut imperfect) = (Vec::new(), Vec::new());
     for probe in 0..probes {
-        let work = watch.start(format!("{name}: trace {} of {probes}", probe + 1), SETTLED);
+        let task = watch.start(&format!("trace {} of {probes}", probe + 1), CONVERGED);
         let start = signs(sums.unknowns(), probe);
-        let space = settled(sums, start, &work, &|w: f64| w / ((w + eps) * (w + eps)));
+        let space = converged_space(sums, start, &task, &|w: f64| w / ((w + eps) * (w + eps)));
         let order = sums.unknowns() as f64;
         thermal.push(order * space.quadrature(|w| w / ((w + eps) * (w + eps))));
         imperfect.push(order * space.quadrature(|w| (eps / (w + eps)).powi(2)));
@@ -82,35 +77,37 @@ pub fn traces(
 pub fn noise_variance(
     sums: &HarmonicSums,
     regularisation: f64,
-    (nside, probes): (usize, usize),
-    (watch, name): (&SolveWatch, &str),
+    nside: usize,
+    probes: usize,
+    watch: NamedWatch<'_>,
 ) -> Result<Vec<f64>, SolveError> {
     let eps = regularisation;
     let transform = Transform::new(nside, sums.setup().l_max)?;
     let mut variance = vec![0.0; crate::sky::healpix::pixel_count(nside)];
     for probe in 0..probes {
-        let work = watch.start(format!("{name}: noise map {} of {probes}", probe + 1), SETTLED);
+        let task = watch.start(&format!("noise map {} of {probes}", probe + 1), CONVERGED);
         let mut stream = random_stream(1, StreamKind::Probe, [sums.unknowns() as u64, probe as u64]);
         let start: Vec<f64> = (0..sums.unknowns()).map(|_| StandardNormal.sample(&mut stream)).collect();
-        let length = start.iter().map(|x| x * x).sum::<f64>().sqrt();
+        let length = norm(&start);
         let noise = |w: f64| w.max(0.0).sqrt() / (w + eps);
-        let space = settled(sums, start, &work, &|w| noise(w).powi(2));
+        let space = converged_space(sums, start, &task, &|w| noise(w).powi(2));
         let map = transform.synthesis(&coefficients(&space.function(length, noise), sums.setup().l_max))?;
         variance.iter_mut().zip(map).for_each(|(sum, x)| *sum += x * x / probes as f64);
     }
     Ok(variance)
 }
 
-/// The effective beam at one pixel of an `nside` map: what a sky of 1 K in that pixel alone, up to the map's
-/// degree, becomes; `B_eff = (A + eps)^-1 A`.
+/// The effective beam at one pixel of an `nside` map: the map of a sky that is 1 K in that pixel alone, up to the map's
+/// degree; `B_eff = (A + eps)^-1 A`.
 ///
 /// # Errors
 /// An nside or degree for which there is no transform; a pixel that the map does not have.
 pub fn effective_beam(
     sums: &HarmonicSums,
     regularisation: f64,
-    (nside, pixel): (usize, usize),
-    (watch, name): (&SolveWatch, &str),
+    nside: usize,
+    pixel: usize,
+    watch: NamedWatch<'_>,
 ) -> Result<Vec<f64>, SolveError> {
     let l_max = sums.setup().l_max;
     let transform = Transform::new(nside, l_max)?;
@@ -118,10 +115,10 @@ pub fn effective_beam(
     let pixels = map.len();
     *map.get_mut(pixel).ok_or(SolveError::NoPixel { pixel, pixels })? = 1.0;
     let start = unknowns(&transform.adjoint(&map)?);
-    let length = start.iter().map(|x| x * x).sum::<f64>().sqrt();
-    let work = watch.start(format!("{name}: beam at pixel {pixel}"), SETTLED);
+    let length = norm(&start);
+    let task = watch.start(&format!("beam at pixel {pixel}"), CONVERGED);
     let beam = |w: f64| w / (w + regularisation);
-    let space = settled(sums, start, &work, &beam);
+    let space = converged_space(sums, start, &task, &beam);
     Ok(transform.synthesis(&coefficients(&space.function(length, beam), l_max))?)
 }
 
@@ -138,8 +135,13 @@ struct Space {
     vectors: Mat<f64>,
 }
 
-/// A space in which `e1.f(T)e1` has settled.
-fn settled(sums: &dyn NormalSums, start: Vec<f64>, work: &Work<'_>, f: &dyn Fn(f64) -> f64) -> Space {
+/// A Krylov space large enough for `e1.f(T)e1` to have converged.
+fn converged_space(
+    sums: &dyn NormalSums,
+    start: Vec<f64>,
+    task: &SolveTask<'_>,
+    f: &dyn Fn(f64) -> f64,
+) -> Space {
     let mut krylov = Krylov::new(start);
     let mut last = f64::NAN;
     for step in 1..=STEPS_MAX.min(sums.unknowns()) {
@@ -150,7 +152,7 @@ fn settled(sums: &dyn NormalSums, start: Vec<f64>, work: &Work<'_>, f: &dyn Fn(f
             });
             let change = ((value - last) / value).abs();
             last = value;
-            if !is_open || change < SETTLED || !work.goes_on(step, change) {
+            if !is_open || change < CONVERGED || !task.report(step, change) {
                 break;
             }
         }
@@ -195,7 +197,7 @@ impl Space {
     }
 }
 
-/// A vector of random signs: their traces spread least.
+/// A probe of random signs, which gives traces the least spread.
 fn signs(order: usize, probe: usize) -> Vec<f64> {
     let mut stream = random_stream(2, StreamKind::Probe, [order as u64, probe as u64]);
     let mut sign = || -> f64 { StandardNormal.sample(&mut stream) };

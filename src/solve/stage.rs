@@ -5,13 +5,13 @@ use std::sync::Arc;
 
 use super::harmonic::{HarmonicRequest, solve_harmonics};
 use super::{Diagnostics, SolveError, SolveWatch, StoppingRule, solve_pixels};
-use crate::accumulation::{Snapshot, Sums};
+use crate::accumulation::{Snapshot, SnapshotSums};
 use crate::frames::Instrument;
 use crate::runtime::{Outlet, Stage, Units};
 use crate::sky::healpix::pixel_count;
 use crate::units::{ChannelId, PerChannel};
 
-/// A map of one channel and what goes with it.
+/// A map of one channel.
 pub struct Solution {
     /// Instrument.
     pub instrument: Arc<Instrument>,
@@ -19,11 +19,11 @@ pub struct Solution {
     pub channel: ChannelId,
     /// Number of the snapshot in its channel, from 1.
     pub number: u32,
-    /// Whether all data is in it.
+    /// Whether it is from all data.
     pub is_final: bool,
-    /// First and last mission time of the data in it, s.
+    /// First and last mission time of its data, s.
     pub span_s: [f64; 2],
-    /// Visibilities in it.
+    /// Visibilities in the sums.
     pub visibilities: u64,
     /// nside of the maps.
     pub nside: usize,
@@ -31,7 +31,7 @@ pub struct Solution {
     pub map_k: Vec<f64>,
     /// Map of noise alone, made from noise of the data's weights, K.
     pub noise_k: Vec<f64>,
-    /// Regularisation, and how the solution was found.
+    /// Regularisation and convergence.
     pub diagnostics: Diagnostics,
 }
 
@@ -44,15 +44,15 @@ pub struct SolverSetup {
     pub prior_k: PerChannel<f64>,
     /// Prior maps by channel, K, at the map's nside; empty for none.
     pub prior_maps: Vec<Vec<f64>>,
-    /// When the iteration for a harmonic map stops.
+    /// When the iteration of a harmonic map stops.
     pub rule: StoppingRule,
-    /// Random vectors for the traces of a final harmonic map.
+    /// Random probes for the traces of a final harmonic map.
     pub trace_probes: usize,
-    /// Who is told of progress, and may interrupt.
+    /// Receives progress, and may interrupt.
     pub watch: SolveWatch,
 }
 
-/// Solves every snapshot that comes.
+/// Solves every snapshot.
 pub struct Solver {
     setup: SolverSetup,
     solved: u64,
@@ -88,17 +88,17 @@ impl Stage for Solver {
         let prior = self.prior(index, pixel_count(nside));
         let visibilities = sums.counts().visibilities;
         let (map_k, noise_k, diagnostics) = match sums {
-            Sums::Pixel(sums) => {
+            SnapshotSums::Pixel(sums) => {
                 let solved = solve_pixels(sums, epsilon, prior.as_deref())?;
                 (solved.map_k, solved.noise_k, solved.diagnostics)
             }
-            Sums::Harmonic(sums) => {
+            SnapshotSums::Harmonic(sums) => {
                 let probes = if is_final { self.setup.trace_probes } else { 0 };
                 let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes };
                 let frequency_hz = instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
                 let name = format!("{:.3} MHz", frequency_hz / 1e6);
                 let start = self.last.remove(&channel);
-                let watch = (&self.setup.watch, name.as_str());
+                let watch = self.setup.watch.named(&name);
                 let solved = solve_harmonics(&sums, request, prior.as_deref(), start.as_ref(), watch)?;
                 if !is_final {
                     self.last.insert(channel, solved.unknowns);

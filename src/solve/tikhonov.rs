@@ -7,9 +7,10 @@ use super::conjugate_gradients::Convergence;
 use super::error::SolveError;
 use super::lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
 use super::probing::Traces;
+use super::vectors::{add, subtract};
 use crate::accumulation::{NormalSums, PixelSums};
 
-/// How a map was found. Eigenvalues and traces are those of pixels, also for a map of harmonics.
+/// Diagnostics of a solution. Eigenvalues and traces are those of pixels, also for a map of harmonics.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Diagnostics {
     /// epsilon of `R = epsilon W_max I`.
@@ -27,7 +28,7 @@ pub struct Diagnostics {
     /// How the iteration for the noise-only map ended.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub noise_convergence: Option<Convergence>,
-    /// Traces of the covariances, if they were asked for.
+    /// Traces of the covariances, if requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub traces: Option<Traces>,
 }
@@ -43,6 +44,24 @@ pub struct PixelSolution {
     pub diagnostics: Diagnostics,
 }
 
+/// Whether there is data, and a regularisation.
+pub(super) fn check_request(sums: &dyn NormalSums, epsilon: f64) -> Result<(), SolveError> {
+    if sums.counts().visibilities == 0 {
+        return Err(SolveError::NoData);
+    }
+    if epsilon.is_nan() || epsilon <= 0.0 {
+        return Err(SolveError::Epsilon(epsilon));
+    }
+    Ok(())
+}
+
+/// `right -= BtN^-1B prior`.
+pub(super) fn subtract_prediction(sums: &dyn NormalSums, prior: &[f64], right: &mut [f64]) {
+    let mut predicted = vec![0.0; prior.len()];
+    sums.apply(prior, &mut predicted);
+    subtract(right, 1.0, &predicted);
+}
+
 /// Solves by Cholesky factorisation, in the memory of the sums.
 ///
 /// `T = (BtN^-1B + R)^-1 (BtN^-1V - BtN^-1B T_p) + T_p`; the noise-only map is the same inverse times
@@ -55,13 +74,8 @@ pub fn solve_pixels(
     epsilon: f64,
     prior_k: Option<&[f64]>,
 ) -> Result<PixelSolution, SolveError> {
+    check_request(&sums, epsilon)?;
     let pixels = sums.unknowns();
-    if sums.counts.visibilities == 0 {
-        return Err(SolveError::NoData);
-    }
-    if epsilon.is_nan() || epsilon <= 0.0 {
-        return Err(SolveError::Epsilon(epsilon));
-    }
     let LargestEigenvalue { value: w_max, iterations, .. } =
         largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| true);
     let mut map_k = sums.right.clone();
@@ -69,9 +83,7 @@ pub fn solve_pixels(
         if prior_k.len() != pixels {
             return Err(SolveError::PriorLength { found: prior_k.len(), expected: pixels });
         }
-        let mut predicted = vec![0.0; pixels];
-        sums.apply(prior_k, &mut predicted);
-        map_k.iter_mut().zip(predicted).for_each(|(right, predicted)| *right -= predicted);
+        subtract_prediction(&sums, prior_k, &mut map_k);
     }
     let PixelSums { mut normal, noise: mut noise_k, .. } = sums;
     normal.add_to_diagonal(epsilon * w_max);
@@ -79,7 +91,7 @@ pub fn solve_pixels(
         Cholesky::new(normal).map_err(|NotPositive(pixel)| SolveError::NotPositive { pixel, epsilon })?;
     rayon::join(|| factor.solve(&mut map_k), || factor.solve(&mut noise_k));
     if let Some(prior_k) = prior_k {
-        map_k.iter_mut().zip(prior_k).for_each(|(map, prior)| *map += prior);
+        add(&mut map_k, prior_k);
     }
     Ok(PixelSolution {
         map_k,

@@ -1,15 +1,15 @@
-//! What a long solution tells of itself while it works, and how it is asked to end.
+//! Progress of a long solution, and how it is interrupted.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::runtime::Cancel;
 
-/// How far a solution is.
+/// Progress of a solution.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Solving {
-    /// Number of the work since the start, so that a new one can be told from the last.
+    /// Number of the task since the start, to tell a new one from the last.
     pub number: u64,
-    /// What is done: `map at 10.000 MHz`.
+    /// The task: `map at 10.000 MHz`.
     pub what: String,
     /// Products with BtN^-1B so far.
     pub iteration: usize,
@@ -23,11 +23,25 @@ pub struct Solving {
 #[derive(Clone, Debug, Default)]
 pub struct SolveWatch {
     cancel: Cancel,
-    state: Arc<Mutex<(u64, Option<Solving>)>>,
+    state: Arc<Mutex<WatchState>>,
 }
 
-/// Iterations that a solution still gets when the run was interrupted before it began: enough for the well-measured
-/// part of a map.
+#[derive(Debug, Default)]
+struct WatchState {
+    /// Tasks started so far.
+    started: u64,
+    now: Option<Solving>,
+}
+
+/// A watch, and the name under which a solution reports to it.
+#[derive(Clone, Copy, Debug)]
+pub struct NamedWatch<'a> {
+    watch: &'a SolveWatch,
+    name: &'a str,
+}
+
+/// Iterations that a solution may take if the run was interrupted before it began: enough for the well-measured part of
+/// a map.
 const ITERATIONS_WHEN_CANCELLED: usize = 12;
 
 impl SolveWatch {
@@ -37,33 +51,46 @@ impl SolveWatch {
         Self { cancel, state: Arc::default() }
     }
 
-    /// What is being solved now, if anything.
+    /// The solution in progress, if any.
     #[must_use]
     pub fn now(&self) -> Option<Solving> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner).1.clone()
+        self.state().now.clone()
     }
 
-    /// Starts a piece of work.
-    pub(super) fn start(&self, what: String, target: f64) -> Work<'_> {
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        state.0 += 1;
-        let number = state.0;
-        state.1 = Some(Solving { number, what, iteration: 0, residual: 1.0, target });
-        Work { watch: self, was_cancelled: self.cancel.is_cancelled() }
+    /// The watch for a solution of this name.
+    #[must_use]
+    pub fn named<'a>(&'a self, name: &'a str) -> NamedWatch<'a> {
+        NamedWatch { watch: self, name }
+    }
+
+    fn state(&self) -> MutexGuard<'_, WatchState> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// One piece of work under watch.
-pub(super) struct Work<'a> {
+impl<'a> NamedWatch<'a> {
+    /// Starts a task that ends at the residual `target`.
+    pub(super) fn start(self, what: &str, target: f64) -> SolveTask<'a> {
+        let Self { watch, name } = self;
+        let mut state = watch.state();
+        state.started += 1;
+        let number = state.started;
+        let what = format!("{name}: {what}");
+        state.now = Some(Solving { number, what, iteration: 0, residual: 1.0, target });
+        SolveTask { watch, was_cancelled: watch.cancel.is_cancelled() }
+    }
+}
+
+/// A task in progress.
+pub(super) struct SolveTask<'a> {
     watch: &'a SolveWatch,
     was_cancelled: bool,
 }
 
-impl Work<'_> {
-    /// Notes an iteration; whether to go on.
-    pub(super) fn goes_on(&self, iteration: usize, residual: f64) -> bool {
-        let mut state = self.watch.state.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(solving) = &mut state.1 {
+impl SolveTask<'_> {
+    /// Reports an iteration; whether to continue.
+    pub(super) fn report(&self, iteration: usize, residual: f64) -> bool {
+        if let Some(solving) = &mut self.watch.state().now {
             solving.iteration = iteration;
             solving.residual = residual;
         }
@@ -75,8 +102,8 @@ impl Work<'_> {
     }
 }
 
-impl Drop for Work<'_> {
+impl Drop for SolveTask<'_> {
     fn drop(&mut self) {
-        self.watch.state.lock().unwrap_or_else(PoisonError::into_inner).1 = None;
+        self.watch.state().now = None;
     }
 }

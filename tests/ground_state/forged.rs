@@ -40,8 +40,8 @@ fn memory_follows_what_a_state_holds_not_what_it_announces() {
     let again = place.session("state", &[&file], &[]);
     assert_eq!([within_the_limit(&again).0, within_the_limit(&again).0], [Some(0); 2]);
 
-    // The pixel engine's head, behind its magic and length: nside 64, of 9.7 GB.
-    let nside = |bytes: &[u8]| bytes.windows(8).position(|eight| eight == b"LNRPIX02").unwrap() + 12;
+    // The pixel engine's head, behind its magic, version, kind and length: nside 64, of 9.7 GB.
+    let nside = |bytes: &[u8]| bytes.windows(8).position(|eight| eight == b"LNRENGIN").unwrap() + 15;
     let good = place.bytes("state");
     assert_eq!(good[nside(&good)..][..4], 4_u32.to_le_bytes());
     forge(&place.path("state"), nside, &64_u32.to_le_bytes());

@@ -67,7 +67,7 @@ fn observe(sky: &SkyMap, frequency_hz: f64, baseline_m_max: f64, count: usize) -
     blocks
 }
 
-fn add_all<E: NormalEngine>(mut engine: E, blocks: &[PlacedVisibilities]) -> E::Sums {
+fn add_all<E: NormalEngine>(mut engine: E, blocks: &[PlacedVisibilities]) -> E::Equations {
     for block in blocks {
         let added = engine.add(block).unwrap();
         assert!(added.visibilities == 1 && added.refused.is_empty());
@@ -119,7 +119,7 @@ fn both_engines_make_the_same_map() {
     let pixel = solve_pixels(by_pixel, epsilon, None).unwrap();
     let request = HarmonicRequest { epsilon, nside: NSIDE, rule: RULE, probes: 0 };
     let watch = SolveWatch::default();
-    let harmonic = solve_harmonics(&by_harmonic, request, None, None, (&watch, "test")).unwrap();
+    let harmonic = solve_harmonics(&by_harmonic, request, None, None, watch.named("test")).unwrap();
     assert!(harmonic.diagnostics.convergence.unwrap().converged);
     // The largest eigenvalue belongs to the smoothest functions, which averages over pixels hardly change:
     // by the square of the pixel window at l < 6, 1 - l (l + 1) / (12 nside^2) and more.
@@ -170,7 +170,7 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
     let eps = regularisation(&sums, epsilon);
     assert!((eps / (epsilon * w_max) - 1.0).abs() < 1e-5, "{eps}");
     let watch = SolveWatch::default();
-    let found = traces(&sums, eps, 24, (&watch, "test"));
+    let found = traces(&sums, eps, 24, watch.named("test"));
     let exact_n: f64 = eigenvalues.iter().map(|w| w / (w + eps).powi(2)).sum();
     let exact_s: f64 = eigenvalues.iter().map(|w| (eps / (w + eps)).powi(2)).sum();
     for (found, exact) in [(found.sigma_n_k2, exact_n), (found.sigma_s, exact_s)] {
@@ -179,10 +179,10 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
         assert!(found.error < 0.3 * exact, "{found:?} {exact}");
     }
     // The solution against the matrix's.
-    let right = sums.noise_side();
+    let right = sums.noise_right_hand_side();
     let request =
         HarmonicRequest { epsilon, nside: 8, rule: StoppingRule { residual_max: 1e-7, ..RULE }, probes: 0 };
-    let solved = solve_harmonics(&sums, request, None, None, (&watch, "test")).unwrap();
+    let solved = solve_harmonics(&sums, request, None, None, watch.named("test")).unwrap();
     let apply = |f: &dyn Fn(f64) -> f64, v: &[f64]| -> Vec<f64> {
         let mut out = vec![0.0; order];
         for k in 0..order {
@@ -200,7 +200,7 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
     // Pixel noise and beam: diagonals and columns of functions of the matrix, at the pixels of a map.
     let nside = 4;
     let transform = lunarray::sky::harmonics::Transform::new(nside, 16).unwrap();
-    let variance = noise_variance(&sums, eps, (nside, 64), (&watch, "test")).unwrap();
+    let variance = noise_variance(&sums, eps, nside, 64, watch.named("test")).unwrap();
     let mut ratios = Vec::new();
     for pixel in [0, 50, 100, 191] {
         let mut map = vec![0.0; variance.len()];
@@ -210,7 +210,7 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
         let exact: f64 =
             apply(&|w| w.max(0.0) / (w + eps).powi(2), &y).iter().zip(&y).map(|(a, b)| a * b).sum();
         ratios.push(variance[pixel] / exact);
-        let beam = effective_beam(&sums, eps, (nside, pixel), (&watch, "test")).unwrap();
+        let beam = effective_beam(&sums, eps, nside, pixel, watch.named("test")).unwrap();
         let area = pixel_area_sr(nside);
         let delta: Vec<f64> = y.iter().map(|y| y * area).collect();
         let exact = transform
@@ -239,7 +239,7 @@ fn traces_agree_with_the_pixel_engine() {
     let sums = harmonic_sums(&blocks, 22, baseline_m_max);
     for epsilon in [0.1, 1e-2] {
         let eps = regularisation(&sums, epsilon);
-        let found = traces(&sums, eps, 24, (&SolveWatch::default(), "test"));
+        let found = traces(&sums, eps, 24, SolveWatch::default().named("test"));
         let found = found.sigma_n_k2 / pixel_area_sr(nside);
         let exact = exact.trace_sigma_n(epsilon);
         // Fringes of u < 2.5 end at l = 16; a pixel's window of nside 8 lowers their power there by 9 %, on average
@@ -259,9 +259,9 @@ fn solutions_start_warm_and_end_early() {
     let (early, late) = (harmonic_sums(&blocks[..most], 24, 1_500.0), harmonic_sums(&blocks, 24, 1_500.0));
     let request = HarmonicRequest { epsilon: 1e-4, nside: 8, rule: RULE, probes: 0 };
     let watch = SolveWatch::default();
-    let first = solve_harmonics(&early, request, None, None, (&watch, "test")).unwrap();
-    let cold = solve_harmonics(&late, request, None, None, (&watch, "test")).unwrap();
-    let warm = solve_harmonics(&late, request, None, Some(&first.unknowns), (&watch, "test")).unwrap();
+    let first = solve_harmonics(&early, request, None, None, watch.named("test")).unwrap();
+    let cold = solve_harmonics(&late, request, None, None, watch.named("test")).unwrap();
+    let warm = solve_harmonics(&late, request, None, Some(&first.unknowns), watch.named("test")).unwrap();
     let steps =
         |solved: &lunarray::solve::HarmonicSolution| solved.diagnostics.convergence.unwrap().iterations;
     assert!(steps(&warm) < steps(&cold), "{} {}", steps(&warm), steps(&cold));
@@ -276,7 +276,7 @@ fn solutions_start_warm_and_end_early() {
     cancel.cancel();
     let hurried = SolveWatch::new(cancel);
     let request = HarmonicRequest { rule: StoppingRule { residual_max: 1e-9, ..RULE }, ..request };
-    let ended = solve_harmonics(&late, request, None, None, (&hurried, "test")).unwrap();
+    let ended = solve_harmonics(&late, request, None, None, hurried.named("test")).unwrap();
     let convergence = ended.diagnostics.convergence.unwrap();
     assert!(!convergence.converged && convergence.iterations <= 12);
     assert!(distance(&ended.map_k, &cold.map_k) < 0.1, "{}", distance(&ended.map_k, &cold.map_k));
@@ -295,8 +295,8 @@ fn a_prior_fills_what_is_not_measured() {
     let request = HarmonicRequest { epsilon: 1e-3, nside: 8, rule: RULE, probes: 0 };
     let prior = vec![level_k; 12 * 16 * 16];
     let watch = SolveWatch::default();
-    let without = solve_harmonics(&sums, request, None, None, (&watch, "test")).unwrap();
-    let with = solve_harmonics(&sums, request, Some(&prior), None, (&watch, "test")).unwrap();
+    let without = solve_harmonics(&sums, request, None, None, watch.named("test")).unwrap();
+    let with = solve_harmonics(&sums, request, Some(&prior), None, watch.named("test")).unwrap();
     let mean = |map: &[f64]| map.iter().sum::<f64>() / map.len() as f64;
     assert!((mean(&with.map_k) / level_k - 1.0).abs() < 0.01, "{}", mean(&with.map_k));
     assert!(mean(&without.map_k) < 0.9 * level_k, "{}", mean(&without.map_k));

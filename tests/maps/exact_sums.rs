@@ -101,7 +101,7 @@ fn in_disorder<E: NormalEngine>(
         add(engine, part);
         match stream.random_range(0..40) {
             0 => drop(engine.sums()),
-            1 => engine.settle(),
+            1 => engine.flush(),
             2 => *engine = E::restore(&mut bytes(engine).as_slice()).unwrap(),
             // Out and in again.
             3 => {
@@ -315,6 +315,48 @@ fn what_is_out_of_range_is_refused_and_counted() {
         let setup = PixelSetup { weight_max, ..*pixel(1, PixelMethod::Centre, 1.0).setup() };
         assert!(PixelEngine::new(setup).is_err());
     }
+}
+
+/// An overflow is of one visibility: it is refused as `Full` and counted, and the others of its call go in.
+#[test]
+fn a_full_engine_refuses_what_it_has_no_room_for_and_takes_the_rest() {
+    fn fill<E: NormalEngine>(make: impl Fn() -> E) {
+        let block = data(1, 1.0, 8).swap_remove(0);
+        let of = |weight: &[f64]| PlacedVisibilities {
+            weight: weight.to_vec(),
+            value_k_sr: vec![Complex64::ONE; weight.len()],
+            time_s: vec![block.time_s[0]; weight.len()],
+            r_i_m: vec![block.r_i_m[0]; weight.len()],
+            r_j_m: vec![block.r_j_m[0]; weight.len()],
+            ..block.clone()
+        };
+        let restore = |bytes: &Vec<u8>| E::restore(&mut bytes.as_slice()).unwrap();
+        // Engines of 1, 2, 4, .. of the greatest weight, until there is no room for twice as much.
+        let mut powers = vec![bytes(&mut in_order(&make, &[of(&[4.0])]))];
+        loop {
+            let last = &powers[powers.len() - 1];
+            let mut twice = restore(last);
+            match twice.merge(restore(last)) {
+                Ok(()) => powers.push(bytes(&mut twice)),
+                Err(error) => break assert!(matches!(error, AccumulationError::Range), "{error}"),
+            }
+        }
+        // All of them but the first: room for one of the greatest weight.
+        let mut engine = make();
+        powers[1..].iter().for_each(|power| engine.merge(restore(power)).unwrap());
+        let held = engine.counts().visibilities;
+        assert_eq!(held, (u64::MAX >> (64 - powers.len())) - 1);
+        let added = engine.add(&of(&[2.0, 4.0, 2.0, 4.0])).unwrap();
+        assert_eq!(added.visibilities, 2);
+        assert_eq!(added.refused, [(Refusal::Full, 2)].into_iter().collect());
+        assert_eq!(engine.counts().visibilities, held + 2);
+        // What went in comes out, and nothing else is there.
+        assert_eq!(engine.remove(&of(&[2.0, 2.0])).unwrap().visibilities, 2);
+        powers[1..].iter().for_each(|power| engine.subtract(restore(power)).unwrap());
+        assert!(bytes(&mut engine) == bytes(&mut make()));
+    }
+    fill(|| pixel(2, PixelMethod::Centre, 4.0));
+    fill(|| harmonic(4.0));
 }
 
 fn part_twice(block: &PlacedVisibilities) -> PlacedVisibilities {

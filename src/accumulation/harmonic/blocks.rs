@@ -22,7 +22,7 @@ pub struct OrderBlocks {
     blocks: Vec<[Mat<f64>; 2]>,
 }
 
-/// Factors of the blocks with something on their diagonal.
+/// Cholesky factors of the blocks, where there are any.
 pub struct OrderFactors {
     l_max: usize,
     factors: Vec<[Option<Llt<f64>>; 2]>,
@@ -46,7 +46,7 @@ impl OrderBlocks {
             let last = (first + MUS_AT_ONCE - 1).min(l_max);
             let parts: Vec<MuPart> = (first..=last)
                 .into_par_iter()
-                .map(|mu| MuPart::new(mu, l_max, (patterns, &totals), &wigner))
+                .map(|mu| MuPart::new(mu, l_max, patterns, &totals, &wigner))
                 .collect();
             blocks.par_iter_mut().enumerate().for_each(|(m, blocks)| {
                 parts.iter().for_each(|part| part.add(m, blocks));
@@ -61,7 +61,7 @@ impl OrderBlocks {
         self.blocks[0][l % 2][(l / 2, l / 2)]
     }
 
-    /// Factors of the blocks plus `regularisation` I; a block that has no factor is left as it is.
+    /// Factors of the blocks plus `regularisation` I; a block without a factor leaves its unknowns unchanged.
     #[must_use]
     pub fn factors(&self, regularisation: f64) -> OrderFactors {
         let factor = |block: &Mat<f64>| {
@@ -87,11 +87,11 @@ impl OrderFactors {
             for (parity, factor) in factors.iter().enumerate() {
                 let Some(factor) = factor else { continue };
                 let count = size(self.l_max, m, parity);
-                let mut sides = Mat::from_fn(count, parts, |k, part| of_m[(2 * k + parity) * parts + part]);
-                factor.solve_in_place(&mut sides);
+                let mut right = Mat::from_fn(count, parts, |k, part| of_m[(2 * k + parity) * parts + part]);
+                factor.solve_in_place(&mut right);
                 for k in 0..count {
                     for part in 0..parts {
-                        of_m[(2 * k + parity) * parts + part] = sides[(k, part)];
+                        of_m[(2 * k + parity) * parts + part] = right[(k, part)];
                     }
                 }
             }
@@ -99,7 +99,7 @@ impl OrderFactors {
     }
 }
 
-/// Orders mu whose parts are held at once.
+/// Orders mu whose parts are in memory at once.
 const MUS_AT_ONCE: usize = 16;
 
 /// Degrees l = m + parity, + 2, .. <= l_max.
@@ -124,7 +124,29 @@ fn totals(grids: &Grids, tori: &Tori) -> Vec<[f64; NODES]> {
         .collect()
 }
 
-/// One order mu: what its patterns make of the weights, and its rows of d.
+/// The banded matrix of weights times the patterns of order mu, for both signs of mu.
+fn weighted(patterns: &FilteredPatterns, totals: &[[f64; NODES]], mu: usize, l_max: usize) -> Vec<f32> {
+    let count = degrees(l_max, mu);
+    let stride = 2 * patterns.grid.count;
+    let pattern = &patterns.order(mu)[..count * stride];
+    let mut weighted = vec![0.0_f32; count * stride];
+    for (out, row) in weighted.chunks_exact_mut(stride).zip(pattern.chunks_exact(stride)) {
+        for (k, totals) in totals.iter().enumerate() {
+            for (d, total) in totals.iter().enumerate().take_while(|(d, _)| k + d < patterns.grid.count) {
+                for sign in 0..2 {
+                    let (low, high) = (2 * k + sign, 2 * (k + d) + sign);
+                    out[low] += *total as f32 * row[high];
+                    if d > 0 {
+                        out[high] += *total as f32 * row[low];
+                    }
+                }
+            }
+        }
+    }
+    weighted
+}
+
+/// One order mu: the weights times its patterns, and its rows of d.
 struct MuPart {
     mu: usize,
     l_max: usize,
@@ -138,27 +160,14 @@ impl MuPart {
     fn new(
         mu: usize,
         l_max: usize,
-        (patterns, totals): (&FilteredPatterns, &[[f64; NODES]]),
+        patterns: &FilteredPatterns,
+        totals: &[[f64; NODES]],
         wigner: &WignerTable,
     ) -> Self {
         let count = degrees(l_max, mu);
         let stride = 2 * patterns.grid.count;
         let pattern = &patterns.order(mu)[..count * stride];
-        // The banded matrix of weights times the patterns, both signs of mu.
-        let mut weighted = vec![0.0_f32; count * stride];
-        for (out, row) in weighted.chunks_exact_mut(stride).zip(pattern.chunks_exact(stride)) {
-            for (k, totals) in totals.iter().enumerate() {
-                for (d, total) in totals.iter().enumerate().take_while(|(d, _)| k + d < patterns.grid.count) {
-                    for sign in 0..2 {
-                        let (low, high) = (2 * k + sign, 2 * (k + d) + sign);
-                        out[low] += *total as f32 * row[high];
-                        if d > 0 {
-                            out[high] += *total as f32 * row[low];
-                        }
-                    }
-                }
-            }
-        }
+        let weighted = weighted(patterns, totals, mu, l_max);
         let mut powers = vec![0.0_f32; count * count];
         faer::linalg::matmul::matmul(
             MatMut::from_column_major_slice_mut(&mut powers, count, count),

@@ -1,4 +1,4 @@
-//! How much of a downlink the harmonic engine covers, before anything is summed.
+//! Survey of a downlink before anything is summed: how much of it the harmonic engine covers.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -11,22 +11,22 @@ use crate::frames::{GroundFrame, Instrument};
 use crate::response::harmonic::{GeometryLimits, GeometryRefusal, NominalOrbit, PairOrientation};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// The circle that pairs are on, and those that are not.
+/// The common circular orbit, and the visibilities on and off it.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct GeometryCoverage {
     /// Inclination of the common circle, degrees.
     pub inclination_deg: Option<f64>,
     /// Radius of the common circle, m.
     pub radius_m: Option<f64>,
-    /// Visibilities on it, within the limits.
+    /// Visibilities within the limits.
     pub covered: u64,
     /// Visibilities that are refused, by reason.
     pub refused: BTreeMap<String, u64>,
-    /// Good visibilities that no ephemeris covers.
+    /// Good visibilities without an ephemeris.
     pub without_ephemeris: u64,
 }
 
-/// Goes through what the ground receives.
+/// Surveys received frames.
 #[derive(Debug, Default)]
 pub struct GeometrySurvey {
     instrument: Option<Instrument>,
@@ -44,17 +44,17 @@ impl GeometrySurvey {
         Self { limits, ..Self::default() }
     }
 
-    /// Looks at a frame.
+    /// Surveys a frame.
     pub fn see(&mut self, frame: &GroundFrame) {
         match frame {
             GroundFrame::Instrument(instrument) => {
                 self.instrument.get_or_insert_with(|| instrument.clone());
             }
             GroundFrame::Ephemeris(segment) => {
-                // What could not be used shows as visibilities without ephemeris.
+                // A segment that cannot be used shows as visibilities without ephemeris.
                 self.ephemeris.insert(segment.clone());
             }
-            // A daughter's own power has no baseline.
+            // An auto-correlation has no baseline.
             GroundFrame::Visibilities(block) if block.pair.i == block.pair.j => {}
             GroundFrame::Visibilities(block) => {
                 let channel = usize::from(block.channel.0);
@@ -80,7 +80,7 @@ impl GeometrySurvey {
         }
     }
 
-    /// What was found.
+    /// The coverage found.
     #[must_use]
     pub fn finish(self) -> GeometryCoverage {
         GeometryCoverage {

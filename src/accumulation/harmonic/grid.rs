@@ -1,17 +1,18 @@
-//! The grids on which a harmonic engine keeps its sums.
+//! The grids of a harmonic engine's sums.
 
 use std::f64::consts::TAU;
 
+use crate::accumulation::fixed_point::rows::RowLayout;
 use crate::response::harmonic::NodeGrid;
 use crate::response::harmonic::filter::FilteredPatterns;
 use crate::response::harmonic::kernel::{Kernel, LANES};
 use crate::response::harmonic::sizes::fft_length;
 
-/// Nodes in u, a wavelength; a pattern's band of |n_y| <= 1 needs 2.
+/// Nodes in u per wavelength; a pattern's band of |n_y| <= 1 needs 2.
 const NODES_PER_WAVELENGTH: f64 = 3.0;
 /// Nodes in u that a visibility is spread to, and so the number of diagonals of the sums of weights.
 pub(super) const NODES: usize = 5;
-/// Nodes are taken in groups: a cache line of patterns.
+/// Nodes of a group: a cache line of patterns.
 pub(super) const NODE_GROUP: usize = 8;
 /// Nodes in alpha that a weight is spread to.
 const WEIGHT_ALPHAS: usize = 14;
@@ -20,7 +21,7 @@ const WEIGHT_ALPHAS: usize = 14;
 const WEIGHT_BETAS: [f64; 2] = [6.0, 7.0];
 /// Error of the data's kernels in alpha and gamma.
 const DATA_TOLERANCE: f64 = 1e-4;
-/// Points of the weights' grid, a degree: products of two sky orders have differences up to 2 `l_max`.
+/// Points of the weights' grid per degree: products of two sky orders have differences up to 2 `l_max`.
 const POINTS_PER_DEGREE: f64 = 4.5;
 
 /// Multiply-adds of spreading one visibility: pairs of nodes and alphas of weights, nodes and about 11 alphas of four
@@ -74,7 +75,7 @@ impl Grids {
         self.data.transforms(&frequencies).iter().map(|t| 1.0 / t).collect()
     }
 
-    /// The nodes at which patterns have to be known so that those at `nodes` can be filtered.
+    /// The nodes whose patterns are needed to filter those at `nodes`.
     pub(super) fn table_nodes(&self) -> NodeGrid {
         let margin = FilteredPatterns::MARGIN;
         let NodeGrid { step, count, .. } = self.nodes;
@@ -83,15 +84,25 @@ impl Grids {
 
     /// Bytes of the sums at one node.
     pub(super) fn node_bytes(&self) -> u64 {
-        (4 * (self.weights_len() + self.sides_len())) as u64
+        (4 * (self.weights_len() + self.right_len())) as u64
     }
 
-    /// Length of a row of weights.
+    /// Layout of a row of weights: `[diagonal][gamma]`.
+    pub(super) fn weight_row(&self) -> RowLayout {
+        RowLayout { stride: self.weight_stride(), parts: NODES, overhang: OVERHANG }
+    }
+
+    /// Layout of a row of data: `[data re, data im, noise re, noise im][gamma]`.
+    pub(super) fn data_row(&self) -> RowLayout {
+        RowLayout { stride: self.data_stride(), parts: 4, overhang: OVERHANG }
+    }
+
+    /// Length of one diagonal of a row of weights.
     pub(super) fn weight_stride(&self) -> usize {
         self.points + OVERHANG
     }
 
-    /// Length of a row of data.
+    /// Length of one part of a row of data.
     pub(super) fn data_stride(&self) -> usize {
         self.data_points() + OVERHANG
     }
@@ -101,8 +112,8 @@ impl Grids {
         self.points * NODES * self.weight_stride()
     }
 
-    /// Floats of a node's sides: `[alpha][data re, data im, noise re, noise im][gamma]`.
-    pub(super) fn sides_len(&self) -> usize {
+    /// Floats of a node's right-hand sides: `[alpha][data re, data im, noise re, noise im][gamma]`.
+    pub(super) fn right_len(&self) -> usize {
         self.data_points() * 4 * self.data_stride()
     }
 

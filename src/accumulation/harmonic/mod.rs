@@ -1,4 +1,4 @@
-//! The harmonic engine: sums on tori, from which BtN^-1B acts on harmonic coefficients.
+//! Normal equations over spherical harmonics: sums on tori, from which BtN^-1B acts on harmonic coefficients.
 //!
 //! On a common circular orbit every row of B is one rotation of a pattern that depends on the baseline's length
 //! alone (see [`mod@crate::response::harmonic`]). A row at baseline u is interpolated from nodes u_k by a compact
@@ -12,15 +12,17 @@
 //! summed. On the torus it multiplies pointwise. Its grid is fine enough for the products of two
 //! functions of degree `l_max`, so the weights are spread by kernels whose spectra are flat over their band.
 //!
-//! The sums are additive: they can be merged and subtracted, and their size does not grow with the data. They are
-//! exact: with M the power of four not below `weight_max`, weights are rounded to `2^-30 M` and data to
-//! `2^-19 sqrt(M)`, those above 2^21 of these to 21 bits; see the module `exact`.
+//! Summing a visibility costs some thousand multiply-adds, whatever the map's size, and the size of the sums does not
+//! grow with the data. With M the power of four not below `weight_max`, weights are rounded to `2^-30 M` and data to
+//! `2^-19 sqrt(M)`, those above 2^21 of these to 21 bits (see the module `exact`); there is room for a total weight of
+//! `2^32 M`.
 
 mod blocks;
 mod checkpoint;
 mod coverage;
 mod exact;
 mod grid;
+mod lines;
 mod operator;
 mod setup;
 mod spread;
@@ -28,10 +30,9 @@ mod sums;
 #[cfg(test)]
 mod tests;
 mod tori;
+mod workspace;
 
 use std::sync::{Arc, OnceLock};
-
-use rayon::prelude::*;
 
 pub use blocks::{OrderBlocks, OrderFactors};
 pub use coverage::{GeometryCoverage, GeometrySurvey};
@@ -39,198 +40,118 @@ pub use grid::SPREAD_MULTIPLY_ADDS;
 pub use setup::{ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, application_size, memory, orbit_of};
 pub use sums::{HarmonicSums, coefficients, unknowns};
 
-use super::harmonic::exact::{ExactTori, Quanta};
-use super::harmonic::grid::Grids;
-use super::harmonic::operator::Operator;
-use super::harmonic::spread::Pending;
-use super::noise::companion_noise;
-use super::scale::{Scale, Totals};
-use super::{AccumulationError, Added, Direction, NormalEngine, Refusal, SumCounts};
-use crate::frames::PlacedVisibilities;
+use self::checkpoint::HarmonicHead;
+use self::exact::{ExactTori, Quanta, SCALES_MAX};
+use self::grid::Grids;
+use self::operator::Operator;
+use self::spread::TorusPoint;
+use self::tori::Tori;
+use super::checkpoint::{BasisKind, FrameReader, FrameWriter};
+use super::engine::{Accepted, CommonSetup, ExactEngine, SkyBasis};
+use super::fixed_point::{Direction, WeightScale};
+use super::{AccumulationError, Refusal, SumCounts};
 use crate::response::harmonic::PairOrientation;
+use crate::units::vector::Vec3;
 
-/// Visibilities that are spread together: enough to keep all cores busy over the nodes, little memory.
-const BATCH: usize = 16_384;
+/// The engine that sums over spherical harmonics. Memory grows as baselines of more lengths arrive.
+pub type HarmonicEngine = ExactEngine<HarmonicBasis>;
 
-/// Sums weights and data on tori; each visibility costs some thousand multiply-adds, whatever the map's size.
-#[derive(Debug)]
-pub struct HarmonicEngine {
+/// Spherical harmonics, of satellites on one circular orbit.
+pub struct HarmonicBasis {
     setup: HarmonicSetup,
-    scale: Scale,
+    quanta: Quanta,
     grids: Arc<Grids>,
     tables: Arc<OnceLock<Operator>>,
-    tori: ExactTori,
-    /// All that were put in, also those that wait.
-    totals: Totals,
-    pending: Vec<Pending>,
-    /// What is to become of those that wait.
-    direction: Direction,
 }
 
-impl HarmonicEngine {
-    /// An empty engine. Memory is taken as baselines of more lengths arrive.
-    ///
-    /// # Errors
-    /// [`AccumulationError::Setup`].
-    pub fn new(setup: HarmonicSetup) -> Result<Self, AccumulationError> {
-        setup.check()?;
-        let grids = Arc::new(setup.grids());
-        Ok(Self {
-            scale: Scale::new(setup.weight_max)?,
-            tables: Arc::new(OnceLock::new()),
-            tori: ExactTori::zeros(&grids),
-            grids,
-            totals: Totals::default(),
-            pending: Vec::with_capacity(BATCH),
-            direction: Direction::In,
-            setup,
-        })
-    }
-
-    /// Setup.
-    #[must_use]
-    pub fn setup(&self) -> &HarmonicSetup {
-        &self.setup
-    }
-
-    /// Where a visibility goes, or why it cannot.
-    fn place(&self, placed: &PlacedVisibilities, k: usize) -> Result<Pending, Refusal> {
-        let setup = &self.setup;
-        let orientation = PairOrientation::of(placed.r_i_m[k], placed.r_j_m[k])?;
-        let pair = setup.orbit.pair(&orientation, setup.wavelength_m())?;
-        if orientation.baseline_m > setup.baseline_m_max {
-            return Err(Refusal::TooLong);
-        }
-        let (weight, mut value) = (placed.weight[k], placed.value_k_sr[k]);
-        self.scale.check(value, weight, setup.weight_max)?;
-        if pair.reversed {
-            value = value.conj();
-        }
-        let noise = companion_noise(setup.companion_seed, placed, k) * weight.sqrt();
-        Ok(Pending {
-            alpha_rad: pair.state.node_rad - std::f64::consts::FRAC_PI_2,
-            gamma_rad: pair.state.phase_rad + std::f64::consts::FRAC_PI_2,
-            u: pair.state.baseline_wavelengths,
-            weight,
-            sides: [weight * value.re, weight * value.im, noise.re, noise.im],
-        })
-    }
-
-    fn quanta(&self) -> Quanta {
-        Quanta::new(self.scale)
-    }
-
-    /// Puts visibilities in or takes them out.
-    fn take(
-        &mut self,
-        placed: &PlacedVisibilities,
-        direction: Direction,
-    ) -> Result<Added, AccumulationError> {
-        let (expected_hz, found_hz) = (self.setup.frequency_hz, placed.frequency_hz);
-        if found_hz != expected_hz {
-            return Err(AccumulationError::Frequency { expected_hz, found_hz });
-        }
-        let found: Vec<_> = (0..placed.len()).into_par_iter().map(|k| self.place(placed, k)).collect();
-        let one = |pending: &Pending| Totals::one(self.scale, pending.weight);
-        let totals = found
-            .iter()
-            .flatten()
-            .try_fold(self.totals, |totals, pending| totals.and(one(pending), direction));
-        self.totals = totals.ok_or(AccumulationError::NothingHeld(placed.channel))?;
-        if self.direction != direction {
-            self.settle();
-            self.direction = direction;
-        }
-        let mut added = Added::default();
-        for found in found {
-            match found {
-                Ok(pending) => {
-                    added.visibilities += 1;
-                    self.pending.push(pending.times(direction.sign()));
-                }
-                Err(reason) => added.refuse(reason),
-            }
-            if self.pending.len() >= BATCH {
-                self.settle();
-            }
-        }
-        Ok(added)
-    }
-
-    fn combine(&mut self, mut other: Self, direction: Direction) -> Result<(), AccumulationError> {
-        if self.setup != other.setup {
-            return Err(AccumulationError::Mismatch {
-                what: "degrees, frequencies, baselines, orbits, seeds or greatest weights",
-            });
-        }
-        self.totals = self.totals.and(other.totals, direction).ok_or(AccumulationError::Range)?;
-        self.settle();
-        other.settle();
-        self.tori.combine(&self.grids, &other.tori, direction);
-        Ok(())
-    }
-
-    fn with(&self, tori: tori::Tori) -> HarmonicSums {
+impl HarmonicBasis {
+    fn sums(&self, tori: Tori, counts: SumCounts) -> HarmonicSums {
         HarmonicSums {
             setup: self.setup,
             grids: Arc::clone(&self.grids),
             tables: Arc::clone(&self.tables),
             tori,
-            counts: self.totals.counts(self.scale),
+            counts,
             right: OnceLock::new(),
             noise: OnceLock::new(),
         }
     }
 }
 
-impl NormalEngine for HarmonicEngine {
-    type Sums = HarmonicSums;
+impl SkyBasis for HarmonicBasis {
+    type Setup = HarmonicSetup;
+    type Place = TorusPoint;
+    type Exact = ExactTori;
+    type Equations = HarmonicSums;
+    type Head = HarmonicHead;
 
-    fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        self.take(placed, Direction::In)
+    const KIND: BasisKind = BasisKind::Harmonic;
+    /// Enough to keep all cores busy over the nodes, in little memory.
+    const BATCH: usize = 16_384;
+    const SCALES_MAX: f64 = SCALES_MAX;
+
+    fn new(setup: &HarmonicSetup, scale: WeightScale) -> Result<Self, AccumulationError> {
+        setup.check()?;
+        Ok(Self {
+            setup: *setup,
+            quanta: Quanta::new(scale),
+            grids: Arc::new(setup.grids()),
+            tables: Arc::new(OnceLock::new()),
+        })
     }
 
-    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        self.take(placed, Direction::Out)
+    fn common(setup: &HarmonicSetup) -> CommonSetup {
+        let &HarmonicSetup { frequency_hz, weight_max, companion_seed, .. } = setup;
+        CommonSetup { frequency_hz, weight_max, companion_seed }
     }
 
-    fn settle(&mut self) {
-        if !self.pending.is_empty() {
-            let quanta = self.quanta();
-            self.tori.add((&self.grids, quanta), &self.pending, self.direction);
-            self.pending.clear();
+    fn zeros(&self) -> ExactTori {
+        ExactTori::zeros(&self.grids)
+    }
+
+    fn place(&self, r_i_m: Vec3, r_j_m: Vec3) -> Result<TorusPoint, Refusal> {
+        let orientation = PairOrientation::of(r_i_m, r_j_m)?;
+        let pair = self.setup.orbit.pair(&orientation, self.setup.wavelength_m())?;
+        if orientation.baseline_m > self.setup.baseline_m_max {
+            return Err(Refusal::TooLong);
         }
+        Ok(TorusPoint {
+            alpha_rad: pair.state.node_rad - std::f64::consts::FRAC_PI_2,
+            gamma_rad: pair.state.phase_rad + std::f64::consts::FRAC_PI_2,
+            u: pair.state.baseline_wavelengths,
+            reversed: pair.reversed,
+        })
     }
 
-    fn merge(&mut self, other: Self) -> Result<(), AccumulationError> {
-        self.combine(other, Direction::In)
+    fn sum(&self, exact: &mut ExactTori, batch: &[Accepted<TorusPoint>], direction: Direction) {
+        exact.add(&self.grids, self.quanta, batch, direction);
     }
 
-    fn subtract(&mut self, other: Self) -> Result<(), AccumulationError> {
-        self.combine(other, Direction::Out)
+    fn combine(&self, exact: &mut ExactTori, other: &ExactTori, direction: Direction) {
+        exact.combine(&self.grids, other, direction);
     }
 
-    fn counts(&self) -> SumCounts {
-        self.totals.counts(self.scale)
+    fn equations(&self, exact: &ExactTori, counts: SumCounts) -> HarmonicSums {
+        self.sums(exact.values(&self.grids, self.quanta), counts)
     }
 
-    fn sums(&mut self) -> HarmonicSums {
-        self.settle();
-        self.with(self.tori.values(&self.grids, self.quanta()))
+    fn into_equations(&self, exact: ExactTori, counts: SumCounts) -> HarmonicSums {
+        self.sums(exact.into_values(&self.grids, self.quanta), counts)
     }
 
-    fn into_sums(mut self) -> HarmonicSums {
-        self.settle();
-        let tori = std::mem::take(&mut self.tori);
-        self.with(tori.into_values(&self.grids, self.quanta()))
+    fn head(setup: &HarmonicSetup) -> HarmonicHead {
+        HarmonicHead::new(setup)
     }
 
-    fn checkpoint(&mut self, out: &mut dyn std::io::Write) -> Result<(), AccumulationError> {
-        self.settle();
-        checkpoint::write(self, out)
+    fn setup_of(head: HarmonicHead) -> Result<HarmonicSetup, AccumulationError> {
+        head.setup()
     }
 
-    fn restore(from: &mut dyn std::io::Read) -> Result<Self, AccumulationError> {
-        checkpoint::read(from)
+    fn write(&self, exact: &ExactTori, out: &mut FrameWriter<'_>) -> Result<(), AccumulationError> {
+        exact.write(&self.grids, out)
+    }
+
+    fn read(&self, from: &mut FrameReader<'_>) -> Result<ExactTori, AccumulationError> {
+        ExactTori::read(&self.grids, from)
     }
 }

@@ -1,4 +1,4 @@
-//! What a harmonic engine is made for.
+//! Setup of a harmonic engine, and the memory it takes.
 
 use super::grid::Grids;
 use super::operator::Operator;
@@ -14,36 +14,36 @@ pub struct HarmonicSetup {
     pub l_max: usize,
     /// Frequency, Hz.
     pub frequency_hz: f64,
-    /// Longest baseline that is taken, m.
+    /// Longest baseline that is accepted, m.
     pub baseline_m_max: f64,
     /// Radius of the body that hides the sky, m.
     pub moon_radius_m: f64,
     /// Antenna response.
     pub response: AntennaResponse,
-    /// The circle on which the satellites fly.
+    /// The common circular orbit.
     pub orbit: NominalOrbit,
     /// Seed of the noise-only companion.
     pub companion_seed: u64,
-    /// Greatest weight that is taken, (K sr)^-2; it sets the resolution of the sums.
+    /// Greatest weight that is accepted, (K sr)^-2; it sets the resolution of the sums.
     pub weight_max: f64,
 }
 
-/// Greatest degree that is taken: its sums would hold 25 GB at 125 wavelengths.
+/// Greatest degree that is accepted: its sums would take 25 GB at 125 wavelengths.
 pub const L_MAX: usize = 383;
-/// Longest baseline that is taken, wavelengths.
+/// Longest baseline that is accepted, wavelengths.
 const U_MAX: f64 = 1000.0;
 
-/// Nominal inclinations are multiples of this, so that they do not depend on which data comes first.
+/// Nominal inclinations are multiples of this, so that they do not depend on which data arrives first.
 const INCLINATION_STEP_DEG: f64 = 0.05;
 /// Nominal radii likewise.
 const RADIUS_STEP_M: f64 = 100.0;
 
-/// The circle that the first pair with a known orientation is on; `None` if there is none.
+/// The orbit of the first pair with a known orientation; `None` if there is none.
 #[must_use]
 pub fn orbit_of(placed: &PlacedVisibilities, limits: GeometryLimits) -> Option<NominalOrbit> {
     let mut pairs = placed.r_i_m.iter().zip(&placed.r_j_m);
     let found = pairs.find_map(|(&r_i_m, &r_j_m)| PairOrientation::of(r_i_m, r_j_m).ok())?;
-    // A satellite j that leads turns the pair's plane upside down; orbits are taken as prograde.
+    // A satellite j that leads turns the pair's plane upside down; orbits are assumed prograde.
     let inclination_rad = found.inclination_rad.min(std::f64::consts::PI - found.inclination_rad);
     let inclination_deg =
         (inclination_rad.to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
@@ -100,18 +100,18 @@ impl HarmonicSetup {
             wavelength_m: self.wavelength_m(),
             response: self.response,
         };
-        Operator::new(self.l_max, grids.clone(), (geometry, self.orbit.inclination_rad), 0.0)
+        Operator::new(self.l_max, grids.clone(), geometry, self.orbit.inclination_rad, 0.0)
     }
 }
 
-/// Memory that an engine and a solution take, bytes.
+/// Memory of an engine and its solution, bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct HarmonicMemory {
     /// The sums themselves, if baselines of all lengths occur.
     pub sums: u64,
     /// Patterns and rotations, shared by an engine and its snapshots.
     pub tables: u64,
-    /// What threads work in during a solution.
+    /// Workspaces of the threads during a solution.
     pub workspace: u64,
 }
 
@@ -126,7 +126,7 @@ pub fn memory(l_max: usize, u_max: f64, threads: usize) -> HarmonicMemory {
     }
 }
 
-/// How much work one product with BtN^-1B is when all nodes and phases hold data.
+/// Size of one product with BtN^-1B when all nodes and phases hold data.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ApplicationSize {
     /// Points of a line of phases.

@@ -1,35 +1,37 @@
-//! Spreading visibilities onto the sums at the nodes.
+//! Spreads visibilities onto the sums at the nodes.
 
 use pulp::{Arch, Simd, WithSimd};
 
-use super::exact::{BIAS, ExactNode, Integers, Quanta, Row, TERM_MAX, biases};
+use super::exact::{BIAS, ExactNode, Quanta, TERM_MAX, biases};
 use super::grid::{Grids, NODES};
-use crate::accumulation::Direction;
+use crate::accumulation::engine::Accepted;
+use crate::accumulation::fixed_point::Direction;
+use crate::accumulation::fixed_point::rows::{IntegerRow, Integers};
 use crate::response::harmonic::kernel::LANES;
 
-/// A visibility as it waits to be spread; one that is to be taken out has a negative weight and negative sides.
+/// A visibility's place among the sums, on a torus at a baseline length.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Pending {
+pub struct TorusPoint {
     /// Omega - pi/2, rad.
     pub(super) alpha_rad: f64,
     /// phi + pi/2, rad.
     pub(super) gamma_rad: f64,
     /// Baseline, wavelengths.
     pub(super) u: f64,
-    /// Inverse variance, (K sr)^-2.
-    pub(super) weight: f64,
-    /// Weight times visibility, real and imaginary part; root of the weight times unit noise, likewise.
-    pub(super) sides: [f64; 4],
+    /// Whether the sums hold the conjugate: the visibility of the pair with its satellites exchanged.
+    pub(super) reversed: bool,
 }
 
-impl Pending {
-    /// As it is to count, 1 or -1 times.
-    pub(super) fn times(self, sign: f64) -> Self {
-        Self { weight: sign * self.weight, sides: self.sides.map(|side| sign * side), ..self }
+impl Accepted<TorusPoint> {
+    /// Weight times visibility, real and imaginary part; root of the weight times unit noise, likewise.
+    pub(super) fn right_hand_sides(&self) -> [f64; 4] {
+        let value = if self.place.reversed { self.value_k_sr.conj() } else { self.value_k_sr };
+        let noise = self.noise * self.weight.sqrt();
+        [self.weight * value.re, self.weight * value.im, noise.re, noise.im]
     }
 }
 
-/// A visibility's place on every grid, and its numbers in quanta.
+/// A visibility's place on every grid, and its weight and data in quanta.
 #[derive(Clone, Debug)]
 pub(super) struct Located {
     pub(super) first_node: usize,
@@ -46,11 +48,11 @@ pub(super) struct Located {
     weight: f32,
     weight_shift: u32,
     /// Likewise.
-    sides: [f32; 4],
-    side_shifts: [u32; 4],
+    right: [f32; 4],
+    right_shifts: [u32; 4],
 }
 
-/// Numbers of quanta as multiples of a power of two that leaves the greatest no more than [`TERM_MAX`].
+/// Numbers of quanta in multiples of the least power of two for which none exceeds [`TERM_MAX`].
 fn shifted<const N: usize>(quanta: [f64; N]) -> ([f32; N], u32) {
     let greatest = quanta.iter().fold(0.0_f64, |most, x| most.max(x.abs()));
     let (mut shift, mut step) = (0, 1.0);
@@ -63,17 +65,25 @@ fn shifted<const N: usize>(quanta: [f64; N]) -> ([f32; N], u32) {
 
 impl Located {
     /// `u` must lie within the grid.
-    pub(super) fn new(grids: &Grids, quanta: Quanta, pending: &Pending) -> Self {
-        let (first_node, u) = grids.u.spread((pending.u - grids.nodes.first) / grids.nodes.step);
+    pub(super) fn new(
+        grids: &Grids,
+        quanta: Quanta,
+        visibility: &Accepted<TorusPoint>,
+        direction: Direction,
+    ) -> Self {
+        let TorusPoint { alpha_rad, gamma_rad, u, .. } = visibility.place;
+        let (first_node, u) = grids.u.spread((u - grids.nodes.first) / grids.nodes.step);
         let (points, data_points) = (grids.points, grids.data_points());
-        let (a, weight_alpha) = Grids::on_circle(&grids.weight_alpha, points, pending.alpha_rad);
-        let (g, weight_gamma) = Grids::on_circle(&grids.weight_gamma, points, pending.gamma_rad);
-        let (da, data_alpha) = Grids::on_circle(&grids.data, data_points, pending.alpha_rad);
-        let (dg, data_gamma) = Grids::on_circle(&grids.data, data_points, pending.gamma_rad);
-        let ([weight], weight_shift) = shifted([pending.weight / quanta.weight]);
-        let [a_re, a_im, n_re, n_im] = pending.sides.map(|side| side / quanta.side);
-        let (([d_re, d_im], data_shift), ([n_re, n_im], noise_shift)) =
-            (shifted([a_re, a_im]), shifted([n_re, n_im]));
+        let (a, weight_alpha) = Grids::on_circle(&grids.weight_alpha, points, alpha_rad);
+        let (g, weight_gamma) = Grids::on_circle(&grids.weight_gamma, points, gamma_rad);
+        let (da, data_alpha) = Grids::on_circle(&grids.data, data_points, alpha_rad);
+        let (dg, data_gamma) = Grids::on_circle(&grids.data, data_points, gamma_rad);
+        let sign = direction.sign();
+        let ([weight], weight_shift) = shifted([sign * visibility.weight / quanta.weight]);
+        let [data_re, data_im, noise_re, noise_im] =
+            visibility.right_hand_sides().map(|term| sign * term / quanta.right);
+        let ([data_re, data_im], data_shift) = shifted([data_re, data_im]);
+        let ([noise_re, noise_im], noise_shift) = shifted([noise_re, noise_im]);
         Self {
             first_node: first_node.max(0) as usize,
             u,
@@ -87,8 +97,8 @@ impl Located {
             data_gamma,
             weight,
             weight_shift,
-            sides: [d_re, d_im, n_re, n_im],
-            side_shifts: [data_shift, data_shift, noise_shift, noise_shift],
+            right: [data_re, data_im, noise_re, noise_im],
+            right_shifts: [data_shift, data_shift, noise_shift, noise_shift],
         }
     }
 
@@ -103,63 +113,68 @@ impl Located {
 }
 
 /// Adds visibilities to the sums at node `index`, which all of them reach.
-///
-/// Consecutive ones in one cell of the grid, of one power of two, are added together in registers.
 pub(super) fn spread(
-    (grids, direction): (&Grids, Direction),
+    grids: &Grids,
+    direction: Direction,
     index: usize,
-    (located, reaching): (&[Located], &[u32]),
+    reaching: &[&Located],
     node: &mut ExactNode,
 ) {
     let arch = Arch::new();
-    let of = |k: &u32| &located[*k as usize];
-    let cell = |k: &u32| (of(k).first_node, of(k).weight_first, of(k).weight_shift);
-    for run in reaching.chunk_by(|a, b| cell(a) == cell(b)) {
-        for group in run.chunks(GROUP) {
-            let at = index - of(&group[0]).first_node;
+    let at = |one: &Located| index - one.first_node;
+    in_groups(
+        reaching,
+        |one| (one.first_node, one.weight_first, one.weight_shift),
+        |first, group| {
             let rows = Rows {
                 rows: &mut node.weights,
                 stride: grids.weight_stride(),
-                first: of(&group[0]).weight_first,
+                first: first.weight_first,
                 alphas: grids.weight_alpha.width(),
-                used: NODES - at,
-                shifts: [of(&group[0]).weight_shift; NODES],
+                used: NODES - at(first),
+                shifts: [first.weight_shift; NODES],
                 direction,
             };
-            let mut terms = [Term::EMPTY; GROUP];
-            for (term, k) in terms.iter_mut().zip(group) {
-                let one = of(k);
-                *term = Term {
-                    values: one.diagonals(at),
-                    alphas: &one.weight_alpha,
-                    parts: &one.weight_parts,
-                    gammas: &one.weight_gamma,
-                };
-            }
-            arch.dispatch(Spreading { rows, terms: &terms[..group.len()] });
-        }
-    }
-    let cell = |k: &u32| (of(k).first_node, of(k).data_first, of(k).side_shifts);
-    for run in reaching.chunk_by(|a, b| cell(a) == cell(b)) {
-        for group in run.chunks(GROUP) {
-            let at = index - of(&group[0]).first_node;
+            rows.add(arch, group, |one| Term {
+                values: one.diagonals(at(one)),
+                alphas: &one.weight_alpha,
+                parts: &one.weight_parts,
+                gammas: &one.weight_gamma,
+            });
+        },
+    );
+    in_groups(
+        reaching,
+        |one| (one.first_node, one.data_first, one.right_shifts),
+        |first, group| {
             let rows = Rows {
-                rows: &mut node.sides,
+                rows: &mut node.right,
                 stride: grids.data_stride(),
-                first: of(&group[0]).data_first,
+                first: first.data_first,
                 alphas: grids.data.width(),
                 used: 4,
-                shifts: of(&group[0]).side_shifts,
+                shifts: first.right_shifts,
                 direction,
             };
-            let mut terms = [Term::EMPTY; GROUP];
-            for (term, k) in terms.iter_mut().zip(group) {
-                let one = of(k);
-                let values = one.sides.map(|side| side * one.u[at]);
-                *term =
-                    Term { values, alphas: &one.data_alpha, parts: &one.data_parts, gammas: &one.data_gamma };
-            }
-            arch.dispatch(Spreading { rows, terms: &terms[..group.len()] });
+            rows.add(arch, group, |one| Term {
+                values: one.right.map(|term| term * one.u[at(one)]),
+                alphas: &one.data_alpha,
+                parts: &one.data_parts,
+                gammas: &one.data_gamma,
+            });
+        },
+    );
+}
+
+/// Calls `add` with groups of consecutive visibilities in one cell of the grid, and of one power of two.
+fn in_groups<C: PartialEq>(
+    reaching: &[&Located],
+    cell: impl Fn(&Located) -> C,
+    mut add: impl FnMut(&Located, &[&Located]),
+) {
+    for run in reaching.chunk_by(|a, b| cell(a) == cell(b)) {
+        for group in run.chunks(GROUP) {
+            add(group[0], group);
         }
     }
 }
@@ -169,7 +184,7 @@ const GROUP: usize = 8;
 
 /// By alpha `[K][gamma]`, and the first point in alpha and gamma to add to.
 struct Rows<'a, const K: usize> {
-    rows: &'a mut [Row],
+    rows: &'a mut [IntegerRow],
     stride: usize,
     first: [u32; 2],
     /// Alphas that are reached.
@@ -179,6 +194,18 @@ struct Rows<'a, const K: usize> {
     /// Powers of two, in quanta, that values of each of K are multiples of.
     shifts: [u32; K],
     direction: Direction,
+}
+
+impl<const K: usize> Rows<'_, K> {
+    /// Adds the terms of a group of at most [`GROUP`] visibilities together, in registers.
+    #[inline(always)]
+    fn add<'t>(self, arch: Arch, group: &[&'t Located], term: impl Fn(&'t Located) -> Term<'t, K>) {
+        let mut terms = [Term::EMPTY; GROUP];
+        for (to, one) in terms.iter_mut().zip(group) {
+            *to = term(one);
+        }
+        arch.dispatch(Spreading { rows: self, terms: &terms[..group.len()] });
+    }
 }
 
 /// One visibility's factors.
@@ -202,11 +229,10 @@ impl<const K: usize> Term<'_, K> {
     }
 }
 
-/// Parts of one in which bounds of kernels are counted.
+/// Bounds of kernels are counted in units of 2^-8.
 const PARTS: u32 = 8;
 
-/// Bounds of kernels, which are at most one up to rounding: a sixteenth more, for what kernels and products are greater
-/// than they should be.
+/// Bounds of kernels, which are at most one up to rounding: a sixteenth more, for roundings of kernels and products.
 #[inline(always)]
 fn parts(kernel: &[f32; LANES]) -> [u16; LANES] {
     kernel.map(|alpha| (alpha.abs() * 1.0625 * (1 << PARTS) as f32) as u16 + 1)
@@ -266,9 +292,9 @@ impl<const K: usize> WithSimd for Spreading<'_, K> {
     }
 }
 
-/// What the terms of one alpha are rounded to, summed over visibilities.
+/// The rounded terms of one alpha, summed over visibilities.
 ///
-/// In registers by name: a compiler left to itself takes several visibilities at a time, and gathers.
+/// With named registers: the compiler would otherwise vectorise over visibilities, with gathers.
 #[inline(always)]
 fn multiples<S: Simd, const K: usize>(simd: S, terms: &[Term<'_, K>], lane: usize, k: usize) -> [u32; LANES] {
     let mut multiples = [biases(terms.len()).wrapping_neg().cast_unsigned(); LANES];

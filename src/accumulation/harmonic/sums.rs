@@ -5,7 +5,7 @@ use std::sync::{Arc, OnceLock};
 use super::HarmonicSetup;
 use super::blocks::OrderBlocks;
 use super::grid::Grids;
-use super::operator::Operator;
+use super::operator::{Operator, RightHandSide};
 use super::tori::Tori;
 use crate::accumulation::{NormalSums, SumCounts};
 use crate::sky::harmonics::Alm;
@@ -26,7 +26,7 @@ pub struct HarmonicSums {
 }
 
 impl HarmonicSums {
-    /// What the sums were made for.
+    /// Setup.
     #[must_use]
     pub fn setup(&self) -> &HarmonicSetup {
         &self.setup
@@ -42,8 +42,8 @@ impl HarmonicSums {
         self.operator().matrix_product_flops(&self.tori)
     }
 
-    /// The parts of BtN^-1B that do not change m, with weights that do not depend on the phase: what is left of
-    /// it when the orbit has swept all nodes and phases evenly.
+    /// The blocks of BtN^-1B that keep m, with weights averaged over the phase: all of it once the orbit has swept all nodes
+    /// and phases evenly.
     #[must_use]
     pub fn order_blocks(&self) -> OrderBlocks {
         OrderBlocks::new(&self.operator().patterns, &self.grids, &self.tori, &self.setup)
@@ -61,11 +61,13 @@ impl NormalSums for HarmonicSums {
     }
 
     fn right_hand_side(&self) -> &[f64] {
-        self.right.get_or_init(|| unknowns_of_gradient(&self.operator().project(&self.tori, 0)))
+        self.right
+            .get_or_init(|| unknowns_of_gradient(&self.operator().project(&self.tori, RightHandSide::Data)))
     }
 
-    fn noise_side(&self) -> &[f64] {
-        self.noise.get_or_init(|| unknowns_of_gradient(&self.operator().project(&self.tori, 1)))
+    fn noise_right_hand_side(&self) -> &[f64] {
+        self.noise
+            .get_or_init(|| unknowns_of_gradient(&self.operator().project(&self.tori, RightHandSide::Noise)))
     }
 
     fn counts(&self) -> SumCounts {
@@ -73,7 +75,7 @@ impl NormalSums for HarmonicSums {
     }
 }
 
-/// Coefficients from a vector of unknowns; those that it lacks are zero.
+/// Coefficients from a vector of unknowns; missing ones are zero.
 #[must_use]
 pub fn coefficients(unknowns: &[f64], l_max: usize) -> Alm {
     let half = std::f64::consts::FRAC_1_SQRT_2;
@@ -93,15 +95,15 @@ pub fn coefficients(unknowns: &[f64], l_max: usize) -> Alm {
 /// The vector of unknowns of these coefficients.
 #[must_use]
 pub fn unknowns(alm: &Alm) -> Vec<f64> {
-    stretched(alm, std::f64::consts::SQRT_2)
+    scaled(alm, std::f64::consts::SQRT_2)
 }
 
-/// A gradient with regard to `Re T_lm` and `Im T_lm` as one with regard to the unknowns.
+/// The gradient with respect to the unknowns, from that with respect to `Re T_lm` and `Im T_lm`.
 fn unknowns_of_gradient(gradient: &Alm) -> Vec<f64> {
-    stretched(gradient, std::f64::consts::FRAC_1_SQRT_2)
+    scaled(gradient, std::f64::consts::FRAC_1_SQRT_2)
 }
 
-fn stretched(alm: &Alm, factor: f64) -> Vec<f64> {
+fn scaled(alm: &Alm, factor: f64) -> Vec<f64> {
     let (zonal, rest) = alm.values().split_at(alm.l_max() + 1);
     let rest = rest.iter().flat_map(|value| [factor * value.re, factor * value.im]);
     zonal.iter().map(|value| value.re).chain(rest).collect()

@@ -1,9 +1,10 @@
 use num_complex::Complex64;
 
 use super::*;
-use crate::accumulation::NormalSums;
+use crate::accumulation::noise::companion_noise;
+use crate::accumulation::{NormalEngine, NormalSums};
 use crate::array::{Array, ArrayConfig};
-use crate::frames::AntennaResponse;
+use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::response::harmonic::{
     GeometryLimits, GeometryRefusal, HarmonicModel, ModelSettings, NominalOrbit, PairState, PatternGeometry,
 };
@@ -227,7 +228,7 @@ fn noise_is_projected_as_data_is() {
         }
     }
     let second = engine(&blocks).into_sums();
-    for (a, b) in first.noise_side().iter().zip(second.right_hand_side()) {
+    for (a, b) in first.noise_right_hand_side().iter().zip(second.right_hand_side()) {
         // Weighted in another order before rounding to f32.
         assert!((a - b).abs() < 1e-5 * b.abs().max(1e-2), "{a} {b}");
     }
@@ -293,7 +294,7 @@ fn blocks_snapshots_and_checkpoints_do_not_change_a_bit() {
                 parts.checkpoint(&mut bytes).unwrap();
                 parts = HarmonicEngine::restore(&mut bytes.as_slice()).unwrap();
             }
-            6 => parts.settle(),
+            6 => parts.flush(),
             _ => {}
         }
     }
@@ -414,24 +415,26 @@ fn blocks_of_orders_are_symmetric_and_solved() {
 fn sums_are_within_their_resolution_of_plain_ones() {
     let blocks = blocks(0, 20);
     let mut engine = engine(&blocks);
-    let (tori, quanta) = (engine.sums().tori, engine.quanta());
-    let grids = Arc::clone(&engine.grids);
+    let (tori, quanta) = (engine.sums().tori, engine.basis.quanta);
+    let grids = Arc::clone(&engine.basis.grids);
     let mut sums = [vec![Cell::default(); tori.nodes.len() * grids.weights_len()], Vec::new()];
-    sums[1] = vec![Cell::default(); tori.nodes.len() * grids.sides_len()];
-    for pending in blocks.iter().flat_map(|block| (0..block.len()).map(|k| engine.place(block, k).unwrap())) {
-        let (first_node, u) = grids.u.spread((pending.u - grids.nodes.first) / grids.nodes.step);
+    sums[1] = vec![Cell::default(); tori.nodes.len() * grids.right_len()];
+    for visibility in
+        blocks.iter().flat_map(|block| (0..block.len()).map(|k| engine.accept(block, k).unwrap()))
+    {
+        let (first_node, u) = grids.u.spread((visibility.place.u - grids.nodes.first) / grids.nodes.step);
         let circles = [
             (&grids.weight_alpha, &grids.weight_gamma, grids.points, grids.weight_stride(), quanta.weight),
-            (&grids.data, &grids.data, grids.data_points(), grids.data_stride(), quanta.side),
+            (&grids.data, &grids.data, grids.data_points(), grids.data_stride(), quanta.right),
         ];
         for (which, (by_alpha, by_gamma, points, stride, quantum)) in circles.into_iter().enumerate() {
-            let (alpha, alphas) = Grids::on_circle(by_alpha, points, pending.alpha_rad);
-            let (gamma, gammas) = Grids::on_circle(by_gamma, points, pending.gamma_rad);
+            let (alpha, alphas) = Grids::on_circle(by_alpha, points, visibility.place.alpha_rad);
+            let (gamma, gammas) = Grids::on_circle(by_gamma, points, visibility.place.gamma_rad);
             for at in 0..grid::NODES {
                 let values: Vec<f64> = if which == 0 {
-                    (at..grid::NODES).map(|above| pending.weight * f64::from(u[at] * u[above])).collect()
+                    (at..grid::NODES).map(|above| visibility.weight * f64::from(u[at] * u[above])).collect()
                 } else {
-                    pending.sides.iter().map(|side| side * f64::from(u[at])).collect()
+                    visibility.right_hand_sides().iter().map(|side| side * f64::from(u[at])).collect()
                 };
                 let parts = [grid::NODES, 4][which];
                 let node = (first_node as usize + at) * points * parts * stride;
@@ -455,7 +458,7 @@ fn sums_are_within_their_resolution_of_plain_ones() {
                 assert!(sums.iter().all(|cell| cell.error_max == 0.0));
                 continue;
             };
-            let found = if which == 0 { &node.weights } else { &node.sides };
+            let found = if which == 0 { &node.weights } else { &node.right };
             for (found, cell) in found.iter().zip(sums) {
                 let off = f64::from(*found) - cell.sum;
                 assert!(off.abs() <= cell.error_max, "{found} {} {:e}", cell.sum, cell.error_max);

@@ -1,4 +1,4 @@
-//! Sums at the nodes in baseline length, ready to be used: for each a torus in alpha and gamma.
+//! Sums at the nodes in baseline length as numbers: for each node a torus in alpha and gamma.
 
 use rayon::prelude::*;
 
@@ -6,35 +6,35 @@ use super::grid::Grids;
 
 /// The sums at one node.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Node {
+pub(super) struct NodeSums {
     /// `[alpha][diagonal][gamma]`: weights of this node with itself and with the nodes above, (K sr)^-2.
     pub(super) weights: Vec<f32>,
     /// `[alpha][data re, data im, noise re, noise im][gamma]`, (K sr)^-1.
-    pub(super) sides: Vec<f32>,
+    pub(super) right: Vec<f32>,
 }
 
 /// All nodes; those that no visibility has reached take no memory.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Tori {
-    pub(super) nodes: Vec<Option<Node>>,
+    pub(super) nodes: Vec<Option<NodeSums>>,
 }
 
-impl Node {
+impl NodeSums {
     pub(super) fn zeros(grids: &Grids) -> Self {
-        Self { weights: vec![0.0; grids.weights_len()], sides: vec![0.0; grids.sides_len()] }
+        Self { weights: vec![0.0; grids.weights_len()], right: vec![0.0; grids.right_len()] }
     }
 }
 
 impl Tori {
-    /// The nodes that hold something: the first, and one behind the last.
+    /// The range of nodes that hold data.
     pub(super) fn reached(&self) -> std::ops::Range<usize> {
         let first = self.nodes.iter().position(Option::is_some).unwrap_or(0);
         let last = self.nodes.iter().rposition(Option::is_some).map_or(first, |last| last + 1);
         first..last
     }
 
-    /// Which alphas of a grid of `points` have data; `part` gives the sums on it and floats an alpha.
-    pub(super) fn alphas(&self, points: usize, part: impl Fn(&Node) -> &[f32] + Sync) -> Vec<bool> {
+    /// Which alphas of a grid of `points` hold data; `part` selects the sums.
+    pub(super) fn alphas(&self, points: usize, part: impl Fn(&NodeSums) -> &[f32] + Sync) -> Vec<bool> {
         let used = |alpha: usize| {
             self.nodes.iter().flatten().any(|node| {
                 let sums = part(node);

@@ -19,13 +19,13 @@ pub(super) const STRIDE: usize = TILE + 16;
 pub struct SymmetricTiles {
     order: usize,
     /// Tile (i, j), i >= j, at i (i + 1) / 2 + j; columns of [`STRIDE`] elements. Of a diagonal tile
-    /// only the lower triangle has a meaning.
+    /// only the lower triangle is used.
     tiles: Vec<Vec<f64>>,
 }
 
-/// A block of rows of A, for A A^T: `order` numbers after each other a column, `columns` of them.
+/// A block of columns of A, for A A^T: `columns` columns of `order` consecutive numbers.
 #[derive(Clone, Copy, Debug)]
-pub struct Columns<'a, T> {
+pub struct ColumnBlock<'a, T> {
     /// Numbers; column k begins at `k stride`.
     pub values: &'a [T],
     /// Number of columns.
@@ -66,7 +66,7 @@ impl SymmetricTiles {
         Self { order, tiles }
     }
 
-    /// Of tiles in their order.
+    /// A matrix of these tiles, in their order.
     pub(super) fn of(order: usize, tiles: Vec<Vec<f64>>) -> Self {
         Self { order, tiles }
     }
@@ -100,7 +100,7 @@ impl SymmetricTiles {
         Self::view(&self.tiles[i * (i + 1) / 2 + j], extent(self.order, i), extent(self.order, j))
     }
 
-    /// All tiles with their places, to be worked on side by side.
+    /// All tiles, to be changed in parallel.
     pub(crate) fn tiles_mut(&mut self) -> &mut [Vec<f64>] {
         &mut self.tiles
     }
@@ -120,14 +120,14 @@ impl SymmetricTiles {
         MatMut::from_column_major_slice_with_stride_mut(values, rows, columns, STRIDE)
     }
 
-    /// Adds A A^T by products of the library, which are of no fixed rounding; a yardstick for the engine's own.
-    pub fn add_products_f64(&mut self, a: Columns<'_, f64>) {
+    /// Adds A A^T by the library's products, whose rounding is not fixed; a yardstick for the engine's own.
+    pub fn add_products_f64(&mut self, a: ColumnBlock<'_, f64>) {
         let order = self.order;
         self.tiles.par_iter_mut().enumerate().for_each(|(index, tile)| {
             let (i, j) = place(index);
             let (left, right) = (strip(a, order, i), strip(a, order, j));
             let tile = Self::view_mut(tile, left.nrows(), right.nrows());
-            add_product(tile, left, right, i == j);
+            add_product(tile, 1.0, left, right, i == j);
         });
     }
 
@@ -186,20 +186,35 @@ pub(super) fn extent(order: usize, i: usize) -> usize {
 }
 
 /// Rows of A that belong to tile row `i`.
-fn strip<T>(a: Columns<'_, T>, order: usize, i: usize) -> MatRef<'_, T> {
+fn strip<T>(a: ColumnBlock<'_, T>, order: usize, i: usize) -> MatRef<'_, T> {
     MatRef::from_column_major_slice_with_stride(a.values, order, a.columns, a.stride)
         .subrows(i * TILE, extent(order, i))
 }
 
-/// `to += left right^T`, of a diagonal tile the lower triangle.
-fn add_product(to: MatMut<'_, f64>, left: MatRef<'_, f64>, right: MatRef<'_, f64>, diagonal: bool) {
+/// `to += factor left right^T`, of a diagonal tile the lower triangle.
+pub(crate) fn add_product(
+    to: MatMut<'_, f64>,
+    factor: f64,
+    left: MatRef<'_, f64>,
+    right: MatRef<'_, f64>,
+    diagonal: bool,
+) {
+    let (accum, right) = (Accum::Add, right.transpose());
     if diagonal {
         use triangular::BlockStructure::{Rectangular, TriangularLower};
-        let right = right.transpose();
-        let accum = Accum::Add;
-        triangular::matmul(to, TriangularLower, accum, left, Rectangular, right, Rectangular, 1.0, Par::Seq);
+        triangular::matmul(
+            to,
+            TriangularLower,
+            accum,
+            left,
+            Rectangular,
+            right,
+            Rectangular,
+            factor,
+            Par::Seq,
+        );
     } else {
-        matmul(to, Accum::Add, left, right.transpose(), 1.0, Par::Seq);
+        matmul(to, accum, left, right, factor, Par::Seq);
     }
 }
 
@@ -266,7 +281,7 @@ mod tests {
             let stride = order + 3;
             let a = random(stride * columns, 1);
             let mut exact = SymmetricTiles::zeros(order);
-            exact.add_products_f64(Columns { values: &a, columns, stride });
+            exact.add_products_f64(ColumnBlock { values: &a, columns, stride });
             let plain = |r: usize, c: usize| -> f64 {
                 (0..columns).map(|k| a[k * stride + r] * a[k * stride + c]).sum()
             };

@@ -1,30 +1,27 @@
-//! The scale of exact sums, and what they hold.
-//!
-//! Sums are integers: every term is rounded to a multiple of a quantum that was fixed before any data came, and
-//! integers add up to the same bits in any order, batch, number of threads or tree of merges; what was added can be
-//! taken out again without a trace. The quantum follows from the greatest weight that is taken, `weight_max`.
+//! The scale of exact sums, which follows from the greatest weight that is accepted, and their totals.
 
-use super::error::AccumulationError;
-use super::{Direction, SumCounts};
+use num_complex::Complex64;
+
+use crate::accumulation::{AccumulationError, Refusal, SumCounts};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 /// Boltzmann's constant, J/K.
 const BOLTZMANN_J_K: f64 = 1.380_649e-23;
-/// What a satellite at 300 km sees of the sky, sr.
+/// The part of the sky that a satellite at 300 km sees, sr.
 const SEEN_SR: f64 = 9.6;
 /// The longest integration of the paper's array, s.
 const INTEGRATION_S: f64 = 25.0;
 /// Room above the weight expected of a sky of Cane's brightness: for longer integrations, fainter skies and gains.
 const HEAD_ROOM: f64 = 1024.0;
 /// Greatest signal-to-noise ratio of one visibility; thermal noise of the sky itself allows 600.
-pub(super) const SIGNAL_TO_NOISE_MAX: f64 = 16_384.0;
+const SIGNAL_TO_NOISE_MAX: f64 = 16_384.0;
 /// Weights are counted in this part of the scale.
 const WEIGHT_STEPS: f64 = 18_446_744_073_709_551_616.0; // 2^64
 
 /// The greatest weight of a thermal visibility at a frequency in a channel of a width, (K sr)^-2, with room above it.
 ///
 /// `2 dnu dt / T_sys^2` of 25 s under the mean sky of Cane (1979, MNRAS 189, 465), times 1024. It depends on nothing
-/// that the data says, so that engines of one channel always agree.
+/// in the data, so that engines of one channel always agree.
 #[must_use]
 pub fn automatic_weight_max(frequency_hz: f64, width_hz: f64) -> f64 {
     let mhz = frequency_hz / 1e6;
@@ -35,17 +32,17 @@ pub fn automatic_weight_max(frequency_hz: f64, width_hz: f64) -> f64 {
     HEAD_ROOM * 2.0 * width_hz * INTEGRATION_S / (sky_k * SEEN_SR).powi(2)
 }
 
-/// The scale: the least even power of two that `weight_max` does not exceed, so that its root is one too.
+/// The least even power of two that `weight_max` does not exceed, so that its root is a power of two as well.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Scale {
-    /// Greatest weight that is taken, (K sr)^-2.
-    pub(super) weight: f64,
+pub struct WeightScale {
+    /// Greatest weight that is accepted, (K sr)^-2.
+    pub(in crate::accumulation) weight: f64,
     /// Its root, (K sr)^-1.
-    pub(super) root: f64,
+    pub(in crate::accumulation) root: f64,
 }
 
-impl Scale {
-    pub(super) fn new(weight_max: f64) -> Result<Self, AccumulationError> {
+impl WeightScale {
+    pub(in crate::accumulation) fn new(weight_max: f64) -> Result<Self, AccumulationError> {
         if !(1e-60..=1e60).contains(&weight_max) {
             let expected = "1e-60 to 1e60 (K sr)^-2";
             return Err(AccumulationError::Setup { name: "weight_max", value: weight_max, expected });
@@ -56,38 +53,57 @@ impl Scale {
         Ok(Self { weight: 4_f64.powi(half), root: 2_f64.powi(half) })
     }
 
-    /// Whether a value (K sr) of this weight can be summed, or why not.
-    pub(super) fn check(
+    /// Why a value (K sr) of this weight cannot be summed, if so.
+    pub(in crate::accumulation) fn check(
         self,
-        value: num_complex::Complex64,
+        value: Complex64,
         weight: f64,
         weight_max: f64,
-    ) -> Result<(), crate::accumulation::Refusal> {
+    ) -> Result<(), Refusal> {
         if !(value.re.is_finite() && value.im.is_finite() && weight > 0.0 && weight.is_finite()) {
-            return Err(crate::accumulation::Refusal::NotFinite);
+            return Err(Refusal::NotFinite);
         }
         let signal = value.re.abs().max(value.im.abs()) * weight.sqrt();
         if weight > weight_max || signal > SIGNAL_TO_NOISE_MAX {
-            return Err(crate::accumulation::Refusal::OutOfRange);
+            return Err(Refusal::OutOfRange);
         }
         Ok(())
     }
 }
 
-/// How many visibilities are in sums, and their weight in 2^-64 of the scale: exact as the sums are.
+/// Whether visibilities are added or removed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Direction {
+    /// Added.
+    In,
+    /// Removed.
+    Out,
+}
+
+impl Direction {
+    /// 1 or -1.
+    pub(in crate::accumulation) fn sign(self) -> f64 {
+        match self {
+            Self::In => 1.0,
+            Self::Out => -1.0,
+        }
+    }
+}
+
+/// Number of visibilities in the sums, and their weight in 2^-64 of the scale: exact as the sums are.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
-pub(super) struct Totals {
+pub struct Totals {
     visibilities: u64,
     weight: u128,
 }
 
 impl Totals {
-    pub(super) fn one(scale: Scale, weight: f64) -> Self {
+    pub(in crate::accumulation) fn one(scale: WeightScale, weight: f64) -> Self {
         Self { visibilities: 1, weight: (weight / scale.weight * WEIGHT_STEPS).round() as u128 }
     }
 
-    /// `None` if more would be taken out than is there.
-    pub(super) fn and(self, other: Self, direction: Direction) -> Option<Self> {
+    /// `None` if more would be removed than is there, or more added than can be counted.
+    pub(in crate::accumulation) fn and(self, other: Self, direction: Direction) -> Option<Self> {
         let (visibilities, weight) = match direction {
             Direction::In => {
                 (self.visibilities.checked_add(other.visibilities), self.weight.checked_add(other.weight))
@@ -100,11 +116,11 @@ impl Totals {
     }
 
     /// The weight in units of the scale, rounded.
-    pub(super) fn scales(self) -> f64 {
+    pub(in crate::accumulation) fn scales(self) -> f64 {
         self.weight as f64 / WEIGHT_STEPS
     }
 
-    pub(super) fn counts(self, scale: Scale) -> SumCounts {
+    pub(in crate::accumulation) fn counts(self, scale: WeightScale) -> SumCounts {
         SumCounts { visibilities: self.visibilities, weight: self.scales() * scale.weight }
     }
 }
@@ -118,10 +134,10 @@ mod tests {
         for (weight_max, weight, root) in
             [(1.0, 1.0, 1.0), (1.01, 4.0, 2.0), (4.0, 4.0, 2.0), (0.2, 0.25, 0.5)]
         {
-            assert_eq!(Scale::new(weight_max).unwrap(), Scale { weight, root });
+            assert_eq!(WeightScale::new(weight_max).unwrap(), WeightScale { weight, root });
         }
         for weight_max in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e-70, 1e70] {
-            assert!(Scale::new(weight_max).is_err());
+            assert!(WeightScale::new(weight_max).is_err());
         }
     }
 

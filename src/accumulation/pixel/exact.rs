@@ -1,27 +1,14 @@
 //! Exact sums of products: a symmetric matrix of integers in tiles.
 //!
-//! A running sum that starts at `BIAS = 1.5 2^52` and takes products by fused multiply-add stays between 2^52 and
-//! 2^53, where neighbouring numbers differ by one: each addition rounds its product to a whole number, and nothing
-//! else is ever rounded. Nor does the rounding of a product depend on the sum so far, for there are no ties: factors
-//! are odd multiples of 2^-28, so that a product is an odd multiple of 2^-56 and never half a whole number (or zero).
-//! What the sum's bits are above those of the bias is the sum of the rounded products, an integer, and is added to
-//! a 64-bit one.
-//!
-//! Matrix products need this kernel of their own: a library's product starts its running sums at zero.
+//! Rounded by fused multiply-adds, see [`crate::accumulation::fixed_point::rounding`]. Matrix products need this kernel
+//! of their own: a library's product starts its running sums at zero.
 
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-use super::tiles::{Columns, STRIDE, SymmetricTiles, TILE, extent, place, tiles_along};
-
-/// Where running sums start; it is even, so that a term and its negative are rounded alike.
-const BIAS: f64 = 1.5 * 4_503_599_627_370_496.0;
-/// Steps of factors in one.
-const STEPS: f64 = 268_435_456.0; // 2^28
-/// Adding it rounds a factor to a step.
-const FACTOR_BIAS: f64 = BIAS / STEPS;
-/// Greatest factor: roots of [`WEIGHT_QUANTA`], and a little room for rounding.
-const FACTOR_MAX: f64 = 2.1e6;
+use super::tiles::{ColumnBlock, STRIDE, SymmetricTiles, TILE, extent, place, tiles_along};
+use crate::accumulation::fixed_point::Direction;
+use crate::accumulation::fixed_point::rounding::{BIAS, above_bias};
 
 /// Quanta of a term of the greatest weight, 2^42; its factors go up to 2^21.
 pub(super) const WEIGHT_QUANTA: f64 = 4_398_046_511_104.0;
@@ -35,31 +22,6 @@ pub(super) const SCALES_MAX: f64 = 2_097_152.0 - 1.0;
 const LEFT: usize = 8;
 const RIGHT: usize = 6;
 
-/// Rounds factors to odd multiples of 2^-28, or zero.
-#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn round_factors(factors: &mut [f64]) {
-    for factor in factors {
-        let odd = f64::from_bits((*factor + FACTOR_BIAS).to_bits() | 1) - FACTOR_BIAS;
-        // Beyond the range are only rows of geometries that make no numbers.
-        let is_term = *factor != 0.0 && factor.abs() < FACTOR_MAX;
-        *factor = if is_term { odd } else { 0.0 };
-    }
-}
-
-/// Adds each of `row` times `factor`, rounded to a whole number, to `sums`; products of up to 2^50 are taken.
-#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn add_scaled(sums: &mut [i64], row: &[f64], factor: f64) {
-    for (sum, row) in sums.iter_mut().zip(row) {
-        *sum = sum.wrapping_add(above_bias(row * factor + BIAS));
-    }
-}
-
-/// What a running sum holds.
-#[inline(always)]
-fn above_bias(sum: f64) -> i64 {
-    (sum.to_bits() as i64).wrapping_sub(BIAS.to_bits() as i64)
-}
-
 /// Factors in the order in which they are multiplied: panels of rows, in each column after column.
 pub(super) struct Panels {
     columns: usize,
@@ -71,7 +33,7 @@ pub(super) struct Panels {
 
 impl Panels {
     /// Of rounded factors; the products count `sign` (1 or -1) times.
-    pub(super) fn new(a: Columns<'_, f64>, order: usize, sign: f64) -> Self {
+    pub(super) fn new(a: ColumnBlock<'_, f64>, order: usize, sign: f64) -> Self {
         let by_tile = |i: usize| (a, i * TILE..i * TILE + extent(order, i));
         Self {
             columns: a.columns,
@@ -82,7 +44,10 @@ impl Panels {
 }
 
 /// Rows in panels of `N`; where rows end, zeros.
-fn panels<const N: usize>((a, rows): (Columns<'_, f64>, std::ops::Range<usize>), sign: f64) -> Vec<[f64; N]> {
+fn panels<const N: usize>(
+    (a, rows): (ColumnBlock<'_, f64>, std::ops::Range<usize>),
+    sign: f64,
+) -> Vec<[f64; N]> {
     let mut out = Vec::with_capacity(rows.len().div_ceil(N) * a.columns);
     for first in rows.clone().step_by(N) {
         let count = N.min(rows.end - first);
@@ -119,17 +84,12 @@ impl ExactTiles {
         });
     }
 
-    /// Adds another matrix of the same order.
-    pub(super) fn add(&mut self, other: &Self) {
-        self.combine(other, i64::wrapping_add);
-    }
-
-    /// Takes out another matrix of the same order.
-    pub(super) fn subtract(&mut self, other: &Self) {
-        self.combine(other, i64::wrapping_sub);
-    }
-
-    fn combine(&mut self, other: &Self, with: fn(i64, i64) -> i64) {
+    /// Adds another matrix of the same order, or removes it.
+    pub(super) fn combine(&mut self, other: &Self, direction: Direction) {
+        let with = match direction {
+            Direction::In => i64::wrapping_add,
+            Direction::Out => i64::wrapping_sub,
+        };
         self.tiles.par_iter_mut().zip(&other.tiles).for_each(|(tile, other)| {
             tile.iter_mut().zip(other).for_each(|(sum, term)| *sum = with(*sum, *term));
         });
@@ -214,6 +174,7 @@ mod tests {
     use rand::seq::SliceRandom;
 
     use super::*;
+    use crate::accumulation::fixed_point::rounding::{STEPS, round_factors};
     use crate::units::{StreamKind, random_stream};
 
     /// Rows of factors of all sizes, rounded.
@@ -234,7 +195,7 @@ mod tests {
         let mut tiles = ExactTiles::zeros(order);
         for batch in batches {
             let values: Vec<f64> = batch.concat();
-            let a = Columns { values: &values, columns: batch.len(), stride: order };
+            let a = ColumnBlock { values: &values, columns: batch.len(), stride: order };
             tiles.add_products(&Panels::new(a, order, sign));
         }
         tiles
@@ -276,10 +237,10 @@ mod tests {
                 let (first, second) = rows.split_at(stream.random_range(1..40));
                 assert!(sum(order, &[first, second], 1.0) == whole);
                 let mut merged = sum(order, &[second], 1.0);
-                merged.add(&sum(order, &[first], 1.0));
+                merged.combine(&sum(order, &[first], 1.0), Direction::In);
                 assert!(merged == whole);
-                merged.subtract(&sum(order, &[second], 1.0));
-                merged.add(&sum(order, &[first], -1.0));
+                merged.combine(&sum(order, &[second], 1.0), Direction::Out);
+                merged.combine(&sum(order, &[first], -1.0), Direction::In);
                 assert!(merged == ExactTiles::zeros(order));
             }
         }

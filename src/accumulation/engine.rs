@@ -1,0 +1,301 @@
+//! The engine: all of it that does not depend on what the sky is expanded in.
+//!
+//! An [`ExactEngine`] checks and counts visibilities, collects them in batches, and hands each batch to its [`SkyBasis`],
+//! which turns it into integers and adds them to the exact sums.
+
+use std::fmt;
+use std::io::{Read, Write};
+
+use num_complex::Complex64;
+use rayon::prelude::*;
+
+use super::checkpoint::{BasisKind, FrameReader, FrameWriter};
+use super::fixed_point::{Direction, Totals, WeightScale};
+use super::noise::companion_noise;
+use super::{AccumulationError, Added, NormalEngine, NormalSums, Refusal, SumCounts};
+use crate::frames::PlacedVisibilities;
+use crate::units::vector::Vec3;
+
+/// What the sky is expanded in: how a visibility enters the sums, and what the sums mean.
+pub trait SkyBasis: Sized + Send + Sync {
+    /// What distinguishes one engine from another.
+    type Setup: Copy + fmt::Debug + PartialEq + Send + Sync;
+    /// Where a visibility belongs in the sums.
+    type Place: Copy + Send + Sync;
+    /// The sums as integers.
+    type Exact: Clone + Send + Sync;
+    /// The sums as numbers, ready to be solved.
+    type Equations: NormalSums;
+    /// A setup as it stands in a checkpoint.
+    type Head: bincode::Encode + bincode::Decode<()>;
+
+    /// Number of the basis in checkpoints.
+    const KIND: BasisKind;
+    /// Visibilities that are summed together.
+    const BATCH: usize;
+    /// Most weight that the sums have room for, in units of the scale.
+    const SCALES_MAX: f64;
+
+    /// The tables for a setup; no sums yet.
+    ///
+    /// # Errors
+    /// A setup that cannot be used.
+    fn new(setup: &Self::Setup, scale: WeightScale) -> Result<Self, AccumulationError>;
+
+    /// The settings that every engine has.
+    fn common(setup: &Self::Setup) -> CommonSetup;
+
+    /// Sums of nothing.
+    fn zeros(&self) -> Self::Exact;
+
+    /// Where a visibility of satellites at these positions belongs.
+    ///
+    /// # Errors
+    /// PairPositions that the basis does not cover.
+    fn place(&self, r_i_m: Vec3, r_j_m: Vec3) -> Result<Self::Place, Refusal>;
+
+    /// Adds a batch to the sums, or removes it.
+    fn sum(&self, exact: &mut Self::Exact, batch: &[Accepted<Self::Place>], direction: Direction);
+
+    /// Adds other sums, or removes them.
+    fn combine(&self, exact: &mut Self::Exact, other: &Self::Exact, direction: Direction);
+
+    /// The sums as numbers.
+    fn equations(&self, exact: &Self::Exact, counts: SumCounts) -> Self::Equations {
+        self.into_equations(exact.clone(), counts)
+    }
+
+    /// The sums as numbers; the integers are given up.
+    #[expect(clippy::wrong_self_convention)] // It is the sums that are converted.
+    fn into_equations(&self, exact: Self::Exact, counts: SumCounts) -> Self::Equations;
+
+    /// The setup for a checkpoint.
+    fn head(setup: &Self::Setup) -> Self::Head;
+
+    /// The setup from a checkpoint.
+    ///
+    /// # Errors
+    /// Values out of range.
+    fn setup_of(head: Self::Head) -> Result<Self::Setup, AccumulationError>;
+
+    /// Writes the sums.
+    ///
+    /// # Errors
+    /// The writer's.
+    fn write(&self, exact: &Self::Exact, out: &mut FrameWriter<'_>) -> Result<(), AccumulationError>;
+
+    /// Reads the sums; memory follows the data that could be read.
+    ///
+    /// # Errors
+    /// The reader's, or values out of range.
+    fn read(&self, from: &mut FrameReader<'_>) -> Result<Self::Exact, AccumulationError>;
+}
+
+/// The settings that every engine has.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CommonSetup {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Greatest weight of a visibility, (K sr)^-2.
+    pub weight_max: f64,
+    /// Seed of the noise-only companion.
+    pub companion_seed: u64,
+}
+
+/// A visibility that was accepted and waits for its batch.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Accepted<P> {
+    /// Where it belongs.
+    pub place: P,
+    /// Inverse variance, (K sr)^-2.
+    pub weight: f64,
+    /// Value, K sr.
+    pub value_k_sr: Complex64,
+    /// Noise of the noise-only companion, in units of the standard deviation.
+    pub noise: Complex64,
+}
+
+/// Exact normal equations of one channel over a basis; see [`NormalEngine`].
+pub struct ExactEngine<B: SkyBasis> {
+    setup: B::Setup,
+    scale: WeightScale,
+    pub(super) basis: B,
+    exact: B::Exact,
+    /// All that the engine holds, pending visibilities included.
+    totals: Totals,
+    pending: Vec<Accepted<B::Place>>,
+    /// Whether the pending visibilities are to be added or removed.
+    direction: Direction,
+}
+
+impl<B: SkyBasis> fmt::Debug for ExactEngine<B> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ExactEngine")
+            .field("setup", &self.setup)
+            .field("totals", &self.totals)
+            .finish_non_exhaustive()
+    }
+}
+
+impl<B: SkyBasis> ExactEngine<B> {
+    /// An empty engine.
+    ///
+    /// # Errors
+    /// A setup out of range.
+    pub fn new(setup: B::Setup) -> Result<Self, AccumulationError> {
+        Self::of(setup, Totals::default(), |basis| Ok(basis.zeros()))
+    }
+
+    /// An engine that holds the sums made by `exact`, which is called only if the setup is valid.
+    fn of(
+        setup: B::Setup,
+        totals: Totals,
+        exact: impl FnOnce(&B) -> Result<B::Exact, AccumulationError>,
+    ) -> Result<Self, AccumulationError> {
+        let scale = WeightScale::new(B::common(&setup).weight_max)?;
+        let basis = B::new(&setup, scale)?;
+        Ok(Self {
+            exact: exact(&basis)?,
+            setup,
+            scale,
+            basis,
+            totals,
+            pending: Vec::with_capacity(B::BATCH),
+            direction: Direction::In,
+        })
+    }
+
+    /// Setup.
+    #[must_use]
+    pub fn setup(&self) -> &B::Setup {
+        &self.setup
+    }
+
+    /// Visibility `k` as it enters the sums, or why it does not.
+    pub(super) fn accept(
+        &self,
+        placed: &PlacedVisibilities,
+        k: usize,
+    ) -> Result<Accepted<B::Place>, Refusal> {
+        let CommonSetup { weight_max, companion_seed, .. } = B::common(&self.setup);
+        let place = self.basis.place(placed.r_i_m[k], placed.r_j_m[k])?;
+        let (weight, value_k_sr) = (placed.weight[k], placed.value_k_sr[k]);
+        self.scale.check(value_k_sr, weight, weight_max)?;
+        Ok(Accepted { place, weight, value_k_sr, noise: companion_noise(companion_seed, placed, k) })
+    }
+
+    /// Adds visibilities or removes them.
+    fn take(
+        &mut self,
+        placed: &PlacedVisibilities,
+        direction: Direction,
+    ) -> Result<Added, AccumulationError> {
+        let (expected_hz, found_hz) = (B::common(&self.setup).frequency_hz, placed.frequency_hz);
+        if found_hz != expected_hz {
+            return Err(AccumulationError::Frequency { expected_hz, found_hz });
+        }
+        let found: Vec<_> = (0..placed.len()).into_par_iter().map(|k| self.accept(placed, k)).collect();
+        let one = |accepted: &Accepted<B::Place>| Totals::one(self.scale, accepted.weight);
+        if direction == Direction::Out {
+            let mut accepted = found.iter().flatten();
+            let left = accepted.try_fold(self.totals, |totals, removed| totals.and(one(removed), direction));
+            left.ok_or(AccumulationError::NothingHeld(placed.channel))?;
+        }
+        if self.direction != direction {
+            self.flush();
+            self.direction = direction;
+        }
+        let mut added = Added::default();
+        for found in found {
+            let one = |accepted: &Accepted<B::Place>| Totals::one(self.scale, accepted.weight);
+            match found.and_then(|accepted| Ok((self.with(one(&accepted), direction)?, accepted))) {
+                Ok((totals, accepted)) => {
+                    added.visibilities += 1;
+                    self.totals = totals;
+                    self.pending.push(accepted);
+                }
+                Err(reason) => added.refuse(reason),
+            }
+            if self.pending.len() >= B::BATCH {
+                self.flush();
+            }
+        }
+        Ok(added)
+    }
+
+    /// The totals with others, if the integers have room for both: no element exceeds what the weights allow.
+    fn with(&self, others: Totals, direction: Direction) -> Result<Totals, Refusal> {
+        let totals = self.totals.and(others, direction).ok_or(Refusal::Full)?;
+        if totals.scales() > B::SCALES_MAX { Err(Refusal::Full) } else { Ok(totals) }
+    }
+
+    fn combine(&mut self, mut other: Self, direction: Direction) -> Result<(), AccumulationError> {
+        if self.setup != other.setup {
+            return Err(AccumulationError::Mismatch {
+                what: "map sizes, frequencies, baselines, orbits, responses, seeds or greatest weights",
+            });
+        }
+        let totals = self.with(other.totals, direction).map_err(|_| AccumulationError::Range)?;
+        self.flush();
+        other.flush();
+        self.basis.combine(&mut self.exact, &other.exact, direction);
+        self.totals = totals;
+        Ok(())
+    }
+}
+
+impl<B: SkyBasis> NormalEngine for ExactEngine<B> {
+    type Equations = B::Equations;
+
+    fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        self.take(placed, Direction::In)
+    }
+
+    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        self.take(placed, Direction::Out)
+    }
+
+    fn flush(&mut self) {
+        if !self.pending.is_empty() {
+            self.basis.sum(&mut self.exact, &self.pending, self.direction);
+            self.pending.clear();
+        }
+    }
+
+    fn merge(&mut self, other: Self) -> Result<(), AccumulationError> {
+        self.combine(other, Direction::In)
+    }
+
+    fn subtract(&mut self, other: Self) -> Result<(), AccumulationError> {
+        self.combine(other, Direction::Out)
+    }
+
+    fn counts(&self) -> SumCounts {
+        self.totals.counts(self.scale)
+    }
+
+    fn sums(&mut self) -> B::Equations {
+        self.flush();
+        self.basis.equations(&self.exact, self.counts())
+    }
+
+    fn into_sums(mut self) -> B::Equations {
+        self.flush();
+        let counts = self.counts();
+        self.basis.into_equations(self.exact, counts)
+    }
+
+    fn checkpoint(&mut self, out: &mut dyn Write) -> Result<(), AccumulationError> {
+        self.flush();
+        let mut out = FrameWriter::new(out, B::KIND, (B::head(&self.setup), self.totals))?;
+        self.basis.write(&self.exact, &mut out)?;
+        Ok(out.finish()?)
+    }
+
+    fn restore(from: &mut dyn Read) -> Result<Self, AccumulationError> {
+        let (mut from, (head, totals)) = FrameReader::new(from, B::KIND)?;
+        let engine = Self::of(B::setup_of(head)?, totals, |basis| basis.read(&mut from))?;
+        from.finish()?;
+        Ok(engine)
+    }
+}

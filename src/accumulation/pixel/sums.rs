@@ -1,0 +1,41 @@
+//! Normal equations over pixels, ready to be solved.
+
+use super::tiles::SymmetricTiles;
+use crate::accumulation::{NormalSums, SumCounts};
+
+/// Normal equations over pixels.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PixelSums {
+    /// HEALPix nside.
+    pub nside: usize,
+    /// BtN^-1B, K^-2.
+    pub normal: SymmetricTiles,
+    /// BtN^-1V, K^-1.
+    pub right: Vec<f64>,
+    /// BtN^-1n, K^-1.
+    pub noise: Vec<f64>,
+    /// What is in them.
+    pub counts: SumCounts,
+}
+
+impl NormalSums for PixelSums {
+    fn unknowns(&self) -> usize {
+        self.right.len()
+    }
+
+    fn apply(&self, x: &[f64], y: &mut [f64]) {
+        self.normal.multiply(x, y);
+    }
+
+    fn right_hand_side(&self) -> &[f64] {
+        &self.right
+    }
+
+    fn noise_right_hand_side(&self) -> &[f64] {
+        &self.noise
+    }
+
+    fn counts(&self) -> SumCounts {
+        self.counts
+    }
+}
