@@ -1,4 +1,4 @@
-//! Makes the seeds of all targets, in `fuzz/seeds`: `cargo run --release --example fuzz_seeds`.
+//! Generates the seeds of all targets in `fuzz/seeds`: `cargo run --release --example fuzz_seeds`.
 #![allow(clippy::expect_used)] // It may stop at anything.
 
 use std::fs;
@@ -238,7 +238,7 @@ fn maps() {
     fs::remove_dir_all(folder).expect("removed");
 }
 
-/// The cards of a header, one a line, without END; and what follows the header.
+/// The cards of a header, one per line, without END; and what follows the header.
 fn split_header(file: &[u8]) -> (Vec<u8>, &[u8]) {
     let cards: Vec<&[u8]> = file.chunks(CARD).take_while(|card| !card.starts_with(b"END ")).collect();
     let lines: Vec<&[u8]> = cards.iter().map(|card| card.trim_ascii_end()).collect();

@@ -1,23 +1,23 @@
-//! Files that are there whole or not at all; for everything that writes.
+//! Atomic files: complete under their name, or absent. Everything that writes files uses them.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-/// Bytes that are gathered before they are written.
+/// Bytes that are buffered before a write.
 const WRITE_BYTES: usize = 1 << 20;
 
-/// What becomes of a file that was begun and not finished.
+/// What happens to a file that is dropped before it is finished.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum IfUnfinished {
     /// It is removed.
     Remove,
-    /// It stays under the name `NAME.partial`.
+    /// It remains as `NAME.partial`.
     Keep,
 }
 
-/// A file called `NAME.partial` until [`AtomicFile::finish`] has put all of it on the disk; then it takes
-/// its name, replacing an older file.
+/// A file that is called `NAME.partial` until [`AtomicFile::finish`] has put all of it on disk. Then it takes its name
+/// and replaces an older file.
 #[derive(Debug)]
 pub struct AtomicFile {
     path: PathBuf,
@@ -30,10 +30,10 @@ pub struct AtomicFile {
 }
 
 impl AtomicFile {
-    /// Begins a file, in a folder that is made if it is not there.
+    /// Creates the file, and its folder if necessary.
     ///
     /// # Errors
-    /// What the system says.
+    /// The system's error.
     pub fn create(path: &Path, unfinished: IfUnfinished) -> io::Result<Self> {
         if let Some(folder) = folder_of(path) {
             fs::create_dir_all(folder)?;
@@ -49,16 +49,16 @@ impl AtomicFile {
         Ok(Self { path: path.to_owned(), partial_path, file, unfinished, pending: Vec::new(), written: 0 })
     }
 
-    /// Bytes so far.
+    /// Bytes written so far.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.written + self.pending.len() as u64
     }
 
-    /// Puts everything on the disk and gives the file its name; returns its length.
+    /// Flushes the file to disk and gives it its name; returns its length, bytes.
     ///
     /// # Errors
-    /// What the system says; the file is then unfinished.
+    /// The system's error; the file is then unfinished.
     pub fn finish(mut self) -> io::Result<u64> {
         self.flush()?;
         if let Some(file) = &self.file {
@@ -66,7 +66,7 @@ impl AtomicFile {
         }
         fs::rename(&self.partial_path, &self.path)?;
         self.file = None;
-        // The new name is on the disk once its folder is.
+        // The rename is durable once the folder is synchronised.
         File::open(folder_of(&self.path).unwrap_or(Path::new(".")))?.sync_all()?;
         Ok(self.written)
     }
@@ -96,19 +96,19 @@ impl Drop for AtomicFile {
         if self.file.is_none() {
             return;
         }
-        // What went wrong before is what counts; remains are a nuisance, not an error.
+        // The error that stopped the writing matters; a leftover file does not.
         match self.unfinished {
             IfUnfinished::Remove => drop(fs::remove_file(&self.partial_path)),
-            // All that was handed over, and not only what filled a buffer.
+            // Everything written so far, not only full buffers.
             IfUnfinished::Keep => drop(self.flush()),
         }
     }
 }
 
-/// Writes a whole file at once.
+/// Writes a whole file atomically.
 ///
 /// # Errors
-/// What the system says.
+/// The system's error.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let mut file = AtomicFile::create(path, IfUnfinished::Remove)?;
     file.write_all(bytes)?;

@@ -1,5 +1,5 @@
-//! A gigabyte of noise, and a tenth behind a sound pass: no panic, bounded memory, an end. In a process of its own, as the
-//! process's greatest memory is what is looked at.
+//! A gigabyte of noise, and a tenth of it after a sound pass: no panic, bounded memory, bounded time. In a process of
+//! its own, because it measures the process's peak memory.
 #![allow(clippy::unwrap_used)] // Also in the helpers.
 
 mod common;
@@ -11,12 +11,12 @@ use lunarray::downlink::{Decoder, DownlinkConfig, Format, Intake};
 use lunarray::units::{StreamKind, random_stream};
 use rand::Rng;
 
-/// Of a stream whose format is not known, which is searched for either.
+/// A stream of unknown format is searched for both.
 const NOISE_BYTES: u64 = 1_000_000_000;
-/// Behind a sound pass, which tells the format.
+/// After a sound pass, which reveals the format.
 const NOISE_BYTES_BEHIND: u64 = 100_000_000;
 
-/// The greatest memory that this process has had, bytes, where the system says so.
+/// Peak memory of this process, bytes, if the system reports it.
 fn memory_bytes() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;
@@ -24,7 +24,7 @@ fn memory_bytes() -> Option<u64> {
     Some(1024 * kilobytes)
 }
 
-/// Random bytes without an end, none of which is ever kept.
+/// An endless source of random bytes.
 struct Noise(rand_chacha::ChaCha8Rng);
 
 impl Read for Noise {
@@ -34,7 +34,7 @@ impl Read for Noise {
     }
 }
 
-/// Packets found in noise behind `sound` bytes, and the format that was taken.
+/// Packets found in noise after `sound` bytes, and the format detected.
 fn receive(sound: &[u8], seed: u64) -> (u64, Option<Format>) {
     let bytes = if sound.is_empty() { NOISE_BYTES } else { NOISE_BYTES_BEHIND };
     let noise = Noise(random_stream(seed, StreamKind::Probe, [0, 0])).take(bytes);
@@ -68,7 +68,7 @@ fn a_gigabyte_of_noise_ends_in_bounded_memory() {
         // Noise holds no packet and no frame: each is checked by more bits than there are places.
         let expected = if format.is_some() { packets_sent } else { 0 };
         assert_eq!((packets, found), (expected, format));
-        // The greatest packet, a few chunks of 256 KiB and frames: a few MiB; noise that gathered would show at once.
+        // The longest packet, a few chunks of 256 KiB and frames: a few MiB. Noise that piled up would exceed this at once.
         if let Some((before, after)) = before.zip(memory_bytes()) {
             assert!(after - before < 32 << 20, "{} MiB", (after - before) >> 20);
         }

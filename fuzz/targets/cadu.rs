@@ -1,4 +1,4 @@
-//! Streams of bits between two sound passes, which must survive what can be told from noise.
+//! Streams of bits between two sound passes, which must survive unless the bits imitate frames.
 #![no_main]
 
 use std::sync::LazyLock;

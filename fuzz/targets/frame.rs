@@ -1,4 +1,4 @@
-//! Frames that the code finds nothing wrong with.
+//! Frames without errors in their code.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -13,7 +13,7 @@ fuzz_target!(|data: &[u8]| {
     for part in data.chunks(DATA_BYTES) {
         let mut block = part.to_vec();
         block.resize(code.block_bytes(), 0);
-        // Version 01: others go no further.
+        // Version 01: others are rejected early.
         block[0] = block[0] & 0x3F | 0x40;
         code.encode(&mut block);
         randomize(&mut block);

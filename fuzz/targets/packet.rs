@@ -1,4 +1,4 @@
-//! Streams of packets; checks are put right, so that the fuzzer need not guess them.
+//! Streams of packets. Checksums are corrected, so that the fuzzer need not guess them.
 #![no_main]
 
 use crc_fast::{CrcAlgorithm, checksum};

@@ -1,4 +1,4 @@
-//! Payloads in packets that nothing is wrong with. What is made of them meets what the ground relies on.
+//! Payloads in sound packets. Decoded frames must meet the invariants the ground relies on.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;

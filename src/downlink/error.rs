@@ -1,4 +1,4 @@
-//! What can go wrong with a downlink as a whole; bad data in it is counted instead.
+//! Errors of a downlink as a whole. Bad data in a stream is counted instead.
 
 use std::io;
 use std::path::PathBuf;
@@ -12,19 +12,19 @@ use crate::units::InvalidValue;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum DownlinkError {
-    /// A value of the configuration that is not accepted.
+    /// A configuration value is not accepted.
     #[error(transparent)]
     Invalid(#[from] InvalidValue),
-    /// A frame was to be sent before the instrument description, which gives the time codes their epoch.
-    #[error("a frame was to be sent before the instrument description; send that one first")]
+    /// A frame precedes the instrument description, which sets the epoch of the time codes.
+    #[error("a frame was to be sent before the instrument description; send the description first")]
     NoInstrument,
-    /// A frame that the ground would refuse.
-    #[error("a frame cannot be sent: {0}")]
+    /// The ground would refuse the frame.
+    #[error("invalid frame: {0}")]
     Frame(#[from] PayloadFault),
-    /// A time that the packets' time code cannot express.
+    /// The packets' time code cannot express a time.
     #[error(
         "{time_s} s after the mission epoch lies outside 1958-2094, which the packets' time code covers; \
-             mend the epoch (epoch_tai_s = {epoch_tai_s})"
+             correct the epoch (epoch_tai_s = {epoch_tai_s})"
     )]
     Time {
         /// Mission epoch, TAI seconds since 1958.
@@ -32,32 +32,32 @@ pub enum DownlinkError {
         /// Mission time, s.
         time_s: f64,
     },
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error("{}: cannot {action}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// What was tried.
+        /// The attempted action.
         action: &'static str,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// A file without a single byte.
+    /// The file is empty.
     #[error("{}: the file is empty; expected CCSDS space packets as `lunarray simulate` writes them", path.display())]
     Empty {
         /// The file.
         path: PathBuf,
     },
-    /// Packets of another mission among those of one.
+    /// The stream describes a second instrument.
     #[error(
         "at byte {offset} of the packets: the description of another instrument than that of the packets before it; \
-         expected one mission a replay, and a state"
+        expected one mission per replay and state"
     )]
     OtherInstrument {
-        /// Place in the stream.
+        /// Offset in the stream, bytes.
         offset: u64,
     },
-    /// States that hold the same visibilities.
+    /// Two states hold the same visibilities.
     #[error(
         "the packet of APID {apid:#x} and count {count} is in the sums of both; expected states of different packets: \
          replay the files of one into the other"
@@ -68,26 +68,26 @@ pub enum DownlinkError {
         /// Packet count.
         count: u64,
     },
-    /// A socket.
+    /// An error of a socket.
     #[error(transparent)]
     Socket(#[from] crate::downlink::transport::socket::SocketError),
-    /// A downlink that was to be damaged and already is.
+    /// The input of the link simulator is damaged already.
     #[error(
-        "at byte {offset}: no sound frame or packet; expected a whole downlink, as `lunarray simulate` writes it"
+        "at byte {offset}: no sound frame or packet; expected an undamaged downlink, as `lunarray simulate` writes it"
     )]
     Unsound {
-        /// Place in it.
+        /// Offset in the downlink, bytes.
         offset: u64,
     },
-    /// What is wrong with a file.
+    /// An error that concerns a file.
     #[error("{}: {source}", path.display())]
     At {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The error.
         source: Box<DownlinkError>,
     },
-    /// Files of both formats together.
+    /// The files differ in format.
     #[error(
         "{} and {} are of different formats (packets, and coded frames of packets); replay them apart",
         other.display(), path.display()
@@ -95,10 +95,10 @@ pub enum DownlinkError {
     Mixed {
         /// The file.
         path: PathBuf,
-        /// One before it, of the other format.
+        /// An earlier file, of the other format.
         other: PathBuf,
     },
-    /// A followed file that is not what it was.
+    /// A followed file was removed, truncated or replaced.
     #[error(
         "{}: after {read} bytes of it were read, the file was removed, cut short or replaced by another; expected it to \
          grow. Replay what is there now beside what was there, with --state",
@@ -107,37 +107,37 @@ pub enum DownlinkError {
     Replaced {
         /// The file.
         path: PathBuf,
-        /// Bytes of it that were read.
+        /// Bytes that had been read.
         read: u64,
     },
-    /// A file that would be written over while it is read.
-    #[error("{}: this is the file that is read; expected another place for what is written", path.display())]
+    /// Input and output are the same file.
+    #[error("{}: input and output are the same file; expected another output file", path.display())]
     SameFile {
         /// The file.
         path: PathBuf,
     },
-    /// A file in which nothing of ours was found.
+    /// The file holds no downlink packet.
     #[error(
-        "{}: not one downlink packet in {bytes} bytes; expected CCSDS space packets with APIDs 0x101 to \
+        "{}: no downlink packet in {bytes} bytes; expected CCSDS space packets with APIDs 0x101 to \
          0x105 and CUC times (P-field 0x1F), plain or in CADUs of AOS frames, as `lunarray simulate` writes them",
         path.display()
     )]
     Foreign {
         /// The file.
         path: PathBuf,
-        /// Its length.
+        /// Its length, bytes.
         bytes: u64,
     },
 }
 
 impl DownlinkError {
-    /// The error with the file that it is about.
+    /// Adds the file that the error concerns.
     pub(crate) fn at(self, path: &std::path::Path) -> Self {
         Self::At { path: path.to_owned(), source: Box::new(self) }
     }
 }
 
-/// An error for a file of so many bytes if there was no packet in it.
+/// Requires that a file of `bytes` bytes held a packet.
 pub(crate) fn require_packets(path: &std::path::Path, bytes: u64, packets: u64) -> Result<(), DownlinkError> {
     match (bytes, packets) {
         (0, _) => Err(DownlinkError::Empty { path: path.to_owned() }),
@@ -146,7 +146,7 @@ pub(crate) fn require_packets(path: &std::path::Path, bytes: u64, packets: u64) 
     }
 }
 
-/// An error of the operating system on a file.
+/// Converts an error of the operating system on a file.
 pub(crate) fn io_error(
     path: &std::path::Path,
     action: &'static str,

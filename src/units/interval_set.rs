@@ -21,6 +21,11 @@ impl<T> Default for IntervalSet<T> {
 }
 
 impl<T: Copy + Ord> IntervalSet<T> {
+    /// A set of the intervals in `ends` (end by start), taken as they are: see [`IntervalSet::is_normalised`].
+    pub(crate) fn from_map(ends: BTreeMap<T, T>) -> Self {
+        Self { ends }
+    }
+
     /// Adds an interval.
     pub fn insert(&mut self, interval: Range<T>) {
         let Range { start, end } = self.take_merged(interval);
@@ -97,6 +102,15 @@ impl<T: Copy + Ord> IntervalSet<T> {
         self.ends.iter().map(|(start, end)| *start..*end)
     }
 
+    /// Whether no interval is empty and none overlaps or touches the next: true unless a map from outside was bad.
+    pub(crate) fn is_normalised(&self) -> bool {
+        let starts_after = self.ends.keys().skip(1).map(Some).chain([None]);
+        self.ends
+            .iter()
+            .zip(starts_after)
+            .all(|((start, end), after)| start < end && after.is_none_or(|after| end < after))
+    }
+
     /// Removes all intervals that overlap or touch `interval`; returns their union with it.
     fn take_merged(&mut self, Range { mut start, mut end }: Range<T>) -> Range<T> {
         if start >= end {
@@ -152,6 +166,18 @@ mod tests {
         assert_eq!(set.iter().collect::<Vec<_>>(), [4..5]);
     }
 
+    #[test]
+    fn a_bad_map_is_noticed() {
+        let is_normalised = |ends: &[(i64, i64)]| {
+            IntervalSet::from_map(ends.iter().copied().collect::<BTreeMap<_, _>>()).is_normalised()
+        };
+        assert!(is_normalised(&[]) && is_normalised(&[(1, 2), (3, 9)]));
+        // Empty, backwards, overlapping, touching; also where they come last.
+        for bad in [&[(4, 4)][..], &[(4, 3)], &[(1, 5), (4, 9)], &[(1, 5), (5, 9)], &[(1, 2), (4, 4)]] {
+            assert!(!is_normalised(bad), "{bad:?}");
+        }
+    }
+
     proptest! {
         #[test]
         fn it_is_a_set_of_values(
@@ -167,8 +193,7 @@ mod tests {
                     set.remove(interval.clone());
                     expected.retain(|value| !interval.contains(value));
                 }
-                let ends: Vec<_> = set.iter().map(|interval| interval.end).collect();
-                prop_assert!(set.iter().skip(1).zip(ends).all(|(interval, end)| end < interval.start));
+                prop_assert!(set.is_normalised());
                 prop_assert_eq!(set.iter().flatten().collect::<BTreeSet<_>>(), expected.clone());
                 prop_assert!((-1..70).all(|value| set.contains(value) == expected.contains(&value)));
                 prop_assert_eq!(set.is_empty(), expected.is_empty());

@@ -1,4 +1,4 @@
-//! Coded downlinks through the commands: the same maps, and ledgers that close whatever the link did.
+//! Coded downlinks through the commands: the same maps, and ledgers that close for any faults of the link.
 
 use crate::common;
 
@@ -92,7 +92,7 @@ fn a_bad_link_is_accounted_for() {
         assert_eq!(written, truth);
         assert!(!Path::new(&format!("{sound}.truth.json")).exists());
 
-        // What does not arrive is lost in the ledger, which closes or the command fails.
+        // The ledger counts what does not arrive as lost, and closes, or the command fails.
         let (of_sound, _) = replay(&place, &sound);
         let (of_bad, _) = replay(&place, &bad);
         let total = |summary: &Value, key: &str| summary["ledger"][key].as_u64().unwrap();
@@ -108,7 +108,7 @@ fn a_bad_link_is_accounted_for() {
     }
 }
 
-/// A command that goes on by itself, and what it printed at its end.
+/// A command in the background, and its output at the end.
 fn replay_of(place: &Workplace, file: &str, out: &str, more: &[&str]) -> std::process::Child {
     let mut command = std::process::Command::new(assert_cmd::cargo::cargo_bin("lunarray"));
     command.args(["replay", file, "--map", &place.pipeline, "--out", &place.path(out), "--json"]).args(more);
@@ -145,8 +145,8 @@ fn a_followed_file_has_the_format_of_those_before_it_and_stays_the_same_file() {
     let bytes = std::fs::read(&plain).unwrap();
     let growing = place.file("growing", &bytes[..bytes.len() / 2]);
     let child = replay_of(&place, &growing, "followed", &["--follow", "--idle-s", "60s"]);
-    // It has read what is there once it has made a folder and a moment has passed; sooner, it sees the short file alone,
-    // which is then not cut while it is read: give it time.
+    // It has read the file a moment after it made a folder. Cut earlier, the file would only be short, and not shrink
+    // while it is read: give it time.
     while !Path::new(&place.path("followed")).exists() {
         std::thread::sleep(std::time::Duration::from_millis(20));
     }
@@ -163,7 +163,7 @@ fn a_sound_file_is_not_written_over_by_its_damaged_self() {
     let file = place.simulate("plain.ccsds", &[]);
     let before = std::fs::read(&file).unwrap();
     let said = fail(&["corrupt", &file, "--out", &file, "--frame-loss", "0.5"]);
-    assert!(said.contains("the file that is read"), "{said}");
+    assert!(said.contains("the same file"), "{said}");
     assert!(std::fs::read(&file).unwrap() == before);
 }
 

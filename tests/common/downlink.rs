@@ -7,7 +7,7 @@ use lunarray::frames::{
 use lunarray::units::{ChannelId, MissionTime, Pair};
 use num_complex::Complex32;
 
-/// So many passes of two channels and two pairs, with so many visibilities a block.
+/// A number of passes with two channels and two pairs, and a number of visibilities per block.
 pub fn mission(passes: i64, visibilities: u32) -> Vec<GroundFrame> {
     let channel = |frequency_hz| Channel { frequency_hz, width_hz: 8e3 };
     let mut frames = vec![GroundFrame::Instrument(Instrument {
@@ -52,7 +52,7 @@ fn block(channel: u16, j: u8, start: MissionTime, count: u32) -> VisibilityBlock
     }
 }
 
-/// The bytes that frames become.
+/// Encodes frames as bytes.
 pub fn transmit(frames: &[GroundFrame], config: &DownlinkConfig) -> Vec<u8> {
     let mut transmission = Transmission::new(config).unwrap();
     let mut bytes = Vec::new();
@@ -63,7 +63,7 @@ pub fn transmit(frames: &[GroundFrame], config: &DownlinkConfig) -> Vec<u8> {
     bytes
 }
 
-/// Packets one after the other, by their length fields.
+/// Splits bytes into packets by their length fields.
 pub fn packets_of(mut bytes: &[u8]) -> Vec<Vec<u8>> {
     let mut packets = Vec::new();
     while let [_, _, _, _, high, low, ..] = *bytes {

@@ -1,4 +1,4 @@
-//! The coded link: what goes into frames comes out of them, whatever happens to the bits.
+//! The coded link: packets survive framing, coding and damage to the bits.
 
 use crate::common;
 
@@ -16,7 +16,7 @@ fn config(interleave: usize) -> DownlinkConfig {
     DownlinkConfig { format: Format::Cadu, interleave, ..DownlinkConfig::default() }
 }
 
-/// Packets that were recovered, and the account.
+/// Recovered packets, and the counters.
 fn receive(stream: &[u8], chunk: usize) -> (Vec<u8>, FrameCounters) {
     let mut receiver = CaduReceiver::new();
     let mut recovered = Vec::new();
@@ -27,7 +27,7 @@ fn receive(stream: &[u8], chunk: usize) -> (Vec<u8>, FrameCounters) {
     (recovered, receiver.counters())
 }
 
-/// The stream behind so many more bits.
+/// The stream after a number of extra bits.
 fn shifted(stream: &[u8], bits: usize) -> Vec<u8> {
     let mut out = vec![0x55; bits / 8];
     let shift = bits % 8;
@@ -110,7 +110,7 @@ fn sound_frames_among_spoilt_ones_are_all_found() {
         let coded = transmit(&frames, &config(interleave));
         let cadu = 4 + 255 * interleave;
         for has_marker in [true, false] {
-            // Six frames with a spoilt one before each, when nothing is known of the stream yet, and one at the end.
+            // Six frames, each after a damaged one, while nothing is known of the stream, and one at the end.
             let mut stream = Vec::new();
             for (k, sound) in coded.chunks(cadu).enumerate() {
                 if k < 6 || (k + 1) * cadu == coded.len() {
@@ -217,7 +217,7 @@ fn noise_holds_no_frame_and_takes_bounded_memory() {
     for _ in 0..20 {
         random.fill_bytes(&mut noise);
         noise.chunks(1 << 16).for_each(|chunk| receiver.push(chunk, &mut recovered));
-        // A chunk, what is let go of at once, and two of the longest frames, twice for growth.
+        // A chunk, the spent bytes, and two of the longest frames, twice for growth.
         assert!(receiver.held_bytes() < 2 * ((1 << 16) + (1 << 18) + 2 * 2_044), "{}", receiver.held_bytes());
     }
     receiver.finish(&mut recovered);
@@ -238,14 +238,14 @@ fn noise_around_a_stream_costs_nothing_of_it() {
     let (recovered, account) = receive(&stream, 100_000);
     assert!(recovered == sent);
     assert_eq!(account.frames * 1279, coded.len() as u64);
-    // Noise is passed over, but for what might have been whole frames.
+    // Noise is skipped, except for what might have been whole frames.
     assert!(
         account.bits_skipped + 8 * 1279 * account.frames_uncorrectable + 8 * account.bytes_truncated
             >= 24_000_000
     );
 }
 
-/// A frame of which so many octets at its beginning or end have come, and what follows.
+/// A frame truncated at its beginning or end, and what follows.
 fn cut(coded: &[u8], cadu: usize, at: usize, left: usize, keep_end: bool) -> Vec<u8> {
     let (before, rest) = coded.split_at(at * cadu);
     let (this, after) = rest.split_at(cadu);
@@ -254,7 +254,7 @@ fn cut(coded: &[u8], cadu: usize, at: usize, left: usize, keep_end: bool) -> Vec
 
 #[test]
 fn a_frame_cut_anywhere_costs_no_other() {
-    // Few octets too early or too late, frames are corrected to their own rotations at depths 1, 2, 4 and 8.
+    // A few octets too early or too late, frames are corrected to their own rotations at depths 1, 2, 4 and 8.
     let frames = mission(1, 60);
     for interleave in INTERLEAVES {
         let coded = transmit(&frames, &config(interleave));
@@ -311,22 +311,22 @@ fn a_stream_of_markers_costs_no_more_than_its_length_earns() {
             let (mut receiver, mut recovered) = (CaduReceiver::new(), Vec::new());
             for chunk in stream.chunks(10_000) {
                 receiver.push(chunk, &mut recovered);
-                // What has been looked at when the last was afforded, and one more look at every depth: 23 codewords
-                // and as many again behind and for the best of them.
+                // The work before the last place was afforded, and one more place at every depth: 23 codewords, and as
+                // many again after it and for the best of them.
                 let earned = 4 * receiver.counters().bytes + (1 << 20) + 3 * 23 * 255;
                 assert!(receiver.octets_decoded() <= earned, "{name}, {known}");
             }
             receiver.finish(&mut recovered);
             let account = receiver.counters();
-            // The stream behind is found once a look at all depths is earned again: 18 kB at four octets each, that is
-            // four frames; twice that, because the markers before count as places too.
+            // The stream that follows is found once a check at all depths is affordable again: 18 kB at four octets each,
+            // that is four frames; twice that, because the markers before count as places too.
             let frames = (first.len() + sound.len()) as u64 / 1279;
             assert!(account.frames + 8 >= frames, "{name}, {known}: {account:?}");
         }
     }
 }
 
-/// A CADU of one codeword with that frame.
+/// A CADU of one codeword with a given frame.
 fn cadu_of(frame: &[u8]) -> Vec<u8> {
     let code = ReedSolomon::new(1).unwrap();
     let mut block = frame.to_vec();
@@ -352,13 +352,13 @@ proptest! {
         for (channel, count, pointer, start, length) in &frames {
             let mut frame = vec![0; DATA_BYTES];
             frame[..2].copy_from_slice(&(1_u16 << 14 | 5 << 6 | u16::from(*channel)).to_be_bytes());
-            // Counts about the wrap of 24 bits.
+            // Counts near the wrap of 24 bits.
             frame[2..5].copy_from_slice(&(0xFF_FFF0_u32.wrapping_add(*count)).to_be_bytes()[1..]);
             frame[6..8].copy_from_slice(&pointer.to_be_bytes());
             for part in frame[8..].chunks_mut(24) {
                 part.copy_from_slice(&start[..part.len()]);
             }
-            // Where a packet is said to begin: one of some hundred bytes, or of any length.
+            // Where a packet is claimed to begin: one of some hundred bytes, or of any length.
             if let Some(field) = frame.get_mut(12 + usize::from(*pointer)..14 + usize::from(*pointer)).filter(|_| *length > 0) {
                 field.copy_from_slice(&(u16::from(*length) * 300).to_be_bytes());
             }
@@ -374,7 +374,7 @@ proptest! {
         // Each byte of a zone is part of one packet or piece at most.
         let given = recovered.len() as u64 + account.bytes_idle_packets + account.bytes_fragments;
         prop_assert!(given <= frames.len() as u64 * (DATA_BYTES as u64 - 8));
-        // What is given are packets, one after the other.
+        // The output consists of packets.
         packets_of(&recovered);
     }
 }

@@ -1,4 +1,4 @@
-//! What the ground makes of a downlink, sound or damaged.
+//! Reception of sound and damaged downlinks.
 
 use std::collections::BTreeSet;
 
@@ -90,7 +90,7 @@ fn packets(bytes: &[u8]) -> Vec<Vec<u8>> {
     packets
 }
 
-/// Frames and account of bytes that come in chunks; the account of bytes must close.
+/// Frames and counters of bytes in chunks. The byte counters must add up.
 fn receive(bytes: &[u8], chunk: usize) -> (Vec<GroundFrame>, ReceptionCounters) {
     let mut receiver = PacketReceiver::new();
     let mut decoder = Decoder::new();
@@ -116,7 +116,7 @@ fn receive(bytes: &[u8], chunk: usize) -> (Vec<GroundFrame>, ReceptionCounters) 
     (frames, counters)
 }
 
-/// Blocks that were one before the packets, in one again.
+/// Joins blocks that were split into packets.
 fn joined(frames: Vec<GroundFrame>) -> Vec<GroundFrame> {
     let mut out: Vec<GroundFrame> = Vec::new();
     for frame in frames {
@@ -170,7 +170,7 @@ fn each_lost_packet_costs_its_own_visibilities_only() {
     }
 }
 
-/// Every visibility as channel, trailing satellite, start, offset and value: what must never be wrong.
+/// Every visibility as channel, trailing satellite, start, offset and value, which must never be wrong.
 fn visibilities(frames: &[GroundFrame]) -> BTreeSet<(u16, u8, i64, u32, u32)> {
     let mut all = BTreeSet::new();
     for frame in frames {
@@ -184,7 +184,7 @@ fn visibilities(frames: &[GroundFrame]) -> BTreeSet<(u16, u8, i64, u32, u32)> {
     all
 }
 
-/// A packet with another payload, its headers and check made to fit.
+/// A packet with another payload, and matching headers and checksum.
 fn forge(packet: &[u8], change: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
     let mut header = PacketHeader::parse(packet).unwrap();
     let mut payload = packet[HEADER_BYTES..packet.len() - TRAILER_BYTES].to_vec();
@@ -197,7 +197,7 @@ fn forge(packet: &[u8], change: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
     forged
 }
 
-/// The packets of [`frames`] and where the first of each kind stands among them.
+/// The packets of [`frames`], and the index of the first of each kind.
 fn packets_and_first(kind: Kind) -> (Vec<Vec<u8>>, usize) {
     let packets = packets(&encode(&frames()));
     let first = packets.iter().position(|p| PacketHeader::parse(p).unwrap().kind == kind).unwrap();
@@ -206,7 +206,7 @@ fn packets_and_first(kind: Kind) -> (Vec<Vec<u8>>, usize) {
 
 #[test]
 fn length_fields_beyond_all_bounds_are_refused_and_counted() {
-    // Where the length stands in each record: see the payload modules.
+    // Offset of the length in each record: see the payload modules.
     let huge = (1_u64 << 60).to_le_bytes();
     for (kind, at, length) in [
         (Kind::Instrument, 0, &huge[..]),
@@ -277,7 +277,7 @@ fn a_frame_that_the_ground_would_refuse_is_not_sent() {
         assert!(error.is_err(), "{frame:?}");
         assert_eq!(bytes.len(), length);
     }
-    // Nothing of that shows in the counts of what follows.
+    // The counters of what follows are not affected.
     packetizer.encode(&GroundFrame::Visibilities(block(0, 1, 0, 3)), &mut bytes).unwrap();
     assert_eq!(PacketHeader::parse(&bytes[length..]).unwrap().count, 0);
 }
@@ -333,7 +333,7 @@ fn instrument_and_ephemeris_come_again_when_their_first_packets_are_lost() {
     assert_eq!(counters.visibilities_decoded, 20_000 - lost);
 }
 
-/// Damage to a stream of which the sound packets must survive.
+/// Damage to a stream whose sound packets must survive.
 fn survives(bytes: &[u8], damaged_packets: u64) -> Result<ReceptionCounters, TestCaseError> {
     let sent = visibilities(&frames());
     let (received, counters) = receive(bytes, 4096);
@@ -468,8 +468,8 @@ proptest! {
                 prop_assert!(block.value_k_sr.iter().all(|v| v.is_finite()));
                 prop_assert!((1..block.len()).all(|k| block.middle_s(k - 1) < block.middle_s(k)));
             }
-            // Sending it again would be allowed: it meets what is asked of a frame. A forged time within 136
-            // years of the epoch may still be one that packets' headers cannot express.
+            // The decoded frame is valid, so it may be sent again. But packets' headers may be unable to express a
+            // forged time within 136 years of the epoch.
             let mut packetizer = Packetizer::new(&DownlinkConfig::default()).unwrap();
             let mut bytes = Vec::new();
             let first = received.first().filter(|frame| matches!(frame, GroundFrame::Instrument(_)));

@@ -1,4 +1,4 @@
-//! Downlink files: written, cut short, damaged, looked through.
+//! Downlink files: written, truncated, damaged, inspected.
 
 use std::fs;
 use std::path::Path;
@@ -190,7 +190,7 @@ fn damage_is_told_with_its_place() {
     assert_eq!(contents.truncated_bytes, cut);
     assert_eq!([contents.gaps.count, contents.bad_checksums.count, contents.garbage.count], [1, 1, 1]);
     let text = contents.to_string();
-    for part in ["gaps: 1", "bad checksums: 1", "garbage: 1", "33 bytes", "cut off"] {
+    for part in ["gaps: 1", "bad checksums: 1", "garbage: 1", "33 bytes", "truncated"] {
         assert!(text.contains(part), "{part}: {text}");
     }
 }

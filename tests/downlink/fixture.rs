@@ -59,7 +59,7 @@ fn version_1_is_read() {
     assert_eq!((counters.packets(), counters.calibration.packets), (6, 1));
     let contents = Contents::read(path).unwrap();
     assert!(contents.is_sound());
-    // The file begins in the midst of a mission: counts do not begin with 0.
+    // The file begins in the middle of a mission: counts do not start at 0.
     let visibilities = contents.packets.iter().find(|row| row.kind == Kind::Visibilities).unwrap();
     assert_eq!(visibilities.first_count, Some(3 << 14));
 }

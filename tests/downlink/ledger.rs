@@ -1,7 +1,7 @@
-//! The whole chain over links with any mix of faults, onboard store and all: nothing is summed twice, and every
-//! visibility is accounted for, on the ground as in the link's truth.
+//! The whole chain, with the onboard store, over links with any mix of faults: nothing is summed twice, and every
+//! visibility is accounted for, on the ground and in the link's truth.
 //!
-//! A few dozen cases; `PROPTEST_CASES` asks for more.
+//! A few dozen cases; set `PROPTEST_CASES` for more.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, LazyLock, Mutex, PoisonError};
@@ -36,7 +36,7 @@ static ARRAY: LazyLock<Arc<Array>> = LazyLock::new(|| {
     Arc::new(Array::new(&ArrayConfig { satellites: SATELLITES, ..ArrayConfig::default() }).unwrap())
 });
 
-/// What the mother makes: every visibility has a number for its value, and positions that the map can use.
+/// The mother's output: every visibility has its number as value, and positions that the map can use.
 static FRAMES: LazyLock<Vec<GroundFrame>> = LazyLock::new(|| {
     let channel = |frequency_hz| Channel { frequency_hz, width_hz: 8e3 };
     let instrument = Instrument {
@@ -86,7 +86,7 @@ fn block(window: ObservingWindow, first: u64) -> VisibilityBlock {
     }
 }
 
-/// Everything that can be asked of the spacecraft and the link.
+/// Configuration of the spacecraft and the link.
 #[derive(Clone, Debug)]
 struct Case {
     seed: u64,
@@ -143,17 +143,17 @@ fn visibilities_by_packet(sound: &[u8]) -> BTreeMap<u64, Vec<u64>> {
     found
 }
 
-/// What the ground makes of it.
+/// The ground's result.
 struct Received {
     ledger: LedgerReport<VisibilityReason>,
     reception: ReceptionCounters,
-    /// Numbers of the visibilities that went into the sums, in order.
+    /// Numbers of the accumulated visibilities, in order.
     summed: Vec<u64>,
 }
 
 fn receive(arrived: &[u8]) -> Received {
     let account = Arc::new(Mutex::new(ReceptionCounters::default()));
-    // All that waits fits.
+    // The hold buffer never fills.
     let mut reception = Reception::new(1 << 24, 1024, Arc::clone(&account));
     let mut frames = Outlet::collect();
     for part in arrived.chunks(7_000) {
@@ -188,7 +188,7 @@ fn counts_of(ranges: &[PacketRange], kind: Kind) -> BTreeSet<u64> {
     ranges.iter().filter(|range| range.apid == kind.apid()).flat_map(PacketRange::counts).collect()
 }
 
-/// Holds a ground without a memory to the truth.
+/// Compares a ground without a state with the truth.
 fn hold_to_the_truth(sent: &Sent) {
     let Sent { sound, arrived, truth } = sent;
     let by_packet = visibilities_by_packet(sound);
@@ -196,7 +196,7 @@ fn hold_to_the_truth(sent: &Sent) {
     let all_sent: BTreeSet<u64> = by_packet.values().flatten().copied().collect();
     let of_lost = |count: &u64| by_packet[count].iter().copied();
     let lost_on_link: BTreeSet<u64> = packets_lost.iter().flat_map(of_lost).collect();
-    // The truth about the spacecraft: what is not sent has been dropped, and counted.
+    // On the spacecraft, what is not sent has been dropped and counted.
     assert_eq!(truth.visibilities_sampled, SAMPLED);
     assert_eq!(truth.visibilities_sent, all_sent.len() as u64);
     assert_eq!(truth.visibilities_sent + truth.visibilities_dropped, SAMPLED);
@@ -207,7 +207,7 @@ fn hold_to_the_truth(sent: &Sent) {
     let summed: BTreeSet<u64> = received.summed.iter().copied().collect();
     assert_eq!(summed.len(), received.summed.len(), "a visibility was summed twice");
     assert_eq!(ledger.accumulated, summed.len() as u64);
-    // What was recovered and did not go into the sums was flagged, unless nobody could read anything.
+    // Visibilities that were recovered but not accumulated are flagged, unless nothing could be decoded.
     let unread = reception.visibilities_before_instrument;
     assert!(unread == 0 || reception.instrument.packets == 0);
     let recovered = &all_sent - &lost_on_link;
@@ -222,7 +222,7 @@ fn hold_to_the_truth(sent: &Sent) {
             recovered.iter().copied().filter(|number| number % u64::from(INTEGRATIONS) % 20 != 3).collect();
         assert_eq!(summed, good);
     }
-    // What the ground says is lost, as far as the spacecraft's last word about it has come.
+    // Losses by the ground's count, as far as the last housekeeping received reports them.
     let reports_lost = counts_of(&truth.packets_lost, Kind::Housekeeping);
     let last_report_came = !reports_lost.contains(&(WINDOWS as u64 - 1));
     if last_report_came && reception.instrument.packets > 0 {
@@ -234,7 +234,7 @@ fn hold_to_the_truth(sent: &Sent) {
     assert!(ledger.sampled <= SAMPLED);
 }
 
-/// Holds a ground with a memory to the truth: packets by number.
+/// Compares a ground with a state with the truth: packets by number.
 fn hold_the_collector_to_the_truth(sent: &Sent) {
     let by_packet = visibilities_by_packet(&sent.sound);
     let mut collector = Collector::new(20_000);
@@ -267,7 +267,7 @@ fn hold_the_collector_to_the_truth(sent: &Sent) {
         let Some(taken) = state.taken(kind).filter(|taken| !taken.is_empty()) else { continue };
         let missing: BTreeSet<u64> = taken.eras().into_iter().flat_map(|era| era.missing).flatten().collect();
         let mut expected = counts_of(&sent.truth.packets_lost, kind);
-        // Behind the last that came nothing is known.
+        // Nothing is known after the last packet received.
         let end = taken.len() + missing.len() as u64;
         expected.retain(|count| *count < end);
         assert_eq!(missing, expected, "{kind}");

@@ -1,4 +1,4 @@
-//! The ground is held to the truth of a simulated link: what can be recovered is, and nothing else arrives.
+//! The ground against the truth of a simulated link: it recovers everything recoverable, and nothing else.
 
 use crate::common;
 
@@ -61,14 +61,14 @@ fn names(ranges: &[PacketRange]) -> BTreeSet<Name> {
     ranges.iter().flat_map(|range| range.counts().map(|count| (range.apid, count))).collect()
 }
 
-/// The names of all packets that were sent.
+/// Identities of all packets sent.
 fn sent_names(frames: &[GroundFrame]) -> BTreeSet<Name> {
     let sound = transmit(frames, &config(Format::Packets));
     let header = |packet: &Vec<u8>| PacketHeader::parse(packet).unwrap();
     packets_of(&sound).iter().map(header).map(|header| (header.kind.apid(), header.count)).collect()
 }
 
-/// Receives and compares with the truth: each packet that the truth does not call lost arrives, once.
+/// Receives, and compares with the truth: each packet not lost by the truth arrives once.
 fn hold_to(truth: &LinkTruth, stream: &[u8], passes: i64) -> Received {
     hold_to_truth(truth, stream, &mission(passes, 1_000))
 }
@@ -95,7 +95,7 @@ fn one_wrong_bit_in_ten_thousand_costs_no_frame() {
     let frames = received.frames.unwrap();
     assert_eq!((truth.frames_recoverable, frames.frames), (truth.frames_sent, truth.frames_sent));
     assert!(truth.bits_flipped > 500 && frames.frames_uncorrectable == 0);
-    // All that is wrong behind the markers is corrected, once for each byte.
+    // Every wrong byte after the markers is corrected, and counted once.
     let bytes_wrong = stream.iter().zip(&sound).enumerate().filter(|(at, (a, b))| at % 1279 >= 4 && a != b);
     assert_eq!(frames.bytes_corrected, bytes_wrong.count() as u64);
 }
@@ -130,7 +130,7 @@ fn a_day_of_data_loses_what_the_truth_says() {
         let received = hold_to_truth(&truth, &stream, &day);
         let found = received.frames.unwrap();
         let lost: u64 = truth.frames_lost.iter().map(|range| u64::from(range.to - range.from) + 1).sum();
-        // At 3e-3, 1e-3 of some 45,000 frames, as the test above has it.
+        // At 3e-3, 1e-3 of some 45,000 frames, as in the test above.
         assert!(frames > 40_000 && losses.contains(&lost), "{lost} of {frames}");
         assert_eq!((found.frames, found.frames_uncorrectable), (frames - lost, lost));
         if lost == 0 {
@@ -213,7 +213,7 @@ fn no_fault_changes_nothing_and_a_damaged_downlink_is_refused() {
         assert!(
             stream == sound && truth.frames_sent == truth.frames_recoverable && truth.packets_lost.is_empty()
         );
-        // In a header, which plain packets are told by too.
+        // In a header, by which plain packets are found too.
         let at = if format == Format::Cadu { 10 * 1279 + 500 } else { 3 };
         sound[at] ^= 1;
         let mut simulator = LinkSimulator::new(&LinkConfig::default(), 8, config(format).code()).unwrap();
@@ -256,14 +256,14 @@ proptest! {
         let sound = transmit(&mission(4, 1_000), &config(format));
         let (stream, truth) = damage(&sound, format, &link, seed, 10_000);
         let received = hold_to(&truth, &stream, 4);
-        // What was decoded and what was not add up to what was sent.
+        // Decoded and lost add up to sent.
         let visibilities = received.account.visibilities_decoded + received.account.visibilities_before_instrument;
         prop_assert!(visibilities <= 16_000);
     }
 
     #[test]
     fn slipped_bits_cost_their_frames_alone(seed in any::<u64>(), link in any_link(true)) {
-        // Where a slip, a cut and a burst over the next marker meet, a frame may be passed over; nothing else.
+        // Where a slip, a cut and a burst over the next marker coincide, a frame may be missed; nothing else.
         let sound = transmit(&mission(3, 1_000), &config(Format::Cadu));
         let (stream, truth) = damage(&sound, Format::Cadu, &link, seed, 10_000);
         let found: BTreeSet<Name> = receive(&stream).packets.into_iter().collect();

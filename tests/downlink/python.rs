@@ -1,4 +1,4 @@
-//! Other people's CCSDS decoders read our packets.
+//! Independent CCSDS decoders read the packets.
 
 use crate::common;
 
@@ -41,7 +41,7 @@ fn block(channel: u16, pair: Pair, start: MissionTime, count: u32) -> Visibility
     }
 }
 
-/// What was sent, for the other side to compare with; made from the frames, not from their bytes.
+/// What was sent, for comparison; derived from the frames, not from their bytes.
 fn expectation(frames: &[GroundFrame]) -> Value {
     let mut expected = json!({ "instrument": null, "ephemeris": [], "visibilities": [], "housekeeping": [] });
     let mut list = |key: &str, entry: Value| expected[key].as_array_mut().unwrap().push(entry);
@@ -108,7 +108,7 @@ fn ccsdspy_and_spacepackets_read_what_was_sent() {
         let time = end;
         frames.push(GroundFrame::Housekeeping(Housekeeping { time, sampled: 6_000, dropped: 1 }));
     }
-    // Smaller packets than usual: more segments to put together. One MiB is never reached: no repeats.
+    // Smaller packets than usual: more segments to assemble. One MiB is never reached: no repeats.
     let config = DownlinkConfig { packet_bytes_max: 2_048, ..Default::default() };
     let mut writer = DownlinkWriter::create(&path, &config).unwrap();
     for frame in &frames {

@@ -1,4 +1,4 @@
-//! A ground that listens, a spacecraft that sends, and replays at a pace: the same bits as through a file.
+//! A listening ground, a sending spacecraft, and paced replays: the same bits as through a file.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // Also in the helpers.
 
 #[path = "../common/mod.rs"]
@@ -25,7 +25,7 @@ use lunarray::downlink::{
 use lunarray::runtime::{Flow, Outlet, Source};
 use serde_json::Value;
 
-/// A pipeline in a folder, and what grounds leave in it.
+/// A pipeline in a folder, and the grounds' outputs.
 struct Place {
     workplace: Workplace,
 }
@@ -47,14 +47,14 @@ impl Place {
         self.workplace.simulate(&format!("small.{format}"), &["--format", format])
     }
 
-    /// Replays a file; the summary.
+    /// Replays a file; returns the summary.
     fn replay(&self, name: &str, file: &str, more: &[&str]) -> Value {
         let out = self.path(name);
         let fixed = ["replay", file, "--map", self.pipeline(), "--out", &out, "--json"];
         serde_json::from_str(&succeed(&[&fixed, more].concat())).unwrap()
     }
 
-    /// Starts a ground that listens.
+    /// Starts a listening ground.
     fn ground(&self, name: &str, more: &[&str]) -> Ground {
         let out = self.path(name);
         let listen =
@@ -120,12 +120,12 @@ impl Ground {
         TcpStream::connect(self.url.strip_prefix("tcp://").unwrap()).unwrap()
     }
 
-    /// Sends all of it, closes, and gives the answer.
+    /// Sends everything, closes, and returns the answer.
     fn send(&self, bytes: &[u8]) -> String {
         finish(self.connect(), bytes)
     }
 
-    /// Most memory that it had, bytes.
+    /// Peak memory, bytes.
     fn memory(&self) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
         let line = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();
@@ -144,7 +144,7 @@ impl Ground {
         }
     }
 
-    /// Its end: status, summary, all that it said.
+    /// Waits for its end: status, summary, messages.
     fn end(mut self) -> (ExitStatus, Value, String) {
         let mut text = String::new();
         self.child.stdout.take().unwrap().read_to_string(&mut text).unwrap();
@@ -168,7 +168,7 @@ impl Ground {
     }
 }
 
-/// Sends the rest, closes, and gives the answer.
+/// Sends the rest, closes, and returns the answer.
 fn finish(mut stream: TcpStream, bytes: &[u8]) -> String {
     stream.write_all(bytes).unwrap();
     stream.shutdown(Shutdown::Write).unwrap();

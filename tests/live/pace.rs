@@ -1,4 +1,4 @@
-//! Replays at a pace.
+//! Paced replays.
 
 use super::*;
 
@@ -18,14 +18,14 @@ fn a_pace_changes_no_bit() {
     for (name, file) in [("plain", &plain), ("coded", &coded)] {
         let since = Instant::now();
         let found = place.replay(name, file, &["--speed", &format!("{}", span / 1.5)]);
-        // By construction: the last packet may not go before.
+        // The last packet may not be released earlier.
         assert!(since.elapsed().as_secs_f64() >= 1.5);
         assert!(place.maps(name) == place.maps("read"), "{name}");
         assert_eq!(found["ledger"], fast["ledger"]);
     }
 }
 
-/// Replays step by step, with so many lines of input; what is said.
+/// Replays step by step with a number of input lines; returns the messages.
 fn step(place: &Place, name: &str, file: &str, step: &str, lines: usize) -> String {
     let output = assert_cmd::Command::cargo_bin("lunarray")
         .unwrap()
@@ -48,7 +48,7 @@ fn steps_are_passes_or_times() {
     let ends = |packet: &&Vec<u8>| PacketHeader::parse(packet).unwrap().kind == Kind::Housekeeping;
     let passes = packets.iter().filter(ends).count();
     assert!(passes > 4);
-    // Three passes are what two steps give.
+    // Two steps release three passes.
     let (mut left, mut three) = (3, Vec::new());
     for packet in &packets {
         if left > 0 {
@@ -64,7 +64,7 @@ fn steps_are_passes_or_times() {
         assert!(place.maps(name) == place.maps("read"), "{name}");
         let begun = format!("{name}.three");
         let said = step(&place, &begun, file, "pass", 2);
-        assert_eq!(said.matches("Enter goes on").count(), 3, "{said}");
+        assert_eq!(said.matches("Enter continues").count(), 3, "{said}");
         assert!(place.maps(&begun) == place.maps("three.out"), "{name}");
     }
     // Steps of a tenth of the time, and a little more: nine marks on the way.
@@ -73,6 +73,6 @@ fn steps_are_passes_or_times() {
     let said = step(&place, "times", &plain, &format!("{every}s"), 100);
     let mut begun: Vec<u64> = times.iter().map(|time| ((time - times[0]) / every) as u64).collect();
     begun.dedup();
-    assert_eq!(said.matches("Enter goes on").count(), begun.len() - 1, "{said}");
+    assert_eq!(said.matches("Enter continues").count(), begun.len() - 1, "{said}");
     assert!(place.maps("times") == place.maps("read"));
 }

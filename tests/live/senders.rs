@@ -1,8 +1,8 @@
-//! Senders that send what they should not, or too much.
+//! Misbehaving senders: bad data, or too much.
 
 use super::*;
 
-/// Headers that claim the greatest packet, without one.
+/// Headers that announce the longest packet, without one.
 fn claims(count: u64) -> Vec<u8> {
     let header = |count| PacketHeader {
         kind: Kind::Visibilities,
@@ -24,9 +24,9 @@ fn bad_senders_are_closed_and_counted_and_a_good_one_loses_nothing() {
     let set = ["first_packet_s_max=4", "idle_s_max=4", "garbage_bytes_max=65536", "memory_bytes_max=4194304"];
     let set = set.map(|limit| format!("downlink.listen.{limit}"));
     let set: Vec<&str> = set.iter().flat_map(|limit| ["--set", limit.as_str()]).collect();
-    // Three give sound packets: the good one, the one that falls silent, the one of another mission.
+    // Three deliver sound packets: the good one, the one that falls silent, the one of another mission.
     let ground = place.ground("heard", &[&set[..], &["--connections", "3"]].concat());
-    // Until the ground closes; what it says then may be lost with the connection.
+    // Until the ground closes; its answer may then be lost with the connection.
     let flood = |piece: &[u8]| {
         let mut stream = ground.connect();
         let mut bytes = 0_u64;
@@ -38,7 +38,7 @@ fn bad_senders_are_closed_and_counted_and_a_good_one_loses_nothing() {
     let noise: Vec<u8> =
         (0..1_u64 << 16).map(|k| (k.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 41) as u8).collect();
     let marker = [0x1A, 0xCF, 0xFC, 0x1D];
-    // Each looks like a frame's beginning; the second kind stands before blocks that are codewords.
+    // Each looks like the beginning of a frame; the second kind precedes blocks that are codewords.
     let markers: Vec<u8> = noise.chunks(3).flat_map(|noise| [&marker, noise].concat()).collect();
     let only_markers = marker.repeat(1 << 12);
     let foreign = transmit(&mission(1, 10), &DownlinkConfig::default());
@@ -46,7 +46,7 @@ fn bad_senders_are_closed_and_counted_and_a_good_one_loses_nothing() {
     let over = AtomicBool::new(false);
     std::thread::scope(|scope| {
         let (ground, packets, foreign, over) = (&ground, &packets, &foreign, &over);
-        // Sends all the while: some packets again, as long as the others are there.
+        // Sends continuously: repeats some packets while the others are connected.
         let good = scope.spawn(move || {
             let (mut stream, mut sent) = (ground.connect(), 0);
             for packets in packets.chunks(packets.len() / 20 + 1) {
@@ -167,7 +167,7 @@ fn a_ground_that_is_slower_slows_the_sender_and_keeps_its_memory() {
         }
         finish(stream, &[])
     });
-    // One look starts the listener; then the ground takes its time.
+    // One call starts the listener; then the ground stalls.
     let mut taken = 0;
     let mut out = Outlet::collect();
     let mut take = |source: &mut SocketSource| {
@@ -176,15 +176,15 @@ fn a_ground_that_is_slower_slows_the_sender_and_keeps_its_memory() {
         (flow, taken)
     };
     let (_, first) = take(&mut source);
-    // Until nothing has moved for a while.
+    // Until nothing has changed for a while.
     let mut stood = 0;
     while stood < 10 || sent.load(Ordering::Relaxed) == 0 {
         let before = sent.load(Ordering::Relaxed);
         std::thread::sleep(Duration::from_millis(50));
         stood = if sent.load(Ordering::Relaxed) == before { stood + 1 } else { 0 };
     }
-    // What is on the way: the backlog, what one connection has in hand, and what the system holds for a connection, 10
-    // MiB at the most on Linux (tcp_wmem and tcp_rmem).
+    // In transit: the backlog, one connection's buffers, and the system's buffers for a connection, at most 10 MiB on
+    // Linux (tcp_wmem and tcp_rmem).
     let on_the_way = sent.load(Ordering::Relaxed) - first;
     assert!(on_the_way < (backlog as usize) + (2 << 20) + (32 << 20), "{on_the_way} bytes");
     assert!(source.listening().status.backlog_bytes() <= backlog);

@@ -1,4 +1,4 @@
-//! Stations that send what they should: the maps are those of files.
+//! Well-behaved stations: the maps equal those from files.
 
 use super::*;
 
@@ -99,7 +99,7 @@ fn interrupted_it_leaves_maps_of_what_was_sent() {
     let packets = packets_of(&good);
     let half: usize = packets.iter().take(packets.len() / 2).map(Vec::len).sum();
     assert_eq!(ground.send(&good[..half]), format!("taken {half} bytes\n"));
-    // Another stays; when it has been taken in is not told.
+    // Another stays; when it is accepted is not reported.
     let mut stream = ground.connect();
     stream.write_all(&packets[0]).unwrap();
     std::thread::sleep(Duration::from_millis(1500));
@@ -117,7 +117,7 @@ fn interrupted_it_leaves_maps_of_what_was_sent() {
     assert!(place.maps("heard") == place.maps("read"));
     let mut answer = String::new();
     stream.read_to_string(&mut answer).unwrap();
-    assert!(answer.contains("the ground has ended its run"), "{answer}");
+    assert!(answer.contains("the ground ended its run"), "{answer}");
 }
 
 #[test]
@@ -125,7 +125,7 @@ fn listening_ends_when_nobody_sends() {
     let place = Place::new();
     let file = place.downlink("cadu");
     let ground = place.ground("heard", &["--idle-s", "3"]);
-    // Who only connects, or sends what is no packet, does not keep it up.
+    // Connections alone, or bytes without packets, do not keep it listening.
     let silent = ground.connect();
     ground.send(&std::fs::read(&file).unwrap());
     ground.wait_for("the sender closed it");

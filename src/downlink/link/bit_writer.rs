@@ -1,10 +1,10 @@
-//! Bytes behind one another at any bit.
+//! Appends bytes at any bit.
 
-/// Puts bytes behind one another; those behind a lost or added bit no longer stand where bytes do.
+/// Appends bytes to a bit stream. After a lost or added bit they are no longer aligned to bytes.
 #[derive(Debug, Default)]
 pub(super) struct BitWriter {
     bytes: Vec<u8>,
-    /// Bits of the last byte that are taken, 0 for all.
+    /// Used bits of the last byte, 0 for all.
     taken: u32,
 }
 
@@ -19,7 +19,7 @@ impl BitWriter {
         }
     }
 
-    /// Puts bytes of which one bit is lost (`None`), or before one of which another is added.
+    /// Appends bytes without one of their bits (`None`), or with another bit added before it.
     pub(super) fn slip(&mut self, bytes: &[u8], bit: usize, added: Option<bool>) {
         let (before, rest) = bytes.split_at(bit / 8);
         self.push(before);
@@ -41,17 +41,17 @@ impl BitWriter {
         self.push(after);
     }
 
-    /// Bits that have been put.
+    /// Bits written so far.
     pub(super) fn bits(&self) -> i64 {
         8 * self.bytes.len() as i64 - i64::from((8 - self.taken) % 8)
     }
 
-    /// All of it, the last byte filled up with zeros.
+    /// All bytes, the last one padded with zeros.
     pub(super) fn into_bytes(self) -> Vec<u8> {
         self.bytes
     }
 
-    /// Puts the upper bits of a byte.
+    /// Appends the upper bits of a byte.
     fn push_bits(&mut self, octet: u8, count: u32) {
         let octet = octet & (0xFF00_u16 >> count) as u8;
         match self.bytes.last_mut().filter(|_| self.taken > 0) {

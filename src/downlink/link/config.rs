@@ -5,18 +5,18 @@ use serde::{Deserialize, Serialize};
 use crate::downlink::wire::Format;
 use crate::units::{Checks, InvalidValue};
 
-/// Greatest distance of a reordered frame, and most frames that a second station repeats.
+/// Maximum delay of a reordered frame, and maximum number of frames that a second station repeats.
 const FRAMES_MAX: u64 = 1 << 20;
 
-/// The `[downlink.link]` section: all faults are off unless asked for.
+/// The `[downlink.link]` section: all faults are off by default.
 ///
-/// "Frame" is a coded frame (CADU), or a packet where packets are sent as they are.
+/// "Frame" means a coded frame (CADU), or a packet if packets are sent plain.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LinkConfig {
     /// Probability that a bit is wrong.
     pub bit_error_rate: f64,
-    /// Mean distance of bursts, bits; 0 for none. Bursts and what lies between them are the states of a
+    /// Mean distance between bursts, bits; 0 for none. Bursts and the gaps between them are the states of a
     /// Gilbert-Elliott channel.
     pub burst_every_bits: f64,
     /// Mean length of bursts, bits.
@@ -27,19 +27,19 @@ pub struct LinkConfig {
     pub frame_loss: f64,
     /// Probability that a pass does not arrive.
     pub pass_loss: f64,
-    /// Probability that a pass is cut off somewhere.
+    /// Probability that a pass is truncated.
     pub pass_cut: f64,
     /// Probability that a frame arrives twice.
     pub duplicate: f64,
-    /// Probability that a frame arrives later than it should.
+    /// Probability that a frame arrives late.
     pub reorder: f64,
-    /// Greatest number of frames that it then comes too late by.
+    /// Maximum delay of a late frame, frames.
     pub reorder_frames: u64,
     /// Probability that a pass arrives after the one that follows it.
     pub pass_swap: f64,
     /// Probability that a bit is lost or added within a coded frame.
     pub bit_slip: f64,
-    /// Frames at the end of each pass that a second station hears too, with faults of its own.
+    /// Frames at the end of each pass that a second station receives too, with faults of its own.
     pub second_station_frames: u64,
 }
 
@@ -64,7 +64,7 @@ impl Default for LinkConfig {
 }
 
 impl LinkConfig {
-    /// Whether the link does anything to what is sent over it.
+    /// Whether the link has any faults.
     #[must_use]
     pub fn is_on(&self) -> bool {
         let rates = [
@@ -81,7 +81,7 @@ impl LinkConfig {
         self.second_station_frames > 0 || rates.iter().any(|rate| *rate != 0.0)
     }
 
-    /// Everything that is wrong with the configuration for a format; empty if it is good.
+    /// All values that are invalid for a format; empty for a valid configuration.
     #[must_use]
     pub fn problems(&self, format: Format) -> Vec<InvalidValue> {
         let mut checks = Checks::of("downlink.link");

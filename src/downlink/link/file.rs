@@ -1,4 +1,4 @@
-//! The link as a stage, and between files; the truth beside what it damages.
+//! The link as a stage and between files. The truth is written beside the damaged file.
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -17,7 +17,7 @@ use crate::runtime::{Outlet, Stage, Units};
 /// Bytes read at a time.
 const READ_BYTES: usize = 1 << 18;
 
-/// Where the truth about a damaged downlink stands: beside it, `.truth.json` behind its name.
+/// Path of the truth about a damaged downlink: its name with the suffix `.truth.json`.
 #[must_use]
 pub fn truth_path(downlink: &Path) -> PathBuf {
     let mut name = downlink.as_os_str().to_owned();
@@ -31,7 +31,7 @@ fn write_truth(downlink: &Path, truth: &LinkTruth) -> Result<(), DownlinkError> 
     text.and_then(|text| write_atomically(&path, &text)).map_err(io_error(&path, "write the truth"))
 }
 
-/// The link between spacecraft and ground, where a configuration asks for faults.
+/// The link between spacecraft and ground, as a stage.
 #[derive(Debug)]
 pub struct LinkStage {
     simulator: LinkSimulator,
@@ -40,13 +40,13 @@ pub struct LinkStage {
 }
 
 impl LinkStage {
-    /// A link whose truth goes beside the file `downlink`; `None` if it is to have no faults
-    /// and no end of its rate.
+    /// A link whose truth is written beside the file `downlink`; `None` for a link without faults and without a limit
+    /// of its rate.
     ///
     /// # Errors
-    /// A bad configuration.
+    /// The configuration is invalid.
     pub fn new(config: &DownlinkConfig, seed: u64, downlink: &Path) -> Result<Option<Self>, DownlinkError> {
-        // What is dropped for want of time is to be told too.
+        // A limited rate makes the spacecraft drop data, which the truth reports too.
         if !config.link.is_on() && config.rate_bits_per_s_max == 0.0 {
             return Ok(None);
         }
@@ -87,10 +87,10 @@ impl Stage for LinkStage {
     }
 }
 
-/// Sends a sound file over a link, to another file; the truth goes beside it.
+/// Sends an undamaged file over a link to another file, and writes the truth beside it.
 ///
 /// # Errors
-/// Files that cannot be read or written, a file that is no sound downlink, a bad configuration.
+/// A file cannot be read or written; the input is not an undamaged downlink; the configuration is invalid.
 pub fn corrupt(from: &Path, to: &Path, config: &LinkConfig, seed: u64) -> Result<LinkTruth, DownlinkError> {
     if std::fs::canonicalize(to).is_ok_and(|to| std::fs::canonicalize(from).is_ok_and(|from| from == to)) {
         return Err(DownlinkError::SameFile { path: to.to_owned() });

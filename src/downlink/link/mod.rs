@@ -1,7 +1,10 @@
-//! A link that does what links do: wrong bits, bursts, losses, doubles, disorder, cuts. Seeded.
+//! A simulated link with seeded faults: bit errors, bursts, losses, duplicates, reordering, truncation.
 //!
-//! It takes a sound downlink of either format, and tells the truth about what it did: what cannot be recovered any
-//! more, by frame and by packet, whatever the receiver is like. The ground can be held to that.
+//! [`LinkSimulator`] takes an undamaged downlink of either format and records the truth: which frames and packets no
+//! receiver can recover any more. Tests hold the ground to it. [`LinkStage`] is the link in a pipeline, [`corrupt`]
+//! the link between two files.
+//!
+//! Uses `wire`, and `receive` to detect a file's format. The same seed gives the same faults, for any chunk size.
 
 mod bit_writer;
 mod config;

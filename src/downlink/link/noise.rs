@@ -1,20 +1,20 @@
-//! Wrong bits: a Gilbert-Elliott channel (Gilbert 1960, Elliott 1963).
+//! Bit errors: a Gilbert-Elliott channel (Gilbert 1960, Elliott 1963).
 
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::config::LinkConfig;
 
-/// Two states, each with a probability of wrong bits and a geometric length; one state without bursts.
+/// Two states, each with a bit error rate and a geometrically distributed length; one state if there are no bursts.
 #[derive(Debug)]
 pub(super) struct Noise {
     random: ChaCha8Rng,
-    /// Probability of wrong bits between bursts and in them.
+    /// Bit error rates between bursts and in them.
     rates: [f64; 2],
     /// Probability that a bit is the last of its state.
     ends: [f64; 2],
     in_burst: bool,
-    /// Bits that the state goes on for.
+    /// Bits left in the current state.
     left: u64,
 }
 
@@ -27,14 +27,14 @@ impl Noise {
         Self { random, rates, ends, in_burst: false, left }
     }
 
-    /// Flips bits; says where.
-    pub(super) fn spoil(&mut self, bytes: &mut [u8], mut flipped: impl FnMut(usize)) {
+    /// Flips bits, and reports their places.
+    pub(super) fn apply(&mut self, bytes: &mut [u8], mut flipped: impl FnMut(usize)) {
         let (mut at, end) = (0, 8 * bytes.len() as u64);
         while at < end {
             let state = usize::from(self.in_burst);
             let until = end.min(at.saturating_add(self.left));
             self.left -= until - at;
-            // Distances have no memory, so each stretch may begin anew.
+            // The geometric distribution has no memory, so distances may be drawn afresh in each state.
             loop {
                 at = at.saturating_add(geometric(&mut self.random, self.rates[state]));
                 if at >= until {
@@ -54,13 +54,13 @@ impl Noise {
     }
 }
 
-/// Failures before the first success of trials with a probability.
+/// Failures before the first success of independent trials.
 fn geometric(random: &mut ChaCha8Rng, probability: f64) -> u64 {
     if probability <= 0.0 {
         return u64::MAX;
     }
     let open: f64 = 1.0 - random.random::<f64>();
-    // A cast of a float too great, as when the probability is tiny, gives the greatest integer.
+    // A cast saturates at the largest integer, as for a tiny probability.
     (open.ln() / (-probability).ln_1p()) as u64
 }
 
@@ -69,13 +69,13 @@ mod tests {
     use super::*;
     use crate::units::{StreamKind, random_stream};
 
-    /// Flips in so many bytes.
+    /// Places of the flipped bits in a number of bytes.
     fn flips(config: &LinkConfig, bytes: usize) -> Vec<usize> {
         let mut noise = Noise::new(config, random_stream(1, StreamKind::Link, [0, 0]));
         let mut found = Vec::new();
         for first in (0..bytes).step_by(1_000) {
             let mut part = [0; 1_000];
-            noise.spoil(&mut part, |bit| found.push(8 * first + bit));
+            noise.apply(&mut part, |bit| found.push(8 * first + bit));
             let wrong: u32 = part.iter().map(|octet| octet.count_ones()).sum();
             assert!(found.iter().filter(|bit| **bit >= 8 * first).count() == wrong as usize);
         }

@@ -1,4 +1,4 @@
-//! What a link makes of a downlink, and the truth about it.
+//! Applies the faults of a link to a downlink, and records the truth.
 
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -17,17 +17,17 @@ use crate::units::{StreamKind, random_stream};
 #[derive(Clone, Copy, Debug)]
 struct Dispatch {
     unit: usize,
-    /// Place in the order of arrival.
+    /// Rank in the order of arrival.
     order: u64,
-    /// So many of its bytes arrive.
+    /// Number of its bytes that arrive.
     bytes: usize,
     slips: bool,
 }
 
-/// A pass that sets out.
+/// A pass on its way.
 #[derive(Debug)]
 struct Departure {
-    /// Passes sent, this one included.
+    /// Number of the pass, from 1.
     number: u64,
     pass: SentPass,
     copies: Vec<Dispatch>,
@@ -35,18 +35,18 @@ struct Departure {
     random: ChaCha8Rng,
 }
 
-/// What has become of a unit.
+/// What happened to a unit.
 #[derive(Clone, Copy, Debug, Default)]
 struct UnitOutcome {
-    /// Copies that can be recovered.
+    /// Recoverable copies.
     good: u32,
-    /// The fate of the one that got furthest of the others.
+    /// Of the other copies, the fate of the one that got furthest.
     fate: Option<FrameFate>,
 }
 
-/// Damages a downlink as a link would, pass by pass. Holds one pass, and another while it is swapped.
+/// Damages a downlink pass by pass, as a link would. Holds one pass, and a second one while two are swapped.
 ///
-/// Faults of a pass depend on the seed and its number alone.
+/// The faults of a pass depend only on the seed and its number.
 #[derive(Debug)]
 pub struct LinkSimulator {
     config: LinkConfig,
@@ -54,14 +54,14 @@ pub struct LinkSimulator {
     splitter: Splitter,
     /// A pass that arrives after the next.
     held: Option<Departure>,
-    /// Bits by which frames have been put off since the receiver last stood at the beginning of one; `None` before that.
-    /// Unless they are whole frames, it finds the next by its marker alone.
-    put_off_bits: Option<i64>,
+    /// Shift of the frames since the receiver was last in lock, bits; `None` before that. Unless the shift is a whole
+    /// number of frames, the receiver finds the next frame only by its marker.
+    shift_bits: Option<i64>,
     truth: LinkTruth,
 }
 
 impl LinkSimulator {
-    /// A link for plain packets, or for frames of that code.
+    /// A link for plain packets, or for frames with the given code.
     ///
     /// # Errors
     /// The first of [`LinkConfig::problems`].
@@ -76,15 +76,15 @@ impl LinkSimulator {
             code,
             splitter: Splitter::new(code),
             held: None,
-            put_off_bits: None,
+            shift_bits: None,
             truth,
         })
     }
 
-    /// Takes the next bytes of a sound downlink; appends what arrives to `out`.
+    /// Sends the next bytes of an undamaged downlink; appends what arrives to `out`.
     ///
     /// # Errors
-    /// Anything but a sound downlink.
+    /// The bytes are not an undamaged downlink.
     pub fn push(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         let mut passes = Vec::new();
         self.splitter.push(bytes, |pass| passes.push(pass))?;
@@ -94,10 +94,10 @@ impl LinkSimulator {
         Ok(())
     }
 
-    /// Says that all has been sent; appends what has not arrived yet to `out`.
+    /// Ends the transmission; appends what has not arrived yet to `out`.
     ///
     /// # Errors
-    /// A downlink that ends within a frame or packet.
+    /// The downlink ends within a frame or packet.
     pub fn finish(&mut self, out: &mut Vec<u8>) -> Result<&LinkTruth, DownlinkError> {
         if let Some(pass) = self.splitter.finish()? {
             self.send(pass, out);
@@ -145,12 +145,12 @@ impl LinkSimulator {
 
     fn deliver(&mut self, mut departure: Departure, out: &mut Vec<u8>) {
         let bytes = self.carry(&mut departure);
-        self.settle(&departure.pass, &departure.outcomes);
+        self.record(&departure.pass, &departure.outcomes);
         self.truth.bytes_delivered += bytes.len() as u64;
         out.extend_from_slice(&bytes);
     }
 
-    /// The copies that set out and arrive, in the order in which they do.
+    /// The copies that arrive, in the order of arrival.
     fn schedule(
         &mut self,
         pass: &SentPass,
@@ -161,7 +161,7 @@ impl LinkSimulator {
         let mut cut = (count, 0);
         if random.random_bool(self.config.pass_cut) && count > 0 {
             let unit = random.random_range(0..count);
-            // So much is missing that no code can make up for it.
+            // More is missing than any code can correct.
             cut = (unit, random.random_range(0..=pass.units[unit].bytes.len() / 2));
             self.truth.passes_cut += 1;
         }
@@ -194,7 +194,7 @@ impl LinkSimulator {
         copies
     }
 
-    /// What arrives of the copies, wrong bits and all.
+    /// The bytes that arrive, with all faults.
     fn carry(&mut self, departure: &mut Departure) -> Vec<u8> {
         let Departure { number, pass, copies, outcomes, random } = departure;
         let mut noise =
@@ -204,7 +204,7 @@ impl LinkSimulator {
             let sent = &pass.units[copy.unit].bytes;
             let mut bytes = sent[..copy.bytes].to_vec();
             let mut flips = Vec::new();
-            noise.spoil(&mut bytes, |bit| flips.push(bit));
+            noise.apply(&mut bytes, |bit| flips.push(bit));
             self.truth.copies_delivered += 1;
             self.truth.copies_damaged += u64::from(!flips.is_empty());
             self.truth.bits_flipped += flips.len() as u64;
@@ -213,10 +213,10 @@ impl LinkSimulator {
                 Some(FrameFate::CutOff)
             } else if copy.slips {
                 Some(FrameFate::Slipped)
-            } else if is_spoilt(&flips, self.code) || !self.is_found(sent.len(), &flips) {
+            } else if is_unrecoverable(&flips, self.code) || !self.is_found(sent.len(), &flips) {
                 Some(FrameFate::Spoilt)
             } else {
-                self.put_off_bits = Some(0);
+                self.shift_bits = Some(0);
                 None
             };
             outcome.good += u32::from(fate.is_none());
@@ -225,7 +225,7 @@ impl LinkSimulator {
             match self.code.filter(|_| copy.slips && copy.bytes == sent.len()) {
                 Some(code) => {
                     self.truth.copies_slipped += 1;
-                    // So far from both ends that no code can make up for it.
+                    // Farther from both ends than any code can correct.
                     let margin = 8 * (SYNC_MARKER_BYTES + 64 * code.interleave());
                     let bit = random.random_range(margin..8 * sent.len() - margin);
                     let added = random.random::<bool>().then(|| random.random());
@@ -233,29 +233,29 @@ impl LinkSimulator {
                 }
                 None => writer.push(&bytes),
             }
-            self.put_off(writer.bits() - begun - 8 * sent.len() as i64);
+            self.shift(writer.bits() - begun - 8 * sent.len() as i64);
         }
         let begun = writer.bits();
         let bytes = writer.into_bytes();
-        self.put_off(8 * bytes.len() as i64 - begun);
+        self.shift(8 * bytes.len() as i64 - begun);
         bytes
     }
 
-    fn put_off(&mut self, bits: i64) {
-        self.put_off_bits = self.put_off_bits.map(|before| before + bits);
+    fn shift(&mut self, bits: i64) {
+        self.shift_bits = self.shift_bits.map(|before| before + bits);
     }
 
-    /// Whether the receiver finds a frame of so many bytes: it stands where it is due, or its marker tells.
+    /// Whether the receiver finds a frame of `bytes` bytes: where it is due, or by its marker.
     fn is_found(&self, bytes: usize, flips: &[usize]) -> bool {
         let wrong = flips.iter().filter(|bit| **bit < 8 * SYNC_MARKER_BYTES).count();
-        let is_due = self.put_off_bits.is_some_and(|bits| bits % (8 * bytes as i64) == 0);
+        let is_due = self.shift_bits.is_some_and(|bits| bits % (8 * bytes as i64) == 0);
         self.code.is_none() || is_due || wrong <= MARKER_ERRORS_MAX as usize
     }
 
-    /// Takes the outcomes of a pass into the account.
-    fn settle(&mut self, pass: &SentPass, outcomes: &[UnitOutcome]) {
+    /// Adds the outcomes of a pass to the truth.
+    fn record(&mut self, pass: &SentPass, outcomes: &[UnitOutcome]) {
         if let Some(report) = pass.report {
-            // Of two passes that are swapped the later one says more.
+            // Counts only grow; of two swapped passes the later one has the larger.
             self.truth.visibilities_sampled = self.truth.visibilities_sampled.max(report.sampled);
             self.truth.visibilities_dropped = self.truth.visibilities_dropped.max(report.dropped);
         }
@@ -282,8 +282,9 @@ impl LinkSimulator {
     }
 }
 
-/// Whether wrong bits cost a unit: more wrong bytes in a codeword than can be corrected, or any in a packet.
-fn is_spoilt(flips: &[usize], code: Option<ReedSolomon>) -> bool {
+/// Whether bit errors make a unit unrecoverable: more wrong bytes in a codeword than can be corrected, or any in a
+/// plain packet.
+fn is_unrecoverable(flips: &[usize], code: Option<ReedSolomon>) -> bool {
     let Some(code) = code else { return !flips.is_empty() };
     let mut wrong = [0; 8];
     let mut last = None;

@@ -1,4 +1,4 @@
-//! A sound downlink, taken apart to what a link can lose: frames or packets, pass by pass.
+//! Splits an undamaged downlink into what a link can lose: passes, and frames or packets.
 
 use std::collections::BTreeMap;
 
@@ -14,10 +14,10 @@ use crate::frames::Housekeeping;
 /// Octets of a space packet's primary header.
 const PRIMARY_BYTES: usize = 6;
 
-/// Octets of a packet that are kept: more than housekeeping takes.
+/// Leading octets of a packet that are kept: more than a housekeeping packet has.
 const HEAD_BYTES: usize = 128;
 
-/// A coded frame, or a packet where packets are sent plain.
+/// A coded frame, or a packet if packets are sent plain.
 #[derive(Debug)]
 pub(super) struct Unit {
     pub(super) bytes: Vec<u8>,
@@ -25,7 +25,7 @@ pub(super) struct Unit {
     pub(super) frame: Option<(u8, u32)>,
 }
 
-/// A packet and the units that it lies in.
+/// A packet, and the units that hold it.
 #[derive(Debug)]
 pub(super) struct SentPacket {
     pub(super) apid: u16,
@@ -34,19 +34,19 @@ pub(super) struct SentPacket {
     pub(super) units: Vec<usize>,
 }
 
-/// What is sent from one window's end to the next one's. Packets never run from one pass into another.
+/// What is sent from the end of one window to the end of the next. No packet crosses from one pass into another.
 #[derive(Debug, Default)]
 pub(super) struct SentPass {
     pub(super) units: Vec<Unit>,
     pub(super) packets: Vec<SentPacket>,
-    /// The spacecraft's own counts at its end.
+    /// The spacecraft's own counts at the end of the pass.
     pub(super) report: Option<Housekeeping>,
 }
 
 impl SentPass {
-    /// Takes a packet that begins with `head`, in all of it if it is a short one.
+    /// Adds a packet that begins with `head`, or, if short, consists of it.
     fn add(&mut self, head: &[u8], units: Vec<usize>) {
-        // Idle packets have other headers than ours.
+        // Idle packets have no header of this format.
         let Some(header) = PacketHeader::parse(head) else { return };
         let payload = header.bytes - HEADER_BYTES - TRAILER_BYTES;
         let visibilities =
@@ -59,7 +59,7 @@ impl SentPass {
     }
 }
 
-/// A packet of which not all has been seen.
+/// An incomplete packet.
 #[derive(Debug, Default)]
 struct Open {
     head: Vec<u8>,
@@ -67,10 +67,10 @@ struct Open {
     units: Vec<usize>,
 }
 
-/// Takes a sound downlink apart; holds one pass.
+/// Splits an undamaged downlink; holds one pass.
 #[derive(Debug)]
 pub(super) struct Splitter {
-    /// Of coded frames.
+    /// Code of the frames; `None` for plain packets.
     code: Option<ReedSolomon>,
     buffer: Vec<u8>,
     offset: u64,
@@ -79,15 +79,15 @@ pub(super) struct Splitter {
 }
 
 impl Splitter {
-    /// For coded frames, or for plain packets.
+    /// A splitter for frames with the given code, or for plain packets.
     pub(super) fn new(code: Option<ReedSolomon>) -> Self {
         Self { code, buffer: Vec::new(), offset: 0, pass: SentPass::default(), open: BTreeMap::new() }
     }
 
-    /// Takes the next bytes; gives each pass that they complete to `done`.
+    /// Takes the next bytes; passes each completed pass to `done`.
     ///
     /// # Errors
-    /// Anything but a sound downlink.
+    /// The bytes are not an undamaged downlink.
     pub(super) fn push(&mut self, bytes: &[u8], mut done: impl FnMut(SentPass)) -> Result<(), DownlinkError> {
         self.buffer.extend_from_slice(bytes);
         let buffer = std::mem::take(&mut self.buffer);
@@ -108,10 +108,10 @@ impl Splitter {
         Ok(())
     }
 
-    /// What is left at the end, if anything.
+    /// Ends the stream; returns the last pass, if it is not empty.
     ///
     /// # Errors
-    /// An unfinished frame or packet.
+    /// The stream ends within a frame or packet.
     pub(super) fn finish(&mut self) -> Result<Option<SentPass>, DownlinkError> {
         if !self.buffer.is_empty() {
             return Err(self.unsound());
@@ -124,7 +124,7 @@ impl Splitter {
         DownlinkError::Unsound { offset: self.offset }
     }
 
-    /// The packet that comes next: its bytes, and whether a pass ends with it.
+    /// Takes the next packet; returns its length and whether a pass ends with it.
     fn take_packet(&mut self, rest: &[u8]) -> Result<Option<(usize, bool)>, DownlinkError> {
         if rest.len() < HEADER_BYTES {
             return Ok(None);
@@ -137,7 +137,7 @@ impl Splitter {
         Ok(Some((header.bytes, header.kind == Kind::Housekeeping)))
     }
 
-    /// The coded frame that comes next: its bytes, and whether a pass may end with it.
+    /// Takes the next coded frame; returns its length and whether a pass may end with it.
     fn take_frame(&mut self, rest: &[u8], code: ReedSolomon) -> Result<Option<(usize, bool)>, DownlinkError> {
         let Some(bytes) = rest.get(..SYNC_MARKER_BYTES + code.block_bytes()) else { return Ok(None) };
         let (marker, block) = bytes.split_at(SYNC_MARKER_BYTES);

@@ -1,4 +1,4 @@
-//! What became of everything that was sent over a simulated link.
+//! What happened to everything that was sent over a simulated link.
 
 use std::fmt;
 use std::ops::RangeInclusive;
@@ -8,19 +8,19 @@ use serde::{Deserialize, Serialize};
 use super::config::LinkConfig;
 use crate::downlink::wire::Format;
 
-/// Why a frame cannot be recovered on the ground. Of several copies the one that got furthest counts.
+/// Why a frame cannot be recovered on the ground. Of several copies, that of the one that got furthest.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FrameFate {
     /// Its pass did not arrive.
     PassLost,
-    /// Its pass was cut off before its end.
+    /// Its pass was truncated before its end.
     CutOff,
     /// It did not arrive.
     Lost,
     /// A bit was lost or added in it.
     Slipped,
-    /// More of it is wrong than can be corrected; of a plain packet, anything.
+    /// It has more errors than can be corrected; for a plain packet, any.
     Spoilt,
 }
 
@@ -33,7 +33,7 @@ pub struct LostFrames {
     pub from: u32,
     /// Count of the last.
     pub to: u32,
-    /// Why.
+    /// Reason.
     pub fate: FrameFate,
 }
 
@@ -49,7 +49,7 @@ pub struct PacketRange {
 }
 
 impl PacketRange {
-    /// Counts.
+    /// The counts.
     #[must_use]
     pub fn counts(&self) -> RangeInclusive<u64> {
         self.from..=self.to
@@ -61,7 +61,7 @@ impl PacketRange {
 pub struct LinkTruth {
     /// Seed of all faults.
     pub seed: u64,
-    /// What the link was told to do.
+    /// Configuration of the link.
     pub link: LinkConfig,
     /// Plain packets, or coded frames.
     pub format: Format,
@@ -69,21 +69,21 @@ pub struct LinkTruth {
     pub passes: u64,
     /// Passes that did not arrive.
     pub passes_lost: u64,
-    /// Passes cut off.
+    /// Passes truncated.
     pub passes_cut: u64,
-    /// Passes that arrived after the one that followed them.
+    /// Passes that arrived after their successor.
     pub passes_swapped: u64,
-    /// Frames sent (packets where these are sent plain).
+    /// Frames sent (packets if they are sent plain).
     pub frames_sent: u64,
-    /// Frames of which at least one copy can be recovered.
+    /// Frames with at least one recoverable copy.
     pub frames_recoverable: u64,
-    /// Copies that arrived, whole or not.
+    /// Copies that arrived, complete or not.
     pub copies_delivered: u64,
-    /// Copies beyond the first of frames that arrived twice.
+    /// Recoverable copies beyond the first of a frame.
     pub copies_duplicate: u64,
-    /// Copies that arrived later than they should.
+    /// Copies that arrived late.
     pub copies_delayed: u64,
-    /// Copies with wrong bits.
+    /// Copies with bit errors.
     pub copies_damaged: u64,
     /// Copies with a bit lost or added.
     pub copies_slipped: u64,
@@ -91,11 +91,11 @@ pub struct LinkTruth {
     pub bits_flipped: u64,
     /// Bytes delivered.
     pub bytes_delivered: u64,
-    /// Packets sent, idle ones left out.
+    /// Packets sent, without idle ones.
     pub packets_sent: u64,
-    /// Visibilities that the spacecraft had integrated by the end of the last pass, as she counts.
+    /// Visibilities that the spacecraft had integrated by the end of the last pass, by its own count.
     pub visibilities_sampled: u64,
-    /// Visibilities of those that she dropped because her store was full.
+    /// Visibilities that it dropped because its store was full.
     pub visibilities_dropped: u64,
     /// Visibilities sent.
     pub visibilities_sent: u64,
@@ -105,7 +105,7 @@ pub struct LinkTruth {
     pub frames_lost: Vec<LostFrames>,
     /// Packets that cannot be recovered.
     pub packets_lost: Vec<PacketRange>,
-    /// Packets of which more than one copy can be recovered.
+    /// Packets with more than one recoverable copy.
     pub packets_duplicate: Vec<PacketRange>,
 }
 
@@ -114,13 +114,13 @@ impl fmt::Display for LinkTruth {
         let what = if self.format == Format::Cadu { "coded frames" } else { "packets" };
         writeln!(
             f,
-            "passes         {} sent, {} lost, {} cut off, {} swapped",
+            "passes         {} sent, {} lost, {} truncated, {} swapped",
             self.passes, self.passes_lost, self.passes_cut, self.passes_swapped
         )?;
         writeln!(
             f,
-            "{what:<14} {} sent, {} recoverable; copies: {} delivered, {} with wrong bits ({} bits), {} slipped, {} \
-             late, {} to spare",
+            "{what:<14} {} sent, {} recoverable; copies: {} delivered, {} with bit errors ({} bits), {} slipped, {} \
+            late, {} duplicate",
             self.frames_sent,
             self.frames_recoverable,
             self.copies_delivered,

@@ -1,4 +1,4 @@
-//! What the ground has received, lost and refused.
+//! Counters of what the ground has received, lost and refused.
 
 use serde::Serialize;
 
@@ -9,34 +9,34 @@ use crate::downlink::wire::payload::PayloadFault;
 /// Packets of one kind.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct KindCounts {
-    /// Good packets, duplicates left out.
+    /// Sound packets without duplicates.
     pub packets: u64,
     /// Bytes of those.
     pub bytes: u64,
-    /// Packets whose headers hold but whose body does not.
+    /// Packets with sound headers and a bad packet checksum.
     pub damaged: u64,
-    /// Packets that had been here before.
+    /// Packets received before.
     pub duplicates: u64,
     /// Gaps in the packet count.
     pub gaps: u64,
     /// Packets in those gaps.
     pub missing: u64,
-    /// Packets that have filled a gap, or the place of a damaged one, afterwards.
+    /// Packets that filled a gap, or replaced a damaged one, later.
     pub late: u64,
-    /// Times that the spacecraft has begun to count anew.
+    /// Restarts of the packet count.
     pub restarts: u64,
-    /// Packets of payloads that could not be put together, for want of a segment.
+    /// Payloads, or parts of them, that lack a segment.
     pub orphans: u64,
 }
 
-/// Payloads that were refused although their packets' checks held, by reason.
+/// Payloads refused although their packets' checksums are right, by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct FaultCounts {
     /// Unknown format version.
     pub version: u64,
     /// Malformed record.
     pub record: u64,
-    /// Length other than the record asks for.
+    /// Length that contradicts the record.
     pub length: u64,
     /// Value out of range.
     pub value: u64,
@@ -62,25 +62,25 @@ impl FaultCounts {
     }
 }
 
-/// The account of a reception.
+/// Counters of a reception.
 ///
-/// `bytes = bytes_garbage + bytes_truncated + bytes_damaged + bytes_duplicate +` those of the kinds'
-/// packets. Visibilities in good packets are `decoded + bad_value + refused + before_instrument + foreign`.
+/// `bytes = bytes_garbage + bytes_truncated + bytes_damaged + bytes_duplicate +` those of the kinds' packets.
+/// Visibilities in sound packets are `decoded + bad_value + refused + before_instrument + foreign`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct ReceptionCounters {
-    /// Coded frames, if packets came in such; all other counts are of what was recovered from them.
+    /// Counters of coded frames, if packets came in such. All other counters are of recovered packets.
     pub frames: Option<FrameCounters>,
-    /// Bytes received; of coded frames, those of packets.
+    /// Bytes received; for coded frames, recovered packet bytes.
     pub bytes: u64,
     /// Bytes that belong to no packet.
     pub bytes_garbage: u64,
-    /// Stretches of those.
+    /// Runs of such bytes.
     pub garbage_stretches: u64,
     /// Bytes of unfinished packets at the end of a stream.
     pub bytes_truncated: u64,
     /// Bytes of damaged packets.
     pub bytes_damaged: u64,
-    /// Bytes of packets that had been here before.
+    /// Bytes of duplicate packets.
     pub bytes_duplicate: u64,
     /// Instrument descriptions.
     pub instrument: KindCounts,
@@ -92,17 +92,17 @@ pub struct ReceptionCounters {
     pub calibration: KindCounts,
     /// The spacecraft's own counts.
     pub housekeeping: KindCounts,
-    /// Payloads refused.
+    /// Refused payloads.
     pub faults: FaultCounts,
     /// Instrument descriptions that contradict the first.
     pub instruments_contradictory: u64,
-    /// Payloads other than instrument descriptions that followed a contradictory one, and were refused.
+    /// Payloads refused because they followed a contradictory instrument description.
     pub payloads_foreign: u64,
-    /// Payloads that came before any instrument description and could not be understood.
+    /// Payloads that could not be decoded because they came before any instrument description.
     pub payloads_before_instrument: u64,
-    /// Visibilities handed on.
+    /// Visibilities decoded.
     pub visibilities_decoded: u64,
-    /// Visibilities dropped because they are not finite, or of weight or duration zero.
+    /// Visibilities dropped because they are not finite, or have zero weight or duration.
     pub visibilities_bad_value: u64,
     /// Visibilities in refused payloads.
     pub visibilities_refused: u64,
@@ -135,7 +135,7 @@ impl ReceptionCounters {
         }
     }
 
-    /// Adds the account of packets and payloads of another decoder; not that of bytes between them.
+    /// Adds another decoder's counters of packets and payloads, but not those of bytes between packets.
     pub(crate) fn add(&mut self, other: &Self) {
         self.combine(other, u64::saturating_add);
     }
@@ -170,7 +170,7 @@ impl ReceptionCounters {
         combine(&mut self.visibilities_foreign, other.visibilities_foreign);
     }
 
-    /// Adds what a stream held besides sound packets: garbage, damage, a cut end, and the account of its frames.
+    /// Adds a stream's counters of everything but sound packets: garbage, damage, a truncated end, and frames.
     pub(crate) fn add_stream(&mut self, other: &Self) {
         self.bytes += other.bytes_garbage + other.bytes_truncated + other.bytes_damaged;
         self.bytes_garbage += other.bytes_garbage;
@@ -185,19 +185,19 @@ impl ReceptionCounters {
         }
     }
 
-    /// What is to be said of restarts of the spacecraft's counts, if there were any.
+    /// A sentence about restarts of the packet counts, if there were any.
     pub(crate) fn restarts_text(&self) -> Option<String> {
         let kinds = Kind::ALL.into_iter().filter(|kind| self.kind(*kind).restarts > 0);
         let times: Vec<String> = kinds.map(|kind| format!("{kind} {}", self.kind(kind).restarts)).collect();
         (!times.is_empty()).then(|| {
             format!(
-                "the spacecraft began to count anew (times: {}): what she sent last before that is not known to be missing",
+                "the spacecraft began to count anew (times: {}): losses just before a restart cannot be known",
                 times.join(", ")
             )
         })
     }
 
-    /// Good packets of all kinds.
+    /// Sound packets of all kinds.
     #[must_use]
     pub fn packets(&self) -> u64 {
         Kind::ALL.iter().map(|kind| self.kind(*kind).packets).sum()
@@ -205,7 +205,7 @@ impl ReceptionCounters {
 }
 
 impl std::fmt::Display for ReceptionCounters {
-    /// A line for each kind of packet, and one for everything that was wrong.
+    /// One line per kind of packet, then one about bad data.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         if let Some(frames) = &self.frames {
             writeln!(f, "{frames}")?;
@@ -232,7 +232,7 @@ impl std::fmt::Display for ReceptionCounters {
         }
         write!(
             f,
-            "{} bytes between packets, {} in a cut end, {} payloads refused, {} visibilities of bad value",
+            "{} bytes between packets, {} in a truncated end, {} payloads refused, {} visibilities of bad value",
             self.bytes_garbage,
             self.bytes_truncated,
             self.faults.total(),

@@ -1,4 +1,4 @@
-//! Packets to frames.
+//! Packets to ground frames.
 
 use super::{Event, Packet, ReceptionCounters};
 use crate::downlink::wire::payload::{
@@ -8,10 +8,10 @@ use crate::downlink::wire::payload::{
 use crate::downlink::wire::{CucTime, FORMAT_VERSION, Kind, PacketHeader, PacketSegment};
 use crate::frames::{GroundFrame, Instrument};
 
-/// Greatest payload that is put together from segments; a window's ephemeris is a thousandth of it.
+/// Longest payload that is assembled from segments; the ephemeris of a window is a thousandth of it.
 const PAYLOAD_BYTES_MAX: usize = 1 << 24;
 
-/// A payload of which not all segments have come.
+/// A payload that lacks segments.
 #[derive(Clone, Debug)]
 struct Partial {
     next: u64,
@@ -19,7 +19,7 @@ struct Partial {
     bytes: Vec<u8>,
 }
 
-/// What an instrument description says, compared with what is known.
+/// Whether the instrument is known, and whether the latest description agrees.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 enum Standing {
     #[default]
@@ -29,7 +29,7 @@ enum Standing {
     Contradicted,
 }
 
-/// What a decoder has learnt and counted, for another to go on with; segments of unfinished payloads left out.
+/// The state of a decoder, from which another can resume: instrument and counters, without unfinished payloads.
 #[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct DecoderState {
     instrument: Option<Instrument>,
@@ -38,17 +38,17 @@ pub struct DecoderState {
 }
 
 impl DecoderState {
-    /// The account.
+    /// The counters.
     #[must_use]
     pub fn counters(&self) -> &ReceptionCounters {
         &self.counters
     }
 }
 
-/// Makes frames of packets and keeps the account.
+/// Decodes packets into ground frames, and counts.
 ///
-/// The first instrument description holds. Identical repeats are passed over; after one that contradicts it
-/// all frames are refused until the first comes again.
+/// The first instrument description is the valid one. Identical repeats are skipped. After a contradictory one all
+/// frames are refused until the first is repeated.
 #[derive(Debug, Default)]
 pub struct Decoder {
     instrument: Option<Instrument>,
@@ -59,27 +59,27 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// A decoder that knows nothing yet.
+    /// A decoder without an instrument.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// What it knows.
+    /// Its state.
     #[must_use]
     pub fn state(&self) -> DecoderState {
         let Self { instrument, standing, counters, .. } = self;
         DecoderState { instrument: instrument.clone(), standing: *standing, counters: counters.clone() }
     }
 
-    /// A decoder that knows what another knew.
+    /// A decoder that resumes from a state.
     #[must_use]
     pub fn resume(state: DecoderState) -> Self {
         let DecoderState { instrument, standing, counters } = state;
         Self { instrument, standing, counters, ..Self::new() }
     }
 
-    /// A decoder that knows the same and has counted nothing.
+    /// A decoder with the same instrument and zero counters.
     pub(crate) fn uncounted(&self) -> Self {
         Self { instrument: self.instrument.clone(), standing: self.standing, ..Self::new() }
     }
@@ -89,7 +89,7 @@ impl Decoder {
         self.counters.subtract(counters);
     }
 
-    /// Takes what another has learnt and counted. Whether both are of one instrument; if not, nothing changes.
+    /// Merges the state of another decoder. Returns false, and changes nothing, if the instruments differ.
     pub fn absorb(&mut self, other: DecoderState) -> bool {
         let DecoderState { instrument, standing, counters, .. } = other;
         match (&self.instrument, instrument) {
@@ -101,14 +101,14 @@ impl Decoder {
         true
     }
 
-    /// Whether this is the payload of another instrument's description than the one that holds.
+    /// Whether a payload describes another instrument than the known one.
     #[must_use]
     pub fn contradicts(&self, payload: &[u8]) -> bool {
         let known = self.instrument.as_ref();
         known.is_some_and(|known| decode_instrument(payload).is_ok_and(|found| found != *known))
     }
 
-    /// Takes an event into the account; gives the frame that it completes.
+    /// Counts an event; returns the frame that it completes.
     pub fn accept(&mut self, event: &Event<'_>) -> Option<GroundFrame> {
         let counters = &mut self.counters;
         match *event {
@@ -142,26 +142,26 @@ impl Decoder {
         None
     }
 
-    /// Says that the stream is at its end: payloads that lack a segment are given up. Another stream may follow.
+    /// Ends the stream: discards incomplete payloads. Another stream may follow.
     pub fn finish(&mut self) {
         for kind in Kind::ALL {
             self.give_up(kind);
         }
     }
 
-    /// The account so far.
+    /// The counters so far.
     #[must_use]
     pub fn counters(&self) -> &ReceptionCounters {
         &self.counters
     }
 
-    /// The instrument description that holds.
+    /// The valid instrument description.
     #[must_use]
     pub fn instrument(&self) -> Option<&Instrument> {
         self.instrument.as_ref()
     }
 
-    /// The payload that was refused last: place of its last packet, and why. Said once.
+    /// The payload refused last: offset of its last packet, and the reason. Returned once.
     pub fn take_fault(&mut self) -> Option<(u64, PayloadFault)> {
         self.fault.take()
     }
@@ -184,7 +184,7 @@ impl Decoder {
         self.take_payload(packet, &whole)
     }
 
-    /// Adds a segment; gives the payload if it is the last.
+    /// Adds a segment; returns the payload if it is complete.
     fn assemble(&mut self, packet: Packet<'_>) -> Option<Vec<u8>> {
         let PacketHeader { kind, segment, count, time, .. } = packet.header;
         if segment == PacketSegment::First {
@@ -212,7 +212,7 @@ impl Decoder {
         None
     }
 
-    /// Counts the segments of a payload that will not be completed.
+    /// Discards an incomplete payload and counts it.
     fn give_up(&mut self, kind: Kind) {
         if self.partial[kind.index()].take().is_some() {
             self.counters.kind_mut(kind).orphans += 1;
@@ -273,7 +273,7 @@ impl Decoder {
         Ok(GroundFrame::Visibilities(block))
     }
 
-    /// Counts a payload that cannot be understood for want of its instrument description.
+    /// Counts a payload that cannot be decoded because its instrument description is missing.
     fn set_aside(&mut self, kind: Kind, payload: &[u8]) {
         let visibilities = if kind == Kind::Visibilities { count_visibilities(payload) } else { 0 };
         let counters = &mut self.counters;

@@ -1,4 +1,4 @@
-//! Bytes of a downlink to packets, whichever format they are in.
+//! Bytes to packets, for either format.
 
 use std::io::{self, Read};
 
@@ -11,9 +11,8 @@ const CHUNK_BYTES: usize = 1 << 18;
 
 /// Finds packets in a stream of either format, given in chunks of any size.
 ///
-/// Content tells: the format is that of which a packet or a frame is found first, none of which are found in the
-/// other by chance. Use it as a [`PacketReceiver`]. Of a coded stream, offsets of events count in the packets that
-/// were recovered from it.
+/// Detects the format by content: by the first packet or coded frame, neither of which occurs in the other format by
+/// chance. Used like a [`PacketReceiver`]. In a coded stream, offsets of events count recovered packet bytes.
 #[derive(Debug, Default)]
 pub struct Intake {
     format: Option<Format>,
@@ -32,7 +31,7 @@ impl Intake {
         Self::default()
     }
 
-    /// An intake whose receiver is [`PacketReceiver::unfiltered`].
+    /// An intake with a [`PacketReceiver::unfiltered`].
     #[must_use]
     pub fn unfiltered() -> Self {
         Self { unfiltered: true, packets: PacketReceiver::unfiltered(), ..Self::default() }
@@ -55,10 +54,10 @@ impl Intake {
         }
     }
 
-    /// Takes the next bytes from a reader; returns how many, 0 at its end.
+    /// Takes the next bytes from a reader; returns their number, 0 at its end.
     ///
     /// # Errors
-    /// Those of the reader, interruptions excepted.
+    /// Those of the reader, except interruptions.
     pub fn fill_from(&mut self, reader: &mut impl Read) -> io::Result<usize> {
         if self.format == Some(Format::Packets) {
             let bytes = self.packets.fill_from(reader)?;
@@ -80,7 +79,7 @@ impl Intake {
         read
     }
 
-    /// Says that the stream is at its end.
+    /// Ends the stream.
     pub fn finish(&mut self) {
         if self.format != Some(Format::Packets) {
             self.recovered.clear();
@@ -90,30 +89,30 @@ impl Intake {
         self.packets.finish();
     }
 
-    /// The next event; `None` until more bytes come, or when all is said.
+    /// The next event; `None` until more bytes arrive, or at the end of the stream.
     pub fn next_event(&mut self) -> Option<Event<'_>> {
-        // What garbage is can only be said once the format is known, or at the end.
+        // Bytes can be called garbage only once the format is known, or at the end.
         if self.format.is_none() && !self.packets.is_finished() {
             return None;
         }
         self.packets.next_event()
     }
 
-    /// Bytes taken so far.
+    /// Bytes received so far.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.bytes
     }
 
-    /// Memory taken for the stream, bytes.
+    /// Memory held for the stream, bytes.
     #[must_use]
     pub fn held_bytes(&self) -> usize {
         let chunks = self.chunk.capacity() + self.recovered.capacity();
         self.packets.held_bytes() + self.frames.held_bytes() + chunks
     }
 
-    /// Times that the spacecraft has begun to count packets of a kind anew, in whatever order they came.
-    pub(crate) fn restarts(&self, kind: Kind) -> u64 {
+    /// Restarts of the packet count of a kind, independent of the order of arrival.
+    pub(super) fn restarts(&self, kind: Kind) -> u64 {
         self.packets.restarts(kind)
     }
 
@@ -123,13 +122,13 @@ impl Intake {
         self.format
     }
 
-    /// The account of the frames, if there are any.
+    /// The frame counters of a coded stream.
     #[must_use]
     pub fn frames(&self) -> Option<FrameCounters> {
         (self.format == Some(Format::Cadu)).then(|| self.frames.counters())
     }
 
-    /// Hands on what the frames have given; the first frame settles the format.
+    /// Passes recovered packets on. The first frame decides the format.
     fn take_recovered(&mut self) {
         if self.format.is_none() && self.frames.has_frame() {
             self.format = Some(Format::Cadu);

@@ -1,4 +1,4 @@
-//! Bytes to packets: the ground's end, robust against whatever a link or a disk does to them.
+//! Bytes to packets, robust against any damage by a link or a disk.
 
 use std::collections::VecDeque;
 use std::io::{self, Read};
@@ -6,83 +6,82 @@ use std::io::{self, Read};
 use super::sequence::{Arrival, Sequence};
 use crate::downlink::wire::{HEADER_BYTES, Kind, PacketHeader, TRAILER_BYTES, packet_holds};
 
-/// Bytes that [`PacketReceiver::fill_from`] asks for at a time.
+/// Bytes that [`PacketReceiver::fill_from`] reads at a time.
 const CHUNK_BYTES: usize = 1 << 18;
 
-/// A packet whose checks hold.
+/// A sound packet: its checksums are right.
 #[derive(Clone, Copy, Debug)]
 pub struct Packet<'a> {
-    /// Place in the stream.
+    /// Offset in the stream, bytes.
     pub offset: u64,
     /// Its headers.
     pub header: PacketHeader,
-    /// What it carries, without headers and check.
+    /// The payload, without headers and checksum.
     pub payload: &'a [u8],
-    /// Its check, over headers and payload.
+    /// Its checksum, over headers and payload.
     pub check: u32,
-    /// Whether it fills a gap that has been reported.
+    /// Whether it fills a gap reported earlier.
     pub late: bool,
 }
 
-/// What a stream holds, in order. The bytes of all events but [`Event::Gap`] and [`Event::Restart`] together are
-/// those of the stream.
+/// What a stream contains, in order. Events other than [`Event::Gap`] and [`Event::Restart`] cover each byte of the
+/// stream exactly once.
 #[derive(Clone, Copy, Debug)]
 #[non_exhaustive]
 pub enum Event<'a> {
-    /// A packet.
+    /// A sound packet.
     Packet(Packet<'a>),
-    /// A good packet that has been here before.
+    /// A sound packet received before.
     Duplicate {
-        /// Place in the stream.
+        /// Offset in the stream, bytes.
         offset: u64,
         /// Its headers.
         header: PacketHeader,
     },
-    /// A packet whose headers hold but whose body does not.
+    /// A packet with sound headers and a bad packet checksum.
     Damaged {
-        /// Place in the stream.
+        /// Offset in the stream, bytes.
         offset: u64,
         /// Its headers.
         header: PacketHeader,
-        /// Bytes passed over: the packet, or its headers alone when no other packet follows where it
-        /// should end.
+        /// Bytes skipped: the packet, or only its headers if no other packet follows where it should end.
         bytes: u64,
     },
-    /// Packets of a kind are missing, from the count `expected` to before that of the next packet.
+    /// Packets of a kind are missing: counts from `expected` to just below that of the next packet.
     Gap {
-        /// Place of the next packet.
+        /// Offset of the next packet, bytes.
         offset: u64,
         /// Headers of the next packet.
         header: PacketHeader,
         /// Count of the first missing packet.
         expected: u64,
     },
-    /// The spacecraft has begun to count anew.
+    /// The spacecraft restarted its packet count.
     Restart {
-        /// Place of the next packet.
+        /// Offset of the next packet, bytes.
         offset: u64,
         /// Headers of the next packet.
         header: PacketHeader,
-        /// Count that was due.
+        /// The count that was due.
         expected: u64,
     },
     /// Bytes that belong to no packet.
     Garbage {
-        /// Place in the stream.
+        /// Offset in the stream, bytes.
         offset: u64,
-        /// How many.
+        /// Number of bytes.
         bytes: u64,
     },
     /// The stream ends within a packet.
     Truncated {
-        /// Place of the packet.
+        /// Offset of the packet, bytes.
         offset: u64,
-        /// Bytes of it that are there.
+        /// Bytes of it in the stream.
         bytes: u64,
     },
 }
 
-/// An event without its bytes. All but gaps consume what they cover when they are handed out.
+/// An event without its bytes. Except for gaps and restarts, handing it out consumes the bytes it covers.
 #[derive(Clone, Copy, Debug)]
 enum PendingEvent {
     Packet { header: PacketHeader, late: bool },
@@ -94,44 +93,43 @@ enum PendingEvent {
     Truncated { bytes: usize },
 }
 
-/// What stands at some place of the buffer.
+/// What begins at the first unconsumed byte.
 enum PacketMatch {
-    /// A whole packet.
+    /// A sound packet.
     Good(PacketHeader),
-    /// Headers whose packet does not hold; bytes to pass over.
+    /// Sound headers of a damaged packet; bytes to skip.
     Bad(PacketHeader, usize),
-    /// Headers of a packet that the stream ends in.
+    /// Headers of a packet in which the stream ends.
     Cut,
-    /// More bytes are needed to say.
+    /// More bytes are needed to decide.
     Unknown,
-    /// Nothing of ours.
+    /// No downlink packet.
     Nothing,
 }
 
 /// Finds packets in a stream of bytes, given in chunks of any size.
 ///
-/// Push bytes, then take events until there are none; at the end call [`PacketReceiver::finish`] and take the rest.
-/// Then the memory stays below the greatest packet plus twice the greatest chunk.
+/// Push bytes, then take events until there are none. At the end call [`PacketReceiver::finish`] and take the rest.
+/// Used so, memory stays below the longest packet plus twice the longest chunk.
 ///
-/// After damage it looks for the next headers whose check holds. Time is linear in the stream: a body is
-/// checked once for each headers with a good check of their own, which noise yields once in 10^11 bytes
-/// and a forger at most once in 22.
+/// After damage it searches for the next sound headers. Time is linear in the stream: a packet checksum is computed
+/// once per sound headers, which noise yields once in 10^11 bytes and a forger at most once in 22.
 #[derive(Debug, Default)]
 pub struct PacketReceiver {
     buffer: Vec<u8>,
-    /// Bytes of the buffer that are not yet consumed.
+    /// Unconsumed bytes of the buffer: `begin..end`.
     begin: usize,
     end: usize,
-    /// Place of `buffer[0]` in the stream.
+    /// Offset of `buffer[0]` in the stream.
     offset: u64,
-    /// Where the present run of garbage began.
+    /// Where the current run of garbage began.
     garbage_from: Option<u64>,
-    /// Where headers were met at the end whose packet is not all there.
+    /// Where, near the end, headers of an incomplete packet were found.
     cut_at: Option<u64>,
     finished: bool,
-    steps: VecDeque<PendingEvent>,
+    pending: VecDeque<PendingEvent>,
     sequences: [Sequence; Kind::ALL.len()],
-    /// Whether whoever takes the events keeps the account of packet counts.
+    /// Whether packet counts are left to the caller.
     unfiltered: bool,
 }
 
@@ -142,8 +140,8 @@ impl PacketReceiver {
         Self::default()
     }
 
-    /// A receiver that hands out every good packet, however often it comes, and says nothing of gaps: for those
-    /// who know better what has been here before.
+    /// A receiver that hands out every sound packet, duplicates too, and reports no gaps: for callers that keep a
+    /// received set of their own.
     #[must_use]
     pub fn unfiltered() -> Self {
         Self { unfiltered: true, ..Self::default() }
@@ -155,10 +153,10 @@ impl PacketReceiver {
         self.end += bytes.len();
     }
 
-    /// Takes the next bytes from a reader, without a copy in between; returns how many, 0 at its end.
+    /// Takes the next bytes from a reader without an extra copy; returns their number, 0 at its end.
     ///
     /// # Errors
-    /// Those of the reader, interruptions excepted.
+    /// Those of the reader, except interruptions.
     pub fn fill_from(&mut self, reader: &mut impl Read) -> io::Result<usize> {
         loop {
             match reader.read(self.room(CHUNK_BYTES)) {
@@ -172,55 +170,55 @@ impl PacketReceiver {
         }
     }
 
-    /// Says that the stream is at its end.
+    /// Ends the stream.
     pub fn finish(&mut self) {
         self.finished = true;
     }
 
-    /// Whether the stream is at its end.
-    pub(crate) fn is_finished(&self) -> bool {
+    /// Whether the stream has ended.
+    pub(super) fn is_finished(&self) -> bool {
         self.finished
     }
 
-    /// Whether headers of a packet, sound or damaged, are what comes next after garbage.
-    pub(crate) fn has_header(&mut self) -> bool {
-        if self.steps.is_empty() {
+    /// Whether the headers of a packet, sound or damaged, come next after garbage.
+    pub(super) fn has_header(&mut self) -> bool {
+        if self.pending.is_empty() {
             self.look();
         }
-        let of_packet = |step: &PendingEvent| {
+        let of_packet = |next: &PendingEvent| {
             matches!(
-                step,
+                next,
                 PendingEvent::Packet { .. } | PendingEvent::Duplicate(_) | PendingEvent::Damaged(..)
             )
         };
-        self.steps.iter().any(of_packet)
+        self.pending.iter().any(of_packet)
     }
 
-    /// Times that the spacecraft has begun to count packets of a kind anew, in whatever order they came.
-    pub(crate) fn restarts(&self, kind: Kind) -> u64 {
+    /// Restarts of the packet count of a kind, independent of the order of arrival.
+    pub(super) fn restarts(&self, kind: Kind) -> u64 {
         self.sequences[kind.index()].restarts()
     }
 
-    /// Bytes taken so far.
+    /// Bytes received so far.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.offset + self.end as u64
     }
 
-    /// Memory taken for bytes of the stream.
+    /// Memory held for the stream, bytes.
     #[must_use]
     pub fn held_bytes(&self) -> usize {
         self.buffer.capacity()
     }
 
-    /// The next event; `None` until more bytes come, or when all is said.
+    /// The next event; `None` until more bytes arrive, or at the end of the stream.
     pub fn next_event(&mut self) -> Option<Event<'_>> {
-        if self.steps.is_empty() {
+        if self.pending.is_empty() {
             self.look();
         }
-        let step = self.steps.pop_front()?;
+        let next = self.pending.pop_front()?;
         let offset = self.offset + self.begin as u64;
-        Some(match step {
+        Some(match next {
             PendingEvent::Packet { header, late } => {
                 let packet = &self.buffer[self.begin..self.begin + header.bytes];
                 self.begin += header.bytes;
@@ -246,7 +244,7 @@ impl PacketReceiver {
         })
     }
 
-    /// Room for so many bytes behind those in the buffer.
+    /// Space for `bytes` more bytes at the end of the buffer.
     fn room(&mut self, bytes: usize) -> &mut [u8] {
         if self.end + bytes > self.buffer.len() {
             if self.begin > 0 {
@@ -262,7 +260,7 @@ impl PacketReceiver {
         &mut self.buffer[self.end..self.end + bytes]
     }
 
-    /// Moves on to the next packet, if it is there, and lays down what is to be said.
+    /// Advances to the next packet, if it is complete, and queues its events.
     fn look(&mut self) {
         while self.begin < self.end {
             match self.find() {
@@ -281,11 +279,11 @@ impl PacketReceiver {
         }
     }
 
-    /// What stands at the beginning of the unconsumed bytes.
+    /// Examines the beginning of the unconsumed bytes.
     fn find(&self) -> PacketMatch {
         let rest = &self.buffer[self.begin..self.end];
         let Some(bytes) = rest.get(..HEADER_BYTES) else {
-            // Less than headers: the beginning of a packet if it follows one and looks like one.
+            // Too short for headers: the beginning of a packet if it follows one and looks like one.
             return match (self.finished, rest[0] == PacketHeader::FIRST_BYTE) {
                 (_, false) => PacketMatch::Nothing,
                 (false, true) => PacketMatch::Unknown,
@@ -312,7 +310,7 @@ impl PacketReceiver {
         PacketMatch::Bad(header, if another_follows { header.bytes } else { HEADER_BYTES })
     }
 
-    /// Passes over one byte and on to the next that could begin a packet.
+    /// Skips one byte, then all up to the next that could begin a packet.
     fn pass_garbage(&mut self) {
         self.garbage_from.get_or_insert(self.offset + self.begin as u64);
         self.begin += 1;
@@ -322,7 +320,7 @@ impl PacketReceiver {
 
     fn end_garbage(&mut self, end: u64) {
         if let Some(offset) = self.garbage_from.take().filter(|offset| *offset < end) {
-            self.steps.push_back(PendingEvent::Garbage { offset, bytes: end - offset });
+            self.pending.push_back(PendingEvent::Garbage { offset, bytes: end - offset });
         }
     }
 
@@ -332,7 +330,7 @@ impl PacketReceiver {
             false => self.sequences[header.kind.index()].receive(header.count, header.time),
         };
         self.announce(header, arrival);
-        self.steps.push_back(match arrival {
+        self.pending.push_back(match arrival {
             Arrival::Duplicate => PendingEvent::Duplicate(header),
             other => PendingEvent::Packet { header, late: other == Arrival::Late },
         });
@@ -344,21 +342,23 @@ impl PacketReceiver {
             false => self.sequences[header.kind.index()].pass_damaged(header.count, header.time),
         };
         self.announce(header, arrival);
-        self.steps.push_back(PendingEvent::Damaged(header, bytes));
+        self.pending.push_back(PendingEvent::Damaged(header, bytes));
     }
 
-    /// What is to be said before a packet.
+    /// Queues what precedes a packet: garbage, a gap or a restart.
     fn announce(&mut self, header: PacketHeader, arrival: Arrival) {
         self.cut_at = None;
         self.end_garbage(self.offset + self.begin as u64);
         match arrival {
-            Arrival::AfterGap { expected } => self.steps.push_back(PendingEvent::Gap { header, expected }),
-            Arrival::Restart { expected } => self.steps.push_back(PendingEvent::Restart { header, expected }),
+            Arrival::AfterGap { expected } => self.pending.push_back(PendingEvent::Gap { header, expected }),
+            Arrival::Restart { expected } => {
+                self.pending.push_back(PendingEvent::Restart { header, expected })
+            }
             Arrival::InOrder | Arrival::Late | Arrival::Early | Arrival::Duplicate => {}
         }
     }
 
-    /// The end of the stream: what is left is garbage, then perhaps the beginning of a packet.
+    /// At the end of the stream, the rest is garbage, then perhaps the beginning of a packet.
     fn take_rest(&mut self) {
         let end = self.offset + self.end as u64;
         let cut_at = self.cut_at.take().unwrap_or(end);
@@ -366,7 +366,7 @@ impl PacketReceiver {
         if cut_at < end {
             let bytes = (end - cut_at) as usize;
             self.begin = self.end - bytes;
-            self.steps.push_back(PendingEvent::Truncated { bytes });
+            self.pending.push_back(PendingEvent::Truncated { bytes });
         }
     }
 }
@@ -379,7 +379,7 @@ mod tests {
     use crate::downlink::wire::{CucTime, FORMAT_VERSION, PACKET_BYTES_MAX, PacketSegment};
     use crate::units::{StreamKind, random_stream};
 
-    /// Bytes that a stream's events cover, and what the receiver ever held; it must have read all of it.
+    /// Bytes that a stream's events cover, and the most that the receiver held. It must have read all of it.
     fn cover(stream: &mut impl Read) -> (u64, usize) {
         let mut receiver = PacketReceiver::new();
         let (mut covered, mut held) = (0, 0);
@@ -426,7 +426,7 @@ mod tests {
 
     #[test]
     fn forged_headers_without_bodies_end_in_time() {
-        // Each names the greatest packet, so that each makes the receiver check 64 KiB.
+        // Each announces the longest packet, so that each makes the receiver check 64 KiB.
         let forged: Vec<u8> = (0..20_000)
             .flat_map(|count| {
                 PacketHeader {

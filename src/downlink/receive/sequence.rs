@@ -1,4 +1,4 @@
-//! Packet counts of one kind: what is missing, late, twice.
+//! Packet counts of one kind: what is missing, late or duplicate.
 
 use std::ops::Range;
 
@@ -10,48 +10,48 @@ use crate::units::IntervalSet;
 /// times the packets of the paper's mission. Bounds the memory to some 100 MB a kind, whatever a forger sends.
 const INTERVALS_MAX: usize = 1 << 20;
 
-/// What the count of a packet says.
+/// How a packet's count relates to those before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Arrival {
-    /// The first of its kind, or the one after the last.
+pub(super) enum Arrival {
+    /// The first of its kind, or the successor of the last.
     InOrder,
     /// Packets are missing before it.
     AfterGap {
         /// The count that was due.
         expected: u64,
     },
-    /// It fills a gap that has been reported.
+    /// It fills a gap reported earlier.
     Late,
-    /// It was sent before the first of its kind that came, or before a restart.
+    /// It was sent before the first of its kind received, or before a restart.
     Early,
-    /// It has been here before.
+    /// It was received before.
     Duplicate,
-    /// Its count is lower, yet it was made later: the spacecraft has begun to count anew.
+    /// Its count is lower, yet its time is later: the spacecraft restarted its count.
     Restart {
         /// The count that was due.
         expected: u64,
     },
 }
 
-/// The counts that have arrived.
+/// The counts received so far.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Sequence {
+pub(super) struct Sequence {
     begun: bool,
-    /// Count of the packet that came first, since the last restart.
+    /// Count of the first packet since the last restart.
     first: u64,
     next: u64,
-    /// Time of the latest good packet.
+    /// Latest time of a sound packet.
     newest: CucTime,
-    /// Good packets that came.
+    /// Sound packets received.
     taken: Taken,
     /// Missing counts below `next`, in at most [`INTERVALS_MAX`] intervals.
     missing: IntervalSet<u64>,
 }
 
 impl Sequence {
-    /// Takes a packet into the account.
-    pub(crate) fn receive(&mut self, count: u64, time: CucTime) -> Arrival {
-        let arrival = self.judge(count, time);
+    /// Records a sound packet.
+    pub(super) fn receive(&mut self, count: u64, time: CucTime) -> Arrival {
+        let arrival = self.classify(count, time);
         match arrival {
             Arrival::InOrder | Arrival::AfterGap { .. } | Arrival::Restart { .. } => self.next = count + 1,
             Arrival::Late | Arrival::Early => self.fill(count),
@@ -63,10 +63,9 @@ impl Sequence {
         arrival
     }
 
-    /// Takes a damaged packet, of which the headers alone hold, into the account: its place is passed but
-    /// may still be filled.
-    pub(crate) fn pass_damaged(&mut self, count: u64, time: CucTime) -> Arrival {
-        let arrival = self.judge(count, time);
+    /// Records a damaged packet with sound headers: its count is passed, but a sound copy may still arrive.
+    pub(super) fn pass_damaged(&mut self, count: u64, time: CucTime) -> Arrival {
+        let arrival = self.classify(count, time);
         if !matches!(arrival, Arrival::Late | Arrival::Early | Arrival::Duplicate) {
             self.miss(count..count + 1);
             self.next = count + 1;
@@ -74,12 +73,12 @@ impl Sequence {
         arrival
     }
 
-    /// Times that the spacecraft has begun to count anew.
-    pub(crate) fn restarts(&self) -> u64 {
+    /// Restarts of the count.
+    pub(super) fn restarts(&self) -> u64 {
         self.taken.restarts()
     }
 
-    fn judge(&mut self, count: u64, time: CucTime) -> Arrival {
+    fn classify(&mut self, count: u64, time: CucTime) -> Arrival {
         let expected = self.next;
         if self.taken.contains(count, time) {
             return Arrival::Duplicate;
@@ -102,7 +101,7 @@ impl Sequence {
         }
     }
 
-    /// Begins with a packet: what was sent before it is no gap, but may still come.
+    /// Starts with a packet. Packets sent before it are no gap, but may still arrive.
     fn begin(&mut self, count: u64) {
         self.first = count;
         self.missing.clear();
@@ -167,7 +166,7 @@ mod tests {
         for count in 0..3 {
             assert_eq!(sequence.receive(count, at(9)), Arrival::InOrder);
         }
-        // Lower counts, the one that is due, and higher ones: none is a duplicate, none tells of a gap.
+        // Lower counts, the one that is due, and higher ones: none is a duplicate, none reveals a gap.
         for count in 0..9 {
             assert_eq!(sequence.receive(count, at(1)), Arrival::Early, "{count}");
             assert_eq!(sequence.receive(count, at(1)), Arrival::Duplicate, "{count}");
@@ -193,7 +192,7 @@ mod tests {
             sequence.receive(count, at(1));
         }
         assert_eq!(sequence.missing.intervals(), INTERVALS_MAX);
-        // The oldest are forgotten, all others are not.
+        // Only the lowest intervals are dropped.
         assert_eq!(sequence.receive(1, at(1)), Arrival::Early);
         assert_eq!(sequence.receive(2 * 500 + 1, at(1)), Arrival::Late);
         assert_eq!(sequence.receive(last - 1, at(1)), Arrival::Late);

@@ -1,96 +1,87 @@
-//! Which packets of a kind have been taken, for good.
+//! The packets of one kind received over all files and sessions.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
 
+use bincode::de::Decoder;
+use bincode::enc::Encoder;
+use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 
 use crate::downlink::wire::{COUNT_MAX, CucTime};
+use crate::units::IntervalSet;
 
-/// The packets of one kind that have been taken: an exact set of counts and the times at which they were made, whatever
-/// the order in which they came, in memory that grows with the number of those times and of gaps.
+/// The received set of one kind: packets by count and creation time, in any order of arrival. Memory grows with the
+/// number of distinct times and of gaps.
 ///
-/// Counts of 46 bits never wrap. After a restart of the spacecraft they begin anew, which packets' times tell: two
-/// packets of one count that were made at different times are two packets, of two eras.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
+/// Counts of 46 bits never wrap. They restart with the spacecraft, which the packets' times reveal: two packets with
+/// the same count and different times are two packets, of two eras.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Taken {
-    /// Stretches of counts made at one time: time and beginning, and end (one beyond the last).
-    stretches: BTreeMap<(CucTime, u64), u64>,
+    /// Intervals of counts with the same time: `(time, first)..(time, last + 1)`.
+    packets: IntervalSet<(CucTime, u64)>,
 }
 
-/// The counts between two times at which the spacecraft began to count anew, as far as packets have come.
+/// The counts received between two restarts of the spacecraft's count.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Era {
-    /// Time of its first packet that came.
+    /// Time of its first packet received.
     pub from: CucTime,
-    /// Counts that are missing: between packets that came, and from 0 to the first.
+    /// Missing counts: between packets received, and from 0 to the first.
     pub missing: Vec<Range<u64>>,
-    /// One beyond the last count that came. What was sent behind it, before the next era, is not known.
+    /// One beyond the last count received. Packets sent after it, before the next era, are unknown.
     pub end: u64,
 }
 
 impl Taken {
-    /// Takes a packet; whether it was not there before.
+    /// Adds a packet. Returns whether it is new.
     pub fn take(&mut self, count: u64, time: CucTime) -> bool {
         if self.contains(count, time) {
             return false;
         }
-        self.insert(time, count, count + 1);
+        self.packets.insert((time, count)..(time, count + 1));
         true
     }
 
-    /// Takes a packet out again.
+    /// Removes a packet.
     pub fn forget(&mut self, count: u64, time: CucTime) {
-        let Some((start, end)) = self.stretch_of(count, time) else { return };
-        self.stretches.remove(&(time, start));
-        for (from, to) in [(start, count), (count + 1, end)] {
-            if from < to {
-                self.stretches.insert((time, from), to);
-            }
-        }
+        self.packets.remove((time, count)..(time, count + 1));
     }
 
-    /// Whether a packet is among them.
+    /// Whether a packet is in the set.
     #[must_use]
     pub fn contains(&self, count: u64, time: CucTime) -> bool {
-        self.stretch_of(count, time).is_some()
+        self.packets.contains((time, count))
     }
 
-    /// Takes what another set has too.
+    /// Adds all packets of another set.
     pub fn absorb(&mut self, other: &Self) {
-        for (&(time, start), &end) in &other.stretches {
-            self.insert(time, start, end);
-        }
+        other.packets.iter().for_each(|interval| self.packets.insert(interval));
     }
 
-    /// Whether it is as taking packets makes it, which one that was read need not be: stretches of counts that packets
-    /// have, apart.
+    /// Whether a decoded set is valid: disjoint intervals of possible counts.
     pub(crate) fn is_sound(&self) -> bool {
-        let before = std::iter::once(None).chain(self.stretches.iter().map(Some));
-        before.zip(&self.stretches).all(|(before, (&(time, start), &end))| {
-            let apart = before.is_none_or(|(&(at, _), &until)| at != time || until < start);
-            apart && start < end && end <= COUNT_MAX + 1
-        })
+        self.packets.is_normalised() && self.packets.iter().all(|Range { end, .. }| end.1 <= COUNT_MAX + 1)
     }
 
     /// Number of packets.
     #[must_use]
     pub fn len(&self) -> u64 {
         // A forged set may have 2^46 packets at each of many times.
-        self.stretches.iter().fold(0, |sum: u64, ((_, start), end)| sum.saturating_add(end - start))
+        self.packets.iter().fold(0, |sum: u64, Range { start, end }| sum.saturating_add(end.1 - start.1))
     }
 
-    /// Whether none has been taken.
+    /// Whether the set is empty.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.stretches.is_empty()
+        self.packets.is_empty()
     }
 
-    /// What has come between one restart and the next: counts that go back with time are of another era.
+    /// The eras, by time: where counts decrease with time, a new one begins.
     #[must_use]
     pub fn eras(&self) -> Vec<Era> {
         let mut eras: Vec<Era> = Vec::new();
-        for (&(time, start), &end) in &self.stretches {
+        for Range { start: (time, start), end: (_, end) } in self.packets.iter() {
             if eras.last().is_none_or(|era| start < era.end) {
                 eras.push(Era { from: time, ..Era::default() });
             }
@@ -103,39 +94,37 @@ impl Taken {
         eras
     }
 
-    /// Times that the spacecraft has begun to count anew, as far as packets have come.
+    /// Number of restarts among the packets received.
     #[must_use]
     pub fn restarts(&self) -> u64 {
         let mut end = 0;
-        let goes_back = |(&(_, start), &to): (&(CucTime, u64), &u64)| start < std::mem::replace(&mut end, to);
-        self.stretches.iter().map(goes_back).filter(|goes_back| *goes_back).count() as u64
+        let decreases = |of: Range<(CucTime, u64)>| of.start.1 < std::mem::replace(&mut end, of.end.1);
+        self.packets.iter().map(decreases).filter(|decreases| *decreases).count() as u64
     }
 
-    /// Forgets the packets that were made first until no more than so many stretches are left.
-    pub(crate) fn forget_oldest(&mut self, stretches_max: usize) {
-        while self.stretches.len() > stretches_max {
-            self.stretches.pop_first();
-        }
-    }
-
-    /// Beginning and end of the stretch that a packet lies in.
-    fn stretch_of(&self, count: u64, time: CucTime) -> Option<(u64, u64)> {
-        let (&(at, start), &end) = self.stretches.range(..=(time, count)).next_back()?;
-        (at == time && count < end).then_some((start, end))
-    }
-
-    /// Adds a stretch, joined with those of its time that it meets.
-    fn insert(&mut self, time: CucTime, mut start: u64, mut end: u64) {
-        while let Some((&(at, from), &to)) = self.stretches.range(..=(time, end)).next_back() {
-            if at != time || to < start {
-                break;
-            }
-            self.stretches.remove(&(at, from));
-            (start, end) = (start.min(from), end.max(to));
-        }
-        self.stretches.insert((time, start), end);
+    /// Drops the packets with the earliest times until at most `intervals_max` intervals are left.
+    pub(super) fn forget_oldest(&mut self, intervals_max: usize) {
+        self.packets.drop_lowest(intervals_max);
     }
 }
+
+/// Stored as a map from (time, first count) to the count after the last.
+impl Encode for Taken {
+    fn encode<E: Encoder>(&self, encoder: &mut E) -> Result<(), EncodeError> {
+        (self.packets.intervals() as u64).encode(encoder)?;
+        self.packets.iter().try_for_each(|Range { start, end }| (start, end.1).encode(encoder))
+    }
+}
+
+impl<C> Decode<C> for Taken {
+    fn decode<D: Decoder<Context = C>>(decoder: &mut D) -> Result<Self, DecodeError> {
+        let ends: BTreeMap<(CucTime, u64), u64> = Decode::decode(decoder)?;
+        let ends = ends.into_iter().map(|((time, start), end)| ((time, start), (time, end)));
+        Ok(Self { packets: IntervalSet::from_map(ends.collect()) })
+    }
+}
+
+bincode::impl_borrow_decode!(Taken);
 
 #[cfg(test)]
 mod tests {
@@ -213,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn forged_stretches_are_not_sound() {
+    fn forged_intervals_are_not_sound() {
         let mut taken = Taken::default();
         for (count, s) in [(3, 1), (4, 1), (9, 2), (COUNT_MAX, 3), (2, 7)] {
             taken.take(count, at(s));
@@ -221,15 +210,28 @@ mod tests {
         assert!(taken.is_sound() && Taken::default().is_sound());
         taken.forget(3, at(1));
         assert!(taken.is_sound());
-        let forged = |stretches: &[(u64, u64)]| {
-            let stretches = stretches.iter().map(|&(start, end)| ((at(1), start), end)).collect();
-            Taken { stretches }.is_sound()
+        let forged = |intervals: &[(u64, u64)]| {
+            let ends = intervals.iter().map(|&(start, end)| ((at(1), start), (at(1), end)));
+            Taken { packets: IntervalSet::from_map(ends.collect()) }.is_sound()
         };
         assert!(forged(&[(1, 2), (3, 9)]));
         // Nothing in it, backwards, overlapping, touching, and beyond all counts.
         for bad in [&[(4, 4)][..], &[(4, 3)], &[(1, 5), (4, 9)], &[(1, 5), (5, 9)], &[(7, u64::MAX)]] {
             assert!(!forged(bad), "{bad:?}");
         }
+    }
+
+    #[test]
+    fn it_is_stored_as_a_map() {
+        let mut taken = Taken::default();
+        for (count, s) in [(3, 1), (4, 1), (9, 2), (2, 7)] {
+            assert!(taken.take(count, at(s)));
+        }
+        let map = BTreeMap::from([((at(1), 3_u64), 5_u64), ((at(2), 9), 10), ((at(7), 2), 3)]);
+        let config = bincode::config::standard();
+        let bytes = bincode::encode_to_vec(&taken, config).unwrap();
+        assert_eq!(bytes, bincode::encode_to_vec(map, config).unwrap());
+        assert_eq!(bincode::decode_from_slice(&bytes, config).unwrap(), (taken, bytes.len()));
     }
 
     #[test]

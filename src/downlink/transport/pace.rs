@@ -1,4 +1,4 @@
-//! A recorded downlink at the pace at which it was sent, faster, or step by step.
+//! Replays a recorded downlink at the pace at which it was sent, faster, or step by step.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -11,57 +11,57 @@ use crate::downlink::receive::{Event, Intake};
 use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
 use crate::runtime::{Flow, Outlet, Source, Units};
 
-/// Bytes looked at before it is asked whether they may go: far less than a coded frame.
+/// Bytes examined between two decisions about their release: far less than a coded frame.
 const PIECE_BYTES: usize = 128;
 
-/// Longest wait before it is looked whether the run has been ended.
+/// Longest wait between two checks for the end of the run.
 const POLL: Duration = Duration::from_millis(100);
 
-/// When packets may go.
+/// When packets are released.
 pub enum Pace {
-    /// So many times as fast as their times pass.
+    /// At this multiple of real time.
     Speed(f64),
-    /// Whenever somebody says so.
+    /// On request.
     Steps(Steps),
 }
 
-/// Going on by hand.
+/// Steps on request.
 pub struct Steps {
-    /// Mission time of a step, s; `None` for a pass.
+    /// Mission time of a step, s; `None` for one pass per step.
     pub every_s: Option<f64>,
-    /// A step for each message; once nobody can send any more, the stream is at its end.
+    /// One step per message. The stream ends when the channel is disconnected.
     pub go: Receiver<()>,
-    /// Is told whenever it waits.
+    /// Called whenever the stream waits for a step.
     pub tell: Teller,
 }
 
-/// What holds the stream up.
+/// What the stream waits for.
 #[derive(Clone, Copy, Debug)]
 enum Gate {
     Open,
-    /// Until then.
+    /// An instant.
     Until(Instant),
-    /// Until the next step.
+    /// The next step.
     Step,
 }
 
-/// Gives the bytes of a source, all and unchanged, but no packet before its time. Times are those at which packets
-/// were made, as their headers have them.
+/// Passes on the bytes of a source unchanged, but no packet before its time. Times are the creation times in the
+/// packets' headers.
 pub struct Paced<S> {
     source: S,
     pace: Pace,
     gate: Gate,
-    /// Finds the packets; what it finds is only looked at.
+    /// Finds the packets ahead of their release.
     scout: Intake,
-    /// Bytes that have not been given, and how many of the first of them the scout has.
+    /// Chunks not yet released, and the number of bytes of the first that the scout has examined.
     pending: VecDeque<Vec<u8>>,
     scouted: usize,
-    /// Place of the first of them in the stream.
+    /// Bytes released so far.
     given: u64,
-    /// When the first packet went, and its time.
+    /// When the first packet was released, and its time.
     start: Option<(Instant, CucTime)>,
     newest: CucTime,
-    /// Time at which the next step begins.
+    /// Packet time at which the next step begins.
     mark: CucTime,
     /// Whether a pass has ended since the last step.
     pass_over: bool,
@@ -70,7 +70,7 @@ pub struct Paced<S> {
 }
 
 impl<S> Paced<S> {
-    /// A source at a pace.
+    /// Paces a source.
     #[must_use]
     pub fn new(source: S, pace: Pace) -> Self {
         Self {
@@ -95,7 +95,7 @@ impl<S> Paced<S> {
         &self.source
     }
 
-    /// Looks at the next bytes; how many of them may go, all unless the gate closes.
+    /// Examines the next bytes. Returns how many may be released: all, unless the gate closes.
     fn scout(&mut self, bytes: &[u8]) -> usize {
         while self.scouted < bytes.len() {
             let from = self.scouted;
@@ -106,7 +106,7 @@ impl<S> Paced<S> {
             while let Some(event) = self.scout.next_event() {
                 let Event::Packet(packet) = event else { continue };
                 let (header, offset) = (packet.header, packet.offset);
-                if let Some(gate) = judge(&self.pace, self.start, (self.mark, self.pass_over), &header) {
+                if let Some(gate) = gate_for(&self.pace, self.start, self.mark, self.pass_over, &header) {
                     self.gate = gate;
                     first_held.get_or_insert(offset);
                 }
@@ -121,7 +121,7 @@ impl<S> Paced<S> {
         bytes.len()
     }
 
-    /// Takes note of a packet that goes, or will when the gate opens.
+    /// Records a packet that is released now or when the gate opens.
     fn note(&mut self, header: &PacketHeader) {
         self.start.get_or_insert_with(|| (Instant::now(), header.time));
         self.newest = self.newest.max(header.time);
@@ -138,7 +138,7 @@ impl<S> Paced<S> {
         }
     }
 
-    /// Waits a little at the gate.
+    /// Waits at the gate for at most [`POLL`].
     fn wait(&mut self) {
         match (self.gate, &self.pace) {
             (Gate::Until(due), _) => {
@@ -156,7 +156,7 @@ impl<S> Paced<S> {
         }
     }
 
-    /// Gives the first bytes of what is pending.
+    /// Releases bytes.
     fn give(&mut self, bytes: Vec<u8>, out: &mut Outlet<Vec<u8>>) {
         self.given += bytes.len() as u64;
         if !bytes.is_empty() {
@@ -164,21 +164,22 @@ impl<S> Paced<S> {
         }
     }
 
-    fn say_step(&mut self) {
+    fn announce_step(&mut self) {
         self.steps += 1;
         if let Pace::Steps(steps) = &self.pace {
             let (now, start) = (self.newest.tai_s(), self.start.map_or(0.0, |(_, time)| time.tai_s()));
             let hours = (now - start) / 3600.0;
-            (steps.tell)(&format!("step {} at {hours:.2} h: Enter goes on, end of input ends", self.steps));
+            (steps.tell)(&format!("step {} at {hours:.2} h: Enter continues, end of input ends", self.steps));
         }
     }
 }
 
-/// What a packet has to wait for, if it has to.
-fn judge(
+/// What a packet has to wait for, if anything.
+fn gate_for(
     pace: &Pace,
     start: Option<(Instant, CucTime)>,
-    (mark, pass_over): (CucTime, bool),
+    mark: CucTime,
+    pass_over: bool,
     header: &PacketHeader,
 ) -> Option<Gate> {
     let (since, time) = start?;
@@ -217,7 +218,7 @@ impl<S: Source<Out = Vec<u8>, Error = DownlinkError>> Source for Paced<S> {
         }
         self.give(bytes, out);
         if matches!(self.gate, Gate::Step) {
-            self.say_step();
+            self.announce_step();
         }
         Ok(Flow::Continue)
     }

@@ -7,7 +7,7 @@ use crate::units::{MissionTime, TICKS_PER_SECOND};
 /// P-field: no extension, time code 001 (TAI since 1958-01-01), 4 bytes of seconds, 3 of fraction.
 pub(super) const P_FIELD: u8 = 0x1F;
 
-/// Seconds of the epoch that 4 bytes can count.
+/// Latest epoch that 4 bytes of seconds can express.
 const SECONDS_MAX: f64 = u32::MAX as f64;
 
 /// TAI since 1958-01-01 in units of 2^-24 s (60 ns).
@@ -28,8 +28,8 @@ const SECONDS_MAX: f64 = u32::MAX as f64;
 pub struct CucTime(pub u64);
 
 impl CucTime {
-    /// The time code of a mission time, given the mission epoch in TAI seconds since 1958; `None` outside
-    /// 1958-2094, which the code cannot express.
+    /// The time code of a mission time, for a mission epoch in TAI seconds since 1958; `None` outside 1958-2094, which
+    /// the code cannot express.
     #[must_use]
     pub fn new(epoch_tai_s: f64, time: MissionTime) -> Option<Self> {
         if !(0.0..=SECONDS_MAX).contains(&epoch_tai_s) {
@@ -57,7 +57,7 @@ impl CucTime {
         bytes
     }
 
-    /// The time that eight bytes express; `None` if their P-field is another than ours.
+    /// The time of eight bytes; `None` if the P-field differs.
     #[must_use]
     pub fn from_bytes(mut bytes: [u8; 8]) -> Option<Self> {
         let p_field = std::mem::take(&mut bytes[0]);

@@ -1,10 +1,10 @@
-//! Packet headers: CCSDS 133.0-B, section 4.1, and our own fields behind them.
+//! Packet headers: CCSDS 133.0-B, section 4.1, followed by fields of our own.
 
 use crc_fast::{CrcAlgorithm, checksum};
 
 use super::{CucTime, Kind};
 
-/// Version of headers and payloads; a receiver skips packets of another one and counts them.
+/// Version of headers and payloads. A receiver skips packets of another version and counts them.
 pub const FORMAT_VERSION: u8 = 1;
 
 /// Bytes before the payload.
@@ -13,7 +13,7 @@ pub const HEADER_BYTES: usize = 22;
 /// Bytes after the payload: CRC-32C.
 pub const TRAILER_BYTES: usize = 4;
 
-/// Greatest packet that the 16-bit length field allows.
+/// Longest packet that the 16-bit length field allows.
 pub const PACKET_BYTES_MAX: usize = 65_542;
 
 const PRIMARY_BYTES: usize = 6;
@@ -22,10 +22,10 @@ const MAGIC: u8 = 0x4C;
 const IDENTIFICATION: u16 = 1 << 11;
 const COUNT_BITS: u32 = 14;
 
-/// Bits of a packet count.
+/// Largest packet count: 46 bits.
 pub(crate) const COUNT_MAX: u64 = (1 << 46) - 1;
 
-/// Segmentation flags: where in its payload a packet stands.
+/// Segmentation flags: which part of a payload a packet carries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 #[repr(u8)]
 pub enum PacketSegment {
@@ -44,15 +44,15 @@ pub enum PacketSegment {
 pub struct PacketHeader {
     /// Kind, by APID.
     pub kind: Kind,
-    /// Place in the payload.
+    /// Part of the payload.
     pub segment: PacketSegment,
     /// Packets of this kind sent before this one, 46 bits.
     pub count: u64,
-    /// Time at which the packet was made.
+    /// Creation time of the packet.
     pub time: CucTime,
     /// Format version.
     pub version: u8,
-    /// Bytes of the packet from the first of its headers to the last of its check.
+    /// Length of the packet from its first header byte to the last checksum byte.
     pub bytes: usize,
 }
 
@@ -80,7 +80,7 @@ impl PacketHeader {
         out
     }
 
-    /// The headers that `bytes` begin with; `None` if they are not ours or their check fails.
+    /// Parses the headers at the beginning of `bytes`; `None` for other headers or a bad checksum.
     #[must_use]
     pub fn parse(bytes: &[u8]) -> Option<Self> {
         let bytes: &[u8; HEADER_BYTES] = bytes.first_chunk()?;
@@ -110,11 +110,11 @@ impl PacketHeader {
         })
     }
 
-    /// First byte of every packet: the APIDs have their upper three bits in common.
+    /// First byte of every packet: all APIDs share their upper three bits.
     pub(crate) const FIRST_BYTE: u8 = ((IDENTIFICATION | crate::downlink::wire::APID_BASE) >> 8) as u8;
 }
 
-/// CRC-16 as CCSDS has it (0x1021, start 0xFFFF, not reflected) of the bytes before the check.
+/// CRC-16 of CCSDS (0x1021, start 0xFFFF, not reflected) of the bytes before it.
 fn header_check(bytes: &[u8; HEADER_BYTES]) -> u16 {
     checksum(CrcAlgorithm::Crc16Ibm3740, &bytes[..HEADER_BYTES - 2]) as u16
 }
@@ -124,7 +124,7 @@ pub(crate) fn packet_check(bytes: &[u8]) -> [u8; TRAILER_BYTES] {
     crc_fast::crc32_iscsi(bytes).to_be_bytes()
 }
 
-/// Whether the last four bytes of a packet are the check of the others.
+/// Whether the last four bytes of a packet are the checksum of the others.
 pub(crate) fn packet_holds(bytes: &[u8]) -> bool {
     bytes.split_last_chunk().is_some_and(|(body, check)| packet_check(body) == *check)
 }

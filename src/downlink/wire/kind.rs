@@ -4,10 +4,10 @@ use std::fmt;
 
 use serde::Serialize;
 
-/// APID of kind `k` is this plus the kind's number; chosen among the 2040 that CCSDS leaves to missions.
+/// The APID of a kind is this plus the kind's number; chosen among the 2040 that CCSDS leaves to missions.
 pub const APID_BASE: u16 = 0x100;
 
-/// What a packet carries; each kind has an APID and a packet count of its own.
+/// What a packet carries. Each kind has its own APID and packet count.
 #[derive(
     Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, bincode::Encode, bincode::Decode,
 )]
@@ -43,7 +43,7 @@ impl Kind {
         Self::ALL.into_iter().find(|kind| kind.apid() == apid)
     }
 
-    /// Place in [`Kind::ALL`].
+    /// Index in [`Kind::ALL`].
     #[must_use]
     pub fn index(self) -> usize {
         self as usize - 1

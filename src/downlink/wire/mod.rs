@@ -1,4 +1,14 @@
-//! The bytes on the link, and how they are made: payloads, space packets, coded transfer frames.
+//! The format on the link, and its encoders: payloads, space packets, coded transfer frames.
+//!
+//! | layer | encoder |
+//! |---|---|
+//! | payload | `payload` |
+//! | space packet | [`Packetizer`] |
+//! | coded frame | [`cadu::CaduEncoder`] |
+//! | either format | [`Transmission`] |
+//!
+//! Uses `frames` and `units`. The same ground frames give the same bytes; `fixtures/` holds a file to prove it. The
+//! tables of the format are in [`crate::downlink`] and [`cadu`].
 
 pub mod cadu;
 mod cuc;

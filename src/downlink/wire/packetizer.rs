@@ -1,4 +1,4 @@
-//! Frames to packets: the spacecraft's end.
+//! Ground frames to packets: the spacecraft's end.
 
 use super::payload::{
     check_visibilities, encode_ephemeris, encode_housekeeping, encode_instrument, encode_visibilities,
@@ -13,14 +13,14 @@ use crate::downlink::error::DownlinkError;
 use crate::frames::{EphemerisSegment, GroundFrame, Instrument, VisibilityBlock};
 use crate::units::MissionTime;
 
-/// Ephemeris segments that are repeated: those of one window, parted at the formation's turnarounds.
+/// Ephemeris segments that are repeated: those of one window, split at the formation's turnarounds.
 const REPEATED_SEGMENTS_MAX: usize = 8;
 
-/// Makes packets of frames.
+/// Encodes ground frames as packets.
 ///
-/// A visibility block becomes packets that stand each for itself, so that a lost one costs its own
-/// visibilities only; other payloads are segmented when they exceed a packet. The instrument description
-/// and the latest ephemeris segments are repeated now and then.
+/// A visibility block becomes packets that can each be decoded alone, so that a lost one costs only its own
+/// visibilities. Other payloads are segmented if they exceed a packet. The instrument description and the latest
+/// ephemeris segments are repeated at intervals.
 #[derive(Debug)]
 pub struct Packetizer {
     packet_bytes_max: usize,
@@ -37,7 +37,7 @@ pub struct Packetizer {
 }
 
 impl Packetizer {
-    /// A packetizer whose counts begin with 0.
+    /// A packetizer whose counts start at 0.
     ///
     /// # Errors
     /// The first of [`DownlinkConfig::problems`].
@@ -58,11 +58,11 @@ impl Packetizer {
         })
     }
 
-    /// Appends the packets of a frame to `out`; on an error `out` is as it was.
+    /// Appends the packets of a frame to `out`; leaves `out` unchanged on an error.
     ///
     /// # Errors
-    /// [`DownlinkError::NoInstrument`] unless an instrument description came first; [`DownlinkError::Frame`] for
-    /// a frame that the ground would refuse; [`DownlinkError::Time`] for a time outside 1958-2094.
+    /// [`DownlinkError::NoInstrument`] before the instrument description; [`DownlinkError::Frame`] for a frame that the
+    /// ground would refuse; [`DownlinkError::Time`] for a time outside 1958-2094.
     pub fn encode(&mut self, frame: &GroundFrame, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         let (start, counts, now) = (out.len(), self.counts, self.now);
         let result = self.repeat(out).and_then(|()| self.send(frame, out));
@@ -74,7 +74,7 @@ impl Packetizer {
         result
     }
 
-    /// Sends instrument and ephemeris again if it is time for that.
+    /// Repeats instrument and ephemeris if they are due.
     fn repeat(&mut self, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         if self.bytes_since_repeat < self.repeat_bytes {
             return Ok(());
@@ -124,7 +124,7 @@ impl Packetizer {
         let instrument = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?;
         self.payload.clear();
         encode_ephemeris(segment, instrument, &mut self.payload)?;
-        // Positions are known ahead: they do not move the clock on.
+        // Positions are known ahead, so they do not advance the clock.
         let now = *self.now.get_or_insert(segment.start);
         self.send_payload(Kind::Ephemeris, now, out)
     }
@@ -156,7 +156,7 @@ impl Packetizer {
         Ok(())
     }
 
-    /// Sends `self.payload` in as many segments as it needs.
+    /// Sends `self.payload` in as many segments as necessary.
     fn send_payload(
         &mut self,
         kind: Kind,
@@ -183,7 +183,7 @@ impl Packetizer {
         Ok(())
     }
 
-    /// Fills in the headers of the packet that begins at `start` and appends its check.
+    /// Fills in the headers of the packet that begins at `start` and appends its checksum.
     fn seal(&mut self, kind: Kind, segment: PacketSegment, time: CucTime, start: usize, out: &mut Vec<u8>) {
         let bytes = out.len() - start + TRAILER_BYTES;
         let count = &mut self.counts[kind.index()];
@@ -194,7 +194,7 @@ impl Packetizer {
         out.extend_from_slice(&check);
     }
 
-    /// Moves the clock on to `time`, never back; packets are made at what it shows.
+    /// Advances the clock to `time`, never back. The clock gives packets their creation time.
     fn advance(&mut self, time: MissionTime) -> MissionTime {
         *self.now.insert(self.now.map_or(time, |now| now.max(time)))
     }

@@ -1,4 +1,4 @@
-//! Frames to the bytes of a downlink: the spacecraft's end, whatever the format.
+//! Ground frames to the bytes of a downlink, in either format: the spacecraft's end.
 
 use super::Packetizer;
 use super::cadu::CaduEncoder;
@@ -6,7 +6,7 @@ use crate::downlink::config::DownlinkConfig;
 use crate::downlink::error::DownlinkError;
 use crate::frames::GroundFrame;
 
-/// Makes packets of frames, and CADUs of those if the configuration says so.
+/// Encodes ground frames as packets, and packets as CADUs if configured.
 #[derive(Debug)]
 pub struct Transmission {
     packetizer: Packetizer,
@@ -23,7 +23,7 @@ impl Transmission {
         Ok(Self { packetizer: Packetizer::new(config)?, encoder: config.encoder(), packets: Vec::new() })
     }
 
-    /// Appends what a frame adds to the downlink. Housekeeping ends a pass.
+    /// Appends the bytes that a frame adds to the downlink. Housekeeping ends a pass.
     ///
     /// # Errors
     /// Those of [`Packetizer::encode`].
@@ -38,7 +38,7 @@ impl Transmission {
         Ok(())
     }
 
-    /// Appends what is still in hand.
+    /// Appends what is still buffered.
     pub fn finish(&mut self, out: &mut Vec<u8>) {
         if let Some(encoder) = &mut self.encoder {
             encoder.flush(out);

@@ -1,4 +1,4 @@
-//! What the ground has made of a coded stream.
+//! Counters of a coded stream.
 
 use std::fmt;
 
@@ -9,59 +9,59 @@ use serde::Serialize;
 pub struct ChannelCounts {
     /// Virtual channel.
     pub channel: u8,
-    /// Good frames, duplicates left out.
+    /// Sound frames without duplicates.
     pub frames: u64,
     /// Gaps in the frame count.
     pub gaps: u64,
     /// Frames in those gaps.
     pub missing: u64,
-    /// Frames that have filled a gap afterwards.
+    /// Frames that filled a gap later.
     pub late: u64,
-    /// Frames that had been here before.
+    /// Frames received before.
     pub duplicates: u64,
 }
 
-/// The account of a coded stream.
+/// Counters of a coded stream.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct FrameCounters {
     /// Bytes received.
     pub bytes: u64,
     /// Codewords interleaved in a block; 0 if no frame was found.
     pub interleave: usize,
-    /// Good frames, idle ones and duplicates included.
+    /// Sound frames, including idle ones and duplicates.
     pub frames: u64,
-    /// Good frames in which something had to be corrected.
+    /// Sound frames after correction.
     pub frames_corrected: u64,
-    /// Bytes corrected in those.
+    /// Bytes corrected in them.
     pub bytes_corrected: u64,
-    /// Frames found that could not be corrected.
+    /// Uncorrectable frames.
     pub frames_uncorrectable: u64,
-    /// Good frames of another version or spacecraft, or of more virtual channels than are kept apart.
+    /// Sound frames of another version or spacecraft, or of virtual channels beyond the supported number.
     pub frames_foreign: u64,
-    /// Good frames with a pointer beyond their end.
+    /// Sound frames with a pointer beyond their end.
     pub frames_malformed: u64,
-    /// Good frames of idle data.
+    /// Sound frames of idle data.
     pub frames_idle: u64,
-    /// Times that the stream was lost and had to be searched for.
+    /// Losses of synchronisation.
     pub sync_losses: u64,
-    /// Bits passed over in searches.
+    /// Bits skipped in searches for a marker.
     pub bits_skipped: u64,
-    /// Times that the stream turned to its inverse or back.
+    /// Changes of polarity.
     pub inversions: u64,
-    /// Bytes of an unfinished frame at the end.
+    /// Bytes of an incomplete frame at the end.
     pub bytes_truncated: u64,
     /// Bytes of idle packets.
     pub bytes_idle_packets: u64,
-    /// Beginnings, middles and ends of packets that wait for their other frames, or waited in vain.
+    /// Pieces of packets whose other frames have not arrived, or never did.
     pub fragments: u64,
-    /// Bytes of those.
+    /// Bytes of these pieces.
     pub bytes_fragments: u64,
-    /// Virtual channels, idle frames left out.
+    /// Virtual channels, without that of idle frames.
     pub channels: Vec<ChannelCounts>,
 }
 
 impl FrameCounters {
-    /// Adds the account of another stream; the interleave stays that of the first.
+    /// Adds the counters of another stream. The interleave remains that of the first.
     pub(in crate::downlink) fn add(&mut self, other: &Self) {
         self.bytes += other.bytes;
         self.interleave = if self.interleave == 0 { other.interleave } else { self.interleave };
@@ -93,7 +93,7 @@ impl FrameCounters {
         }
     }
 
-    /// Whether nothing is missing and nothing had to be corrected.
+    /// Whether nothing is missing and nothing was corrected.
     #[must_use]
     pub fn is_sound(&self) -> bool {
         let faults =

@@ -1,4 +1,4 @@
-//! Coded transfer frames to packets: the sync marker found at any bit, codewords corrected, packets put together.
+//! Coded transfer frames to packets: synchronisation at any bit, error correction, packet assembly.
 
 mod assembler;
 mod counters;

@@ -1,8 +1,8 @@
-//! Seconds since 1958 as dates.
+//! Dates of TAI seconds since 1958.
 
 const DAY_S: i64 = 86_400;
 
-/// A date and time of day, to the millisecond, as ISO 8601 has it: for TAI seconds since 1958-01-01T00:00:00.
+/// The ISO 8601 date and time of day, to the millisecond, of TAI seconds since 1958-01-01T00:00:00.
 ///
 /// Gregorian calendar by Hinnant's algorithm (civil from days, in eras of 400 years that begin in March).
 pub(super) fn tai_text(tai_s: f64) -> String {

@@ -1,4 +1,4 @@
-//! Contents for people.
+//! Renders contents as tables.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -6,10 +6,10 @@ use std::fmt;
 use super::{Contents, VisibilityCounts};
 use crate::downlink::receive::{Listing, ReceptionCounters};
 
-/// Columns of channels side by side.
+/// Channels side by side.
 const CHANNELS_A_ROW: usize = 6;
 
-/// Entries of damage shown of each sort; `--json` has more.
+/// Entries shown per list; `--json` has more.
 const SHOWN_MAX: usize = 10;
 
 impl fmt::Display for Contents {
@@ -26,7 +26,7 @@ impl fmt::Display for Contents {
     }
 }
 
-/// Seconds in the unit that people would choose.
+/// A duration in a convenient unit.
 fn duration(s: f64) -> String {
     match s {
         s if s >= 2.0 * 86_400.0 => format!("{:.2} d", s / 86_400.0),
@@ -38,7 +38,7 @@ fn duration(s: f64) -> String {
 impl Contents {
     fn show_head(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.instrument {
-            None => writeln!(f, "\ninstrument    none found: nothing else can be understood without it")?,
+            None => writeln!(f, "\ninstrument    none found: nothing else can be decoded without it")?,
             Some(i) => {
                 writeln!(
                     f,
@@ -70,9 +70,9 @@ impl Contents {
             writeln!(f, "on board      {sampled} sampled, {dropped} dropped {until}")?;
         }
         let ephemeris = &self.ephemeris;
-        let (segments, stretches) = (ephemeris.segments, ephemeris.covered.count);
+        let (segments, intervals) = (ephemeris.segments, ephemeris.covered.count);
         let covered = duration(ephemeris.covered_s);
-        writeln!(f, "ephemeris     {segments} segments over {covered} in {stretches} stretches")
+        writeln!(f, "ephemeris     {segments} segments over {covered} in {intervals} intervals")
     }
 
     fn show_packets(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -128,7 +128,7 @@ impl Contents {
         pairs.dedup();
         let rows = self.baselines.iter().map(|row| ((&*row.pair, row.channel), row.visibilities.count));
         let counts: BTreeMap<(&str, u16), u64> = rows.collect();
-        // The spectrometer has other channels.
+        // The spectrometer has channels of its own.
         pairs.retain(|pair| self.channels.iter().any(|row| counts.contains_key(&(*pair, row.channel))));
         for channels in self.channels.chunks(CHANNELS_A_ROW) {
             if pairs.is_empty() {
@@ -156,7 +156,7 @@ impl Contents {
             writeln!(f, "\n{restarts}")?;
         }
         if self.is_sound() {
-            return writeln!(f, "\nsound: no gaps, no bad checksums, no garbage, nothing cut off");
+            return writeln!(f, "\nsound: no gaps, no bad checksums, no garbage, not truncated");
         }
         show_list(f, "gaps", &self.gaps, |gap| {
             format!(
@@ -174,15 +174,19 @@ impl Contents {
             format!("byte {}: {}", fault.offset, fault.reason)
         })?;
         if self.truncated_bytes > 0 {
-            writeln!(f, "\ncut off: the last {} bytes are the beginning of a packet", self.truncated_bytes)?;
+            writeln!(
+                f,
+                "\ntruncated: the last {} bytes are the beginning of a packet",
+                self.truncated_bytes
+            )?;
         }
         if self.reception.payloads_before_instrument > 0 {
             let ReceptionCounters { payloads_before_instrument: payloads, .. } = self.reception;
             let visibilities = self.reception.visibilities_before_instrument;
             writeln!(
                 f,
-                "\n{payloads} payloads with {visibilities} visibilities stand before any instrument description and are in \
-                 no table above; a replay lets them wait for it"
+                "\n{payloads} payloads with {visibilities} visibilities precede any instrument description and are in no \
+                table above; a replay holds them until the description arrives"
             )?;
         }
         if self.reception.instruments_contradictory > 0 {

@@ -1,27 +1,27 @@
-//! Configuration of a ground that listens: limits of its senders.
+//! Configuration of a listening ground: limits of its senders.
 
 use serde::{Deserialize, Serialize};
 
 use crate::units::{Checks, InvalidValue};
 
-/// The `[downlink.listen]` section: limits of a ground that listens. Memory for senders stays below
-/// `connections_max` times `memory_bytes_max` and twice 64 KiB, and `backlog_bytes_max`.
+/// The `[downlink.listen]` section: limits for senders. Memory for all of them stays below `connections_max` times
+/// (`memory_bytes_max` + 128 KiB), plus `backlog_bytes_max`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ListenConfig {
-    /// Connections at a time; others are refused.
+    /// Maximum number of open connections; further ones are refused.
     pub connections_max: usize,
-    /// Time from connecting to the first sound packet or frame, s; 0 for no limit.
+    /// Maximum time from connecting to the first sound packet or frame, s; 0 for no limit.
     pub first_packet_s_max: f64,
-    /// Time between sound packets or frames, s; 0 for no limit. Bytes alone are no sign of life.
+    /// Maximum time between sound packets or frames, s; 0 for no limit. Bytes alone are no sign of life.
     pub idle_s_max: f64,
-    /// Bytes a second that are read from a connection; 0 for no limit. TCP slows the sender to it.
+    /// Maximum rate at which a connection is read, bytes/s; 0 for no limit. TCP slows the sender accordingly.
     pub bytes_per_s_max: f64,
-    /// Bytes of a connection without a sound packet or frame among them.
+    /// Maximum number of bytes between sound packets or frames.
     pub garbage_bytes_max: u64,
-    /// Memory for what a connection has begun and not ended, bytes.
+    /// Maximum memory for a connection's incomplete data, bytes.
     pub memory_bytes_max: u64,
-    /// Bytes of packets that wait for the ground, of all connections together.
+    /// Maximum backlog of packets of all connections together, bytes.
     pub backlog_bytes_max: u64,
 }
 
@@ -40,7 +40,7 @@ impl Default for ListenConfig {
 }
 
 impl ListenConfig {
-    /// Everything that is wrong with the limits; empty if they are good.
+    /// All invalid limits; empty for a valid configuration.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("downlink.listen");

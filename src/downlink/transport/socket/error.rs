@@ -1,4 +1,4 @@
-//! What can go wrong with a socket as a whole; what senders do wrong is counted instead.
+//! Errors of a socket as a whole. Faults of senders are counted instead.
 
 use std::io;
 
@@ -6,74 +6,74 @@ use thiserror::Error;
 
 use super::url::TcpUrl;
 
-/// Why there is no listening or sending.
+/// Why listening or sending failed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum SocketError {
-    /// A place that is none.
+    /// The text is not a TCP URL.
     #[error("{text:?}: expected tcp://HOST:PORT, such as tcp://127.0.0.1:4711 or tcp://[::1]:4711")]
     Url {
-        /// What was given.
+        /// The text.
         text: String,
     },
-    /// A host without an address.
+    /// The host has no address.
     #[error("{url}: the host has no address: {source}")]
     Resolve {
-        /// The place.
+        /// The URL.
         url: TcpUrl,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// An address that other machines can reach.
+    /// Other machines can reach the address.
     #[error(
         "{url}: other machines may reach this address, and whoever connects can add to the maps; expected \
          127.0.0.1, [::1] or localhost, or --allow-remote"
     )]
     Remote {
-        /// The place.
+        /// The URL.
         url: TcpUrl,
     },
-    /// No listening.
+    /// The address cannot be bound.
     #[error("cannot listen on {url}: {source}")]
     Listen {
-        /// The place.
+        /// The URL.
         url: TcpUrl,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// No event loop.
+    /// The event loop cannot start.
     #[error("cannot start the listener: {source}")]
     Start {
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// The listener's thread fell.
-    #[error("the listener has ended by itself, which is a bug of the program")]
+    /// The listener's thread panicked.
+    #[error("the listener stopped unexpectedly, which is a bug in the program")]
     Fallen,
-    /// Nobody listens.
+    /// No connection could be made.
     #[error(
         "{url}: no connection within {waited_s} s: {source}; start `lunarray replay --listen {url}` first, or wait \
          longer (--connect-s)"
     )]
     Connect {
-        /// The place.
+        /// The URL.
         url: TcpUrl,
-        /// How long it was tried, s.
+        /// Time spent trying, s.
         waited_s: f64,
-        /// What the system said last.
+        /// The system's last error.
         source: io::Error,
     },
-    /// The other side has had enough.
+    /// The receiver closed the connection.
     #[error("{url}: the receiver closed the connection; {bytes} bytes had been sent: {reason}")]
     Closed {
-        /// The place.
+        /// The URL.
         url: TcpUrl,
-        /// Bytes handed to the system until then.
+        /// Bytes sent until then.
         bytes: u64,
-        /// What it said, or what the system said.
+        /// The receiver's answer, or the system's error.
         reason: String,
     },
-    /// Faults of a link whose truth has no place.
+    /// The link has faults, but there is no file beside which to write their truth.
     #[error(
         "downlink.link has faults, and their truth goes beside the downlink file; name one with --out FILE"
     )]

@@ -1,4 +1,4 @@
-//! The thread that listens: takes connections, and knows when it is enough.
+//! The listening thread: accepts connections until its end condition holds.
 
 use std::net::SocketAddr;
 use std::pin::pin;
@@ -18,25 +18,25 @@ use super::connection::serve;
 use super::report::Listening;
 use super::sender_intake::Mission;
 
-/// Between two looks at whether it is enough.
+/// Interval between two checks of the end condition.
 const TICK: Duration = Duration::from_millis(50);
 
-/// Notes that may be said at once; later one a second.
+/// Number of notes allowed at once; after that one per second.
 const NOTES_AT_ONCE: f64 = 20.0;
 
-/// Whom to tell what becomes of connections.
+/// Receives notes about connections.
 pub type Teller = Box<dyn Fn(&str) + Send + Sync>;
 
-/// When a ground has listened long enough, besides when its run is ended.
+/// When listening ends, apart from the end of the run.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Until {
-    /// After so many seconds without a sound packet or frame of anyone; 0 for never.
+    /// After this time without a sound packet or frame from anyone, s; 0 for never.
     pub idle_s: f64,
-    /// After so many connections that gave packets have ended; 0 for never.
+    /// After this number of connections that delivered packets have ended; 0 for never.
     pub connections: u64,
 }
 
-/// Packets for the ground, and the room that they take until it has them.
+/// Packets on their way to the ground, and the room that they occupy in the backlog.
 pub(super) struct PacketBatch {
     pub(super) bytes: Vec<u8>,
     pub(super) room: OwnedSemaphorePermit,
@@ -49,16 +49,16 @@ pub(super) struct ListenContext {
     pub(super) mission: Mission,
     pub(super) listening: Listening,
     pub(super) room: Arc<Semaphore>,
-    pub(super) deliveries: Sender<PacketBatch>,
-    /// True once nothing more is to be read.
+    pub(super) batches: Sender<PacketBatch>,
+    /// True once reading must stop.
     pub(super) stop: Arc<watch::Sender<bool>>,
     pub(super) notes: Notes,
-    /// When a sound packet or frame came last, of anyone.
+    /// When the last sound packet or frame arrived, from anyone.
     pub(super) sign: Mutex<Instant>,
 }
 
 impl ListenContext {
-    /// Room for all packets that may wait.
+    /// Size of the backlog, bytes.
     pub(super) fn room_bytes(config: &ListenConfig) -> usize {
         (config.backlog_bytes_max as usize).min(Semaphore::MAX_PERMITS)
     }
@@ -67,9 +67,9 @@ impl ListenContext {
         *self.sign.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
     }
 
-    /// Waits until nothing more is to be read.
+    /// Waits until reading must stop.
     pub(super) async fn stopped(&self) {
-        // An error says that the other end is gone, which is the same.
+        // An error means that the other end is gone, which is the same.
         let _ = self.stop.subscribe().wait_for(|stop| *stop).await;
     }
 
@@ -80,7 +80,7 @@ impl ListenContext {
             return true;
         }
         if status.waiting.load(Ordering::Relaxed) > 0 {
-            // It is the ground that takes its time.
+            // The ground is slow, not the senders.
             self.note_sign();
         }
         let sign = *self.sign.lock().unwrap_or_else(PoisonError::into_inner);
@@ -89,13 +89,13 @@ impl ListenContext {
 
     fn refuse(&self, stream: &TcpStream, peer: SocketAddr) {
         self.listening.write().refused += 1;
-        // Whether it is heard is no concern of ours.
+        // A sender need not read the answer.
         let _ = stream.try_write(b"closed: there are downlink.listen.connections_max others\n");
         self.notes.say(&format!("{peer}: refused; there are downlink.listen.connections_max others"));
     }
 }
 
-/// Listens until it is over, then until all connections have ended.
+/// Listens until the end condition holds, then waits for all connections to end.
 pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
     let mut connections = JoinSet::new();
     shared.note_sign();
@@ -111,9 +111,9 @@ pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
                     connections.spawn(serve(stream, peer, Arc::clone(&shared)));
                 }
             }
-            // No more files may be open, or the peer has gone already: others may come.
+            // Too many open files, or the peer is gone already: others may connect.
             First::B(Ok(Err(error))) => {
-                shared.notes.say(&format!("a connection could not be taken: {error}"));
+                shared.notes.say(&format!("cannot accept a connection: {error}"));
                 sleep(TICK).await;
             }
         }
@@ -123,13 +123,13 @@ pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
     while connections.join_next().await.is_some() {}
 }
 
-/// What ended first.
+/// Which of two futures completed first.
 pub(super) enum First<A, B> {
     A(A),
     B(B),
 }
 
-/// Waits for the first of two to end; drops the other.
+/// Waits for the first of two futures; drops the other.
 pub(super) async fn first<A, B>(a: impl Future<Output = A>, b: impl Future<Output = B>) -> First<A, B> {
     let (mut a, mut b) = (pin!(a), pin!(b));
     std::future::poll_fn(|context| match a.as_mut().poll(context) {
@@ -139,10 +139,10 @@ pub(super) async fn first<A, B>(a: impl Future<Output = A>, b: impl Future<Outpu
     .await
 }
 
-/// Says what happens, but not faster than can be read.
+/// Reports events, but no faster than people can read.
 pub(super) struct Notes {
     tell: Teller,
-    /// Notes that may be said, as of when; and those that were not.
+    /// Notes allowed, as of when; and notes suppressed.
     budget: Mutex<(f64, Instant, u64)>,
 }
 

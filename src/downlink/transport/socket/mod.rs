@@ -1,24 +1,24 @@
 //! The downlink over TCP: a ground that listens to several stations at once, and a spacecraft that sends to it.
 //!
-//! A connection carries the bytes of a downlink file, in either format, and nothing else; so any tool that sends a
-//! file over TCP is a station. What the ground does with it:
+//! A connection carries the bytes of a downlink file, in either format, and nothing else. So any tool that sends a
+//! file over TCP can be a station. The ground works in three places:
 //!
-//! | | where | on |
+//! | task | where | on |
 //! |---|---|---|
-//! | accepts, reads, keeps time | `listener`, `connection` | one thread, the only place with an event loop |
-//! | finds packets in the bytes of one connection, with a receiver of its own | `line` | a pool, so that hard work for one does not hold up others |
-//! | hands whole packets to the chain | [`SocketSource`] | the source's thread |
+//! | accepts, reads, keeps time | `listener`, `connection` | one thread, the only one with an event loop |
+//! | finds packets in the bytes of one connection | `sender_intake` | a pool, so that one busy connection does not delay others |
+//! | passes whole packets to the pipeline | [`SocketSource`] | the source's thread |
 //!
-//! Between the second and the third there is room for so many bytes, given out in the order of asking. Who waits for
-//! room does not read: TCP then slows its sender, and no other. Packets of a payload in segments stay together, so
-//! that those of two connections never mix.
+//! The backlog between the second and the third is bounded in bytes; connections get room in the order of request. A
+//! connection that waits for room does not read, so TCP slows its sender and no other. Segments of one payload stay
+//! together, so that those of two connections never mix.
 //!
-//! A sender that does not keep to the limits of [`ListenConfig`] is closed, counted by reason and said; the
-//! others go on. When a sender has closed its side and everything is handed over, the ground answers with a line of
+//! A sender that violates the limits of [`ListenConfig`] is disconnected, counted by reason and reported; the others
+//! continue. Once a sender has closed its side and all its packets are passed on, the ground answers with a line of
 //! text, `taken N bytes`, and closes.
 //!
-//! Packets bear no signature: whoever can connect can add to the maps. That is why other addresses than those of the
-//! machine itself must be asked for.
+//! Packets carry no signature: whoever can connect can add to the maps. Therefore addresses other than those of this
+//! machine require an explicit option.
 
 mod config;
 mod connection;

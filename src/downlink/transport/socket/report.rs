@@ -1,4 +1,4 @@
-//! What came over a socket, from whom, and how it ended.
+//! Reports on what came over a socket: from whom, how much, and how it ended.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -11,7 +11,7 @@ use crate::downlink::receive::Listing;
 use crate::downlink::receive::ReceptionCounters;
 use crate::downlink::wire::Format;
 
-/// How a connection has ended.
+/// How a connection ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
@@ -24,15 +24,15 @@ pub enum ConnectionEnd {
     Stopped,
     /// No sound packet or frame within `first_packet_s_max`.
     FirstPacket,
-    /// None for `idle_s_max`.
+    /// No sound packet or frame for `idle_s_max`.
     Idle,
-    /// None among `garbage_bytes_max` bytes.
+    /// No sound packet or frame in `garbage_bytes_max` bytes.
     Garbage,
-    /// More than `memory_bytes_max` in hand.
+    /// More than `memory_bytes_max` of incomplete data.
     Memory,
-    /// The description of another instrument than the one that the ground knows.
+    /// A description of another instrument than the ground's.
     OtherInstrument,
-    /// Its receiver failed: a bug of the program.
+    /// Its receiver failed: a bug in the program.
     Failed,
 }
 
@@ -41,13 +41,13 @@ impl fmt::Display for ConnectionEnd {
         f.write_str(match self {
             Self::Whole => "the sender closed it",
             Self::Broken => "the connection broke",
-            Self::Stopped => "the ground has ended its run",
+            Self::Stopped => "the ground ended its run",
             Self::FirstPacket => "no sound packet within downlink.listen.first_packet_s_max",
             Self::Idle => "no sound packet for downlink.listen.idle_s_max",
             Self::Garbage => "no sound packet in downlink.listen.garbage_bytes_max",
-            Self::Memory => "more unfinished than downlink.listen.memory_bytes_max",
+            Self::Memory => "more incomplete data than downlink.listen.memory_bytes_max",
             Self::OtherInstrument => "packets of another instrument than the ground's",
-            Self::Failed => "its receiver failed, which is a bug of the program",
+            Self::Failed => "its receiver failed, which is a bug in the program",
         })
     }
 }
@@ -57,11 +57,11 @@ impl fmt::Display for ConnectionEnd {
 pub struct SenderReport {
     /// Its address.
     pub peer: String,
-    /// Format of its stream, if it was found out.
+    /// Format of its stream, if it was detected.
     pub format: Option<Format>,
     /// Bytes read.
     pub bytes: u64,
-    /// Sound packets handed to the ground.
+    /// Sound packets passed to the ground.
     pub packets: u64,
     /// How it ended.
     pub ended: ConnectionEnd,
@@ -70,31 +70,31 @@ pub struct SenderReport {
 /// All connections of a run.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct ListenReport {
-    /// Where the ground listened.
+    /// Address on which the ground listened.
     pub address: String,
-    /// Connections taken.
+    /// Accepted connections.
     pub connections: u64,
-    /// Connections refused because there were `connections_max`.
+    /// Connections refused because `connections_max` were open.
     pub refused: u64,
     /// Bytes read.
     pub bytes: u64,
-    /// Sound packets handed to the ground.
+    /// Sound packets passed to the ground.
     pub packets: u64,
-    /// Sound packets that were not, of connections that were closed for their instrument.
+    /// Sound packets refused because their connection described another instrument.
     pub packets_refused: u64,
-    /// Most bytes of packets that waited for the ground.
+    /// Largest backlog of packets, bytes.
     pub backlog_bytes_max: u64,
-    /// Connections by how they ended.
+    /// Connections by end.
     pub ended: BTreeMap<ConnectionEnd, u64>,
-    /// The first of them.
+    /// The first connections.
     pub senders: Listing<SenderReport>,
-    /// What else than packets was in the streams; of packets, nothing.
+    /// Counters of everything in the streams but packets.
     #[serde(skip)]
     pub(super) streams: ReceptionCounters,
 }
 
 impl ListenReport {
-    /// Adds to the account of a reception what its chain has not seen: all but the packets.
+    /// Adds what the pipeline has not seen to the counters of a reception: everything but packets.
     pub fn complete(&self, reception: &mut ReceptionCounters) {
         reception.add_stream(&self.streams);
     }
@@ -115,7 +115,7 @@ impl fmt::Display for ListenReport {
         write!(
             f,
             "{address}: {connections} connections, {refused} refused; {bytes} bytes, {packets} packets, \
-             {packets_refused} refused; at most {} bytes waited",
+             {packets_refused} refused; backlog at most {} bytes",
             self.backlog_bytes_max
         )?;
         for (ended, count) in &self.ended {
@@ -125,20 +125,20 @@ impl fmt::Display for ListenReport {
     }
 }
 
-/// What can be seen while a ground listens.
+/// Live status of a listening ground.
 #[derive(Debug, Default)]
 pub struct ListenStatus {
     pub(super) open: AtomicUsize,
     pub(super) bytes: AtomicU64,
     pub(super) backlog_bytes: AtomicU64,
-    /// Connections that wait for room.
+    /// Connections that wait for room in the backlog.
     pub(super) waiting: AtomicUsize,
-    /// Connections that gave packets and have ended.
+    /// Ended connections that delivered packets.
     pub(super) done: AtomicU64,
 }
 
 impl ListenStatus {
-    /// Connections that are open.
+    /// Open connections.
     #[must_use]
     pub fn open(&self) -> usize {
         self.open.load(Ordering::Relaxed)
@@ -150,34 +150,34 @@ impl ListenStatus {
         self.bytes.load(Ordering::Relaxed)
     }
 
-    /// Says that nothing waits.
+    /// Marks the backlog as empty.
     pub(super) fn clear_backlog(&self) {
         self.backlog_bytes.store(0, Ordering::Relaxed);
     }
 
-    /// Bytes of packets that wait for the ground, when some were added last.
+    /// Backlog of packets at the last addition, bytes.
     #[must_use]
     pub fn backlog_bytes(&self) -> u64 {
         self.backlog_bytes.load(Ordering::Relaxed)
     }
 }
 
-/// Both, shared.
+/// Status and report, shared between threads.
 #[derive(Clone, Debug, Default)]
 pub struct Listening {
-    /// For looking at on the way.
+    /// Live status.
     pub status: Arc<ListenStatus>,
-    account: Arc<Mutex<ListenReport>>,
+    report: Arc<Mutex<ListenReport>>,
 }
 
 impl Listening {
-    /// The account of the connections that have ended.
+    /// The report on the connections that have ended.
     #[must_use]
     pub fn report(&self) -> ListenReport {
         self.write().clone()
     }
 
     pub(super) fn write(&self) -> MutexGuard<'_, ListenReport> {
-        self.account.lock().unwrap_or_else(PoisonError::into_inner)
+        self.report.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

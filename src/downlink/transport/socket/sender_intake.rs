@@ -1,4 +1,4 @@
-//! One sender's bytes to whole packets.
+//! The bytes of one sender to whole packets.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -8,10 +8,10 @@ use crate::downlink::receive::{Decoder, Event, Intake, Packet, ReceptionCounters
 use crate::downlink::wire::{Format, HEADER_BYTES, Kind, PacketSegment, packet_check};
 use crate::frames::{GroundFrame, Instrument};
 
-/// Segments are kept together up to so many bytes; a window's ephemeris is a hundredth of it.
+/// Segments of a payload are kept together up to this number of bytes; the ephemeris of a window is a hundredth of it.
 const GROUP_BYTES_MAX: usize = 1 << 20;
 
-/// The instrument that a ground knows: that of its state, or the first that a sender describes.
+/// The ground's instrument: that of its state, or the first that a sender describes. Shared by all connections.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Mission(Arc<Mutex<Option<Instrument>>>);
 
@@ -20,29 +20,28 @@ impl Mission {
         Self(Arc::new(Mutex::new(instrument)))
     }
 
-    /// Whether an instrument is the one that is known; it is from now on if none was.
+    /// Whether an instrument is the ground's. The first one becomes the ground's.
     fn agrees(&self, found: &Instrument) -> bool {
         let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         known.get_or_insert_with(|| found.clone()) == found
     }
 }
 
-/// The receiver of one connection. It keeps the account of all that is no packet; packets are for the ground to
-/// count.
+/// The receiver of one connection. It counts everything but packets, which the ground counts.
 #[derive(Debug)]
 pub(super) struct SenderIntake {
     intake: Intake,
     stream: Decoder,
-    /// Follows the descriptions of instruments alone.
+    /// Decodes instrument descriptions only.
     instruments: Decoder,
     mission: Mission,
-    /// Packets of a payload whose last segment has not come.
+    /// Packets of a payload that lacks its last segment.
     group: Vec<u8>,
     grouped: u64,
     packets: u64,
     packets_refused: u64,
     foreign: bool,
-    /// Sound packets and frames at the last look, and the bytes until then.
+    /// Sound packets and frames at the last sign of life, and the bytes until then.
     signs: u64,
     bytes_at_sign: u64,
 }
@@ -64,11 +63,11 @@ impl SenderIntake {
         }
     }
 
-    /// Takes the next bytes and appends the packets that they complete to `out`; whether there was a sign of life: a
-    /// sound packet or frame.
+    /// Takes the next bytes and appends the packets that they complete to `out`. Returns whether there was a sign of
+    /// life: a sound packet or frame.
     ///
     /// # Errors
-    /// [`ConnectionEnd::OtherInstrument`]: from there on no packet is handed out.
+    /// [`ConnectionEnd::OtherInstrument`]: from then on no packet is appended.
     pub(super) fn take(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<bool, ConnectionEnd> {
         self.intake.push(bytes);
         self.hand_out(out);
@@ -76,7 +75,7 @@ impl SenderIntake {
         if self.foreign { Err(ConnectionEnd::OtherInstrument) } else { Ok(alive) }
     }
 
-    /// Says that the stream is at its end; appends what is left.
+    /// Ends the stream; appends the remaining packets.
     pub(super) fn finish(&mut self, out: &mut Vec<u8>) {
         self.intake.finish();
         self.hand_out(out);
@@ -84,9 +83,9 @@ impl SenderIntake {
         self.look_for_signs();
     }
 
-    /// Whether a sound packet or frame has come since the last look.
+    /// Whether a sound packet or frame has arrived since the last check.
     fn look_for_signs(&mut self) -> bool {
-        // A block of equal octets is a codeword too, and so is a stream of nothing but markers: it has to be a frame.
+        // Blocks of equal octets and streams of markers are codewords too, so only valid frames count.
         let ours = |frames: FrameCounters| frames.frames - frames.frames_foreign - frames.frames_malformed;
         let frames = self.intake.frames().map_or(0, ours);
         let signs = self.packets + self.grouped + self.packets_refused + frames;
@@ -107,7 +106,7 @@ impl SenderIntake {
         self.signs > 0
     }
 
-    /// Packets handed out, and those that were not.
+    /// Numbers of packets passed on and of packets refused.
     pub(super) fn packets(&self) -> (u64, u64) {
         (self.packets, self.packets_refused)
     }
@@ -116,12 +115,12 @@ impl SenderIntake {
         self.intake.format()
     }
 
-    /// Memory taken, bytes.
+    /// Memory held, bytes.
     pub(super) fn held_bytes(&self) -> usize {
         self.intake.held_bytes() + self.group.capacity()
     }
 
-    /// The account of all that was no packet.
+    /// Counters of everything but packets.
     pub(super) fn stream(&self) -> ReceptionCounters {
         ReceptionCounters { frames: self.intake.frames(), ..self.stream.counters().clone() }
     }
@@ -163,7 +162,7 @@ impl SenderIntake {
     }
 }
 
-/// Appends a packet as it was sent: its headers have no other bits than those that are known of them.
+/// Appends a packet as it was sent. Parsed headers hold every bit of the originals.
 fn append(packet: &Packet<'_>, out: &mut Vec<u8>) {
     let start = out.len();
     out.reserve(packet.header.bytes.min(HEADER_BYTES + packet.payload.len() + 4));
@@ -196,7 +195,7 @@ mod tests {
         }
     }
 
-    /// A description, and positions in many segments.
+    /// A description, positions in many segments, and housekeeping.
     fn sent(name: &str, format: Format) -> Vec<u8> {
         let config = DownlinkConfig { packet_bytes_max: 512, format, ..DownlinkConfig::default() };
         let (mut transmission, mut bytes) = (Transmission::new(&config).unwrap(), Vec::new());
@@ -217,16 +216,16 @@ mod tests {
         bytes
     }
 
-    /// Everything that a line hands out, piece by piece.
-    fn through(line: &mut SenderIntake, bytes: &[u8], piece: usize) -> (Vec<Vec<u8>>, bool) {
+    /// Everything that an intake passes on, piece by piece.
+    fn through(sender: &mut SenderIntake, bytes: &[u8], piece: usize) -> (Vec<Vec<u8>>, bool) {
         let (mut pieces, mut foreign) = (Vec::new(), false);
         for bytes in bytes.chunks(piece) {
             let mut out = Vec::new();
-            foreign |= line.take(bytes, &mut out).is_err();
+            foreign |= sender.take(bytes, &mut out).is_err();
             pieces.push(out);
         }
         let mut out = Vec::new();
-        line.finish(&mut out);
+        sender.finish(&mut out);
         pieces.push(out);
         (pieces, foreign)
     }
@@ -236,13 +235,13 @@ mod tests {
         let plain = sent("ours", Format::Packets);
         for format in [Format::Packets, Format::Cadu] {
             for piece in [1, 100, 1 << 16] {
-                let mut line = SenderIntake::new(Mission::default());
-                let (pieces, foreign) = through(&mut line, &sent("ours", format), piece);
+                let mut sender = SenderIntake::new(Mission::default());
+                let (pieces, foreign) = through(&mut sender, &sent("ours", format), piece);
                 assert!(!foreign && pieces.concat() == plain);
-                // The description, the positions and the counts: whatever the pieces, no payload is divided.
+                // The description, the positions and the counts: for any pieces, no payload is divided.
                 let handed = pieces.iter().filter(|piece| !piece.is_empty()).count();
                 assert!(handed <= 3, "{handed}");
-                assert_eq!(line.format(), Some(format));
+                assert_eq!(sender.format(), Some(format));
             }
         }
     }
@@ -252,14 +251,14 @@ mod tests {
         for format in [Format::Packets, Format::Cadu] {
             let mission = Mission::default();
             through(&mut SenderIntake::new(mission.clone()), &sent("ours", format), 1000);
-            let mut line = SenderIntake::new(mission.clone());
-            let (pieces, foreign) = through(&mut line, &sent("theirs", format), 1000);
+            let mut sender = SenderIntake::new(mission.clone());
+            let (pieces, foreign) = through(&mut sender, &sent("theirs", format), 1000);
             assert!(foreign && pieces.concat().is_empty());
-            assert!(line.packets().0 == 0 && line.packets().1 > 10);
+            assert!(sender.packets().0 == 0 && sender.packets().1 > 10);
             // Also from a sender that began with the right one.
-            let mut line = SenderIntake::new(mission);
+            let mut sender = SenderIntake::new(mission);
             let both = [sent("ours", format), sent("theirs", format)].concat();
-            let (pieces, foreign) = through(&mut line, &both, 1000);
+            let (pieces, foreign) = through(&mut sender, &both, 1000);
             assert!(foreign && pieces.concat() == sent("ours", Format::Packets));
         }
     }
@@ -277,12 +276,12 @@ mod tests {
                 bytes[at] ^= octet;
             }
             bytes.truncate(1 + cut.index(bytes.len()));
-            let mut line = SenderIntake::new(Mission::default());
-            let (pieces, _) = through(&mut line, &bytes, piece);
-            let account = line.stream();
-            let others = account.bytes_garbage + account.bytes_damaged + account.bytes_truncated;
+            let mut sender = SenderIntake::new(Mission::default());
+            let (pieces, _) = through(&mut sender, &bytes, piece);
+            let counters = sender.stream();
+            let others = counters.bytes_garbage + counters.bytes_damaged + counters.bytes_truncated;
             prop_assert_eq!(pieces.concat().len() as u64 + others, bytes.len() as u64);
-            prop_assert_eq!(line.intake.bytes(), bytes.len() as u64);
+            prop_assert_eq!(sender.intake.bytes(), bytes.len() as u64);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The spacecraft's end of a connection.
+//! Sends a byte stream over TCP: the spacecraft's end of a connection.
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
@@ -11,29 +11,29 @@ use super::url::TcpUrl;
 use crate::downlink::error::DownlinkError;
 use crate::runtime::{Cancel, Sink, Units};
 
-/// How long a system call may block before it is looked whether the run has been ended.
+/// Longest blocking of a system call between two checks for the end of the run.
 const POLL: Duration = Duration::from_millis(200);
 
-/// How long a receiver may take nothing once the run has been ended early.
+/// Patience with a stalled receiver once the run has been cancelled.
 const GRACE: Duration = Duration::from_secs(10);
 
-/// Bytes sent between two looks at the rate.
+/// Bytes sent between two checks of the rate.
 const PIECE_BYTES: usize = 1 << 16;
 
-/// Bytes of an answer that are read.
+/// Maximum length of an answer, bytes.
 const ANSWER_BYTES_MAX: u64 = 1 << 10;
 
-/// How to send.
+/// Options for sending.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SendOptions {
-    /// How long to try to connect, s.
+    /// Time limit for connecting, s.
     pub connect_s: f64,
-    /// Bytes a second at most; 0 for as many as the receiver takes.
+    /// Maximum rate, bytes/s; 0 for as fast as the receiver reads.
     pub bytes_per_s: f64,
 }
 
-/// Sends what comes to a place that listens. It connects with the first bytes; while the receiver does not read, it
-/// waits, and so does whoever makes the bytes.
+/// Sends a byte stream to a listening ground. Connects with the first bytes, and blocks while the receiver does not
+/// read.
 #[derive(Debug)]
 pub struct SocketSink {
     url: TcpUrl,
@@ -48,10 +48,10 @@ pub struct SocketSink {
 }
 
 impl SocketSink {
-    /// A sink that has not connected yet.
+    /// A sink that is not connected yet.
     ///
     /// # Errors
-    /// A host without an address.
+    /// The host has no address.
     pub fn new(url: &TcpUrl, options: SendOptions, cancel: &Cancel) -> Result<Self, SocketError> {
         Ok(Self {
             url: url.clone(),
@@ -65,7 +65,7 @@ impl SocketSink {
         })
     }
 
-    /// Bytes that the receiver has said it has taken; all of them, or none if it says nothing.
+    /// Bytes that the receiver has confirmed: all of them, or none without an answer.
     #[must_use]
     pub fn confirmed(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.confirmed)
@@ -99,12 +99,12 @@ impl SocketSink {
         move |reason| SocketError::Closed { url: url.clone(), bytes, reason: reason.to_string() }
     }
 
-    /// Sends a piece; waits as long as the receiver does not read.
+    /// Sends a piece; blocks while the receiver does not read.
     fn send(&mut self, stream: &mut TcpStream, mut piece: &[u8]) -> Result<(), SocketError> {
         let mut taken = Instant::now();
         while !piece.is_empty() {
             match stream.write(piece) {
-                Ok(0) => return Err(self.refused(stream, &"it takes nothing any more")),
+                Ok(0) => return Err(self.refused(stream, &"it accepts no more bytes")),
                 Ok(bytes) => {
                     self.bytes += bytes as u64;
                     piece = &piece[bytes..];
@@ -117,7 +117,7 @@ impl SocketSink {
         Ok(())
     }
 
-    /// The receiver has closed: it may have said why.
+    /// The receiver closed the connection; it may have sent a reason.
     fn refused(&self, stream: &mut TcpStream, error: &dyn ToString) -> SocketError {
         let mut said = String::new();
         let _ = stream.take(ANSWER_BYTES_MAX).read_to_string(&mut said);
@@ -125,15 +125,15 @@ impl SocketSink {
         self.closed()(reason)
     }
 
-    /// After Ctrl-C a receiver that takes nothing is not waited for without end.
+    /// After cancellation, limits the wait for a stalled receiver.
     fn require_patience(&self, taken: Instant) -> Result<(), SocketError> {
         match self.cancel.is_cancelled() && taken.elapsed() > GRACE {
-            true => Err(self.closed()("ended early, and it does not take the rest")),
+            true => Err(self.closed()("the run was ended early, and the receiver does not read the rest")),
             false => Ok(()),
         }
     }
 
-    /// Keeps to the rate, counted from the first byte.
+    /// Waits as long as the rate requires, counted from the first byte.
     fn hold_back(&self) {
         if self.options.bytes_per_s <= 0.0 {
             return;
@@ -147,7 +147,7 @@ impl SocketSink {
         }
     }
 
-    /// What the receiver says when all has been sent.
+    /// The receiver's answer after the last byte.
     fn answer(&self, stream: &mut TcpStream) -> Result<String, SocketError> {
         stream.shutdown(Shutdown::Write).map_err(self.closed())?;
         let since = Instant::now();
@@ -157,7 +157,7 @@ impl SocketSink {
             match stream.read(&mut piece) {
                 Ok(0) => return Ok(String::from_utf8_lossy(&said).trim().to_owned()),
                 Ok(bytes) if said.len() as u64 + bytes as u64 > ANSWER_BYTES_MAX => {
-                    return Err(self.closed()("its answer is no line of text"));
+                    return Err(self.closed()("its answer is not a line of text"));
                 }
                 Ok(bytes) => said.extend_from_slice(&piece[..bytes]),
                 Err(error) if may_go_on(&error) => self.require_patience(since)?,
@@ -167,7 +167,7 @@ impl SocketSink {
     }
 }
 
-/// Whether it only was not the time.
+/// Whether the operation may be tried again.
 fn may_go_on(error: &io::Error) -> bool {
     use io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
     matches!(error.kind(), Interrupted | TimedOut | WouldBlock)

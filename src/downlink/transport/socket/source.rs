@@ -1,4 +1,4 @@
-//! Packets of all senders, as a source.
+//! The packets of all senders, as a source.
 
 use std::io;
 use std::net::SocketAddr;
@@ -19,15 +19,15 @@ use crate::downlink::error::DownlinkError;
 use crate::frames::Instrument;
 use crate::runtime::{Flow, Outlet, Source, Units};
 
-/// How long to wait for packets before looking whether the run has been ended.
+/// Longest wait for packets between two checks for the end of the run.
 const POLL: Duration = Duration::from_millis(100);
 
-/// Listens, and gives whole packets of all senders in the order in which they are found.
+/// Listens, and passes on whole packets of all senders in the order in which they are found.
 pub struct SocketSource {
     address: SocketAddr,
     config: ListenConfig,
     until: Until,
-    /// Until the run begins.
+    /// Set until the run starts.
     waiting: Option<(std::net::TcpListener, Mission, Teller)>,
     running: Option<(Receiver<PacketBatch>, JoinHandle<()>)>,
     room: Arc<Semaphore>,
@@ -37,10 +37,10 @@ pub struct SocketSource {
 }
 
 impl SocketSource {
-    /// Binds one of the addresses. Senders may connect from now on; they are served when the run begins.
+    /// Binds one of the addresses. Senders may connect from now on; they are served when the run starts.
     ///
     /// # Errors
-    /// Addresses that cannot be listened on.
+    /// No address can be bound.
     pub fn bind(addresses: &[SocketAddr], config: &ListenConfig, until: Until) -> Result<Self, SocketError> {
         let failed = |source| {
             let none = SocketAddr::from(([0, 0, 0, 0], 0));
@@ -66,7 +66,7 @@ impl SocketSource {
         })
     }
 
-    /// Takes packets of this instrument alone; without it, of the one that is described first.
+    /// Accepts packets of this instrument only; with `None`, of the one described first.
     #[must_use]
     pub fn knowing(mut self, instrument: Option<Instrument>) -> Self {
         if let Some((_, mission, _)) = &mut self.waiting {
@@ -75,7 +75,7 @@ impl SocketSource {
         self
     }
 
-    /// Says what becomes of connections; a note at a time.
+    /// Reports what happens to connections, one note at a time.
     #[must_use]
     pub fn telling(mut self, tell: Teller) -> Self {
         if let Some((_, _, teller)) = &mut self.waiting {
@@ -84,13 +84,13 @@ impl SocketSource {
         self
     }
 
-    /// Where it listens; the port is the one that was chosen if none was named.
+    /// The address bound, with the port that the system chose for port 0.
     #[must_use]
     pub fn url(&self) -> TcpUrl {
         TcpUrl::from(self.address)
     }
 
-    /// What can be seen of its connections, on the way and at the end.
+    /// Status and report of its connections.
     #[must_use]
     pub fn listening(&self) -> Listening {
         self.listening.clone()
@@ -111,15 +111,15 @@ impl SocketSource {
             let _inside = runtime.enter();
             tokio::net::TcpListener::from_std(listener).map_err(failed)?
         };
-        // Bounded by the room that deliveries take.
-        let (deliveries, receiver) = unbounded();
+        // Bounded by the room that batches occupy.
+        let (batches, receiver) = unbounded();
         let shared = Arc::new(ListenContext {
             config: self.config.clone(),
             until: self.until,
             mission,
             listening: self.listening.clone(),
             room: Arc::clone(&self.room),
-            deliveries,
+            batches,
             stop: Arc::clone(&self.stop),
             notes: Notes::new(tell),
             sign: Mutex::new(tokio::time::Instant::now()),
@@ -130,13 +130,13 @@ impl SocketSource {
         Ok(())
     }
 
-    fn give(&mut self, delivery: PacketBatch, out: &mut Outlet<Vec<u8>>) {
-        self.bytes += delivery.bytes.len() as u64;
-        out.push(delivery.bytes);
-        drop(delivery.room);
+    fn give(&mut self, batch: PacketBatch, out: &mut Outlet<Vec<u8>>) {
+        self.bytes += batch.bytes.len() as u64;
+        out.push(batch.bytes);
+        drop(batch.room);
     }
 
-    /// Waits for the listener's thread, which has nothing left to do.
+    /// Waits for the listener's thread, which is about to end.
     fn join(&mut self) -> Result<(), SocketError> {
         match self.running.take().map(|(_, thread)| thread.join()) {
             Some(Err(_)) => Err(SocketError::Fallen),
@@ -153,7 +153,7 @@ impl Source for SocketSource {
         self.start()?;
         let Some((receiver, _)) = &self.running else { return Ok(Flow::Done) };
         match receiver.recv_timeout(POLL) {
-            Ok(delivery) => self.give(delivery, out),
+            Ok(batch) => self.give(batch, out),
             Err(RecvTimeoutError::Timeout) => self.listening.status.clear_backlog(),
             Err(RecvTimeoutError::Disconnected) => {
                 self.join()?;
@@ -163,11 +163,11 @@ impl Source for SocketSource {
         Ok(Flow::Continue)
     }
 
-    /// Reads no further, but hands on what has been read.
+    /// Stops reading, but passes on what has been read.
     fn finish(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
         self.stop.send_replace(true);
-        while let Some(delivery) = self.running.as_ref().and_then(|(receiver, _)| receiver.recv().ok()) {
-            self.give(delivery, out);
+        while let Some(batch) = self.running.as_ref().and_then(|(receiver, _)| receiver.recv().ok()) {
+            self.give(batch, out);
         }
         Ok(self.join()?)
     }
@@ -178,7 +178,7 @@ impl Source for SocketSource {
 }
 
 impl Drop for SocketSource {
-    /// After a failure elsewhere nobody takes packets any more: whoever waits for room must not wait for ever.
+    /// After a failure elsewhere nobody drains the backlog: connections that wait for room must not wait for ever.
     fn drop(&mut self) {
         self.stop.send_replace(true);
         self.room.close();

@@ -1,4 +1,4 @@
-//! `tcp://HOST:PORT`.
+//! Addresses of the form `tcp://HOST:PORT`.
 
 use std::fmt;
 use std::net::{SocketAddr, ToSocketAddrs};
@@ -6,7 +6,7 @@ use std::str::FromStr;
 
 use super::error::SocketError;
 
-/// A place that speaks TCP.
+/// A TCP host and port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TcpUrl {
     host: String,
@@ -17,7 +17,7 @@ impl TcpUrl {
     /// Its addresses.
     ///
     /// # Errors
-    /// A host without any.
+    /// The host has none.
     pub fn addresses(&self) -> Result<Vec<SocketAddr>, SocketError> {
         let found = (self.host.as_str(), self.port).to_socket_addrs().map(Vec::from_iter);
         match found {
@@ -29,10 +29,10 @@ impl TcpUrl {
         }
     }
 
-    /// Its addresses, if all are this machine's own.
+    /// Its addresses, if all are loopback addresses.
     ///
     /// # Errors
-    /// [`SocketError::Remote`]; a host without an address.
+    /// [`SocketError::Remote`]; the host has no address.
     pub fn own_addresses(&self) -> Result<Vec<SocketAddr>, SocketError> {
         let found = self.addresses()?;
         match found.iter().all(|address| address.ip().to_canonical().is_loopback()) {

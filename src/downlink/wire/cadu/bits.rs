@@ -1,14 +1,14 @@
-//! Bytes at any bit of a stream, and the search for the sync marker.
+//! Reads bytes at any bit of a stream, and searches for the sync marker.
 
 use multiversion::multiversion;
 
 use super::SYNC_MARKER;
 
-/// Wrong bits of a marker that is still taken for one. Noise has so few, or so few right ones, at 2.6e-6 of
-/// all bits; a true marker has more at 2e-6 of all places when 1 bit in 400 is wrong.
+/// Maximum number of wrong bits in a marker. Noise has as few wrong or as few right bits at 2.6e-6 of all places; a
+/// true marker has more wrong bits with a probability of 2e-6 at a bit error rate of 1 in 400.
 pub const MARKER_ERRORS_MAX: u32 = 3;
 
-/// The 32 bits from bit `at` on; what lies beyond the end is 0.
+/// The 32 bits from bit `at` on, zeros beyond the end.
 pub(crate) fn word_at(bytes: &[u8], at: usize) -> u32 {
     let mut eight = [0; 8];
     let rest = bytes.get(at / 8..).unwrap_or_default();
@@ -17,7 +17,7 @@ pub(crate) fn word_at(bytes: &[u8], at: usize) -> u32 {
     (u64::from_be_bytes(eight) << (at % 8) >> 32) as u32
 }
 
-/// Copies bytes from bit `at` on; they must be there.
+/// Copies bytes from bit `at` on. The bits must exist.
 pub(crate) fn copy_at(bytes: &[u8], at: usize, out: &mut [u8]) {
     let (first, shift) = (at / 8, at % 8);
     if shift == 0 {
@@ -30,7 +30,7 @@ pub(crate) fn copy_at(bytes: &[u8], at: usize, out: &mut [u8]) {
     }
 }
 
-/// Whether 32 bits are a marker, perhaps inverted.
+/// The polarity of a marker, if 32 bits are one.
 pub(crate) fn marker(word: u32) -> Option<Polarity> {
     match (word ^ SYNC_MARKER).count_ones() {
         0..=MARKER_ERRORS_MAX => Some(Polarity::Upright),
@@ -39,13 +39,13 @@ pub(crate) fn marker(word: u32) -> Option<Polarity> {
     }
 }
 
-/// Wrong bits of a marker.
+/// Number of wrong bits in a marker.
 pub(crate) fn marker_errors(word: u32, polarity: Polarity) -> u32 {
     let wrong = (word ^ SYNC_MARKER).count_ones();
     if polarity == Polarity::Upright { wrong } else { 32 - wrong }
 }
 
-/// Whether the bits of a stream are as they were sent.
+/// Whether the bits of a stream are as sent or inverted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Polarity {
     #[default]
@@ -53,11 +53,11 @@ pub(crate) enum Polarity {
     Inverted,
 }
 
-/// The first place from bit `from` to before bit `to` with a marker. The bytes of markers up to there must be there.
+/// The first place in `from..to` (bits) with a marker. The bytes of a marker at the last place must exist.
 pub(crate) fn find_marker(bytes: &[u8], from: usize, to: usize) -> Option<usize> {
     let mut at = from;
     while at < to {
-        // Whole bytes are searched many bits at once; one in which something was found is gone through bit by bit.
+        // Whole bytes are searched many bits at once; a byte with a hit is searched bit by bit.
         if at.is_multiple_of(8) {
             at = 8 * find_byte(bytes, at / 8, to / 8);
         }
@@ -70,8 +70,8 @@ pub(crate) fn find_marker(bytes: &[u8], from: usize, to: usize) -> Option<usize>
     None
 }
 
-/// The first byte from `from` on in which a marker begins, or `to`, or a byte shortly before the end, where
-/// too little is left to look at many bits at once.
+/// The first byte from `from` on in which a marker begins; or `to`; or a byte just before the end, where too little is
+/// left to examine many bits at once.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl+avx512vpopcntdq", "x86_64+avx2+popcnt"))]
 fn find_byte(bytes: &[u8], from: usize, to: usize) -> usize {
     const MARKER: u64 = SYNC_MARKER as u64;

@@ -5,7 +5,7 @@ use super::reed_solomon::ReedSolomon;
 use super::{HOUSEKEEPING, IDLE, SCIENCE, SYNC_MARKER, SYNC_MARKER_BYTES, randomize};
 use crate::downlink::wire::Kind;
 
-/// Puts packets into frames and codes those.
+/// Packs packets into frames and encodes these as CADUs.
 #[derive(Debug)]
 pub struct CaduEncoder {
     code: ReedSolomon,
@@ -17,7 +17,7 @@ pub struct CaduEncoder {
 }
 
 impl CaduEncoder {
-    /// An encoder whose counts begin with 0; each pass begins with `idle_frames` of idle data.
+    /// An encoder whose counts start at 0; each pass starts with `idle_frames` frames of idle data.
     #[must_use]
     pub fn new(code: ReedSolomon, spacecraft: u8, idle_frames: u32) -> Self {
         let framer = |channel| Framer::new(spacecraft, channel, code.data_bytes());
@@ -37,7 +37,7 @@ impl CaduEncoder {
         SYNC_MARKER_BYTES + self.code.block_bytes()
     }
 
-    /// Appends the CADUs that whole packets fill. Bytes that are no whole packet are left out.
+    /// Appends the CADUs that complete packets fill. Ignores an incomplete packet at the end.
     pub fn encode(&mut self, packets: &[u8], out: &mut Vec<u8>) {
         let code = self.code;
         if !std::mem::replace(&mut self.in_pass, true) {
@@ -57,7 +57,7 @@ impl CaduEncoder {
         }
     }
 
-    /// Ends a pass: appends what is in hand, filled up with idle packets; science before housekeeping.
+    /// Ends a pass: appends the partial frames, padded with idle packets; science before housekeeping.
     pub fn flush(&mut self, out: &mut Vec<u8>) {
         let code = self.code;
         self.science.flush(|frame| code_frame(code, frame, out));

@@ -3,22 +3,22 @@
 /// The field's polynomial without its leading term.
 const POLYNOMIAL: u8 = 0x87;
 
-/// Rows of the matrix that takes a symbol from the conventional to the dual basis, its highest power first
+/// Rows of the matrix that transforms a symbol from the conventional to the dual basis, the highest power first
 /// (131.0-B, annex F).
 const TO_DUAL: [u8; 8] = [0x8D, 0xEF, 0xEC, 0x86, 0xFA, 0x99, 0xAF, 0x7B];
 
 /// Number of powers of the primitive element.
 pub(super) const ORDER: usize = 255;
 
-/// Stands for the logarithm of 0: beyond all sums of two others.
+/// Stands for the logarithm of 0: larger than any sum of two others.
 const LOG_OF_ZERO: u16 = 511;
 
 /// Tables of the field.
 #[derive(Debug)]
 pub(super) struct GaloisField {
-    /// Powers of the primitive element, twice over, so that sums of two logarithms need no reduction; then zeros.
+    /// Powers of the primitive element, repeated once, so that sums of two logarithms need no reduction; then zeros.
     exp: [u8; 1024],
-    /// Logarithms; that of 0 is so great that its sum with any other leads to a zero.
+    /// Logarithms; that of 0 is so large that its sum with any other indexes a zero.
     log: [u16; 256],
     /// Symbols in the dual basis by those in the conventional one.
     pub(super) to_dual: [u8; 256],
@@ -26,7 +26,7 @@ pub(super) struct GaloisField {
     pub(super) to_conventional: [u8; 256],
 }
 
-/// The tables, made when the program is compiled.
+/// The tables, computed at compile time.
 pub(super) static FIELD: GaloisField = tables();
 
 const fn tables() -> GaloisField {
@@ -66,12 +66,12 @@ impl GaloisField {
         self.exp[self.log(a) + self.log(b)]
     }
 
-    /// Logarithm of an element other than 0.
+    /// Logarithm of a non-zero element.
     pub(super) fn log(&self, a: u8) -> usize {
         usize::from(self.log[usize::from(a)])
     }
 
-    /// `a` over `b`, which is not 0.
+    /// `a` over a non-zero `b`.
     pub(super) fn divide(&self, a: u8, b: u8) -> u8 {
         self.exp[self.log(a) + ORDER - self.log(b)]
     }

@@ -10,7 +10,7 @@ pub(crate) const ZONE_START: usize = FRAME_HEADER_BYTES + 2;
 pub const SCIENCE: u8 = 1;
 /// Virtual channel of the spacecraft's own counts.
 pub const HOUSEKEEPING: u8 = 2;
-/// Virtual channel of frames of idle data alone: all ones, as the standard has it.
+/// Virtual channel of idle frames: all ones, by the standard.
 pub const IDLE: u8 = 0x3F;
 
 /// First header pointer of a zone in which no packet begins.
@@ -28,7 +28,7 @@ pub struct FrameHeader {
     pub spacecraft: u8,
     /// Virtual channel, 6 bits.
     pub channel: u8,
-    /// Frames of this virtual channel sent before this one, of so many bits as `count_bits` says.
+    /// Number of frames of this virtual channel sent before this one, modulo `count_bits` bits.
     pub count: u32,
     /// 24, or 28 where the count cycle is used, as here.
     pub count_bits: u32,
@@ -46,7 +46,7 @@ impl FrameHeader {
         [id_0, id_1, c0, c1, c2, signaling]
     }
 
-    /// The header that `bytes` begin with; `None` for another version of frame.
+    /// Parses the header at the beginning of `bytes`; `None` for another frame version.
     #[must_use]
     pub fn parse(bytes: &[u8]) -> Option<Self> {
         let &[id_0, id_1, c0, c1, c2, signaling] = bytes.first_chunk()?;

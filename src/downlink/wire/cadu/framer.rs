@@ -1,4 +1,4 @@
-//! Packets into the packet zones of one virtual channel's frames (CCSDS 732.0-B, section 4.1.4.2).
+//! Packs packets into the packet zones of one virtual channel's frames (CCSDS 732.0-B, section 4.1.4.2).
 
 use super::frame::{FrameHeader, NO_HEADER, ZONE_START};
 
@@ -6,26 +6,26 @@ use super::frame::{FrameHeader, NO_HEADER, ZONE_START};
 pub(crate) const IDLE_APID: u16 = 0x7FF;
 /// Octets of a space packet's primary header.
 pub(crate) const PACKET_HEADER_BYTES: usize = 6;
-/// What idle packets hold; the randomizer sees to the transitions.
+/// Content of idle packets; the randomizer provides bit transitions.
 const IDLE_OCTET: u8 = 0x55;
 
-/// Count bits that frames carry.
+/// Bits of a frame count.
 const COUNT_BITS: u32 = 28;
 
 /// Fills the frames of one virtual channel.
 #[derive(Debug)]
-pub(crate) struct Framer {
+pub(super) struct Framer {
     spacecraft: u8,
     channel: u8,
     frame_bytes: usize,
     count: u32,
-    /// The frame in hand, its header still to be filled in.
+    /// The current frame, with its header still blank.
     frame: Vec<u8>,
     first_header: u16,
     idle: IdleData,
 }
 
-/// What idle frames hold: the sequence of x^32 + x^22 + x^2 + x + 1 from all ones, never begun anew.
+/// Content of idle frames: the sequence of x^32 + x^22 + x^2 + x + 1 from all ones, never restarted.
 ///
 /// A constant will not do: a block of equal octets is a codeword at every depth of interleaving.
 #[derive(Debug)]
@@ -43,7 +43,7 @@ impl IdleData {
 }
 
 impl Framer {
-    pub(crate) fn new(spacecraft: u8, channel: u8, frame_bytes: usize) -> Self {
+    pub(super) fn new(spacecraft: u8, channel: u8, frame_bytes: usize) -> Self {
         let frame = vec![0; ZONE_START];
         Self {
             spacecraft,
@@ -56,8 +56,8 @@ impl Framer {
         }
     }
 
-    /// Adds a packet; `send` is given each frame that it fills.
-    pub(crate) fn add(&mut self, packet: &[u8], mut send: impl FnMut(&[u8])) {
+    /// Adds a packet; passes each frame that it fills to `send`.
+    pub(super) fn add(&mut self, packet: &[u8], mut send: impl FnMut(&[u8])) {
         if self.first_header == NO_HEADER {
             self.first_header = (self.frame.len() - ZONE_START) as u16;
         }
@@ -72,9 +72,9 @@ impl Framer {
         }
     }
 
-    /// Fills the frame in hand, if anything is in it, with an idle packet; two frames where the room left is less
-    /// than the shortest packet.
-    pub(crate) fn flush(&mut self, send: impl FnMut(&[u8])) {
+    /// Pads the current frame, unless it is empty, with an idle packet, which runs into a second frame if the room left is
+    /// shorter than the shortest packet.
+    pub(super) fn flush(&mut self, send: impl FnMut(&[u8])) {
         if self.frame.len() == ZONE_START {
             return;
         }
@@ -84,9 +84,9 @@ impl Framer {
         self.add(&idle_packet(length), send);
     }
 
-    /// A frame of idle data alone.
-    pub(crate) fn idle(&mut self, mut send: impl FnMut(&[u8])) {
-        // There is no packet zone: idle data begins behind the primary header.
+    /// Sends a frame of idle data only.
+    pub(super) fn idle(&mut self, mut send: impl FnMut(&[u8])) {
+        // There is no packet zone: idle data begins after the primary header.
         let pointer = u16::from_be_bytes([self.idle.octet(), self.idle.octet()]);
         let rest = self.frame_bytes - ZONE_START;
         self.frame.extend((0..rest).map(|_| self.idle.octet()));
@@ -111,7 +111,7 @@ impl Framer {
     }
 }
 
-/// An idle packet of `bytes` octets, more than its header has.
+/// An idle packet of `bytes` octets, which must exceed its header.
 fn idle_packet(bytes: usize) -> Vec<u8> {
     let mut packet = vec![IDLE_OCTET; bytes];
     let length = (bytes - PACKET_HEADER_BYTES - 1) as u16;

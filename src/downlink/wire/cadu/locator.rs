@@ -1,4 +1,4 @@
-//! From syndromes to errors: Berlekamp-Massey, Chien's search, Forney's formula.
+//! Syndromes to errors: Berlekamp-Massey, Chien's search, Forney's formula.
 
 use std::sync::LazyLock;
 
@@ -10,11 +10,11 @@ use super::reed_solomon::{ERRORS_MAX, PARITY_BYTES, ROOT_FIRST, ROOT_STEP};
 /// Wrong octets of a codeword.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Errors {
-    /// How many; the first so many of the arrays count.
+    /// Number of errors; only this many elements of the arrays are valid.
     pub(super) count: usize,
     /// Places in the codeword, the first octet sent being 0.
     pub(super) places: [u8; ERRORS_MAX],
-    /// What is to be added to them, in the conventional basis.
+    /// Values to add there, in the conventional basis.
     pub(super) values: [u8; ERRORS_MAX],
 }
 
@@ -29,7 +29,7 @@ fn inverse_locator(place: usize) -> u8 {
     FIELD.power(ROOT_STEP * (ORDER - (ORDER - 1 - place)))
 }
 
-/// The errors that make the syndromes; `None` if there are more than can be told.
+/// The errors that explain the syndromes; `None` if there are too many.
 pub(super) fn locate(syndromes: &[u8; PARITY_BYTES]) -> Option<Errors> {
     let (locator, count) = shortest_register(syndromes)?;
     let mut values = *INVERSE_LOCATORS;
@@ -79,7 +79,7 @@ fn shortest_register(syndromes: &[u8; PARITY_BYTES]) -> Option<(Polynomial, usiz
     (locator[length] != 0).then_some((locator, length))
 }
 
-/// S(x) times the locator, modulo x^count: all that Forney's formula needs.
+/// S(x) times the locator, modulo x^count, for Forney's formula.
 fn evaluator(syndromes: &[u8; PARITY_BYTES], locator: &Polynomial, count: usize) -> [u8; ERRORS_MAX] {
     let mut product = [0; ERRORS_MAX];
     for (n, coefficient) in product.iter_mut().enumerate().take(count) {
@@ -95,7 +95,7 @@ fn forney(evaluator: &[u8], locator: &[u8], place: usize) -> Option<u8> {
         coefficients.rev().fold(0, |sum, coefficient| FIELD.multiply(sum, x) ^ coefficient)
     };
     let above = at(&mut evaluator.iter().copied(), inverse);
-    // In characteristic 2 the derivative has the odd terms alone, one power lower each.
+    // In characteristic 2 the derivative has only the odd terms, each one power lower.
     let square = FIELD.multiply(inverse, inverse);
     let below = at(&mut locator.iter().skip(1).step_by(2).copied(), square);
     if below == 0 || above == 0 {
@@ -107,7 +107,7 @@ fn forney(evaluator: &[u8], locator: &[u8], place: usize) -> Option<u8> {
 
 /// Replaces each x by the value of a polynomial there.
 ///
-/// All at once by Horner's rule, with multiplications that a compiler turns into vector instructions.
+/// All at once by Horner's rule, with multiplications that the compiler vectorises.
 #[multiversion(targets("x86_64+avx512f+avx512bw", "x86_64+avx2"))]
 fn evaluate(coefficients: &[u8], x: &mut [u8; 256]) {
     let mut sum = [0_u8; 256];

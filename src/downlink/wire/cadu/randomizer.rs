@@ -1,11 +1,11 @@
-//! The pseudo-randomizer (CCSDS 131.0-B, section 10): x^8 + x^7 + x^5 + x^3 + 1 from all ones, anew for each block.
+//! The pseudo-randomizer (CCSDS 131.0-B, section 10): x^8 + x^7 + x^5 + x^3 + 1 from all ones, restarted per block.
 
 use super::reed_solomon::CODEWORD_BYTES;
 
 /// Octets of the longest block, 8 codewords.
 const BLOCK_BYTES_MAX: usize = 8 * CODEWORD_BYTES;
 
-/// What is added to a block. The sequence's period is 255 bits, hence also 255 octets.
+/// The sequence that is added to a block. Its period is 255 bits, hence also 255 octets.
 static SEQUENCE: [u8; BLOCK_BYTES_MAX] = sequence();
 
 const fn sequence() -> [u8; BLOCK_BYTES_MAX] {
@@ -22,7 +22,7 @@ const fn sequence() -> [u8; BLOCK_BYTES_MAX] {
     out
 }
 
-/// Adds the sequence to a block, or takes it off again. At most 2040 octets.
+/// Adds the sequence to a block of at most 2040 octets, or removes it again.
 pub fn randomize(block: &mut [u8]) {
     for (octet, added) in block.iter_mut().zip(&SEQUENCE) {
         *octet ^= added;

@@ -1,12 +1,12 @@
 //! The Reed-Solomon code (255, 223) with interleaving and the dual basis (CCSDS 131.0-B, section 4).
 //!
-//! Octets of a block belong to codewords in turn; 223 of each codeword are data and 32 are parity, the
+//! The octets of a block belong to its codewords in turn. Of each codeword 223 octets are data and 32 are parity: the
 //! remainder of the data times x^32 by g(x) = prod (x - a^(11 j)), j = 112..=143. Up to 16 wrong octets of a codeword
 //! are corrected.
 //!
-//! The remainder is linear in the data, also in the dual basis, so it is taken by tables, four octets at a time
-//! (as CRCs are by slicing). A received codeword is clean if the remainder of its data is its parity; only
-//! otherwise are syndromes needed, and they follow from the difference of the two alone.
+//! The remainder is linear in the data, also in the dual basis, so it is computed from tables, four octets at a time
+//! (like CRCs by slicing). A received codeword is clean if the remainder of its data equals its parity. Otherwise its
+//! syndromes follow from the difference of the two.
 
 use std::sync::LazyLock;
 
@@ -21,16 +21,16 @@ pub const CODEWORD_BYTES: usize = 255;
 pub const PARITY_BYTES: usize = 32;
 /// Octets of data in a codeword.
 pub const DATA_BYTES: usize = CODEWORD_BYTES - PARITY_BYTES;
-/// Wrong octets of a codeword that can be corrected.
+/// Maximum number of correctable octets in a codeword.
 pub const ERRORS_MAX: usize = PARITY_BYTES / 2;
-/// Codewords that may be interleaved.
+/// Permitted depths of interleaving.
 pub const INTERLEAVES: [usize; 6] = [1, 2, 3, 4, 5, 8];
 
 /// Exponents of the generator's roots: 11 times 112 to 143.
-pub(crate) const ROOT_STEP: usize = 11;
-pub(crate) const ROOT_FIRST: usize = 112;
+pub(super) const ROOT_STEP: usize = 11;
+pub(super) const ROOT_FIRST: usize = 112;
 
-/// Octets that the tables take at a time.
+/// Octets processed per table lookup.
 const SLICE: usize = 4;
 /// Slices of a codeword's data; the first lacks its first octet.
 const SLICES: usize = DATA_BYTES.div_ceil(SLICE);
@@ -38,10 +38,10 @@ const SLICES: usize = DATA_BYTES.div_ceil(SLICE);
 /// 32 octets, the first sent in the upper bits of the first word.
 type Parity = [u32; PARITY_BYTES / 4];
 
-/// By place, half and value.
+/// Indexed by place, half and value.
 type SyndromeTables = [[[[u8; PARITY_BYTES]; 16]; 2]; PARITY_BYTES];
 
-/// A codeword with more wrong octets than can be corrected.
+/// A codeword has more wrong octets than can be corrected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Uncorrectable;
 
@@ -52,20 +52,20 @@ static REMAINDERS: LazyLock<Box<[[Parity; 256]; SLICE]>> = LazyLock::new(remaind
 /// half (upper first) and value.
 static SYNDROMES: LazyLock<Box<SyndromeTables>> = LazyLock::new(syndrome_tables);
 
-/// The code with so many codewords interleaved.
+/// The code at a depth of interleaving.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReedSolomon {
     interleave: usize,
 }
 
 impl ReedSolomon {
-    /// The code at a depth; `None` for one that the standard does not have, see [`INTERLEAVES`].
+    /// The code at a depth; `None` for a depth outside the standard, see [`INTERLEAVES`].
     #[must_use]
     pub fn new(interleave: usize) -> Option<Self> {
         INTERLEAVES.contains(&interleave).then_some(Self { interleave })
     }
 
-    /// Codewords interleaved.
+    /// Depth of interleaving.
     #[must_use]
     pub fn interleave(self) -> usize {
         self.interleave
@@ -83,7 +83,7 @@ impl ReedSolomon {
         CODEWORD_BYTES * self.interleave
     }
 
-    /// Fills in the parity of a block, which is [`ReedSolomon::block_bytes`] long and begins with its data.
+    /// Fills in the parity of a block of [`ReedSolomon::block_bytes`] octets that begins with its data.
     pub fn encode(self, block: &mut [u8]) {
         let found = self.remainders(block);
         for (at, row) in block[self.data_bytes()..].chunks_exact_mut(self.interleave).enumerate() {
@@ -93,10 +93,10 @@ impl ReedSolomon {
         }
     }
 
-    /// Corrects a block, which is [`ReedSolomon::block_bytes`] long; returns the octets corrected.
+    /// Corrects a block of [`ReedSolomon::block_bytes`] octets; returns the number of octets corrected.
     ///
     /// # Errors
-    /// A codeword with more errors than can be corrected; the block is then partly corrected at most.
+    /// A codeword has more errors than can be corrected; the block may then be partly corrected.
     pub fn decode(self, block: &mut [u8]) -> Result<usize, Uncorrectable> {
         let mut found = self.remainders(block);
         let mut wrong = 0;
@@ -123,7 +123,7 @@ impl ReedSolomon {
     fn remainders(self, block: &[u8]) -> [Parity; 8] {
         let mut found = [Parity::default(); 8];
         let data = &block[..self.data_bytes()];
-        // Depths known to the compiler let it work on all codewords at once, in registers.
+        // A depth known at compile time keeps all codewords in registers.
         match self.interleave {
             1 => divide::<1>(data, &REMAINDERS, &mut found),
             2 => divide::<2>(data, &REMAINDERS, &mut found),

@@ -1,42 +1,42 @@
-//! Numbers in bulk, little-endian. The loops are plain copies on a little-endian machine.
+//! Arrays of numbers, little-endian. The loops compile to plain copies on little-endian machines.
 
 use num_complex::Complex32;
 
 use crate::units::vector::Vec3;
 
-/// Appends `4 n` zero bytes and returns them.
+/// Appends `N * count` zero bytes and returns them.
 fn room<const N: usize>(out: &mut Vec<u8>, count: usize) -> &mut [[u8; N]] {
     let start = out.len();
     out.resize(start + N * count, 0);
     out[start..].as_chunks_mut().0
 }
 
-pub(crate) fn put_u32(values: &[u32], out: &mut Vec<u8>) {
+pub(super) fn put_u32(values: &[u32], out: &mut Vec<u8>) {
     for (bytes, value) in room::<4>(out, values.len()).iter_mut().zip(values) {
         *bytes = value.to_le_bytes();
     }
 }
 
-pub(crate) fn put_f32(values: &[f32], out: &mut Vec<u8>) {
+pub(super) fn put_f32(values: &[f32], out: &mut Vec<u8>) {
     for (bytes, value) in room::<4>(out, values.len()).iter_mut().zip(values) {
         *bytes = value.to_le_bytes();
     }
 }
 
-pub(crate) fn put_complex32(values: &[Complex32], out: &mut Vec<u8>) {
+pub(super) fn put_complex32(values: &[Complex32], out: &mut Vec<u8>) {
     for (bytes, value) in room::<8>(out, values.len()).iter_mut().zip(values) {
         bytes[..4].copy_from_slice(&value.re.to_le_bytes());
         bytes[4..].copy_from_slice(&value.im.to_le_bytes());
     }
 }
 
-pub(crate) fn put_f64<'a>(values: impl ExactSizeIterator<Item = &'a f64>, out: &mut Vec<u8>) {
+pub(super) fn put_f64<'a>(values: impl ExactSizeIterator<Item = &'a f64>, out: &mut Vec<u8>) {
     for (bytes, value) in room::<8>(out, values.len()).iter_mut().zip(values) {
         *bytes = value.to_le_bytes();
     }
 }
 
-pub(crate) fn put_vec3(values: &[Vec3], out: &mut Vec<u8>) {
+pub(super) fn put_vec3(values: &[Vec3], out: &mut Vec<u8>) {
     for (bytes, value) in room::<24>(out, values.len()).iter_mut().zip(values) {
         for (bytes, x) in bytes.as_chunks_mut().0.iter_mut().zip(value) {
             *bytes = x.to_le_bytes();
@@ -44,11 +44,10 @@ pub(crate) fn put_vec3(values: &[Vec3], out: &mut Vec<u8>) {
     }
 }
 
-/// Bytes of a payload, taken from the front array by array.
+/// Bytes of a payload, from whose front arrays are taken one by one.
 ///
-/// The caller has compared the total length with what the arrays need; an array of a payload that is
-/// shorter all the same comes out short.
-pub(crate) struct Arrays<'a>(pub(crate) &'a [u8]);
+/// The caller must have checked the total length; from a shorter payload an array comes out short.
+pub(super) struct Arrays<'a>(pub(super) &'a [u8]);
 
 impl<'a> Arrays<'a> {
     fn take<const N: usize>(&mut self, count: usize) -> &'a [[u8; N]] {
@@ -57,23 +56,23 @@ impl<'a> Arrays<'a> {
         front.as_chunks().0
     }
 
-    pub(crate) fn u8(&mut self, count: usize) -> &'a [u8] {
+    pub(super) fn u8(&mut self, count: usize) -> &'a [u8] {
         self.take::<1>(count).as_flattened()
     }
 
-    pub(crate) fn u32(&mut self, count: usize) -> Vec<u32> {
+    pub(super) fn u32(&mut self, count: usize) -> Vec<u32> {
         self.take(count).iter().map(|bytes| u32::from_le_bytes(*bytes)).collect()
     }
 
-    pub(crate) fn f32(&mut self, count: usize) -> Vec<f32> {
+    pub(super) fn f32(&mut self, count: usize) -> Vec<f32> {
         self.take(count).iter().map(|bytes| f32::from_le_bytes(*bytes)).collect()
     }
 
-    pub(crate) fn f64(&mut self, count: usize) -> impl Iterator<Item = f64> {
+    pub(super) fn f64(&mut self, count: usize) -> impl Iterator<Item = f64> {
         self.take(count).iter().map(|bytes| f64::from_le_bytes(*bytes))
     }
 
-    pub(crate) fn complex32(&mut self, count: usize) -> Vec<Complex32> {
+    pub(super) fn complex32(&mut self, count: usize) -> Vec<Complex32> {
         let complex = |bytes: &[u8; 8]| {
             let [a, b, c, d, e, f, g, h] = *bytes;
             Complex32::new(f32::from_le_bytes([a, b, c, d]), f32::from_le_bytes([e, f, g, h]))
@@ -81,7 +80,7 @@ impl<'a> Arrays<'a> {
         self.take(count).iter().map(complex).collect()
     }
 
-    pub(crate) fn vec3(&mut self, count: usize) -> Vec<Vec3> {
+    pub(super) fn vec3(&mut self, count: usize) -> Vec<Vec3> {
         let vector = |bytes: &[u8; 24]| {
             let (numbers, _) = bytes.as_chunks::<8>();
             std::array::from_fn(|k| f64::from_le_bytes(numbers[k]))

@@ -1,6 +1,6 @@
 //! Satellite positions.
 //!
-//! Record: `start_ticks` i64, `step_ticks` u32, `satellites` u8, `nodes` u32. Array: positions, f64 x 3, m, node after
+//! Record: `start_ticks` i64, `step_ticks` u32, `satellites` u8, `nodes` u32. Array: positions, f64 x 3, m, node by
 //! node, `satellites` each.
 
 use bincode::{Decode, Encode};
@@ -10,11 +10,11 @@ use super::{PayloadFault, put_record, require, require_length, require_time, tak
 use crate::frames::{EphemerisSegment, Instrument};
 use crate::units::MissionTime;
 
-/// Least number of nodes of a segment: those of one interpolation.
+/// Minimum number of nodes of a segment: those of one interpolation.
 pub const NODES_MIN: usize = 8;
-/// Two months of one-minute nodes; a payload of 150 MB for 64 satellites never comes that far.
+/// Maximum number of nodes: two months of one-minute nodes. (For 64 satellites the payload limit is reached earlier.)
 const NODES_MAX: usize = 100_000;
-/// Beyond any orbit about the Moon, m.
+/// A distance beyond any orbit about the Moon, m.
 const COORDINATE_M_MAX: f64 = 1e9;
 
 #[derive(Encode, Decode)]

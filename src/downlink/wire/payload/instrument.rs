@@ -2,7 +2,7 @@
 //!
 //! Record: `name` (u64 length, UTF-8), `epoch_tai_s` f64, `moon_radius_m` f64, `satellites` u8, `response` u8,
 //! `seed` u64, `configuration_hash` u64, `channels` u16. Arrays: `frequency_hz` and `width_hz`, f64, one pair a channel.
-//! With a spectrometer three more f64: its lowest frequency, the width of its channels (Hz), and their number.
+//! With a spectrometer, three more f64: its lowest frequency, the width of its channels (Hz), and their number.
 
 use bincode::{Decode, Encode};
 
@@ -14,9 +14,9 @@ use crate::units::MAX_SATELLITES;
 const NAME_BYTES_MAX: usize = 256;
 /// The whole band in channels of 8 kHz is 3738 of them.
 const CHANNELS_MAX: usize = 4096;
-/// Bytes of a spectrometer behind the channels.
+/// Bytes of a spectrometer after the channels.
 const SPECTROMETER_BYTES: usize = 24;
-/// Where a spectrometer may listen, Hz.
+/// Frequency range of a spectrometer, Hz.
 const SPECTRUM_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=1e9;
 /// The band of the mission, Hz.
 const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=30e6;
@@ -156,7 +156,7 @@ mod tests {
         let mut bytes = Vec::new();
         encode(&instrument, &mut bytes).unwrap();
         assert_eq!(decode(&bytes).unwrap(), instrument);
-        // Without its last numbers it is the description of before.
+        // Without the last numbers it is a description without a spectrometer.
         let plain = Instrument { spectrometer: None, ..instrument.clone() };
         assert_eq!(decode(&bytes[..bytes.len() - SPECTROMETER_BYTES]).unwrap(), plain);
         assert!(decode(&bytes[..bytes.len() - 8]).is_err());

@@ -1,8 +1,8 @@
-//! What packets carry: a bincode-2 record, then raw little-endian arrays.
+//! Payloads of packets: a bincode-2 record, then raw little-endian arrays.
 //!
-//! Records are little-endian with fixed widths: other languages read them with a struct of the fields in
-//! the order in which they are listed here. What comes out of `decode` meets every invariant that the
-//! ground relies on; `encode` refuses what `decode` would.
+//! Records are little-endian with fixed widths. Other languages read them as a struct of the fields in the order
+//! listed here. `decode` returns only values that meet every invariant the ground relies on; `encode` refuses what
+//! `decode` would refuse.
 
 mod arrays;
 mod ephemeris;
@@ -25,17 +25,17 @@ pub(crate) use visibilities::{
     decode as decode_visibilities, encode as encode_visibilities, span as visibilities_span,
 };
 
-/// Bytes that any record may take; bincode refuses to allocate more whatever a length field says.
+/// Maximum length of a record; bincode refuses to allocate more, for any value of a length field.
 const RECORD_BYTES_MAX: usize = 512;
 
-/// Seconds that the four bytes of a packet's time code can count; bounds every time in a payload.
+/// Range of the four bytes of seconds in a packet's time code; bounds every time in a payload.
 const TIME_S_MAX: i64 = 1 << 32;
 
-/// Why a payload was refused although its packet's check held.
+/// Why a payload was refused although its packet's checksum is right.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum PayloadFault {
-    /// A format version that this program does not know.
+    /// Unknown format version.
     #[error("format version {found}: this program reads version {expected}")]
     Version {
         /// Version found.
@@ -43,38 +43,38 @@ pub enum PayloadFault {
         /// Version expected.
         expected: u8,
     },
-    /// The record could not be decoded.
+    /// The record cannot be decoded.
     #[error("the {what} record is malformed")]
     Record {
         /// Kind of record.
         what: &'static str,
     },
-    /// Payload and record disagree about the length.
-    #[error("{what}: {found} bytes or elements where its record asks for {expected}")]
+    /// Payload and record disagree about a length.
+    #[error("{what}: {found} bytes or elements, but the record requires {expected}")]
     Length {
-        /// What has the length.
+        /// The quantity.
         what: &'static str,
-        /// Length asked for.
+        /// Required length.
         expected: u64,
         /// Length found.
         found: u64,
     },
-    /// A value out of range.
+    /// A value is out of range.
     #[error("{what} = {value}: expected {expected}")]
     Value {
-        /// What has the value.
+        /// The quantity.
         what: &'static str,
         /// The value.
         value: f64,
-        /// Range that is accepted.
+        /// Accepted range.
         expected: &'static str,
     },
-    /// The middles of the integrations should increase and do not.
-    #[error("the middles of the integrations do not increase")]
+    /// The mid-times of the integrations do not increase.
+    #[error("the mid-times of the integrations do not increase")]
     Order,
 }
 
-/// A fault unless `good`.
+/// Returns a fault unless `good`.
 fn require(good: bool, what: &'static str, value: f64, expected: &'static str) -> Result<(), PayloadFault> {
     if good { Ok(()) } else { Err(PayloadFault::Value { what, value, expected }) }
 }
@@ -84,7 +84,7 @@ fn require_length(what: &'static str, expected: usize, found: usize) -> Result<(
     if expected == found { Ok(()) } else { Err(PayloadFault::Length { what, expected, found }) }
 }
 
-/// Times within one span of the time code about the epoch: no sum of ticks overflows later.
+/// Requires a time within one range of the time code about the epoch, so that no sum of ticks overflows later.
 fn require_time(time: MissionTime) -> Result<(), PayloadFault> {
     let good = time.0.unsigned_abs() <= (TIME_S_MAX * TICKS_PER_SECOND) as u64;
     require(good, "time (s)", time.seconds(), "within 136 years of the mission epoch")
@@ -100,7 +100,7 @@ fn put_record<R: Encode>(what: &'static str, record: R, out: &mut Vec<u8>) -> Re
     Ok(())
 }
 
-/// A record and what follows it.
+/// Splits a payload into its record and the rest.
 fn take_record<'a, R: Decode<()>>(
     what: &'static str,
     bytes: &'a [u8],

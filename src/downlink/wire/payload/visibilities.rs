@@ -3,10 +3,10 @@
 //! Record: `channel` u16, `i` u8, `j` u8 (satellites from 0), `start_ticks` i64, `count` u32. Arrays of `count`
 //! each: `offset_ticks` u32, `duration_ticks` u32, value (re, im) f32 x 2, `weight` f32, `flags` u8.
 //!
-//! A satellite with itself (`i` = `j`) is its own power: the mean of |x|^2, with the weight n / P^2. A spectrometer is
-//! the satellite behind the last, and its channels count on behind the last.
+//! A pair of a satellite with itself (`i` = `j`) is an auto-correlation: the mean of |x|^2, with the weight n / P^2. A
+//! spectrometer is the satellite after the last, and its channels are numbered after the last channel.
 //!
-//! A long block is split over packets that stand each for itself: same record but for the count.
+//! A long block is split over packets that can each be decoded alone, with the same record but for the count.
 
 use std::ops::Range;
 
@@ -31,7 +31,7 @@ struct VisibilityRecord {
     count: u32,
 }
 
-/// Visibilities that fit into a payload of `bytes`.
+/// Number of visibilities that fit into a payload of `bytes`.
 pub(crate) fn capacity(bytes: usize) -> usize {
     bytes.saturating_sub(RECORD_BYTES) / VISIBILITY_BYTES
 }
@@ -58,8 +58,8 @@ pub(crate) fn encode(
     Ok(())
 }
 
-/// The block of a payload without its bad visibilities, and how many those were: not finite, of weight or
-/// duration zero or less.
+/// The block of a payload without its bad visibilities, and their number: not finite, or of zero or negative weight
+/// or duration.
 pub(crate) fn decode(bytes: &[u8], instrument: &Instrument) -> Result<(VisibilityBlock, u64), PayloadFault> {
     let (record, rest) = take_record::<VisibilityRecord>("visibility", bytes)?;
     let count = record.count as usize;
@@ -80,13 +80,13 @@ pub(crate) fn decode(bytes: &[u8], instrument: &Instrument) -> Result<(Visibilit
     Ok((block, bad))
 }
 
-/// How many visibilities a payload says it has, for the account of a payload that is refused.
+/// Number of visibilities that a payload claims, for the counters of refused payloads.
 pub(crate) fn count(bytes: &[u8]) -> u64 {
     take_record::<VisibilityRecord>("visibility", bytes)
         .map_or(0, |(record, rest)| u64::from(record.count).min((rest.len() / VISIBILITY_BYTES) as u64))
 }
 
-/// First and last instant of the visibilities that a payload says it has, as far as it can be read.
+/// First and last instant of the visibilities that a payload claims, if it can be read.
 pub(crate) fn span(bytes: &[u8]) -> Option<[MissionTime; 2]> {
     let (record, rest) = take_record::<VisibilityRecord>("visibility", bytes).ok()?;
     let count = record.count as usize;
@@ -98,7 +98,7 @@ pub(crate) fn span(bytes: &[u8]) -> Option<[MissionTime; 2]> {
     Some([start.plus_ticks(i64::from(*offsets.first()?)), start.plus_ticks(end)])
 }
 
-/// What holds of a block as a whole.
+/// Checks the invariants of a block as a whole.
 pub(crate) fn check(block: &VisibilityBlock, instrument: &Instrument) -> Result<(), PayloadFault> {
     let Pair { i, j } = block.pair;
     require(i <= j, "trailing satellite of a pair", f64::from(j), "the leading one or after it")?;
@@ -118,7 +118,7 @@ pub(crate) fn check(block: &VisibilityBlock, instrument: &Instrument) -> Result<
     if disorder { Err(PayloadFault::Order) } else { Ok(()) }
 }
 
-/// Whether any visibility is bad: branch-free, so that the usual answer costs one pass.
+/// Whether any visibility is bad. Branch-free, so that the usual answer costs one pass.
 fn bad_values(block: &VisibilityBlock) -> bool {
     let durations = block.duration_ticks.iter().fold(false, |bad, ticks| bad | (*ticks == 0));
     let weights = block.weight.iter().fold(false, |bad, w| bad | !(*w > 0.0 && *w < f32::INFINITY));
