@@ -8,7 +8,7 @@ use crate::pipeline::{ConfigError, Plan};
 /// Check a pipeline and say what it will cost, without running it.
 ///
 /// Lists everything that is wrong with the file at once; then visibilities by channel, downlink bytes,
-/// memory, operations, and a time predicted from a measurement of a fraction of a second.
+/// memory, operations, and and an estimate of the time.
 #[derive(Debug, Args)]
 pub(super) struct CheckArgs {
     #[command(flatten)]
