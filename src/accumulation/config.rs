@@ -17,10 +17,10 @@ pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
 /// Greatest nside of maps from the harmonic engine: pixels ten times finer than its greatest degree.
 pub const HARMONIC_ENGINE_NSIDE_MAX: usize = 1024;
 
-/// Degrees of a harmonic map, a nside, if none are given: as many as pixels carry with 1e-6.
+/// Default highest degree of a harmonic map over nside: what pixels represent to 1e-6.
 const DEGREES_PER_NSIDE: f64 = 2.5;
 
-/// What the normal equations are summed over.
+/// Basis of the normal equations.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
@@ -32,17 +32,17 @@ pub enum EngineKind {
     Harmonic,
 }
 
-/// The ground's map making.
+/// The `[map]` section.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MapConfig {
     /// HEALPix nside of the maps.
     pub nside: usize,
-    /// What the normal equations are summed over: `pixel` or `harmonic`.
+    /// Basis of the normal equations: `pixel` or `harmonic`.
     pub engine: EngineKind,
-    /// How rows of B are made by the pixel engine.
+    /// Rows of B of the pixel engine.
     pub rows: PixelMethod,
-    /// Greatest degree of a map from the harmonic engine; 0 for 2.5 nside.
+    /// Highest degree of a map from the harmonic engine; 0 for 2.5 nside.
     pub l_max: usize,
     /// Longest baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
     pub baseline_bp_max: f64,
@@ -54,20 +54,21 @@ pub struct MapConfig {
     pub prior_files: Vec<PathBuf>,
     /// FWHM to which prior maps are smoothed, degrees.
     pub prior_fwhm_deg: f64,
-    /// Mission time between snapshot maps, s; 0 for a final map alone.
+    /// Mission time between snapshot maps, s; 0 for a final map only.
     pub snapshot_every_s: f64,
-    /// Greatest weight of a visibility that is taken, (K sr)^-2; it sets the resolution of the sums. 0 for 1024 times
-    /// that of 25 s under the mean sky of the channel's frequency.
+    /// Largest weight of a visibility, (K sr)^-2; it sets the resolution of the sums. 0 for 1024 times the weight of 25 s
+    /// under the mean sky at the frequency of the channel.
     pub weight_max: f64,
     /// Seed of the noise-only companion map.
     pub companion_seed: u64,
-    /// Residual at which the harmonic solution ends, relative to the right-hand side, in the preconditioner's norm.
+    /// Residual at which a harmonic solution is accepted, relative to the right-hand side, in the norm of the
+    /// preconditioner.
     pub residual_max: f64,
     /// Most iterations of a harmonic solution.
     pub iterations_max: usize,
     /// Random vectors for the traces of the covariances of a final harmonic map; 0 for none.
     pub trace_probes: usize,
-    /// Departures from the common circle that the harmonic engine takes.
+    /// Deviations from the common circle that the harmonic engine accepts.
     pub limits: GeometryLimits,
 }
 
@@ -135,7 +136,7 @@ impl MapConfig {
             "0, or 1e-60 to 1e60",
         );
         let every = self.snapshot_every_s;
-        checks.number("snapshot_every_s", every, every >= 0.0, "seconds, or 0 for a final map alone");
+        checks.number("snapshot_every_s", every, every >= 0.0, "seconds, or 0 for a final map only");
         let one = self.prior_files.is_empty() || self.prior_k.values().iter().all(|&k| k == 0.0);
         let files = self.prior_files.len();
         checks.require("prior_files", format!("({files} files)"), one, "none where map.prior_k is given");
@@ -148,7 +149,7 @@ impl MapConfig {
         if self.l_max > 0 { self.l_max } else { (DEGREES_PER_NSIDE * self.nside as f64) as usize }
     }
 
-    /// The settings that shape sums, by key; the others only shape what is made of them.
+    /// The settings on which the sums depend, by key; the others only affect solutions.
     #[must_use]
     pub fn of_sums(&self) -> Vec<(&'static str, String)> {
         let Self { nside, engine, rows, baseline_bp_max, companion_seed, limits, weight_max, .. } = self;
@@ -178,7 +179,7 @@ impl MapConfig {
         self.baseline_bp_max * SPEED_OF_LIGHT_M_S / frequency_hz / pixel_rad
     }
 
-    /// Settings by channel that do not fit an instrument of `channels` channels.
+    /// Lists by channel that do not fit an instrument of `channels` channels.
     #[must_use]
     pub fn misfits(&self, channels: usize) -> Vec<InvalidValue> {
         let files = self.prior_files.len();

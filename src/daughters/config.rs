@@ -13,17 +13,17 @@ pub const FLOAT_BITS: u32 = 32;
 pub struct DaughtersConfig {
     /// Bits of the real and of the imaginary part: 1, 2, 4, 8, or 32 for floats.
     pub bits: u32,
-    /// Time in which the level control follows the power, s.
+    /// Time constant of the automatic level control, s.
     pub level_time_constant_s: f64,
     /// Samples in a block.
     pub block_samples: usize,
     /// Greatest rate of the link from one daughter to the mother, bit/s; 0 for no limit.
     pub link_bits_per_s_max: f64,
-    /// Buffer of one daughter before the link, bytes.
+    /// Buffer of one daughter before its link, bytes.
     pub link_buffer_bytes: u64,
     /// What is dropped when the buffer is full.
     pub link_drop: DropPolicy,
-    /// What is wrong with the daughters; nothing by default.
+    /// Faults and artificial signals; none by default.
     pub disturbances: Disturbances,
 }
 
@@ -31,14 +31,14 @@ pub struct DaughtersConfig {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum DropPolicy {
-    /// The block that comes.
+    /// The newest block.
     #[default]
     Newest,
-    /// Those that have waited longest.
+    /// The oldest blocks.
     Oldest,
 }
 
-/// Faults and artificial signals. Lists have one value a daughter; an empty list is none of it.
+/// Faults and artificial signals. Lists have one value a daughter, or are empty for no such fault.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Disturbances {
@@ -50,15 +50,15 @@ pub struct Disturbances {
     pub phase_rad: Vec<f64>,
     /// Its drift, rad/s since the epoch.
     pub phase_drift_rad_per_s: Vec<f64>,
-    /// Clock offset, s: positive samples too late.
+    /// Clock offset, s; positive if samples are late.
     pub clock_offset_s: Vec<f64>,
     /// Its drift, s/s since the epoch.
     pub clock_drift: Vec<f64>,
-    /// Power of the Earth's narrow-band leak at the limb, K sr; 0 for none.
+    /// Power of narrow-band leakage from the Earth at the limb, K sr; 0 for none.
     pub interference_k_sr: f64,
     /// Its frequency, Hz from the channel's centre.
     pub interference_offset_hz: f64,
-    /// Depth behind the limb over which its power falls by e, m.
+    /// Depth behind the limb over which its power falls by a factor e, m.
     pub interference_depth_m: f64,
     /// Power of the calibration tone, K sr, equal and in phase at all daughters; 0 for none.
     pub calibration_k_sr: f64,

@@ -10,7 +10,7 @@ use super::wire::payload::{VISIBILITY_BYTES, visibilities_in};
 use super::wire::{HEADER_BYTES, PACKET_BYTES_MAX, TRAILER_BYTES};
 use crate::units::{Checks, InvalidValue};
 
-/// Least packet that holds headers and more than one record of any kind.
+/// Smallest packet that holds headers and more than one record of any kind.
 const PACKET_BYTES_MIN: usize = 256;
 
 /// Most frames of idle data before a pass: a megabyte.
@@ -20,22 +20,22 @@ const IDLE_FRAMES_MAX: u32 = 1_000;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DownlinkConfig {
-    /// Plain packets, or packets in coded frames.
+    /// Format: packets without coding, or packets in coded frames.
     pub format: Format,
-    /// Greatest packet, bytes. A lost packet loses its own visibilities only (21 bytes each).
+    /// Greatest size of a packet, bytes. A lost packet costs only its own visibilities (21 bytes each).
     pub packet_bytes_max: usize,
-    /// After so many bytes the instrument description and the present ephemeris are sent again, so that
-    /// no single damaged packet costs more than this.
+    /// Interval after which the instrument description and the current ephemeris are repeated, bytes. No single damaged
+    /// packet costs more data than this.
     pub repeat_bytes: u64,
     /// Reed-Solomon codewords interleaved in a block, for `cadu`: 1, 2, 3, 4, 5 or 8. A frame has 223 bytes each.
     pub interleave: usize,
     /// Spacecraft identifier of the frames, for `cadu`.
     pub spacecraft_id: u8,
-    /// Frames of idle data that begin each pass, for `cadu`: the ground needs one to find the stream.
+    /// Frames of idle data at the start of each pass, for `cadu`: the ground needs one to synchronise.
     pub idle_frames: u32,
-    /// Rate of the link, coding and all, bit/s; 0 for no limit. What the passes have no time for stays on board.
+    /// Rate of the link with coding, bit/s; 0 for no limit. Data that does not fit into a pass stays on board.
     pub rate_bits_per_s_max: f64,
-    /// Faults of the link; none unless asked for.
+    /// Faults of the link; none by default.
     pub link: LinkConfig,
     /// Limits of a ground that listens.
     pub listen: ListenConfig,
@@ -92,7 +92,7 @@ impl DownlinkConfig {
         }
     }
 
-    /// Rate at which visibilities can be sent, headers and coding taken off, bytes a second; `None` for no limit.
+    /// Rate of visibilities on the link, without headers and coding, bytes/s; `None` for no limit.
     #[must_use]
     pub fn payload_bytes_per_s(&self) -> Option<f64> {
         let payload = self.packet_bytes_max.saturating_sub(HEADER_BYTES + TRAILER_BYTES);
@@ -101,7 +101,7 @@ impl DownlinkConfig {
         (self.rate_bits_per_s_max > 0.0).then(|| self.rate_bits_per_s_max / 8.0 / overhead)
     }
 
-    /// The encoder of frames that the format asks for; `None` for plain packets.
+    /// The encoder of coded frames; `None` for plain packets.
     #[must_use]
     pub fn encoder(&self) -> Option<CaduEncoder> {
         self.code().map(|code| CaduEncoder::new(code, self.spacecraft_id, self.idle_frames))

@@ -18,15 +18,15 @@ pub const CHANNELS_MAX: usize = 30;
 /// Lowest and highest channel frequency, Hz: the mission's band.
 pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 
-/// Narrowest channel of samples, Hz: those made together, 2^14, take half a minute, in which the array moves by some
-/// degrees; what narrower ones would need grows with the third power of that time.
+/// Narrowest channel of samples, Hz. The 2^14 samples that are synthesised together then span half a minute, in which the
+/// array moves by some degrees; the cost of narrower channels grows with the third power of that time.
 const SAMPLES_WIDTH_HZ_MIN: f64 = 500.0;
 
-/// The space segment at the level of integrated visibilities.
+/// The `[spacecraft]` section.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SpacecraftConfig {
-    /// What is simulated: integrated visibilities, or the samples that they are made of.
+    /// What is simulated: integrated visibilities, or samples that are correlated.
     pub fidelity: Fidelity,
     /// Centre frequencies, Hz.
     pub channels_hz: Vec<f64>,
@@ -34,43 +34,41 @@ pub struct SpacecraftConfig {
     pub channel_width_hz: f64,
     /// Length of the mission, s.
     pub duration_s: f64,
-    /// Observe in every n-th window only.
+    /// Observe only in every n-th window.
     pub every_nth_window: u64,
-    /// Observe so long only in each window, from its start, s; 0 for all of it.
+    /// Observe only for this time from the start of each window, s; 0 for all of it.
     pub window_s_max: f64,
-    /// Send down every n-th integration of a window only.
+    /// Send only every n-th integration of a window.
     pub every_nth_integration: PerChannel<u64>,
     /// Longest integration, s.
     pub integration_s_max: f64,
-    /// Wavelengths that a baseline may move in one integration.
+    /// Longest motion of a baseline in one integration, wavelengths.
     pub motion_wavelengths_max: f64,
     /// Longest baseline that is correlated, wavelengths; 0 for no limit.
     pub baseline_wavelengths_max: PerChannel<f64>,
-    /// How visibilities are simulated.
+    /// Visibility model.
     pub model: ModelChoice,
-    /// Whether visibilities are averages over their integrations (motion along the orbit; harmonic model only) or
-    /// of the instants in their middle.
+    /// Whether visibilities are averages over their integrations (motion along the orbit; harmonic model only), or
+    /// values at their middle.
     pub smear_integrations: bool,
-    /// Whether visibilities are averages over their channel's width, as those of samples are: the integrand times
-    /// `sinc(pi n . r_ij dnu / c)`. Rows of B that the ground makes are of the channel's centre.
+    /// Whether visibilities are averages over the width of their channel, as those of samples are: the integrand times
+    /// `sinc(pi n . r_ij dnu / c)`. The ground's rows of B are for the centre of the channel.
     pub smear_bandwidth: bool,
-    /// Whether thermal noise is added. Weights are those of the noise either way.
+    /// Whether thermal noise is added. Weights describe the noise in either case.
     pub thermal_noise: bool,
-    /// Receiver noise T_rec / zeta, as the antenna would see it from the sky, K sr.
+    /// Receiver noise T_rec / zeta, referred to the sky, K sr.
     pub receiver_noise_k_sr: f64,
     /// Antenna response of the daughters.
     pub antenna: Antenna,
-    /// Sub-bands that each channel of samples is divided into before it is correlated: a power of two, 1 for none.
+    /// Sub-bands into which each channel of samples is divided before correlation: a power of two, 1 for none.
     pub sub_bands: usize,
-    /// Ecliptic longitude and latitude, deg, towards which samples are delayed before they are correlated; nothing
-    /// for no delays.
+    /// Delay centre of samples: ecliptic longitude and latitude, deg; empty for no delays.
     pub delay_centre_deg: Vec<f64>,
-    /// Time over which the powers of the daughters' samples are integrated and sent down, s, in whole blocks; 0 to leave
-    /// them out.
+    /// Integration time of auto-correlations, s, in whole blocks of samples; 0 for no auto-correlations.
     pub auto_integration_s: f64,
-    /// Whether such powers come down with fidelity "visibilities", too; samples have them anyway.
+    /// Whether auto-correlations are simulated with fidelity "visibilities", too; with samples they always are.
     pub auto_powers: bool,
-    /// Numbers that a block of samples may be ahead of one that the mother waits for.
+    /// Blocks that the correlator reads ahead while one is missing.
     pub wait_blocks: u64,
     /// Capacity of the onboard store, bytes.
     pub store_bytes_max: u64,
@@ -82,14 +80,14 @@ pub struct SpacecraftConfig {
     pub ninth: NinthConfig,
 }
 
-/// How much of the spacecraft is simulated; what comes down looks the same.
+/// Level of detail of the simulated spacecraft; the form of the downlink does not depend on it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Fidelity {
     /// Integrated visibilities with thermal noise: for years of mission time.
     #[default]
     Visibilities,
-    /// Samples of every daughter, quantised, sent over links and correlated: for minutes to hours.
+    /// Samples of every daughter, quantised, sent over links and correlated: for minutes to hours of mission time.
     Samples,
 }
 
@@ -97,13 +95,13 @@ pub enum Fidelity {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum StoreDrop {
-    /// What was observed last, of all channels and pairs alike.
+    /// The newest data, of all channels and pairs alike.
     #[default]
     Newest,
-    /// What was observed first, likewise.
+    /// The oldest data, of all channels and pairs alike.
     Oldest,
-    /// What adds least to the map a byte: the blocks of least weight a visibility, in terms of what a second of their
-    /// channel weighs. Those are the long baselines, whose integrations are short.
+    /// The data that adds least to the map for each byte: blocks with the least weight of a visibility, relative to the
+    /// weight of a second of their channel. These are the long baselines, whose integrations are short.
     LowestValue,
 }
 
@@ -150,7 +148,7 @@ impl Default for SpacecraftConfig {
             sub_bands: 1,
             delay_centre_deg: Vec::new(),
             auto_integration_s: 1.0,
-            // One a second over years would be several times as many as visibilities.
+            // One each second over years would be several times as many as the visibilities.
             auto_powers: false,
             wait_blocks: 16,
             store_bytes_max: 4 << 30,
@@ -184,7 +182,7 @@ impl SpacecraftConfig {
         self.channels_hz.iter().map(|&frequency_hz| Channel { frequency_hz, width_hz }).collect()
     }
 
-    /// Length of the integrations of the daughters' own powers, s; 0 if there are none.
+    /// Integration time of auto-correlations, s; 0 if there are none.
     #[must_use]
     pub fn autos_s(&self) -> f64 {
         if self.auto_powers || self.fidelity == Fidelity::Samples { self.auto_integration_s } else { 0.0 }
@@ -240,7 +238,7 @@ impl SpacecraftConfig {
             let inside = (low_hz..=high_hz).contains(&value);
             checks.require(&key, value, inside, format!("{low_hz} Hz to {high_hz} Hz"));
             let half_hz = 0.5 * self.channel_width_hz;
-            // Sub-bands are channels of the downlink, which has them within the band; others only must not reach zero.
+            // Sub-bands are channels of the downlink, which lie within the band; others must only stay above zero.
             let out = value - half_hz < low_hz || value + half_hz > high_hz;
             let reaches_zero = half_hz >= value;
             let fits = !reaches_zero && !(self.sub_bands > 1 && out);

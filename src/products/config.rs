@@ -4,15 +4,15 @@ use serde::{Deserialize, Serialize};
 
 use crate::units::{Checks, InvalidValue};
 
-/// What is written beside the final maps.
+/// The `[products]` section: products besides the final maps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ProductsConfig {
     /// Whether pictures are drawn.
     pub pictures: bool,
-    /// Whether every snapshot is written as a FITS map too.
+    /// Whether every snapshot is written as a FITS map, too.
     pub snapshot_maps: bool,
-    /// FWHM to which the final map is smoothed after its pixels were split, degrees; 0 for none.
+    /// FWHM to which the final map, with split pixels, is smoothed, degrees; 0 for none.
     pub smooth_fwhm_deg: f64,
 }
 

@@ -110,7 +110,7 @@ pub(super) struct Inlet<T> {
     receiver: Receiver<Stamped<T>>,
 }
 
-enum Arrival<T> {
+enum Input<T> {
     Item(Stamped<T>),
     End,
     Halt,
@@ -122,7 +122,7 @@ impl<T> Inlet<T> {
     }
 
     /// Waits for the next item; timed and counted.
-    fn receive(&mut self, watch: &mut Watch) -> Arrival<T> {
+    fn receive(&mut self, watch: &mut Watch) -> Input<T> {
         let depth = self.receiver.len();
         watch.counters.set_working(false);
         let received = match self.receiver.try_recv() {
@@ -134,14 +134,14 @@ impl<T> Inlet<T> {
         watch.counters.set_working(true);
         // After the wait: a closed channel means an end only if nothing failed.
         if watch.halt.is_set() {
-            return Arrival::Halt;
+            return Input::Halt;
         }
         let Some(stamped) = received else {
-            return Arrival::End;
+            return Input::End;
         };
         watch.counters.note_depth(depth.max(1));
         watch.counters.count_in();
-        Arrival::Item(stamped)
+        Input::Item(stamped)
     }
 
     fn wait(&self, halt: &Halt) -> Option<Stamped<T>> {
@@ -194,13 +194,13 @@ impl<S: Stage> Worker for StageWorker<S> {
         let Self { stage, inlet, out } = self;
         loop {
             match inlet.receive(watch) {
-                Arrival::Item(Stamped { item, born }) => {
+                Input::Item(Stamped { item, born }) => {
                     out.descend_from(born);
                     stage.step(item, out)?;
                     watch.worked_into(out, Some(born), stage.units());
                 }
-                Arrival::End => break,
-                Arrival::Halt => return Ok(Ending::Halted),
+                Input::End => break,
+                Input::Halt => return Ok(Ending::Halted),
             }
         }
         watch.finishing = true;
@@ -221,12 +221,12 @@ impl<S: Sink> Worker for SinkWorker<S> {
         let Self { sink, inlet } = self;
         loop {
             match inlet.receive(watch) {
-                Arrival::Item(Stamped { item, born }) => {
+                Input::Item(Stamped { item, born }) => {
                     sink.take(item)?;
                     watch.worked(Duration::ZERO, Some(born), sink.units());
                 }
-                Arrival::End => break,
-                Arrival::Halt => return Ok(Ending::Halted),
+                Input::End => break,
+                Input::Halt => return Ok(Ending::Halted),
             }
         }
         watch.finishing = true;

@@ -5,18 +5,18 @@ use serde::{Deserialize, Serialize};
 use crate::downlink::wire::Format;
 use crate::units::{Checks, InvalidValue};
 
-/// Greatest distance of a reordered frame, and most frames that a second station repeats.
+/// Longest delay of a frame, and greatest number of frames at a second station.
 const FRAMES_MAX: u64 = 1 << 20;
 
-/// The `[downlink.link]` section: all faults are off unless asked for.
+/// The `[downlink.link]` section; all faults are off by default.
 ///
-/// "Frame" is a coded frame (CADU), or a packet where packets are sent as they are.
+/// "Frame" is a coded frame (CADU), or a packet if packets are sent without coding.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LinkConfig {
     /// Probability that a bit is wrong.
     pub bit_error_rate: f64,
-    /// Mean distance of bursts, bits; 0 for none. Bursts and what lies between them are the states of a
+    /// Mean distance between bursts, bits; 0 for none. Bursts and the intervals between them are the two states of a
     /// Gilbert-Elliott channel.
     pub burst_every_bits: f64,
     /// Mean length of bursts, bits.
@@ -31,15 +31,15 @@ pub struct LinkConfig {
     pub pass_cut: f64,
     /// Probability that a frame arrives twice.
     pub duplicate: f64,
-    /// Probability that a frame arrives later than it should.
+    /// Probability that a frame is delayed.
     pub reorder: f64,
-    /// Greatest number of frames that it then comes too late by.
+    /// Longest delay, frames.
     pub reorder_frames: u64,
     /// Probability that a pass arrives after the one that follows it.
     pub pass_swap: f64,
     /// Probability that a bit is lost or added within a coded frame.
     pub bit_slip: f64,
-    /// Frames at the end of each pass that a second station hears too, with faults of its own.
+    /// Frames at the end of each pass that a second station also receives, with faults of its own.
     pub second_station_frames: u64,
 }
 
@@ -64,7 +64,7 @@ impl Default for LinkConfig {
 }
 
 impl LinkConfig {
-    /// Whether the link does anything to what is sent over it.
+    /// Whether the link has any fault.
     #[must_use]
     pub fn is_on(&self) -> bool {
         let rates = [

@@ -4,22 +4,22 @@ use serde::{Deserialize, Serialize};
 
 use crate::units::{Checks, InvalidValue};
 
-/// The `[downlink.listen]` section: limits of a ground that listens. Memory for senders stays below
-/// `connections_max` times `memory_bytes_max` and twice 64 KiB, and `backlog_bytes_max`.
+/// The `[downlink.listen]` section: limits of a ground that listens. The memory for senders is at most `connections_max`
+/// times (`memory_bytes_max` + 128 KiB), plus `backlog_bytes_max`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ListenConfig {
-    /// Connections at a time; others are refused.
+    /// Connections at a time; further ones are refused.
     pub connections_max: usize,
-    /// Time from connecting to the first sound packet or frame, s; 0 for no limit.
+    /// Longest time from connecting to the first valid packet or frame, s; 0 for no limit.
     pub first_packet_s_max: f64,
-    /// Time between sound packets or frames, s; 0 for no limit. Bytes alone are no sign of life.
+    /// Longest time between valid packets or frames, s; 0 for no limit. Other bytes do not count.
     pub idle_s_max: f64,
-    /// Bytes a second that are read from a connection; 0 for no limit. TCP slows the sender to it.
+    /// Greatest rate at which a connection is read, bytes/s; 0 for no limit. TCP slows the sender down to it.
     pub bytes_per_s_max: f64,
-    /// Bytes of a connection without a sound packet or frame among them.
+    /// Greatest number of bytes of a connection without a valid packet or frame.
     pub garbage_bytes_max: u64,
-    /// Memory for what a connection has begun and not ended, bytes.
+    /// Memory for incomplete frames and packets of a connection, bytes.
     pub memory_bytes_max: u64,
     /// Bytes of packets that wait for the ground, of all connections together.
     pub backlog_bytes_max: u64,
