@@ -42,7 +42,7 @@ pub struct MapConfig {
     pub engine: EngineKind,
     /// How the pixel engine computes rows of B.
     pub rows: PixelMethod,
-    /// Greatest degree of a map from the harmonic engine; 0 for 2.5 nside.
+    /// Highest degree of a map from the harmonic engine; 0 for 2.5 nside.
     pub l_max: usize,
     /// Longest baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
     pub baseline_bp_max: f64,
@@ -54,7 +54,7 @@ pub struct MapConfig {
     pub prior_files: Vec<PathBuf>,
     /// FWHM to which prior maps are smoothed, degrees.
     pub prior_fwhm_deg: f64,
-    /// Mission time between snapshot maps, s; 0 for a final map alone.
+    /// Mission time between snapshot maps, s; 0 for a final map only.
     pub snapshot_every_s: f64,
     /// Greatest weight of a visibility that is accepted, (K sr)^-2; it sets the resolution of the sums. 0 for 1024 times
     /// that of 25 s under the mean sky of the channel's frequency.
@@ -135,7 +135,7 @@ impl MapConfig {
             "0, or 1e-60 to 1e60",
         );
         let every = self.snapshot_every_s;
-        checks.number("snapshot_every_s", every, every >= 0.0, "seconds, or 0 for a final map alone");
+        checks.number("snapshot_every_s", every, every >= 0.0, "seconds, or 0 for a final map only");
         let one = self.prior_files.is_empty() || self.prior_k.values().iter().all(|&k| k == 0.0);
         let files = self.prior_files.len();
         checks.require("prior_files", format!("({files} files)"), one, "none where map.prior_k is given");

@@ -6,7 +6,7 @@ use thiserror::Error;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
 
-/// Which way the ascending node moves.
+/// Sense of the precession of the ascending node.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum NodeMotion {
@@ -31,9 +31,9 @@ pub struct ArrayConfig {
     pub inclination_deg: f64,
     /// Orbital period, s.
     pub orbital_period_s: f64,
-    /// Time in which the node goes round once, s.
+    /// Period of the precession of the node, s.
     pub precession_period_s: f64,
-    /// Sense of the node's motion.
+    /// Sense of the precession.
     pub node_motion: NodeMotion,
     /// Orbital phase of daughter 1 at the epoch, degrees.
     pub orbital_phase_deg: f64,
@@ -63,21 +63,21 @@ impl Default for ArrayConfig {
     }
 }
 
-/// How the formation contracts and expands along the track (the paper, Sect. 2).
+/// Contraction and expansion of the formation along the track (the paper, Sect. 2).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct BreathingConfig {
-    /// Contraction and expansion together, s.
+    /// Period of contraction and expansion, s.
     pub period_s: f64,
-    /// Least distance of daughters 1 and 2, m; R_2 times this is the greatest.
+    /// Smallest distance of daughters 1 and 2, m; the largest is R_2 times this.
     pub first_spacing_m_min: f64,
-    /// Ratio R_2 of greatest to least distance of daughters 1 and 2.
+    /// Ratio R_2 of largest to smallest distance of daughters 1 and 2.
     pub first_ratio: f64,
-    /// Least distance of daughters 2 and 3, m; R times this is the greatest.
+    /// Smallest distance of daughters 2 and 3, m; the largest is R times this.
     pub second_spacing_m_min: f64,
-    /// Ratio R of greatest to least arc of daughters 3 and later.
+    /// Ratio R of largest to smallest arc of daughters 3 and later.
     pub ratio: f64,
-    /// Greatest arc from the first to the last daughter, m.
+    /// Longest arc from the first to the last daughter, m.
     pub span_m_max: f64,
 }
 

@@ -16,7 +16,7 @@ use crate::pipeline::error::PipelineError;
 use crate::pipeline::ground_segment::{GroundOutcome, WAIT_BYTES, add_sums, reception};
 use crate::pipeline::models;
 use crate::pipeline::plan::Plan;
-use crate::pipeline::sampling::{SampleCounts, sample_stages};
+use crate::pipeline::{SampleCounts, sample_stages};
 use crate::runtime::{Cancel, Flow, Graph, Metrics, Outlet, Report, Sink, Source, StageProgress, Units};
 use crate::sky::SkyMap;
 

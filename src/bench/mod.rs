@@ -11,13 +11,13 @@ use std::time::Instant;
 use serde::Serialize;
 
 use crate::downlink::Transmitter;
-use crate::frames::{GroundFrame, ObservingWindow, Samples, SpaceFrame};
+use crate::frames::{GroundFrame, Samples, SpaceFrame};
 use crate::mother::Fidelity;
 use crate::pipeline::config::Config;
 use crate::pipeline::error::PipelineError;
 use crate::pipeline::ground_segment::{WAIT_BYTES, reception};
 use crate::pipeline::plan::Plan;
-use crate::pipeline::sampling::{SampleCounts, sample_stages};
+use crate::pipeline::{SampleCounts, sample_stages};
 use crate::pipeline::{models, space_segment};
 use crate::runtime::{Flow, Outlet, Report, Source, Stage};
 use crate::sky::SkyMap;
@@ -175,27 +175,6 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
         ground,
         growth,
     })
-}
-
-/// What the chain of samples takes on this machine, s: before the first sample, and for each second of mission time. Runs
-/// it for two and for six seconds of the first window.
-///
-/// # Errors
-/// As [`bench`].
-pub(super) fn sampling_cost(plan: &Plan) -> Result<[f64; 2], PipelineError> {
-    let skies = space_segment::skies(plan)?;
-    let run = |ticks: i64| -> Result<[f64; 2], PipelineError> {
-        let cut = |window: &ObservingWindow| ObservingWindow {
-            end: window.end.min(window.start.plus_ticks(ticks)),
-            ..*window
-        };
-        let plan = Plan { windows: plan.windows.iter().take(1).map(cut).collect(), ..plan.clone() };
-        let (spent, run) = timed(|| chain::run(&plan, &skies));
-        run.map(|_| [seconds_of(&plan), spent.seconds])
-    };
-    let ([short_s, first_s], [long_s, second_s]) = (run(2_000_000)?, run(6_000_000)?);
-    let rate = ((second_s - first_s) / (long_s - short_s).max(0.1)).max(0.0);
-    Ok([(first_s - rate * short_s).max(0.0), rate])
 }
 
 /// Mission time of a plan's windows, s.

@@ -13,7 +13,7 @@ const SUB_BANDS_MAX: usize = 64;
 /// Bits of samples that are corrected, in words.
 const QUANTISER_BITS: &str = "0 for none, 1, 2 or 4";
 
-/// Which calibration is applied.
+/// Choice of the calibration hook.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum CalibrationHook {
@@ -28,14 +28,14 @@ pub enum CalibrationHook {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CalibrationConfig {
-    /// Which calibration is applied.
+    /// Calibration hook.
     pub hook: CalibrationHook,
     /// File of gains, for `antenna-gains`; relative to the folder that [`CalibrationConfig::build`] is given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gains_file: Option<PathBuf>,
     /// Bits of the samples whose correlations are corrected: 1, 2 or 4; 0 for no correction.
     pub quantiser_bits: u32,
-    /// Successive channels of the downlink, sub-bands of one, that go into one map.
+    /// Number of successive channels of the downlink that are sub-bands of one channel of the map.
     pub sub_bands: usize,
 }
 
@@ -70,10 +70,10 @@ impl CalibrationConfig {
         checks.finish()
     }
 
-    /// The correction of quantised correlations, if there is one.
+    /// The van Vleck correction, if any.
     ///
     /// # Errors
-    /// A number of bits that none is made for.
+    /// A number of bits without a correction.
     pub fn van_vleck(&self) -> Result<Option<VanVleck>, CalibrationError> {
         if self.quantiser_bits == 0 {
             return Ok(None);
@@ -88,7 +88,7 @@ impl CalibrationConfig {
         })
     }
 
-    /// The calibration; `folder` is where the configuration lies.
+    /// The calibration; `folder` is that of the configuration.
     ///
     /// # Errors
     /// The first of [`CalibrationConfig::problems`], or what is wrong with the gains file.

@@ -7,14 +7,14 @@ use serde::{Deserialize, Serialize};
 use super::CalibrationError;
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
 
-/// How gains go from one solution to the next.
+/// Interpolation of gains between solutions.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Interpolation {
-    /// Log amplitude and phase change linearly, the phase by the shorter way round.
+    /// Linear in log amplitude and phase, the phase along the shorter arc.
     #[default]
     LogLinear,
-    /// The solution that is nearer in time holds; the earlier one half-way.
+    /// The solution nearer in time; the earlier one half-way.
     Nearest,
 }
 
@@ -24,15 +24,15 @@ pub enum Interpolation {
 #[doc = include_str!("gains_example.toml")]
 /// ```
 ///
-/// Before the first and after the last solution that one holds. A gain of zero or (in TOML) `nan`
-/// says that a satellite is of no use at that time.
+/// Before the first and after the last solution that one applies. A gain of zero or (in TOML) `nan` marks a satellite
+/// as unusable at that time.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GainsFile {
-    /// How gains go from one solution to the next.
+    /// Interpolation of gains between solutions.
     #[serde(default)]
     pub interpolation: Interpolation,
-    /// Largest distance of a channel from the frequency whose gains it takes, Hz.
+    /// Largest difference between the frequencies of a channel and of the gains that it uses, Hz.
     #[serde(default = "half_a_channel_hz")]
     pub frequency_tolerance_hz: f64,
     /// Gains by channel, in any order.
@@ -65,7 +65,7 @@ pub struct GainSolution {
 }
 
 impl GainsFile {
-    /// Reads a file: JSON if its name ends so, TOML otherwise. Its values are not looked at.
+    /// Reads a file: JSON if its name ends in `.json`, TOML otherwise. Does not check its values.
     ///
     /// # Errors
     /// [`CalibrationError::Read`] and [`CalibrationError::Syntax`].

@@ -12,7 +12,7 @@ use crate::downlink::transport::socket::{SocketError, SocketSource, TcpUrl, Unti
 use crate::downlink::{FileSource, Pace, Paced, Steps};
 use crate::ground::archive::Keeper;
 use crate::pipeline::{
-    Config, ConfigSource, GroundSource, PipelineError, READ, Receiving, Summary, WAIT_BYTES, replay,
+    Config, ConfigSource, GroundSource, PipelineError, READ, Receiving, RunSummary, WAIT_BYTES, replay,
     use_threads,
 };
 use crate::runtime::Cancel;
@@ -145,7 +145,7 @@ fn from_senders(
     url: &TcpUrl,
     config: &Config,
     keeper: Option<Keeper>,
-) -> Result<Summary, CommandError> {
+) -> Result<RunSummary, CommandError> {
     let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
     let until = Until { idle_s: args.idle_s, connections: args.connections };
     let source = SocketSource::bind(&addresses, &config.downlink.listen, until)
@@ -164,7 +164,11 @@ fn from_senders(
     Ok(watched(source, args, config, receiving, &cancel)?)
 }
 
-fn from_files(args: &ReplayArgs, config: &Config, keeper: Option<Keeper>) -> Result<Summary, CommandError> {
+fn from_files(
+    args: &ReplayArgs,
+    config: &Config,
+    keeper: Option<Keeper>,
+) -> Result<RunSummary, CommandError> {
     let files = match args.follow {
         true => FileSource::follow(&args.files, args.idle_s)?,
         false => FileSource::open(&args.files)?,
@@ -191,7 +195,7 @@ fn watched<S: GroundSource + 'static>(
     config: &Config,
     receiving: Receiving,
     cancel: &Cancel,
-) -> Result<Summary, PipelineError> {
+) -> Result<RunSummary, PipelineError> {
     let mut progress = None;
     replay(source, config, receiving, &args.out, cancel, &mut |watched| {
         progress = Some(Progress::watch(watched, READ, 0));

@@ -20,7 +20,7 @@ const IDLE_FRAMES_MAX: u32 = 1_000;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DownlinkConfig {
-    /// Plain packets, or packets in coded frames.
+    /// Format: packets without coding, or packets in coded frames.
     pub format: Format,
     /// Maximum packet length, bytes. A lost packet loses only its own visibilities (21 bytes each).
     pub packet_bytes_max: usize,

@@ -3,9 +3,9 @@
 use crate::units::MissionTime;
 use crate::units::vector::Vec3;
 
-/// Positions of all satellites at equal steps over a stretch of time without manoeuvres.
+/// Positions of all satellites at equal steps over an interval without manoeuvres.
 ///
-/// The stretch is smooth: interpolation never crosses a segment's ends.
+/// The motion is smooth within a segment; interpolation never crosses its ends.
 #[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct EphemerisSegment {
     /// Time of the first node.

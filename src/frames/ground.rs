@@ -1,11 +1,11 @@
-//! What travels between the ground's stages.
+//! Frames between the stages of the ground.
 
 use super::{Housekeeping, Instrument, PlacedVisibilities};
 
-/// What calibration hands to accumulation.
+/// Frames from calibration to accumulation.
 #[derive(Clone, Debug, PartialEq)]
 pub enum PlacedFrame {
-    /// The instrument description; before any visibility, once.
+    /// The instrument description; once, before any visibility.
     Instrument(Instrument),
     /// Calibrated visibilities with the positions of their satellites.
     Visibilities(PlacedVisibilities),

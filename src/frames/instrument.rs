@@ -1,4 +1,4 @@
-//! The instrument description: all that the ground knows of the array besides its ephemeris.
+//! The instrument description: all that the ground knows of the array, except its ephemeris.
 
 use crate::units::{ChannelId, Pair};
 
@@ -22,7 +22,7 @@ pub enum AntennaResponse {
     DipoleNormal,
 }
 
-/// A spectrometer: one more satellite that hears the whole sky by herself, in adjoining channels.
+/// A spectrometer: one more satellite, which measures the total power of the sky in adjacent channels.
 #[derive(Clone, Copy, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct Spectrometer {
     /// Lowest frequency of the first channel, Hz.
@@ -46,14 +46,14 @@ impl Spectrometer {
     }
 }
 
-/// What the spacecraft says of itself at the start of a downlink.
+/// The instrument description at the start of a downlink.
 #[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct Instrument {
     /// Name of the pipeline or mission.
     pub name: String,
     /// Mission epoch: TAI seconds since 1958-01-01, the CCSDS epoch.
     pub epoch_tai_s: f64,
-    /// Radius of the body that hides the sky, m.
+    /// Radius of the body that occults the sky, m.
     pub moon_radius_m: f64,
     /// Number of daughters.
     pub satellites: u8,
@@ -65,7 +65,7 @@ pub struct Instrument {
     pub seed: u64,
     /// Hash of the space segment's configuration; 0 for real data.
     pub configuration_hash: u64,
-    /// One more satellite, behind those that are correlated, whose channels count on behind theirs.
+    /// Spectrometer, if any: the satellite after those that are correlated, with the channels after theirs.
     pub spectrometer: Option<Spectrometer>,
 }
 
@@ -83,7 +83,7 @@ impl Instrument {
         (k < spectrometer.channels).then(|| spectrometer.channel(k))
     }
 
-    /// Whether `pair` is the spectrometer with herself.
+    /// Whether `pair` is the auto-correlation of the spectrometer.
     #[must_use]
     pub fn is_spectrum(&self, pair: Pair) -> bool {
         self.spectrometer.is_some() && (pair.i, pair.j) == (self.satellites, self.satellites)

@@ -1,7 +1,7 @@
-//! What travels between stages.
+//! Data that travels between stages, and the reasons for which it does not reach the result.
 //!
-//! Uses [`crate::units`] only. These are plain data: every invariant that a stage relies on is
-//! checked where the data enters (the configuration on the spacecraft, the decoder on the ground).
+//! Uses [`crate::units`] only. These are plain data. Their invariants are checked where the data enters: by the
+//! configuration on the spacecraft, by the decoder on the ground.
 
 mod ephemeris;
 mod flags;
@@ -21,20 +21,20 @@ pub use reason::{SampleReason, VisibilityReason};
 pub use samples::{SampleBlock, Samples, SpaceFrame};
 pub use visibility::{AutoPower, PlacedVisibilities, VisibilityBlock};
 
-/// What the ground reads from a downlink, in the order in which it was sent.
+/// Frames that the ground reads from a downlink, in the order in which they were sent.
 #[derive(Clone, Debug, PartialEq)]
 pub enum GroundFrame {
     /// The instrument description; the first frame of every downlink.
     Instrument(Instrument),
-    /// Satellite positions over a stretch of time without manoeuvres.
+    /// Satellite positions over an interval without manoeuvres.
     Ephemeris(EphemerisSegment),
     /// Integrated visibilities of one pair and channel.
     Visibilities(VisibilityBlock),
-    /// What the spacecraft has counted so far.
+    /// Counts of the spacecraft so far.
     Housekeeping(Housekeeping),
 }
 
-/// A stretch of time in which the Earth is hidden from the first daughter.
+/// An observing window: an interval in which the Moon hides the Earth from the first daughter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ObservingWindow {
     /// Number of the window since the mission epoch; one an orbit.

@@ -1,4 +1,4 @@
-//! Samples of the daughters, on their way to the mother.
+//! Samples of the daughters, between them and the mother.
 
 use super::ObservingWindow;
 use crate::units::{ChannelId, MissionTime};
@@ -6,7 +6,7 @@ use crate::units::{ChannelId, MissionTime};
 /// Complex baseband samples as planes of real and imaginary parts of equal length.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Samples {
-    /// Not quantised, sqrt(K sr).
+    /// Floats, sqrt(K sr).
     Float {
         /// Real parts.
         re: Vec<f32>,
@@ -42,7 +42,7 @@ impl Samples {
         self.len() == 0
     }
 
-    /// Bits that the samples take on a link.
+    /// Size of the samples on a link, bits.
     #[must_use]
     pub fn bits(&self) -> u64 {
         let each = match self {
@@ -60,7 +60,7 @@ pub struct SampleBlock {
     pub channel: ChannelId,
     /// Daughter, from 0.
     pub daughter: u8,
-    /// Number of the block since the window's start; all but a window's last block are equally long.
+    /// Number of the block since the start of the window; all blocks but the last of a window are equally long.
     pub number: u64,
     /// Time tag of the first sample, by the mission's time.
     pub time: MissionTime,
@@ -70,12 +70,12 @@ pub struct SampleBlock {
     pub samples: Samples,
 }
 
-/// What travels from the daughters to the mother, in order but for what the link drops or delays.
+/// Frames from the daughters to the mother, in order except for what the link drops or delays.
 #[derive(Clone, Debug, PartialEq)]
 pub enum SpaceFrame {
     /// A window begins; before its first block.
     WindowStart(ObservingWindow),
-    /// Samples of the window: blocks that travel together, any number of them and from anyone.
+    /// Samples of the window: blocks that travel together, any number of them and from any daughter.
     Samples(Vec<SampleBlock>),
     /// The window has ended; after its last block.
     WindowEnd(ObservingWindow),

@@ -1,4 +1,4 @@
-//! Integrated visibilities, before and after the ground has placed them.
+//! Integrated visibilities, before and after the ground has assigned positions to them.
 
 use num_complex::{Complex32, Complex64};
 
@@ -6,7 +6,7 @@ use super::Flags;
 use crate::units::vector::Vec3;
 use crate::units::{ChannelId, MissionTime, Pair};
 
-/// Consecutive integrations of one pair in one channel, as the mother makes them.
+/// Consecutive integrations of one pair in one channel, as the mother produces them.
 ///
 /// Structure of arrays; all arrays have the same length.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -42,7 +42,7 @@ impl VisibilityBlock {
         self.value_k_sr.is_empty()
     }
 
-    /// Takes off what stands at `at` and behind, as a block of its own.
+    /// Splits the integrations from `at` on off into a block of their own.
     ///
     /// # Panics
     /// If the block is shorter than that.
@@ -69,7 +69,7 @@ impl VisibilityBlock {
     }
 }
 
-/// The power of one daughter in one channel, calibrated.
+/// A calibrated auto-correlation: the power of one daughter in one channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AutoPower {
     /// Daughter, from 0.
@@ -93,7 +93,7 @@ pub struct AutoPower {
 pub struct PlacedVisibilities {
     /// Channel.
     pub channel: ChannelId,
-    /// Which of the channel's sub-bands was measured, from 0, where several make one channel; else 0.
+    /// Sub-band of the channel, from 0, where several make one channel; else 0.
     pub band: u16,
     /// Centre frequency of the channel, Hz.
     pub frequency_hz: f64,

@@ -57,9 +57,9 @@ pub struct SpacecraftConfig {
     /// Whether visibilities are averages over the channel's width, as in sample fidelity: the integrand times
     /// `sinc(pi n . r_ij dnu / c)`. The ground's rows of B are for the channel's centre.
     pub smear_bandwidth: bool,
-    /// Whether thermal noise is added. Weights are those of the noise either way.
+    /// Whether thermal noise is added. Weights describe the noise in either case.
     pub thermal_noise: bool,
-    /// Receiver noise T_rec / zeta, as the antenna would see it from the sky, K sr.
+    /// Receiver noise T_rec / zeta, referred to the sky, K sr.
     pub receiver_noise_k_sr: f64,
     /// Antenna response of the daughters.
     pub antenna: Antenna,
@@ -242,7 +242,7 @@ impl SpacecraftConfig {
             let inside = (low_hz..=high_hz).contains(&value);
             checks.require(&key, value, inside, format!("{low_hz} Hz to {high_hz} Hz"));
             let half_hz = 0.5 * self.channel_width_hz;
-            // Sub-bands are channels of the downlink, which has them within the band; others only must not reach zero.
+            // Sub-bands are channels of the downlink, which lie within the band; others must only stay above zero.
             let out = value - half_hz < low_hz || value + half_hz > high_hz;
             let reaches_zero = half_hz >= value;
             let fits = !reaches_zero && !(self.sub_bands > 1 && out);

@@ -15,14 +15,14 @@ use crate::runtime::RuntimeConfig;
 use crate::sky::SkyConfig;
 use crate::units::Checks;
 
-/// A whole pipeline: what is in the sky, what flies, and what the ground makes of it.
+/// A whole pipeline: the sky, the spacecraft and the ground.
 ///
-/// Sections stand in the order in which data passes. A ground segment reads `calibration`, `map`,
-/// `products` and `runtime` only, and `downlink.listen` where it listens.
+/// Sections are in the order of the data path. A ground segment reads only `calibration`, `map`, `products` and
+/// `runtime`, and `downlink.listen` when it listens.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Name; products go to `out/NAME` unless told otherwise.
+    /// Name; products go to `out/NAME` by default.
     pub name: String,
     /// Seed of everything random in the space segment.
     pub seed: u64,
@@ -40,7 +40,7 @@ pub struct Config {
     pub calibration: CalibrationConfig,
     /// Map making.
     pub map: MapConfig,
-    /// What is written.
+    /// Products.
     pub products: ProductsConfig,
     /// Queues and threads.
     pub runtime: RuntimeConfig,

@@ -6,9 +6,9 @@ use thiserror::Error;
 
 use super::config::{Config, Problems};
 
-/// What messages call the pipeline that runs when no file is named.
+/// Name of the default pipeline in messages.
 const QUICKLOOK_NAME: &str = "embedded quicklook";
-/// The pipeline that runs when no file is named.
+/// The default pipeline, which runs when no file is named.
 pub const QUICKLOOK: &str = include_str!("../../pipelines/quicklook.toml");
 
 /// Why there is no usable configuration.
@@ -20,10 +20,10 @@ pub enum ConfigError {
     Read {
         /// Path.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Not TOML, or keys and types that a pipeline does not have.
+    /// Not TOML, or unknown keys or wrong types.
     #[error("{origin}: {source}")]
     Parse {
         /// File, or the embedded default's name.
@@ -34,7 +34,7 @@ pub enum ConfigError {
     /// A `--set` that is not `key=value`.
     #[error("--set {0}: expected key=value, for example --set map.nside=32")]
     Override(String),
-    /// A `--set` through something that is not a section.
+    /// A `--set` with a key below one that is not a section.
     #[error("--set {key}: `{part}` is not a section")]
     NotASection {
         /// Whole key.
@@ -42,7 +42,7 @@ pub enum ConfigError {
         /// Part of the key.
         part: String,
     },
-    /// A key that pipelines do not have.
+    /// An unknown key.
     #[error("{0}: no such key; pipelines/reference.toml holds all of them")]
     Unknown(String),
     /// Invalid values; all of them.
@@ -59,7 +59,7 @@ fn bullets(problems: &[Box<dyn std::error::Error + Send + Sync>]) -> String {
     problems.iter().map(|problem| format!("  - {problem}")).collect::<Vec<_>>().join("\n")
 }
 
-/// Where a configuration comes from and what is laid over it.
+/// Where a configuration comes from, and overrides of it.
 #[derive(Clone, Debug, Default)]
 pub struct ConfigSource {
     /// Pipeline file; `None` for the embedded quicklook.
@@ -71,13 +71,13 @@ pub struct ConfigSource {
 }
 
 impl ConfigSource {
-    /// What messages call this source.
+    /// Name of this source in messages.
     #[must_use]
     pub fn origin(&self) -> String {
         self.file.as_deref().map_or_else(|| QUICKLOOK_NAME.into(), |path| path.display().to_string())
     }
 
-    /// Reads, overrides and parses; values are not checked yet.
+    /// Reads the file, applies the overrides and parses; does not check values.
     ///
     /// # Errors
     /// An unreadable file, TOML errors with line and column, unknown keys, bad overrides.
@@ -88,7 +88,7 @@ impl ConfigSource {
         }
     }
 
-    /// [`Self::parse`] of a text that has been read.
+    /// As [`Self::parse`], with this text instead of the file.
     ///
     /// # Errors
     /// As [`Self::parse`].
@@ -96,7 +96,7 @@ impl ConfigSource {
         let origin = self.origin();
         let parse_error = |origin: String, table: Option<&toml::Table>, source: toml::de::Error| {
             let unknown = table.map(unknown_keys).unwrap_or_default();
-            // One alone is told by the parser, which knows its line.
+            // A single one is reported by the parser, which knows its line.
             if unknown.len() > 1 {
                 let problems = unknown.into_iter().map(|key| Box::new(ConfigError::Unknown(key)) as _);
                 return ConfigError::Values { origin, problems: problems.collect() };
@@ -132,14 +132,14 @@ impl ConfigSource {
     /// [`Self::parse`], then every check of a whole pipeline.
     ///
     /// # Errors
-    /// As [`Self::parse`]; [`ConfigError::Values`] with everything that is wrong.
+    /// As [`Self::parse`]; [`ConfigError::Values`] with all invalid values.
     pub fn load(&self) -> Result<Config, ConfigError> {
         let config = self.parse()?;
         refuse(self.origin(), config.problems()).map(|()| config)
     }
 
-    /// [`Self::parse`], then the checks of the ground segment's sections. Without a file these have their defaults, which
-    /// fit any downlink; the quicklook's are for its own three channels.
+    /// [`Self::parse`], then the checks of the sections of the ground segment. Without a file these have their defaults,
+    /// which fit any downlink; those of the quicklook are for its own three channels.
     ///
     /// # Errors
     /// As [`Self::load`].
@@ -163,7 +163,7 @@ fn read(path: &Path) -> Result<String, ConfigError> {
 /// Keys that have no default because they may be absent.
 const OPTIONAL_KEYS: [&str; 2] = ["sky.file", "calibration.gains_file"];
 
-/// All keys of a table that pipelines do not have, with their sections.
+/// All unknown keys of a table, with their sections.
 fn unknown_keys(table: &toml::Table) -> Vec<String> {
     fn walk(prefix: &str, table: &toml::Table, known: &toml::Table, found: &mut Vec<String>) {
         for (key, value) in table {
@@ -185,7 +185,7 @@ fn unknown_keys(table: &toml::Table) -> Vec<String> {
     found
 }
 
-/// Lays `key=value` over a table; a value that is not TOML is taken as a string.
+/// Sets `key=value` in a table; a value that is not TOML is a string.
 fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
     let (key, value) = text.split_once('=').ok_or_else(|| ConfigError::Override(text.to_owned()))?;
     let key = key.trim();

@@ -1,4 +1,4 @@
-//! Why a pipeline did not run.
+//! Errors of a pipeline.
 
 use thiserror::Error;
 
@@ -25,13 +25,13 @@ pub enum PipelineError {
     /// The generated sky.
     #[error(transparent)]
     GeneratedSky(#[from] crate::sky::generated::GeneratedSkyError),
-    /// The sky's coefficients cannot be found.
-    #[error("the simulated sky's coefficients: {0}")]
+    /// The harmonic coefficients of the simulated sky cannot be computed.
+    #[error("the harmonic coefficients of the simulated sky: {0}")]
     Coefficients(#[from] crate::sky::harmonics::HarmonicsError),
     /// A value of the configuration that does not fit the files that it names.
     #[error(transparent)]
     Invalid(#[from] crate::units::InvalidValue),
-    /// A model of visibilities cannot be.
+    /// An invalid model of visibilities.
     #[error(transparent)]
     Model(#[from] crate::response::model::ModelError),
     /// A map file.
@@ -55,39 +55,39 @@ pub enum PipelineError {
     /// Products cannot be written.
     #[error(transparent)]
     Products(#[from] crate::products::ProductsError),
-    /// The state of the ground cannot be kept.
+    /// The state of the ground cannot be read or written.
     #[error(transparent)]
     State(#[from] crate::ground::archive::StateError),
-    /// Nothing to make a map of.
+    /// No data for any map.
     #[error(
-        "no pair's visibility could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",
+        "no visibility of a pair could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",
         summary.display()
     )]
     NoMap {
         /// Where the summary is.
         summary: std::path::PathBuf,
-        /// What became of every visibility.
+        /// The ledger of visibilities.
         ledger: Box<crate::runtime::LedgerReport<VisibilityReason>>,
     },
-    /// The array never observes.
+    /// No observing window.
     #[error(
-        "spacecraft.duration_s = {duration_s}: there is no observing window in it; the first begins when the Earth sets \
-         for daughter 1, at most an orbit of {orbit_s:.0} s later, and every_nth_window = {every_nth} are left out between two"
+        "spacecraft.duration_s = {duration_s}: there is no observing window in it. The first begins when the Earth sets for \
+         daughter 1, within an orbit of {orbit_s:.0} s, and only one of every_nth_window = {every_nth} is used"
     )]
     NoWindow {
         /// Length of the mission, s.
         duration_s: f64,
         /// An orbit, s.
         orbit_s: f64,
-        /// Windows from one to the next that is used.
+        /// Distance between used windows, windows.
         every_nth: u64,
     },
-    /// No thread pool.
+    /// The thread pool cannot be started.
     #[error("cannot start {threads} worker threads: {reason}")]
     Threads {
         /// Threads asked for.
         threads: usize,
-        /// What the system said.
+        /// The system's error.
         reason: String,
     },
 }

@@ -1,16 +1,18 @@
 //! From a configuration to a running graph: parse, validate, build, run.
 //!
-//! The only place where space and ground meet, and where concrete stages are wired.
+//! The only place where space and ground meet, and where concrete stages are connected. Uses every folder before it.
 
 pub(crate) mod config;
 mod config_source;
 mod cost;
 mod engine_cost;
 pub(crate) mod error;
+mod file_problems;
 pub(crate) mod ground_segment;
 pub(crate) mod models;
 mod notes;
 pub(crate) mod plan;
+mod rates;
 mod run;
 mod sample_summary;
 pub(crate) mod sampling;
@@ -26,7 +28,7 @@ pub use plan::{Expected, Plan};
 pub use run::{
     Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, simulate, use_threads,
 };
-pub use sample_summary::{BlockSummary, SampleSummary};
-pub use sampling::{SampleCounts, sample_stages};
+pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
+pub use sampling::sample_stages;
 pub use space_segment::INTEGRATE;
-pub use summary::{Segment, Summary};
+pub use summary::{RunScope, RunSummary};

@@ -1,4 +1,4 @@
-//! The models that predict the channels' visibilities.
+//! The visibility model of each channel.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use crate::sky::{Frame, SkyConfig, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 impl Plan {
-    /// Which model each channel gets, for skies of these nsides, channel by channel.
+    /// The choice of model for each channel, with skies of these nsides, channel by channel.
     #[must_use]
     pub fn model_plans(&self, nsides: &[usize]) -> Vec<ModelPlan> {
         let spacecraft = &self.config.spacecraft;
@@ -42,8 +42,8 @@ impl Plan {
                 smeared: spacecraft.smear_integrations,
             };
             if spacecraft.fidelity == Fidelity::Samples {
-                // They ask for powers and for pairs stretched over the channel, beyond what is correlated: the
-                // harmonic model is laid out for neither.
+                // The sampler needs auto-correlations and pairs stretched over the channel; the harmonic model is made for
+                // neither.
                 let direct = ModelPlan::new(ModelChoice::Direct, load);
                 return ModelPlan { why: "samples take direct sums", ..direct };
             }
@@ -67,8 +67,8 @@ impl Plan {
     }
 }
 
-/// The longest baseline that a schedule lets pass, wavelengths. The limit holds where an integration starts; until its
-/// middle a baseline moves by less than what the rule allows.
+/// The longest baseline of a schedule, wavelengths. The limit holds at the start of an integration; until its middle a
+/// baseline moves by less than the rule allows.
 fn longest_baseline_wavelengths(array: &Array, schedule: &Schedule) -> f64 {
     let formation = array.formation();
     // Arcs are greatest at the start of a period.
@@ -86,7 +86,7 @@ fn longest_baseline_wavelengths(array: &Array, schedule: &Schedule) -> f64 {
 /// The model of each channel.
 ///
 /// # Errors
-/// A sky whose coefficients cannot be found; a model that cannot be.
+/// A sky whose coefficients cannot be computed; an invalid model.
 pub(crate) fn build(plan: &Plan, skies: &[SkyMap]) -> Result<Vec<Box<dyn VisibilityModel>>, PipelineError> {
     let nsides: Vec<usize> = skies.iter().map(SkyMap::nside).collect();
     let array = &plan.array;
@@ -115,7 +115,7 @@ pub(crate) fn build(plan: &Plan, skies: &[SkyMap]) -> Result<Vec<Box<dyn Visibil
     Ok(models)
 }
 
-/// The model as it is, or averaged over its channel.
+/// The model, averaged over its channel if the configuration asks for it.
 fn averaged(plan: &Plan, model: Box<dyn VisibilityModel>, frequency_hz: f64) -> Box<dyn VisibilityModel> {
     let spacecraft = &plan.config.spacecraft;
     match spacecraft.smear_bandwidth {

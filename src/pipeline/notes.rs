@@ -1,4 +1,4 @@
-//! What is odd about a pipeline that can run as it is.
+//! Notes on valid configurations that are probably not meant.
 
 use std::f64::consts::TAU;
 
@@ -7,17 +7,17 @@ use crate::calibration::VanVleck;
 use crate::mother::Fidelity;
 use crate::units::constants::{MOON_GM_M3_S2, MOON_RADIUS_M};
 
-/// Part by which an orbit's period may differ from Kepler's: the paper's does by 2e-4.
+/// Relative difference of the orbital period from Kepler's that is accepted; the paper's is 2e-4.
 const PERIOD_PART: f64 = 0.01;
 
 impl Config {
-    /// What its author may not have meant.
+    /// Notes on values that are valid and probably not meant.
     #[must_use]
     pub fn notes(&self) -> Vec<String> {
         [self.period_note(), self.quantiser_note()].into_iter().flatten().collect()
     }
 
-    /// Settings of the orbit that do not follow each other.
+    /// An orbital period that does not fit the altitude.
     fn period_note(&self) -> Option<String> {
         let array = &self.array;
         let radius_m = array.moon_radius_m + array.altitude_m;
@@ -27,14 +27,14 @@ impl Config {
         (differs && array.moon_radius_m == MOON_RADIUS_M).then(|| {
             format!(
                 "array.orbital_period_s = {}, but an orbit {:.0} km above the Moon takes {kepler_s:.2} s; \
-                 array.precession_period_s does not follow the altitude either",
+                 array.precession_period_s does not follow the altitude, either",
                 array.orbital_period_s,
                 array.altitude_m / 1e3
             )
         })
     }
 
-    /// Coarse samples whose correlations stay as they are.
+    /// Coarse samples without a correction of their correlations.
     fn quantiser_note(&self) -> Option<String> {
         let bits = self.daughters.bits;
         let coarse = self.spacecraft.fidelity == Fidelity::Samples && VanVleck::new(bits).is_ok();

@@ -1,8 +1,8 @@
-//! A checked pipeline, and what it will cost.
+//! A checked pipeline and what follows from its configuration.
 
 use std::sync::Arc;
 
-use super::config::{Config, Problems};
+use super::config::Config;
 use super::error::PipelineError;
 use crate::array::Array;
 use crate::daughters::DaughtersConfig;
@@ -29,7 +29,7 @@ impl Plan {
     /// The plan of a configuration that [`crate::pipeline::ConfigSource::load`] has checked.
     ///
     /// # Errors
-    /// An array that cannot be, or that never observes.
+    /// An invalid array, or one that never observes.
     pub fn new(config: Config) -> Result<Self, PipelineError> {
         let array = Arc::new(Array::new(&config.array)?);
         let spacecraft = &config.spacecraft;
@@ -63,12 +63,6 @@ impl Plan {
         Ok(Self { config, array, instrument, schedules, windows })
     }
 
-    /// What is wrong with the files that the configuration names; reads them.
-    #[must_use]
-    pub fn file_problems(&self) -> Problems {
-        crate::pipeline::space_segment::file_problems(self)
-    }
-
     /// Rate that the daughters' samples need on their links, bit/s; `None` without samples.
     #[must_use]
     pub fn samples_bits_per_s(&self) -> Option<f64> {
@@ -78,8 +72,8 @@ impl Plan {
             .then(|| daughters.rate_bits_per_s(count, channels, spacecraft.channel_width_hz))
     }
 
-    /// Rate that one daughter's samples need on her link, and the greatest that it has, bit/s; `None` without samples
-    /// or limit.
+    /// Rate that one daughter's samples need on its link, and the greatest that the link has, bit/s; `None` without
+    /// samples or limit.
     #[must_use]
     pub fn link_bits_per_s(&self) -> Option<[f64; 2]> {
         let needed = self.samples_bits_per_s()? / self.array.satellites() as f64;
@@ -87,7 +81,7 @@ impl Plan {
         (limit > 0.0).then_some([needed, limit])
     }
 
-    /// Keys of samples that are not as by default while there are no samples.
+    /// Keys for samples that differ from their defaults while the fidelity has no samples.
     #[must_use]
     pub fn without_effect(&self) -> Vec<String> {
         let Config { spacecraft, daughters, .. } = &self.config;
@@ -110,14 +104,14 @@ impl Plan {
         found
     }
 
-    /// Rate of the ninth daughter's spectra while the array observes, bit/s; `None` without her.
+    /// Rate of the ninth daughter's spectra while the array observes, bit/s; `None` without it.
     #[must_use]
     pub fn ninth_bits_per_s(&self) -> Option<f64> {
         let ninth = &self.config.spacecraft.ninth;
         ninth.on.then(|| ninth.bits_per_s())
     }
 
-    /// Windows by which progress is measured; 0 where stages are not paced by them.
+    /// Windows by which progress is measured; 0 for samples, whose stages do not take whole windows.
     #[must_use]
     pub fn windows_watched(&self) -> u64 {
         match self.config.spacecraft.fidelity {
@@ -126,7 +120,7 @@ impl Plan {
         }
     }
 
-    /// About how many visibilities each channel will have, sent down and within the map's limit.
+    /// Estimated visibilities of each channel, sent down and within the map's limit.
     #[must_use]
     pub fn visibilities(&self) -> Vec<Expected> {
         let map = &self.config.map;
@@ -150,7 +144,7 @@ impl Plan {
     }
 }
 
-/// Keys of a table whose values are not the usual ones, with their sections.
+/// Keys of a table whose values differ from the usual ones, with their sections.
 fn changed_keys(prefix: &str, table: &toml::Table, usual: &toml::Table, found: &mut Vec<String>) {
     for (key, value) in table {
         let path = format!("{prefix}.{key}");

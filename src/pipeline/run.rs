@@ -8,9 +8,8 @@ use super::config::Config;
 use super::error::PipelineError;
 use super::ground_segment::{GroundOutcome, Receiving, WAIT_BYTES};
 use super::plan::Plan;
-use super::sample_summary::SampleSummary;
-use super::sampling::SampleCounts;
-use super::summary::{Segment, Summary};
+use super::sample_summary::{SampleCounts, SampleSummary};
+use super::summary::{RunScope, RunSummary};
 use super::{ground_segment, space_segment};
 use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
@@ -87,7 +86,12 @@ pub fn downlink_file(format: Format) -> &'static str {
 ///
 /// # Errors
 /// The first failure of any stage; a ledger that does not close; no visibility for any map.
-pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Result<Summary, PipelineError> {
+pub fn run(
+    plan: &Plan,
+    out: &Path,
+    cancel: &Cancel,
+    watch: Watcher<'_>,
+) -> Result<RunSummary, PipelineError> {
     make_folder(out)?;
     let skies = space_segment::skies(plan)?;
     let mut graph = Graph::new();
@@ -110,7 +114,7 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
         ground_segment::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()), receiving)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: None };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
-    conclude(Segment::Whole, &plan.config, out, report, (outcome, None, counts.close(plan)?))
+    conclude(RunScope::Whole, &plan.config, out, report, (outcome, None, counts.close(plan)?))
 }
 
 /// The space segment alone, to a downlink file, a ground that listens, or both.
@@ -163,7 +167,7 @@ pub fn replay<S: GroundSource + 'static>(
     out: &Path,
     cancel: &Cancel,
     watch: Watcher<'_>,
-) -> Result<Summary, PipelineError> {
+) -> Result<RunSummary, PipelineError> {
     make_folder(out)?;
     let mut graph = Graph::new();
     let listening = source.listening();
@@ -173,7 +177,7 @@ pub fn replay<S: GroundSource + 'static>(
     let outcome = ground_segment::add(&mut graph, bytes, config, out, watching, receiving)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone() };
     let report = start(graph, &config.runtime, cancel, (watched, watch))?;
-    conclude(Segment::Ground, config, out, report, (outcome, listening, None))
+    conclude(RunScope::Ground, config, out, report, (outcome, listening, None))
 }
 
 /// The link's faults, if any are asked for; the truth about them goes beside the downlink file.
@@ -209,12 +213,12 @@ fn start(
 }
 
 fn conclude(
-    segment: Segment,
+    segment: RunScope,
     config: &Config,
     out: &Path,
     report: Report,
     (outcome, listening, samples): (GroundOutcome, Option<Listening>, Option<SampleSummary>),
-) -> Result<Summary, PipelineError> {
+) -> Result<RunSummary, PipelineError> {
     let mut reception = outcome.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = outcome.channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let ledger = outcome.ledger.close()?;
@@ -224,7 +228,7 @@ fn conclude(
     }
     let mut autos = outcome.autos.lock().unwrap_or_else(PoisonError::into_inner);
     write_autos(&mut autos, out, config.products.pictures)?;
-    let mut summary = Summary::new(segment, config, report, ledger, reception, channels);
+    let mut summary = RunSummary::new(segment, config, report, ledger, reception, channels);
     (summary.listening, summary.samples) = (listening, samples);
     let path = summary.write(out)?;
     if summary.channels.is_empty() && !summary.cancelled {

@@ -1,25 +1,47 @@
 //! What became of the samples of a run in sample fidelity.
 
 use std::fmt;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use serde::Serialize;
 
-use super::sampling::SampleCounts;
-use crate::daughters::LinkCounts;
+use super::error::PipelineError;
+use super::plan::Plan;
+use crate::daughters::{LinkCounts, SamplerCounts};
 use crate::frames::SampleReason;
+use crate::mother::Fidelity;
+use crate::mother::correlator::CorrelatorCounts;
 use crate::runtime::{Ledger, LedgerImbalance, LedgerReport};
+
+/// What the stages of sample fidelity count while they run.
+#[derive(Clone, Default)]
+pub struct SampleCounts {
+    /// Sampling.
+    pub sampler: Arc<Mutex<SamplerCounts>>,
+    /// The links to the mother.
+    pub link: Arc<Mutex<LinkCounts>>,
+    /// The correlator.
+    pub correlator: Arc<Mutex<CorrelatorCounts>>,
+}
+
+impl SampleCounts {
+    /// The summary of the samples of a plan's run; `None` without samples.
+    pub(crate) fn close(&self, plan: &Plan) -> Result<Option<SampleSummary>, PipelineError> {
+        let sampled = plan.config.spacecraft.fidelity == Fidelity::Samples;
+        Ok(sampled.then(|| SampleSummary::close(self)).transpose()?)
+    }
+}
 
 /// A run's samples in figures; complex samples of all daughters and channels.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SampleSummary {
     /// Real and imaginary parts beyond a quantiser's range.
     pub saturated: u64,
-    /// Correlations that were looked at while samples were drawn.
+    /// Correlations that were checked while samples were drawn.
     pub correlations: u64,
-    /// Those that were made smaller so that a matrix became a covariance.
+    /// Correlations that were reduced so that a matrix became a covariance.
     pub repaired: u64,
-    /// Greatest change of one, as a part of the two daughters' powers.
+    /// Greatest change of a correlation, as a part of the two daughters' powers.
     pub repair_max: f32,
     /// What the links carried and dropped.
     pub link: LinkCounts,
@@ -27,7 +49,7 @@ pub struct SampleSummary {
     pub blocks: BlockSummary,
     /// Visibilities made of the samples.
     pub visibilities: u64,
-    /// The account of samples.
+    /// The ledger of samples.
     pub ledger: LedgerReport<SampleReason>,
 }
 
@@ -36,20 +58,20 @@ pub struct SampleSummary {
 pub struct BlockSummary {
     /// Correlated.
     pub used: u64,
-    /// Not there when others went on.
+    /// Absent when the others were correlated.
     pub missing: u64,
-    /// There when others had gone on.
+    /// Received after the others had been correlated.
     pub late: u64,
-    /// There again.
+    /// Duplicates.
     pub duplicate: u64,
-    /// Such as cannot be.
+    /// Malformed.
     pub malformed: u64,
     /// Outside any window.
     pub stray: u64,
 }
 
 impl SampleSummary {
-    /// Closes the account of samples: sampled = correlated + lost.
+    /// Closes the ledger of samples: sampled = correlated + lost.
     ///
     /// # Errors
     /// [`LedgerImbalance`] if what was sampled is not what became of it.
@@ -96,7 +118,7 @@ impl fmt::Display for SampleSummary {
         let BlockSummary { used, missing, late, duplicate, malformed, stray } = blocks;
         write!(
             f,
-            "blocks: {used} used, {missing} missing, {late} late, {duplicate} again, {malformed} malformed, {stray} stray"
+            "blocks: {used} used, {missing} missing, {late} late, {duplicate} duplicates, {malformed} malformed, {stray} stray"
         )
     }
 }

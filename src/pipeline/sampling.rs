@@ -1,35 +1,15 @@
 //! The space segment in sample fidelity: samples, links, correlator.
 
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
-use super::error::PipelineError;
 use super::plan::Plan;
-use super::sample_summary::SampleSummary;
-use crate::daughters::{LinkCounts, SampleLink, Sampler, SamplerCounts, Scene};
+use super::sample_summary::SampleCounts;
+use crate::daughters::{SampleLink, Sampler, Scene};
 use crate::frames::{Channel, GroundFrame, Instrument};
-use crate::mother::correlator::{Correlator, CorrelatorCounts, CorrelatorSetup};
-use crate::mother::{Fidelity, Schedule};
+use crate::mother::Schedule;
+use crate::mother::correlator::{Correlator, CorrelatorSetup};
 use crate::response::model::VisibilityModel;
 use crate::runtime::{Graph, Link};
-
-/// What the stages of sample fidelity count while they run.
-#[derive(Clone, Default)]
-pub struct SampleCounts {
-    /// Sampling.
-    pub sampler: Arc<Mutex<SamplerCounts>>,
-    /// The links to the mother.
-    pub link: Arc<Mutex<LinkCounts>>,
-    /// The correlator.
-    pub correlator: Arc<Mutex<CorrelatorCounts>>,
-}
-
-impl SampleCounts {
-    /// The account of samples of a plan's run; `None` without samples.
-    pub(crate) fn close(&self, plan: &Plan) -> Result<Option<SampleSummary>, PipelineError> {
-        let sampled = plan.config.spacecraft.fidelity == Fidelity::Samples;
-        Ok(sampled.then(|| SampleSummary::close(self)).transpose()?)
-    }
-}
 
 /// The stages of sample fidelity for a plan, not yet in a graph.
 #[must_use]
@@ -50,7 +30,7 @@ pub fn sample_stages(
     let sampler = Sampler::new(scene, daughters.clone(), windows.clone(), Arc::clone(&counts.sampler));
     let link = SampleLink::new(daughters, array, Arc::clone(&counts.link));
     let division = config.spacecraft.division();
-    // What comes down are sub-bands, each a channel of its own.
+    // On the downlink each sub-band is a channel of its own.
     let channels = division.divided(&instrument.channels);
     let instrument = Instrument { channels, ..instrument.clone() };
     let of_band = |(k, band): (usize, &Channel)| Schedule {
@@ -69,7 +49,7 @@ pub fn sample_stages(
     (sampler, link, Correlator::new(setup, Arc::clone(&counts.correlator)))
 }
 
-/// Adds them to `graph`.
+/// Adds the stages of sample fidelity to `graph`.
 pub(crate) fn samples(
     graph: &mut Graph,
     plan: &Plan,

@@ -1,11 +1,12 @@
-//! The space segment as a graph: windows, visibilities, the onboard store, packets.
+//! The space segment as part of a graph: windows, visibilities, the onboard store, packets.
 
 use std::sync::Arc;
 
-use super::config::Problems;
 use super::error::PipelineError;
+use super::models;
 use super::plan::Plan;
-use super::sampling::{SampleCounts, samples};
+use super::sample_summary::SampleCounts;
+use super::sampling::samples;
 use crate::downlink::Transmitter;
 use crate::frames::GroundFrame;
 use crate::mother::{
@@ -20,21 +21,6 @@ use crate::sky::{Frame, SkyMap};
 
 /// Name of the stage by whose windows progress is measured.
 pub const INTEGRATE: &str = "integrate";
-
-/// What is wrong with the files that a pipeline names; each is read.
-pub(crate) fn file_problems(plan: &Plan) -> Problems {
-    let mut found = Problems::new();
-    let skies = plan.config.sky.file.iter().flat_map(|files| files.values());
-    for path in skies.chain(&plan.config.map.prior_files) {
-        if let Err(problem) = read_whole_map(path, &ReadOptions::default()) {
-            found.push(Box::new(problem));
-        }
-    }
-    if let Err(problem) = plan.config.calibration.build(std::path::Path::new("")) {
-        found.push(Box::new(problem));
-    }
-    found
-}
 
 /// The simulated sky of every channel, in its own pixels and frame.
 ///
@@ -55,11 +41,11 @@ pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
     plan.config.spacecraft.channels_hz.iter().enumerate().map(sky).collect()
 }
 
-/// Adds the space segment to `graph`; what comes out are the bytes of the downlink. With sample fidelity its stages
-/// count in `counts`.
+/// Adds the space segment to `graph`; its output are the bytes of the downlink. With sample fidelity its stages count in
+/// `counts`.
 ///
 /// # Errors
-/// A model of the visibilities or a downlink configuration that cannot be.
+/// An invalid model of the visibilities or configuration of the downlink.
 pub fn add(
     graph: &mut Graph,
     plan: &Plan,
@@ -68,7 +54,7 @@ pub fn add(
 ) -> Result<Link<Vec<u8>>, PipelineError> {
     let Plan { config, array, instrument, schedules, windows } = plan;
     let capacity = config.runtime.queue_capacity;
-    let models = crate::pipeline::models::build(plan, skies)?;
+    let models = models::build(plan, skies)?;
     if config.spacecraft.fidelity == Fidelity::Samples {
         let frames = samples(graph, plan, models, counts);
         let frames = add_ninth(graph, plan, skies, frames)?;
@@ -85,14 +71,14 @@ pub fn add(
     };
     let integrator =
         Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options);
-    // A window waiting is nothing; a window's visibilities are.
+    // A window itself is small; its visibilities are not.
     let windows = graph.source("observe", 1, Observer::new(windows.clone()));
     let frames = graph.stage(INTEGRATE, capacity, windows, integrator);
     let frames = add_ninth(graph, plan, skies, frames)?;
     transmit(graph, plan, frames)
 }
 
-/// The ninth daughter's spectra among the frames, if there is one.
+/// Adds the spectra of the ninth daughter to the frames, if it is on.
 fn add_ninth(
     graph: &mut Graph,
     plan: &Plan,
@@ -117,8 +103,8 @@ fn add_ninth(
     })
 }
 
-/// What the ninth daughter hears: the generated sky at her own frequencies, or the file of the highest channel, carried
-/// on as a power of frequency.
+/// The sky of the ninth daughter: the generated sky at its own frequencies, or the map file of the highest channel,
+/// continued as a power of frequency.
 fn ninth_sky(plan: &Plan, skies: &[SkyMap]) -> Result<NinthSky, PipelineError> {
     let Plan { config, array, instrument, .. } = plan;
     let model = |sky: &SkyMap, at_hz| DirectSum::new(sky, at_hz, array.moon_radius_m(), instrument.response);
@@ -139,7 +125,7 @@ fn ninth_sky(plan: &Plan, skies: &[SkyMap]) -> Result<NinthSky, PipelineError> {
     Ok(NinthSky::Maps(NinthSky::nodes_hz(ninth.band_hz).into_iter().map(map).collect::<Result<_, _>>()?))
 }
 
-/// What comes after the visibilities, however they were made.
+/// Adds the onboard store and the transmitter.
 fn transmit(
     graph: &mut Graph,
     plan: &Plan,

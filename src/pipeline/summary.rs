@@ -1,4 +1,4 @@
-//! What a run leaves in `summary.json` and prints at its end.
+//! The summary of a run: `summary.json`, and what is printed at the end.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -18,23 +18,23 @@ use crate::runtime::{LedgerReport, Report};
 /// Which part of the chain ran.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Segment {
+pub enum RunScope {
     /// Space and ground in one process.
     Whole,
     /// The ground alone, from files.
     Ground,
 }
 
-/// A run in figures.
+/// The results of a run.
 #[derive(Clone, Debug, Serialize)]
-pub struct Summary {
+pub struct RunSummary {
     /// Version of the program.
     pub version: &'static str,
     /// Name of the pipeline.
     pub name: String,
     /// Which part of the chain ran.
-    pub segment: Segment,
-    /// Whether it was ended early.
+    pub segment: RunScope,
+    /// Whether it was cancelled.
     pub cancelled: bool,
     /// Seed of the space segment, as the instrument description has it.
     pub seed: Option<u64>,
@@ -44,12 +44,12 @@ pub struct Summary {
     pub ground_hash: String,
     /// The maps, channel by channel.
     pub channels: Vec<ChannelSummary>,
-    /// What became of every visibility.
+    /// The ledger of visibilities.
     pub ledger: LedgerReport<VisibilityReason>,
-    /// What became of samples; absent without sample fidelity.
+    /// Statistics of samples; absent without sample fidelity.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples: Option<SampleSummary>,
-    /// What was received, and what was wrong with it.
+    /// Counters of what was received and of its faults.
     pub reception: ReceptionCounters,
     /// The senders, if the ground listened.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -58,11 +58,11 @@ pub struct Summary {
     pub report: Report,
 }
 
-impl Summary {
-    /// Puts the parts together.
+impl RunSummary {
+    /// A summary without samples and senders.
     #[must_use]
     pub(super) fn new(
-        segment: Segment,
+        segment: RunScope,
         config: &Config,
         report: Report,
         ledger: LedgerReport<VisibilityReason>,
@@ -86,8 +86,8 @@ impl Summary {
         }
     }
 
-    /// Writes `summary.json` into `folder`; removes the maps and pictures that an earlier run named in its own there
-    /// and that this one did not write, so that all that is there belongs together.
+    /// Writes `summary.json` into `folder`. Removes maps and pictures that the summary of an earlier run there names and
+    /// that this run did not write, so that all files belong to this run.
     ///
     /// # Errors
     /// A file that cannot be written.
@@ -102,7 +102,7 @@ impl Summary {
             self.channels.iter().flat_map(|channel| &channel.files).map(String::as_str).collect();
         for file in files_of(&before).iter().filter(|file| !ours.contains(file.as_str())) {
             let file = folder.join(file);
-            // What is gone already, or the folder that still holds something, may stay so.
+            // A file may be gone already, and a folder may hold other files.
             let _ = std::fs::remove_file(&file);
             let _ = file.parent().map(std::fs::remove_dir);
         }
@@ -131,7 +131,7 @@ fn files_of(summary: &[u8]) -> Vec<String> {
     named.channels.into_iter().flat_map(|channel| channel.files).filter(is_product).collect()
 }
 
-impl fmt::Display for Summary {
+impl fmt::Display for RunSummary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "Stages\n{}\n", self.report)?;
         writeln!(f, "Ledger of visibilities\n{}\n", self.ledger)?;

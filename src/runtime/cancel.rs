@@ -1,4 +1,4 @@
-//! Stopping a run: politely from outside, at once from inside.
+//! Ending a run early: in order from outside, at once after a failure.
 
 use std::convert::Infallible;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use crossbeam_channel::{Receiver, Sender, bounded};
 
-/// Asks a run to stop early and tidily: sources stop, the rest drains, every `finish` runs.
+/// Asks a run to end early: sources stop, all stages drain their queues, every `finish` runs.
 ///
 /// Clones share one state; safe to trigger from a signal handler's thread.
 #[derive(Clone, Debug, Default)]
@@ -19,7 +19,7 @@ impl Cancel {
         Self::default()
     }
 
-    /// Triggers it, for good.
+    /// Triggers it; it cannot be reset.
     pub fn cancel(&self) {
         self.0.store(true, Ordering::Release);
     }
@@ -33,13 +33,13 @@ impl Cancel {
 
 /// Set by the first failure; wakes every thread that waits on a channel.
 ///
-/// The flag is set before the failing thread lets go of its channels. So whoever finds a channel
-/// closed reads from the flag whether its other end finished or fell.
+/// The flag is set before the failing thread drops its channels. So a thread that finds a channel closed reads from the
+/// flag whether the other end finished or failed.
 #[derive(Debug)]
 pub(super) struct Halt {
     set: AtomicBool,
     stop: Receiver<Infallible>,
-    /// Dropped to disconnect `stop`, which wakes all that select on it.
+    /// Dropped to disconnect `stop`, which wakes all threads that select on it.
     hold: Mutex<Option<Sender<Infallible>>>,
 }
 

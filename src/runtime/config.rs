@@ -4,18 +4,18 @@ use serde::{Deserialize, Serialize};
 
 use crate::units::{Checks, InvalidValue};
 
-/// Queues and threads; no choice changes a single byte of the results.
+/// Queues and threads. None of this changes a byte of the results.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RuntimeConfig {
-    /// Items that wait between two stages at most.
+    /// Greatest number of items between two stages.
     pub queue_capacity: usize,
     /// Threads for the work inside stages; 0 for one a core.
     pub threads: usize,
     /// Time that stages have to end after a failure, s.
     pub shutdown_s: f64,
-    /// Time in which something has to move, s, or the run fails; longer than the longest step, that of a solution for
-    /// example. 0 for ever.
+    /// Longest time without progress before the run fails, s; must exceed the longest step, for example that of a
+    /// solution. 0 for no limit.
     pub stall_s: f64,
 }
 
@@ -50,7 +50,7 @@ impl RuntimeConfig {
             "stall_s",
             stall,
             stall == 0.0 || (0.1..=1e6).contains(&stall),
-            "0.1 s to 1e6 s, or 0 for ever",
+            "0.1 s to 1e6 s, or 0 for no limit",
         );
         checks.finish()
     }

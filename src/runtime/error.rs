@@ -1,4 +1,4 @@
-//! Why a run fails.
+//! Errors of a run.
 
 use std::fmt;
 use std::time::Duration;
@@ -8,13 +8,13 @@ use thiserror::Error;
 /// Any error of a stage.
 pub type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
-/// Where in a stage's life something happened.
+/// Position of a stage when something happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Moment {
-    /// While working on this input, counted from 0; for a source, while making this item.
+    /// While it processed this input, counted from 0; a source: while it made this item.
     Item(u64),
-    /// In `finish`, after so many inputs; for a source, after so many items made.
+    /// In `finish`, after this number of inputs; a source: of items.
     Finish(u64),
 }
 
@@ -27,12 +27,12 @@ impl fmt::Display for Moment {
     }
 }
 
-/// Stages that had not ended when the deadline passed; shown as nothing if there are none.
+/// Stages that had not ended by the deadline; displayed as an empty string if there are none.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Laggards {
     /// Their names, in the order in which they were added.
     pub stages: Vec<String>,
-    /// How long they were waited for.
+    /// How long the supervisor waited for them.
     pub waited: Duration,
 }
 
@@ -46,7 +46,7 @@ impl fmt::Display for Laggards {
     }
 }
 
-/// Why a graph cannot run, or did not run to its end.
+/// Why a graph cannot run, or did not finish.
 ///
 /// A stage's own error is the `source()`, not part of the message: print the chain.
 #[derive(Debug, Error)]
@@ -57,11 +57,11 @@ pub enum RuntimeError {
     Failed {
         /// Name of the stage.
         stage: String,
-        /// Where it stood.
+        /// Its position.
         at: Moment,
-        /// Who did not stop in time.
+        /// Stages that did not stop in time.
         laggards: Laggards,
-        /// What the stage said.
+        /// The stage's error.
         source: BoxError,
     },
     /// A stage panicked; the first failure of the run.
@@ -69,21 +69,21 @@ pub enum RuntimeError {
     Panicked {
         /// Name of the stage.
         stage: String,
-        /// Where it stood.
+        /// Its position.
         at: Moment,
         /// The panic's message.
         message: String,
-        /// Who did not stop in time.
+        /// Stages that did not stop in time.
         laggards: Laggards,
     },
-    /// Nothing moved any more.
-    #[error("nothing has moved for {:.1} s, in work: `{}`{laggards}", waited.as_secs_f64(), stages.join("`, `"))]
+    /// No stage made progress any more.
+    #[error("no stage made progress for {:.1} s; in a step: `{}`{laggards}", waited.as_secs_f64(), stages.join("`, `"))]
     Stalled {
-        /// Names of the stages that were neither waiting for input nor for room.
+        /// Names of the stages that waited neither for input nor for room.
         stages: Vec<String>,
-        /// How long nothing moved.
+        /// How long there was no progress.
         waited: Duration,
-        /// Who did not stop in time.
+        /// Stages that did not stop in time.
         laggards: Laggards,
     },
     /// A thread could not be started.
@@ -91,30 +91,30 @@ pub enum RuntimeError {
     Thread {
         /// Name of the stage.
         stage: String,
-        /// Who did not stop in time.
+        /// Stages that did not stop in time.
         laggards: Laggards,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// A queue that can hold nothing.
+    /// A queue without capacity.
     #[error("stage `{stage}`: queue capacity 0; expected at least 1")]
     Capacity {
         /// Name of the stage that fills the queue.
         stage: String,
     },
-    /// A name that cannot be a thread's, or that is taken.
-    #[error("stage name `{stage}`: expected a name of its own, not empty and without NUL")]
+    /// A name that is no name for a thread, or in use.
+    #[error("stage name `{stage}`: expected a unique name, not empty and without NUL")]
     Name {
         /// The name.
         stage: String,
     },
-    /// A link that leads nowhere.
-    #[error("nothing takes what stage `{stage}` gives; end its chain with a sink")]
+    /// A link without a receiver.
+    #[error("no stage takes the output of stage `{stage}`; end its chain with a sink")]
     OpenEnd {
         /// Name of the stage.
         stage: String,
     },
-    /// A link of another graph.
+    /// A link that belongs to another graph.
     #[error("the input of stage `{stage}` belongs to another graph")]
     ForeignLink {
         /// Name of the stage.

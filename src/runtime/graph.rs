@@ -1,4 +1,4 @@
-//! Building a graph of typed links.
+//! Graphs of stages with typed links.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,10 +13,10 @@ use super::report::Report;
 use super::stage::{Sink, Source, Stage};
 use super::supervisor;
 use super::supervisor::Limits;
-use super::worker::{Inlet, SinkWorker, SourceWorker, StageWorker, Worker};
+use super::worker::{Inlet, SinkWorker, SourceWorker, StageNode, StageWorker, Worker};
 
-/// The output of a source or stage that nothing takes yet.
-#[must_use = "nothing takes this output yet: end the chain with a sink"]
+/// The output of a source or stage, not yet connected.
+#[must_use = "this output is not connected: end the chain with a sink"]
 pub struct Link<T> {
     receiver: Receiver<Stamped<T>>,
     capacity: usize,
@@ -25,22 +25,14 @@ pub struct Link<T> {
     halt: Arc<Halt>,
 }
 
-/// A worker that waits for its thread.
-pub(super) struct Node {
-    pub(super) counters: Arc<Counters>,
-    pub(super) worker: Box<dyn Worker>,
-    /// Whether something takes its output; true of a sink.
-    taken: bool,
-}
-
 /// Sources, stages and sinks, each to run on a thread of its own.
 pub struct Graph {
-    nodes: Vec<Node>,
+    nodes: Vec<StageNode>,
     metrics: Arc<Metrics>,
     halt: Arc<Halt>,
-    /// Time without any movement after which the run fails; none for ever.
+    /// Longest time without progress before the run fails; `None` for no limit.
     stall: Option<Duration>,
-    /// First mistake made while building.
+    /// First mistake in the calls that built the graph.
     mistake: Option<RuntimeError>,
 }
 
@@ -65,7 +57,7 @@ impl Graph {
 
     /// Adds a source whose output queue holds `capacity` items.
     ///
-    /// A mistake (a name that is taken, capacity 0) is reported by [`Graph::run`].
+    /// A mistake (a name in use, capacity 0) is reported by [`Graph::run`].
     pub fn source<S>(&mut self, name: &str, capacity: usize, source: S) -> Link<S::Out>
     where
         S: Source<Out: 'static> + 'static,
@@ -76,10 +68,9 @@ impl Graph {
         link
     }
 
-    /// Adds a stage that takes what comes over `input`; its output queue holds `capacity` items.
+    /// Adds a stage that reads `input`; its output queue holds `capacity` items.
     ///
-    /// A mistake (a name that is taken, capacity 0, a link of another graph) is reported by
-    /// [`Graph::run`].
+    /// A mistake (a name in use, capacity 0, a link of another graph) is reported by [`Graph::run`].
     pub fn stage<S>(&mut self, name: &str, capacity: usize, input: Link<S::In>, stage: S) -> Link<S::Out>
     where
         S: Stage<In: 'static, Out: 'static> + 'static,
@@ -91,9 +82,9 @@ impl Graph {
         link
     }
 
-    /// Adds a sink that takes what comes over `input`.
+    /// Adds a sink that reads `input`.
     ///
-    /// A mistake (a name that is taken, a link of another graph) is reported by [`Graph::run`].
+    /// A mistake (a name in use, a link of another graph) is reported by [`Graph::run`].
     pub fn sink<S>(&mut self, name: &str, input: Link<S::In>, sink: S)
     where
         S: Sink<In: 'static> + 'static,
@@ -103,13 +94,13 @@ impl Graph {
         self.add(counters, Box::new(SinkWorker { sink, inlet }), true);
     }
 
-    /// Lets the run fail when for so long nothing has moved in it: no step of any stage has ended, no item has been
-    /// taken or given. Must be longer than the longest step.
+    /// Makes the run fail after this time without progress: no step of any stage has ended, no item was received or
+    /// sent. Must exceed the longest step.
     pub fn fail_after_stall(&mut self, stall: Duration) {
         self.stall = Some(stall);
     }
 
-    /// Counters that may be polled while the graph runs.
+    /// Counters that may be read while the graph runs.
     #[must_use]
     pub fn metrics(&self) -> Arc<Metrics> {
         Arc::clone(&self.metrics)
@@ -117,9 +108,9 @@ impl Graph {
 
     /// Runs every stage on its own thread until all have ended.
     ///
-    /// After `cancel` the sources stop and the rest drains for as long as it takes. After a failure
-    /// the stages have until `deadline` has passed to end; those that do not are left to themselves
-    /// and named in the error. A thread cannot be ended from outside, so the process should be.
+    /// After `cancel` the sources stop and the other stages drain, without a deadline. After a failure the stages have
+    /// `deadline` to end; the error names those that do not, which keep running. A thread cannot be ended from outside, so
+    /// the process should be.
     ///
     /// # Errors
     /// [`RuntimeError`]: a mistake in the graph, or the first failure of a stage.
@@ -162,7 +153,7 @@ impl Graph {
     }
 
     fn add(&mut self, counters: Arc<Counters>, worker: Box<dyn Worker>, taken: bool) {
-        self.nodes.push(Node { counters, worker, taken });
+        self.nodes.push(StageNode { counters, worker, taken });
     }
 
     fn note(&mut self, mistake: RuntimeError) {

@@ -1,9 +1,24 @@
-//! Counters that may be read while a run goes on.
+//! Counters that may be read during a run.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::stage::Units;
+/// Amount that a stage has processed, in a unit of its choice (visibilities, bytes), for its throughput.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Units {
+    /// Number since the start.
+    pub count: u64,
+    /// Name of the unit in the plural; empty if the stage counts none.
+    pub name: &'static str,
+}
+
+impl Units {
+    /// `count` units called `name`.
+    #[must_use]
+    pub fn of(count: u64, name: &'static str) -> Self {
+        Self { count, name }
+    }
+}
 
 /// Counters of one stage; written by its thread alone, so stores suffice.
 #[derive(Debug)]
@@ -108,20 +123,20 @@ impl Counters {
     }
 }
 
-/// What one stage has done so far.
+/// Counters of one stage.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct StageProgress {
     /// Name of the stage.
     pub name: String,
-    /// Items taken, the one in work included.
+    /// Items received, including the one in work.
     pub items_in: u64,
-    /// Items given.
+    /// Items sent.
     pub items_out: u64,
-    /// Units dealt with, as of the last completed step.
+    /// Units processed up to the last completed step.
     pub units: Units,
-    /// Most items found waiting before the stage.
+    /// Greatest number of items found in the queue before the stage.
     pub queue_depth_max: usize,
-    /// Room before the stage; `None` for a source.
+    /// Capacity of that queue; `None` for a source.
     pub queue_capacity: Option<usize>,
     /// Whether the stage has ended.
     pub ended: bool,

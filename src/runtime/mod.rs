@@ -1,18 +1,17 @@
-//! Stages on named threads over bounded channels, with one supervisor; knows no physics.
+//! Stages on named threads, connected by bounded channels, under one supervisor. Knows no physics; uses [`crate::units`].
 //!
-//! A [`Graph`] is built of one or more chains source -> stages -> sink. Every link is a bounded
-//! channel that keeps order, so a fast source waits for a slow sink, and what is in flight is at most
-//! the sum of the capacities and a few items a stage. The runner owns receiving, timing, thread
-//! names and panics; a [`Stage`] holds nothing but its own work and is tested alone with
-//! [`Outlet::collect`].
+//! A [`Graph`] consists of chains source -> stages -> sink. Every link is a bounded channel that keeps the order of its
+//! items. So a fast source waits for a slow sink, and the items in flight are at most the sum of the capacities plus a few
+//! for each stage. The runner owns receiving, timing, thread names and panics. A [`Stage`] does only its own work and is
+//! tested alone with [`Outlet::collect`].
 //!
-//! How a run ends:
-//! - The source is done, or [`Cancel`] stops it: every stage works off its queue, every `finish`
-//!   runs, and the run returns a [`Report`].
-//! - A stage fails or panics: the first error is kept with the stage's name and place, everybody is
-//!   woken and stops without `finish`, and whoever does not end by the deadline is named in the error.
+//! A run ends in one of two ways:
+//! - The source is done, or [`Cancel`] stops it. Every stage drains its queue, every `finish` runs, and the run returns a
+//!   [`Report`].
+//! - A stage fails or panics. The supervisor keeps the first error with the name and position of the stage, and wakes all
+//!   other stages, which stop without `finish`. The error names the stages that do not end by the deadline.
 //!
-//! [`Ledger`] is the account that a run closes with.
+//! A [`Ledger`] counts what became of every sample; it must balance at the end of a run.
 
 mod cancel;
 mod config;
@@ -35,8 +34,8 @@ pub use config::RuntimeConfig;
 pub use error::{BoxError, Laggards, Moment, RuntimeError};
 pub use graph::{Graph, Link};
 pub use ledger::{Ledger, LedgerImbalance, LedgerReport};
-pub use metrics::{Metrics, StageProgress};
+pub use metrics::{Metrics, StageProgress, Units};
 pub use outlet::Outlet;
 pub use report::{QueueReport, Report, StageReport};
-pub use stage::{Flow, Sink, Source, Stage, Units};
-pub use timing::Summary;
+pub use stage::{Flow, Sink, Source, Stage};
+pub use timing::TimingSummary;

@@ -1,4 +1,4 @@
-//! Where a stage puts what it makes.
+//! The output of a stage.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -8,17 +8,16 @@ use crossbeam_channel::{Sender, TrySendError, select};
 use super::cancel::Halt;
 use super::metrics::Counters;
 
-/// An item and the instant at which its source emitted what it descends from.
+/// An item, and the instant at which the source emitted the item that it was made from.
 pub(super) struct Stamped<T> {
     pub(super) item: T,
     pub(super) born: Instant,
 }
 
-/// Takes what a stage makes, in order: a queue to the next stage, or a list for tests.
+/// Takes the outputs of a stage, in order: a queue to the next stage, or a list for tests.
 ///
-/// On a queue, [`Outlet::push`] waits while it is full. Once the run has failed elsewhere, pushing
-/// does nothing and the runner ends the stage after its step; a stage that makes very much in one
-/// step may ask [`Outlet::is_closed`] and leave early.
+/// [`Outlet::push`] waits while the queue is full. After a failure of another stage, pushing does nothing and the runner
+/// ends the stage after its step. A stage with many outputs in one step may check [`Outlet::is_closed`] and return early.
 pub struct Outlet<T>(Target<T>);
 
 enum Target<T> {
@@ -37,7 +36,7 @@ impl<T> Outlet<T> {
         Self(Target::Queue(queue))
     }
 
-    /// Hands `item` on.
+    /// Passes `item` to the next stage.
     pub fn push(&mut self, item: T) {
         match &mut self.0 {
             Target::Queue(queue) => queue.push(item),
@@ -45,7 +44,7 @@ impl<T> Outlet<T> {
         }
     }
 
-    /// Whether nobody will take anything any more.
+    /// Whether pushed items are discarded, as the run has failed.
     #[must_use]
     pub fn is_closed(&self) -> bool {
         match &self.0 {
@@ -54,7 +53,7 @@ impl<T> Outlet<T> {
         }
     }
 
-    /// What a collecting outlet holds; empty for a queue.
+    /// Items of a collecting outlet; empty for a queue.
     #[must_use]
     pub fn items(&self) -> &[T] {
         match &self.0 {
@@ -63,7 +62,7 @@ impl<T> Outlet<T> {
         }
     }
 
-    /// Takes out what a collecting outlet holds; empty for a queue.
+    /// Removes the items of a collecting outlet; empty for a queue.
     pub fn take(&mut self) -> Vec<T> {
         match &mut self.0 {
             Target::Queue(_) => Vec::new(),
@@ -71,13 +70,13 @@ impl<T> Outlet<T> {
         }
     }
 
-    /// What a collecting outlet held; empty for a queue.
+    /// Items of a collecting outlet; empty for a queue.
     #[must_use]
     pub fn into_vec(mut self) -> Vec<T> {
         self.take()
     }
 
-    /// Gives all that is pushed from now on the birth of `born`.
+    /// Stamps all items that are pushed from now on with `born`.
     pub(super) fn descend_from(&mut self, born: Instant) {
         if let Target::Queue(queue) = &mut self.0 {
             queue.born = Some(born);

@@ -1,43 +1,43 @@
-//! What a run was like.
+//! Statistics of a run.
 
 use std::fmt;
 
 use serde::Serialize;
 
 use super::metrics::Counters;
-use super::timing::Summary;
+use super::timing::TimingSummary;
 use super::worker::Timings;
 
 /// Use of the queue before a stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct QueueReport {
-    /// Items it has room for.
+    /// Items that it can hold.
     pub capacity: usize,
-    /// Most items found in it.
+    /// Greatest number of items found in it.
     pub depth_max: usize,
 }
 
-/// What one stage did. The three kinds of time add up to the thread's life.
+/// Statistics of one stage. The three kinds of time add up to the lifetime of its thread.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StageReport {
     /// Name of the stage.
     pub name: String,
-    /// Items taken.
+    /// Items received.
     pub items_in: u64,
-    /// Items given.
+    /// Items sent.
     pub items_out: u64,
-    /// Units dealt with.
+    /// Units processed.
     pub units: u64,
     /// Name of the unit; empty if none is counted.
     pub unit: &'static str,
-    /// Waiting for input: an entry an input, and one for its end.
-    pub waiting_in: Summary,
-    /// Working: an entry a step, and one for `finish`.
-    pub working: Summary,
-    /// Waiting for room in the output queue: an entry a step, and one for `finish`.
-    pub waiting_out: Summary,
-    /// From a source's pushing an item to the end of the step on what came of it; an entry an input.
-    pub since_source: Summary,
+    /// Waiting for input: one entry for each input, and one for the end.
+    pub waiting_in: TimingSummary,
+    /// Working: one entry for each step, and one for `finish`.
+    pub working: TimingSummary,
+    /// Waiting for room in the output queue: one entry for each step, and one for `finish`.
+    pub waiting_out: TimingSummary,
+    /// From the source's push of an item to the end of the step on what was made from it; one entry for each input.
+    pub since_source: TimingSummary,
     /// The queue before the stage; `None` for a source.
     pub queue: Option<QueueReport>,
 }
@@ -62,14 +62,14 @@ impl StageReport {
     }
 }
 
-/// What a run was like, stage by stage; shown as a table.
+/// Statistics of a run, stage by stage; shown as a table.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Report {
     /// The stages in the order in which they were added.
     pub stages: Vec<StageReport>,
-    /// Wall time, s.
+    /// Elapsed time, s.
     pub elapsed_s: f64,
-    /// Whether a source was stopped before its end.
+    /// Whether a source was cancelled before its end.
     pub cancelled: bool,
 }
 
@@ -95,8 +95,7 @@ const HEADINGS: [&str; 10] = [
 ];
 
 impl fmt::Display for Report {
-    /// A table in plain text: shares of each thread's time, most items queued of the room there was,
-    /// time of a step, latency.
+    /// A table in plain text: shares of each thread's time, greatest queue length and capacity, time of a step, latency.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut rows = vec![HEADINGS.map(str::to_owned)];
         rows.extend(self.stages.iter().map(|stage| self.row(stage)));
@@ -119,7 +118,7 @@ impl fmt::Display for Report {
 impl Report {
     fn row(&self, stage: &StageReport) -> [String; HEADINGS.len()] {
         let life_s = stage.waiting_in.total_s + stage.working.total_s + stage.waiting_out.total_s;
-        let share = |summary: &Summary| match life_s {
+        let share = |summary: &TimingSummary| match life_s {
             0.0 => "-".to_owned(),
             _ => format!("{:.0} %", 100.0 * summary.total_s / life_s),
         };
@@ -143,7 +142,7 @@ impl Report {
     }
 }
 
-fn percentiles(summary: &Summary) -> String {
+fn percentiles(summary: &TimingSummary) -> String {
     if summary.count == 0 {
         return "-".to_owned();
     }

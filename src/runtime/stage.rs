@@ -1,53 +1,37 @@
-//! What a pipeline is made of.
+//! The three parts of a chain: sources, stages and sinks.
 
 use std::error::Error;
 
+use super::metrics::Units;
 use super::outlet::Outlet;
 
 /// Whether a source has more to give.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Flow {
-    /// Ask again.
+    /// Call `next` again.
     Continue,
-    /// Nothing more will come; `finish` is next.
+    /// There is no more; call `finish`.
     Done,
 }
 
-/// What a stage has dealt with so far, in a unit of its own (visibilities, bytes), for throughput.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Units {
-    /// How many since the start.
-    pub count: u64,
-    /// Name of the unit in the plural; empty if the stage counts none.
-    pub name: &'static str,
-}
-
-impl Units {
-    /// `count` units called `name`.
-    #[must_use]
-    pub fn of(count: u64, name: &'static str) -> Self {
-        Self { count, name }
-    }
-}
-
-/// Turns inputs into any number of outputs each, in order.
+/// Turns each input into any number of outputs, in order.
 ///
-/// A stage never spawns threads, logs in its loop or reads clocks: that is the runner's business.
+/// A stage never spawns threads, logs in its loop or reads clocks: the runner does that.
 pub trait Stage: Send {
-    /// What it takes.
+    /// Type of its inputs.
     type In: Send;
-    /// What it gives.
+    /// Type of its outputs.
     type Out: Send;
-    /// Why it may fail.
+    /// Its error.
     type Error: Error + Send + Sync + 'static;
 
-    /// Works on one input, pushing what comes of it.
+    /// Processes one input and pushes the outputs.
     ///
     /// # Errors
-    /// An error ends the whole run: data that is merely bad is counted and dropped instead.
+    /// An error ends the whole run. Bad data is not an error: it is counted and dropped.
     fn step(&mut self, input: Self::In, out: &mut Outlet<Self::Out>) -> Result<(), Self::Error>;
 
-    /// Called once after the last input of a run that did not fail, cancelled or not; flushes.
+    /// Flushes; called once after the last input of a run that did not fail, cancelled or not.
     ///
     /// # Errors
     /// As [`Stage::step`].
@@ -56,21 +40,21 @@ pub trait Stage: Send {
         Ok(())
     }
 
-    /// What was dealt with so far; the unit's name must not change.
+    /// Units processed so far; the name of the unit must not change.
     fn units(&self) -> Units {
         Units::default()
     }
 }
 
-/// Where data comes from.
+/// The start of a chain.
 pub trait Source: Send {
-    /// What it gives.
+    /// Type of its outputs.
     type Out: Send;
-    /// Why it may fail.
+    /// Its error.
     type Error: Error + Send + Sync + 'static;
 
-    /// Pushes the next items, any number of them. Should return often: cancellation and failure
-    /// elsewhere are looked for between calls.
+    /// Pushes the next items, any number of them. Should return often: the runner looks for cancellation and failures
+    /// of other stages between calls.
     ///
     /// # Errors
     /// An error ends the whole run.
@@ -85,17 +69,17 @@ pub trait Source: Send {
         Ok(())
     }
 
-    /// What was given so far; the unit's name must not change.
+    /// Units produced so far; the name of the unit must not change.
     fn units(&self) -> Units {
         Units::default()
     }
 }
 
-/// Where data ends.
+/// The end of a chain.
 pub trait Sink: Send {
-    /// What it takes.
+    /// Type of its inputs.
     type In: Send;
-    /// Why it may fail.
+    /// Its error.
     type Error: Error + Send + Sync + 'static;
 
     /// Takes one input.
@@ -112,7 +96,7 @@ pub trait Sink: Send {
         Ok(())
     }
 
-    /// What was taken so far; the unit's name must not change.
+    /// Units consumed so far; the name of the unit must not change.
     fn units(&self) -> Units {
         Units::default()
     }

@@ -1,4 +1,4 @@
-//! Starts the threads, keeps the first failure, wakes everybody and joins with a deadline.
+//! Starts the threads, keeps the first failure, wakes all stages and joins them with a deadline.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -10,10 +10,9 @@ use crossbeam_channel::{Receiver, Sender, after, bounded, never, select, tick};
 
 use super::cancel::{Cancel, Halt};
 use super::error::{Laggards, RuntimeError};
-use super::graph::Node;
 use super::metrics::Counters;
 use super::report::{Report, StageReport};
-use super::worker::{Ending, Timings, Watch, Worker};
+use super::worker::{Ending, StageNode, Timings, Watch, Worker};
 
 /// Keeps the first failure of a run.
 struct Verdict {
@@ -32,14 +31,14 @@ impl Verdict {
     }
 }
 
-/// A thread's last word.
-struct Ended {
+/// The result of a thread.
+struct WorkerEnd {
     index: usize,
     ending: Ending,
     timings: Timings,
 }
 
-/// A thread that was started, and what it left.
+/// A thread that was started, and its timings when it has ended.
 struct Member {
     counters: Arc<Counters>,
     handle: Option<JoinHandle<()>>,
@@ -49,13 +48,13 @@ struct Member {
 /// How long a run waits for its stages.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Limits {
-    /// For all to end after a failure.
+    /// For all stages to end after a failure.
     pub(super) deadline: Duration,
-    /// For anything to move; for ever if there is none.
+    /// For any progress; `None` for no limit.
     pub(super) stall: Option<Duration>,
 }
 
-/// Looks whether anything moves.
+/// Detects that no stage makes progress.
 struct StallWatch {
     patience: Duration,
     seen: Vec<[u64; 4]>,
@@ -63,7 +62,7 @@ struct StallWatch {
 }
 
 impl StallWatch {
-    /// Stages at work, if nothing has moved for as long as the patience lasts.
+    /// Stages in a step, if there was no progress for the whole patience.
     fn look(&mut self, members: &[Member]) -> Option<Vec<String>> {
         let now: Vec<[u64; 4]> = members.iter().map(|member| member.counters.moves()).collect();
         if now != self.seen {
@@ -76,7 +75,7 @@ impl StallWatch {
 }
 
 pub(super) fn run(
-    nodes: Vec<Node>,
+    nodes: Vec<StageNode>,
     halt: &Arc<Halt>,
     cancel: &Cancel,
     limits: Limits,
@@ -104,16 +103,21 @@ fn names<'a>(members: impl Iterator<Item = &'a Member>) -> Vec<String> {
     members.map(|member| member.counters.name.clone()).collect()
 }
 
-/// Starts a thread for every node, or as many as the system gives.
-fn start(nodes: Vec<Node>, verdict: &Arc<Verdict>, cancel: &Cancel, say: &Sender<Ended>) -> Vec<Member> {
+/// Starts a thread for every node, or as many as the system allows.
+fn start(
+    nodes: Vec<StageNode>,
+    verdict: &Arc<Verdict>,
+    cancel: &Cancel,
+    say: &Sender<WorkerEnd>,
+) -> Vec<Member> {
     let mut members = Vec::with_capacity(nodes.len());
-    for (index, Node { counters, worker, .. }) in nodes.into_iter().enumerate() {
+    for (index, StageNode { counters, worker, .. }) in nodes.into_iter().enumerate() {
         let watch = Watch::new(Arc::clone(&counters), cancel.clone(), Arc::clone(&verdict.halt));
         let (verdict_there, say) = (Arc::clone(verdict), say.clone());
         let body = move || {
             let (ending, timings) = live(worker, watch, &verdict_there);
             // Fails only if the supervisor has stopped waiting.
-            let _ = say.send(Ended { index, ending, timings });
+            let _ = say.send(WorkerEnd { index, ending, timings });
         };
         match thread::Builder::new().name(counters.name.clone()).spawn(body) {
             Ok(handle) => members.push(Member { counters, handle: Some(handle), timings: None }),
@@ -127,7 +131,7 @@ fn start(nodes: Vec<Node>, verdict: &Arc<Verdict>, cancel: &Cancel, say: &Sender
     members
 }
 
-/// A thread's whole life: works, reports a failure before it lets go of its links, cleans up.
+/// The life of a thread: works, reports a failure before it drops its links, cleans up.
 fn live(mut worker: Box<dyn Worker>, mut watch: Watch, verdict: &Verdict) -> (Ending, Timings) {
     let worked = catch_unwind(AssertUnwindSafe(|| worker.work(&mut watch)));
     let (stage, at) = (watch.counters.name.clone(), watch.moment());
@@ -162,9 +166,9 @@ fn panic_message(payload: &(dyn Any + Send)) -> String {
     text.unwrap_or("a payload that is not text").to_owned()
 }
 
-/// Waits for all members, but after a failure no longer than `deadline`; members that ended have no
-/// handle any more. Returns whether a source was cut short by cancellation.
-fn join(members: &mut [Member], heard: &Receiver<Ended>, verdict: &Verdict, limits: Limits) -> bool {
+/// Waits for all members, after a failure no longer than `deadline`; removes the handles of members that ended. Returns
+/// whether cancellation stopped a source early.
+fn join(members: &mut [Member], heard: &Receiver<WorkerEnd>, verdict: &Verdict, limits: Limits) -> bool {
     let mut cancelled = false;
     let mut remaining = members.len();
     let mut stop = verdict.halt.stop().clone();
@@ -175,13 +179,13 @@ fn join(members: &mut [Member], heard: &Receiver<Ended>, verdict: &Verdict, limi
     while remaining > 0 {
         select! {
             recv(heard) -> ended => {
-                let Ok(Ended { index, ending, timings }) = ended else { break };
+                let Ok(WorkerEnd { index, ending, timings }) = ended else { break };
                 cancelled |= ending == Ending::Cancelled;
                 remaining -= 1;
                 let Some(member) = members.get_mut(index) else { continue };
                 member.timings = Some(timings);
                 if let Some(handle) = member.handle.take() {
-                    // The thread has nothing left to do but to return, and it catches its panics.
+                    // The thread only has to return, and it catches its panics.
                     let _ = handle.join();
                 }
             }

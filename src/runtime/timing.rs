@@ -1,11 +1,11 @@
-//! Durations summed up in bounded memory.
+//! Statistics of durations in bounded memory.
 
 use std::time::Duration;
 
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
-/// Longest duration told apart, ns: one day. Longer ones count as this one in the percentiles.
+/// Longest duration in the histogram, ns: one day. Longer ones count as this one in the percentiles.
 const LONGEST_NS: u64 = 86_400_000_000_000;
 
 /// Decimal digits kept: 1 % of a duration. About 40 kB a histogram, whatever the number of entries.
@@ -32,9 +32,9 @@ impl Timing {
         self.longest = self.longest.max(duration);
     }
 
-    pub(super) fn summary(&self) -> Summary {
+    pub(super) fn summary(&self) -> TimingSummary {
         let at = |quantile| self.histogram.value_at_quantile(quantile) as f64 * 1e-9;
-        Summary {
+        TimingSummary {
             count: self.histogram.len(),
             total_s: self.total.as_secs_f64(),
             p50_s: at(0.5),
@@ -45,9 +45,9 @@ impl Timing {
     }
 }
 
-/// Durations of one kind in one stage, in s; percentiles to 1 %, total and maximum exact.
+/// Statistics of durations of one kind in one stage, s; percentiles to 1 %, total and maximum exact.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Summary {
+pub struct TimingSummary {
     /// Number of entries.
     pub count: u64,
     /// Sum.
@@ -92,6 +92,6 @@ mod tests {
         let summary = timing.summary();
         assert_eq!(summary.count, 2);
         assert!(summary.p999_s >= 86_400.0);
-        assert_eq!(Timing::new().summary(), Summary::default());
+        assert_eq!(Timing::new().summary(), TimingSummary::default());
     }
 }

@@ -1,4 +1,4 @@
-//! What each thread does: the loops around a source, a stage and a sink.
+//! The loops of the threads: around a source, a stage and a sink.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -7,19 +7,19 @@ use crossbeam_channel::{Receiver, TryRecvError, select};
 
 use super::cancel::{Cancel, Halt};
 use super::error::{BoxError, Moment};
-use super::metrics::Counters;
+use super::metrics::{Counters, Units};
 use super::outlet::{Outlet, Stamped};
-use super::stage::{Flow, Sink, Source, Stage, Units};
+use super::stage::{Flow, Sink, Source, Stage};
 use super::timing::Timing;
 
 /// How a worker ended without an error of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Ending {
-    /// All was worked off and `finish` ran.
+    /// The input was drained and `finish` ran.
     Finished,
-    /// As `Finished`, but a source was cut short by [`Cancel`].
+    /// As `Finished`, but [`Cancel`] stopped a source.
     Cancelled,
-    /// Something failed elsewhere.
+    /// Another stage failed.
     Halted,
 }
 
@@ -27,6 +27,14 @@ pub(super) enum Ending {
 pub(super) trait Worker: Send {
     /// Works until the input ends, the run halts, or an error.
     fn work(&mut self, watch: &mut Watch) -> Result<Ending, BoxError>;
+}
+
+/// A stage of the graph that has no thread yet.
+pub(super) struct StageNode {
+    pub(super) counters: Arc<Counters>,
+    pub(super) worker: Box<dyn Worker>,
+    /// Whether its output is connected; true for a sink.
+    pub(super) taken: bool,
 }
 
 /// The four timings of a stage.
@@ -44,7 +52,7 @@ pub(super) struct Watch {
     cancel: Cancel,
     halt: Arc<Halt>,
     finishing: bool,
-    /// End of what was timed last.
+    /// End of the last timed interval.
     mark: Instant,
 }
 
@@ -59,7 +67,7 @@ impl Watch {
         Self { counters, timings, cancel, halt, finishing: false, mark: Instant::now() }
     }
 
-    /// Where the worker stands, for an error.
+    /// Position of the worker, for an error.
     pub(super) fn moment(&self) -> Moment {
         let is_source = self.counters.queue_capacity.is_none();
         match (self.finishing, is_source) {
@@ -77,7 +85,7 @@ impl Watch {
         self.mark = now;
     }
 
-    /// A step is over; `waited` of it went by waiting for room.
+    /// A step is over, of which `waited` was spent waiting for room.
     fn worked(&mut self, waited: Duration, born: Option<Instant>, units: Units) {
         let now = Instant::now();
         self.timings.working.record((now - self.mark).saturating_sub(waited));
@@ -102,7 +110,7 @@ pub(super) struct Inlet<T> {
     receiver: Receiver<Stamped<T>>,
 }
 
-enum Received<T> {
+enum Input<T> {
     Item(Stamped<T>),
     End,
     Halt,
@@ -114,7 +122,7 @@ impl<T> Inlet<T> {
     }
 
     /// Waits for the next item; timed and counted.
-    fn receive(&mut self, watch: &mut Watch) -> Received<T> {
+    fn receive(&mut self, watch: &mut Watch) -> Input<T> {
         let depth = self.receiver.len();
         watch.counters.set_working(false);
         let received = match self.receiver.try_recv() {
@@ -126,14 +134,14 @@ impl<T> Inlet<T> {
         watch.counters.set_working(true);
         // After the wait: a closed channel means an end only if nothing failed.
         if watch.halt.is_set() {
-            return Received::Halt;
+            return Input::Halt;
         }
         let Some(stamped) = received else {
-            return Received::End;
+            return Input::End;
         };
         watch.counters.note_depth(depth.max(1));
         watch.counters.count_in();
-        Received::Item(stamped)
+        Input::Item(stamped)
     }
 
     fn wait(&self, halt: &Halt) -> Option<Stamped<T>> {
@@ -186,13 +194,13 @@ impl<S: Stage> Worker for StageWorker<S> {
         let Self { stage, inlet, out } = self;
         loop {
             match inlet.receive(watch) {
-                Received::Item(Stamped { item, born }) => {
+                Input::Item(Stamped { item, born }) => {
                     out.descend_from(born);
                     stage.step(item, out)?;
                     watch.worked_into(out, Some(born), stage.units());
                 }
-                Received::End => break,
-                Received::Halt => return Ok(Ending::Halted),
+                Input::End => break,
+                Input::Halt => return Ok(Ending::Halted),
             }
         }
         watch.finishing = true;
@@ -213,12 +221,12 @@ impl<S: Sink> Worker for SinkWorker<S> {
         let Self { sink, inlet } = self;
         loop {
             match inlet.receive(watch) {
-                Received::Item(Stamped { item, born }) => {
+                Input::Item(Stamped { item, born }) => {
                     sink.take(item)?;
                     watch.worked(Duration::ZERO, Some(born), sink.units());
                 }
-                Received::End => break,
-                Received::Halt => return Ok(Ending::Halted),
+                Input::End => break,
+                Input::Halt => return Ok(Ending::Halted),
             }
         }
         watch.finishing = true;

@@ -8,18 +8,17 @@ use super::generated::GeneratedSky;
 use super::healpix::is_valid_nside;
 use crate::units::{Checks, InvalidValue, PerChannel};
 
-/// Where the simulated sky comes from.
+/// The `[sky]` section.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SkyConfig {
-    /// HEALPix FITS maps in K, one, or one a channel; the generated sky if none is named.
+    /// HEALPix FITS maps in K, one or one a channel; without them the sky is generated.
     pub file: Option<PerChannel<PathBuf>>,
     /// nside of the generated sky.
     pub nside: usize,
-    /// Greatest band limit of skies that are simulated through harmonics, less for a map that holds less; 0 for
-    /// what the baselines ask for.
+    /// Highest degree of the harmonic model, at most what the map determines; 0 for what the baselines need.
     pub l_max: usize,
-    /// The generated sky's parts.
+    /// Components of the generated sky.
     pub generated: GeneratedSky,
 }
 
@@ -32,11 +31,11 @@ impl Default for SkyConfig {
 /// Greatest nside of a generated sky.
 pub const GENERATED_NSIDE_MAX: usize = 1024;
 
-/// Greatest band limit of harmonic simulation.
+/// Highest degree of the harmonic model.
 const L_MAX: usize = 1536;
 
 impl SkyConfig {
-    /// Greatest band limit that a map of `nside` determines.
+    /// Highest degree that a map of `nside` determines.
     #[must_use]
     pub fn l_max_most(nside: usize) -> usize {
         L_MAX.min(5 * nside / 2)

@@ -20,5 +20,5 @@ pub const YEAR_S: f64 = 365.25 * DAY_S;
 /// Sidereal month: the period of the Earth's direction as seen from the Moon, s.
 pub const SIDEREAL_MONTH_S: f64 = 27.321_661 * DAY_S;
 
-/// HEALPix value of a pixel that was never seen, K.
+/// HEALPix value of a pixel without data, K.
 pub const HEALPIX_UNSEEN: f64 = -1.637_5e30;

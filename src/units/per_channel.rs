@@ -1,4 +1,4 @@
-//! Settings that may differ from channel to channel.
+//! Configuration values that may differ between channels.
 
 use serde::{Deserialize, Serialize};
 
@@ -22,7 +22,7 @@ impl<T: Clone> PerChannel<T> {
         }
     }
 
-    /// The same of something else.
+    /// Applies `change` to every value.
     #[must_use]
     pub fn map<U>(&self, change: impl Fn(&T) -> U) -> PerChannel<U> {
         match self {
@@ -40,7 +40,7 @@ impl<T: Clone> PerChannel<T> {
         }
     }
 
-    /// All values given.
+    /// All values, one or one for each channel.
     pub fn values(&self) -> &[T] {
         match self {
             Self::All(value) => std::slice::from_ref(value),

@@ -1,15 +1,15 @@
-//! Random streams keyed by what they are for, so that nothing depends on scheduling.
+//! Random streams keyed by their purpose, so that nothing depends on scheduling.
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
-/// What a random stream is for; streams of different kinds are independent.
+/// Purpose of a random stream; streams of different kinds are independent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum StreamKind {
     /// Thermal noise of integrated visibilities.
     VisibilityNoise = 1,
-    /// Noise drawn on the ground for the noise-only companion map.
+    /// Noise of the noise-only companion map, drawn on the ground.
     CompanionNoise = 2,
     /// Small-scale structure of a generated sky.
     SkyFluctuations = 3,

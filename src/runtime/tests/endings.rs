@@ -4,14 +4,14 @@ use std::error::Error;
 use std::sync::mpsc;
 use std::time::Duration;
 
-use super::parts::{Count, Each, Into, Keep, PATIENCE, Refused};
+use super::parts::{Count, Each, Into, Keep, PATIENCE, TestError};
 use crate::runtime::{Cancel, Flow, Graph, Moment, Outlet, RuntimeError, Sink, Source, Stage};
 
 /// Runs numbers through `stage` into a sink that keeps them; without end unless something stops it.
 /// Returns the error, and whether the sink ran its `finish`.
 fn fail_with<S>(stage: S) -> (RuntimeError, bool)
 where
-    S: Stage<In = u64, Out = u64, Error = Refused> + 'static,
+    S: Stage<In = u64, Out = u64, Error = TestError> + 'static,
 {
     let mut graph = Graph::new();
     let numbers = graph.source("count", 2, Count::to(100));
@@ -31,12 +31,12 @@ fn pass(n: u64, out: &mut Outlet<u64>) {
 fn an_error_in_the_middle_carries_stage_place_and_cause() {
     let (error, finished) = fail_with(Each::new(|n, out: &mut Outlet<u64>| {
         pass(n, out);
-        if n == 41 { Err(Refused(n)) } else { Ok(()) }
+        if n == 41 { Err(TestError(n)) } else { Ok(()) }
     }));
     assert!(!finished, "a failed run must not look complete to its sink");
     assert_eq!(error.to_string(), "stage `middle` failed at item 41");
-    let cause = error.source().and_then(|cause| cause.downcast_ref::<Refused>());
-    assert_eq!(cause, Some(&Refused(41)));
+    let cause = error.source().and_then(|cause| cause.downcast_ref::<TestError>());
+    assert_eq!(cause, Some(&TestError(41)));
 }
 
 #[test]
@@ -45,7 +45,7 @@ fn an_error_in_finish_is_told_apart() {
         pass(n, out);
         Ok(())
     };
-    let (error, finished) = fail_with(Each::with_finish(step, |_: &mut Outlet<u64>| Err(Refused(7))));
+    let (error, finished) = fail_with(Each::with_finish(step, |_: &mut Outlet<u64>| Err(TestError(7))));
     assert!(!finished);
     assert!(matches!(error, RuntimeError::Failed { at: Moment::Finish(100), .. }), "{error:?}");
     assert_eq!(error.to_string(), "stage `middle` failed in finish, after 100 items");
@@ -99,11 +99,11 @@ struct Failing(u64);
 
 impl Source for Failing {
     type Out = u64;
-    type Error = Refused;
+    type Error = TestError;
 
-    fn next(&mut self, out: &mut Outlet<u64>) -> Result<Flow, Refused> {
+    fn next(&mut self, out: &mut Outlet<u64>) -> Result<Flow, TestError> {
         if self.0 == 3 {
-            return Err(Refused(self.0));
+            return Err(TestError(self.0));
         }
         out.push(self.0);
         self.0 += 1;
@@ -112,18 +112,18 @@ impl Source for Failing {
 }
 
 /// A sink that refuses to finish.
-struct Unfinished;
+struct FailingSink;
 
-impl Sink for Unfinished {
+impl Sink for FailingSink {
     type In = u64;
-    type Error = Refused;
+    type Error = TestError;
 
-    fn take(&mut self, _: u64) -> Result<(), Refused> {
+    fn take(&mut self, _: u64) -> Result<(), TestError> {
         Ok(())
     }
 
-    fn finish(&mut self) -> Result<(), Refused> {
-        Err(Refused(0))
+    fn finish(&mut self) -> Result<(), TestError> {
+        Err(TestError(0))
     }
 }
 
@@ -139,7 +139,7 @@ fn errors_at_both_ends_say_where() {
 
     let mut graph = Graph::new();
     let numbers = graph.source("count", 2, Count::to(4));
-    graph.sink("end", numbers, Unfinished);
+    graph.sink("end", numbers, FailingSink);
     let error = graph.run(&Cancel::new(), PATIENCE).unwrap_err();
     assert_eq!(error.to_string(), "stage `end` failed in finish, after 4 items");
 }
@@ -216,7 +216,7 @@ fn cancelling_a_run_that_is_complete_changes_nothing() {
         move |_: &mut Outlet<u64>| {
             // Runs after the source has ended.
             trigger.cancel();
-            told.send(()).map_err(|_| Refused(0))
+            told.send(()).map_err(|_| TestError(0))
         },
     );
     let passed = graph.stage("middle", 16, numbers, wait);
@@ -242,7 +242,7 @@ fn a_stuck_stage_is_named() {
         Ok(())
     });
     let held = graph.stage("hang", 1, numbers, hang);
-    let fail = Into::new(|n: u64| if n == 2 { Err(Refused(n)) } else { Ok(()) });
+    let fail = Into::new(|n: u64| if n == 2 { Err(TestError(n)) } else { Ok(()) });
     graph.sink("fail", held, fail);
     let metrics = graph.metrics();
     let error = graph.run(&Cancel::new(), Duration::from_millis(300)).unwrap_err();
@@ -265,8 +265,8 @@ fn a_failure_wakes_a_chain_that_waits_for_its_source() {
     struct Silent(mpsc::Receiver<()>);
     impl Source for Silent {
         type Out = u64;
-        type Error = Refused;
-        fn next(&mut self, _: &mut Outlet<u64>) -> Result<Flow, Refused> {
+        type Error = TestError;
+        fn next(&mut self, _: &mut Outlet<u64>) -> Result<Flow, TestError> {
             let _ = self.0.recv();
             Ok(Flow::Done)
         }
@@ -275,7 +275,7 @@ fn a_failure_wakes_a_chain_that_waits_for_its_source() {
     let nothing = graph.source("silent", 1, Silent(stuck));
     graph.sink("waiting", nothing, Into::new(|_: u64| Ok(())));
     let numbers = graph.source("count", 1, Count::to(u64::MAX));
-    graph.sink("fail", numbers, Into::new(|n: u64| if n == 9 { Err(Refused(n)) } else { Ok(()) }));
+    graph.sink("fail", numbers, Into::new(|n: u64| if n == 9 { Err(TestError(n)) } else { Ok(()) }));
     let error = graph.run(&Cancel::new(), Duration::from_millis(300)).unwrap_err();
     let RuntimeError::Failed { stage, laggards, .. } = &error else { panic!("{error:?}") };
     assert_eq!(stage, "fail");

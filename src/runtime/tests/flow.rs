@@ -4,11 +4,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use super::parts::{Count, Each, Into, Keep, PATIENCE, Refused};
+use super::parts::{Count, Each, Into, Keep, PATIENCE, TestError};
 use crate::runtime::{Cancel, Graph, Outlet, RuntimeError, Stage};
 
 /// Gives each number twice, and -1 at the end.
-fn twice() -> impl Stage<In = u64, Out = i64, Error = Refused> {
+fn twice() -> impl Stage<In = u64, Out = i64, Error = TestError> {
     Each::with_finish(
         |n: u64, out: &mut Outlet<i64>| {
             out.push(n as i64);

@@ -13,7 +13,7 @@ pub const PATIENCE: Duration = Duration::from_secs(60);
 
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("refused {0}")]
-pub struct Refused(pub u64);
+pub struct TestError(pub u64);
 
 /// Gives `0..count`, one a call.
 pub struct Count {
@@ -29,9 +29,9 @@ impl Count {
 
 impl Source for Count {
     type Out = u64;
-    type Error = Refused;
+    type Error = TestError;
 
-    fn next(&mut self, out: &mut Outlet<u64>) -> Result<Flow, Refused> {
+    fn next(&mut self, out: &mut Outlet<u64>) -> Result<Flow, TestError> {
         if self.next == self.count {
             return Ok(Flow::Done);
         }
@@ -52,9 +52,9 @@ pub struct Each<I, O, F, G> {
     kind: PhantomData<fn(I) -> O>,
 }
 
-impl<I, O, F> Each<I, O, F, fn(&mut Outlet<O>) -> Result<(), Refused>>
+impl<I, O, F> Each<I, O, F, fn(&mut Outlet<O>) -> Result<(), TestError>>
 where
-    F: FnMut(I, &mut Outlet<O>) -> Result<(), Refused>,
+    F: FnMut(I, &mut Outlet<O>) -> Result<(), TestError>,
 {
     pub fn new(step: F) -> Self {
         Self { step, finish: |_| Ok(()), kind: PhantomData }
@@ -63,8 +63,8 @@ where
 
 impl<I, O, F, G> Each<I, O, F, G>
 where
-    F: FnMut(I, &mut Outlet<O>) -> Result<(), Refused>,
-    G: FnMut(&mut Outlet<O>) -> Result<(), Refused>,
+    F: FnMut(I, &mut Outlet<O>) -> Result<(), TestError>,
+    G: FnMut(&mut Outlet<O>) -> Result<(), TestError>,
 {
     pub fn with_finish(step: F, finish: G) -> Self {
         Self { step, finish, kind: PhantomData }
@@ -75,18 +75,18 @@ impl<I, O, F, G> Stage for Each<I, O, F, G>
 where
     I: Send,
     O: Send,
-    F: FnMut(I, &mut Outlet<O>) -> Result<(), Refused> + Send,
-    G: FnMut(&mut Outlet<O>) -> Result<(), Refused> + Send,
+    F: FnMut(I, &mut Outlet<O>) -> Result<(), TestError> + Send,
+    G: FnMut(&mut Outlet<O>) -> Result<(), TestError> + Send,
 {
     type In = I;
     type Out = O;
-    type Error = Refused;
+    type Error = TestError;
 
-    fn step(&mut self, input: I, out: &mut Outlet<O>) -> Result<(), Refused> {
+    fn step(&mut self, input: I, out: &mut Outlet<O>) -> Result<(), TestError> {
         (self.step)(input, out)
     }
 
-    fn finish(&mut self, out: &mut Outlet<O>) -> Result<(), Refused> {
+    fn finish(&mut self, out: &mut Outlet<O>) -> Result<(), TestError> {
         (self.finish)(out)
     }
 }
@@ -110,14 +110,14 @@ impl<T> Keep<T> {
 
 impl<T: Send> Sink for Keep<T> {
     type In = T;
-    type Error = Refused;
+    type Error = TestError;
 
-    fn take(&mut self, input: T) -> Result<(), Refused> {
+    fn take(&mut self, input: T) -> Result<(), TestError> {
         self.0.lock().unwrap().items.push(input);
         Ok(())
     }
 
-    fn finish(&mut self) -> Result<(), Refused> {
+    fn finish(&mut self) -> Result<(), TestError> {
         self.0.lock().unwrap().finished = true;
         Ok(())
     }
@@ -129,17 +129,17 @@ pub struct Into<I, F> {
     kind: PhantomData<fn(I)>,
 }
 
-impl<I, F: FnMut(I) -> Result<(), Refused>> Into<I, F> {
+impl<I, F: FnMut(I) -> Result<(), TestError>> Into<I, F> {
     pub fn new(take: F) -> Self {
         Self { take, kind: PhantomData }
     }
 }
 
-impl<I: Send, F: FnMut(I) -> Result<(), Refused> + Send> Sink for Into<I, F> {
+impl<I: Send, F: FnMut(I) -> Result<(), TestError> + Send> Sink for Into<I, F> {
     type In = I;
-    type Error = Refused;
+    type Error = TestError;
 
-    fn take(&mut self, input: I) -> Result<(), Refused> {
+    fn take(&mut self, input: I) -> Result<(), TestError> {
         (self.take)(input)
     }
 }

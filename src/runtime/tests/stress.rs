@@ -7,12 +7,12 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
-use super::parts::{Count, Each, Into, PATIENCE, Refused};
+use super::parts::{Count, Each, Into, PATIENCE, TestError};
 use crate::runtime::{Cancel, Graph, Outlet, Report, RuntimeError};
 
 /// What befalls a run, at which stage and which item.
 #[derive(Clone, Copy, Debug)]
-enum Fate {
+enum Mishap {
     Nothing,
     Error { stage: u64, item: u64 },
     Panic { stage: u64, item: u64 },
@@ -21,7 +21,7 @@ enum Fate {
 
 const ITEMS: u64 = 40;
 
-fn run(stages: u64, fate: Fate, random: &mut ChaCha8Rng) -> Result<Report, RuntimeError> {
+fn run(stages: u64, fate: Mishap, random: &mut ChaCha8Rng) -> Result<Report, RuntimeError> {
     let cancel = Cancel::new();
     let mut graph = Graph::new();
     let mut link = graph.source("source", random.random_range(1..4), Count::to(ITEMS));
@@ -29,12 +29,12 @@ fn run(stages: u64, fate: Fate, random: &mut ChaCha8Rng) -> Result<Report, Runti
         let trigger = cancel.clone();
         let step = move |n: u64, out: &mut Outlet<u64>| {
             match fate {
-                Fate::Error { stage, item } if (stage, item) == (index, n) => return Err(Refused(n)),
+                Mishap::Error { stage, item } if (stage, item) == (index, n) => return Err(TestError(n)),
                 // Unwinds without the hook that would print every one of these.
-                Fate::Panic { stage, item } if (stage, item) == (index, n) => {
+                Mishap::Panic { stage, item } if (stage, item) == (index, n) => {
                     std::panic::resume_unwind(Box::new("wanted"))
                 }
-                Fate::Cancel { stage, item } if (stage, item) == (index, n) => trigger.cancel(),
+                Mishap::Cancel { stage, item } if (stage, item) == (index, n) => trigger.cancel(),
                 _ => {}
             }
             out.push(n);
@@ -46,17 +46,17 @@ fn run(stages: u64, fate: Fate, random: &mut ChaCha8Rng) -> Result<Report, Runti
     graph.run(&cancel, PATIENCE)
 }
 
-fn check(stages: u64, fate: Fate, result: Result<Report, RuntimeError>) {
+fn check(stages: u64, fate: Mishap, result: Result<Report, RuntimeError>) {
     match (fate, result) {
-        (Fate::Nothing, Ok(report)) => {
+        (Mishap::Nothing, Ok(report)) => {
             assert_eq!(report.stage("sink").map(|sink| sink.items_in), Some(ITEMS));
         }
-        (Fate::Error { stage, .. }, Err(RuntimeError::Failed { stage: name, laggards, .. }))
-        | (Fate::Panic { stage, .. }, Err(RuntimeError::Panicked { stage: name, laggards, .. })) => {
+        (Mishap::Error { stage, .. }, Err(RuntimeError::Failed { stage: name, laggards, .. }))
+        | (Mishap::Panic { stage, .. }, Err(RuntimeError::Panicked { stage: name, laggards, .. })) => {
             assert_eq!(name, format!("stage {stage}"));
             assert!(laggards.stages.is_empty(), "{laggards}");
         }
-        (Fate::Cancel { .. }, Ok(report)) => {
+        (Mishap::Cancel { .. }, Ok(report)) => {
             let given = report.stage("source").map(|source| source.items_out);
             assert_eq!(report.stage("sink").map(|sink| sink.items_in), given);
             assert!(report.cancelled || given == Some(ITEMS));
@@ -74,10 +74,10 @@ fn no_run_hangs() {
             let stages = random.random_range(1..5);
             let (stage, item) = (random.random_range(0..stages), random.random_range(0..ITEMS));
             let fate = match random.random_range(0..4) {
-                0 => Fate::Nothing,
-                1 => Fate::Error { stage, item },
-                2 => Fate::Panic { stage, item },
-                _ => Fate::Cancel { stage, item },
+                0 => Mishap::Nothing,
+                1 => Mishap::Error { stage, item },
+                2 => Mishap::Panic { stage, item },
+                _ => Mishap::Cancel { stage, item },
             };
             check(stages, fate, run(stages, fate, &mut random));
         }

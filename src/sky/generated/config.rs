@@ -7,12 +7,12 @@ use crate::sky::harmonics::HarmonicsError;
 use crate::sky::healpix::is_valid_nside;
 use crate::units::{Checks, InvalidValue};
 
-/// Frequencies for which there is a sky, Hz.
+/// Frequencies of generated skies, Hz.
 const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=120e6;
 /// Finest map.
 const NSIDE_MAX: usize = 1024;
 
-/// Switches and amplitudes of a generated sky.
+/// The `[sky.generated]` section: components of a generated sky and their amplitudes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GeneratedSky {
@@ -20,23 +20,23 @@ pub struct GeneratedSky {
     pub small_scales: bool,
     /// Factor on the amplitude of the small scales of Remazeilles et al. (2015).
     pub small_scale_amplitude: f64,
-    /// Resolution of the smooth model on which small scales are put, FWHM, degrees.
+    /// Resolution of the smooth model below the small scales, FWHM, degrees.
     pub small_scale_fwhm_deg: f64,
     /// Greatest degree l of the small scales; a map holds at most 3 nside - 1.
     pub small_scale_l_max: usize,
-    /// Standard deviation of the logarithm of the gas's opacity over the sky.
+    /// Standard deviation of the logarithm of the opacity of the gas over the sky.
     pub cloud_log_rms: f64,
     /// Standard deviation of the synchrotron index over the sky.
     pub index_rms: f64,
-    /// Whether the radio loops, with the North Polar Spur, are there.
+    /// Whether the sky has the radio loops, with the North Polar Spur.
     pub loops: bool,
-    /// Whether opaque nebulae are there.
+    /// Whether the sky has opaque nebulae.
     pub nebulae: bool,
-    /// Whether point sources are there.
+    /// Whether the sky has point sources.
     pub point_sources: bool,
-    /// Faintest source drawn, Jy at 154 MHz; fainter ones are part of the smooth background.
+    /// Flux density of the faintest source, Jy at 154 MHz; fainter ones are part of the smooth background.
     pub source_flux_jy_min: f64,
-    /// Brightest source drawn, Jy at 154 MHz.
+    /// Flux density of the brightest source, Jy at 154 MHz.
     pub source_flux_jy_max: f64,
     /// Spectral index of the sources' fluxes.
     pub source_spectral_index: f64,
@@ -64,7 +64,7 @@ impl Default for GeneratedSky {
     }
 }
 
-/// Why there is no such sky.
+/// Why a sky cannot be generated.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum GeneratedSkyError {

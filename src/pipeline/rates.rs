@@ -1,0 +1,31 @@
+//! Rates of one core, measured once, from which times are estimated.
+//!
+//! The machine: a virtual machine with 2 cores of an AMD EPYC without AVX-512; the figures are those of the README's
+//! table of speeds. Another machine is faster or slower by some factor: what counts is which part takes longest, and
+//! whether it is minutes or days.
+
+/// Fringes of direct sums in a second (bench `response`).
+pub(super) const FRINGES_PER_S: f64 = 7.2e8;
+
+/// Multiply-adds of the pixel engine's rank-k updates in a second, rows of B included (`lunarray run` of the embedded
+/// quicklook, which takes 75 s).
+pub(super) const RANK_K_MULTIPLY_ADDS_PER_S: f64 = 1.0e10;
+
+/// Multiply-adds of a Cholesky factorisation in a second: its panels keep one of two cores waiting.
+pub(super) const CHOLESKY_MULTIPLY_ADDS_PER_S: f64 = 0.5 * RANK_K_MULTIPLY_ADDS_PER_S;
+
+/// Visibilities that the harmonic engine adds in a second, at any degree (bench `harmonic`).
+pub(super) const HARMONIC_VISIBILITIES_PER_S: f64 = 4e5;
+
+/// Multiply-adds of Fourier transforms of lines of 300 to 900 points in a second (bench `harmonic`: products with
+/// BtN^-1B, which are four transforms a line).
+pub(super) const TRANSFORM_MULTIPLY_ADDS_PER_S: f64 = 6e9;
+
+/// Samples of one daughter and channel that are drawn, quantised, sent and correlated in a second, with eight daughters
+/// (`lunarray bench`: 30 channels of 8 kHz at 23 times real time).
+pub(super) const SAMPLES_PER_S: f64 = 2.2e7;
+
+/// Cores that work inside stages.
+pub(super) fn cores() -> f64 {
+    rayon::current_num_threads() as f64
+}
