@@ -1,4 +1,4 @@
-//! The harmonic engine's ingredients against values computed by independent code.
+//! Wigner functions and pattern coefficients against values computed by independent code.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
 mod common;
