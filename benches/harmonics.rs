@@ -1,4 +1,4 @@
-//! Spherical harmonic transforms: rate, share of the machine's multiply-add peak, ratio to healpy's time.
+//! Spherical harmonic transforms: rate, fraction of the machine's multiply-add peak, ratio to healpy's time.
 //!
 //! `cargo bench --bench harmonics [-- NSIDE..]`; healpy is timed too if `LUNARRAY_PYTHON` is set.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A program for people at a terminal.
@@ -14,7 +14,7 @@ use num_complex::Complex64;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-/// Multiply-adds of independent registers, as many as hide their latency.
+/// Multiply-adds on independent registers, enough to hide their latency.
 struct PeakLoop(usize);
 
 impl WithSimd for PeakLoop {
@@ -56,7 +56,7 @@ fn peak() -> f64 {
     per_thread * threads as f64 / seconds
 }
 
-/// Least time of some runs, s.
+/// Least time of several runs, s.
 fn best(runs: usize, mut run: impl FnMut()) -> f64 {
     let time = |_| {
         let start = Instant::now();
@@ -66,8 +66,7 @@ fn best(runs: usize, mut run: impl FnMut()) -> f64 {
     (0..runs).map(time).fold(f64::INFINITY, f64::min)
 }
 
-/// Multiply-adds that a transform cannot do without: six for each ring pair and two degrees, of orders that
-/// reach the ring.
+/// Multiply-adds that a transform needs: six for each ring pair and two degrees, for the orders that reach the ring.
 fn needed(nside: usize, l_max: usize) -> f64 {
     let of_ring = |k: usize| {
         let top = (l_max as f64 * ring(nside, k).sin_theta) as usize;
@@ -156,7 +155,7 @@ fn least_squares(nside: usize, l_max: usize) {
     );
 }
 
-/// Coefficients of size one.
+/// Coefficients of order one.
 fn coefficients(l_max: usize) -> Alm {
     let mut alm = Alm::zeros(l_max);
     for (k, value) in alm.values_mut().iter_mut().enumerate() {

@@ -1,4 +1,4 @@
-//! Rate of the response's kernels on one core, and its ratio to the project's limit for them.
+//! Rate of the response kernels on one core, and its ratio to the required rate.
 //!
 //! `cargo bench --bench response`
 #![allow(clippy::unwrap_used)] // A program for people at a terminal.
@@ -11,10 +11,10 @@ use lunarray::frames::AntennaResponse;
 use lunarray::response::pixel::{Directions, PairGeometry, PixelMethod, RowMaker, exact, sky_sums};
 use lunarray::sky::healpix::{pixel_area_sr, pixel_directions};
 
-/// Pixel-fringes a second and core that the kernels are to make at least.
+/// Required pixel-fringes a second and core.
 const LIMIT_PER_S: f64 = 5e8;
 
-/// Least time of some runs, s: what the machine can do when nothing else runs.
+/// Least time of several runs, s, which is the least disturbed by other programs.
 fn best(runs: usize, mut run: impl FnMut()) -> f64 {
     let mut least_s = f64::INFINITY;
     for _ in 0..runs {
@@ -25,7 +25,7 @@ fn best(runs: usize, mut run: impl FnMut()) -> f64 {
     least_s
 }
 
-/// Pairs 1-2 to 1-4 at many times, as frequencies make them `pixels_long` pixels of `nside` long.
+/// Pairs 1-2 to 1-4 at many times, at frequencies that make their baselines `pixels_long` pixels of `nside` long.
 fn pairs(count: usize, nside: usize, pixels_long: f64) -> Vec<PairGeometry> {
     let array = Array::new(&ArrayConfig::default()).unwrap();
     let width_rad = pixel_area_sr(nside).sqrt();

@@ -1,7 +1,7 @@
-//! Tabulated positions: made on the spacecraft, interpolated on the ground.
+//! Tabulated positions: sampled on the spacecraft, interpolated on the ground.
 //!
-//! Interpolation is Lagrange's through the eight nodes about the time asked for, within one segment, written as one
-//! polynomial from each node to the next: many visibilities lie between two nodes. Its
+//! Lagrange interpolation through the eight nodes about a time, within one segment, written as one polynomial between
+//! adjacent nodes because many visibilities lie between two nodes. Its
 //! error is at most `|d8r/dt8| h^8 max|s (s-1) .. (s-7)| / 8!` (Abramowitz and Stegun 25.2.27); on an orbit
 //! of radius R and angular speed w it is R (w h)^8 / 940 in the middle of a segment and 28 times that in its
 //! outermost steps: about a micrometre for nodes a minute apart.
@@ -16,13 +16,13 @@ use crate::units::{MissionTime, TICKS_PER_SECOND};
 /// Nodes of one interpolation.
 const NODES: usize = 8;
 
-/// Segments looked at for one time: the latest to begin before it, and a few that overlap it.
+/// Segments examined for one time: the latest that start before it, a few of which may overlap.
 const OVERLAPPING_MAX: usize = 8;
 
-/// The ephemeris of `array` from `start` to `end`, in segments that no turnaround of the formation parts, with
-/// nodes at most `step_s_max` apart and at least eight of them.
+/// The ephemeris of `array` from `start` to `end`, in segments without a turnaround of the formation inside, each of at
+/// least eight nodes at most `step_s_max` apart.
 ///
-/// Every time from `start` to `end` is covered; segments may reach beyond by less than a step.
+/// Covers every time from `start` to `end`; segments may extend beyond by less than a step.
 #[must_use]
 pub fn segments_for(
     array: &Array,
@@ -41,7 +41,7 @@ pub fn segments_for(
     segments
 }
 
-/// The tick of the first turnaround after `from`, which may itself be the tick of one.
+/// The tick of the first turnaround after `from`, which may itself be one.
 fn turnaround_after(array: &Array, from: MissionTime) -> MissionTime {
     let next_after =
         |time: MissionTime| MissionTime::from_seconds(array.formation().next_turnaround_s(time.seconds()));
@@ -50,10 +50,10 @@ fn turnaround_after(array: &Array, from: MissionTime) -> MissionTime {
     if found > from { found } else { next_after(next_tick).max(next_tick) }
 }
 
-/// One segment over a stretch of time in which nothing jumps.
+/// One segment over an interval without a jump in velocity.
 ///
-/// Its nodes are whole ticks apart, so that it may be a few ticks longer than asked for: before its beginning
-/// when it ends at a turnaround, behind its end otherwise.
+/// Its nodes are whole ticks apart, so it may be a few ticks longer than the interval: at its start if it ends at a
+/// turnaround, otherwise at its end.
 fn segment(
     array: &Array,
     [from, to]: [MissionTime; 2],
@@ -89,7 +89,7 @@ pub enum Insertion {
     Unusable,
 }
 
-/// The positions that the ground knows, from ephemeris frames alone.
+/// Positions of the satellites as the ground knows them, from ephemeris frames only.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ephemeris {
     segments: BTreeMap<MissionTime, EphemerisSegment>,
@@ -122,12 +122,12 @@ impl Ephemeris {
         self.segments.is_empty()
     }
 
-    /// All segments, in the order of their beginnings.
+    /// All segments, in order of their start.
     pub fn segments(&self) -> impl Iterator<Item = &EphemerisSegment> {
         self.segments.values()
     }
 
-    /// Offers a segment.
+    /// Inserts a segment.
     pub fn insert(&mut self, segment: EphemerisSegment) -> Insertion {
         let positions = segment.nodes() * usize::from(segment.satellites);
         let whole = positions == segment.positions_m.len();
@@ -149,23 +149,23 @@ impl Ephemeris {
         Insertion::New
     }
 
-    /// The segment that begins at a time.
+    /// The segment that starts at a given time.
     #[must_use]
     pub fn segment(&self, start: MissionTime) -> Option<&EphemerisSegment> {
         self.segments.get(&start)
     }
 
-    /// Takes the segment that begins at a time out again.
+    /// Removes the segment that starts at a given time.
     pub fn remove(&mut self, start: MissionTime) -> Option<EphemerisSegment> {
         self.segments.remove(&start)
     }
 
-    /// Whether segments cover all of a stretch of time, both ends included.
+    /// Whether segments cover all of an interval, both ends included.
     #[must_use]
     pub fn covers(&self, [from, to]: [MissionTime; 2]) -> bool {
         let mut time = from;
         while time <= to {
-            let Some(segment) = self.stretch_at(time).segment else { return false };
+            let Some(segment) = self.valid_at(time).segment else { return false };
             time = segment.end().plus_ticks(1);
         }
         true
@@ -178,26 +178,26 @@ impl Ephemeris {
             return None;
         }
         let time = MissionTime::from_seconds(time_s);
-        let piece = Piece::at(self.stretch_at(time).segment?, 2 * time.0, [satellite])?;
+        let piece = Piece::at(self.valid_at(time).segment?, 2 * time.0, [satellite])?;
         let middle_s = piece.middle_half_ticks as f64 / 2e6;
         let [position_m] = piece.positions_m((time_s - middle_s) * 2e6);
         Some(position_m)
     }
 
-    /// The segment that holds at a time and the times up to which it does: the latest to begin that covers
-    /// it. A function of the time and the table alone, however it is reached.
-    pub(super) fn stretch_at(&self, time: MissionTime) -> Stretch<'_> {
+    /// The segment valid at a time, the one of latest start that covers it, and the time up to which it is valid. A
+    /// function of the time and the table only.
+    pub(super) fn valid_at(&self, time: MissionTime) -> ValidSegment<'_> {
         let before = self.segments.range(..=time).rev().take(OVERLAPPING_MAX);
         let segment = before.map(|(_, segment)| segment).find(|segment| segment.covers(time));
         let after = self.segments.range(time.plus_ticks(1)..).next();
         let next = after.map_or(MissionTime(i64::MAX), |(start, _)| start.plus_ticks(-1));
-        Stretch { segment, first: time, last: segment.map_or(next, |segment| segment.end().min(next)) }
+        ValidSegment { segment, first: time, last: segment.map_or(next, |segment| segment.end().min(next)) }
     }
 }
 
-/// A stretch of time, both ends included, over which one segment holds, or none.
+/// An interval, both ends included, over which one segment is valid, or none.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Stretch<'a> {
+pub(super) struct ValidSegment<'a> {
     pub(super) segment: Option<&'a EphemerisSegment>,
     pub(super) first: MissionTime,
     pub(super) last: MissionTime,
@@ -216,8 +216,8 @@ pub(super) struct Piece<const N: usize> {
 }
 
 impl<const N: usize> Piece<N> {
-    /// The piece that holds at a time, which the first and last of a segment go beyond; `None` if the segment has
-    /// fewer than eight nodes or lacks a satellite.
+    /// The piece valid at a time; the first and last piece of a segment extrapolate. `None` if the segment has fewer
+    /// than eight nodes or lacks a satellite.
     pub(super) fn at(segment: &EphemerisSegment, half_ticks: i64, satellites: [usize; N]) -> Option<Self> {
         const MONOMIALS: [[[f64; NODES]; NODES]; NODES - 1] = monomials();
         let known = usize::from(segment.satellites);
@@ -248,8 +248,8 @@ impl<const N: usize> Piece<N> {
         })
     }
 
-    /// Positions, m, so many half ticks after the middle.
-    #[inline(always)] // For the registers of the caller.
+    /// Positions, m, a number of half ticks after the middle.
+    #[inline(always)] // To use the registers of the caller.
     pub(super) fn positions_m(&self, half_ticks_after: f64) -> [Vec3; N] {
         let steps = half_ticks_after * self.steps_per_half_tick;
         let [lower @ .., highest] = &self.coefficients_m;
@@ -263,7 +263,7 @@ impl<const N: usize> Piece<N> {
     }
 }
 
-/// Lagrange's polynomials through nodes 0 to 7 in powers of `s - o - 1/2`: `[o][m]` has the coefficients of
+/// Lagrange polynomials through nodes 0 to 7 in powers of `s - o - 1/2`: `[o][m]` has the coefficients of
 /// `l_m(s) = prod_{k != m} (s - k) / (m - k)`.
 const fn monomials() -> [[[f64; NODES]; NODES]; NODES - 1] {
     const SCALE: [f64; NODES] = inverse_products();
@@ -385,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stretch_is_covered_without_a_hole() {
+    fn an_interval_is_covered_without_a_gap() {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         // Parted at the turnaround.
         let turnaround_s = 7.0 * DAY_S;

@@ -2,10 +2,10 @@
 
 use super::config::{ArrayConfig, ArrayError};
 
-/// Arcs by which the daughters trail daughter 1, at their greatest, and how they breathe.
+/// Greatest arcs by which the daughters trail daughter 1, and their breathing.
 ///
-/// `s_1 = 0`, `s_n = a_offset + a0 q0^(n-2)` for n >= 2 at the start of a period; then linear to
-/// `s_n / R_n` over half a period, and back (the paper, Sect. 2).
+/// `s_1 = 0`, `s_n = a_offset + a0 q0^(n-2)` for n >= 2 at the start of a period; they shrink linearly to
+/// `s_n / R_n` in half a period, and grow back (the paper, Sect. 2).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Formation {
     /// Ratio q0 of successive steps.
@@ -88,7 +88,7 @@ impl Formation {
     }
 }
 
-/// The q > 1 with (q^steps - 1) / (q - 1) = `sum`, by bisection on a function that rises with q.
+/// The q > 1 with (q^steps - 1) / (q - 1) = `sum`, by bisection; the left side rises with q.
 fn step_ratio(steps: usize, sum: f64) -> Option<f64> {
     let steps = i32::try_from(steps).ok()?;
     let series = |q: f64| (0..steps).rev().fold(0.0, |acc, _| acc * q + 1.0);

@@ -3,7 +3,7 @@
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, norm, sub};
 
-/// How long the mother integrates.
+/// Limits of the integration time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct IntegrationRule {
     /// Longest integration, s.

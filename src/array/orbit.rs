@@ -1,4 +1,4 @@
-//! Orbital motion of the daughters, the Earth's direction, and occultation by the Moon.
+//! Orbital motion of the daughters, direction of the Earth, and occultation by the Moon.
 
 use std::f64::consts::TAU;
 
@@ -16,7 +16,7 @@ pub struct SatelliteState {
     pub velocity_m_s: Vec3,
 }
 
-/// The array in motion: positions of everything at any time.
+/// The array in motion: positions at any time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Array {
     formation: Formation,
@@ -34,7 +34,7 @@ impl Array {
     /// The array of a configuration.
     ///
     /// # Errors
-    /// The first of [`ArrayConfig::problems`], or a formation that does not exist.
+    /// The first of [`ArrayConfig::problems`], or a formation that cannot be built.
     pub fn new(config: &ArrayConfig) -> Result<Self, ArrayError> {
         if let Some(problem) = config.problems().into_iter().next() {
             return Err(problem.into());
@@ -100,14 +100,14 @@ impl Array {
     pub fn state(&self, n: usize, t_s: f64) -> SatelliteState {
         let radius = self.orbit_radius_m;
         let (arc_m, arc_rate_m_s) = self.formation.arc_m(n, t_s);
-        // As the paper writes it; after 1.3 years the phase's last bit is worth 7 um along the track.
+        // As in the paper; after 1.3 years the last bit of the phase is worth 7 um along the track.
         let phase = self.phase_rad + TAU * t_s / self.orbital_period_s - arc_m / radius;
         let phase_rate = TAU / self.orbital_period_s - arc_rate_m_s / radius;
         let (sin_f, cos_f) = phase.sin_cos();
         let (sin_o, cos_o) = (self.node_rad + self.node_rate_rad_s * t_s).sin_cos();
         let (sin_i, cos_i) = self.inclination_rad.sin_cos();
-        // The point of the orbital plane first, then turned into place, fused: fewer roundings than with the
-        // radius outside. Half a nanometre is 1e-10 of a turn at 30 MHz, as much as rows may be off.
+        // The point in the orbital plane, then its rotation with fused operations: fewer roundings than with the radius
+        // outside. Half a nanometre is 1e-10 of a turn at 30 MHz, the accuracy required of rows.
         let (along_node, across) = (radius * cos_f, radius * sin_f);
         let position_m = [
             (-sin_o * cos_i).mul_add(across, cos_o * along_node),
@@ -125,7 +125,7 @@ impl Array {
         }
     }
 
-    /// Position of a satellite that trails daughter 1 by an arc of so many metres on the same circle, m.
+    /// Position of a satellite that trails daughter 1 by an arc `arc_m` on the same circle, m.
     #[must_use]
     pub fn trailing_m(&self, arc_m: f64, t_s: f64) -> Vec3 {
         let ahead_m = self.position_m(0, t_s);
@@ -134,7 +134,7 @@ impl Array {
         add(scale(cos, ahead_m), scale(sin, along_m))
     }
 
-    /// Normal of the plane in which the daughters are.
+    /// Normal of the orbital plane.
     #[must_use]
     pub fn orbit_normal_hat(&self, t_s: f64) -> Vec3 {
         let (sin_o, cos_o) = (self.node_rad + self.node_rate_rad_s * t_s).sin_cos();
@@ -161,12 +161,12 @@ impl Array {
         self.earth_depth_m(t_s) > 0.0
     }
 
-    /// How deep the Earth stands behind the limb for daughter 1, m: positive when hidden.
+    /// Depth of the Earth behind the limb for daughter 1, m: positive when hidden.
     pub(super) fn earth_depth_m(&self, t_s: f64) -> f64 {
         self.earth_depth_of_m(0, t_s)
     }
 
-    /// How deep the Earth stands behind the limb for daughter `n` (from 0), m: positive when hidden.
+    /// Depth of the Earth behind the limb for daughter `n` (from 0), m: positive when hidden.
     #[must_use]
     pub fn earth_depth_of_m(&self, n: usize, t_s: f64) -> f64 {
         let position = self.position_m(n, t_s);

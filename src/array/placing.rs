@@ -1,4 +1,4 @@
-//! Visibilities to their satellites' positions.
+//! Placing of visibilities: adds the positions of the two satellites.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -10,23 +10,23 @@ use super::ephemeris::{Ephemeris, Piece};
 use crate::frames::{PlacedVisibilities, VisibilityBlock, VisibilityReason};
 use crate::units::MissionTime;
 
-/// What became of the visibilities of a block; the three parts make up the block.
+/// Counts of the visibilities of a block by result; they add up to the block.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct PlacingCounts {
     /// Placed.
     pub placed: u64,
-    /// Left out because of a flag, by the first one's reason.
+    /// Skipped because of a flag, by the reason of the first one.
     pub flagged: BTreeMap<VisibilityReason, u64>,
-    /// Left out because no ephemeris covers their time.
+    /// Skipped because no ephemeris covers their time.
     pub without_ephemeris: u64,
 }
 
 impl Ephemeris {
-    /// The good visibilities of a block with the positions of their two satellites at the middle of each
-    /// integration, and what became of the others.
+    /// The good visibilities of a block with the positions of their two satellites at the middle of each integration,
+    /// and the counts.
     ///
     /// `frequency_hz` is that of the block's channel. The result is a function of each visibility's own
-    /// time: it does not depend on how a longer block was split.
+    /// time: it does not depend on how blocks are split.
     #[must_use]
     pub fn place(&self, block: &VisibilityBlock, frequency_hz: f64) -> (PlacedVisibilities, PlacingCounts) {
         let mut out = PlacedVisibilities {
@@ -43,15 +43,14 @@ impl Ephemeris {
         let mut counts = PlacingCounts::default();
         let mut from = 0;
         while from < block.len() {
-            let to = self.place_run(block, from, &mut out, &mut counts);
-            from = to;
+            from = self.place_run(block, from, &mut out, &mut counts);
         }
         counts.placed = out.len() as u64;
         (out, counts)
     }
 
-    /// Places the visibilities from `from` on that share its piece of the ephemeris, or its fate; the index of the
-    /// first that does not.
+    /// Places the visibilities from `from` on that share its piece of the ephemeris (or its reason for being skipped);
+    /// returns the index of the first that does not.
     fn place_run(
         &self,
         block: &VisibilityBlock,
@@ -64,20 +63,20 @@ impl Ephemeris {
             return from + 1;
         }
         let half_ticks = middle_half_ticks(block, from);
-        let stretch = self.stretch_at(MissionTime(half_ticks >> 1));
-        let mut holds = [2 * stretch.first.0, stretch.last.0.saturating_mul(2).saturating_add(1)];
+        let valid = self.valid_at(MissionTime(half_ticks >> 1));
+        let mut holds = [2 * valid.first.0, valid.last.0.saturating_mul(2).saturating_add(1)];
         let satellites = [block.pair.i, block.pair.j].map(usize::from);
-        let piece = stretch.segment.and_then(|segment| Piece::at(segment, half_ticks, satellites));
+        let piece = valid.segment.and_then(|segment| Piece::at(segment, half_ticks, satellites));
         if let Some(piece) = &piece {
-            // The first and last pieces go beyond their nodes: they hold at this time in any case.
+            // The first and last pieces extend beyond their nodes: they are valid at this time in any case.
             let end = (piece.middle_half_ticks + piece.reach_half_ticks - 1).max(half_ticks);
             holds[1] = holds[1].min(end);
         }
-        let goes_on = |&k: &usize| {
+        let continues = |&k: &usize| {
             let half_ticks = middle_half_ticks(block, k);
             block.flags[k].is_good() && holds[0] <= half_ticks && half_ticks <= holds[1]
         };
-        let to = from + (from..block.len()).take_while(goes_on).count();
+        let to = from + (from..block.len()).take_while(continues).count();
         match piece {
             Some(piece) => extend(out, block, from..to, &piece),
             None => counts.without_ephemeris += (to - from) as u64,
@@ -86,9 +85,10 @@ impl Ephemeris {
     }
 }
 
-/// Appends the visibilities in `range`, for all of which `piece` holds.
+/// Appends the visibilities in `range`, for all of which `piece` is valid.
 ///
-/// Compiled for wide registers, in plain loops, as closures in iterators would not be; no multiplication is fused with an addition, so that every version gives the same bits.
+/// Plain loops compile for wide registers, which closures in iterators do not. No multiplication is fused with an
+/// addition, so that every target gives the same bits.
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2"))]
 fn extend(out: &mut PlacedVisibilities, block: &VisibilityBlock, range: Range<usize>, piece: &Piece<2>) {
     let (from, to) = (out.time_s.len(), out.time_s.len() + range.len());
@@ -113,7 +113,7 @@ fn extend(out: &mut PlacedVisibilities, block: &VisibilityBlock, range: Range<us
     }
 }
 
-/// Middle of integration `k` since the mission epoch in half ticks, exactly.
+/// Middle of integration `k` after the mission epoch, half ticks, exact.
 fn middle_half_ticks(block: &VisibilityBlock, k: usize) -> i64 {
     2 * (block.start.0 + i64::from(block.offset_ticks[k])) + i64::from(block.duration_ticks[k])
 }

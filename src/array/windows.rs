@@ -1,15 +1,15 @@
-//! When the array observes.
+//! Observing windows.
 
 use super::orbit::Array;
 use crate::frames::ObservingWindow;
 use crate::units::MissionTime;
 
-/// Steps of the search for a limb crossing, an orbit; a window is a third of an orbit.
+/// Steps an orbit of the search for a limb crossing; a window is a third of an orbit.
 const STEPS_PER_ORBIT: f64 = 64.0;
 
-/// Observing windows in the order of time: the stretches in which the Earth is hidden from daughter 1.
+/// Observing windows in order of time: the intervals in which the Earth is hidden from daughter 1.
 ///
-/// Windows are whole: one that has begun at `from_s` is left out, one that has not ended at `until_s` too.
+/// Only whole windows: one in progress at `from_s` or at `until_s` is skipped.
 #[derive(Clone, Debug)]
 pub struct ObservingWindows<'a> {
     array: &'a Array,
@@ -25,7 +25,7 @@ impl<'a> ObservingWindows<'a> {
         Self { array, now_s: from_s, until_s, index: 0 }
     }
 
-    /// The next time after `now_s` at which the Earth begins (`hides`) or ceases to be hidden.
+    /// The next time after `now_s` at which the Earth sets (`hides`) or rises.
     fn next_edge_s(&self, mut now_s: f64, hides: bool) -> Option<f64> {
         let step_s = self.array.orbital_period_s() / STEPS_PER_ORBIT;
         let is_past = |t_s: f64| (self.array.earth_depth_m(t_s) > 0.0) == hides;
@@ -44,7 +44,7 @@ impl<'a> ObservingWindows<'a> {
     }
 }
 
-/// How long the Earth is in sight of daughter 1 between two times, s.
+/// Time for which the Earth is visible from daughter 1 between two times, s.
 #[must_use]
 pub fn earth_in_sight_s(array: &Array, from_s: f64, until_s: f64) -> f64 {
     let edges = ObservingWindows::new(array, from_s, until_s);

@@ -160,8 +160,7 @@ impl ChannelFolder {
         self.write_map("map.fits", map, provenance, solution)?;
         self.write_map("noise.fits", noise, provenance, solution)?;
         if self.config.smooth_fwhm_deg > 0.0 {
-            let fine = map.upgrade(4 * map.nside())?;
-            let smooth = fine.smoothed(self.config.smooth_fwhm_deg.to_radians())?;
+            let smooth = map.refined(4, self.config.smooth_fwhm_deg.to_radians())?;
             self.write_map("map-smooth.fits", &smooth, provenance, solution)?;
         }
         if let Some(truth) = self.truth.clone() {

@@ -1,7 +1,7 @@
-//! The beam matrix B: what each pair of daughters measures of the sky.
+//! The beam matrix B: the response of each pair of daughters to the sky.
 //!
-//! `V_ij(nu) = Int T(n) A(n) S_i(n) S_j(n) exp(-2 pi i (nu/c) n . r_ij) dn`, in K sr (the paper, Eq. 7); a row of B is the
-//! integrand without T, pixel by pixel or harmonic by harmonic.
+//! `V_ij(nu) = Int T(n) A(n) S_i(n) S_j(n) exp(-2 pi i (nu/c) n . r_ij) dn`, in K sr (the paper, Eq. 7); a row of B is
+//! the integrand without T, by pixels or by spherical harmonics.
 //!
 //! | module | holds |
 //! |---|---|
@@ -9,8 +9,8 @@
 //! | [`harmonic`] | rows of B over spherical harmonics, for satellites on one circle |
 //! | [`model`] | visibilities of a given sky, by either of the two |
 //!
-//! Uses [`crate::units`], [`crate::frames`], [`crate::sky`] and [`mod@crate::array`]. Simulation and mapping both use it,
-//! so it is tested against values of independent code.
+//! Uses [`crate::units`], [`crate::frames`], [`crate::sky`] and [`mod@crate::array`]. Simulation and mapping share it,
+//! so a bug here would cancel out unseen: tests compare it with reference values made by other code.
 
 pub mod harmonic;
 pub mod model;

@@ -1,4 +1,4 @@
-//! A map against the truth: spectra, correlation, signal to noise, relative error.
+//! Comparison of a map with the truth: spectra, correlation, signal to noise, relative error.
 
 use serde::Serialize;
 
@@ -9,12 +9,12 @@ use super::map::SkyMap;
 use super::spectra::{auto_cl, cross_cl, normalised};
 use crate::units::constants::HEALPIX_UNSEEN;
 
-/// What a comparison finds. Arrays run over `l` = 0 .. l_max; monopole and dipole are kept.
+/// Result of a comparison. Arrays run over `l` = 0 .. l_max, including monopole and dipole.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Comparison {
-    /// The nside at which the maps were compared: the coarsest of theirs.
+    /// The nside of the comparison: the coarsest of the maps'.
     pub nside: usize,
-    /// Their frame: the common one of all maps, or ecliptic.
+    /// Frame: that of all maps if they agree, else ecliptic.
     pub frame: Frame,
     /// Degrees.
     pub l: Vec<usize>,
@@ -29,14 +29,14 @@ pub struct Comparison {
     /// SNR_l = C_l^X / sqrt(C_l^in C_l^ns), if there is a noise map.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub snr: Option<Vec<f64>>,
-    /// The relative error's mean, root mean square and percentiles.
+    /// Mean, root mean square and percentiles of the relative error.
     pub relative_error: ErrorSummary,
     /// (map - truth) / truth; UNSEEN where the truth is zero.
     #[serde(skip)]
     pub relative_error_map: SkyMap,
 }
 
-/// Statistics of (map - truth) / truth over all pixels in which the truth is not zero.
+/// Statistics of (map - truth) / truth over all pixels where the truth is not zero.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ErrorSummary {
     /// Mean.
@@ -51,14 +51,13 @@ pub struct ErrorSummary {
     pub percentile_95: f64,
 }
 
-/// Compares a map with the truth, and with a map of nothing but noise for SNR_l.
+/// Compares a map with the truth, and with a map of pure noise for SNR_l.
 ///
-/// All are brought to one frame (turned to ecliptic axes by interpolation if theirs differ) and then to the
-/// coarsest nside by averaging. `l_max` is 3 nside - 1 unless given. Coefficients are found as healpy's
-/// `anafast` finds them.
+/// Brings all maps to one frame (rotated to ecliptic by interpolation if their frames differ), then to the coarsest
+/// nside by averaging. `l_max` is 3 nside - 1 unless given. Coefficients are those of healpy's `anafast`.
 ///
 /// # Errors
-/// [`MapError::BadPixels`] for a map with unusable pixels; [`MapError::Harmonics`] for `l_max` above
+/// [`MapError::BadPixels`] for a map with invalid pixels; [`MapError::Harmonics`] for `l_max` above
 /// 3 nside - 1.
 pub fn compare(
     map: &SkyMap,

@@ -1,37 +1,37 @@
-//! What can be wrong with a map.
+//! Errors of maps.
 
 use thiserror::Error;
 
 use super::healpix::NSIDE_MAX;
 
-/// Why a map, or what is asked of it, does not make sense.
+/// Why an operation on a map failed.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum MapError {
     /// The number of values is not that of a HEALPix map.
     #[error(
-        "{pixels} values are no HEALPix map; expected 12 nside^2, nside a power of two up to {NSIDE_MAX}"
+        "{pixels} values do not make a HEALPix map; expected 12 nside^2, nside a power of two up to {NSIDE_MAX}"
     )]
     PixelCount {
         /// Number of values found.
         pixels: usize,
     },
-    /// Not an nside.
+    /// Invalid nside.
     #[error("nside {nside} is not allowed; expected a power of two from 1 to {NSIDE_MAX}")]
     Nside {
         /// Value found.
         nside: usize,
     },
-    /// The target of a degradation or upgrade lies on the wrong side.
+    /// The target nside of an upgrade or degradation is in the wrong direction.
     #[error("a map of nside {from} cannot be {verb} to nside {to}; expected {expected}")]
     Direction {
-        /// What was asked, "degraded" or "upgraded".
+        /// The operation, "degraded" or "upgraded".
         verb: &'static str,
         /// Own nside.
         from: usize,
         /// Requested nside.
         to: usize,
-        /// What would have been allowed.
+        /// Allowed values.
         expected: &'static str,
     },
     /// Pixels without a usable value.
@@ -49,7 +49,7 @@ pub enum MapError {
         /// Its value.
         value: f64,
     },
-    /// A width of a Gaussian that is not one.
+    /// Invalid width of a Gaussian beam.
     #[error("a beam of FWHM {fwhm_rad} rad is not allowed; expected a finite width of at least 0")]
     Width {
         /// Value found, rad.

@@ -1,4 +1,4 @@
-//! The celestial frames that maps come in, and how they are turned to ecliptic axes.
+//! Celestial frames of maps, and the rotations between them.
 
 use std::fmt;
 
@@ -13,7 +13,7 @@ pub type Rotation = [Vec3; 3];
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Frame {
-    /// Mean ecliptic and equinox of J2000; the frame of all computation here.
+    /// Mean ecliptic and equinox of J2000, the frame of all computation.
     #[default]
     Ecliptic,
     /// Galactic (IAU 1958).
@@ -24,7 +24,7 @@ pub enum Frame {
 
 /// Galactic to ecliptic.
 ///
-/// As astropy 8.0 turns `galactic` into `barycentricmeanecliptic` (IAU 2006 obliquity and frame bias,
+/// As astropy 8.0 transforms `galactic` into `barycentricmeanecliptic` (IAU 2006 obliquity and frame bias,
 /// Capitaine & Wallace 2006; Galactic pole of Reid & Brunthaler 2004), which is what healpy's `Rotator` uses.
 const GALACTIC_TO_ECLIPTIC: Rotation = [
     [-5.487_563_486_628_312e-2, 4.941_095_288_578_971_6e-1, -8.676_660_868_040_493e-1],
@@ -68,7 +68,7 @@ impl Frame {
         }
     }
 
-    /// The frame of a COORDSYS value: a letter (C or Q for equatorial) or its word, in any case.
+    /// The frame of a COORDSYS value: a letter (C or Q for equatorial) or the name, upper or lower case.
     #[must_use]
     pub fn from_coordsys(text: &str) -> Option<Self> {
         match text.trim().to_ascii_uppercase().as_str() {
@@ -90,7 +90,7 @@ impl fmt::Display for Frame {
     }
 }
 
-/// `rotation` applied to a direction.
+/// Applies `rotation` to a direction.
 #[inline]
 #[must_use]
 pub fn rotate(rotation: &Rotation, direction: Vec3) -> Vec3 {
@@ -103,7 +103,7 @@ pub fn transpose(rotation: &Rotation) -> Rotation {
     std::array::from_fn(|i| std::array::from_fn(|j| rotation[j][i]))
 }
 
-/// The rotation that does `first`, then `second`.
+/// The rotation `first` followed by `second`.
 #[must_use]
 pub fn product(second: &Rotation, first: &Rotation) -> Rotation {
     let columns = transpose(first);

@@ -1,13 +1,13 @@
 //! HEALPix pixels (Gorski et al. 2005): numbers, centres, continuous positions inside a face.
 //!
-//! Numbering is `cdshealpix`'s. Searching is written out for its speed; directions are computed here
-//! because rows of B need them to the last bits and at points that are not pixel centres.
+//! Conversions between RING and NESTED are those of `cdshealpix`. The search is written here for speed, and directions
+//! because rows of B need them to the last bits and at points other than pixel centres.
 
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};
 
 use crate::units::vector::Vec3;
 
-/// Greatest nside that maps may have.
+/// Greatest nside of maps.
 pub const NSIDE_MAX: usize = 8192;
 
 /// Ring of each base face's southern corner, in units of nside (Gorski et al. 2005, `jrll`).
@@ -27,7 +27,7 @@ pub const fn pixel_count(nside: usize) -> usize {
     12 * nside * nside
 }
 
-/// The nside of a map of `pixels` pixels, if there is one.
+/// The nside of a map of `pixels` pixels, if it is valid.
 #[must_use]
 pub fn nside_of(pixels: usize) -> Option<usize> {
     let nside = ((pixels / 12) as f64).sqrt().round() as usize;
@@ -131,7 +131,7 @@ pub fn nested_to_ring(nside: usize, pixel: usize) -> usize {
     cdshealpix::nested::get(depth).to_ring(pixel as u64) as usize
 }
 
-/// RING number of the pixel that holds a direction, of any length whose square is a normal number.
+/// RING number of the pixel that contains a direction, given as a vector of any length with a normal square.
 ///
 /// Gorski et al. 2005, Sect. 4: a direction lies between two ascending and two descending edges.
 #[must_use]

@@ -10,10 +10,10 @@ use super::healpix::{
 use crate::units::constants::HEALPIX_UNSEEN;
 use crate::units::vector::Vec3;
 
-/// Coarse pixels that one task averages; fixed, so that the work does not depend on the thread count.
+/// Pixels of one task; fixed, so that results do not depend on the number of threads.
 const PIXELS_PER_TASK: usize = 4096;
 
-/// A HEALPix map in RING order, K unless said otherwise.
+/// A HEALPix map in RING order, in K unless stated otherwise.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SkyMap {
     nside: usize,
@@ -21,8 +21,7 @@ pub struct SkyMap {
     values: Vec<f64>,
 }
 
-/// Whether a value marks a pixel that was never seen: within 1e-5 of -1.6375e30, as healpy decides, which
-/// covers its single-precision form.
+/// Whether a value is UNSEEN: within 1e-5 of -1.6375e30, as in healpy, which includes its single-precision form.
 #[inline]
 #[must_use]
 pub fn is_unseen(value: f64) -> bool {
@@ -39,7 +38,7 @@ impl SkyMap {
         Ok(Self { nside, frame, values })
     }
 
-    /// The same value everywhere.
+    /// A constant map.
     ///
     /// # Errors
     /// [`MapError::Nside`].
@@ -66,26 +65,25 @@ impl SkyMap {
         &self.values
     }
 
-    /// Values in RING order, to be changed.
+    /// Mutable values in RING order.
     pub fn values_mut(&mut self) -> &mut [f64] {
         &mut self.values
     }
 
-    /// The values alone, in RING order.
+    /// Consumes the map and returns its values in RING order.
     #[must_use]
     pub fn into_values(self) -> Vec<f64> {
         self.values
     }
 
-    /// Other values of the map's own nside.
+    /// A map of other values with the nside of this one.
     pub(super) fn with_values(&self, frame: Frame, values: Vec<f64>) -> Self {
         debug_assert_eq!(values.len(), self.values.len());
         Self { nside: self.nside, frame, values }
     }
 
-    /// Directions of the map's own pixel centres on ecliptic axes, in the order of its values.
-    ///
-    /// With these a map in any frame is used as it is, without interpolation.
+    /// Directions of the map's pixel centres on ecliptic axes, in the order of its values: with these, maps in any
+    /// frame need no interpolation.
     #[must_use]
     pub fn directions_ecliptic(&self) -> Vec<Vec3> {
         let mut directions = pixel_directions(self.nside);
@@ -98,8 +96,7 @@ impl SkyMap {
         directions
     }
 
-    /// Means over children, down to `nside`; UNSEEN children are left out, and a pixel with none left is
-    /// UNSEEN.
+    /// The map averaged down to `nside`. UNSEEN children are ignored; a pixel of only such children is UNSEEN.
     ///
     /// # Errors
     /// [`MapError::Nside`]; [`MapError::Direction`] if `nside` is above the map's own.
@@ -124,15 +121,15 @@ impl SkyMap {
         Ok(Self { nside, frame: self.frame, values })
     }
 
-    /// The map at another nside: averaged or split, or as it is.
+    /// The map at another nside: averaged, split, or unchanged.
     ///
     /// # Errors
-    /// [`MapError::Nside`] unless `nside` is a power of two that maps may have.
+    /// [`MapError::Nside`] unless `nside` is a valid power of two.
     pub fn resized(&self, nside: usize) -> Result<Self, MapError> {
         if nside <= self.nside { self.degrade(nside) } else { self.upgrade(nside) }
     }
 
-    /// Every pixel split into its children, up to `nside`.
+    /// The map with every pixel split into its children, up to `nside`.
     ///
     /// # Errors
     /// [`MapError::Nside`]; [`MapError::Direction`] if `nside` is below the map's own.
@@ -156,7 +153,7 @@ impl SkyMap {
         Ok(Self { nside, frame: self.frame, values })
     }
 
-    /// Whether every pixel has a usable value.
+    /// Checks that every pixel has a usable value.
     ///
     /// # Errors
     /// [`MapError::BadPixels`] with the number and the first of the pixels that are NaN, infinite or UNSEEN.

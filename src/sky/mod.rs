@@ -1,6 +1,15 @@
 //! The sky: HEALPix maps and their files, spherical harmonics, spectra, generated skies.
 //!
-//! Uses [`crate::units`] only.
+//! | module | holds |
+//! |---|---|
+//! | [`healpix`] | pixel numbers and directions |
+//! | [`fits`] | reading and writing map files |
+//! | [`harmonics`] | coefficients, transforms, rotations |
+//! | [`spectra`] | power spectra and Gaussian smoothing |
+//! | [`generated`] | a sky from a formula |
+//!
+//! Maps ([`SkyMap`]) are in RING order and K; all computation is on ecliptic axes ([`Frame::Ecliptic`]). Uses
+//! [`crate::units`] and [`crate::files`] only.
 
 mod compare;
 mod config;

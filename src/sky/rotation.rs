@@ -1,4 +1,4 @@
-//! Turning maps to another frame by interpolation between pixels.
+//! Rotation of maps to another frame by interpolation between pixels.
 
 use std::f64::consts::TAU;
 
@@ -11,15 +11,15 @@ use super::map::{SkyMap, is_unseen};
 use crate::units::constants::HEALPIX_UNSEEN;
 use crate::units::vector::Vec3;
 
-/// Pixels of one task; fixed, so that the work does not depend on the thread count.
+/// Pixels of one task; fixed, so that results do not depend on the number of threads.
 const PIXELS_PER_TASK: usize = 4096;
 
 /// A ring and its colatitude, rad.
 type PlacedRing = (Ring, f64);
 
-/// Bilinear interpolation on a HEALPix map, along the two rings that enclose a direction and between them,
-/// as healpy's `get_interp_val` does it: weights linear in longitude, then in colatitude; beyond the last
-/// ring, the pole is the mean of that ring's four pixels.
+/// Bilinear interpolation on a HEALPix map, along the two rings that enclose a direction and between them, as in
+/// healpy's `get_interp_val`: weights are linear in longitude, then in colatitude; beyond the last ring the value at
+/// the pole is the mean of that ring's four pixels.
 #[derive(Clone, Debug)]
 pub struct Bilinear {
     nside: usize,
@@ -28,7 +28,7 @@ pub struct Bilinear {
 }
 
 impl Bilinear {
-    /// For maps of `nside`.
+    /// Prepares interpolation on maps of `nside`.
     ///
     /// # Errors
     /// [`MapError::Nside`].
@@ -41,7 +41,7 @@ impl Bilinear {
         Ok(Self { nside, rings: (1..4 * nside).map(with_colatitude).collect() })
     }
 
-    /// Four RING pixels and their weights, which add up to 1, for a direction of any length.
+    /// Four RING pixels and their weights, which add up to 1, for a vector of any length.
     #[must_use]
     pub fn weights(&self, [x, y, z]: Vec3) -> [(usize, f64); 4] {
         let colatitude = x.hypot(y).atan2(z);
@@ -63,7 +63,7 @@ impl Bilinear {
         }
     }
 
-    /// Value of `map` (RING order) in a direction; UNSEEN where a pixel that counts is.
+    /// Value of `map` (RING order) in a direction; UNSEEN if a pixel with weight is.
     #[must_use]
     pub fn value(&self, map: &[f64], direction: Vec3) -> f64 {
         let mut sum = 0.0;
@@ -80,7 +80,7 @@ impl Bilinear {
     fn rings_around(&self, colatitude: f64) -> [Option<&PlacedRing>; 2] {
         let n = self.nside as f64;
         let (sin, cos) = colatitude.sin_cos();
-        // The ring from the formula for its colatitude, then made certain against roundings.
+        // The ring from the formula for its colatitude, then corrected for rounding.
         let guess = if cos.abs() <= 2.0 / 3.0 {
             n * (2.0 - 1.5 * cos)
         } else {
@@ -124,9 +124,8 @@ fn cap(ring: &Ring, longitude: f64, towards: f64) -> [(usize, f64); 4] {
 }
 
 impl SkyMap {
-    /// The map on the axes of another frame, by [`Bilinear`] interpolation at the new pixels' centres (healpy:
-    /// `rotate_map_pixel`). Loses some power near the pixel scale; [`SkyMap::directions_ecliptic`] uses a map
-    /// without that loss.
+    /// The map in another frame, by [`Bilinear`] interpolation at the new pixel centres (healpy: `rotate_map_pixel`).
+    /// Loses some power near the pixel scale; [`SkyMap::directions_ecliptic`] avoids that loss.
     #[must_use]
     pub fn rotate_pixels(&self, frame: Frame) -> Self {
         let (Ok(bilinear), true) = (Bilinear::new(self.nside()), frame != self.frame()) else {
@@ -144,7 +143,7 @@ impl SkyMap {
         self.with_values(frame, values)
     }
 
-    /// The map on ecliptic axes, see [`SkyMap::rotate_pixels`].
+    /// The map in the ecliptic frame, see [`SkyMap::rotate_pixels`].
     #[must_use]
     pub fn to_ecliptic(&self) -> Self {
         self.rotate_pixels(Frame::Ecliptic)

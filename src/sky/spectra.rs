@@ -7,7 +7,7 @@ use super::frame::Frame;
 use super::harmonics::{Alm, AnalysisOptions, Transform};
 use super::map::SkyMap;
 
-/// C_l = sum over m of Re(a_lm conj(b_lm)) / (2 l + 1) for every l that both have, from l = 0.
+/// Cross power C_l = sum over m of Re(a_lm conj(b_lm)) / (2 l + 1), from l = 0 to the smaller l_max.
 #[must_use]
 pub fn cross_cl(a: &Alm, b: &Alm) -> Vec<f64> {
     let l_max = a.l_max().min(b.l_max());
@@ -19,15 +19,14 @@ pub fn cross_cl(a: &Alm, b: &Alm) -> Vec<f64> {
     (0..=l_max).map(of_degree).collect()
 }
 
-/// C_l of one set of coefficients.
+/// Auto power C_l of one set of coefficients.
 #[must_use]
 pub fn auto_cl(alm: &Alm) -> Vec<f64> {
     cross_cl(alm, alm)
 }
 
-/// Ratio of a cross spectrum to the geometric mean of two spectra, degree by degree: rho_l with the spectra
-/// of both maps, SNR_l with those of the input and of a noise map (the paper, Sect. 4). NaN where a spectrum
-/// is zero.
+/// Ratio of a cross spectrum to the geometric mean of two spectra, by degree: rho_l with the spectra of both maps,
+/// SNR_l with those of the input and of a noise map (the paper, Sect. 4). NaN where a spectrum is zero.
 #[must_use]
 pub fn normalised(cross: &[f64], one: &[f64], other: &[f64]) -> Vec<f64> {
     cross
@@ -43,7 +42,7 @@ pub fn rho(a: &Alm, b: &Alm) -> Vec<f64> {
     normalised(&cross_cl(a, b), &auto_cl(a), &auto_cl(b))
 }
 
-/// What a Gaussian beam of a FWHM (rad) multiplies a_lm by, l = 0 .. `l_max`:
+/// Factors of a_lm for a Gaussian beam of a FWHM (rad), l = 0 .. `l_max`:
 /// exp(-l (l + 1) sigma^2 / 2), sigma = FWHM / sqrt(8 ln 2).
 #[must_use]
 pub fn gaussian_beam(fwhm_rad: f64, l_max: usize) -> Vec<f64> {
@@ -70,13 +69,13 @@ impl SkyMap {
         Ok(Transform::new(self.nside(), l_max)?.analysis(self.values(), options)?.alm)
     }
 
-    /// The map without the degrees beyond `l_max`, at the pixel centres of `nside`, in ecliptic coordinates.
+    /// The map without degrees beyond `l_max`, at the pixel centres of `nside`, in ecliptic coordinates.
     ///
-    /// Averages over pixels, as [`SkyMap::resized`] takes them, also lower the degrees that they keep, and let those
-    /// beyond the new pixels' reach in: with point sources a tenth of the power at l = 2 nside.
+    /// Averages over pixels, as in [`SkyMap::resized`], also attenuate lower degrees and alias higher ones: with point
+    /// sources a tenth of the power at l = 2 nside.
     ///
     /// # Errors
-    /// [`MapError::BadPixels`]; [`MapError::Harmonics`] for an nside that is none.
+    /// [`MapError::BadPixels`]; [`MapError::Harmonics`] for an invalid nside.
     pub fn band_limited(&self, nside: usize, l_max: usize) -> Result<Self, MapError> {
         let l_max = l_max.min(3 * self.nside() - 1);
         let alm = self.harmonics(l_max, &AnalysisOptions::default())?;
@@ -88,7 +87,7 @@ impl SkyMap {
     }
 
     /// The map convolved with a Gaussian beam of a FWHM (rad), through harmonics up to l = 3 nside - 1, as
-    /// healpy's `smoothing` does it.
+    /// in healpy's `smoothing`.
     ///
     /// # Errors
     /// [`MapError::Width`] for a negative or infinite FWHM, [`MapError::BadPixels`].
@@ -104,22 +103,13 @@ impl SkyMap {
         Ok(self.with_values(self.frame(), transform.synthesis(&alm)?))
     }
 
-    /// The paper's post-processing: every pixel split into `factor`^2 and the map smoothed to a FWHM (rad).
+    /// Post-processing as in the paper: splits every pixel into `factor`^2 and smooths to a FWHM (rad).
     ///
     /// # Errors
     /// [`MapError::Nside`] unless `factor` is a power of two that leads to a valid nside; as
     /// [`SkyMap::smoothed`].
     pub fn refined(&self, factor: usize, fwhm_rad: f64) -> Result<Self, MapError> {
         self.upgrade(self.nside().saturating_mul(factor))?.smoothed(fwhm_rad)
-    }
-
-    /// The paper's post-processing with its numbers: nside 64 split to 256 and smoothed to 1 deg, and the
-    /// same in proportion for any nside.
-    ///
-    /// # Errors
-    /// As [`SkyMap::refined`].
-    pub fn refined_as_published(&self) -> Result<Self, MapError> {
-        self.refined(4, (64.0 / self.nside() as f64).to_radians())
     }
 }
 
@@ -196,7 +186,7 @@ mod tests {
         let alm = varied(l_max, 0.3);
         let map =
             SkyMap::new(Frame::Galactic, crate::sky::harmonics::synthesis(&alm, nside).unwrap()).unwrap();
-        let refined = map.refined_as_published().unwrap();
+        let refined = map.refined(4, 8_f64.to_radians()).unwrap();
         assert_eq!((refined.nside(), refined.frame()), (32, Frame::Galactic));
         let found = refined.harmonics(l_max, &AnalysisOptions { method: Method::ACCURATE }).unwrap();
         // 8 deg of smoothing and pixels of 7 deg cost 8 % of the amplitude at l = 6; the phases stay.

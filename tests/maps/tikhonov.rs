@@ -11,7 +11,7 @@ use lunarray::units::Pair;
 use num_complex::Complex64;
 use serde_json::Value;
 
-/// Agreement asked for: both sides sum 800 products of exact rows in f64, and solve systems whose
+/// Required agreement: both sides sum 800 products of exact rows in f64, and solve systems whose
 /// condition number is at most 1e6.
 const TOLERANCE: f64 = 1e-8;
 

@@ -78,8 +78,8 @@ fn gauss_legendre(n: usize) -> Vec<(f64, f64)> {
         .collect()
 }
 
-/// The visibility as an integral over the directions that neither satellite's Moon hides: by colatitude
-/// about the orbit normal and longitude up to the exact edge. Checks that edge with `hidden_by_moon`.
+/// The visibility as an integral over the directions that both satellites see: over colatitude about the orbit normal,
+/// and longitude up to the exact edge. Checks that edge with `hidden_by_moon`.
 fn direct(alm: &Alm, state: &PairState) -> Complex64 {
     let (so, co) = state.node_rad.sin_cos();
     let (si, ci) = INCLINATION_RAD.sin_cos();
@@ -145,7 +145,7 @@ fn model(sky: &Alm, u_max: f64) -> HarmonicModel {
         .expect("a good model")
 }
 
-/// Part of an observing window: the node turns, the baseline breathes.
+/// Part of an observing window: the node moves, and the baseline changes by breathing.
 fn window(count: usize, node: f64, phase: f64, u: f64, growth: f64) -> Vec<PairState> {
     (0..count)
         .map(|k| {

@@ -1,4 +1,4 @@
-//! The array in motion against values computed by independent code.
+//! Orbit, formation and windows against values computed by independent code.
 
 use crate::common;
 
@@ -42,12 +42,12 @@ fn epochs_agree() {
     let array = Array::new(&ArrayConfig::default()).unwrap();
     for epoch in reference["epochs"].as_array().unwrap() {
         let t_s = epoch["t_s"].as_f64().unwrap();
-        // Where breathing turns, speeds jump; the reference then has the mean of both sides.
+        // At a turnaround of the breathing speeds jump; the reference then has the mean of both sides.
         let turnaround = t_s % (7.0 * 86_400.0) == 0.0;
         for n in 0..8 {
             let state = array.state(n, t_s);
             let position = vector(&epoch["sat_m"][n]);
-            // 1e-6 m: the accuracy asked for; 5e-13 of the orbit's radius.
+            // 1e-6 m: the required accuracy; 5e-13 of the orbit's radius.
             assert!(norm(sub(state.position_m, position)) < 1e-6, "t = {t_s}, daughter {n}");
             if !turnaround {
                 let velocity = vector(&epoch["sat_velocity_m_s"][n]);

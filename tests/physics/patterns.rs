@@ -1,4 +1,4 @@
-//! The harmonic engine's ingredients against values computed by independent code.
+//! Wigner functions and pattern coefficients against values computed by independent code.
 
 use crate::common;
 

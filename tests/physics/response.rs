@@ -1,4 +1,4 @@
-//! Rows of B and visibilities against independent values.
+//! Rows of B and visibilities against values computed by independent code.
 
 use crate::common;
 
@@ -39,7 +39,7 @@ fn test_sky(n: Vec3) -> f64 {
     3e5 * (smooth + 2.0 * spot([0.36, 0.48, 0.8], 0.01) + 1.5 * spot([-0.6, 0.64, -0.48], 0.004))
 }
 
-/// Pixels of which a limb cuts some children but not others.
+/// Whether a limb hides some children of a pixel but not others.
 fn is_cut(pair: &PairGeometry, nside: usize, pixel: usize) -> bool {
     let (face, ix, iy) = healpix::nested_to_face(nside, healpix::ring_to_nested(nside, pixel));
     let seen = |k: usize| {
@@ -89,7 +89,7 @@ fn rows_agree_with_independent_rows() {
         let (mut re, mut im) = (vec![0.0_f64; directions.len()], vec![0.0_f64; directions.len()]);
         RowMaker::new(nside, PixelMethod::Centre).unwrap().fill(&pair, 1.0, &mut re, &mut im);
         for p in 0..directions.len() {
-            // Sines in f32 of phases reduced in f64; 1e-4 rad is asked for.
+            // Sines in f32 of phases reduced in f64; 1e-4 rad is required.
             assert!((re[p] - centre_re[p]).abs() < 2e-6, "{name}, pixel {p}");
             assert!((im[p] - centre_im[p]).abs() < 2e-6, "{name}, pixel {p}");
         }
@@ -99,7 +99,7 @@ fn rows_agree_with_independent_rows() {
             .map(|p| ([re[p], im[p]], [average_re[p], average_im[p]], is_cut(&pair, nside, p)));
         let [away, on_edge] = rms(compared);
         eprintln!("{name}: averaged rows differ by {away:.1e} rms away from the limb, {on_edge:.1e} on it");
-        // What the issue asks for; the closed form leaves out curvature beyond first order.
+        // The required accuracy; the closed form neglects curvature beyond first order.
         assert!(away < 1e-3, "{name}: {away}");
         assert!(on_edge < 2e-2, "{name}: {on_edge}");
     }
@@ -157,7 +157,7 @@ fn fast_rows_keep_the_phase_of_the_longest_baseline() {
     RowMaker::new(32, PixelMethod::Centre).unwrap().fill(&pair, 1.0, &mut re, &mut im);
     for (p, value) in expected.iter().enumerate() {
         let off = (re[p] - value.re).hypot(im[p] - value.im);
-        // f32 sines and one f32 product; 1e-4 rad is asked for.
+        // f32 sines and one f32 product; 1e-4 rad is required.
         assert!(off < 2e-6, "pixel {p}: {off}");
     }
 }

@@ -1,4 +1,4 @@
-//! Map files: round trips, and what hostile files do.
+//! Map files: round trips, error messages, and hostile files.
 
 use std::fs;
 use std::io::Cursor;
@@ -11,7 +11,7 @@ use lunarray::sky::{Frame, MapError, SkyMap};
 use lunarray::units::constants::HEALPIX_UNSEEN;
 use proptest::prelude::*;
 
-/// Values that single precision holds exactly.
+/// Values that are exact in single precision.
 fn map(nside: usize) -> SkyMap {
     SkyMap::new(Frame::Galactic, (0..12 * nside * nside).map(|p| 0.5 + p as f64).collect()).unwrap()
 }
@@ -167,7 +167,7 @@ fn a_file_without_a_frame_needs_one_named() {
 fn forged_sizes_neither_panic_nor_allocate() {
     let whole = bytes_of(&map(16), &WriteOptions::default());
     let partial = bytes_of(&map(16), &WriteOptions { partial: true, ..WriteOptions::default() });
-    // Any of these, believed, would ask for terabytes and abort.
+    // Any of these, if trusted, would allocate terabytes and abort.
     let huge = ["1000000000000000", "9223372036854775807", "-1", "99999999999999999999999", "1E300", "'x'"];
     let keys = ["NAXIS1", "NAXIS2", "TFIELDS", "NSIDE", "PCOUNT", "GCOUNT"];
     for bytes in [&whole, &partial] {
@@ -207,7 +207,7 @@ proptest! {
     #[test]
     fn truncation_is_an_error(cut in 0.0..1.0_f64, form in 0_usize..8) {
         let bytes = bytes_of(&map(16), &all_options()[form]);
-        // The last block's padding may go without loss.
+        // The padding of the last block may be missing.
         let data_end = bytes.len() - 2880;
         prop_assert!(parse(&bytes[..(cut * data_end as f64) as usize]).is_err());
     }

@@ -8,7 +8,7 @@ use lunarray::sky::harmonics::{
 use lunarray::sky::healpix::{pixel_area_sr, pixel_directions};
 use num_complex::Complex64;
 
-/// Coefficients of size one, in no order.
+/// Pseudo-random coefficients of order one.
 fn white(l_max: usize) -> Alm {
     let mut alm = Alm::zeros(l_max);
     let mut state = 1_u64;
@@ -22,7 +22,7 @@ fn white(l_max: usize) -> Alm {
     alm
 }
 
-/// Over all m, negative ones included.
+/// Scalar product over all m, including negative ones.
 fn product(a: &Alm, b: &Alm) -> f64 {
     let l_max = a.l_max();
     let terms = a.values().iter().zip(b.values()).enumerate();
@@ -37,7 +37,7 @@ fn relative_error(found: &Alm, expected: &Alm) -> f64 {
 #[test]
 fn low_degrees_are_the_textbook_harmonics() {
     let nside = 8;
-    // Condon-Shortley Y_00, Y_10, Y_11, Y_20, Y_21, Y_22 and what 2 Re(a Y) is for m > 0.
+    // Condon-Shortley Y_00, Y_10, Y_11, Y_20, Y_21, Y_22 and 2 Re(a Y) for m > 0.
     let directions = pixel_directions(nside);
     type Harmonic = fn([f64; 3]) -> Complex64;
     let cases: [(usize, usize, Harmonic); 6] = [

@@ -2,7 +2,7 @@
 
 use std::f64::consts::PI;
 
-/// Most terms that are ever used.
+/// Greatest number of terms.
 pub(crate) const TERMS_MAX: usize = 16;
 
 /// Terms needed for `exp(i h tau)`, |tau| <= 1, to `tolerance`: the error is about `2 (h/2)^K / K!`.
@@ -28,7 +28,7 @@ pub(crate) fn points(terms: usize) -> Vec<f64> {
     (0..terms).map(|k| (PI * (k as f64 + 0.5) / terms as f64).cos()).collect()
 }
 
-/// `[n][k]`: what the value at point k adds to the coefficient of T_n.
+/// `[n][k]`: contribution of the value at point k to the coefficient of T_n.
 pub(crate) fn analysis(terms: usize) -> Vec<Vec<f64>> {
     (0..terms)
         .map(|n| {

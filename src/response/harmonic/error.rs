@@ -1,34 +1,34 @@
-//! What the harmonic model refuses.
+//! Errors of the harmonic model.
 
 use thiserror::Error;
 
-/// Why a harmonic model cannot be, or a state cannot be computed.
+/// Why a harmonic model cannot be built or evaluated.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum HarmonicError {
     /// A parameter outside its range.
     #[error("harmonic model: {name} = {value}: expected {expected}")]
     Parameter {
-        /// Which.
+        /// Name of the parameter.
         name: &'static str,
         /// Value found.
         value: f64,
         /// Range that is accepted.
         expected: &'static str,
     },
-    /// A state with a value that is not a number.
+    /// A state with a value that is not finite.
     #[error("state {index}: node, phase, baseline and span must be finite numbers")]
     NotFinite {
-        /// Its place among the states.
+        /// Index of the state.
         index: usize,
     },
-    /// A baseline beyond what the model was made for.
+    /// A baseline beyond the range of the model.
     #[error(
-        "state {index}: a baseline of {u} wavelengths is outside 0 to {u_max}, for which the model was made; \
-         raise its u_max"
+        "state {index}: a baseline of {u} wavelengths is outside the range of the model, 0 to {u_max}; raise its \
+         u_max"
     )]
     Baseline {
-        /// Its place among the states.
+        /// Index of the state.
         index: usize,
         /// Its baseline in wavelengths.
         u: f64,
@@ -36,11 +36,11 @@ pub enum HarmonicError {
         u_max: f64,
     },
     /// Input and output differ in length.
-    #[error("{states} states, but room for {values} visibilities")]
+    #[error("{states} states, but an output of {values} visibilities")]
     Lengths {
         /// States given.
         states: usize,
-        /// Values asked for.
+        /// Length of the output.
         values: usize,
     },
 }

@@ -1,4 +1,4 @@
-//! Linear filters along the nodes.
+//! Linear filters of patterns along the nodes in u.
 
 use faer::Mat;
 use faer::prelude::*;
@@ -10,22 +10,22 @@ use crate::units::arithmetic::sinc;
 
 /// Taps on each side of a node.
 const REACH: usize = 10;
-/// Frequencies at which a filter is fitted, a tap.
+/// Frequencies of the fit, for each tap.
 const SAMPLES_PER_TAP: usize = 12;
 
-/// Patterns after a symmetric filter along the nodes, signs interleaved for the forward kernel.
+/// Patterns after a symmetric filter along the nodes, with both signs of mu interleaved.
 #[derive(Clone, Debug)]
 pub(crate) struct FilteredPatterns {
     pub(crate) grid: NodeGrid,
-    /// By mu: for l = mu, mu + 2, ..: `f_{l,mu}` and `(-1)^mu f_{l,-mu}` of node after node; padding at the end.
+    /// By mu: for l = mu, mu + 2, ..: `f_{l,mu}` and `(-1)^mu f_{l,-mu}` at one node after another; padding at the end.
     orders: Vec<Vec<f32>>,
 }
 
-/// Floats after the last row, so that a full vector may be read from any node.
+/// Padding after the last row, so that a full vector can be read from any node.
 const PADDING: usize = 32;
 
 impl FilteredPatterns {
-    /// Nodes that are needed beyond each end of what is wanted.
+    /// Additional nodes needed at each end.
     pub(crate) const MARGIN: usize = REACH;
 
     /// Filters every coefficient as a function of u: the component `exp(2 pi i f k)` of node k is
@@ -79,7 +79,7 @@ fn tap(values: &[f32], taps: &[f32; 2 * REACH + 1]) -> f32 {
     f32::entry(f64::from(sum))
 }
 
-/// Symmetric taps by least squares over the band; the rest of the spectrum is left free.
+/// Symmetric taps by least squares over the band; the rest of the spectrum is not constrained.
 fn fit(
     grid: NodeGrid,
     band: f64,

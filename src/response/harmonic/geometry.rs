@@ -1,4 +1,4 @@
-//! From two positions to the rotation that the harmonic basis needs.
+//! From two positions to the rotation and the lengths that the harmonic basis needs.
 //!
 //! With `y = (r_i - r_j) / b`, x the direction of the mid-point, `z = x cross y`, the matrix of columns x, y, z is
 //!
@@ -7,9 +7,9 @@
 //!                                z = (sin i sin Omega, -sin i cos Omega, cos i)
 //! ```
 //!
-//! Two satellites at one distance from the Moon's centre are exact in it, whatever their orbits: any two
-//! directions have a plane. A pair off the track of the others has another plane than the orbit, with a node
-//! and an inclination of its own.
+//! For two satellites at one distance from the Moon's centre this is exact, whatever their orbits: any two directions
+//! define a plane. The plane of a pair off the common track is not that of the orbit; it has its own node and
+//! inclination.
 //!
 //! The engine knows one inclination i0. Of all rotations with it, the nearest to R is the one with R's own
 //! Omega and phi: in unit quaternions the scalar product of two rotations is
@@ -18,10 +18,10 @@
 //! cos(i/2) cos(i0/2) cos((dOmega + dphi)/2) + sin(i/2) sin(i0/2) cos((dOmega - dphi)/2)
 //! ```
 //!
-//! which is greatest, `cos((i - i0)/2)`, where both differences vanish. What is left is a turn by `i - i0`
-//! about the line of nodes. [`GeometryLimits`] bounds it and the altitude, and what is beyond is refused.
+//! which is greatest, `cos((i - i0)/2)`, where both differences vanish. The remaining error is a rotation by `i - i0`
+//! about the line of nodes. [`GeometryLimits`] bounds it and the altitude; pairs beyond the limits are refused.
 //!
-//! What the limits let through is not exact. Rms error over rms visibility, for a diffuse sky with a monopole
+//! Pairs within the limits are approximated. Rms error over rms visibility, for a diffuse sky with a monopole
 //! (tests/harmonic_departures.rs):
 //!
 //! | u = b / wavelength | 0.1 deg, l <= 64 | l <= 191 | 5 km, l <= 64 | l <= 191 |
@@ -31,9 +31,9 @@
 //! | 30 | 1.1 % | 3.1 % | 34 % | 39 % |
 //! | 120 | 0.9 % | 2.1 % | 57 % | 68 % |
 //!
-//! A tilt of 0.1 deg stays within a few per cent. 5 km of altitude do not: they move the Moon's limb by
-//! 0.23 deg, and a sky without small scales is seen by long baselines at the limb alone. The 150 m that are
-//! allowed unless told otherwise keep errors below 2 % at all of these u.
+//! A tilt of 0.1 deg costs a few per cent. 5 km of altitude cost more: they move the Moon's limb by 0.23 deg, and long
+//! baselines see a sky without small scales at the limb only. The default limit of 150 m keeps errors below 2 % at all
+//! of these u.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -41,12 +41,12 @@ use thiserror::Error;
 use super::PairState;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
 
-/// A pair's own frame as Euler angles, and its size.
+/// Euler angles of a pair's own frame, and its lengths.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PairOrientation {
     /// Longitude Omega of the ascending node of the pair's plane, rad.
     pub node_rad: f64,
-    /// Inclination of the pair's plane, rad; beyond pi/2 when satellite j leads on a prograde orbit.
+    /// Inclination of the pair's plane, rad; above pi/2 if satellite j leads on a prograde orbit.
     pub inclination_rad: f64,
     /// Phase phi of the mid-point in that plane, rad from the node.
     pub phase_rad: f64,
@@ -54,21 +54,21 @@ pub struct PairOrientation {
     pub baseline_m: f64,
     /// Mean distance of the two from the Moon's centre, m.
     pub radius_m: f64,
-    /// Distance of i less that of j, m.
+    /// Distance of i minus that of j, m.
     pub radius_difference_m: f64,
 }
 
-/// Departures from the orbit that an engine takes; all of them small angles and lengths.
+/// Greatest departures from the orbit that an engine accepts.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GeometryLimits {
     /// Greatest angle between a baseline and the plane of the orbit, degrees.
     pub out_of_track_deg_max: f64,
-    /// Greatest difference of the orbit's inclination from its nominal value, degrees.
+    /// Greatest deviation of the orbit's inclination from its nominal value, degrees.
     pub inclination_deg_max: f64,
-    /// Greatest difference of the altitude from its nominal value, m.
+    /// Greatest deviation of the altitude from its nominal value, m.
     pub altitude_m_max: f64,
-    /// Greatest angle between a baseline and the horizontal of its mid-point, degrees: what unequal altitudes make.
+    /// Greatest angle between a baseline and the horizontal at its mid-point, degrees, from unequal altitudes.
     pub radial_deg_max: f64,
 }
 
@@ -97,23 +97,23 @@ impl Default for GeometryLimits {
     }
 }
 
-/// The circle that an engine was made for.
+/// The orbit of an engine.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NominalOrbit {
     /// Inclination, rad.
     pub inclination_rad: f64,
     /// Distance from the Moon's centre, m.
     pub radius_m: f64,
-    /// What may depart from it.
+    /// Accepted departures.
     pub limits: GeometryLimits,
 }
 
 /// A pair on the nominal circle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NominalPair {
-    /// Its state, for an instant.
+    /// The state for an instant.
     pub state: PairState,
-    /// Whether satellite j leads: V_ij is then the conjugate of what this state gives.
+    /// Whether satellite j leads: V_ij is then the conjugate of the visibility of this state.
     pub reversed: bool,
 }
 
@@ -121,34 +121,34 @@ pub struct NominalPair {
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum GeometryRefusal {
-    /// A position that is not a number, or at the Moon's centre.
+    /// A position that is not finite, or at the Moon's centre.
     #[error("a position is not finite")]
     NotFinite,
-    /// Both satellites in one place, or opposite each other.
+    /// Both satellites at one position, or opposite each other.
     #[error("the baseline has no direction")]
     Degenerate,
-    /// The pair's plane is another one than the orbit's.
+    /// The plane of the pair differs from that of the orbit.
     #[error("out of the orbit's plane")]
     Inclination,
     /// Too high or too low.
     #[error("off the orbit's altitude")]
     Altitude,
-    /// One satellite much higher than the other.
+    /// One satellite is much higher than the other.
     #[error("unequal altitudes of a pair")]
     UnequalRadii,
 }
 
 impl GeometryRefusal {
-    /// All reasons, for tables of counts.
+    /// All refusals, for tables of counts.
     pub const ALL: [Self; 5] =
         [Self::NotFinite, Self::Degenerate, Self::Inclination, Self::Altitude, Self::UnequalRadii];
 }
 
-/// Shortest baseline with a direction, m: rounding of positions turns a shorter one by more than 1e-6 rad.
+/// Shortest baseline with a direction, m: rounding of positions rotates shorter ones by more than 1e-6 rad.
 const BASELINE_M_MIN: f64 = 1e-3;
 
 impl PairOrientation {
-    /// Of a pair at these positions (m, Moon-centred, ecliptic axes).
+    /// The orientation of a pair at these positions (m, Moon-centred, ecliptic axes).
     ///
     /// # Errors
     /// [`GeometryRefusal::NotFinite`], [`GeometryRefusal::Degenerate`].
@@ -158,12 +158,12 @@ impl PairOrientation {
         let baseline_m = norm(difference);
         let (radius_i_m, radius_j_m) = (norm(r_i_m), norm(r_j_m));
         let all = baseline_m + radius_i_m + radius_j_m;
-        // Lengths are sums of squares: one that is not finite shows here.
+        // Lengths are sums of squares, so any value that is not finite shows here.
         if !(all.is_finite() && radius_i_m > 0.0 && radius_j_m > 0.0) {
             return Err(GeometryRefusal::NotFinite);
         }
         let y = scale(1.0 / baseline_m, difference);
-        // Square to the baseline also where the distances differ.
+        // Orthogonal to the baseline even if the distances differ.
         let across = sub(sum, scale(dot(sum, y), y));
         let across_m = norm(across);
         if !(baseline_m > BASELINE_M_MIN && across_m > BASELINE_M_MIN) {
@@ -178,7 +178,8 @@ impl PairOrientation {
         })
     }
 
-    /// Of one satellite at a position (m, Moon-centred, ecliptic axes) on an orbit with this normal: a pair of length 0.
+    /// The orientation of one satellite at a position (m, Moon-centred, ecliptic axes) on an orbit with this normal: a
+    /// pair of length 0.
     ///
     /// # Errors
     /// [`GeometryRefusal::NotFinite`], [`GeometryRefusal::Degenerate`] for a position along the normal.
@@ -195,12 +196,12 @@ impl PairOrientation {
         Ok(Self { radius_m, ..Self::of_axes(x, scale(1.0 / along_m, along)) })
     }
 
-    /// The angles of two axes square to each other, without lengths.
+    /// The angles of two orthogonal axes, without lengths.
     #[inline]
     fn of_axes(x: Vec3, y: Vec3) -> Self {
         let z = cross(x, y);
         let sin_inclination = z[0].hypot(z[1]);
-        // In the ecliptic the node is nowhere; any one will do with a phase counted from it.
+        // In the ecliptic the node is undefined; any direction will do, with the phase counted from it.
         let node = if sin_inclination > 0.0 {
             [-z[1] / sin_inclination, z[0] / sin_inclination]
         } else {
@@ -218,10 +219,11 @@ impl PairOrientation {
 }
 
 impl NominalOrbit {
-    /// A pair's state on this orbit: its own node, phase and baseline, with the orbit's inclination and radius.
+    /// The state of a pair on this orbit: the node, phase and baseline of the pair with the inclination and radius of
+    /// the orbit.
     ///
     /// # Errors
-    /// What departs from the orbit by more than the limits.
+    /// The departure from the orbit that exceeds the limits.
     #[inline]
     pub fn pair(
         &self,
@@ -232,13 +234,13 @@ impl NominalOrbit {
         let limits = &self.limits;
         let reversed = (orientation.inclination_rad - self.inclination_rad).abs()
             > (PI - orientation.inclination_rad - self.inclination_rad).abs();
-        // Exchanging i and j turns y and z round: by pi about x.
+        // Exchanging i and j reverses y and z: a rotation by pi about x.
         let (node_rad, inclination_rad, phase_rad) = if reversed {
             (orientation.node_rad + PI, PI - orientation.inclination_rad, PI - orientation.phase_rad)
         } else {
             (orientation.node_rad, orientation.inclination_rad, orientation.phase_rad)
         };
-        // Two positions do not tell a tilted pair from a tilted orbit.
+        // Two positions do not distinguish a tilted pair from a tilted orbit.
         let tilt_rad_max = (limits.out_of_track_deg_max + limits.inclination_deg_max).to_radians();
         if (inclination_rad - self.inclination_rad).abs() > tilt_rad_max {
             return Err(GeometryRefusal::Inclination);
@@ -294,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn one_satellite_has_the_frame_of_a_pair_about_her() {
+    fn one_satellite_has_the_frame_of_a_pair_about_it() {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         for t_s in [0.0, 1234.5, 7e6] {
             let (r_m, normal_hat) = (array.position_m(2, t_s), array.orbit_normal_hat(t_s));

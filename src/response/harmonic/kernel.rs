@@ -1,19 +1,19 @@
-//! Compact kernels: how a value between nodes is made from the nodes around it.
+//! Compact kernels for interpolation between equally spaced nodes.
 //!
 //! Two kinds:
 //! - the *exponential of semicircle* `phi(x) = exp(beta (sqrt(1 - (2x/w)^2) - 1))`, |x| <= w/2 (Barnett,
-//!   Magland & af Klinteberg 2019). Its transform is divided out of what is interpolated. With oversampling
+//!   Magland & af Klinteberg 2019). Its transform is divided out of the data. With oversampling
 //!   sigma its error is about `exp(-pi w sqrt(1 - 1/sigma))`;
-//! - the *windowed sinc* `sinc(x) K(2x/w)`, K the Kaiser window: longer, but with a transform that is 1 over the
-//!   band, so nothing has to be divided out. That is what the weights need: they multiply products of
-//!   two patterns, whose transforms cannot be divided out of one.
+//! - the *windowed sinc* `sinc(x) K(2x/w)`, K the Kaiser window: longer, but with a transform of 1 over the band,
+//!   so nothing has to be divided out. The weights need that: they multiply products of two patterns, whose
+//!   transforms cannot be divided out of one.
 
 use std::f64::consts::PI;
 
 use super::quadrature::GaussLegendre;
 use crate::units::arithmetic::sinc;
 
-/// Most nodes that a kernel reaches.
+/// Greatest width of a kernel, nodes.
 pub(crate) const LANES: usize = 16;
 
 /// A compact kernel on a grid.
@@ -21,11 +21,11 @@ pub(crate) const LANES: usize = 16;
 pub(crate) struct Kernel {
     width: usize,
     shape: Shape,
-    /// Coefficients of the polynomials in the distance to the middle, highest power first, one lane a node.
+    /// Coefficients of the polynomials in the distance from the centre, highest power first; one lane a node.
     polynomial: Vec<[f32; LANES]>,
 }
 
-/// Which of the two kinds, and how fast it falls off.
+/// The kind of kernel and its shape parameter.
 #[derive(Clone, Copy, Debug)]
 enum Shape {
     Semicircle { beta: f64 },
@@ -33,8 +33,7 @@ enum Shape {
 }
 
 impl Kernel {
-    /// The narrowest exponential of semicircle that errs by less than `tolerance` on a grid with
-    /// `oversampling` > 1.
+    /// The narrowest exponential of semicircle with an error below `tolerance` on a grid with `oversampling` > 1.
     pub(crate) fn new(tolerance: f64, oversampling: f64) -> Self {
         let rate = PI * (1.0 - 1.0 / oversampling).sqrt();
         let width = ((1.0 / tolerance).ln() / rate + 0.7).ceil().clamp(3.0, LANES as f64) as usize;
@@ -47,8 +46,8 @@ impl Kernel {
         Self::of(width, Shape::Semicircle { beta })
     }
 
-    /// A sinc of `width` <= 16 nodes under a Kaiser window of parameter `beta`; the greater that is, the flatter the
-    /// band and the wider its edge at half a cycle a node.
+    /// A sinc of `width` <= 16 nodes under a Kaiser window of parameter `beta`; a greater `beta` gives a flatter band
+    /// and a wider edge at half a cycle a node.
     pub(crate) fn windowed_sinc(width: usize, beta: f64) -> Self {
         Self::of(width, Shape::WindowedSinc { beta, middle: bessel_i0(beta) })
     }
@@ -59,12 +58,12 @@ impl Kernel {
         kernel
     }
 
-    /// Number of nodes it reaches.
+    /// Width, nodes.
     pub(crate) fn width(&self) -> usize {
         self.width
     }
 
-    /// At `x` grid steps from the middle.
+    /// The kernel at `x` grid steps from its centre.
     pub(crate) fn value(&self, x: f64) -> f64 {
         let t = 2.0 * x / self.width as f64;
         let inside = 1.0 - t * t;
@@ -89,11 +88,11 @@ impl Kernel {
         frequencies.iter().map(|&f| at(f)).collect()
     }
 
-    /// The first node reached from `x` (in grid steps), and the kernel at the nodes from there on.
+    /// The first node within reach of `x` (in grid steps), and the kernel at the nodes from there on.
     #[inline(always)]
     pub(crate) fn spread(&self, x: f64) -> (i64, [f32; LANES]) {
         let first = (x - 0.5 * self.width as f64).ceil();
-        // From -1 to 1 as x goes from one node to the next.
+        // Goes from -1 to 1 as x goes from one node to the next.
         let t = (2.0 * (first - (x - 0.5 * self.width as f64)) - 1.0) as f32;
         let mut lanes = [0.0; LANES];
         for row in &self.polynomial {

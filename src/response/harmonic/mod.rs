@@ -1,9 +1,18 @@
-//! Spherical harmonics of what a pair on a circular orbit sees.
+//! Rows of the beam matrix B over spherical harmonics, for satellites on one circular orbit.
 //!
-//! Every visibility is the sky, turned into the orbit's plane, times a pattern that depends on the baseline's length
-//! alone: `V = sum_{m mu} exp(-i m alpha) exp(-i mu gamma) sum_l conj(T_lm) d^l_{m mu}(i) f_{l mu}(u)` with
-//! `alpha = Omega - pi/2`, `gamma = phi + pi/2`. [`PatternTable`] holds f, [`RotationTable`] d, and
-//! [`HarmonicModel`] makes visibilities of them; [`mod@crate::accumulation`] has the normal equations.
+//! A visibility is the sky, rotated into the orbital plane, times a pattern that depends on the length of the baseline
+//! only: `V = sum_{m mu} exp(-i m alpha) exp(-i mu gamma) sum_l conj(T_lm) d^l_{m mu}(i) f_{l mu}(u)` with
+//! `alpha = Omega - pi/2`, `gamma = phi + pi/2`, i the inclination and u the baseline in wavelengths.
+//!
+//! | entry point | holds or does |
+//! |---|---|
+//! | [`PairOrientation`], [`NominalOrbit`] | from two positions to Omega, phi and u, and the limits of the basis |
+//! | [`PatternTable`] | f at equally spaced u |
+//! | [`RotationTable`] | d for real skies |
+//! | [`HarmonicModel`] | visibilities of a sky at many states of pairs |
+//!
+//! [`mod@crate::accumulation`] builds its normal equations on the same tables. Uses [`crate::sky::harmonics`]; results
+//! do not depend on the number of threads.
 
 mod batch;
 mod blocked;
@@ -31,7 +40,7 @@ pub use pattern::{NodeGrid, PatternGeometry, PatternTable, degrees};
 pub use real::Real;
 pub use rotation::{RotationTable, orders};
 
-/// Where a pair is and how long its baseline is: all that a visibility depends on besides the sky.
+/// Position and baseline length of a pair: all that a visibility depends on besides the sky.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PairState {
     /// Longitude Omega of the ascending node, rad.
@@ -40,6 +49,6 @@ pub struct PairState {
     pub phase_rad: f64,
     /// Baseline in wavelengths, u = b nu / c >= 0.
     pub baseline_wavelengths: f64,
-    /// Phase that the pair sweeps in one integration, rad; 0 for an instant.
+    /// Phase swept in one integration, rad; 0 for an instant.
     pub span_rad: f64,
 }

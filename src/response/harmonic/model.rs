@@ -195,8 +195,8 @@ impl HarmonicModel {
     /// Any order is correct. Consecutive integrations of a pair are fast, and many pairs over several observing windows
     /// in one call are fastest. At a baseline of zero the result is the auto-correlation power `Int T S A dn`.
     ///
-    /// # Errors
-    /// [`HarmonicError::NotFinite`], [`HarmonicError::Baseline`] beyond the longest baseline, [`HarmonicError::Lengths`].
+    /// # Errors [`HarmonicError::NotFinite`], [`HarmonicError::Baseline`] beyond the longest baseline,
+    /// [`HarmonicError::Lengths`].
     pub fn visibilities(
         &mut self,
         states: &[PairState],

@@ -10,13 +10,13 @@
 //! f_{l mu} = Int dtheta sin theta lambda_{l mu}(theta) I_mu(theta)
 //! ```
 //!
-//! by Gauss-Legendre in theta where the ring is whole and, beyond, in the angle chi along the Moon's limb,
+//! by Gauss-Legendre quadrature: in theta where rings are whole, and elsewhere in the angle chi along the Moon's limb,
 //! `cos theta = (R_moon / r) sin chi`, in which the edge is analytic. f is real, and zero where l + mu is odd
 //! (mirror symmetry in the orbit plane).
 //!
-//! The nodes in u may be negative: then d is too. That continues f analytically, which is what
-//! interpolation near u = 0 needs. (Where one satellite's hidden arc would leave a sliver opposite the
-//! zenith, `|psi - pi| < d/2 - h`, it is left out: less than d^3 / 40 sr, 1e-10 sr at d = 1.8e-3.)
+//! Nodes may have negative u, and then negative d. That continues f analytically, as interpolation near u = 0
+//! needs. (The sliver opposite the zenith that one satellite's hidden arc would leave, `|psi - pi| < d/2 - h`, is
+//! neglected: less than d^3 / 40 sr, 1e-10 sr at d = 1.8e-3.)
 
 use faer::{Accum, MatMut, MatRef, Par};
 use rayon::prelude::*;
@@ -27,7 +27,7 @@ use super::real::Real;
 use super::ring::RingSolver;
 use crate::frames::AntennaResponse;
 
-/// What the pattern depends on besides the baseline.
+/// Parameters of a pattern besides the baseline.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PatternGeometry {
     /// Radius of the satellites' circle, m.
@@ -43,11 +43,11 @@ pub struct PatternGeometry {
 /// Equally spaced values of u.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NodeGrid {
-    /// The first.
+    /// First value.
     pub first: f64,
-    /// Their distance; positive.
+    /// Spacing, positive.
     pub step: f64,
-    /// Their number.
+    /// Number of values.
     pub count: usize,
 }
 
@@ -74,11 +74,11 @@ pub struct PatternTable<T> {
     blocks: Vec<Vec<T>>,
 }
 
-/// Bytes that the rings' coefficients of one chunk of nodes may take.
+/// Greatest memory of the ring coefficients of one chunk of nodes, bytes.
 const CHUNK_BYTES: usize = 400 << 20;
 
 impl<T: Real> PatternTable<T> {
-    /// The coefficients for `l <= l_max` at the nodes of `grid`, computed and kept in `T`.
+    /// Computes the coefficients for `l <= l_max` at the nodes of `grid` in `T`.
     #[must_use]
     pub fn new(geometry: PatternGeometry, l_max: usize, grid: NodeGrid) -> Self {
         let mut table = Self {
@@ -95,7 +95,7 @@ impl<T: Real> PatternTable<T> {
         table
     }
 
-    /// Fills in the nodes `first .. first + count`.
+    /// Computes the nodes `first .. first + count`.
     fn fill(&mut self, geometry: PatternGeometry, first: usize, count: usize) {
         let (grid, l_max) = (self.grid, self.l_max);
         let u: Vec<f64> = (first..first + count).map(|k| grid.u(k)).collect();
@@ -134,7 +134,7 @@ impl<T: Real> PatternTable<T> {
                     orders * count,
                 );
                 let out = out.as_mut().subrows_mut(sign * grid.count + first, count);
-                // lambda_{l,-mu} = (-1)^mu lambda_{l,mu}: the sign is the one that is asked for.
+                // lambda_{l,-mu} = (-1)^mu lambda_{l,mu}, which is the sign in the table.
                 faer::linalg::matmul::matmul(out, Accum::Replace, ring, lambda, T::of(1.0), Par::Seq);
             }
         });
@@ -160,7 +160,7 @@ impl<T> PatternTable<T> {
         &self.blocks[mu]
     }
 
-    /// The same, to be changed.
+    /// Mutable rows of all orders.
     pub(crate) fn orders_mut(&mut self) -> &mut [Vec<T>] {
         &mut self.blocks
     }
@@ -177,8 +177,8 @@ fn half_separation(geometry: PatternGeometry, u: f64) -> f64 {
     (0.5 * u * geometry.wavelength_m / geometry.orbit_radius_m).clamp(-1.0, 1.0).asin()
 }
 
-/// A ring of the body frame: its colatitude, the |psi| up to which one satellite at psi = 0 sees it, and
-/// whether that is all of it whatever the satellite's place.
+/// A ring of the body frame: its colatitude, the |psi| up to which a satellite at psi = 0 sees it, and whether any
+/// satellite sees all of it.
 #[derive(Clone, Copy, Debug)]
 struct RingPoint {
     z: f64,
@@ -188,16 +188,16 @@ struct RingPoint {
 }
 
 impl RingPoint {
-    /// The greatest order whose Legendre functions of degree `l_max` are not negligible here: beyond
-    /// l sin(theta) they fall off like Airy functions, whose width is the cube root's.
+    /// The greatest order with Legendre functions of degree `l_max` that are not negligible here: beyond l sin(theta)
+    /// they decay like Airy functions, over a width of its cube root.
     fn orders(&self, l_max: usize) -> usize {
         let turning = l_max as f64 * self.sin_theta;
         l_max.min((turning + 8.0 * turning.cbrt()) as usize + 8)
     }
 }
 
-/// Rings of the northern half, equator first, and their weights (both halves and the antennas' response
-/// included), for degrees up to `l_max` and |u| up to `u_max`; `refine` multiplies the number of points.
+/// Rings of the northern hemisphere, equator first, and their weights (for both hemispheres, with the antennas'
+/// response), for degrees up to `l_max` and |u| up to `u_max`; `refine` multiplies the number of points.
 fn ring_points(
     geometry: PatternGeometry,
     l_max: usize,

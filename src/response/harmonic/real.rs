@@ -1,11 +1,11 @@
-//! The two floating-point types that the kernels work in.
+//! The two floating-point types of the kernels.
 
 /// f32 or f64.
 pub trait Real: faer::traits::RealField + rustfft::FftNum + Default {
     /// The nearest value.
     fn of(value: f64) -> Self;
-    /// A table's entry of order one: the nearest value, or zero where it could only make subnormal
-    /// products, which cost a hundred times as much as others.
+    /// An entry of a table with values of order one: the nearest value, or zero if it is so small that products would
+    /// be subnormal, which are a hundred times as slow.
     fn entry(value: f64) -> Self;
     /// As f64.
     fn wide(self) -> f64;

@@ -7,23 +7,23 @@
 //! I_mu = Int_{-edge}^{edge} cos(x sin psi + mu psi) dpsi
 //! ```
 //!
-//! obey Bessel's recurrence with the boundary terms on the right (integrate the derivative of
+//! obey Bessel's recurrence with boundary terms on the right-hand side (integrate the derivative of
 //! `sin(x sin psi + mu psi)`):
 //!
 //! ```text
 //! x I_{mu+1} + 2 mu I_mu + x I_{mu-1} = 4 sin(x sin edge + mu edge)
 //! ```
 //!
-//! Where |mu| < x its solutions oscillate and it is followed upwards from `I_0` and `I_1`, which are
-//! integrated; where |mu| > x it is solved as a boundary-value problem (Olver's method), with the
-//! leading term of the integral by parts at the far end. Each coefficient costs a few operations.
+//! For |mu| < x its solutions oscillate, and it is followed upwards from `I_0` and `I_1`, which come from quadrature.
+//! For |mu| > x it is solved as a boundary-value problem (Olver's method), with the leading term of the integral by
+//! parts at the far end. Each coefficient costs a few operations.
 
 use std::f64::consts::PI;
 
 use super::quadrature::GaussLegendre;
 use super::trigonometry::sin_cos;
 
-/// Quadrature rules for `I_0` and `I_1`, and room for one ring.
+/// Quadrature rules for `I_0` and `I_1`, and buffers for one ring.
 #[derive(Clone, Debug)]
 pub(crate) struct RingSolver {
     rules: std::sync::Arc<Vec<GaussLegendre>>,
@@ -36,7 +36,7 @@ pub(crate) struct RingSolver {
 const RULE_STEP: usize = 16;
 
 impl RingSolver {
-    /// For |x| <= `x_max`.
+    /// A solver for |x| <= `x_max`.
     pub(crate) fn new(x_max: f64) -> Self {
         let points = GaussLegendre::points_for(0.5 * PI * x_max.abs());
         let rules = (0..=points / RULE_STEP + 1).map(|k| GaussLegendre::new(RULE_STEP * k.max(1))).collect();
@@ -54,10 +54,10 @@ impl RingSolver {
         let first_below = if x.abs() >= 1.0 { 4.0 / x.abs() * boundary.sin() - start[1] } else { 0.0 };
         self.branch(x.abs(), start, [boundary, edge]);
         for n in 0..=self.order_max {
-            // Turning x round turns mu round.
+            // Reversing the sign of x reverses that of mu.
             out[if x < 0.0 { centre - n } else { centre + n }] = self.values[n];
         }
-        // (-1)^n I_{-n} obeys the same recurrence with the right side -4 (-1)^n sin(boundary - n edge).
+        // (-1)^n I_{-n} obeys the same recurrence with the right-hand side -4 (-1)^n sin(boundary - n edge).
         self.branch(x.abs(), [start[0], -first_below], [boundary + PI, PI - edge]);
         for n in 0..=self.order_max {
             let sign = if n % 2 == 0 { 1.0 } else { -1.0 };
@@ -98,7 +98,7 @@ impl RingSolver {
             if turning >= self.order_max {
                 return;
             }
-            // The right side at n = `known` belongs to the row that the boundary value replaces.
+            // The right-hand side at n = `known` belongs to the row that the boundary value replaces.
             advance();
         }
         let mut above = 0.0;
@@ -110,7 +110,7 @@ impl RingSolver {
             ratio[n] = above;
             values[n] = carried;
         }
-        // By parts: the boundary term over its phase's slope; what it misses dies out on the way down.
+        // By parts: the boundary term over the slope of its phase; the error decays on the way down.
         let mut next = advance() / (2.0 * (far + 1) as f64);
         for n in (known + 1..=far).rev() {
             next = values[n] - ratio[n] * next;
@@ -119,7 +119,7 @@ impl RingSolver {
     }
 }
 
-/// Orders beyond the last one wanted, over which the far end's error dies out.
+/// Additional orders over which the error of the far end decays.
 const FAR_MARGIN: usize = 40;
 
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]

@@ -60,8 +60,8 @@ impl<T: Real> RotationTable<T> {
     /// Rotates degree l into the orbital plane at several alphas: writes `Re t_{l mu}` for all mu = l mod 2, + 2, .. of
     /// one alpha after another, then likewise `Im t_{l mu}`.
     ///
-    /// `coefficient(m)` is `conj(T_lm)`; `turns` holds sine and cosine of m alpha, `[m][alpha]`; `z` is scratch, at least
-    /// (l + 1) values an alpha each; `out` has two values for each alpha and mu.
+    /// `coefficient(m)` is `conj(T_lm)`; `turns` holds sine and cosine of m alpha, `[m][alpha]`; `z` is scratch, at
+    /// least (l + 1) values an alpha each; `out` has two values for each alpha and mu.
     pub(crate) fn rotate_degree(
         &self,
         l: usize,

@@ -1,8 +1,8 @@
-//! Runs: consecutive states of a pair along which node and baseline change little, and linearly.
+//! Runs: consecutive states of a pair along which node and baseline change little and linearly.
 //!
-//! In an observing window the node turns by 0.4 mrad and a baseline changes by a fraction of a wavelength,
-//! while the phase goes through a third of a turn. Along such a run everything but `exp(-i mu gamma)` is
-//! smooth in the phase, so a handful of Chebyshev points carry it.
+//! In an observing window the node moves by 0.4 mrad and the baseline by a fraction of a wavelength, while the phase
+//! covers a third of a turn. Along such a run everything but `exp(-i mu gamma)` is smooth in the phase, so a few
+//! Chebyshev points represent it.
 
 use std::f64::consts::{PI, TAU};
 
@@ -21,7 +21,7 @@ pub(crate) struct Run {
     pub(crate) span: f64,
 }
 
-/// What a run may be.
+/// Limits of a run.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RunLimits {
     /// Greatest order m.
@@ -32,7 +32,7 @@ pub(crate) struct RunLimits {
     pub(crate) node_half: f64,
     /// Greatest half range of the phase `2 pi u + m node`, rad.
     pub(crate) drift_half: f64,
-    /// Greatest departure of that phase from a straight line, rad.
+    /// Greatest deviation of that phase from a straight line, rad.
     pub(crate) residual: f64,
 }
 
@@ -44,13 +44,13 @@ impl Run {
     }
 }
 
-/// To [-pi, pi].
+/// Reduces an angle to [-pi, pi].
 #[inline]
 pub(crate) fn wrap(angle: f64) -> f64 {
     angle - TAU * (angle / TAU).round()
 }
 
-/// Cuts `states` into runs, in order.
+/// Splits `states` into runs, in order.
 pub(crate) fn split(states: &[PairState], limits: RunLimits) -> Vec<Run> {
     let mut runs = Vec::new();
     let mut first = 0;
@@ -80,7 +80,7 @@ fn breaks(a: &PairState, b: &PairState, step: f64, limits: RunLimits) -> bool {
         || (b.span_rad - a.span_rad).abs() > 0.02 * a.span_rad.abs()
 }
 
-/// Halves a stretch until each part is a run.
+/// Halves an interval of states until each part is a run.
 fn cut(states: &[PairState], first: usize, len: usize, limits: RunLimits, runs: &mut Vec<Run>) {
     let run = straight(states, first, len);
     if len <= 1 || fits(&states[first..first + len], &run, limits) {
@@ -92,10 +92,10 @@ fn cut(states: &[PairState], first: usize, len: usize, limits: RunLimits, runs: 
     }
 }
 
-/// The straight line through the ends of a stretch.
+/// The straight line through the ends of an interval of states.
 fn straight(states: &[PairState], first: usize, len: usize) -> Run {
     let (a, b) = (&states[first], &states[first + len - 1]);
-    // Steps are forward and less than a turn together.
+    // Steps are forward and add up to less than a turn.
     let swept = (b.phase_rad - a.phase_rad).rem_euclid(TAU);
     let turned = wrap(b.node_rad - a.node_rad);
     let grown = b.baseline_wavelengths - a.baseline_wavelengths;

@@ -1,6 +1,6 @@
-//! Transform lengths.
+//! Lengths of Fourier transforms.
 
-/// The least length >= `n` that is a product of 2s, 3s and at most one 5, even: what the FFT does fastest.
+/// The least even length >= `n` with prime factors 2, 3 and at most one 5, which the FFT transforms fastest.
 pub(crate) fn fft_length(n: usize) -> usize {
     let n = n.max(2);
     let mut best = n.next_power_of_two();

@@ -1,12 +1,12 @@
-//! Sine and cosine that vectorise.
+//! Sine and cosine for vectorised loops.
 
 /// Sine and cosine of `v`, |v| < 1e6, to about 1e-16 (and 1e-16 |v| from the argument itself).
 ///
 /// Reduction by quarter turns in three parts, then the Cephes polynomials (Moshier) on |r| <= pi/4.
-/// Straight-line code: loops over it become vector code.
+/// Without branches, so that loops over it become vector code.
 #[inline(always)]
 pub(crate) fn sin_cos(v: f64) -> (f64, f64) {
-    /// Adding 1.5 * 2^52 rounds to a whole number and leaves it in the low bits.
+    /// Adding 1.5 * 2^52 rounds to a whole number, which is then in the low bits.
     const ROUND: f64 = 6_755_399_441_055_744.0;
     let shifted = v * std::f64::consts::FRAC_2_PI + ROUND;
     let quarter = shifted.to_bits();

@@ -38,8 +38,8 @@ impl BandAverage {
         1.0 + 0.5 * width_hz / frequency_hz
     }
 
-    /// Number of frequencies that a baseline needs. A rule of K points errs by less than `(e x / 4 K)^(2 K)` for a phase
-    /// that goes from -x to x over the channel.
+    /// Number of frequencies that a baseline needs. A rule of K points errs by less than `(e x / 4 K)^(2 K)` for a
+    /// phase that goes from -x to x over the channel.
     #[must_use]
     pub fn frequencies(baseline_m: f64, width_hz: f64) -> usize {
         let x = PI * baseline_m * width_hz / SPEED_OF_LIGHT_M_S;

@@ -93,8 +93,8 @@ pub trait VisibilityModel: Send + Sync {
         1
     }
 
-    /// Predicts one noise-free visibility V_ij (K sr) for each position; `out` has the length of `positions`. Fastest for
-    /// consecutive integrations of one pair after another.
+    /// Predicts one noise-free visibility V_ij (K sr) for each position; `out` has the length of `positions`. Fastest
+    /// for consecutive integrations of one pair after another.
     ///
     /// # Errors
     /// [`ModelError`] for positions that the model does not cover.

@@ -103,8 +103,8 @@ pub(super) struct BlockClass {
     pub per_side: usize,
     /// Blocks of all pixels in RING order, `per_side`^2 for each, with gaps.
     pub whole: BlockSet,
-    /// Smaller blocks that fill the gaps, where pixels are strongly curved (at the poles) or creased (at the boundary of
-    /// the polar caps).
+    /// Smaller blocks that fill the gaps, where pixels are strongly curved (at the poles) or creased (at the boundary
+    /// of the polar caps).
     pub finer: Vec<BlockSet>,
 }
 

@@ -8,7 +8,7 @@ use super::error::FitsProblem;
 pub(super) const CARD_BYTES: usize = 80;
 /// Where fixed-format values of numbers end.
 const VALUE_END: usize = 30;
-/// Most characters of text that fit one card between its quotes.
+/// Most characters of text between the quotes of one card.
 const TEXT_MAX: usize = 68;
 
 /// The value of a card.
@@ -20,7 +20,7 @@ pub enum CardValue {
     Integer(i64),
     /// A finite number.
     Real(f64),
-    /// Printable ASCII text; longer than a card it is continued (CONTINUE cards).
+    /// Printable ASCII text; text longer than a card is continued (CONTINUE cards).
     Text(String),
 }
 
@@ -31,7 +31,7 @@ pub struct Card {
     pub key: String,
     /// Value.
     pub value: CardValue,
-    /// Comment; cut where it does not fit.
+    /// Comment; truncated where it does not fit.
     pub comment: String,
 }
 
@@ -71,7 +71,7 @@ impl Card {
         Self { key: key.into(), value: CardValue::Logical(value), comment: comment.into() }
     }
 
-    /// Appends the card, and what continues it, to a header.
+    /// Appends the card and its continuation to a header.
     pub(super) fn write_to(&self, header: &mut Vec<u8>) -> Result<(), FitsProblem> {
         let fail = |reason| Err(FitsProblem::Card { key: self.key.clone(), reason });
         let allowed = |c: u8| c.is_ascii_uppercase() || c.is_ascii_digit() || c == b'-' || c == b'_';
@@ -144,7 +144,7 @@ fn is_printable(text: &str) -> bool {
     text.bytes().all(|c| (0x20..=0x7e).contains(&c))
 }
 
-/// Appends `field`, at most a card long, with as much of the comment as fits.
+/// Appends `field`, at most a card long, and as much of the comment as fits.
 fn push_card(field: &str, comment: &str, header: &mut Vec<u8>) {
     let text = if comment.is_empty() { field.to_owned() } else { format!("{field} / {comment}") };
     let mut card = text.into_bytes();
@@ -152,7 +152,7 @@ fn push_card(field: &str, comment: &str, header: &mut Vec<u8>) {
     header.extend_from_slice(&card);
 }
 
-/// Text up to the closing quote, doubled quotes undone and trailing blanks removed, and what follows.
+/// Text up to the closing quote, unescaped and without trailing blanks, and the rest.
 fn unquote(quoted: &str) -> Option<(String, &str)> {
     let mut text = String::new();
     let mut rest = quoted;

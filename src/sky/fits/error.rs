@@ -1,4 +1,4 @@
-//! What can be wrong with a map file.
+//! Errors of map files.
 
 use std::error::Error;
 use std::fmt;
@@ -9,12 +9,12 @@ use thiserror::Error;
 
 use crate::sky::MapError;
 
-/// A file and what is wrong with it.
+/// A file and its problem.
 #[derive(Debug)]
 pub struct FitsError {
     /// The file.
     pub path: PathBuf,
-    /// What is wrong.
+    /// The problem.
     pub problem: Box<FitsProblem>,
 }
 
@@ -36,22 +36,22 @@ impl Error for FitsError {
     }
 }
 
-/// What is wrong with a map file.
+/// A problem with a map file.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum FitsProblem {
-    /// The operating system refused.
+    /// An input or output error.
     #[error("cannot {action}: {source}")]
     Io {
-        /// What was tried.
+        /// The operation.
         action: &'static str,
-        /// The system's answer.
+        /// The system's error.
         source: io::Error,
     },
-    /// The file has no bytes.
+    /// The file is empty.
     #[error("the file is empty; expected a FITS file with a HEALPix map")]
     Empty,
-    /// The file does not start as FITS files do.
+    /// The file does not start like a FITS file.
     #[error("not a FITS file: it starts with {found}; expected `SIMPLE  =                    T`")]
     NotFits {
         /// The first bytes, escaped, or the name of the format they belong to.
@@ -65,7 +65,7 @@ pub enum FitsProblem {
     Truncated {
         /// What was being read.
         expected: &'static str,
-        /// Where that would end.
+        /// Where it would end.
         needed: u64,
         /// Length of the file, bytes.
         length: u64,
@@ -75,7 +75,7 @@ pub enum FitsProblem {
     EndlessHeader {
         /// Where the header starts.
         start: u64,
-        /// Most cards a header may have here.
+        /// Greatest accepted number of cards.
         limit: usize,
     },
     /// The file holds no binary table.
@@ -87,31 +87,31 @@ pub enum FitsProblem {
         /// Header-data units found.
         units: usize,
     },
-    /// A keyword is not there.
+    /// A keyword is missing.
     #[error("the keyword {keyword} is missing; expected {expected}")]
     Missing {
         /// The keyword.
         keyword: String,
-        /// What it should hold.
+        /// Expected value.
         expected: String,
     },
-    /// A keyword has a value that makes no sense.
+    /// A keyword has an invalid value.
     #[error("the keyword {keyword} is {found}; expected {expected}")]
     Keyword {
         /// The keyword.
         keyword: String,
-        /// What it holds.
+        /// Value found.
         found: String,
-        /// What it should hold.
+        /// Expected value.
         expected: String,
     },
-    /// The file does not say in which frame its map is.
+    /// The file does not state the frame of its map.
     #[error(
         "the keyword COORDSYS is missing, so the map's frame is unknown; expected 'E', 'G' or 'C': add \
-             the keyword, or name the frame to assume"
+             the keyword, or state the frame to assume"
     )]
     NoFrame,
-    /// A map of something else than temperature.
+    /// A map of a quantity other than temperature.
     #[error(
         "the map's unit (TUNIT) is `{found}`; expected K, mK, uK, kK, MK or none, which is K: convert the map"
     )]
@@ -127,7 +127,7 @@ pub enum FitsProblem {
         /// Number of map columns.
         columns: usize,
     },
-    /// The table's size is not that of the map it claims to hold.
+    /// The size of the table does not match its nside.
     #[error("column {name} has {found} values; expected {expected} for nside {nside}")]
     ValueCount {
         /// Name of the column.
@@ -139,7 +139,7 @@ pub enum FitsProblem {
         /// Its nside.
         nside: usize,
     },
-    /// An explicitly numbered pixel does not exist, or is there twice.
+    /// An explicitly numbered pixel does not exist or occurs twice.
     #[error("row {row} gives pixel {pixel}; expected each of 0 to {last} at most once")]
     Pixel {
         /// Row of the table, counted from 0.
@@ -149,7 +149,7 @@ pub enum FitsProblem {
         /// Greatest allowed pixel number.
         last: u64,
     },
-    /// A partial map so sparse that the full map would be out of proportion to its file.
+    /// A partial map too sparse: the full map would be out of proportion to its file.
     #[error(
         "{found} pixels of a map of nside {nside} are too few to expand; expected nside up to {limit}, or \
              at least 1/16 of the sky"
@@ -159,7 +159,7 @@ pub enum FitsProblem {
         found: u64,
         /// Claimed nside.
         nside: usize,
-        /// Greatest nside that any partial map may have.
+        /// Greatest nside of partial maps of any number of pixels.
         limit: usize,
     },
     /// A header card that cannot be written.
@@ -167,12 +167,12 @@ pub enum FitsProblem {
     Card {
         /// Its keyword.
         key: String,
-        /// What is wrong, and what was expected.
+        /// What was expected.
         reason: &'static str,
     },
-    /// A value too great for the precision asked for.
+    /// A value beyond the range of the precision.
     #[error(
-        "pixel {pixel} of column {name} is {value:e}, too great for single precision; write double precision"
+        "pixel {pixel} of column {name} is {value:e}, beyond the range of single precision; write double precision"
     )]
     Overflow {
         /// Name of the column.
@@ -182,7 +182,7 @@ pub enum FitsProblem {
         /// Its value.
         value: f64,
     },
-    /// The map itself is not usable.
+    /// The map itself is invalid.
     #[error(transparent)]
     Map(#[from] MapError),
 }

@@ -7,7 +7,7 @@ use super::error::FitsProblem;
 
 /// FITS files are read and written in multiples of this, bytes.
 pub(super) const BLOCK_BYTES: usize = 2880;
-/// Most cards a header may have; map files have tens.
+/// Greatest accepted number of cards in a header; map files have tens.
 const CARDS_MAX: usize = 36 * 1000;
 
 /// The cards of a header that carry values.
@@ -17,7 +17,7 @@ pub struct Header {
 }
 
 impl Header {
-    /// Reads a header that starts at byte `start` of a file of `length` bytes; also gives where its data start.
+    /// Reads a header that starts at byte `start` of a file of `length` bytes; also returns the offset of its data.
     pub(super) fn read(
         reader: &mut (impl Read + Seek),
         start: u64,
@@ -65,7 +65,7 @@ impl Header {
         }
     }
 
-    /// A keyword's number.
+    /// The number of a keyword.
     #[must_use]
     pub fn real(&self, key: &str) -> Option<f64> {
         match self.get(key)? {
@@ -75,7 +75,7 @@ impl Header {
         }
     }
 
-    /// A keyword that must be an integer of at least 0, if it is there.
+    /// An optional keyword that must be an integer of at least 0.
     pub(super) fn count(&self, key: &str) -> Result<Option<u64>, FitsProblem> {
         let wrong = |found: &CardValue| FitsProblem::keyword(key, found, "an integer of at least 0");
         match self.get(key) {
@@ -90,7 +90,7 @@ impl Header {
         }
     }
 
-    /// A keyword that must be there and an integer of at least 0.
+    /// A required keyword that must be an integer of at least 0.
     pub(super) fn required_count(&self, key: &str) -> Result<u64, FitsProblem> {
         self.count(key)?.ok_or_else(|| FitsProblem::missing(key, "an integer of at least 0"))
     }
@@ -118,11 +118,11 @@ impl Header {
         values
             .and_then(|values| values.checked_add(heap)?.checked_mul(groups)?.checked_mul(bits as u64 / 8))
             .filter(|&bytes| bytes <= i64::MAX as u64)
-            .ok_or_else(|| FitsProblem::keyword("NAXISn", "beyond all bounds", "a size that a file can have"))
+            .ok_or_else(|| FitsProblem::keyword("NAXISn", "out of range", "a size that a file can have"))
     }
 }
 
-/// Appends a card, or joins what continues a text to that text.
+/// Appends a card, or joins a CONTINUE card to the text before it.
 fn push(cards: &mut Vec<Card>, card: Card) {
     if card.key != "CONTINUE" {
         cards.push(card);

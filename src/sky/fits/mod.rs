@@ -1,10 +1,9 @@
-//! HEALPix maps in FITS files (FITS Standard 4.0; "HEALPix file format", Hivon 2013), read and written as
-//! healpy reads and writes them.
+//! HEALPix maps in FITS files (FITS Standard 4.0; "HEALPix file format", Hivon 2013), compatible with healpy.
 //!
-//! A map file is a small corner of FITS: headers of 80-character cards and one binary table of fixed-width
-//! columns. It is read here in bounded memory, every size of the header being held against the length of
-//! the file before anything is allocated, and written with healpy's cards in healpy's order. General FITS
-//! libraries in Rust trust the header (a forged TFIELDS aborts the process) or bring a C library.
+//! A map file needs a small part of FITS: headers of 80-character cards and one binary table of fixed-width columns.
+//! Reading uses bounded memory: every size in the header is checked against the length of the file before anything is
+//! allocated. Writing produces healpy's cards in healpy's order, and whole files or none. General FITS libraries in
+//! Rust trust the header (a forged TFIELDS aborts the process) or need a C library.
 
 mod card;
 mod error;

@@ -1,4 +1,4 @@
-//! Reading maps.
+//! Reading of maps: RING or NESTED, full or partial, any numeric type.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -11,32 +11,32 @@ use crate::sky::healpix::{is_valid_nside, nested_to_ring, nside_of, pixel_count}
 use crate::sky::{Frame, SkyMap, is_unseen};
 use crate::units::constants::HEALPIX_UNSEEN;
 
-/// Rows are read in pieces of about this many bytes.
+/// Size of a read, about, bytes.
 const PIECE_BYTES: usize = 1 << 20;
 /// Most header-data units before the table.
 const UNITS_MAX: usize = 1000;
-/// Greatest nside that a partial map of any number of pixels may have: 100 MB when expanded.
+/// Greatest nside of a partial map of any number of pixels: 100 MB when expanded.
 const NSIDE_MAX_SPARSE: usize = 1024;
 
 /// How to read a map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ReadOptions {
-    /// Which of the table's map columns, counted from 0 (the pixel numbers of a partial map do not count).
+    /// Map column of the table, counted from 0 (pixel numbers of a partial map are not counted).
     pub column: usize,
-    /// The frame of a file without COORDSYS; `None` makes such a file an error.
+    /// Frame of files without COORDSYS; `None` makes such files an error.
     pub frame_if_missing: Option<Frame>,
 }
 
-/// A map and what its file says about it.
+/// A map with the information of its file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MapFile {
-    /// The map, in RING order; pixels that a partial map leaves out are UNSEEN.
+    /// The map, in RING order; pixels missing from a partial map are UNSEEN.
     pub map: SkyMap,
-    /// Name of the column (TTYPE), perhaps empty.
+    /// Name of the column (TTYPE), may be empty.
     pub name: String,
-    /// Its unit (TUNIT), perhaps empty.
+    /// Its unit (TUNIT), may be empty.
     pub unit: String,
-    /// Whether the file has no COORDSYS, so that the frame is the one that the reader assumed.
+    /// Whether the file has no COORDSYS, so that the frame is an assumption of the reader.
     pub frame_assumed: bool,
     /// The header of the table.
     pub header: Header,
@@ -45,15 +45,15 @@ pub struct MapFile {
 /// Reads a map: RING or NESTED, full or partial, integers or floats of any precision.
 ///
 /// # Errors
-/// [`FitsError`] with the file and what is wrong with it.
+/// [`FitsError`] with the file and its problem.
 pub fn read_map(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError> {
     read_map_file(path, options).map(|file| file.map)
 }
 
-/// Reads a map of temperatures that must have a usable value in every pixel, and brings it to K.
+/// Reads a map of temperatures with a usable value in every pixel, and converts it to K.
 ///
 /// # Errors
-/// [`FitsError`], also with [`FitsProblem::Unit`] for a unit that is not one of temperature, and with
+/// [`FitsError`], including [`FitsProblem::Unit`] for a unit other than of temperature, and
 /// [`crate::sky::MapError::BadPixels`] for pixels that are NaN, infinite or UNSEEN.
 pub fn read_whole_map(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError> {
     read_whole_map_file(path, options).map(|file| file.map)
@@ -77,8 +77,8 @@ pub fn read_whole_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile
     Ok(MapFile { map, name, unit, frame_assumed, header })
 }
 
-/// How many K a unit of temperature is, without regard to whether it is one of thermodynamics or of Rayleigh and Jeans:
-/// at these frequencies they are the same. `None` for a unit of something else; a map without one is in K.
+/// A unit of temperature in K, whether thermodynamic or Rayleigh-Jeans: at these frequencies they are the same. `None`
+/// for a unit of another quantity; a map without a unit is in K.
 fn kelvin(unit: &str) -> Option<f64> {
     let unit = unit.trim().trim_matches(['[', ']', '(', ')']);
     let name = unit.split_once('_').map_or(unit, |(name, _)| name);
@@ -95,7 +95,7 @@ fn kelvin(unit: &str) -> Option<f64> {
 /// Reads a map with its header.
 ///
 /// # Errors
-/// [`FitsError`] with the file and what is wrong with it.
+/// [`FitsError`] with the file and its problem.
 pub fn read_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile, FitsError> {
     let read = || {
         let file = File::open(path).map_err(FitsProblem::io("open"))?;
@@ -105,7 +105,7 @@ pub fn read_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile, Fits
     read().map_err(|problem| FitsError::new(path, problem))
 }
 
-/// Reads a map from `length` bytes of anything.
+/// Reads a map from a source of `length` bytes.
 ///
 /// # Errors
 /// [`FitsProblem`].
@@ -128,7 +128,7 @@ pub fn read_map_from(
 
     let values = match index {
         None => read_implicit(reader, &table, column, nside)?,
-        Some(index) => read_explicit(reader, &table, (index, column), nside)?,
+        Some(index) => read_explicit(reader, &table, index, column, nside)?,
     };
     let values = if nested { to_ring(nside, &values) } else { values };
     let number = options.column + 1 + usize::from(explicit);
@@ -154,7 +154,7 @@ fn check_start(reader: &mut (impl Read + Seek), length: u64) -> Result<(), FitsP
     Err(FitsProblem::NotFits { found })
 }
 
-/// The header of the first binary table, and where its rows start.
+/// The header of the first binary table, and the offset of its rows.
 fn find_table(reader: &mut (impl Read + Seek), length: u64) -> Result<(Header, u64), FitsProblem> {
     let mut at = 0;
     let mut units = 0;
@@ -173,7 +173,7 @@ fn find_table(reader: &mut (impl Read + Seek), length: u64) -> Result<(Header, u
     Err(FitsProblem::NoTable { units })
 }
 
-/// Whether the table numbers its pixels itself, by INDXSCHM or else OBJECT.
+/// Whether the table gives pixel numbers, from INDXSCHM or else OBJECT.
 fn is_explicit(header: &Header) -> Result<bool, FitsProblem> {
     match (header.text("INDXSCHM"), header.text("OBJECT")) {
         (Some("EXPLICIT"), _) => Ok(true),
@@ -186,7 +186,7 @@ fn is_explicit(header: &Header) -> Result<bool, FitsProblem> {
     }
 }
 
-/// The column of pixel numbers, if there is one, and the map's.
+/// The column of pixel numbers, if there is one, and that of the map.
 fn choose_columns(
     table: &TableLayout,
     explicit: bool,
@@ -245,7 +245,7 @@ fn frame(header: &Header, options: &ReadOptions) -> Result<(Frame, bool), FitsPr
     }
 }
 
-/// Calls `use_row` with every row in turn; memory is bounded by a piece or a row.
+/// Calls `use_row` for every row; memory is bounded by one read or one row.
 fn for_each_row(
     reader: &mut impl Read,
     table: &TableLayout,
@@ -278,7 +278,7 @@ fn read_implicit(
         let name = column.name.clone();
         return Err(FitsProblem::ValueCount { name, found, expected: pixels as u64, nside });
     }
-    // The file has these values, as the table's layout was held against its length.
+    // The file has these values: the layout of the table was checked against its length.
     let mut values = Vec::with_capacity(pixels);
     for_each_row(reader, table, |_, row| {
         column.decode(column.cells(row), HEALPIX_UNSEEN, &mut values);
@@ -293,7 +293,8 @@ fn read_implicit(
 fn read_explicit(
     reader: &mut impl Read,
     table: &TableLayout,
-    (index, column): (&ColumnLayout, &ColumnLayout),
+    index: &ColumnLayout,
+    column: &ColumnLayout,
     nside: usize,
 ) -> Result<Vec<f64>, FitsProblem> {
     let pixels = pixel_count(nside);
@@ -306,7 +307,7 @@ fn read_explicit(
         return Err(FitsProblem::ValueCount { name, found, expected: pixels as u64, nside });
     }
     let mut values = vec![HEALPIX_UNSEEN; pixels];
-    let mut taken = vec![false; pixels];
+    let mut filled = vec![false; pixels];
     let (mut numbers, mut cells) = (Vec::new(), Vec::new());
     for_each_row(reader, table, |row_number, row| {
         numbers.clear();
@@ -314,9 +315,9 @@ fn read_explicit(
         index.decode_integers(index.cells(row), &mut numbers);
         column.decode(column.cells(row), HEALPIX_UNSEEN, &mut cells);
         for (&pixel, &value) in numbers.iter().zip(&cells) {
-            match usize::try_from(pixel).ok().filter(|&p| p < pixels && !taken[p]) {
+            match usize::try_from(pixel).ok().filter(|&p| p < pixels && !filled[p]) {
                 Some(p) => {
-                    taken[p] = true;
+                    filled[p] = true;
                     values[p] = if is_unseen(value) { HEALPIX_UNSEEN } else { value };
                 }
                 None => {

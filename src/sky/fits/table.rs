@@ -3,7 +3,7 @@
 use super::error::FitsProblem;
 use super::header::Header;
 
-/// Types of cells that a map can have.
+/// Types of cells.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum CellType {
     /// Unsigned byte, B.
@@ -18,7 +18,7 @@ pub(super) enum CellType {
     F32,
     /// Double precision, D.
     F64,
-    /// Anything else: can be stepped over, not read.
+    /// Any other type: can be skipped, not read.
     Other,
 }
 
@@ -38,7 +38,7 @@ pub(super) struct ColumnLayout {
     null: Option<i64>,
 }
 
-/// A table whose size the file really has.
+/// A table whose size was checked against the file.
 #[derive(Clone, Debug)]
 pub(super) struct TableLayout {
     pub rows: u64,
@@ -47,7 +47,7 @@ pub(super) struct TableLayout {
 }
 
 impl TableLayout {
-    /// From a header whose data start at byte `start` of a file of `length` bytes.
+    /// The layout of a header whose data start at byte `start` of a file of `length` bytes.
     pub(super) fn new(header: &Header, start: u64, length: u64) -> Result<Self, FitsProblem> {
         let row_bytes = header.required_count("NAXIS1")?;
         let rows = header.required_count("NAXIS2")?;

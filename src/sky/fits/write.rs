@@ -1,4 +1,4 @@
-//! Writing maps: healpy's cards in healpy's order, whole files or none.
+//! Writing of maps: healpy's cards in healpy's order, whole files or none.
 
 use std::io::Write;
 use std::path::Path;
@@ -11,7 +11,7 @@ use crate::sky::healpix::{nested_to_ring, nside_of};
 use crate::sky::{Frame, MapError, SkyMap, is_unseen};
 use crate::units::constants::HEALPIX_UNSEEN;
 
-/// Values of one column that stand in a row of the table, if the map has more than that.
+/// Values of a column in one row of the table, unless the map has fewer.
 const ROW_VALUES: usize = 1024;
 
 /// Precision of the written values.
@@ -41,9 +41,9 @@ pub struct WriteOptions {
     pub precision: Precision,
     /// Order of pixels in the file.
     pub ordering: Ordering,
-    /// Leave out the pixels that are UNSEEN in the first column, and number the others.
+    /// Write only the pixels that are not UNSEEN in the first column, with their numbers.
     pub partial: bool,
-    /// Further header cards: what made the map and from what.
+    /// Further header cards: the provenance of the map.
     pub cards: Vec<Card>,
 }
 
@@ -52,13 +52,13 @@ pub struct WriteOptions {
 pub struct Column<'a> {
     /// TTYPE.
     pub name: &'a str,
-    /// TUNIT; none is written if empty.
+    /// TUNIT; omitted if empty.
     pub unit: &'a str,
     /// Values in RING order.
     pub values: &'a [f64],
 }
 
-/// Writes one map in K, as the column TEMPERATURE, instead of whatever file is at `path`.
+/// Writes one map in K, as column TEMPERATURE; replaces any file at `path`.
 ///
 /// # Errors
 /// As [`write_columns`].
@@ -67,14 +67,13 @@ pub fn write_map(path: &Path, map: &SkyMap, options: &WriteOptions) -> Result<()
     write_columns(path, map.frame(), &[column], options)
 }
 
-/// Writes maps of one nside and frame as the columns of one table, instead of whatever file is at `path`.
+/// Writes maps of one nside and frame as columns of one table; replaces any file at `path`.
 ///
-/// The file appears whole or not at all: it is written under another name in the same folder, flushed to
-/// the disk and renamed.
+/// The file appears whole or not at all: it is written under a temporary name in the same folder, flushed to
+/// disk and renamed.
 ///
-/// # Errors
-/// [`FitsError`]: columns of unequal or senseless lengths, cards that FITS cannot hold, values beyond the
-/// precision, or what the operating system refuses.
+/// # Errors [`FitsError`]: columns of unequal or invalid length, cards that FITS cannot represent, values beyond the
+/// range of the precision, or an error of the operating system.
 pub fn write_columns(
     path: &Path,
     frame: Frame,
@@ -98,7 +97,7 @@ struct Table<'a> {
     nside: usize,
     /// RING pixels in the order of the file.
     pixels: Vec<usize>,
-    /// Pixel numbers of a partial map as the file's ordering has them.
+    /// Pixel numbers of a partial map in the ordering of the file.
     numbers: Option<Vec<usize>>,
     row_values: usize,
 }
@@ -145,7 +144,7 @@ impl<'a> Table<'a> {
         Ok(())
     }
 
-    /// Bytes of a pixel number: 16, 32 or 64 bits, the least that holds the greatest, as healpy chooses.
+    /// Bytes of a pixel number: the least of 16, 32 and 64 bits that holds the greatest, as in healpy.
     fn number_bytes(&self) -> usize {
         match self.numbers.as_ref().map(|numbers| numbers.last().copied().unwrap_or(0)) {
             None => 0,
@@ -278,8 +277,8 @@ fn end_header(header: &mut Vec<u8>) {
     header.resize(header.len().next_multiple_of(BLOCK_BYTES), b' ');
 }
 
-/// Runs `write` on a new file beside `path`, flushes it to the disk and renames it to `path`; removes it on
-/// any failure.
+/// Runs `write` on a temporary file beside `path`, flushes it to disk and renames it to `path`; removes it on
+/// failure.
 fn write_whole(
     path: &Path,
     write: impl FnOnce(&mut AtomicFile) -> Result<(), FitsProblem>,

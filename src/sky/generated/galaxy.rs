@@ -1,8 +1,8 @@
 //! The smooth Galaxy: synchrotron emission and free-free absorption along lines of sight.
 //!
-//! Disks of emission and of warm ionised gas, with the Sun slightly above their plane inside a cavity. The profiles are
-//! the usual ones of Galactic models (exponential in radius, sech^2 in height, a ring of dense gas at 4 kpc). The numbers
-//! reproduce the published statistics of ULSA (see [`super`]); they do not follow any map.
+//! Disks of emission and of warm ionised gas, with the Sun slightly above their plane inside a cavity. The profiles
+//! are the usual ones of Galactic models (exponential in radius, sech^2 in height, a ring of dense gas at 4 kpc). The
+//! numbers reproduce the published statistics of ULSA (see [`super`]); they do not follow any map.
 
 use std::f64::consts::PI;
 

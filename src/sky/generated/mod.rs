@@ -3,9 +3,9 @@
 //!
 //! Radiative transfer of synchrotron emission through warm ionised gas is solved along lines of sight through a smooth
 //! Galaxy, so the plane goes dark below about 10 MHz while nearby emission, from the radio loops and the local cavity,
-//! stays bright. Behind everything lies an isotropic extragalactic background (Cane 1979). Opaque nebulae hide what they
-//! cover. Gas and spectral index vary over the sky, small scales follow Remazeilles et al. (2015), and point sources the
-//! GLEAM counts of Franzen et al. (2019). The model uses Galactic coordinates; maps are on ecliptic axes.
+//! stays bright. Behind everything lies an isotropic extragalactic background (Cane 1979). Opaque nebulae hide what
+//! they cover. Gas and spectral index vary over the sky, small scales follow Remazeilles et al. (2015), and point
+//! sources the GLEAM counts of Franzen et al. (2019). The model uses Galactic coordinates; maps are on ecliptic axes.
 //!
 //! Published statistics of ULSA (Cong et al. 2021, direction-dependent index; their map at nside 64,
 //! measured in Galactic coordinates, K), to which the model's numbers were fitted:
