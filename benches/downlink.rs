@@ -16,8 +16,10 @@ use lunarray::array::{Array, ArrayConfig, Ephemeris, segments_for};
 use lunarray::calibration::{CalibrationConfig, Calibrator};
 use lunarray::downlink::receive::cadu::CaduReceiver;
 use lunarray::downlink::wire::cadu::{CaduEncoder, ReedSolomon, randomize};
-use lunarray::downlink::{DownlinkConfig, DownlinkReader, FileSource, Packetizer, Receiver};
-use lunarray::frames::{AntennaResponse, Channel, Flags, GroundFrame, Instrument, VisibilityBlock};
+use lunarray::downlink::{DownlinkConfig, DownlinkReader, FileSource, PacketReceiver, Packetizer};
+use lunarray::frames::{
+    AntennaResponse, Channel, Flags, GroundFrame, Instrument, VisibilityBlock, VisibilityReason,
+};
 use lunarray::ground::Reception;
 use lunarray::runtime::{Cancel, Graph, Ledger, Sink, Units};
 use lunarray::units::{ChannelId, MissionTime, Pair, StreamKind, all_pairs, random_stream};
@@ -112,7 +114,7 @@ fn decode(bytes: &[u8], mut each: impl FnMut(GroundFrame)) -> u64 {
 }
 
 fn receive(bytes: &[u8]) -> u64 {
-    let mut receiver = Receiver::new();
+    let mut receiver = PacketReceiver::new();
     let (mut source, mut events) = (bytes, 0);
     while receiver.fill_from(&mut source).unwrap() > 0 {
         while receiver.next_event().is_some() {
@@ -279,7 +281,7 @@ fn replay(bytes: &[u8], sent: u64) {
         }
         digest.finalize()
     };
-    let placed = |graph: &mut Graph, ledger: &Ledger| {
+    let placed = |graph: &mut Graph, ledger: &Ledger<VisibilityReason>| {
         let read = graph.source("read", 64, FileSource::open(std::slice::from_ref(&path)).unwrap());
         let frames =
             graph.stage("receive", 64, read, Reception::new(1 << 28, 8192, std::sync::Arc::default()));
@@ -336,7 +338,7 @@ fn resynchronise(bytes: usize) {
     println!("{:<38} {:>7.2} GB/s", "noise", bytes as f64 / start.elapsed().as_secs_f64() / 1e9);
     let header = lunarray::downlink::PacketHeader {
         kind: lunarray::downlink::Kind::Visibilities,
-        segment: lunarray::downlink::Segment::Whole,
+        segment: lunarray::downlink::PacketSegment::Whole,
         count: 0,
         time: lunarray::downlink::CucTime(0),
         version: lunarray::downlink::FORMAT_VERSION,

@@ -9,7 +9,7 @@ const WRITE_BYTES: usize = 1 << 20;
 
 /// What becomes of a file that was begun and not finished.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Unfinished {
+pub enum IfUnfinished {
     /// It is removed.
     Remove,
     /// It stays under the name `NAME.partial`.
@@ -24,7 +24,7 @@ pub struct AtomicFile {
     partial_path: PathBuf,
     /// `None` once finished.
     file: Option<File>,
-    unfinished: Unfinished,
+    unfinished: IfUnfinished,
     pending: Vec<u8>,
     written: u64,
 }
@@ -34,7 +34,7 @@ impl AtomicFile {
     ///
     /// # Errors
     /// What the system says.
-    pub fn create(path: &Path, unfinished: Unfinished) -> io::Result<Self> {
+    pub fn create(path: &Path, unfinished: IfUnfinished) -> io::Result<Self> {
         if let Some(folder) = folder_of(path) {
             fs::create_dir_all(folder)?;
         }
@@ -98,9 +98,9 @@ impl Drop for AtomicFile {
         }
         // What went wrong before is what counts; remains are a nuisance, not an error.
         match self.unfinished {
-            Unfinished::Remove => drop(fs::remove_file(&self.partial_path)),
+            IfUnfinished::Remove => drop(fs::remove_file(&self.partial_path)),
             // All that was handed over, and not only what filled a buffer.
-            Unfinished::Keep => drop(self.flush()),
+            IfUnfinished::Keep => drop(self.flush()),
         }
     }
 }
@@ -110,7 +110,7 @@ impl Drop for AtomicFile {
 /// # Errors
 /// What the system says.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let mut file = AtomicFile::create(path, Unfinished::Remove)?;
+    let mut file = AtomicFile::create(path, IfUnfinished::Remove)?;
     file.write_all(bytes)?;
     file.finish().map(|_| ())
 }
@@ -127,7 +127,7 @@ mod tests {
     fn a_file_is_there_once_it_is_finished() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("new/folder/file");
-        let mut file = AtomicFile::create(&path, Unfinished::Remove).unwrap();
+        let mut file = AtomicFile::create(&path, IfUnfinished::Remove).unwrap();
         file.write_all(b"some").unwrap();
         assert!(!path.exists());
         assert_eq!(file.finish().unwrap(), 4);
@@ -140,7 +140,7 @@ mod tests {
     #[test]
     fn what_is_not_finished_goes_or_stays_as_asked() {
         let folder = tempfile::tempdir().unwrap();
-        for (unfinished, remains) in [(Unfinished::Remove, false), (Unfinished::Keep, true)] {
+        for (unfinished, remains) in [(IfUnfinished::Remove, false), (IfUnfinished::Keep, true)] {
             let path = folder.path().join(format!("{unfinished:?}"));
             let mut file = AtomicFile::create(&path, unfinished).unwrap();
             file.write_all(&vec![7; WRITE_BYTES + 5]).unwrap();

@@ -2,7 +2,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use lunarray::downlink::Receiver;
+use lunarray::downlink::PacketReceiver;
 use lunarray::downlink::receive::cadu::CaduReceiver;
 use lunarray::downlink::wire::cadu::{DATA_BYTES, ReedSolomon, SYNC_MARKER, randomize};
 
@@ -27,7 +27,7 @@ fuzz_target!(|data: &[u8]| {
     assert_eq!(account.frames, sent);
     let zones = sent * (DATA_BYTES as u64 - 8);
     assert!(packets.len() as u64 + account.bytes_idle_packets + account.bytes_fragments <= 2 * zones);
-    let mut receiver = Receiver::new();
+    let mut receiver = PacketReceiver::new();
     receiver.push(&packets);
     receiver.finish();
     while receiver.next_event().is_some() {}

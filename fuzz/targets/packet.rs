@@ -3,7 +3,7 @@
 
 use crc_fast::{CrcAlgorithm, checksum};
 use libfuzzer_sys::fuzz_target;
-use lunarray::downlink::{Decoder, HEADER_BYTES, Kind, PacketHeader, Receiver};
+use lunarray::downlink::{Decoder, HEADER_BYTES, Kind, PacketHeader, PacketReceiver};
 
 fuzz_target!(|data: &[u8]| {
     let mut stream = data.to_vec();
@@ -20,7 +20,7 @@ fuzz_target!(|data: &[u8]| {
         }
         at += header.bytes;
     }
-    let (mut receiver, mut decoder) = (Receiver::new(), Decoder::new());
+    let (mut receiver, mut decoder) = (PacketReceiver::new(), Decoder::new());
     for part in stream.chunks(97) {
         receiver.push(part);
         while let Some(event) = receiver.next_event() {

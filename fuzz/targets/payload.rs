@@ -2,14 +2,14 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use lunarray::downlink::{CucTime, Decoder, FORMAT_VERSION, HEADER_BYTES, Kind, PacketHeader, Packetizer, Receiver, Segment, TRAILER_BYTES};
+use lunarray::downlink::{CucTime, Decoder, FORMAT_VERSION, HEADER_BYTES, Kind, PacketHeader, Packetizer, PacketReceiver, PacketSegment, TRAILER_BYTES};
 use lunarray::frames::{AntennaResponse, Channel, GroundFrame, Instrument};
 
 fn packet(kind: Kind, count: u64, payload: &[u8]) -> Vec<u8> {
     let bytes = HEADER_BYTES + payload.len() + TRAILER_BYTES;
     let header = PacketHeader {
         kind,
-        segment: Segment::Whole,
+        segment: PacketSegment::Whole,
         count,
         time: CucTime(1 << 50),
         version: FORMAT_VERSION,
@@ -40,7 +40,7 @@ fuzz_target!(|data: &[u8]| {
     let Some((&which, payload)) = data.split_first() else { return };
     let kind = Kind::ALL[usize::from(which) % Kind::ALL.len()];
     stream.extend(packet(kind, 1, &payload[..payload.len().min(60_000)]));
-    let (mut receiver, mut decoder) = (Receiver::new(), Decoder::new());
+    let (mut receiver, mut decoder) = (PacketReceiver::new(), Decoder::new());
     receiver.push(&stream);
     receiver.finish();
     while let Some(event) = receiver.next_event() {

@@ -1,16 +1,15 @@
-//! What can be chosen about the map.
+//! Configuration of maps.
 
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use thiserror::Error;
 
 use super::harmonic::L_MAX;
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
-use crate::units::PerChannel;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
+use crate::units::{Checks, InvalidValue, PerChannel};
 
 /// Greatest nside of the pixel engine: 49152 pixels, 9.7 GB of sums a channel (half of a symmetric matrix, f64).
 pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
@@ -95,94 +94,52 @@ impl Default for MapConfig {
     }
 }
 
-/// A setting of the map that cannot be.
-#[derive(Clone, Debug, Error, PartialEq)]
-#[non_exhaustive]
-pub enum MapConfigError {
-    /// Not a map size.
-    #[error("map.nside = {nside}: expected a power of two from 1 to {most} for this engine")]
-    Nside {
-        /// Value found.
-        nside: usize,
-        /// Greatest that the engine takes.
-        most: usize,
-    },
-    /// A number outside its range.
-    #[error("map.{key} = {value}: expected {expected}")]
-    Parameter {
-        /// Key.
-        key: &'static str,
-        /// Value found.
-        value: f64,
-        /// Range that is accepted.
-        expected: &'static str,
-    },
-    /// A list by channel of the wrong length.
-    #[error("map.{key} has {found} values: expected one value, or one for each of the {channels} channels")]
-    Misfit {
-        /// Key.
-        key: &'static str,
-        /// Number of values.
-        found: usize,
-        /// Number of channels.
-        channels: usize,
-    },
-    /// Two priors at once.
-    #[error("map.prior_k and map.prior_files are both given: expected one of them")]
-    TwoPriors,
-}
-
 impl MapConfig {
     /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
-    pub fn problems(&self) -> Vec<MapConfigError> {
-        let mut found = Vec::new();
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("map");
         let is_harmonic = self.engine == EngineKind::Harmonic;
         let most = if is_harmonic { HARMONIC_ENGINE_NSIDE_MAX } else { PIXEL_ENGINE_NSIDE_MAX };
-        if !is_valid_nside(self.nside) || self.nside > most {
-            found.push(MapConfigError::Nside { nside: self.nside, most });
-        }
-        let mut require = |key, value: f64, good: bool, expected| {
-            if !(good && value.is_finite()) {
-                found.push(MapConfigError::Parameter { key, value, expected });
-            }
-        };
+        let good = is_valid_nside(self.nside) && self.nside <= most;
+        let expected = format!("a power of two from 1 to {most} for this engine");
+        checks.require("nside", self.nside, good, expected);
         let longest = self.baseline_bp_max;
-        require("baseline_bp_max", longest, longest > 0.0, "a positive number, in units of b_p");
+        checks.number("baseline_bp_max", longest, longest > 0.0, "a positive number, in units of b_p");
         for &epsilon in self.epsilon.values() {
-            require("epsilon", epsilon, epsilon > 0.0 && epsilon <= 1.0, "above 0 and at most 1");
+            checks.number("epsilon", epsilon, epsilon > 0.0 && epsilon <= 1.0, "above 0 and at most 1");
         }
         for &prior in self.prior_k.values() {
-            require("prior_k", prior, prior >= 0.0, "K, not negative");
+            checks.number("prior_k", prior, prior >= 0.0, "K, not negative");
         }
         let fwhm = self.prior_fwhm_deg;
-        require("prior_fwhm_deg", fwhm, (0.0..=180.0).contains(&fwhm), "0 to 180");
+        checks.number("prior_fwhm_deg", fwhm, (0.0..=180.0).contains(&fwhm), "0 to 180");
         if is_harmonic {
             let l_max = self.l_max as f64;
-            require("l_max", l_max, self.l_max < 3 * self.nside, "0, or 1 to 3 nside - 1");
+            checks.number("l_max", l_max, self.l_max < 3 * self.nside, "0, or 1 to 3 nside - 1");
             let degree = self.degree() as f64;
-            require("l_max", degree, self.degree() <= L_MAX, "at most 383; 0 stands for 2.5 nside");
+            checks.number("l_max", degree, self.degree() <= L_MAX, "at most 383; 0 stands for 2.5 nside");
         }
         let residual = self.residual_max;
-        require("residual_max", residual, residual > 0.0 && residual < 1.0, "above 0 and below 1");
+        checks.number("residual_max", residual, residual > 0.0 && residual < 1.0, "above 0 and below 1");
         let iterations = self.iterations_max as f64;
-        require("iterations_max", iterations, self.iterations_max > 0, "at least 1");
+        checks.number("iterations_max", iterations, self.iterations_max > 0, "at least 1");
         for (key, value) in self.limits.values() {
-            require(key, value, value >= 0.0, "not negative");
+            checks.number(key, value, value >= 0.0, "not negative");
         }
         let weight = self.weight_max;
-        require(
+        checks.number(
             "weight_max",
             weight,
             weight == 0.0 || (1e-60..=1e60).contains(&weight),
             "0, or 1e-60 to 1e60",
         );
         let every = self.snapshot_every_s;
-        require("snapshot_every_s", every, every >= 0.0, "seconds, or 0 for a final map alone");
-        if !self.prior_files.is_empty() && self.prior_k.values().iter().any(|&k| k != 0.0) {
-            found.push(MapConfigError::TwoPriors);
-        }
-        found
+        checks.number("snapshot_every_s", every, every >= 0.0, "seconds, or 0 for a final map alone");
+        let one = self.prior_files.is_empty() || self.prior_k.values().iter().all(|&k| k == 0.0);
+        let files = self.prior_files.len();
+        checks.require("prior_files", format!("({files} files)"), one, "none where map.prior_k is given");
+        checks.finish()
     }
 
     /// Greatest degree of a map from the harmonic engine.
@@ -223,15 +180,17 @@ impl MapConfig {
 
     /// Settings by channel that do not fit an instrument of `channels` channels.
     #[must_use]
-    pub fn misfits(&self, channels: usize) -> Vec<MapConfigError> {
+    pub fn misfits(&self, channels: usize) -> Vec<InvalidValue> {
         let files = self.prior_files.len();
-        [
+        let mut checks = Checks::of("map");
+        for (key, fits, found) in [
             ("epsilon", self.epsilon.fits(channels), self.epsilon.values().len()),
             ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),
             ("prior_files", files == 0 || files == channels, files),
-        ]
-        .into_iter()
-        .filter_map(|(key, fits, found)| (!fits).then_some(MapConfigError::Misfit { key, found, channels }))
-        .collect()
+        ] {
+            let expected = format!("one value, or one for each of the {channels} channels");
+            checks.require(key, format!("({found} values)"), fits, expected);
+        }
+        checks.finish()
     }
 }

@@ -2,9 +2,8 @@
 
 use thiserror::Error;
 
-use super::config::MapConfigError;
 use crate::response::pixel::ResponseError;
-use crate::units::ChannelId;
+use crate::units::{ChannelId, InvalidValue};
 
 /// Why visibilities could not be summed.
 #[derive(Debug, Error)]
@@ -39,7 +38,7 @@ pub enum AccumulationError {
     },
     /// Settings by channel that do not fit the instrument.
     #[error("the downlink's channels: {0}")]
-    Misfit(#[from] MapConfigError),
+    Misfit(#[from] InvalidValue),
     /// Engines that cannot be merged.
     #[error("engines of different {what} cannot be merged")]
     Mismatch {

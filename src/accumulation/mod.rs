@@ -17,7 +17,7 @@ mod scale;
 mod stage;
 mod tiles;
 
-pub use config::{EngineKind, MapConfig, MapConfigError};
+pub use config::{EngineKind, MapConfig};
 pub use error::AccumulationError;
 pub use pixel::{PixelEngine, PixelSetup, PixelSums};
 pub use scale::automatic_weight_max;
@@ -27,9 +27,8 @@ pub use tiles::{Columns, SymmetricTiles, TILE};
 use std::collections::BTreeMap;
 
 use serde::Serialize;
-use thiserror::Error;
 
-use crate::frames::PlacedVisibilities;
+use crate::frames::{PlacedVisibilities, VisibilityReason};
 use crate::response::harmonic::GeometryRefusal;
 
 /// What an engine or its sums hold.
@@ -42,46 +41,40 @@ pub struct SumCounts {
 }
 
 /// Why an engine does not take a visibility.
-#[derive(Clone, Copy, Debug, Error, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum Refusal {
     /// Its satellites are not where the engine's basis needs them.
-    #[error(transparent)]
-    Geometry(#[from] GeometryRefusal),
+    Geometry(GeometryRefusal),
     /// Its baseline is longer than the engine was made for.
-    #[error("baseline beyond the engine's limit")]
     TooLong,
-    /// Its value or weight is no number that can be summed.
-    #[error("value or weight not finite, or weight not positive")]
+    /// Its value or weight cannot be summed.
     NotFinite,
     /// Its weight, or its value in units of its noise, is more than the sums have room for.
-    #[error("weight or value beyond the range of the sums")]
     OutOfRange,
     /// The sums have no room for more weight.
-    #[error("the sums are full")]
     Full,
 }
 
-impl Refusal {
-    /// The reason as the ledger names it.
-    #[must_use]
-    pub fn reason(self) -> &'static str {
-        match self {
-            Self::Geometry(GeometryRefusal::NotFinite) => "refused by the engine: a position is not finite",
-            Self::Geometry(GeometryRefusal::Degenerate) => {
-                "refused by the engine: the baseline has no direction"
-            }
-            Self::Geometry(GeometryRefusal::Inclination) => "refused by the engine: out of the orbit's plane",
-            Self::Geometry(GeometryRefusal::Altitude) => "refused by the engine: off the orbit's altitude",
-            Self::Geometry(GeometryRefusal::UnequalRadii) => {
-                "refused by the engine: unequal altitudes of a pair"
-            }
-            Self::TooLong => "refused by the engine: baseline beyond its limit",
-            Self::NotFinite => "refused by the engine: value or weight not finite, or weight not positive",
-            Self::OutOfRange => {
-                "refused by the engine: weight above map.weight_max, or value far above its noise"
-            }
-            Self::Full => "refused by the engine: sums full at this map.weight_max",
+impl From<GeometryRefusal> for Refusal {
+    fn from(refusal: GeometryRefusal) -> Self {
+        Self::Geometry(refusal)
+    }
+}
+
+/// The reason in the ledger.
+impl From<Refusal> for VisibilityReason {
+    fn from(refusal: Refusal) -> Self {
+        match refusal {
+            Refusal::Geometry(GeometryRefusal::NotFinite) => Self::PositionNotFinite,
+            Refusal::Geometry(GeometryRefusal::Degenerate) => Self::NoDirection,
+            Refusal::Geometry(GeometryRefusal::Inclination) => Self::OutOfPlane,
+            Refusal::Geometry(GeometryRefusal::Altitude) => Self::OffAltitude,
+            Refusal::Geometry(GeometryRefusal::UnequalRadii) => Self::UnequalAltitudes,
+            Refusal::TooLong => Self::BaselineBeyondEngine,
+            Refusal::NotFinite => Self::ValueNotFinite,
+            Refusal::OutOfRange => Self::WeightOutOfRange,
+            Refusal::Full => Self::SumsFull,
         }
     }
 }

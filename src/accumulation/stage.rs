@@ -6,10 +6,9 @@ use std::sync::Arc;
 use super::harmonic::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
 use super::{
     AccumulationError, Added, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine, PixelSetup,
-    PixelSums, Refusal, SumCounts, automatic_weight_max,
+    PixelSums, SumCounts, automatic_weight_max,
 };
-use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities};
-use crate::response::harmonic::GeometryRefusal;
+use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
 use crate::runtime::{Ledger, Outlet, Stage, Units};
 use crate::units::ChannelId;
 use crate::units::vector::{norm, sub};
@@ -116,7 +115,7 @@ struct ChannelSums {
 /// Sums what calibration hands on; emits snapshots at equal steps of mission time, and a last one.
 pub struct Accumulator {
     config: MapConfig,
-    ledger: Ledger,
+    ledger: Ledger<VisibilityReason>,
     instrument: Option<Arc<Instrument>>,
     channels: Vec<Option<ChannelSums>>,
     next_snapshot_s: Option<f64>,
@@ -128,7 +127,7 @@ pub struct Accumulator {
 impl Accumulator {
     /// A stage that posts to `ledger`.
     #[must_use]
-    pub fn new(config: MapConfig, ledger: Ledger) -> Self {
+    pub fn new(config: MapConfig, ledger: Ledger<VisibilityReason>) -> Self {
         Self {
             config,
             ledger,
@@ -274,14 +273,13 @@ impl Accumulator {
 
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<(), AccumulationError> {
         let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
-        self.ledger.flagged("baseline beyond the map's limit", (placed.len() - near.len()) as u64);
+        self.ledger.left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - near.len()) as u64);
         if near.is_empty() {
             // A channel of which nothing is used has no sums, and no map.
             return Ok(());
         }
         let Some(sums) = self.sums(&near)? else {
-            let reason = Refusal::Geometry(GeometryRefusal::Degenerate);
-            self.ledger.flagged(reason.reason(), near.len() as u64);
+            self.ledger.left_out(VisibilityReason::NoDirection, near.len() as u64);
             return Ok(());
         };
         let Added { visibilities, refused } = sums.engine.add(&near)?;
@@ -292,7 +290,7 @@ impl Accumulator {
         self.accumulated += visibilities;
         self.ledger.accumulated(visibilities);
         for (reason, count) in refused {
-            self.ledger.flagged(reason.reason(), count);
+            self.ledger.left_out(reason.into(), count);
         }
         Ok(())
     }

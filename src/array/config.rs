@@ -1,10 +1,10 @@
-//! What can be chosen about the array.
+//! Configuration of the array.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::units::MAX_SATELLITES;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
+use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
 
 /// Which way the ascending node moves.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -94,20 +94,13 @@ impl Default for BreathingConfig {
     }
 }
 
-/// Why an array cannot be.
+/// Why there is no such array.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ArrayError {
-    /// A parameter outside its range.
-    #[error("array.{key} = {value}: expected {expected}")]
-    Parameter {
-        /// Key in the `[array]` section.
-        key: &'static str,
-        /// Value found.
-        value: f64,
-        /// Range that is accepted.
-        expected: &'static str,
-    },
+    /// A value of the configuration that is not accepted.
+    #[error(transparent)]
+    Invalid(#[from] InvalidValue),
     /// No geometric progression of spacings fits.
     #[error(
         "array.breathing: no progression of spacings fits {satellites} daughters between {first_m} m \
@@ -128,18 +121,13 @@ pub enum ArrayError {
 impl ArrayConfig {
     /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
-    pub fn problems(&self) -> Vec<ArrayError> {
+    pub fn problems(&self) -> Vec<InvalidValue> {
         const POSITIVE: &str = "a positive number";
         const FINITE: &str = "a finite number";
         let breathing = &self.breathing;
-        let mut found = Vec::new();
-        let mut require = |key, value: f64, good: bool, expected| {
-            if !(good && value.is_finite()) {
-                found.push(ArrayError::Parameter { key, value, expected });
-            }
-        };
+        let mut checks = Checks::of("array");
         let count = self.satellites as f64;
-        require("satellites", count, (3..=MAX_SATELLITES).contains(&self.satellites), "3 to 64");
+        checks.number("satellites", count, (3..=MAX_SATELLITES).contains(&self.satellites), "3 to 64");
         for (key, value) in [
             ("moon_radius_m", self.moon_radius_m),
             ("altitude_m", self.altitude_m),
@@ -149,25 +137,25 @@ impl ArrayConfig {
             ("breathing.second_spacing_m_min", breathing.second_spacing_m_min),
             ("breathing.span_m_max", breathing.span_m_max),
         ] {
-            require(key, value, value > 0.0, POSITIVE);
+            checks.number(key, value, value > 0.0, POSITIVE);
         }
         for (key, value) in
             [("breathing.first_ratio", breathing.first_ratio), ("breathing.ratio", breathing.ratio)]
         {
-            require(key, value, value >= 1.0, "a number of at least 1");
+            checks.number(key, value, value >= 1.0, "a number of at least 1");
         }
         let period = self.orbital_period_s;
         // Bounds the number of windows in the longest mission to a million.
-        require("orbital_period_s", period, period >= 1e3, "at least 1000 s");
+        checks.number("orbital_period_s", period, period >= 1e3, "at least 1000 s");
         let inclination = self.inclination_deg;
-        require("inclination_deg", inclination, (0.0..=180.0).contains(&inclination), "0 to 180");
+        checks.number("inclination_deg", inclination, (0.0..=180.0).contains(&inclination), "0 to 180");
         for (key, value) in [
             ("orbital_phase_deg", self.orbital_phase_deg),
             ("node_longitude_deg", self.node_longitude_deg),
             ("earth_longitude_deg", self.earth_longitude_deg),
         ] {
-            require(key, value, true, FINITE);
+            checks.number(key, value, true, FINITE);
         }
-        found
+        checks.finish()
     }
 }

@@ -1,23 +1,24 @@
-//! Where the daughters are, what the Moon hides from them, and how a pair answers to the sky.
+//! Orbit and formation of the daughters, occultation by the Moon, observing windows, and the ephemeris.
 //!
-//! Pure functions of time and position; uses [`crate::units`] and [`crate::sky`].
+//! Pure functions of time and position; uses [`crate::units`] and [`crate::frames`].
 //!
-//! Frame: centred on the Moon, ecliptic axes (x to ecliptic longitude 0, z to the north ecliptic pole).
+//! Coordinates are centred on the Moon, on ecliptic axes: x towards ecliptic longitude 0, z towards the north ecliptic
+//! pole.
 
+mod baseline;
 mod config;
 mod ephemeris;
 mod formation;
 mod integration;
 mod orbit;
 mod placing;
-mod stretch;
 mod windows;
 
+pub use baseline::scaled_baseline;
 pub use config::{ArrayConfig, ArrayError, BreathingConfig, NodeMotion};
 pub use ephemeris::{Ephemeris, Insertion, segments_for};
 pub use formation::Formation;
 pub use integration::{IntegrationRule, integration_time_s};
 pub use orbit::{Array, SatelliteState, hidden_by_moon};
-pub use placing::{FlaggedCounts, PlacingCounts};
-pub use stretch::stretched;
+pub use placing::PlacingCounts;
 pub use windows::{ObservingWindows, earth_in_sight_s};

@@ -37,7 +37,7 @@ impl Array {
     /// The first of [`ArrayConfig::problems`], or a formation that does not exist.
     pub fn new(config: &ArrayConfig) -> Result<Self, ArrayError> {
         if let Some(problem) = config.problems().into_iter().next() {
-            return Err(problem);
+            return Err(problem.into());
         }
         let rate = TAU / config.precession_period_s;
         Ok(Self {

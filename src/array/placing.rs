@@ -1,58 +1,22 @@
 //! Visibilities to their satellites' positions.
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 use multiversion::multiversion;
 use num_complex::Complex64;
-use serde::Serialize;
 
 use super::ephemeris::{Ephemeris, Piece};
-use crate::frames::{Flags, PlacedVisibilities, VisibilityBlock};
+use crate::frames::{PlacedVisibilities, VisibilityBlock, VisibilityReason};
 use crate::units::MissionTime;
 
-/// Flagged visibilities by reason; one with several reasons counts for the first of them.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct FlaggedCounts {
-    /// Radio interference.
-    pub interference: u64,
-    /// Samples missing.
-    pub incomplete: u64,
-    /// A saturated receiver.
-    pub saturated: u64,
-    /// Refused by calibration.
-    pub uncalibrated: u64,
-    /// A reason that this version does not know.
-    pub other: u64,
-}
-
-impl FlaggedCounts {
-    /// Counts a visibility with these flags; a good one is not counted.
-    pub fn add(&mut self, flags: Flags) {
-        let reason = flags.0 & flags.0.wrapping_neg();
-        match Flags(reason) {
-            Flags::GOOD => {}
-            Flags::INTERFERENCE => self.interference += 1,
-            Flags::INCOMPLETE => self.incomplete += 1,
-            Flags::SATURATED => self.saturated += 1,
-            Flags::UNCALIBRATED => self.uncalibrated += 1,
-            _ => self.other += 1,
-        }
-    }
-
-    /// All of them.
-    #[must_use]
-    pub fn total(&self) -> u64 {
-        self.interference + self.incomplete + self.saturated + self.uncalibrated + self.other
-    }
-}
-
 /// What became of the visibilities of a block; the three parts make up the block.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct PlacingCounts {
     /// Placed.
     pub placed: u64,
-    /// Left out because of a flag.
-    pub flagged: FlaggedCounts,
+    /// Left out because of a flag, by the first one's reason.
+    pub flagged: BTreeMap<VisibilityReason, u64>,
     /// Left out because no ephemeris covers their time.
     pub without_ephemeris: u64,
 }
@@ -95,8 +59,8 @@ impl Ephemeris {
         out: &mut PlacedVisibilities,
         counts: &mut PlacingCounts,
     ) -> usize {
-        if !block.flags[from].is_good() {
-            counts.flagged.add(block.flags[from]);
+        if let Some(reason) = block.flags[from].reason() {
+            *counts.flagged.entry(reason).or_default() += 1;
             return from + 1;
         }
         let half_ticks = middle_half_ticks(block, from);
@@ -160,6 +124,7 @@ mod tests {
 
     use super::*;
     use crate::array::{Array, ArrayConfig, segments_for};
+    use crate::frames::Flags;
     use crate::units::vector::{norm, sub};
     use crate::units::{ChannelId, Pair};
 
@@ -213,7 +178,12 @@ mod tests {
         let table = table(&array, start + 10 * 1_000_003, start + 80 * 1_000_003);
         let (placed, counts) = table.place(&block, 1e7);
         assert_eq!(placed.len() as u64, counts.placed);
-        let flagged = FlaggedCounts { interference: 1, uncalibrated: 1, other: 1, ..Default::default() };
+        let flagged = [
+            (VisibilityReason::Interference, 1),
+            (VisibilityReason::Uncalibrated, 1),
+            (VisibilityReason::UnknownFlag, 1),
+        ];
+        let flagged = flagged.into_iter().collect();
         assert_eq!(counts, PlacingCounts { placed: 70, flagged, without_ephemeris: 27 });
     }
 

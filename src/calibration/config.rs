@@ -1,13 +1,17 @@
-//! What can be chosen about calibration.
+//! Configuration of calibration.
 
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
 use super::{AntennaGains, Calibration, CalibrationError, Identity, SubBands, VanVleck};
+use crate::units::{Checks, InvalidValue};
 
 /// Most sub-bands of a channel.
 const SUB_BANDS_MAX: usize = 64;
+
+/// Bits of samples that are corrected, in words.
+const QUANTISER_BITS: &str = "0 for none, 1, 2 or 4";
 
 /// Which calibration is applied.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -44,33 +48,26 @@ impl Default for CalibrationConfig {
 impl CalibrationConfig {
     /// Everything that is wrong with the configuration; empty if it is good. Does not open the file.
     #[must_use]
-    pub fn problems(&self) -> Vec<CalibrationError> {
-        let mut found = Vec::new();
-        if let Err(problem) = self.van_vleck() {
-            found.push(problem);
-        }
-        if self.quantiser_bits != 0 && self.sub_bands > 1 {
-            found.push(CalibrationError::Parameter {
-                key: "calibration.quantiser_bits".to_owned(),
-                value: self.quantiser_bits.to_string(),
-                expected: "0 with sub-bands: what a quantiser does to a correlation at one lag is spread over them",
-            });
-        }
-        if !(1..=SUB_BANDS_MAX).contains(&self.sub_bands) {
-            found.push(CalibrationError::Parameter {
-                key: "calibration.sub_bands".to_owned(),
-                value: self.sub_bands.to_string(),
-                expected: "1 to 64",
-            });
-        }
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("calibration");
+        let bits = self.quantiser_bits;
+        checks.require("quantiser_bits", bits, bits == 0 || VanVleck::new(bits).is_ok(), QUANTISER_BITS);
+        checks.require(
+            "quantiser_bits",
+            bits,
+            bits == 0 || self.sub_bands <= 1,
+            "0 with sub-bands: what a quantiser does to a correlation at one lag is spread over them",
+        );
+        let sub_bands = self.sub_bands;
+        checks.require("sub_bands", sub_bands, (1..=SUB_BANDS_MAX).contains(&sub_bands), "1 to 64");
         let expected = match (self.hook, &self.gains_file) {
             (CalibrationHook::AntennaGains, None) => "the path of a file, for hook = \"antenna-gains\"",
             (CalibrationHook::Identity, Some(_)) => "no such key, or hook = \"antenna-gains\"",
-            _ => return found,
+            _ => return checks.finish(),
         };
         let value = self.gains_file.as_ref().map_or("(missing)".to_owned(), |path| format!("{path:?}"));
-        found.push(CalibrationError::Parameter { key: "calibration.gains_file".to_owned(), value, expected });
-        found
+        checks.require("gains_file", value, false, expected);
+        checks.finish()
     }
 
     /// The correction of quantised correlations, if there is one.
@@ -81,10 +78,13 @@ impl CalibrationConfig {
         if self.quantiser_bits == 0 {
             return Ok(None);
         }
-        VanVleck::new(self.quantiser_bits).map(Some).map_err(|error| CalibrationError::Parameter {
-            key: "calibration.quantiser_bits".to_owned(),
-            value: error.0.to_string(),
-            expected: "0 for none, 1, 2 or 4",
+        VanVleck::new(self.quantiser_bits).map(Some).map_err(|error| {
+            InvalidValue {
+                key: "calibration.quantiser_bits".to_owned(),
+                value: error.0.to_string(),
+                expected: QUANTISER_BITS.into(),
+            }
+            .into()
         })
     }
 
@@ -94,7 +94,7 @@ impl CalibrationConfig {
     /// The first of [`CalibrationConfig::problems`], or what is wrong with the gains file.
     pub fn build(&self, folder: &Path) -> Result<Box<dyn Calibration>, CalibrationError> {
         if let Some(problem) = self.problems().into_iter().next() {
-            return Err(problem);
+            return Err(problem.into());
         }
         let calibration: Box<dyn Calibration> = match &self.gains_file {
             Some(file) => Box::new(AntennaGains::read(&folder.join(file))?),

@@ -4,22 +4,15 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use crate::units::Pair;
+use crate::units::{InvalidValue, Pair};
 
 /// Why a calibration cannot be made or applied.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum CalibrationError {
-    /// A parameter outside its range.
-    #[error("{key} = {value}: expected {expected}")]
-    Parameter {
-        /// Key, with its place in lists counted from 0.
-        key: String,
-        /// Value found.
-        value: String,
-        /// What is accepted.
-        expected: &'static str,
-    },
+    /// A value of the configuration that is not accepted.
+    #[error(transparent)]
+    Invalid(#[from] InvalidValue),
     /// The gains file cannot be read.
     #[error("gains file {}: cannot be read", path.display())]
     Read {
@@ -42,13 +35,13 @@ pub enum CalibrationError {
         /// The file.
         path: PathBuf,
         /// Everything that is wrong with it.
-        problems: Vec<CalibrationError>,
+        problems: Vec<InvalidValue>,
     },
     /// Values that cannot be gains, not from a file.
     #[error("gains: {}", list(problems))]
     Gains {
         /// Everything that is wrong with them.
-        problems: Vec<CalibrationError>,
+        problems: Vec<InvalidValue>,
     },
     /// A channel without gains.
     #[error(
@@ -84,7 +77,7 @@ pub enum CalibrationError {
     },
 }
 
-fn list(problems: &[CalibrationError]) -> String {
+fn list(problems: &[InvalidValue]) -> String {
     let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
     lines.join("; ")
 }

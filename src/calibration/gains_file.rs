@@ -1,11 +1,11 @@
-//! The file of antenna gains.
+//! Files of antenna gains.
 
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
 use super::CalibrationError;
-use crate::units::MAX_SATELLITES;
+use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
 
 /// How gains go from one solution to the next.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -82,28 +82,23 @@ impl GainsFile {
 
     /// Everything that is wrong with the values; empty if they are good.
     #[must_use]
-    pub fn problems(&self) -> Vec<CalibrationError> {
-        let mut found = Problems(Vec::new());
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("");
         let tolerance_hz = self.frequency_tolerance_hz;
-        if !(tolerance_hz.is_finite() && tolerance_hz >= 0.0) {
-            found.add("frequency_tolerance_hz", tolerance_hz, "a finite number of at least 0");
-        }
-        if self.channels.is_empty() {
-            found.add("channels", "[]", "at least one channel");
-        }
+        let expected = "a finite number of at least 0";
+        checks.number("frequency_tolerance_hz", tolerance_hz, tolerance_hz >= 0.0, expected);
+        checks.require("channels", "[]", !self.channels.is_empty(), "at least one channel");
         let satellites = self.satellites();
         for (index, channel) in self.channels.iter().enumerate() {
             let key = format!("channels[{index}]");
             let frequency_hz = channel.frequency_hz;
-            if !(frequency_hz.is_finite() && frequency_hz > 0.0) {
-                found.add(&format!("{key}.frequency_hz"), frequency_hz, "a positive number");
-            }
-            if self.channels[..index].iter().any(|earlier| earlier.frequency_hz == frequency_hz) {
-                found.add(&format!("{key}.frequency_hz"), frequency_hz, "every frequency once");
-            }
-            channel.add_problems(&key, satellites, &mut found);
+            let frequency_key = format!("{key}.frequency_hz");
+            checks.number(&frequency_key, frequency_hz, frequency_hz > 0.0, "a positive number");
+            let is_new = self.channels[..index].iter().all(|earlier| earlier.frequency_hz != frequency_hz);
+            checks.require(&frequency_key, frequency_hz, is_new, "every frequency once");
+            channel.check(&key, satellites, &mut checks);
         }
-        found.0
+        checks.finish()
     }
 
     /// Number of satellites in the first solution; 0 if there is none.
@@ -115,34 +110,23 @@ impl GainsFile {
 }
 
 impl ChannelGains {
-    fn add_problems(&self, key: &str, satellites: usize, found: &mut Problems) {
-        if self.solutions.is_empty() {
-            found.add(&format!("{key}.solutions"), "[]", "at least one solution");
-        }
+    fn check(&self, key: &str, satellites: usize, checks: &mut Checks) {
+        let some = !self.solutions.is_empty();
+        checks.require(format!("{key}.solutions"), "[]", some, "at least one solution");
         let mut before_s = f64::NEG_INFINITY;
         for (index, solution) in self.solutions.iter().enumerate() {
             let key = format!("{key}.solutions[{index}]");
             let time_s = solution.time_s;
-            if !(time_s.is_finite() && time_s > before_s) {
-                found.add(&format!("{key}.time_s"), time_s, "a finite time after the one before");
-            }
+            let expected = "a finite time after the one before";
+            checks.number(format!("{key}.time_s"), time_s, time_s > before_s, expected);
             before_s = before_s.max(time_s);
             let count = solution.gains.len();
-            if !(2..=MAX_SATELLITES).contains(&count) {
-                found.add(&format!("{key}.gains"), format!("({count} satellites)"), "2 to 64 satellites");
-            } else if count != satellites {
-                let expected = "as many satellites as in the first solution";
-                found.add(&format!("{key}.gains"), format!("({count} satellites)"), expected);
-            }
+            let (gains_key, found) = (format!("{key}.gains"), format!("({count} satellites)"));
+            let some = (2..=MAX_SATELLITES).contains(&count);
+            checks.require(&gains_key, &found, some, "2 to 64 satellites");
+            let same = !some || count == satellites;
+            checks.require(&gains_key, &found, same, "as many satellites as in the first solution");
         }
-    }
-}
-
-struct Problems(Vec<CalibrationError>);
-
-impl Problems {
-    fn add(&mut self, key: &str, value: impl ToString, expected: &'static str) {
-        self.0.push(CalibrationError::Parameter { key: key.to_owned(), value: value.to_string(), expected });
     }
 }
 
@@ -196,15 +180,8 @@ mod tests {
             [[channels]]\nfrequency_hz = 1e7\nsolutions = []\n\
             [[channels]]\nfrequency_hz = nan\n\
             solutions = [{ time_s = inf, gains = [[1, 0], [1, 0], [1, 0]] }]";
-        let keys: Vec<String> = read("a.toml", text)
-            .unwrap()
-            .problems()
-            .into_iter()
-            .map(|problem| match problem {
-                CalibrationError::Parameter { key, .. } => key,
-                other => panic!("{other}"),
-            })
-            .collect();
+        let keys: Vec<String> =
+            read("a.toml", text).unwrap().problems().into_iter().map(|problem| problem.key).collect();
         let expected = [
             "frequency_tolerance_hz",
             "channels[0].solutions[1].time_s",

@@ -19,11 +19,11 @@ pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 pub use gains::AntennaGains;
 pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation};
-pub use stage::{Calibrator, CalibratorState, DUPLICATE};
+pub use stage::{Calibrator, CalibratorState};
 pub use sub_bands::SubBands;
 pub use van_vleck::{QuantiserBitsError, VanVleck};
 
-use crate::frames::{Instrument, PlacedVisibilities};
+use crate::frames::{Instrument, PlacedVisibilities, VisibilityReason};
 
 /// Corrects visibilities in place.
 pub trait Calibration: Send {
@@ -60,8 +60,8 @@ pub struct CalibrationReport {
 impl CalibrationReport {
     /// Reason and number of those taken out, for a ledger; zeros included.
     #[must_use]
-    pub fn removed(&self) -> [(&'static str, usize); 1] {
-        [("unusable gain", self.unusable_gain)]
+    pub fn removed(&self) -> [(VisibilityReason, usize); 1] {
+        [(VisibilityReason::UnusableGain, self.unusable_gain)]
     }
 }
 

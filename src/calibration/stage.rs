@@ -8,10 +8,10 @@ use num_complex::Complex64;
 
 use super::autos::{AUTOS_MAX, AutoTable};
 use super::{Calibration, CalibrationError, VanVleck};
-use crate::array::{Ephemeris, FlaggedCounts};
+use crate::array::Ephemeris;
 use crate::frames::{
     AutoPower, Channel, EphemerisSegment, GroundFrame, Housekeeping, Instrument, PlacedFrame,
-    PlacedVisibilities, VisibilityBlock,
+    PlacedVisibilities, VisibilityBlock, VisibilityReason,
 };
 use crate::runtime::{Ledger, Outlet, Stage, Units};
 use crate::units::{ChannelId, MissionTime, Pair};
@@ -19,9 +19,6 @@ use crate::units::{ChannelId, MissionTime, Pair};
 /// Identity of a block of visibilities, the beginning of its first integration in it: every one is used once,
 /// however often it arrives.
 type BlockKey = (ChannelId, Pair, MissionTime);
-
-/// Reason under which a block that has been used already is flagged.
-pub const DUPLICATE: &str = "duplicate";
 
 /// Greatest number of the spacecraft's reports that are kept.
 const REPORTS_MAX: usize = 1 << 16;
@@ -54,7 +51,7 @@ pub struct Calibrator {
     autos: Option<Arc<Mutex<Vec<AutoPower>>>>,
     powers: AutoTable,
     calibration: Box<dyn Calibration>,
-    ledger: Ledger,
+    ledger: Ledger<VisibilityReason>,
     ephemeris: Ephemeris,
     instrument: Option<Instrument>,
     seen: HashSet<BlockKey>,
@@ -67,7 +64,7 @@ pub struct Calibrator {
 impl Calibrator {
     /// A stage that posts to `ledger`.
     #[must_use]
-    pub fn new(calibration: Box<dyn Calibration>, ledger: Ledger) -> Self {
+    pub fn new(calibration: Box<dyn Calibration>, ledger: Ledger<VisibilityReason>) -> Self {
         Self {
             van_vleck: None,
             autos: None,
@@ -218,9 +215,11 @@ impl Calibrator {
     ) -> Result<Option<PlacedVisibilities>, CalibrationError> {
         let Some(channel) = self.prepare(&mut block) else { return Ok(None) };
         let good: Vec<usize> = (0..block.len()).filter(|&k| block.flags[k].is_good()).collect();
-        let mut flagged = FlaggedCounts::default();
-        block.flags.iter().for_each(|&flags| flagged.add(flags));
-        self.post_flagged(&flagged);
+        let mut flagged = BTreeMap::new();
+        for reason in block.flags.iter().filter_map(|flags| flags.reason()) {
+            *flagged.entry(reason).or_default() += 1;
+        }
+        self.post_flagged(flagged);
         let mut placed = PlacedVisibilities {
             channel: block.channel,
             band: 0,
@@ -243,13 +242,13 @@ impl Calibrator {
 
     fn keep_powers(&mut self, placed: &PlacedVisibilities) {
         if self.autos.is_none() {
-            self.ledger.flagged("auto-correlation", placed.len() as u64);
+            self.ledger.left_out(VisibilityReason::Auto, placed.len() as u64);
             return;
         }
         let account = self.powers.take(placed, AUTOS_MAX);
         self.ledger.accumulated(account.kept);
-        self.ledger.flagged("auto-correlation beyond the table", account.beyond);
-        self.ledger.flagged("auto-correlation of an integration that has one", account.twice);
+        self.ledger.left_out(VisibilityReason::AutoTableFull, account.beyond);
+        self.ledger.left_out(VisibilityReason::AutoRepeated, account.twice);
     }
 
     fn visibilities(
@@ -261,7 +260,7 @@ impl Calibrator {
         let Some(key) = key_of(&block) else { return Ok(()) };
         if !self.seen.insert(key) {
             self.ledger.sampled(count);
-            self.ledger.flagged(DUPLICATE, count);
+            self.ledger.left_out(VisibilityReason::Duplicate, count);
             return Ok(());
         }
         *self.received.entry(block.start.0).or_default() += count;
@@ -283,7 +282,7 @@ impl Calibrator {
     fn prepare(&self, block: &mut VisibilityBlock) -> Option<Channel> {
         let channel = self.instrument.as_ref().and_then(|i| i.channel_of(block.channel, block.pair));
         let Some(channel) = channel else {
-            self.ledger.flagged("no instrument description", block.len() as u64);
+            self.ledger.left_out(VisibilityReason::NoInstrument, block.len() as u64);
             return None;
         };
         // A spectrum is not quantised with the samples.
@@ -299,8 +298,8 @@ impl Calibrator {
     fn place(&mut self, mut block: VisibilityBlock) -> Result<Option<PlacedVisibilities>, CalibrationError> {
         let Some(channel) = self.prepare(&mut block) else { return Ok(None) };
         let (mut placed, placing) = self.ephemeris.place(&block, channel.frequency_hz);
-        self.ledger.flagged("no ephemeris", placing.without_ephemeris);
-        self.post_flagged(&placing.flagged);
+        self.ledger.left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
+        self.post_flagged(placing.flagged);
         self.calibrate(&mut placed)?;
         Ok(Some(placed))
     }
@@ -308,17 +307,15 @@ impl Calibrator {
     fn calibrate(&mut self, placed: &mut PlacedVisibilities) -> Result<(), CalibrationError> {
         let calibrated = self.calibration.apply(placed)?;
         for (reason, count) in calibrated.removed() {
-            self.ledger.flagged(reason, count as u64);
+            self.ledger.left_out(reason, count as u64);
         }
         Ok(())
     }
 
-    fn post_flagged(&self, flagged: &FlaggedCounts) {
-        self.ledger.flagged("interference", flagged.interference);
-        self.ledger.flagged("incomplete integration", flagged.incomplete);
-        self.ledger.flagged("saturated receiver", flagged.saturated);
-        self.ledger.flagged("uncalibrated", flagged.uncalibrated);
-        self.ledger.flagged("unknown flag", flagged.other);
+    fn post_flagged(&self, flagged: BTreeMap<VisibilityReason, u64>) {
+        for (reason, count) in flagged {
+            self.ledger.left_out(reason, count);
+        }
     }
 }
 
@@ -369,8 +366,8 @@ impl Stage for Calibrator {
         let counted: u64 = self.received.range(..report.time.0).map(|(_, count)| count).sum();
         let missing = report.sampled.saturating_sub(report.dropped).saturating_sub(counted);
         self.ledger.sampled(counted + missing + report.dropped + (all - counted));
-        self.ledger.lost("store", "full", report.dropped);
-        self.ledger.lost("downlink", "not received", missing);
+        self.ledger.left_out(VisibilityReason::StoreFull, report.dropped);
+        self.ledger.left_out(VisibilityReason::NotReceived, missing);
         Ok(())
     }
 

@@ -1,7 +1,7 @@
 //! Sub-bands of a channel, as one channel.
 
 use super::{Calibration, CalibrationError, CalibrationReport};
-use crate::array::stretched;
+use crate::array::scaled_baseline;
 use crate::frames::{Channel, Instrument, PlacedVisibilities};
 use crate::units::ChannelId;
 
@@ -63,7 +63,7 @@ impl Calibration for SubBands {
         };
         let factor = block.frequency_hz / channel.frequency_hz;
         for (r_i_m, r_j_m) in block.r_i_m.iter_mut().zip(&mut block.r_j_m) {
-            (*r_i_m, *r_j_m) = stretched(*r_i_m, *r_j_m, factor);
+            (*r_i_m, *r_j_m) = scaled_baseline(*r_i_m, *r_j_m, factor);
         }
         block.band = block.channel.0 % self.count as u16;
         block.channel = ChannelId(index as u16);

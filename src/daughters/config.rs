@@ -1,7 +1,8 @@
 //! Configuration of sampling, of the daughters' instrumental errors and of their links.
 
 use serde::{Deserialize, Serialize};
-use thiserror::Error;
+
+use crate::units::{Checks, InvalidValue};
 
 /// Number of bits that means "not quantised": samples stay floats.
 pub const FLOAT_BITS: u32 = 32;
@@ -81,40 +82,23 @@ impl Default for DaughtersConfig {
     }
 }
 
-/// An invalid setting of the daughters.
-#[derive(Clone, Debug, Error, PartialEq)]
-#[error("daughters.{key} = {value}: expected {expected}")]
-pub struct DaughtersError {
-    /// Key.
-    pub key: &'static str,
-    /// Value found.
-    pub value: f64,
-    /// What is accepted.
-    pub expected: &'static str,
-}
-
 impl DaughtersConfig {
     /// All problems of the section for an array of `satellites` and channels of the given width; empty if it is valid.
     #[must_use]
-    pub fn problems(&self, satellites: usize, channel_width_hz: f64) -> Vec<DaughtersError> {
-        let mut found = Vec::new();
-        let mut require = |key, value: f64, good: bool, expected| {
-            if !(good && value.is_finite()) {
-                found.push(DaughtersError { key, value, expected });
-            }
-        };
+    pub fn problems(&self, satellites: usize, channel_width_hz: f64) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("daughters");
         let bits = f64::from(self.bits);
-        require("bits", bits, [1, 2, 4, 8, FLOAT_BITS].contains(&self.bits), "1, 2, 4, 8 or 32");
+        checks.number("bits", bits, [1, 2, 4, 8, FLOAT_BITS].contains(&self.bits), "1, 2, 4, 8 or 32");
         let level = self.level_time_constant_s;
-        require("level_time_constant_s", level, (1e-3..=1e6).contains(&level), "0.001 s to 1e6 s");
+        checks.number("level_time_constant_s", level, (1e-3..=1e6).contains(&level), "0.001 s to 1e6 s");
         let block = self.block_samples;
         let fits = block.is_power_of_two() && (256..=65_536).contains(&block);
-        require("block_samples", block as f64, fits, "a power of two from 256 to 65536");
+        checks.number("block_samples", block as f64, fits, "a power of two from 256 to 65536");
         let rate = self.link_bits_per_s_max;
-        require("link_bits_per_s_max", rate, rate >= 0.0, "bit/s, or 0 for no limit");
+        checks.number("link_bits_per_s_max", rate, rate >= 0.0, "bit/s, or 0 for no limit");
         let buffer = self.link_buffer_bytes;
         let fits = (4096..=1 << 32).contains(&buffer);
-        require("link_buffer_bytes", buffer as f64, fits, "4096 bytes to 4 GiB");
+        checks.number("link_buffer_bytes", buffer as f64, fits, "4096 bytes to 4 GiB");
         let d = &self.disturbances;
         for (key, list) in [
             ("disturbances.gain_error", &d.gain_error),
@@ -125,30 +109,35 @@ impl DaughtersConfig {
             ("disturbances.clock_drift", &d.clock_drift),
         ] {
             let count = list.len();
-            require(key, count as f64, count == 0 || count == satellites, "no value, or one per daughter");
+            checks.number(
+                key,
+                count as f64,
+                count == 0 || count == satellites,
+                "no value, or one per daughter",
+            );
             for &value in list {
-                require(key, value, true, "finite numbers");
+                checks.number(key, value, true, "finite numbers");
             }
         }
         for (key, power) in [
             ("disturbances.interference_k_sr", d.interference_k_sr),
             ("disturbances.calibration_k_sr", d.calibration_k_sr),
         ] {
-            require(key, power, power >= 0.0, "K sr, not negative");
+            checks.number(key, power, power >= 0.0, "K sr, not negative");
         }
         let depth = d.interference_depth_m;
         let good = depth > 0.0 || d.interference_k_sr == 0.0;
-        require("disturbances.interference_depth_m", depth, good, "a positive length, m");
+        checks.number("disturbances.interference_depth_m", depth, good, "a positive length, m");
         for (key, offset_hz) in [
             ("disturbances.interference_offset_hz", d.interference_offset_hz),
             ("disturbances.calibration_offset_hz", d.calibration_offset_hz),
         ] {
             let inside = offset_hz.abs() <= 0.5 * channel_width_hz;
-            require(key, offset_hz, inside, "at most half of spacecraft.channel_width_hz either way");
+            checks.number(key, offset_hz, inside, "at most half of spacecraft.channel_width_hz either way");
         }
         let phase_rad = d.calibration_phase_rad;
-        require("disturbances.calibration_phase_rad", phase_rad, true, "a finite number");
-        found
+        checks.number("disturbances.calibration_phase_rad", phase_rad, true, "a finite number");
+        checks.finish()
     }
 
     /// Data rate of the samples of all daughters, bit/s: daughters x channels x width x 2 x bits.

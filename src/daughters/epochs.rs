@@ -1,7 +1,7 @@
 //! Interpolation over time: from the instants of a prediction to the epochs at which samples are drawn.
 
 use super::nodes::BandInterpolation;
-use crate::response::pixel::kernel::fused;
+use crate::units::arithmetic::fused;
 
 /// Number of epochs and of values that are interpolated together.
 pub(super) const EPOCHS: usize = 4;

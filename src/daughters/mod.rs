@@ -23,7 +23,7 @@ mod sampler;
 mod synthesis;
 mod tile;
 
-pub use config::{DaughtersConfig, DaughtersError, Disturbances, DropPolicy, FLOAT_BITS};
+pub use config::{DaughtersConfig, Disturbances, DropPolicy, FLOAT_BITS};
 pub use link::{LinkCounts, SampleLink};
 pub use repair::Repairs;
 pub(crate) use sampler::sample_ticks;

@@ -3,7 +3,7 @@
 use multiversion::multiversion;
 use rand::Rng;
 
-use crate::response::pixel::kernel::{cos_sin_turns, fused, polynomial};
+use crate::units::arithmetic::{cos_sin_turns, fused, polynomial};
 
 /// Deviates made at once.
 pub(super) const CHUNK: usize = 64;

@@ -3,7 +3,7 @@
 use multiversion::multiversion;
 
 use super::tile::{PIVOT_MIN, TILE, Tile, element};
-use crate::response::pixel::kernel::fused;
+use crate::units::arithmetic::fused;
 
 /// Smallest change of a correlation that is counted; smaller ones are rounding.
 const CHANGE_COUNTED: f32 = 1e-5;

@@ -1,14 +1,14 @@
-//! What can be chosen about the downlink.
+//! Configuration of the downlink.
 
 use serde::{Deserialize, Serialize};
 
-use super::error::DownlinkError;
 use super::link::LinkConfig;
 use super::transport::socket::ListenConfig;
 use super::wire::Format;
 use super::wire::cadu::{CaduEncoder, INTERLEAVES, ReedSolomon};
 use super::wire::payload::{VISIBILITY_BYTES, visibilities_in};
 use super::wire::{HEADER_BYTES, PACKET_BYTES_MAX, TRAILER_BYTES};
+use crate::units::{Checks, InvalidValue};
 
 /// Least packet that holds headers and more than one record of any kind.
 const PACKET_BYTES_MIN: usize = 256;
@@ -61,40 +61,18 @@ impl Default for DownlinkConfig {
 impl DownlinkConfig {
     /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
-    pub fn problems(&self) -> Vec<DownlinkError> {
-        let mut found = Vec::new();
-        if !(PACKET_BYTES_MIN..=PACKET_BYTES_MAX).contains(&self.packet_bytes_max) {
-            found.push(DownlinkError::Parameter {
-                key: "packet_bytes_max",
-                value: self.packet_bytes_max as u64,
-                expected: "256 to 65542",
-            });
-        }
-        if self.repeat_bytes < 1 << 16 {
-            found.push(DownlinkError::Parameter {
-                key: "repeat_bytes",
-                value: self.repeat_bytes,
-                expected: "at least 65536",
-            });
-        }
-        if !INTERLEAVES.contains(&self.interleave) {
-            found.push(DownlinkError::Parameter {
-                key: "interleave",
-                value: self.interleave as u64,
-                expected: "1, 2, 3, 4, 5 or 8",
-            });
-        }
-        if self.idle_frames > IDLE_FRAMES_MAX {
-            found.push(DownlinkError::Parameter {
-                key: "idle_frames",
-                value: u64::from(self.idle_frames),
-                expected: "at most 1000",
-            });
-        }
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("downlink");
+        let bytes = self.packet_bytes_max;
+        let good = (PACKET_BYTES_MIN..=PACKET_BYTES_MAX).contains(&bytes);
+        checks.require("packet_bytes_max", bytes, good, "256 to 65542");
+        checks.require("repeat_bytes", self.repeat_bytes, self.repeat_bytes >= 1 << 16, "at least 65536");
+        let interleave = self.interleave;
+        checks.require("interleave", interleave, INTERLEAVES.contains(&interleave), "1, 2, 3, 4, 5 or 8");
+        checks.require("idle_frames", self.idle_frames, self.idle_frames <= IDLE_FRAMES_MAX, "at most 1000");
         let rate = self.rate_bits_per_s_max;
-        if !(rate >= 0.0 && rate.is_finite()) {
-            found.push(DownlinkError::Rate { value: rate });
-        }
+        checks.number("rate_bits_per_s_max", rate, rate >= 0.0, "bits a second, or 0 for no limit");
+        let mut found = checks.finish();
         found.extend(self.link.problems(self.format));
         found
     }

@@ -6,21 +6,15 @@ use std::path::PathBuf;
 use thiserror::Error;
 
 use super::wire::payload::PayloadFault;
+use crate::units::InvalidValue;
 
 /// Why a downlink cannot be written or read.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum DownlinkError {
-    /// A configuration value outside its range.
-    #[error("downlink.{key} = {value}: expected {expected}")]
-    Parameter {
-        /// Key in the `[downlink]` section.
-        key: &'static str,
-        /// Value found.
-        value: u64,
-        /// Range that is accepted.
-        expected: &'static str,
-    },
+    /// A value of the configuration that is not accepted.
+    #[error(transparent)]
+    Invalid(#[from] InvalidValue),
     /// A frame was to be sent before the instrument description, which gives the time codes their epoch.
     #[error("a frame was to be sent before the instrument description; send that one first")]
     NoInstrument,
@@ -53,22 +47,6 @@ pub enum DownlinkError {
     Empty {
         /// The file.
         path: PathBuf,
-    },
-    /// A configuration value of the link outside its range.
-    #[error("downlink.link.{key} = {value}: expected {expected}")]
-    Link {
-        /// Key in the `[downlink.link]` section.
-        key: &'static str,
-        /// Value found.
-        value: f64,
-        /// Range that is accepted.
-        expected: &'static str,
-    },
-    /// A rate of the link that cannot be.
-    #[error("downlink.rate_bits_per_s_max = {value}: expected bits a second, or 0 for no limit")]
-    Rate {
-        /// Value found.
-        value: f64,
     },
     /// Packets of another mission among those of one.
     #[error(

@@ -5,7 +5,7 @@
 //! | layer | standard | here |
 //! |---|---|---|
 //! | payload: records and arrays | own, versioned | `payload` |
-//! | space packet, time code | CCSDS 133.0-B, 301.0-B | [`Packetizer`], [`Receiver`] |
+//! | space packet, time code | CCSDS 133.0-B, 301.0-B | [`Packetizer`], [`PacketReceiver`] |
 //! | transfer frame, Reed-Solomon, randomizer, sync marker | CCSDS 732.0-B, 131.0-B | [`cadu`] |
 //! | either of the two | | [`Intake`] |
 //! | every packet once, in order, across files and sessions | | [`crate::ground::Collector`] |
@@ -13,7 +13,7 @@
 //! | socket | | [`socket`] |
 //!
 //! The frame layer takes the bytes that [`Packetizer::encode`] appends and hands what it recovers to
-//! [`Receiver::push`]. Idle packets are its own affair and never reach the receiver.
+//! [`PacketReceiver::push`]. Idle packets are its own affair and never reach the receiver.
 //!
 //! # A packet
 //! | byte | field | |
@@ -52,15 +52,15 @@ pub mod wire;
 pub use config::DownlinkConfig;
 pub use error::DownlinkError;
 pub use link::LinkConfig;
-pub use receive::contents::{self, Contents};
+pub use receive::inspect::Contents;
 pub use receive::{
-    Decoder, DecoderState, Era, Event, FaultCounts, Intake, KindCounts, Packet, Receiver, ReceptionCounters,
-    Taken,
+    Decoder, DecoderState, Era, Event, FaultCounts, Intake, KindCounts, Packet, PacketReceiver,
+    ReceptionCounters, Taken,
 };
 pub use transport::{
     DownlinkReader, DownlinkWriter, FileSource, Pace, Paced, Recorder, Steps, Transmitter, socket,
 };
 pub use wire::{
     APID_BASE, CucTime, FORMAT_VERSION, Format, HEADER_BYTES, Kind, NODES_MIN, PACKET_BYTES_MAX,
-    PacketHeader, Packetizer, PayloadFault, Segment, TRAILER_BYTES, Transmission, cadu,
+    PacketHeader, PacketSegment, Packetizer, PayloadFault, TRAILER_BYTES, Transmission, cadu,
 };

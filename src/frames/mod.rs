@@ -4,18 +4,22 @@
 //! checked where the data enters (the configuration on the spacecraft, the decoder on the ground).
 
 mod ephemeris;
+mod flags;
 mod ground;
 mod housekeeping;
 mod instrument;
+mod reason;
 mod samples;
 mod visibility;
 
 pub use ephemeris::EphemerisSegment;
+pub use flags::Flags;
 pub use ground::PlacedFrame;
 pub use housekeeping::Housekeeping;
 pub use instrument::{AntennaResponse, Channel, Instrument, Spectrometer};
+pub use reason::{SampleReason, VisibilityReason};
 pub use samples::{SampleBlock, Samples, SpaceFrame};
-pub use visibility::{AutoPower, Flags, PlacedVisibilities, VisibilityBlock};
+pub use visibility::{AutoPower, PlacedVisibilities, VisibilityBlock};
 
 /// What the ground reads from a downlink, in the order in which it was sent.
 #[derive(Clone, Debug, PartialEq)]

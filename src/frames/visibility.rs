@@ -2,31 +2,9 @@
 
 use num_complex::{Complex32, Complex64};
 
+use super::Flags;
 use crate::units::vector::Vec3;
 use crate::units::{ChannelId, MissionTime, Pair};
-
-/// Why a visibility should not be used; a set of bits, 0 for a good one.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Flags(pub u8);
-
-impl Flags {
-    /// Nothing wrong.
-    pub const GOOD: Self = Self(0);
-    /// Radio interference.
-    pub const INTERFERENCE: Self = Self(1);
-    /// Samples were missing for part of the integration.
-    pub const INCOMPLETE: Self = Self(2);
-    /// A receiver saturated.
-    pub const SATURATED: Self = Self(4);
-    /// Calibration refused it.
-    pub const UNCALIBRATED: Self = Self(8);
-
-    /// Whether no bit is set.
-    #[must_use]
-    pub fn is_good(self) -> bool {
-        self.0 == 0
-    }
-}
 
 /// Consecutive integrations of one pair in one channel, as the mother makes them.
 ///

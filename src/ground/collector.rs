@@ -1,16 +1,15 @@
 //! Packets to frames, each once, across files and sessions.
 
 use std::collections::VecDeque;
-use std::fs::File;
 use std::path::Path;
 
 use bincode::{Decode, Encode};
 
 use super::hold_buffer::{Waiting, WaitingPacket};
-use crate::downlink::error::{DownlinkError, io_error, require_packets};
-use crate::downlink::receive::{Decoder, DecoderState, Event, Intake, ReceptionCounters, Taken};
+use crate::downlink::error::{DownlinkError, require_packets};
+use crate::downlink::receive::{ByteFeed, Decoder, DecoderState, Event, Intake, ReceptionCounters, Taken};
 use crate::downlink::wire::payload::visibilities_span;
-use crate::downlink::wire::{CucTime, Kind, PacketHeader, Segment};
+use crate::downlink::wire::{CucTime, Kind, PacketHeader, PacketSegment};
 use crate::frames::{GroundFrame, Instrument, VisibilityBlock};
 use crate::units::MissionTime;
 
@@ -87,7 +86,7 @@ impl Collector {
     #[must_use]
     pub fn new(wait_bytes: u64) -> Self {
         Self {
-            intake: Intake::unjudged(),
+            intake: Intake::unfiltered(),
             taken: Default::default(),
             waiting: Waiting::new(wait_bytes),
             decoder: Decoder::new(),
@@ -205,17 +204,10 @@ impl Collector {
     /// # Errors
     /// A file that cannot be read, is empty, or does not hold a packet of ours.
     pub fn read_file(&mut self, path: &Path, take: &mut dyn FnMut(Delivery)) -> Result<(), DownlinkError> {
-        let mut file = File::open(path).map_err(io_error(path, "open the file"))?;
-        loop {
-            let read = self.intake.fill_from(&mut file).map_err(io_error(path, "read"))?;
-            if read == 0 {
-                self.finish();
-            }
+        let mut file = ByteFeed::open(path)?;
+        while file.feed(&mut self.intake)? {
             while let Some(found) = self.next_delivery(&|_| true)? {
                 take(found);
-            }
-            if read == 0 {
-                break;
             }
         }
         while let Some(found) = self.next_waiting() {
@@ -392,7 +384,7 @@ impl Collector {
         };
         let (offset, header) = (packet.offset, packet.header);
         let describes = header.kind == Kind::Instrument;
-        if describes && header.segment == Segment::Whole && self.decoder.contradicts(packet.payload) {
+        if describes && header.segment == PacketSegment::Whole && self.decoder.contradicts(packet.payload) {
             return Err(DownlinkError::OtherInstrument { offset });
         }
         if !self.taken[header.kind.index()].take(header.count, header.time) {

@@ -6,7 +6,7 @@ use bincode::{Decode, Encode};
 
 use crate::downlink::receive::{Event, Packet};
 use crate::downlink::wire::payload::visibilities_span;
-use crate::downlink::wire::{COUNT_MAX, CucTime, Kind, PACKET_BYTES_MAX, PacketHeader, Segment};
+use crate::downlink::wire::{COUNT_MAX, CucTime, Kind, PACKET_BYTES_MAX, PacketHeader, PacketSegment};
 use crate::units::MissionTime;
 
 /// Memory that a packet takes while it waits, beyond its bytes.
@@ -170,9 +170,9 @@ impl Waiting {
         let PacketHeader { kind, time, count, segment, .. } = *header;
         let at = |count: u64| self.others.get(&(kind, (time, count))).map(|packet| packet.header);
         let mut last = (segment, count);
-        while !matches!(last.0, Segment::Last | Segment::Whole) {
+        while !matches!(last.0, PacketSegment::Last | PacketSegment::Whole) {
             let next = at(last.1 + 1)?;
-            if !matches!(next.segment, Segment::Continuation | Segment::Last)
+            if !matches!(next.segment, PacketSegment::Continuation | PacketSegment::Last)
                 || next.count - count > SEGMENTS_MAX as u64
             {
                 return None;
@@ -180,9 +180,9 @@ impl Waiting {
             last = (next.segment, next.count);
         }
         let mut first = (segment, count);
-        while !matches!(first.0, Segment::First | Segment::Whole) {
+        while !matches!(first.0, PacketSegment::First | PacketSegment::Whole) {
             let before = at(first.1.checked_sub(1)?)?;
-            if !matches!(before.segment, Segment::Continuation | Segment::First)
+            if !matches!(before.segment, PacketSegment::Continuation | PacketSegment::First)
                 || count - before.count > SEGMENTS_MAX as u64
             {
                 return None;
@@ -223,7 +223,7 @@ mod tests {
     fn packet(count: u64) -> WaitingPacket {
         let header = PacketHeader {
             kind: Kind::Visibilities,
-            segment: Segment::Whole,
+            segment: PacketSegment::Whole,
             count,
             time: CucTime(count / 3),
             version: FORMAT_VERSION,
@@ -289,16 +289,16 @@ mod tests {
 
     #[test]
     fn payloads_are_put_together_whatever_the_order() {
-        let segment = |count: u64, segment: Segment| {
+        let segment = |count: u64, segment: PacketSegment| {
             let header =
                 PacketHeader { kind: Kind::Ephemeris, segment, time: CucTime(7), ..packet(count).header };
             WaitingPacket { header, payload: vec![count as u8], check: 0 }
         };
         let all = [
-            segment(3, Segment::First),
-            segment(4, Segment::Continuation),
-            segment(5, Segment::Last),
-            segment(6, Segment::Whole),
+            segment(3, PacketSegment::First),
+            segment(4, PacketSegment::Continuation),
+            segment(5, PacketSegment::Last),
+            segment(6, PacketSegment::Whole),
         ];
         for order in [[0, 1, 2], [2, 1, 0], [1, 0, 2], [2, 0, 1]] {
             let mut waiting = Waiting::new(0);

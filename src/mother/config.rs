@@ -9,8 +9,8 @@ use super::schedule::Schedule;
 use crate::array::{Array, IntegrationRule};
 use crate::frames::{AntennaResponse, Channel};
 use crate::response::model::ModelChoice;
-use crate::units::PerChannel;
 use crate::units::constants::YEAR_S;
+use crate::units::{Checks, InvalidValue, PerChannel};
 
 /// Maximum number of channels, which is the mission's.
 pub const CHANNELS_MAX: usize = 30;
@@ -164,100 +164,18 @@ impl Default for SpacecraftConfig {
     }
 }
 
-/// A setting of the spacecraft that cannot be.
-#[derive(Clone, Debug, Error, PartialEq)]
-#[non_exhaustive]
-pub enum SpacecraftError {
-    /// A frequency outside the band.
-    #[error("spacecraft.channels_hz[{index}] = {value} Hz: expected {} Hz to {} Hz", BAND_HZ[0], BAND_HZ[1])]
-    Frequency {
-        /// Place in the list.
-        index: usize,
-        /// Value found, Hz.
-        value: f64,
-    },
-    /// A channel that leaves the band.
-    #[error(
-        "spacecraft.channels_hz[{index}] = {value} Hz: a channel of channel_width_hz = {width_hz} Hz about it reaches below \
-         zero, or its sub-bands out of {} Hz to {} Hz; expected all of it within", BAND_HZ[0], BAND_HZ[1]
-    )]
-    Edge {
-        /// Place in the list.
-        index: usize,
-        /// Value found.
-        value: f64,
-        /// Width, Hz.
-        width_hz: f64,
-    },
-    /// Two channels that overlap.
-    #[error(
-        "spacecraft.channels_hz[{first}] and [{second}] are {distance_hz} Hz apart: expected at least \
-         channel_width_hz, and 1 kHz"
-    )]
-    Overlap {
-        /// Place of one in the list.
-        first: usize,
-        /// Place of the other.
-        second: usize,
-        /// Distance, Hz.
-        distance_hz: f64,
-    },
-    /// No or too many channels.
-    #[error("spacecraft.channels_hz has {0} channels: expected 1 to {CHANNELS_MAX}")]
-    ChannelCount(usize),
-    /// A list by channel of the wrong length.
-    #[error("spacecraft.{key}: expected one value, or one for each of the {channels} channels")]
-    PerChannel {
-        /// Key.
-        key: &'static str,
-        /// Number of channels.
-        channels: usize,
-    },
-    /// Sub-bands of visibilities that were never samples.
-    #[error(
-        "spacecraft.sub_bands and spacecraft.delay_centre_deg are of samples: expected 1 and [] with \
-         spacecraft.fidelity = \"visibilities\", which are of one frequency, or averages over the whole channel"
-    )]
-    Division,
-    /// Integrations shorter than the shortest sum of the correlator.
-    #[error(
-        "spacecraft.motion_wavelengths_max and spacecraft.integration_s_max leave integrations of {shortest_s:.3e} s, but \
-         the correlator sums {dump_s:.3e} s at once: expected longer ones, or baselines kept short by \
-         spacecraft.baseline_wavelengths_max"
-    )]
-    Dump {
-        /// The shortest integration, s.
-        shortest_s: f64,
-        /// The shortest sum, s.
-        dump_s: f64,
-    },
-    /// A direction that cannot be.
-    #[error(
-        "spacecraft.delay_centre_deg = {0:?}: expected ecliptic longitude and latitude, -90 to 90 degrees, or []"
-    )]
-    DelayCentre(Vec<f64>),
-    /// Averages asked of direct sums.
-    #[error(
-        "spacecraft.smear_integrations: direct sums are of instants; expected spacecraft.model = \"harmonic\" or \
-         \"auto\" with it"
-    )]
-    Smearing,
-    /// Samples asked of a model that they do not have.
-    #[error(
-        "spacecraft.fidelity = \"samples\" takes direct sums of instants: expected spacecraft.model = \"auto\" or \
-         \"direct\", and spacecraft.smear_integrations = false; smear_bandwidth = false too, as samples are of the whole channel"
-    )]
-    SamplesModel,
-    /// A parameter outside its range.
-    #[error("spacecraft.{key} = {value}: expected {expected}")]
-    Parameter {
-        /// Key.
-        key: &'static str,
-        /// Value found.
-        value: f64,
-        /// Range that is accepted.
-        expected: &'static str,
-    },
+/// Integrations that are shorter than the shortest sum of the correlator.
+#[derive(Clone, Copy, Debug, Error, PartialEq)]
+#[error(
+    "spacecraft.motion_wavelengths_max and spacecraft.integration_s_max leave integrations of {shortest_s:.3e} s, but \
+     the correlator sums {dump_s:.3e} s at once: expected longer ones, or baselines kept short by \
+     spacecraft.baseline_wavelengths_max"
+)]
+pub struct IntegrationTooShort {
+    /// The shortest integration, s.
+    pub shortest_s: f64,
+    /// The shortest sum, s.
+    pub dump_s: f64,
 }
 
 impl SpacecraftConfig {
@@ -287,15 +205,15 @@ impl SpacecraftConfig {
         self.channels_hz.iter().enumerate().map(schedule).collect()
     }
 
-    /// What is wrong with integrations of samples in an array, which are whole sums of the correlator.
+    /// Integrations of samples in an array that are shorter than one sum of the correlator.
     #[must_use]
-    pub fn dump_problem(&self, array: &Array) -> Option<SpacecraftError> {
+    pub fn dump_problem(&self, array: &Array) -> Option<IntegrationTooShort> {
         let schedules = self.schedules();
         let shortest_s = shortest_integration_s(array, &schedules);
         let width_hz = self.channel_width_hz;
         let dump_s = dump_samples(array, &schedules, width_hz, self.sub_bands) as f64 / width_hz;
         let short = self.fidelity == Fidelity::Samples && shortest_s < dump_s;
-        short.then_some(SpacecraftError::Dump { shortest_s, dump_s })
+        short.then_some(IntegrationTooShort { shortest_s, dump_s })
     }
 
     /// The delay centre and the sub-bands of sample fidelity.
@@ -312,9 +230,72 @@ impl SpacecraftConfig {
         Division { sub_bands: self.sub_bands.max(1), delay_centre }
     }
 
-    /// What is wrong with delays and sub-bands.
-    fn division_problems(&self) -> Vec<SpacecraftError> {
-        let mut found = Vec::new();
+    /// Checks channels, and lists by channel.
+    fn check_channels(&self, checks: &mut Checks) {
+        let channels = self.channels_hz.len();
+        let count = format!("({channels} channels)");
+        let expected = format!("1 to {CHANNELS_MAX} channels");
+        checks.require("channels_hz", count, (1..=CHANNELS_MAX).contains(&channels), expected);
+        let [low_hz, high_hz] = BAND_HZ;
+        for (index, &value) in self.channels_hz.iter().enumerate() {
+            let key = format!("channels_hz[{index}]");
+            let inside = (low_hz..=high_hz).contains(&value);
+            checks.require(&key, value, inside, format!("{low_hz} Hz to {high_hz} Hz"));
+            let half_hz = 0.5 * self.channel_width_hz;
+            // Sub-bands are channels of the downlink, which has them within the band; others only must not reach zero.
+            let out = value - half_hz < low_hz || value + half_hz > high_hz;
+            let reaches_zero = half_hz >= value;
+            let fits = !reaches_zero && !(self.sub_bands > 1 && out);
+            let expected = format!(
+                "a channel of channel_width_hz = {} Hz that stays above zero, and with sub-bands within {low_hz} Hz to \
+                 {high_hz} Hz",
+                self.channel_width_hz
+            );
+            checks.require(&key, value, fits, expected);
+        }
+        for (second, &high) in self.channels_hz.iter().enumerate() {
+            for (first, &low) in self.channels_hz[..second].iter().enumerate() {
+                let distance_hz = (high - low).abs();
+                let apart = distance_hz >= self.channel_width_hz.max(1e3);
+                let expected =
+                    format!("at least channel_width_hz, and 1 kHz, from channels_hz[{first}] = {low}");
+                checks.require(format!("channels_hz[{second}]"), high, apart, expected);
+            }
+        }
+        for (key, values, fits) in [
+            (
+                "every_nth_integration",
+                self.every_nth_integration.values().len(),
+                self.every_nth_integration.fits(channels),
+            ),
+            (
+                "baseline_wavelengths_max",
+                self.baseline_wavelengths_max.values().len(),
+                self.baseline_wavelengths_max.fits(channels),
+            ),
+        ] {
+            let expected = format!("one value, or one for each of the {channels} channels");
+            checks.require(key, format!("({values} values)"), fits, expected);
+        }
+    }
+
+    /// Checks what is simulated and how, with delays and sub-bands.
+    fn check_fidelity(&self, checks: &mut Checks) {
+        let samples = self.fidelity == Fidelity::Samples;
+        let direct = self.model != ModelChoice::Harmonic && !self.smear_integrations && !self.smear_bandwidth;
+        checks.require(
+            "fidelity",
+            "\"samples\"",
+            !samples || direct,
+            "spacecraft.model = \"auto\" or \"direct\", and spacecraft.smear_integrations = false, as samples are direct \
+             sums of instants; smear_bandwidth = false too, as they are of the whole channel",
+        );
+        checks.require(
+            "smear_integrations",
+            true,
+            !(self.smear_integrations && self.model == ModelChoice::Direct),
+            "spacecraft.model = \"harmonic\" or \"auto\" with it, as direct sums are of instants",
+        );
         let good = match self.delay_centre_deg[..] {
             [] => true,
             [longitude_deg, latitude_deg] => {
@@ -322,23 +303,17 @@ impl SpacecraftConfig {
             }
             _ => false,
         };
-        if !good {
-            found.push(SpacecraftError::DelayCentre(self.delay_centre_deg.clone()));
-        }
-        let divided = self.sub_bands != 1 || !self.delay_centre_deg.is_empty();
-        if divided && self.fidelity == Fidelity::Visibilities {
-            found.push(SpacecraftError::Division);
-        }
-        for (index, &value) in self.channels_hz.iter().enumerate() {
-            let half_hz = 0.5 * self.channel_width_hz;
-            // Sub-bands are channels of the downlink, which has them within the band; others only must not reach zero.
-            let out = value - half_hz < BAND_HZ[0] || value + half_hz > BAND_HZ[1];
-            if half_hz >= value || (self.sub_bands > 1 && out) {
-                let width_hz = self.channel_width_hz;
-                found.push(SpacecraftError::Edge { index, value, width_hz });
-            }
-        }
-        found
+        let centre = format!("{:?}", self.delay_centre_deg);
+        let expected = "ecliptic longitude and latitude, -90 to 90 degrees, or []";
+        checks.require("delay_centre_deg", &centre, good, expected);
+        let bands = self.sub_bands;
+        let expected =
+            "with fidelity = \"visibilities\", which are of one frequency or averages over the whole channel";
+        checks.require("sub_bands", bands, samples || bands == 1, format!("1 {expected}"));
+        let whole = samples || self.delay_centre_deg.is_empty();
+        checks.require("delay_centre_deg", centre, whole, format!("[] {expected}"));
+        let noisy = self.thermal_noise || !samples;
+        checks.require("thermal_noise", false, noisy, "true with fidelity = \"samples\": samples are noise");
     }
 
     /// The rule of the adaptive integration.
@@ -352,83 +327,60 @@ impl SpacecraftConfig {
 
     /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
-    pub fn problems(&self) -> Vec<SpacecraftError> {
-        let mut found = Vec::new();
-        let channels = self.channels_hz.len();
-        if channels == 0 || channels > CHANNELS_MAX {
-            found.push(SpacecraftError::ChannelCount(channels));
-        }
-        for (index, &value) in self.channels_hz.iter().enumerate() {
-            if !(BAND_HZ[0]..=BAND_HZ[1]).contains(&value) {
-                found.push(SpacecraftError::Frequency { index, value });
-            }
-        }
-        for (second, &high) in self.channels_hz.iter().enumerate() {
-            for (first, &low) in self.channels_hz[..second].iter().enumerate() {
-                let distance_hz = (high - low).abs();
-                if distance_hz < self.channel_width_hz.max(1e3) {
-                    found.push(SpacecraftError::Overlap { first, second, distance_hz });
-                }
-            }
-        }
-        for (key, fits) in [
-            ("every_nth_integration", self.every_nth_integration.fits(channels)),
-            ("baseline_wavelengths_max", self.baseline_wavelengths_max.fits(channels)),
-        ] {
-            if !fits {
-                found.push(SpacecraftError::PerChannel { key, channels });
-            }
-        }
-        let direct = self.model != ModelChoice::Harmonic && !self.smear_integrations && !self.smear_bandwidth;
-        if self.fidelity == Fidelity::Samples && !direct {
-            found.push(SpacecraftError::SamplesModel);
-        }
-        if self.smear_integrations && self.model == ModelChoice::Direct {
-            found.push(SpacecraftError::Smearing);
-        }
-        found.extend(self.division_problems());
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("spacecraft");
+        self.check_channels(&mut checks);
+        self.check_fidelity(&mut checks);
+        self.check_numbers(&mut checks);
+        let mut found = checks.finish();
         found.extend(self.ninth.problems());
-        let mut require = |key, value: f64, good: bool, expected| {
-            if !(good && value.is_finite()) {
-                found.push(SpacecraftError::Parameter { key, value, expected });
-            }
-        };
+        found
+    }
+
+    fn check_numbers(&self, checks: &mut Checks) {
         let seconds = self.duration_s;
-        require("duration_s", seconds, seconds > 0.0 && seconds <= 1e9, "seconds, above 0 and at most 1e9");
+        checks.number(
+            "duration_s",
+            seconds,
+            seconds > 0.0 && seconds <= 1e9,
+            "seconds, above 0 and at most 1e9",
+        );
         let window = self.window_s_max;
-        require("window_s_max", window, window >= 0.0, "seconds, or 0 for all of a window");
+        checks.number("window_s_max", window, window >= 0.0, "seconds, or 0 for all of a window");
         let width = self.channel_width_hz;
-        require("channel_width_hz", width, width > 0.0 && width <= 1e6, "above 0 Hz and at most 1 MHz");
+        checks.number("channel_width_hz", width, width > 0.0 && width <= 1e6, "above 0 Hz and at most 1 MHz");
         let moving = self.fidelity == Fidelity::Visibilities || width >= SAMPLES_WIDTH_HZ_MIN;
-        require("channel_width_hz", width, moving, "at least 500 Hz with fidelity = \"samples\"");
+        checks.number("channel_width_hz", width, moving, "at least 500 Hz with fidelity = \"samples\"");
         let longest = self.integration_s_max;
-        require("integration_s_max", longest, (1e-3..=1000.0).contains(&longest), "0.001 s to 1000 s");
+        checks.number("integration_s_max", longest, (1e-3..=1000.0).contains(&longest), "0.001 s to 1000 s");
         let motion = self.motion_wavelengths_max;
-        require("motion_wavelengths_max", motion, (1e-3..=1.0).contains(&motion), "0.001 to 1");
+        checks.number("motion_wavelengths_max", motion, (1e-3..=1.0).contains(&motion), "0.001 to 1");
         let store = self.store_bytes_max;
-        require("store_bytes_max", store as f64, store >= 1 << 20, "at least 1 MiB (1048576)");
+        checks.number("store_bytes_max", store as f64, store >= 1 << 20, "at least 1 MiB (1048576)");
         let bands = self.sub_bands;
         let good = bands.is_power_of_two() && bands <= SUB_BANDS_MAX;
-        require("sub_bands", bands as f64, good, "a power of two from 1 to 64");
+        checks.number("sub_bands", bands as f64, good, "a power of two from 1 to 64");
         let autos = self.auto_integration_s;
         let good = autos == 0.0 || (1e-3..=1000.0).contains(&autos);
-        require("auto_integration_s", autos, good, "0.001 s to 1000 s, or 0 for none");
+        checks.number("auto_integration_s", autos, good, "0.001 s to 1000 s, or 0 for none");
         let wait = self.wait_blocks;
-        require("wait_blocks", wait as f64, (1..=1024).contains(&wait), "1 to 1024 blocks");
-        let noisy = self.thermal_noise || self.fidelity == Fidelity::Visibilities;
-        require("thermal_noise", 0.0, noisy, "true with fidelity = \"samples\": samples are noise");
+        checks.number("wait_blocks", wait as f64, (1..=1024).contains(&wait), "1 to 1024 blocks");
         let noise = self.receiver_noise_k_sr;
-        require("receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
-        require("every_nth_window", self.every_nth_window as f64, self.every_nth_window >= 1, "at least 1");
+        checks.number("receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
+        checks.number(
+            "every_nth_window",
+            self.every_nth_window as f64,
+            self.every_nth_window >= 1,
+            "at least 1",
+        );
         for &nth in self.every_nth_integration.values() {
-            require("every_nth_integration", nth as f64, nth >= 1, "at least 1");
+            checks.number("every_nth_integration", nth as f64, nth >= 1, "at least 1");
         }
         for &limit in self.baseline_wavelengths_max.values() {
-            require("baseline_wavelengths_max", limit, limit >= 0.0, "wavelengths, or 0 for no limit");
+            checks.number("baseline_wavelengths_max", limit, limit >= 0.0, "wavelengths, or 0 for no limit");
         }
         let epoch = self.epoch_tai_s;
         // Four octets of whole seconds are what the time code holds.
-        require("epoch_tai_s", epoch, (0.0..=3.0e9).contains(&epoch), "0 to 3e9 s");
-        found
+        checks.number("epoch_tai_s", epoch, (0.0..=3.0e9).contains(&epoch), "0 to 3e9 s");
     }
 }

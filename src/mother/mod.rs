@@ -19,7 +19,8 @@ mod schedule;
 mod store;
 
 pub use config::{
-    Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, SpacecraftConfig, SpacecraftError, StoreDrop, VISIBILITY_BYTES,
+    Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, IntegrationTooShort, SpacecraftConfig, StoreDrop,
+    VISIBILITY_BYTES,
 };
 pub use integrator::{Integrator, MeasurementOptions, NoiseModel};
 pub use ninth::{NINTH_BAND_HZ, Ninth, NinthConfig, NinthSetup, NinthSky};

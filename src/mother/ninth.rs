@@ -6,12 +6,12 @@ use num_complex::Complex32;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::config::{SpacecraftError, VISIBILITY_BYTES};
+use super::config::VISIBILITY_BYTES;
 use crate::array::Array;
 use crate::frames::{Flags, GroundFrame, Housekeeping, ObservingWindow, Spectrometer, VisibilityBlock};
 use crate::response::model::{DaughterPosition, DirectSum, ModelError, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
-use crate::units::{ChannelId, Pair, StreamKind, TICKS_PER_SECOND, random_stream};
+use crate::units::{ChannelId, Checks, InvalidValue, Pair, StreamKind, TICKS_PER_SECOND, random_stream};
 
 /// Lowest and highest frequency that a ninth daughter may observe, Hz.
 pub const NINTH_BAND_HZ: [f64; 2] = [30e6, 120e6];
@@ -66,34 +66,34 @@ impl NinthConfig {
 
     /// All problems of the section; empty if it is valid.
     #[must_use]
-    pub fn problems(&self) -> Vec<SpacecraftError> {
-        let mut found = Vec::new();
-        let mut require = |key, value: f64, good: bool, expected| {
-            if !(good && value.is_finite()) {
-                found.push(SpacecraftError::Parameter { key, value, expected });
-            }
-        };
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("spacecraft");
         let [low_hz, high_hz] = self.band_hz;
         let inside = NINTH_BAND_HZ[0] <= low_hz && low_hz < high_hz && high_hz <= NINTH_BAND_HZ[1];
-        require("ninth.band_hz", high_hz, inside, "two frequencies, rising, from 30e6 to 120e6 Hz");
+        checks.number("ninth.band_hz", high_hz, inside, "two frequencies, rising, from 30e6 to 120e6 Hz");
         let channels = self.channels;
-        require("ninth.channels", channels as f64, (1..=1024).contains(&channels), "1 to 1024");
+        checks.number("ninth.channels", channels as f64, (1..=1024).contains(&channels), "1 to 1024");
         let length_s = self.integration_s;
-        require("ninth.integration_s", length_s, (1e-3..=1000.0).contains(&length_s), "0.001 s to 1000 s");
+        checks.number(
+            "ninth.integration_s",
+            length_s,
+            (1e-3..=1000.0).contains(&length_s),
+            "0.001 s to 1000 s",
+        );
         let samples = (high_hz - low_hz) / channels.max(1) as f64 * length_s;
         let many = samples >= SAMPLES_MIN || !inside;
-        require(
+        checks.number(
             "ninth.integration_s",
             length_s,
             many,
             "1e4 samples or more: so much over a channel's width, Hz",
         );
         let noise = self.receiver_noise_k_sr;
-        require("ninth.receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
-        require("ninth.arc_m", self.arc_m, (0.0..=1e6).contains(&self.arc_m), "0 m to 1e6 m");
+        checks.number("ninth.receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
+        checks.number("ninth.arc_m", self.arc_m, (0.0..=1e6).contains(&self.arc_m), "0 m to 1e6 m");
         let index = self.file_index;
-        require("ninth.file_index", index, (-4.0..=0.0).contains(&index), "-4 to 0");
-        found
+        checks.number("ninth.file_index", index, (-4.0..=0.0).contains(&index), "-4 to 0");
+        checks.finish()
     }
 
     /// Data rate of the spectra while the array observes, bit/s, without packet headers.

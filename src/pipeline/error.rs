@@ -2,8 +2,9 @@
 
 use thiserror::Error;
 
-use super::config::ConfigError;
+use super::config_source::ConfigError;
 use crate::array::ArrayError;
+use crate::frames::{SampleReason, VisibilityReason};
 use crate::runtime::{LedgerImbalance, RuntimeError};
 use crate::sky::MapError;
 use crate::sky::fits::FitsError;
@@ -27,9 +28,9 @@ pub enum PipelineError {
     /// The sky's coefficients cannot be found.
     #[error("the simulated sky's coefficients: {0}")]
     Coefficients(#[from] crate::sky::harmonics::HarmonicsError),
-    /// A setting of the sky that does not fit its map.
+    /// A value of the configuration that does not fit the files that it names.
     #[error(transparent)]
-    SkyConfig(#[from] crate::sky::SkyConfigError),
+    Invalid(#[from] crate::units::InvalidValue),
     /// A model of visibilities cannot be.
     #[error(transparent)]
     Model(#[from] crate::response::model::ModelError),
@@ -39,9 +40,12 @@ pub enum PipelineError {
     /// A stage failed.
     #[error(transparent)]
     Runtime(#[from] RuntimeError),
-    /// Data unaccounted for: a bug of the program.
+    /// Visibilities unaccounted for: a bug of the program.
     #[error(transparent)]
-    Ledger(#[from] LedgerImbalance),
+    Ledger(#[from] LedgerImbalance<VisibilityReason>),
+    /// Samples unaccounted for: a bug of the program.
+    #[error(transparent)]
+    SampleLedger(#[from] LedgerImbalance<SampleReason>),
     /// Calibration cannot be set up.
     #[error(transparent)]
     Calibration(#[from] crate::calibration::CalibrationError),
@@ -63,7 +67,7 @@ pub enum PipelineError {
         /// Where the summary is.
         summary: std::path::PathBuf,
         /// What became of every visibility.
-        ledger: Box<crate::runtime::LedgerReport>,
+        ledger: Box<crate::runtime::LedgerReport<VisibilityReason>>,
     },
     /// The array never observes.
     #[error(

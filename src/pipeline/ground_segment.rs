@@ -8,7 +8,7 @@ use super::error::PipelineError;
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::{CalibrationError, Calibrator};
 use crate::downlink::ReceptionCounters;
-use crate::frames::AutoPower;
+use crate::frames::{AutoPower, VisibilityReason};
 use crate::ground::Reception;
 use crate::ground::archive::Keeper;
 use crate::products::{ChannelSummary, Provenance, Publisher, Truth};
@@ -37,7 +37,7 @@ pub enum Receiving {
 #[derive(Clone, Debug, Default)]
 pub struct GroundOutcome {
     /// What became of every visibility.
-    pub ledger: Ledger,
+    pub ledger: Ledger<VisibilityReason>,
     /// What was received, and what was wrong with it.
     pub reception: Arc<Mutex<ReceptionCounters>>,
     /// The daughters' own powers, by channel, daughter and time.
@@ -115,7 +115,7 @@ pub(crate) fn reception(wait_bytes: u64, account: Arc<Mutex<ReceptionCounters>>)
 /// Calibration and sums that know nothing yet.
 pub(crate) fn stages(
     config: &Config,
-    ledger: &Ledger,
+    ledger: &Ledger<VisibilityReason>,
     outcome: &GroundOutcome,
 ) -> Result<(Calibrator, Accumulator), CalibrationError> {
     let calibration = config.calibration.build(Path::new(""))?;

@@ -3,6 +3,7 @@
 //! The only place where space and ground meet, and where concrete stages are wired.
 
 pub(crate) mod config;
+mod config_source;
 mod cost;
 mod engine_cost;
 pub(crate) mod error;
@@ -16,7 +17,8 @@ pub(crate) mod sampling;
 pub(crate) mod space_segment;
 mod summary;
 
-pub use config::{Config, ConfigError, ConfigSource, Problems, QUICKLOOK};
+pub use config::{Config, Problems};
+pub use config_source::{ConfigError, ConfigSource, QUICKLOOK};
 pub use cost::{ChannelCost, Cost};
 pub use error::PipelineError;
 pub use ground_segment::{Receiving, WAIT_BYTES};

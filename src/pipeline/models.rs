@@ -9,12 +9,12 @@ use crate::array::Array;
 use crate::mother::{Fidelity, Schedule};
 use crate::response::harmonic::RotationTable;
 use crate::response::model::{
-    BandAverage, DirectSum, HarmonicSetup, HarmonicSum, Load, ModelChoice, ModelKind, ModelPlan,
+    BandAverage, DirectSum, HarmonicSum, HarmonicSumSetup, Load, ModelChoice, ModelKind, ModelPlan,
     VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
-use crate::sky::{Frame, SkyConfig, SkyConfigError, SkyMap};
+use crate::sky::{Frame, SkyConfig, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 impl Plan {
@@ -30,7 +30,7 @@ impl Plan {
                     let width_hz = spacecraft.channel_width_hz;
                     let longest_m = longest * SPEED_OF_LIGHT_M_S / schedule.frequency_hz;
                     let frequencies = BandAverage::frequencies(longest_m, width_hz);
-                    (frequencies, BandAverage::stretch(schedule.frequency_hz, width_hz))
+                    (frequencies, BandAverage::baseline_factor(schedule.frequency_hz, width_hz))
                 }
                 false => (1, 1.0),
             };
@@ -100,7 +100,7 @@ pub(crate) fn build(plan: &Plan, skies: &[SkyMap]) -> Result<Vec<Box<dyn Visibil
             continue;
         }
         let alm = coefficients(sky, model.l_max)?;
-        let setup = HarmonicSetup {
+        let setup = HarmonicSumSetup {
             frequency_hz,
             orbit_radius_m: array.orbit_radius_m(),
             inclination_rad: array.inclination_rad(),
@@ -129,10 +129,7 @@ fn averaged(plan: &Plan, model: Box<dyn VisibilityModel>, frequency_hz: f64) -> 
 /// # Errors
 /// More degrees than the map determines; a map with values that are not finite.
 fn coefficients(sky: &SkyMap, l_max: usize) -> Result<Alm, PipelineError> {
-    let most = SkyConfig::l_max_most(sky.nside());
-    if l_max > most {
-        return Err(SkyConfigError::BandLimit { l_max, most }.into());
-    }
+    SkyConfig::check_l_max(l_max, sky.nside())?;
     let options = AnalysisOptions { method: Method::ACCURATE };
     let alm = analysis(sky.values(), l_max, &options)?.alm;
     Ok(match sky.frame() {

@@ -218,7 +218,7 @@ fn conclude(
     let mut reception = outcome.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = outcome.channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let ledger = outcome.ledger.close()?;
-    let listening = listening.map(|listening| listening.account());
+    let listening = listening.map(|listening| listening.report());
     if let Some(account) = &listening {
         account.complete(&mut reception);
     }

@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::sampling::SampleCounts;
 use crate::daughters::LinkCounts;
+use crate::frames::SampleReason;
 use crate::runtime::{Ledger, LedgerImbalance, LedgerReport};
 
 /// A run's samples in figures; complex samples of all daughters and channels.
@@ -27,7 +28,7 @@ pub struct SampleSummary {
     /// Visibilities made of the samples.
     pub visibilities: u64,
     /// The account of samples.
-    pub ledger: LedgerReport,
+    pub ledger: LedgerReport<SampleReason>,
 }
 
 /// Blocks at the mother.
@@ -52,7 +53,7 @@ impl SampleSummary {
     ///
     /// # Errors
     /// [`LedgerImbalance`] if what was sampled is not what became of it.
-    pub fn close(counts: &SampleCounts) -> Result<Self, LedgerImbalance> {
+    pub fn close(counts: &SampleCounts) -> Result<Self, LedgerImbalance<SampleReason>> {
         fn read<T: Clone>(counts: &Mutex<T>) -> T {
             counts.lock().unwrap_or_else(PoisonError::into_inner).clone()
         }
@@ -62,10 +63,10 @@ impl SampleSummary {
         let ledger = Ledger::new();
         ledger.sampled(sampler.samples);
         ledger.accumulated(blocks.used_samples);
-        ledger.lost("link", "no room or no time", link.dropped_samples);
-        ledger.lost("correlate", "late", blocks.late_samples);
-        ledger.lost("correlate", "malformed", blocks.malformed_samples);
-        ledger.lost("correlate", "outside any window", correlator.stray_samples);
+        ledger.left_out(SampleReason::LinkOverrun, link.dropped_samples);
+        ledger.left_out(SampleReason::Late, blocks.late_samples);
+        ledger.left_out(SampleReason::Malformed, blocks.malformed_samples);
+        ledger.left_out(SampleReason::OutsideWindow, correlator.stray_samples);
         Ok(Self {
             saturated: sampler.saturated,
             correlations: sampler.repairs.elements,

@@ -9,8 +9,9 @@ use serde::{Deserialize, Serialize};
 use super::config::Config;
 use super::sample_summary::SampleSummary;
 use crate::downlink::ReceptionCounters;
-use crate::downlink::transport::socket::ListenAccount;
+use crate::downlink::transport::socket::ListenReport;
 use crate::files::write_atomically;
+use crate::frames::VisibilityReason;
 use crate::products::{ChannelSummary, ProductsError};
 use crate::runtime::{LedgerReport, Report};
 
@@ -44,7 +45,7 @@ pub struct Summary {
     /// The maps, channel by channel.
     pub channels: Vec<ChannelSummary>,
     /// What became of every visibility.
-    pub ledger: LedgerReport,
+    pub ledger: LedgerReport<VisibilityReason>,
     /// What became of samples; absent without sample fidelity.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples: Option<SampleSummary>,
@@ -52,7 +53,7 @@ pub struct Summary {
     pub reception: ReceptionCounters,
     /// The senders, if the ground listened.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub listening: Option<ListenAccount>,
+    pub listening: Option<ListenReport>,
     /// Stages: throughput, times, queues.
     pub report: Report,
 }
@@ -64,7 +65,7 @@ impl Summary {
         segment: Segment,
         config: &Config,
         report: Report,
-        ledger: LedgerReport,
+        ledger: LedgerReport<VisibilityReason>,
         reception: ReceptionCounters,
         channels: Vec<ChannelSummary>,
     ) -> Self {

@@ -1,7 +1,8 @@
 //! Configuration of products.
 
 use serde::{Deserialize, Serialize};
-use thiserror::Error;
+
+use crate::units::{Checks, InvalidValue};
 
 /// The `[products]` section: what is written beside the final maps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -21,26 +22,13 @@ impl Default for ProductsConfig {
     }
 }
 
-/// An invalid setting of the products.
-#[derive(Clone, Debug, Error, PartialEq)]
-#[error("products.{key} = {value}: expected {expected}")]
-pub struct ProductsConfigError {
-    /// Key.
-    pub key: &'static str,
-    /// Value found.
-    pub value: f64,
-    /// Range that is accepted.
-    pub expected: &'static str,
-}
-
 impl ProductsConfig {
     /// All problems of the section; empty if it is valid.
     #[must_use]
-    pub fn problems(&self) -> Vec<ProductsConfigError> {
-        let value = self.smooth_fwhm_deg;
-        if (0.0..=90.0).contains(&value) {
-            return Vec::new();
-        }
-        vec![ProductsConfigError { key: "smooth_fwhm_deg", value, expected: "0 to 90 degrees" }]
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("products");
+        let fwhm_deg = self.smooth_fwhm_deg;
+        checks.require("smooth_fwhm_deg", fwhm_deg, (0.0..=90.0).contains(&fwhm_deg), "0 to 90 degrees");
+        checks.finish()
     }
 }

@@ -18,7 +18,7 @@ mod truth;
 
 pub use autos::{AutoSummary, summarise, write_autos};
 pub use channel::{draw_comparison, draw_relative_error};
-pub use config::{ProductsConfig, ProductsConfigError};
+pub use config::ProductsConfig;
 pub use error::ProductsError;
 pub use provenance::Provenance;
 pub use publisher::Publisher;

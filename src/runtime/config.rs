@@ -1,7 +1,8 @@
-//! What can be chosen about queues and threads.
+//! Configuration of queues and threads.
 
 use serde::{Deserialize, Serialize};
-use thiserror::Error;
+
+use crate::units::{Checks, InvalidValue};
 
 /// Queues and threads; no choice changes a single byte of the results.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -24,40 +25,33 @@ impl Default for RuntimeConfig {
     }
 }
 
-/// A setting of the runtime that cannot be.
-#[derive(Clone, Debug, Error, PartialEq)]
-#[error("runtime.{key} = {value}: expected {expected}")]
-pub struct RuntimeConfigError {
-    /// Key.
-    pub key: &'static str,
-    /// Value found.
-    pub value: f64,
-    /// Range that is accepted.
-    pub expected: &'static str,
-}
-
 impl RuntimeConfig {
     /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
-    pub fn problems(&self) -> Vec<RuntimeConfigError> {
-        let mut found = Vec::new();
-        let mut require = |key, value: f64, good: bool, expected| {
-            if !(good && value.is_finite()) {
-                found.push(RuntimeConfigError { key, value, expected });
-            }
-        };
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("runtime");
         let capacity = self.queue_capacity;
-        require("queue_capacity", capacity as f64, (1..=65_536).contains(&capacity), "1 to 65536 items");
-        require("threads", self.threads as f64, self.threads <= 1024, "at most 1024, or 0 for one a core");
+        checks.number(
+            "queue_capacity",
+            capacity as f64,
+            (1..=65_536).contains(&capacity),
+            "1 to 65536 items",
+        );
+        checks.number(
+            "threads",
+            self.threads as f64,
+            self.threads <= 1024,
+            "at most 1024, or 0 for one a core",
+        );
         let seconds = self.shutdown_s;
-        require("shutdown_s", seconds, (0.0..=3600.0).contains(&seconds), "0 s to 3600 s");
+        checks.number("shutdown_s", seconds, (0.0..=3600.0).contains(&seconds), "0 s to 3600 s");
         let stall = self.stall_s;
-        require(
+        checks.number(
             "stall_s",
             stall,
             stall == 0.0 || (0.1..=1e6).contains(&stall),
             "0.1 s to 1e6 s, or 0 for ever",
         );
-        found
+        checks.finish()
     }
 }

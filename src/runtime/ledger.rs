@@ -1,190 +1,205 @@
-//! The account that every run closes with: sampled = accumulated + flagged + lost.
+//! The ledger that closes every run: sampled = accumulated + flagged + lost.
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use serde::Serialize;
+use serde::ser::{SerializeStruct, Serializer};
 use thiserror::Error;
 
-type Label = Cow<'static, str>;
+use crate::units::Reason;
 
-#[derive(Debug, Default)]
-struct Accounts {
-    sampled: u64,
-    accumulated: u64,
-    flagged: BTreeMap<Label, u64>,
-    lost: BTreeMap<(Label, Label), u64>,
-}
-
-/// Counts what came in and what became of it. Clones share one account.
+/// Counts what came into being and what became of it. Clones share one set of counts.
 ///
 /// Counts saturate at `u64::MAX`. Posting takes a lock: post by block, not by sample.
-#[derive(Clone, Debug, Default)]
-pub struct Ledger(Arc<Mutex<Accounts>>);
+#[derive(Clone, Debug)]
+pub struct Ledger<R: Reason>(Arc<Mutex<LedgerReport<R>>>);
 
-impl Ledger {
+impl<R: Reason> Default for Ledger<R> {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl<R: Reason> Ledger<R> {
     /// A ledger without entries.
     #[must_use]
     pub fn new() -> Self {
-        Self::default()
+        Self(Arc::default())
     }
 
-    /// Posts all that another account reports.
-    pub fn post_report(&self, report: &LedgerReport) {
-        self.sampled(report.sampled);
-        self.accumulated(report.accumulated);
-        for (reason, &count) in &report.flagged {
-            self.flagged(reason.clone(), count);
-        }
-        for Loss { stage, reason, count } in &report.lost {
-            self.lost(stage.clone(), reason.clone(), *count);
-        }
-    }
-
-    /// Takes all that another account reports off this one, where it stands; empty accounts go.
-    pub fn withdraw(&self, report: &LedgerReport) {
-        let mut accounts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let Accounts { sampled, accumulated, flagged, lost } = &mut *accounts;
-        *sampled = sampled.saturating_sub(report.sampled);
-        *accumulated = accumulated.saturating_sub(report.accumulated);
-        for (reason, &count) in &report.flagged {
-            if let Some(account) = flagged.get_mut(reason.as_str()) {
-                *account = account.saturating_sub(count);
-            }
-        }
-        for Loss { stage, reason, count } in &report.lost {
-            if let Some(account) = lost.get_mut(&(stage.clone().into(), reason.clone().into())) {
-                *account = account.saturating_sub(*count);
-            }
-        }
-        flagged.retain(|_, count| *count > 0);
-        lost.retain(|_, count| *count > 0);
-    }
-
-    /// The accounts as they stand, which begin anew.
-    #[must_use]
-    pub fn take(&self) -> LedgerReport {
-        let report = self.report();
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Accounts::default();
-        report
+    fn counts(&self) -> MutexGuard<'_, LedgerReport<R>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Posts `count` samples that came into being.
     pub fn sampled(&self, count: u64) {
-        self.post(|accounts| &mut accounts.sampled, count);
+        add(&mut self.counts().sampled, count);
     }
 
     /// Posts `count` samples that reached the result.
     pub fn accumulated(&self, count: u64) {
-        self.post(|accounts| &mut accounts.accumulated, count);
+        add(&mut self.counts().accumulated, count);
     }
 
-    /// Posts `count` samples left out on purpose, for `reason`.
-    pub fn flagged(&self, reason: impl Into<Label>, count: u64) {
-        let reason = reason.into();
-        self.post(|accounts| accounts.flagged.entry(reason).or_default(), count);
+    /// Posts `count` samples that were flagged or lost for `reason`.
+    pub fn left_out(&self, reason: R, count: u64) {
+        self.counts().leave_out(reason, count);
     }
 
-    /// Posts `count` samples that got lost in `stage`, for `reason`.
-    pub fn lost(&self, stage: impl Into<Label>, reason: impl Into<Label>, count: u64) {
-        let key = (stage.into(), reason.into());
-        self.post(|accounts| accounts.lost.entry(key).or_default(), count);
-    }
-
-    fn post(&self, account: impl FnOnce(&mut Accounts) -> &mut u64, count: u64) {
-        if count == 0 {
-            return; // Leaves no empty account behind.
+    /// Posts all counts of a report.
+    pub fn post_report(&self, report: &LedgerReport<R>) {
+        let mut counts = self.counts();
+        add(&mut counts.sampled, report.sampled);
+        add(&mut counts.accumulated, report.accumulated);
+        for (&reason, &count) in &report.left_out {
+            counts.leave_out(reason, count);
         }
-        let mut accounts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let account = account(&mut accounts);
-        *account = account.saturating_add(count);
     }
 
-    /// The accounts as they stand, balanced or not.
+    /// Subtracts all counts of a report that was posted before; entries that reach zero go.
+    pub fn withdraw(&self, report: &LedgerReport<R>) {
+        let mut counts = self.counts();
+        counts.sampled = counts.sampled.saturating_sub(report.sampled);
+        counts.accumulated = counts.accumulated.saturating_sub(report.accumulated);
+        for (reason, &count) in &report.left_out {
+            if let Some(entry) = counts.left_out.get_mut(reason) {
+                *entry = entry.saturating_sub(count);
+            }
+        }
+        counts.left_out.retain(|_, count| *count > 0);
+    }
+
+    /// Returns all counts and resets them to zero.
     #[must_use]
-    pub fn report(&self) -> LedgerReport {
-        let accounts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let flagged = accounts.flagged.iter().map(|(reason, &count)| (reason.to_string(), count)).collect();
-        let lost = accounts
-            .lost
-            .iter()
-            .map(|((stage, reason), &count)| Loss {
-                stage: stage.to_string(),
-                reason: reason.to_string(),
-                count,
-            })
-            .collect();
-        LedgerReport { sampled: accounts.sampled, accumulated: accounts.accumulated, flagged, lost }
+    pub fn take(&self) -> LedgerReport<R> {
+        std::mem::take(&mut *self.counts())
     }
 
-    /// Closes the account.
+    /// All counts, balanced or not.
+    #[must_use]
+    pub fn report(&self) -> LedgerReport<R> {
+        self.counts().clone()
+    }
+
+    /// All counts, which must balance.
     ///
     /// # Errors
-    /// [`LedgerImbalance`] if what came in is not what became of it.
-    pub fn close(&self) -> Result<LedgerReport, LedgerImbalance> {
+    /// [`LedgerImbalance`] if what came into being is not what became of it.
+    pub fn close(&self) -> Result<LedgerReport<R>, LedgerImbalance<R>> {
         let report = self.report();
         if report.unaccounted() == 0 { Ok(report) } else { Err(LedgerImbalance { report }) }
     }
 }
 
-/// Samples lost in one stage for one reason.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
-pub struct Loss {
-    /// Where.
-    pub stage: String,
-    /// Why.
-    pub reason: String,
-    /// How many.
-    pub count: u64,
+fn add(entry: &mut u64, count: u64) {
+    *entry = entry.saturating_add(count);
 }
 
-/// The accounts of a run; shown as a table.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
-pub struct LedgerReport {
+/// The counts of a ledger; shown as a table.
+#[derive(Clone, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]
+pub struct LedgerReport<R: Reason> {
     /// Samples that came into being.
     pub sampled: u64,
     /// Samples that reached the result.
     pub accumulated: u64,
-    /// Samples left out on purpose, by reason.
-    pub flagged: BTreeMap<String, u64>,
-    /// Samples lost, by stage and reason.
-    pub lost: Vec<Loss>,
+    /// Samples that were flagged or lost, by reason.
+    pub left_out: BTreeMap<R, u64>,
 }
 
-impl LedgerReport {
+impl<R: Reason> Default for LedgerReport<R> {
+    fn default() -> Self {
+        Self { sampled: 0, accumulated: 0, left_out: BTreeMap::new() }
+    }
+}
+
+/// An entry for samples that were lost.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+struct Loss {
+    stage: &'static str,
+    reason: &'static str,
+    count: u64,
+}
+
+impl<R: Reason> LedgerReport<R> {
+    fn leave_out(&mut self, reason: R, count: u64) {
+        // No entry of zero.
+        if count > 0 {
+            add(self.left_out.entry(reason).or_default(), count);
+        }
+    }
+
+    /// Samples left out for one reason.
+    #[must_use]
+    pub fn count(&self, reason: R) -> u64 {
+        self.left_out.get(&reason).copied().unwrap_or(0)
+    }
+
+    fn total(&self, lost: bool) -> u128 {
+        let entries = self.left_out.iter().filter(|(reason, _)| reason.lost_in().is_some() == lost);
+        entries.map(|(_, &count)| u128::from(count)).sum()
+    }
+
     /// Samples flagged for any reason.
     #[must_use]
     pub fn flagged_total(&self) -> u128 {
-        self.flagged.values().map(|&count| u128::from(count)).sum()
+        self.total(false)
     }
 
-    /// Samples lost anywhere.
+    /// Samples lost in any stage.
     #[must_use]
     pub fn lost_total(&self) -> u128 {
-        self.lost.iter().map(|loss| u128::from(loss.count)).sum()
+        self.total(true)
     }
 
-    /// Samples of which nothing is known; negative if more is known than there were.
+    /// Samples without an entry; negative if the entries are more than the samples.
     #[must_use]
     pub fn unaccounted(&self) -> i128 {
         let known = u128::from(self.accumulated) + self.flagged_total() + self.lost_total();
-        // A u64 per account: 2^63 accounts would have to be full to leave the range.
+        // A u64 an entry: 2^63 entries would have to be full to leave the range.
         i128::from(self.sampled) - i128::try_from(known).unwrap_or(i128::MAX)
+    }
+
+    /// Counts of flagged samples by text, in the order of the texts.
+    fn flagged(&self) -> BTreeMap<&'static str, u64> {
+        let flags = self.left_out.iter().filter(|(reason, _)| reason.lost_in().is_none());
+        flags.map(|(reason, &count)| (reason.text(), count)).collect()
+    }
+
+    /// Entries for lost samples, in the order of stages and texts.
+    fn losses(&self) -> Vec<Loss> {
+        let loss = |(reason, &count): (&R, &u64)| {
+            reason.lost_in().map(|stage| Loss { stage, reason: reason.text(), count })
+        };
+        let mut losses: Vec<Loss> = self.left_out.iter().filter_map(loss).collect();
+        losses.sort_unstable();
+        losses
     }
 
     fn rows(&self) -> Vec<(String, u64)> {
         let mut rows =
             vec![("sampled".to_owned(), self.sampled), ("accumulated".to_owned(), self.accumulated)];
-        rows.extend(self.flagged.iter().map(|(reason, &count)| (format!("flagged: {reason}"), count)));
-        let lost = |loss: &Loss| (format!("lost in {}: {}", loss.stage, loss.reason), loss.count);
-        rows.extend(self.lost.iter().map(lost));
+        rows.extend(self.flagged().into_iter().map(|(reason, count)| (format!("flagged: {reason}"), count)));
+        let lost = |Loss { stage, reason, count }: Loss| (format!("lost in {stage}: {reason}"), count);
+        rows.extend(self.losses().into_iter().map(lost));
         rows
     }
 }
 
-impl fmt::Display for LedgerReport {
+impl<R: Reason> Serialize for LedgerReport<R> {
+    /// Counts by text: `sampled`, `accumulated`, `flagged` by reason, `lost` by stage and reason.
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut report = serializer.serialize_struct("LedgerReport", 4)?;
+        report.serialize_field("sampled", &self.sampled)?;
+        report.serialize_field("accumulated", &self.accumulated)?;
+        report.serialize_field("flagged", &self.flagged())?;
+        report.serialize_field("lost", &self.losses())?;
+        report.end()
+    }
+}
+
+impl<R: Reason> fmt::Display for LedgerReport<R> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let rows = self.rows();
         let width = rows.iter().map(|(name, _)| name.chars().count()).max().unwrap_or(0);
@@ -195,20 +210,20 @@ impl fmt::Display for LedgerReport {
     }
 }
 
-/// The accounts of a run do not balance: a bug of the program.
+/// The counts of a run do not balance: a bug of the program.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error(
     "the ledger does not close: {} samples unaccounted for ({}); expected sampled = accumulated + flagged + \
      lost",
     report.unaccounted(),
-    accounts(report)
+    entries(report)
 )]
-pub struct LedgerImbalance {
-    /// All accounts.
-    pub report: LedgerReport,
+pub struct LedgerImbalance<R: Reason> {
+    /// All counts.
+    pub report: LedgerReport<R>,
 }
 
-fn accounts(report: &LedgerReport) -> String {
+fn entries<R: Reason>(report: &LedgerReport<R>) -> String {
     let rows: Vec<String> = report.rows().iter().map(|(name, count)| format!("{name} {count}")).collect();
     rows.join(", ")
 }
@@ -219,30 +234,47 @@ mod tests {
 
     use super::*;
 
-    const REASONS: [&str; 3] = ["interference", "saturated", "no ephemeris"];
-
-    /// What became of a batch of samples.
-    #[derive(Clone, Copy, Debug)]
-    enum Fate {
-        Accumulated,
-        Flagged(usize),
-        Lost(usize, usize),
+    #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+    enum Why {
+        Saturated,
+        Interference,
+        Checksum,
+        Gap,
+        StoreFull,
     }
 
-    fn fates() -> impl Strategy<Value = Vec<(Fate, u64)>> {
-        let fate = prop_oneof![
-            Just(Fate::Accumulated),
-            (0..REASONS.len()).prop_map(Fate::Flagged),
-            (0..2_usize, 0..REASONS.len()).prop_map(|(stage, reason)| Fate::Lost(stage, reason)),
-        ];
+    const REASONS: [Why; 5] = [Why::Saturated, Why::Interference, Why::Checksum, Why::Gap, Why::StoreFull];
+
+    impl Reason for Why {
+        fn text(self) -> &'static str {
+            match self {
+                Self::Saturated => "saturated",
+                Self::Interference => "interference",
+                Self::Checksum => "checksum",
+                Self::Gap => "gap",
+                Self::StoreFull => "full",
+            }
+        }
+
+        fn lost_in(self) -> Option<&'static str> {
+            match self {
+                Self::Saturated | Self::Interference => None,
+                Self::Checksum | Self::Gap => Some("decode"),
+                Self::StoreFull => Some("a store"),
+            }
+        }
+    }
+
+    /// Batches of samples: accumulated, or left out for a reason.
+    fn fates() -> impl Strategy<Value = Vec<(Option<Why>, u64)>> {
+        let fate = proptest::option::weighted(0.8, proptest::sample::select(&REASONS[..]));
         proptest::collection::vec((fate, 0..1_000_000_u64), 0..40)
     }
 
-    fn post(ledger: &Ledger, fate: Fate, count: u64) {
+    fn post(ledger: &Ledger<Why>, fate: Option<Why>, count: u64) {
         match fate {
-            Fate::Accumulated => ledger.accumulated(count),
-            Fate::Flagged(reason) => ledger.flagged(REASONS[reason], count),
-            Fate::Lost(stage, reason) => ledger.lost(format!("stage {stage}"), REASONS[reason], count),
+            None => ledger.accumulated(count),
+            Some(reason) => ledger.left_out(reason, count),
         }
     }
 
@@ -309,9 +341,9 @@ mod tests {
     #[test]
     fn forged_counts_saturate() {
         let ledger = Ledger::new();
-        ledger.lost("decode", "gap", u64::MAX);
-        ledger.lost("decode", "gap", u64::MAX);
-        ledger.lost("decode", "checksum", u64::MAX);
+        ledger.left_out(Why::Gap, u64::MAX);
+        ledger.left_out(Why::Gap, u64::MAX);
+        ledger.left_out(Why::Checksum, u64::MAX);
         assert_eq!(ledger.report().unaccounted(), -2 * i128::from(u64::MAX));
         assert!(ledger.close().is_err());
     }
@@ -319,18 +351,35 @@ mod tests {
     #[test]
     fn the_report_is_shown_and_serialised() {
         let ledger = Ledger::new();
-        ledger.sampled(10);
+        ledger.sampled(20);
         ledger.accumulated(6);
-        ledger.flagged("saturated", 3);
-        ledger.lost("decode", "checksum", 1);
+        for (reason, count) in REASONS.into_iter().zip([3, 2, 4, 0, 5]) {
+            ledger.left_out(reason, count);
+        }
         let report = ledger.close().unwrap();
+        let rows: Vec<(String, u64)> = report.rows();
+        let rows: Vec<(&str, u64)> = rows.iter().map(|(name, count)| (name.as_str(), *count)).collect();
+        let expected = [
+            ("sampled", 20),
+            ("accumulated", 6),
+            ("flagged: interference", 2),
+            ("flagged: saturated", 3),
+            ("lost in a store: full", 5),
+            ("lost in decode: checksum", 4),
+        ];
+        assert_eq!(rows, expected);
         let table = report.to_string();
-        let lines: Vec<Vec<&str>> = table.lines().map(|line| line.split_whitespace().collect()).collect();
-        assert_eq!(lines[0], ["sampled", "10"]);
-        assert_eq!(lines[3], ["lost", "in", "decode:", "checksum", "1"]);
-        assert_eq!(lines[4], ["unaccounted", "0"]);
-        let json = serde_json::to_value(&report).unwrap();
-        assert_eq!(json["flagged"]["saturated"], 3);
-        assert_eq!(json["lost"][0]["stage"], "decode");
+        let last: Vec<&str> = table.lines().last().unwrap().split_whitespace().collect();
+        assert_eq!((table.lines().count(), last), (7, vec!["unaccounted", "0"]));
+        let expected = serde_json::json!({
+            "sampled": 20,
+            "accumulated": 6,
+            "flagged": { "interference": 2, "saturated": 3 },
+            "lost": [
+                { "stage": "a store", "reason": "full", "count": 5 },
+                { "stage": "decode", "reason": "checksum", "count": 4 },
+            ],
+        });
+        assert_eq!(serde_json::to_value(&report).unwrap(), expected);
     }
 }

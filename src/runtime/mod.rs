@@ -31,10 +31,10 @@ mod worker;
 mod tests;
 
 pub use cancel::Cancel;
-pub use config::{RuntimeConfig, RuntimeConfigError};
+pub use config::RuntimeConfig;
 pub use error::{BoxError, Laggards, Moment, RuntimeError};
 pub use graph::{Graph, Link};
-pub use ledger::{Ledger, LedgerImbalance, LedgerReport, Loss};
+pub use ledger::{Ledger, LedgerImbalance, LedgerReport};
 pub use metrics::{Metrics, StageProgress};
 pub use outlet::Outlet;
 pub use report::{QueueReport, Report, StageReport};

@@ -1,13 +1,12 @@
-//! What can be chosen about the simulated sky.
+//! Configuration of the simulated sky.
 
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use thiserror::Error;
 
 use super::generated::GeneratedSky;
 use super::healpix::is_valid_nside;
-use crate::units::PerChannel;
+use crate::units::{Checks, InvalidValue, PerChannel};
 
 /// Where the simulated sky comes from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -33,36 +32,6 @@ impl Default for SkyConfig {
 /// Greatest nside of a generated sky.
 pub const GENERATED_NSIDE_MAX: usize = 1024;
 
-/// A setting of the sky that cannot be.
-#[derive(Clone, Debug, Error, PartialEq)]
-#[non_exhaustive]
-pub enum SkyConfigError {
-    /// Not a map size.
-    #[error("sky.nside = {0}: expected a power of two from 1 to {GENERATED_NSIDE_MAX}")]
-    Nside(usize),
-    /// A band limit beyond what harmonics or the map hold.
-    #[error("sky.l_max = {l_max}: expected 0, or at most {most}: 2.5 nside of the sky, and {L_MAX}")]
-    BandLimit {
-        /// Value found.
-        l_max: usize,
-        /// Greatest value for this nside.
-        most: usize,
-    },
-    /// Not one file for each channel.
-    #[error(
-        "sky.file: {files} file(s) for {channels} channels; a map holds for one frequency, so expected one a channel"
-    )]
-    FileCount {
-        /// Files named.
-        files: usize,
-        /// Channels of the spacecraft.
-        channels: usize,
-    },
-    /// A part of the generated sky.
-    #[error("sky.generated: {0}")]
-    Generated(String),
-}
-
 /// Greatest band limit of harmonic simulation.
 const L_MAX: usize = 1536;
 
@@ -73,24 +42,39 @@ impl SkyConfig {
         L_MAX.min(5 * nside / 2)
     }
 
+    fn l_max_expected(most: usize) -> String {
+        format!("0, or at most {most}: 2.5 nside of the sky, and {L_MAX}")
+    }
+
+    /// Requires that a map of `nside` determines coefficients up to `l_max`.
+    ///
+    /// # Errors
+    /// [`InvalidValue`] of `sky.l_max`.
+    pub fn check_l_max(l_max: usize, nside: usize) -> Result<(), InvalidValue> {
+        let most = Self::l_max_most(nside);
+        let mut checks = Checks::of("sky");
+        checks.require("l_max", l_max, l_max <= most, Self::l_max_expected(most));
+        checks.finish().pop().map_or(Ok(()), Err)
+    }
+
     /// Everything that is wrong with the configuration for `channels` channels; empty if it is good.
     #[must_use]
-    pub fn problems(&self, channels: usize) -> Vec<SkyConfigError> {
-        let mut found = Vec::new();
-        if !is_valid_nside(self.nside) || self.nside > GENERATED_NSIDE_MAX {
-            found.push(SkyConfigError::Nside(self.nside));
-        }
-        let most = Self::l_max_most(self.nside);
-        if self.file.is_none() && self.l_max > most {
-            found.push(SkyConfigError::BandLimit { l_max: self.l_max, most });
-        }
+    pub fn problems(&self, channels: usize) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("sky");
+        let nside = self.nside;
+        let good = is_valid_nside(nside) && nside <= GENERATED_NSIDE_MAX;
+        checks.require("nside", nside, good, format!("a power of two from 1 to {GENERATED_NSIDE_MAX}"));
+        let most = Self::l_max_most(nside);
+        let good = self.file.is_some() || self.l_max <= most;
+        checks.require("l_max", self.l_max, good, Self::l_max_expected(most));
         if let Some(files) = &self.file {
             let files = files.values().len();
-            if files != channels {
-                found.push(SkyConfigError::FileCount { files, channels });
-            }
+            let expected =
+                format!("one a channel, of which there are {channels}: a map holds for one frequency");
+            checks.require("file", format!("({files} files)"), files == channels, expected);
         }
-        found.extend(self.generated.problems().iter().map(|e| SkyConfigError::Generated(e.to_string())));
+        let mut found = checks.finish();
+        found.extend(self.generated.problems());
         found
     }
 }

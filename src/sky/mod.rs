@@ -15,7 +15,7 @@ mod rotation;
 pub mod spectra;
 
 pub use compare::{Comparison, ErrorSummary, compare};
-pub use config::{GENERATED_NSIDE_MAX, SkyConfig, SkyConfigError};
+pub use config::{GENERATED_NSIDE_MAX, SkyConfig};
 pub use error::MapError;
 pub use frame::{Frame, Rotation, rotate};
 pub use map::{SkyMap, is_unseen};

@@ -1,15 +1,23 @@
-//! Identifiers, mission time, constants, three-vectors and keyed random streams.
+//! Identifiers, mission time, constants, three-vectors, keyed random streams, ledger reasons, checks of configuration
+//! values, and arithmetic for vectorised loops.
 //!
 //! Uses nothing else of the crate.
 
+pub(crate) mod arithmetic;
+mod checks;
 pub mod constants;
 mod ids;
+mod interval_set;
 mod per_channel;
 mod random;
+mod reason;
 mod time;
 pub mod vector;
 
+pub use checks::{Checks, InvalidValue};
 pub use ids::{ChannelId, MAX_SATELLITES, Pair, PairError, all_pairs};
+pub use interval_set::IntervalSet;
 pub use per_channel::PerChannel;
 pub use random::{StreamKind, random_stream};
+pub use reason::Reason;
 pub use time::{MissionTime, TICKS_PER_SECOND};

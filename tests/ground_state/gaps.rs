@@ -6,7 +6,7 @@ use std::path::Path;
 
 use lunarray::accumulation::MapConfig;
 use lunarray::calibration::{CalibrationConfig, Calibrator};
-use lunarray::downlink::{Decoder, Event, Receiver};
+use lunarray::downlink::{Decoder, Event, PacketReceiver};
 use lunarray::frames::{GroundFrame, PlacedFrame};
 use lunarray::runtime::{Ledger, Outlet, Stage};
 use lunarray::units::Pair;
@@ -32,7 +32,7 @@ fn worth(file: &str) -> BTreeMap<u64, Worth> {
     let map = MapConfig { nside: 4, ..MapConfig::default() };
     let hook = CalibrationConfig::default().build(Path::new("")).unwrap();
     let mut calibrator = Calibrator::new(hook, Ledger::new());
-    let (mut receiver, mut decoder) = (Receiver::new(), Decoder::new());
+    let (mut receiver, mut decoder) = (PacketReceiver::new(), Decoder::new());
     receiver.push(&std::fs::read(file).unwrap());
     receiver.finish();
     let mut found = BTreeMap::new();

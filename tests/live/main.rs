@@ -20,7 +20,7 @@ use common::downlink::{mission, packets_of, transmit};
 use common::workplace::{SMALL, Workplace, fail, succeed};
 use lunarray::downlink::transport::socket::{ListenConfig, SocketSource, Until};
 use lunarray::downlink::{
-    CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PACKET_BYTES_MAX, PacketHeader, Segment,
+    CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PACKET_BYTES_MAX, PacketHeader, PacketSegment,
 };
 use lunarray::runtime::{Flow, Outlet, Source};
 use serde_json::Value;

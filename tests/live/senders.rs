@@ -6,7 +6,7 @@ use super::*;
 fn claims(count: u64) -> Vec<u8> {
     let header = |count| PacketHeader {
         kind: Kind::Visibilities,
-        segment: Segment::Whole,
+        segment: PacketSegment::Whole,
         count: 2 * count,
         time: CucTime(1),
         version: FORMAT_VERSION,
@@ -197,5 +197,5 @@ fn a_ground_that_is_slower_slows_the_sender_and_keeps_its_memory() {
     source.finish(&mut Outlet::collect()).unwrap();
     assert_eq!(all, times * length);
     assert_eq!(sender.join().unwrap(), format!("taken {all} bytes\n"));
-    assert!(source.listening().account().backlog_bytes_max <= backlog);
+    assert!(source.listening().report().backlog_bytes_max <= backlog);
 }

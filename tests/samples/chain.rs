@@ -111,8 +111,8 @@ fn the_harmonic_model_is_refused_for_samples_with_a_remedy() {
         let done = command.output().unwrap();
         let said = String::from_utf8_lossy(&done.stderr).replace('\n', " ");
         assert_eq!(done.status.success(), !refused, "{set}: {said}");
-        let message = "spacecraft.fidelity = \"samples\" takes direct sums of instants: expected spacecraft.model = \
-                       \"auto\" or \"direct\", and spacecraft.smear_integrations = false";
+        let message = "spacecraft.fidelity = \"samples\": expected spacecraft.model = \"auto\" or \"direct\", and \
+                       spacecraft.smear_integrations = false";
         assert_eq!(said.contains(message), refused, "{set}: {said}");
     }
 }

@@ -7,7 +7,7 @@ use lunarray::units::vector::{norm, sub};
 use lunarray::units::{ChannelId, all_pairs};
 
 use lunarray::mother::correlator::Division;
-use lunarray::mother::{Fidelity, SpacecraftConfig, SpacecraftError};
+use lunarray::mother::{Fidelity, IntegrationTooShort, SpacecraftConfig};
 
 use crate::craft::{Spacecraft, WIDTH_HZ, block_by_block, constant};
 
@@ -164,7 +164,7 @@ fn integrations_shorter_than_the_correlators_sums_are_refused() {
     let speed_m_s = std::f64::consts::TAU / 8248.68 * 2.0 * 2037.1e3 * (100.0_f64 / 2.0 / 2037.1).sin();
     let dt_s = |motion: f64| motion * SPEED_OF_LIGHT_M_S / 30e6 / speed_m_s;
     let problem = config(30e6, 1e-3, 0.0, 1).dump_problem(&array);
-    let Some(SpacecraftError::Dump { shortest_s, dump_s }) = &problem else { panic!("{problem:?}") };
+    let Some(IntegrationTooShort { shortest_s, dump_s }) = &problem else { panic!("{problem:?}") };
     // The node's motion adds 1e-4 to speeds.
     assert!((shortest_s / dt_s(1e-3) - 1.0).abs() < 1e-3, "{shortest_s}");
     assert_eq!(*dump_s, 16.0 / WIDTH_HZ);

@@ -211,26 +211,12 @@ impl Operator {
         let count = alphas.len();
         let turns = self.turns(circle, alphas);
         let mut z = [vec![0.0_f32; (self.l_max + 1) * ALPHAS], vec![0.0_f32; (self.l_max + 1) * ALPHAS]];
-        let mut out = vec![0.0_f32; orders(self.l_max) * ALPHAS];
+        let mut out = vec![0.0_f32; 2 * orders(self.l_max) * ALPHAS];
         for l in 0..=self.l_max {
-            for m in 0..=l {
-                let a = sky.get(l, m).conj();
-                for (k, (sin, cos)) in turns[m * count..(m + 1) * count].iter().enumerate() {
-                    z[0][k * (l + 1) + m] = (a.re * cos + a.im * sin) as f32;
-                    z[1][k * (l + 1) + m] = (a.im * cos - a.re * sin) as f32;
-                }
-            }
-            let (plus, minus) = self.rotation.degree(l);
-            for (part, d) in [plus, minus].into_iter().enumerate() {
-                let out = &mut out[..orders(l) * count];
-                faer::linalg::matmul::matmul(
-                    MatMut::from_column_major_slice_mut(out, orders(l), count),
-                    Accum::Replace,
-                    MatRef::from_row_major_slice(d, orders(l), l + 1),
-                    MatRef::from_column_major_slice(&z[part][..(l + 1) * count], l + 1, count),
-                    1.0,
-                    Par::Seq,
-                );
+            let [re, im] = &mut z;
+            let out = &mut out[..2 * orders(l) * count];
+            self.rotation.rotate_degree(l, |m| sky.get(l, m).conj(), &turns, [re, im], out);
+            for (part, out) in out.chunks_exact(orders(l) * count).enumerate() {
                 for (k, column) in out.chunks_exact(orders(l)).enumerate() {
                     for (order, value) in column.iter().enumerate() {
                         let mu = l % 2 + 2 * order;

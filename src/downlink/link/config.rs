@@ -1,9 +1,9 @@
-//! What a simulated link does to a downlink.
+//! Configuration of a simulated link: what it does to a downlink.
 
 use serde::{Deserialize, Serialize};
 
-use crate::downlink::error::DownlinkError;
 use crate::downlink::wire::Format;
+use crate::units::{Checks, InvalidValue};
 
 /// Greatest distance of a reordered frame, and most frames that a second station repeats.
 const FRAMES_MAX: u64 = 1 << 20;
@@ -83,13 +83,8 @@ impl LinkConfig {
 
     /// Everything that is wrong with the configuration for a format; empty if it is good.
     #[must_use]
-    pub fn problems(&self, format: Format) -> Vec<DownlinkError> {
-        let mut found = Vec::new();
-        let mut require = |key, value, good: bool, expected| {
-            if !good {
-                found.push(DownlinkError::Link { key, value, expected });
-            }
-        };
+    pub fn problems(&self, format: Format) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("downlink.link");
         for (key, value) in [
             ("bit_error_rate", self.bit_error_rate),
             ("burst_bit_error_rate", self.burst_bit_error_rate),
@@ -101,20 +96,20 @@ impl LinkConfig {
             ("pass_swap", self.pass_swap),
             ("bit_slip", self.bit_slip),
         ] {
-            require(key, value, (0.0..=1.0).contains(&value), "a probability, 0 to 1");
+            checks.require(key, value, (0.0..=1.0).contains(&value), "a probability, 0 to 1");
         }
         let bursts = self.burst_every_bits;
         let good = bursts == 0.0 || (1.0..=1e15).contains(&bursts);
-        require("burst_every_bits", bursts, good, "0, or 1 to 1e15");
+        checks.require("burst_every_bits", bursts, good, "0, or 1 to 1e15");
         let good = bursts == 0.0 || (1.0..=1e15).contains(&self.burst_bits);
-        require("burst_bits", self.burst_bits, good, "1 to 1e15 where there are bursts");
+        checks.require("burst_bits", self.burst_bits, good, "1 to 1e15 where there are bursts");
         let slips_are_possible = self.bit_slip == 0.0 || format == Format::Cadu;
-        require("bit_slip", self.bit_slip, slips_are_possible, "0 unless format is \"cadu\"");
+        checks.require("bit_slip", self.bit_slip, slips_are_possible, "0 unless format is \"cadu\"");
         for (key, value) in
             [("reorder_frames", self.reorder_frames), ("second_station_frames", self.second_station_frames)]
         {
-            require(key, value as f64, value <= FRAMES_MAX, "at most 1048576");
+            checks.require(key, value, value <= FRAMES_MAX, "at most 1048576");
         }
-        found
+        checks.finish()
     }
 }

@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 
 use super::config::LinkConfig;
 use super::simulator::LinkSimulator;
-use super::truth::Truth;
+use super::truth::LinkTruth;
 use crate::downlink::config::DownlinkConfig;
-use crate::downlink::error::{DownlinkError, io_error, require_packets};
-use crate::downlink::receive::Intake;
+use crate::downlink::error::{DownlinkError, io_error};
+use crate::downlink::receive::EventReader;
 use crate::downlink::wire::cadu::ReedSolomon;
-use crate::files::{AtomicFile, Unfinished, write_atomically};
+use crate::files::{AtomicFile, IfUnfinished, write_atomically};
 use crate::runtime::{Outlet, Stage, Units};
 
 /// Bytes read at a time.
@@ -25,7 +25,7 @@ pub fn truth_path(downlink: &Path) -> PathBuf {
     PathBuf::from(name)
 }
 
-fn write_truth(downlink: &Path, truth: &Truth) -> Result<(), DownlinkError> {
+fn write_truth(downlink: &Path, truth: &LinkTruth) -> Result<(), DownlinkError> {
     let path = truth_path(downlink);
     let text = serde_json::to_vec(truth).map_err(std::io::Error::from);
     text.and_then(|text| write_atomically(&path, &text)).map_err(io_error(&path, "write the truth"))
@@ -91,13 +91,13 @@ impl Stage for LinkStage {
 ///
 /// # Errors
 /// Files that cannot be read or written, a file that is no sound downlink, a bad configuration.
-pub fn corrupt(from: &Path, to: &Path, config: &LinkConfig, seed: u64) -> Result<Truth, DownlinkError> {
+pub fn corrupt(from: &Path, to: &Path, config: &LinkConfig, seed: u64) -> Result<LinkTruth, DownlinkError> {
     if std::fs::canonicalize(to).is_ok_and(|to| std::fs::canonicalize(from).is_ok_and(|from| from == to)) {
         return Err(DownlinkError::SameFile { path: to.to_owned() });
     }
     let mut simulator = LinkSimulator::new(config, seed, code_of(from)?)?;
     let mut source = File::open(from).map_err(io_error(from, "open the file"))?;
-    let mut file = AtomicFile::create(to, Unfinished::Remove).map_err(io_error(to, "create the file"))?;
+    let mut file = AtomicFile::create(to, IfUnfinished::Remove).map_err(io_error(to, "create the file"))?;
     let (mut bytes, mut arrived) = (Vec::new(), Vec::new());
     let at = |error: DownlinkError| error.at(from);
     loop {
@@ -119,16 +119,11 @@ pub fn corrupt(from: &Path, to: &Path, config: &LinkConfig, seed: u64) -> Result
 
 /// The code of a file's frames; `None` for plain packets.
 fn code_of(path: &Path) -> Result<Option<ReedSolomon>, DownlinkError> {
-    let mut file = File::open(path).map_err(io_error(path, "open the file"))?;
-    let mut intake = Intake::new();
-    while intake.format().is_none() {
-        if intake.fill_from(&mut file).map_err(io_error(path, "read"))? == 0 {
-            intake.finish();
-            break;
-        }
+    let mut events = EventReader::open(path)?;
+    // The format is known by the first event, or at the end of the file.
+    events.find(|_| Some(()))?;
+    if events.intake().format().is_none() {
+        events.require_packets()?;
     }
-    if intake.format().is_none() {
-        require_packets(path, intake.bytes(), 0)?;
-    }
-    Ok(intake.frames().and_then(|frames| ReedSolomon::new(frames.interleave)))
+    Ok(events.intake().frames().and_then(|frames| ReedSolomon::new(frames.interleave)))
 }

@@ -3,11 +3,11 @@
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
+use super::bit_writer::BitWriter;
 use super::config::LinkConfig;
 use super::noise::Noise;
-use super::truth::{Fate, Truth, list_packet};
-use super::units::{Pass, Splitter};
-use super::writer::BitWriter;
+use super::splitter::{SentPass, Splitter};
+use super::truth::{FrameFate, LinkTruth, list_packet};
 use crate::downlink::error::DownlinkError;
 use crate::downlink::wire::Format;
 use crate::downlink::wire::cadu::{ERRORS_MAX, MARKER_ERRORS_MAX, ReedSolomon, SYNC_MARKER_BYTES};
@@ -29,19 +29,19 @@ struct Dispatch {
 struct Departure {
     /// Passes sent, this one included.
     number: u64,
-    pass: Pass,
+    pass: SentPass,
     copies: Vec<Dispatch>,
-    outcomes: Vec<Outcome>,
+    outcomes: Vec<UnitOutcome>,
     random: ChaCha8Rng,
 }
 
 /// What has become of a unit.
 #[derive(Clone, Copy, Debug, Default)]
-struct Outcome {
+struct UnitOutcome {
     /// Copies that can be recovered.
     good: u32,
     /// The fate of the one that got furthest of the others.
-    fate: Option<Fate>,
+    fate: Option<FrameFate>,
 }
 
 /// Damages a downlink as a link would, pass by pass. Holds one pass, and another while it is swapped.
@@ -57,7 +57,7 @@ pub struct LinkSimulator {
     /// Bits by which frames have been put off since the receiver last stood at the beginning of one; `None` before that.
     /// Unless they are whole frames, it finds the next by its marker alone.
     put_off_bits: Option<i64>,
-    truth: Truth,
+    truth: LinkTruth,
 }
 
 impl LinkSimulator {
@@ -68,9 +68,9 @@ impl LinkSimulator {
     pub fn new(config: &LinkConfig, seed: u64, code: Option<ReedSolomon>) -> Result<Self, DownlinkError> {
         let format = if code.is_some() { Format::Cadu } else { Format::Packets };
         if let Some(problem) = config.problems(format).into_iter().next() {
-            return Err(problem);
+            return Err(problem.into());
         }
-        let truth = Truth { seed, link: config.clone(), format, ..Truth::default() };
+        let truth = LinkTruth { seed, link: config.clone(), format, ..LinkTruth::default() };
         Ok(Self {
             config: config.clone(),
             code,
@@ -98,7 +98,7 @@ impl LinkSimulator {
     ///
     /// # Errors
     /// A downlink that ends within a frame or packet.
-    pub fn finish(&mut self, out: &mut Vec<u8>) -> Result<&Truth, DownlinkError> {
+    pub fn finish(&mut self, out: &mut Vec<u8>) -> Result<&LinkTruth, DownlinkError> {
         if let Some(pass) = self.splitter.finish()? {
             self.send(pass, out);
         }
@@ -110,21 +110,21 @@ impl LinkSimulator {
 
     /// The truth so far.
     #[must_use]
-    pub fn truth(&self) -> &Truth {
+    pub fn truth(&self) -> &LinkTruth {
         &self.truth
     }
 
-    fn send(&mut self, pass: Pass, out: &mut Vec<u8>) {
+    fn send(&mut self, pass: SentPass, out: &mut Vec<u8>) {
         let number = self.truth.passes + 1;
         self.truth.passes = number;
         let mut random = random_stream(self.truth.seed, StreamKind::Link, [number - 1, 0]);
         let lost = random.random_bool(self.config.pass_loss);
         let swapped = random.random_bool(self.config.pass_swap);
-        let mut outcomes = vec![Outcome::default(); pass.units.len()];
+        let mut outcomes = vec![UnitOutcome::default(); pass.units.len()];
         let mut copies = Vec::new();
         if lost {
             self.truth.passes_lost += 1;
-            outcomes.fill(Outcome { good: 0, fate: Some(Fate::PassLost) });
+            outcomes.fill(UnitOutcome { good: 0, fate: Some(FrameFate::PassLost) });
         } else {
             copies = self.schedule(&pass, &mut random, &mut outcomes);
         }
@@ -151,7 +151,12 @@ impl LinkSimulator {
     }
 
     /// The copies that set out and arrive, in the order in which they do.
-    fn schedule(&mut self, pass: &Pass, random: &mut ChaCha8Rng, outcomes: &mut [Outcome]) -> Vec<Dispatch> {
+    fn schedule(
+        &mut self,
+        pass: &SentPass,
+        random: &mut ChaCha8Rng,
+        outcomes: &mut [UnitOutcome],
+    ) -> Vec<Dispatch> {
         let count = pass.units.len();
         let mut cut = (count, 0);
         if random.random_bool(self.config.pass_cut) && count > 0 {
@@ -174,8 +179,8 @@ impl LinkSimulator {
                 let whole = pass.units[unit].bytes.len();
                 let bytes = if by_first && unit == cut.0 { cut.1 } else { whole };
                 let fate = match (by_first && unit >= cut.0, lost) {
-                    (true, _) => Some(Fate::CutOff),
-                    (false, true) => Some(Fate::Lost),
+                    (true, _) => Some(FrameFate::CutOff),
+                    (false, true) => Some(FrameFate::Lost),
                     (false, false) => None,
                 };
                 outcomes[unit].fate = outcomes[unit].fate.max(fate);
@@ -205,11 +210,11 @@ impl LinkSimulator {
             self.truth.bits_flipped += flips.len() as u64;
             let outcome = &mut outcomes[copy.unit];
             let fate = if copy.bytes < sent.len() {
-                Some(Fate::CutOff)
+                Some(FrameFate::CutOff)
             } else if copy.slips {
-                Some(Fate::Slipped)
+                Some(FrameFate::Slipped)
             } else if is_spoilt(&flips, self.code) || !self.is_found(sent.len(), &flips) {
-                Some(Fate::Spoilt)
+                Some(FrameFate::Spoilt)
             } else {
                 self.put_off_bits = Some(0);
                 None
@@ -248,7 +253,7 @@ impl LinkSimulator {
     }
 
     /// Takes the outcomes of a pass into the account.
-    fn settle(&mut self, pass: &Pass, outcomes: &[Outcome]) {
+    fn settle(&mut self, pass: &SentPass, outcomes: &[UnitOutcome]) {
         if let Some(report) = pass.report {
             // Of two passes that are swapped the later one says more.
             self.truth.visibilities_sampled = self.truth.visibilities_sampled.max(report.sampled);

@@ -11,7 +11,7 @@ use crate::downlink::wire::Format;
 /// Why a frame cannot be recovered on the ground. Of several copies the one that got furthest counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Fate {
+pub enum FrameFate {
     /// Its pass did not arrive.
     PassLost,
     /// Its pass was cut off before its end.
@@ -34,7 +34,7 @@ pub struct LostFrames {
     /// Count of the last.
     pub to: u32,
     /// Why.
-    pub fate: Fate,
+    pub fate: FrameFate,
 }
 
 /// Consecutive packets of one kind.
@@ -58,7 +58,7 @@ impl PacketRange {
 
 /// The truth about a damaged downlink.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Truth {
+pub struct LinkTruth {
     /// Seed of all faults.
     pub seed: u64,
     /// What the link was told to do.
@@ -109,7 +109,7 @@ pub struct Truth {
     pub packets_duplicate: Vec<PacketRange>,
 }
 
-impl fmt::Display for Truth {
+impl fmt::Display for LinkTruth {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let what = if self.format == Format::Cadu { "coded frames" } else { "packets" };
         writeln!(
@@ -143,8 +143,8 @@ impl fmt::Display for Truth {
     }
 }
 
-impl Truth {
-    pub(super) fn lose_frame(&mut self, channel: u8, count: u32, fate: Fate) {
+impl LinkTruth {
+    pub(super) fn lose_frame(&mut self, channel: u8, count: u32, fate: FrameFate) {
         match self.frames_lost.last_mut() {
             Some(last) if (last.channel, last.fate, last.to.wrapping_add(1)) == (channel, fate, count) => {
                 last.to = count;

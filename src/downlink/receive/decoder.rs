@@ -5,7 +5,7 @@ use crate::downlink::wire::payload::{
     PayloadFault, count_visibilities, decode_ephemeris, decode_housekeeping, decode_instrument,
     decode_visibilities,
 };
-use crate::downlink::wire::{CucTime, FORMAT_VERSION, Kind, PacketHeader, Segment};
+use crate::downlink::wire::{CucTime, FORMAT_VERSION, Kind, PacketHeader, PacketSegment};
 use crate::frames::{GroundFrame, Instrument};
 
 /// Greatest payload that is put together from segments; a window's ephemeris is a thousandth of it.
@@ -176,7 +176,7 @@ impl Decoder {
         if version != FORMAT_VERSION {
             return self.refuse(packet, PayloadFault::Version { found: version, expected: FORMAT_VERSION });
         }
-        if segment == Segment::Whole {
+        if segment == PacketSegment::Whole {
             self.give_up(kind);
             return self.take_payload(packet, packet.payload);
         }
@@ -187,7 +187,7 @@ impl Decoder {
     /// Adds a segment; gives the payload if it is the last.
     fn assemble(&mut self, packet: Packet<'_>) -> Option<Vec<u8>> {
         let PacketHeader { kind, segment, count, time, .. } = packet.header;
-        if segment == Segment::First {
+        if segment == PacketSegment::First {
             self.give_up(kind);
             let bytes = packet.payload.to_vec();
             self.partial[kind.index()] = Some(Partial { next: count + 1, time, bytes });
@@ -205,7 +205,7 @@ impl Decoder {
         };
         partial.bytes.extend_from_slice(packet.payload);
         partial.next += 1;
-        if segment == Segment::Last {
+        if segment == PacketSegment::Last {
             return Some(partial.bytes);
         }
         self.partial[kind.index()] = Some(partial);

@@ -3,7 +3,7 @@
 use std::io::{self, Read};
 
 use super::cadu::{CaduReceiver, FrameCounters};
-use super::{Event, Receiver};
+use super::{Event, PacketReceiver};
 use crate::downlink::wire::{Format, Kind};
 
 /// Bytes that [`Intake::fill_from`] asks for at a time.
@@ -12,17 +12,17 @@ const CHUNK_BYTES: usize = 1 << 18;
 /// Finds packets in a stream of either format, given in chunks of any size.
 ///
 /// Content tells: the format is that of which a packet or a frame is found first, none of which are found in the
-/// other by chance. Use it as a [`Receiver`]. Of a coded stream, offsets of events count in the packets that
+/// other by chance. Use it as a [`PacketReceiver`]. Of a coded stream, offsets of events count in the packets that
 /// were recovered from it.
 #[derive(Debug, Default)]
 pub struct Intake {
     format: Option<Format>,
-    packets: Receiver,
+    packets: PacketReceiver,
     frames: CaduReceiver,
     bytes: u64,
     chunk: Vec<u8>,
     recovered: Vec<u8>,
-    unjudged: bool,
+    unfiltered: bool,
 }
 
 impl Intake {
@@ -32,10 +32,10 @@ impl Intake {
         Self::default()
     }
 
-    /// An intake whose receiver is [`Receiver::unjudged`].
+    /// An intake whose receiver is [`PacketReceiver::unfiltered`].
     #[must_use]
-    pub fn unjudged() -> Self {
-        Self { unjudged: true, packets: Receiver::unjudged(), ..Self::default() }
+    pub fn unfiltered() -> Self {
+        Self { unfiltered: true, packets: PacketReceiver::unfiltered(), ..Self::default() }
     }
 
     /// Takes the next bytes of the stream.
@@ -133,7 +133,7 @@ impl Intake {
     fn take_recovered(&mut self) {
         if self.format.is_none() && self.frames.has_frame() {
             self.format = Some(Format::Cadu);
-            self.packets = if self.unjudged { Receiver::unjudged() } else { Receiver::new() };
+            self.packets = if self.unfiltered { PacketReceiver::unfiltered() } else { PacketReceiver::new() };
         }
         if !self.recovered.is_empty() {
             self.packets.push(&self.recovered);

@@ -1,16 +1,32 @@
-//! Bytes to packets and frames: synchronisation, decoding, and the count of what is missing or damaged.
+//! Bytes to packets and ground frames: synchronisation, error correction, decoding, and counts of what is missing or
+//! damaged.
+//!
+//! | layer | here |
+//! |---|---|
+//! | coded frames to packets | [`cadu::CaduReceiver`] |
+//! | bytes to packets, gaps and damage | [`PacketReceiver`] |
+//! | either format, detected | [`Intake`], [`EventReader`] |
+//! | packets to ground frames | [`Decoder`] |
+//! | a whole file for people | [`inspect`] |
+//!
+//! Uses `wire` and `frames`. Receivers accept any bytes in chunks of any size, in bounded memory and linear time, and
+//! never fail on bad data: every byte of a stream belongs to exactly one [`Event`], and every packet is counted once.
 
 pub mod cadu;
-pub mod contents;
 mod counters;
 mod decoder;
+mod event_reader;
+pub mod inspect;
 mod intake;
+mod listing;
 mod receiver;
 mod sequence;
 mod taken;
 
 pub use counters::{FaultCounts, KindCounts, ReceptionCounters};
 pub use decoder::{Decoder, DecoderState};
+pub use event_reader::{ByteFeed, EventReader};
 pub use intake::Intake;
-pub use receiver::{Event, Packet, Receiver};
+pub use listing::{LISTED_MAX, Listing};
+pub use receiver::{Event, Packet, PacketReceiver};
 pub use taken::{Era, Taken};

@@ -6,7 +6,7 @@ use std::io::{self, Read};
 use super::sequence::{Arrival, Sequence};
 use crate::downlink::wire::{HEADER_BYTES, Kind, PacketHeader, TRAILER_BYTES, packet_holds};
 
-/// Bytes that [`Receiver::fill_from`] asks for at a time.
+/// Bytes that [`PacketReceiver::fill_from`] asks for at a time.
 const CHUNK_BYTES: usize = 1 << 18;
 
 /// A packet whose checks hold.
@@ -84,7 +84,7 @@ pub enum Event<'a> {
 
 /// An event without its bytes. All but gaps consume what they cover when they are handed out.
 #[derive(Clone, Copy, Debug)]
-enum Step {
+enum PendingEvent {
     Packet { header: PacketHeader, late: bool },
     Duplicate(PacketHeader),
     Damaged(PacketHeader, usize),
@@ -95,7 +95,7 @@ enum Step {
 }
 
 /// What stands at some place of the buffer.
-enum Found {
+enum PacketMatch {
     /// A whole packet.
     Good(PacketHeader),
     /// Headers whose packet does not hold; bytes to pass over.
@@ -110,14 +110,14 @@ enum Found {
 
 /// Finds packets in a stream of bytes, given in chunks of any size.
 ///
-/// Push bytes, then take events until there are none; at the end call [`Receiver::finish`] and take the rest.
+/// Push bytes, then take events until there are none; at the end call [`PacketReceiver::finish`] and take the rest.
 /// Then the memory stays below the greatest packet plus twice the greatest chunk.
 ///
 /// After damage it looks for the next headers whose check holds. Time is linear in the stream: a body is
 /// checked once for each headers with a good check of their own, which noise yields once in 10^11 bytes
 /// and a forger at most once in 22.
 #[derive(Debug, Default)]
-pub struct Receiver {
+pub struct PacketReceiver {
     buffer: Vec<u8>,
     /// Bytes of the buffer that are not yet consumed.
     begin: usize,
@@ -129,13 +129,13 @@ pub struct Receiver {
     /// Where headers were met at the end whose packet is not all there.
     cut_at: Option<u64>,
     finished: bool,
-    steps: VecDeque<Step>,
+    steps: VecDeque<PendingEvent>,
     sequences: [Sequence; Kind::ALL.len()],
     /// Whether whoever takes the events keeps the account of packet counts.
-    unjudged: bool,
+    unfiltered: bool,
 }
 
-impl Receiver {
+impl PacketReceiver {
     /// A receiver at the start of a stream.
     #[must_use]
     pub fn new() -> Self {
@@ -145,8 +145,8 @@ impl Receiver {
     /// A receiver that hands out every good packet, however often it comes, and says nothing of gaps: for those
     /// who know better what has been here before.
     #[must_use]
-    pub fn unjudged() -> Self {
-        Self { unjudged: true, ..Self::default() }
+    pub fn unfiltered() -> Self {
+        Self { unfiltered: true, ..Self::default() }
     }
 
     /// Takes the next bytes of the stream.
@@ -187,8 +187,12 @@ impl Receiver {
         if self.steps.is_empty() {
             self.look();
         }
-        let of_packet =
-            |step: &Step| matches!(step, Step::Packet { .. } | Step::Duplicate(_) | Step::Damaged(..));
+        let of_packet = |step: &PendingEvent| {
+            matches!(
+                step,
+                PendingEvent::Packet { .. } | PendingEvent::Duplicate(_) | PendingEvent::Damaged(..)
+            )
+        };
         self.steps.iter().any(of_packet)
     }
 
@@ -217,28 +221,28 @@ impl Receiver {
         let step = self.steps.pop_front()?;
         let offset = self.offset + self.begin as u64;
         Some(match step {
-            Step::Packet { header, late } => {
+            PendingEvent::Packet { header, late } => {
                 let packet = &self.buffer[self.begin..self.begin + header.bytes];
                 self.begin += header.bytes;
                 let payload = &packet[HEADER_BYTES..packet.len() - TRAILER_BYTES];
                 let check = packet.last_chunk().map_or(0, |check| u32::from_be_bytes(*check));
                 Event::Packet(Packet { offset, header, payload, check, late })
             }
-            Step::Duplicate(header) => {
+            PendingEvent::Duplicate(header) => {
                 self.begin += header.bytes;
                 Event::Duplicate { offset, header }
             }
-            Step::Damaged(header, bytes) => {
+            PendingEvent::Damaged(header, bytes) => {
                 self.begin += bytes;
                 Event::Damaged { offset, header, bytes: bytes as u64 }
             }
-            Step::Truncated { bytes } => {
+            PendingEvent::Truncated { bytes } => {
                 self.begin += bytes;
                 Event::Truncated { offset, bytes: bytes as u64 }
             }
-            Step::Garbage { offset, bytes } => Event::Garbage { offset, bytes },
-            Step::Gap { header, expected } => Event::Gap { offset, header, expected },
-            Step::Restart { header, expected } => Event::Restart { offset, header, expected },
+            PendingEvent::Garbage { offset, bytes } => Event::Garbage { offset, bytes },
+            PendingEvent::Gap { header, expected } => Event::Gap { offset, header, expected },
+            PendingEvent::Restart { header, expected } => Event::Restart { offset, header, expected },
         })
     }
 
@@ -262,14 +266,14 @@ impl Receiver {
     fn look(&mut self) {
         while self.begin < self.end {
             match self.find() {
-                Found::Good(header) => return self.take_good(header),
-                Found::Bad(header, bytes) => return self.take_damaged(header, bytes),
-                Found::Unknown => return,
-                Found::Cut => {
+                PacketMatch::Good(header) => return self.take_good(header),
+                PacketMatch::Bad(header, bytes) => return self.take_damaged(header, bytes),
+                PacketMatch::Unknown => return,
+                PacketMatch::Cut => {
                     self.cut_at.get_or_insert(self.offset + self.begin as u64);
                     self.pass_garbage();
                 }
-                Found::Nothing => self.pass_garbage(),
+                PacketMatch::Nothing => self.pass_garbage(),
             }
         }
         if self.finished {
@@ -278,34 +282,34 @@ impl Receiver {
     }
 
     /// What stands at the beginning of the unconsumed bytes.
-    fn find(&self) -> Found {
+    fn find(&self) -> PacketMatch {
         let rest = &self.buffer[self.begin..self.end];
         let Some(bytes) = rest.get(..HEADER_BYTES) else {
             // Less than headers: the beginning of a packet if it follows one and looks like one.
             return match (self.finished, rest[0] == PacketHeader::FIRST_BYTE) {
-                (_, false) => Found::Nothing,
-                (false, true) => Found::Unknown,
-                (true, true) if self.garbage_from.is_none() => Found::Cut,
-                (true, true) => Found::Nothing,
+                (_, false) => PacketMatch::Nothing,
+                (false, true) => PacketMatch::Unknown,
+                (true, true) if self.garbage_from.is_none() => PacketMatch::Cut,
+                (true, true) => PacketMatch::Nothing,
             };
         };
-        let Some(header) = PacketHeader::parse(bytes) else { return Found::Nothing };
+        let Some(header) = PacketHeader::parse(bytes) else { return PacketMatch::Nothing };
         let Some(packet) = rest.get(..header.bytes) else {
-            return if self.finished { Found::Cut } else { Found::Unknown };
+            return if self.finished { PacketMatch::Cut } else { PacketMatch::Unknown };
         };
         if packet_holds(packet) {
-            return Found::Good(header);
+            return PacketMatch::Good(header);
         }
         let after = &rest[header.bytes..];
         if after.len() < HEADER_BYTES && !self.finished {
-            return Found::Unknown;
+            return PacketMatch::Unknown;
         }
         let another_follows = match after.first() {
             None => true,
             Some(first) if after.len() < HEADER_BYTES => *first == PacketHeader::FIRST_BYTE,
             Some(_) => PacketHeader::parse(after).is_some(),
         };
-        Found::Bad(header, if another_follows { header.bytes } else { HEADER_BYTES })
+        PacketMatch::Bad(header, if another_follows { header.bytes } else { HEADER_BYTES })
     }
 
     /// Passes over one byte and on to the next that could begin a packet.
@@ -318,29 +322,29 @@ impl Receiver {
 
     fn end_garbage(&mut self, end: u64) {
         if let Some(offset) = self.garbage_from.take().filter(|offset| *offset < end) {
-            self.steps.push_back(Step::Garbage { offset, bytes: end - offset });
+            self.steps.push_back(PendingEvent::Garbage { offset, bytes: end - offset });
         }
     }
 
     fn take_good(&mut self, header: PacketHeader) {
-        let arrival = match self.unjudged {
+        let arrival = match self.unfiltered {
             true => Arrival::InOrder,
             false => self.sequences[header.kind.index()].receive(header.count, header.time),
         };
         self.announce(header, arrival);
         self.steps.push_back(match arrival {
-            Arrival::Duplicate => Step::Duplicate(header),
-            other => Step::Packet { header, late: other == Arrival::Late },
+            Arrival::Duplicate => PendingEvent::Duplicate(header),
+            other => PendingEvent::Packet { header, late: other == Arrival::Late },
         });
     }
 
     fn take_damaged(&mut self, header: PacketHeader, bytes: usize) {
-        let arrival = match self.unjudged {
+        let arrival = match self.unfiltered {
             true => Arrival::InOrder,
             false => self.sequences[header.kind.index()].pass_damaged(header.count, header.time),
         };
         self.announce(header, arrival);
-        self.steps.push_back(Step::Damaged(header, bytes));
+        self.steps.push_back(PendingEvent::Damaged(header, bytes));
     }
 
     /// What is to be said before a packet.
@@ -348,8 +352,8 @@ impl Receiver {
         self.cut_at = None;
         self.end_garbage(self.offset + self.begin as u64);
         match arrival {
-            Arrival::AfterGap { expected } => self.steps.push_back(Step::Gap { header, expected }),
-            Arrival::Restart { expected } => self.steps.push_back(Step::Restart { header, expected }),
+            Arrival::AfterGap { expected } => self.steps.push_back(PendingEvent::Gap { header, expected }),
+            Arrival::Restart { expected } => self.steps.push_back(PendingEvent::Restart { header, expected }),
             Arrival::InOrder | Arrival::Late | Arrival::Early | Arrival::Duplicate => {}
         }
     }
@@ -362,7 +366,7 @@ impl Receiver {
         if cut_at < end {
             let bytes = (end - cut_at) as usize;
             self.begin = self.end - bytes;
-            self.steps.push_back(Step::Truncated { bytes });
+            self.steps.push_back(PendingEvent::Truncated { bytes });
         }
     }
 }
@@ -372,12 +376,12 @@ mod tests {
     use rand::Rng;
 
     use super::*;
-    use crate::downlink::wire::{CucTime, FORMAT_VERSION, PACKET_BYTES_MAX, Segment};
+    use crate::downlink::wire::{CucTime, FORMAT_VERSION, PACKET_BYTES_MAX, PacketSegment};
     use crate::units::{StreamKind, random_stream};
 
     /// Bytes that a stream's events cover, and what the receiver ever held; it must have read all of it.
     fn cover(stream: &mut impl Read) -> (u64, usize) {
-        let mut receiver = Receiver::new();
+        let mut receiver = PacketReceiver::new();
         let (mut covered, mut held) = (0, 0);
         loop {
             if receiver.fill_from(stream).unwrap() == 0 {
@@ -427,7 +431,7 @@ mod tests {
             .flat_map(|count| {
                 PacketHeader {
                     kind: Kind::Visibilities,
-                    segment: Segment::Whole,
+                    segment: PacketSegment::Whole,
                     count: 2 * count,
                     time: CucTime(1),
                     version: FORMAT_VERSION,

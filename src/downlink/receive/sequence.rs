@@ -1,14 +1,14 @@
 //! Packet counts of one kind: what is missing, late, twice.
 
-use std::collections::BTreeMap;
 use std::ops::Range;
 
 use super::Taken;
 use crate::downlink::wire::CucTime;
+use crate::units::IntervalSet;
 
-/// Stretches that are remembered: of packets that came, and of missing ones in case they arrive late. Fifteen times the
-/// packets of the paper's mission. Bounds the memory to some 100 MB a kind, whatever a forger sends.
-const STRETCHES_MAX: usize = 1 << 20;
+/// Intervals of counts that are remembered, both of received packets and of missing ones that may arrive late. Fifteen
+/// times the packets of the paper's mission. Bounds the memory to some 100 MB a kind, whatever a forger sends.
+const INTERVALS_MAX: usize = 1 << 20;
 
 /// What the count of a packet says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,8 +44,8 @@ pub(crate) struct Sequence {
     newest: CucTime,
     /// Good packets that came.
     taken: Taken,
-    /// Missing counts below `next`: beginning and end (one beyond the last) of at most [`STRETCHES_MAX`] stretches.
-    missing: BTreeMap<u64, u64>,
+    /// Missing counts below `next`, in at most [`INTERVALS_MAX`] intervals.
+    missing: IntervalSet<u64>,
 }
 
 impl Sequence {
@@ -59,7 +59,7 @@ impl Sequence {
         }
         self.newest = self.newest.max(time);
         self.taken.take(count, time);
-        self.taken.forget_oldest(STRETCHES_MAX);
+        self.taken.forget_oldest(INTERVALS_MAX);
         arrival
     }
 
@@ -95,7 +95,7 @@ impl Sequence {
         } else if time > self.newest {
             self.begin(count);
             Arrival::Restart { expected }
-        } else if count >= self.first && self.stretch_of(count).is_some() {
+        } else if count >= self.first && self.missing.contains(count) {
             Arrival::Late
         } else {
             Arrival::Early
@@ -109,38 +109,16 @@ impl Sequence {
         self.miss(0..count);
     }
 
-    fn miss(&mut self, stretch: Range<u64>) {
-        if stretch.is_empty() {
-            return;
-        }
-        match self.missing.last_entry().filter(|last| *last.get() == stretch.start) {
-            Some(mut last) => *last.get_mut() = stretch.end,
-            None => drop(self.missing.insert(stretch.start, stretch.end)),
-        }
-        self.forget_oldest();
+    /// Marks counts as missing.
+    fn miss(&mut self, counts: Range<u64>) {
+        self.missing.insert(counts);
+        self.missing.drop_lowest(INTERVALS_MAX);
     }
 
-    /// The missing stretch that a count lies in.
-    fn stretch_of(&self, count: u64) -> Option<Range<u64>> {
-        let (&start, &end) = self.missing.range(..=count).next_back()?;
-        (count < end).then_some(start..end)
-    }
-
+    /// Marks a count as received.
     fn fill(&mut self, count: u64) {
-        let Some(stretch) = self.stretch_of(count) else { return };
-        self.missing.remove(&stretch.start);
-        for part in [stretch.start..count, count + 1..stretch.end] {
-            if !part.is_empty() {
-                self.missing.insert(part.start, part.end);
-            }
-        }
-        self.forget_oldest();
-    }
-
-    fn forget_oldest(&mut self) {
-        if self.missing.len() > STRETCHES_MAX {
-            self.missing.pop_first();
-        }
+        self.missing.remove(count..count + 1);
+        self.missing.drop_lowest(INTERVALS_MAX);
     }
 }
 
@@ -210,15 +188,15 @@ mod tests {
     #[test]
     fn memory_is_bounded() {
         let mut sequence = Sequence::default();
-        let last = 2 * (STRETCHES_MAX as u64 + 500);
+        let last = 2 * (INTERVALS_MAX as u64 + 500);
         for count in (0..=last).step_by(2) {
             sequence.receive(count, at(1));
         }
-        assert_eq!(sequence.missing.len(), STRETCHES_MAX);
+        assert_eq!(sequence.missing.intervals(), INTERVALS_MAX);
         // The oldest are forgotten, all others are not.
         assert_eq!(sequence.receive(1, at(1)), Arrival::Early);
         assert_eq!(sequence.receive(2 * 500 + 1, at(1)), Arrival::Late);
         assert_eq!(sequence.receive(last - 1, at(1)), Arrival::Late);
-        assert_eq!(sequence.missing.len(), STRETCHES_MAX - 2);
+        assert_eq!(sequence.missing.intervals(), INTERVALS_MAX - 2);
     }
 }

@@ -1,10 +1,24 @@
-//! How a downlink travels: files, sockets, and the pace of a replay.
+//! How a downlink travels: stages, files, TCP sockets, and the pace of a replay.
+//!
+//! - [`Transmitter`] encodes ground frames as bytes; [`Recorder`] writes a byte stream to a file.
+//! - [`FileSource`] reads files as a byte stream; [`Paced`] releases one at the pace of its packets.
+//! - [`DownlinkWriter`] and [`DownlinkReader`] write and read frames outside a pipeline.
+//! - [`socket`] sends a byte stream over TCP, and listens to several senders.
+//!
+//! Uses `wire`, `receive` and `runtime`. Bytes pass unchanged; a file is complete under its name or has the suffix
+//! `.partial`.
 
-mod file;
+mod file_source;
 mod pace;
+mod reader;
+mod recorder;
 pub mod socket;
-mod stages;
+mod transmitter;
+mod writer;
 
-pub use file::{DownlinkReader, DownlinkWriter};
+pub use file_source::FileSource;
 pub use pace::{Pace, Paced, Steps};
-pub use stages::{FileSource, Recorder, Transmitter};
+pub use reader::DownlinkReader;
+pub use recorder::Recorder;
+pub use transmitter::Transmitter;
+pub use writer::DownlinkWriter;

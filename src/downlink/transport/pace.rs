@@ -77,7 +77,7 @@ impl<S> Paced<S> {
             source,
             pace,
             gate: Gate::Open,
-            scout: Intake::unjudged(),
+            scout: Intake::unfiltered(),
             pending: VecDeque::new(),
             scouted: 0,
             given: 0,

@@ -28,7 +28,7 @@ pub(crate) const COUNT_MAX: u64 = (1 << 46) - 1;
 /// Segmentation flags: where in its payload a packet stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 #[repr(u8)]
-pub enum Segment {
+pub enum PacketSegment {
     /// Neither first nor last.
     Continuation = 0b00,
     /// The first of several.
@@ -45,7 +45,7 @@ pub struct PacketHeader {
     /// Kind, by APID.
     pub kind: Kind,
     /// Place in the payload.
-    pub segment: Segment,
+    pub segment: PacketSegment,
     /// Packets of this kind sent before this one, 46 bits.
     pub count: u64,
     /// Time at which the packet was made.
@@ -98,10 +98,10 @@ impl PacketHeader {
         Some(Self {
             kind,
             segment: match word(2) >> COUNT_BITS {
-                0b00 => Segment::Continuation,
-                0b01 => Segment::First,
-                0b10 => Segment::Last,
-                _ => Segment::Whole,
+                0b00 => PacketSegment::Continuation,
+                0b01 => PacketSegment::First,
+                0b10 => PacketSegment::Last,
+                _ => PacketSegment::Whole,
             },
             count: u64::from(high) << COUNT_BITS | u64::from(word(2) & ((1 << COUNT_BITS) - 1)),
             time,
@@ -136,7 +136,7 @@ mod tests {
     fn header() -> PacketHeader {
         PacketHeader {
             kind: Kind::Visibilities,
-            segment: Segment::Whole,
+            segment: PacketSegment::Whole,
             count: (5 << 14) | 7,
             time: CucTime(0x749E_3B80 << 24),
             version: FORMAT_VERSION,
@@ -173,8 +173,12 @@ mod tests {
 
     #[test]
     fn greatest_count_and_length_survive() {
-        let header =
-            PacketHeader { count: COUNT_MAX, bytes: PACKET_BYTES_MAX, segment: Segment::Last, ..header() };
+        let header = PacketHeader {
+            count: COUNT_MAX,
+            bytes: PACKET_BYTES_MAX,
+            segment: PacketSegment::Last,
+            ..header()
+        };
         assert_eq!(PacketHeader::parse(&header.to_bytes()), Some(header));
     }
 }

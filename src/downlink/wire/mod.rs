@@ -12,7 +12,9 @@ mod transmission;
 pub use cuc::CucTime;
 pub use format::Format;
 pub(crate) use header::{COUNT_MAX, packet_check, packet_holds};
-pub use header::{FORMAT_VERSION, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, Segment, TRAILER_BYTES};
+pub use header::{
+    FORMAT_VERSION, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, PacketSegment, TRAILER_BYTES,
+};
 pub use kind::{APID_BASE, Kind};
 pub use packetizer::Packetizer;
 pub use payload::{NODES_MIN, PayloadFault};

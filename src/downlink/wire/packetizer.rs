@@ -5,7 +5,7 @@ use super::payload::{
     visibilities_in,
 };
 use super::{
-    COUNT_MAX, CucTime, FORMAT_VERSION, HEADER_BYTES, Kind, PacketHeader, Segment, TRAILER_BYTES,
+    COUNT_MAX, CucTime, FORMAT_VERSION, HEADER_BYTES, Kind, PacketHeader, PacketSegment, TRAILER_BYTES,
     packet_check,
 };
 use crate::downlink::config::DownlinkConfig;
@@ -43,7 +43,7 @@ impl Packetizer {
     /// The first of [`DownlinkConfig::problems`].
     pub fn new(config: &DownlinkConfig) -> Result<Self, DownlinkError> {
         if let Some(problem) = config.problems().into_iter().next() {
-            return Err(problem);
+            return Err(problem.into());
         }
         Ok(Self {
             packet_bytes_max: config.packet_bytes_max,
@@ -151,7 +151,7 @@ impl Packetizer {
             let start = out.len();
             out.resize(start + HEADER_BYTES, 0);
             encode_visibilities(block, range, out)?;
-            self.seal(Kind::Visibilities, Segment::Whole, time, start, out);
+            self.seal(Kind::Visibilities, PacketSegment::Whole, time, start, out);
         }
         Ok(())
     }
@@ -169,10 +169,10 @@ impl Packetizer {
         let segments = payload.len().div_ceil(each);
         for (k, part) in payload.chunks(each).enumerate() {
             let segment = match (k == 0, k + 1 == segments) {
-                (true, true) => Segment::Whole,
-                (true, false) => Segment::First,
-                (false, true) => Segment::Last,
-                (false, false) => Segment::Continuation,
+                (true, true) => PacketSegment::Whole,
+                (true, false) => PacketSegment::First,
+                (false, true) => PacketSegment::Last,
+                (false, false) => PacketSegment::Continuation,
             };
             let start = out.len();
             out.resize(start + HEADER_BYTES, 0);
@@ -184,7 +184,7 @@ impl Packetizer {
     }
 
     /// Fills in the headers of the packet that begins at `start` and appends its check.
-    fn seal(&mut self, kind: Kind, segment: Segment, time: CucTime, start: usize, out: &mut Vec<u8>) {
+    fn seal(&mut self, kind: Kind, segment: PacketSegment, time: CucTime, start: usize, out: &mut Vec<u8>) {
         let bytes = out.len() - start + TRAILER_BYTES;
         let count = &mut self.counts[kind.index()];
         let header = PacketHeader { kind, segment, count: *count, time, version: FORMAT_VERSION, bytes };

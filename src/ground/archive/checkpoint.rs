@@ -13,6 +13,7 @@ use super::error::StateError;
 use super::journal::Journal;
 use crate::accumulation::AccumulatorState;
 use crate::calibration::{AutoTable, CalibratorState};
+use crate::frames::VisibilityReason;
 use crate::ground::{CollectorState, CollectorView};
 use crate::runtime::LedgerReport;
 
@@ -40,7 +41,7 @@ pub(super) struct Head {
     pub(super) calibrator: CalibratorState,
     pub(super) powers: AutoTable,
     pub(super) accumulator: AccumulatorState,
-    pub(super) ledger: LedgerReport,
+    pub(super) ledger: LedgerReport<VisibilityReason>,
     pub(super) journal: Journal,
 }
 
@@ -52,7 +53,7 @@ pub(super) struct HeadView<'a> {
     pub(super) calibrator: CalibratorState,
     pub(super) powers: &'a AutoTable,
     pub(super) accumulator: AccumulatorState,
-    pub(super) ledger: LedgerReport,
+    pub(super) ledger: LedgerReport<VisibilityReason>,
     pub(super) journal: &'a Journal,
 }
 
@@ -221,7 +222,7 @@ mod tests {
     use crate::accumulation::Accumulator;
     use crate::calibration::{Calibrator, Identity};
     use crate::downlink::{
-        CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PacketHeader, Segment, Transmission,
+        CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PacketHeader, PacketSegment, Transmission,
     };
     use crate::frames::{
         AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock,
@@ -258,7 +259,7 @@ mod tests {
             GroundFrame::Housekeeping(Housekeeping { time: MissionTime(5), sampled: 9, dropped: 1 }),
         ];
         let ledger = Ledger::new();
-        ledger.flagged("far", 4);
+        ledger.left_out(VisibilityReason::BaselineBeyondMap, 4);
         let mut accumulator = Accumulator::new(Default::default(), ledger.clone());
         let mut calibrator =
             Calibrator::new(Box::new(Identity), ledger.clone()).with_autos(Default::default());
@@ -273,7 +274,7 @@ mod tests {
         collector.push(&bytes);
         collector.finish();
         while collector.next_delivery(&|_| true).unwrap().is_some() {}
-        let (kind, segment, time) = (Kind::Visibilities, Segment::Whole, CucTime(3));
+        let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(3));
         let header = PacketHeader { kind, segment, count: 3, time, version: FORMAT_VERSION, bytes: 60 };
         let mut journal = Journal::default();
         journal.keep(header, 1, None, (2, 3, Some([1.0, 2.0])), &ledger.report());

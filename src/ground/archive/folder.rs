@@ -4,7 +4,7 @@ use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 
 use super::error::StateError;
-use crate::files::{AtomicFile, Unfinished};
+use crate::files::{AtomicFile, IfUnfinished};
 
 const PREFIX: &str = "checkpoint-";
 const SUFFIX: &str = ".lunarray";
@@ -78,7 +78,7 @@ impl StateFolder {
         write: impl FnOnce(&mut AtomicFile, &Path) -> Result<(), StateError>,
     ) -> Result<(), StateError> {
         let path = self.name(self.newest + 1);
-        let file = AtomicFile::create(&path, Unfinished::Remove);
+        let file = AtomicFile::create(&path, IfUnfinished::Remove);
         let mut file = file.map_err(StateError::io(&path, "create the file"))?;
         write(&mut file, &path)?;
         file.finish().map_err(StateError::io(&path, "finish the file"))?;

@@ -1,6 +1,6 @@
 //! A line on every packet that has been read, and what became of it.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use bincode::de::Decoder;
 use bincode::enc::Encoder;
@@ -8,7 +8,7 @@ use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 
 use crate::downlink::{CucTime, Kind, PacketHeader};
-use crate::frames::{PlacedVisibilities, VisibilityBlock};
+use crate::frames::{PlacedVisibilities, VisibilityBlock, VisibilityReason};
 use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime, Pair};
 
@@ -78,8 +78,8 @@ pub(super) struct Line {
     pub(super) offered: u32,
     /// Visibilities in the sums.
     pub(super) accumulated: u32,
-    /// Visibilities left out, by number of the reason in [`Journal`].
-    pub(super) flagged: Vec<(u16, u32)>,
+    /// Visibilities flagged or lost, by reason.
+    pub(super) left_out: Vec<(VisibilityReason, u32)>,
     /// First and last mission time, s, of those that were offered to the sums.
     pub(super) used_s: Option<[f64; 2]>,
 }
@@ -101,8 +101,6 @@ pub(super) struct OtherLine {
 pub(super) struct Journal {
     pub(super) visibilities: BTreeMap<Sent, Line>,
     pub(super) others: BTreeMap<(Kind, Sent), OtherLine>,
-    /// Why visibilities were left out, as the ledger has it.
-    reasons: Vec<String>,
 }
 
 impl Journal {
@@ -126,69 +124,22 @@ impl Journal {
         check: u32,
         block: Option<&VisibilityBlock>,
         (digest, offered, used_s): (u32, u32, Option<[f64; 2]>),
-        account: &LedgerReport,
+        account: &LedgerReport<VisibilityReason>,
     ) {
-        let mut flagged = Vec::new();
-        for (reason, &count) in &account.flagged {
-            flagged.push((self.number_of(reason), count as u32));
-        }
+        let left_out = account.left_out.iter().map(|(&reason, &count)| (reason, count as u32)).collect();
         let (entry, accumulated) = (JournalEntry::of(header, block), account.accumulated as u32);
-        let line = Line { entry, check, digest, offered, accumulated, flagged, used_s };
+        let line = Line { entry, check, digest, offered, accumulated, left_out, used_s };
         self.visibilities.insert((header.time, header.count), line);
-    }
-
-    fn number_of(&mut self, reason: &str) -> u16 {
-        let known = self.reasons.iter().position(|known| known == reason);
-        let number = known.unwrap_or_else(|| {
-            self.reasons.push(reason.to_owned());
-            self.reasons.len() - 1
-        });
-        number as u16
-    }
-
-    /// Numbers the reasons that occur in the order of their names, so that lines do not tell in which order they came.
-    pub(super) fn renumber(&mut self) {
-        let used = self.visibilities.values().flat_map(|line| line.flagged.iter().map(|(number, _)| *number));
-        let used: BTreeSet<u16> = used.collect();
-        let mut names: Vec<(String, u16)> = Vec::new();
-        for number in used {
-            names.extend(self.reasons.get(usize::from(number)).map(|name| (name.clone(), number)));
-        }
-        names.sort();
-        let unchanged =
-            names.len() == self.reasons.len() && names.iter().zip(0..).all(|((_, old), new)| *old == new);
-        if unchanged {
-            return;
-        }
-        let new: BTreeMap<u16, u16> = names.iter().zip(0..).map(|((_, old), new)| (*old, new)).collect();
-        for line in self.visibilities.values_mut() {
-            for (number, _) in &mut line.flagged {
-                *number = new.get(number).copied().unwrap_or(u16::MAX);
-            }
-            line.flagged.sort_unstable();
-        }
-        self.reasons = names.into_iter().map(|(name, _)| name).collect();
-    }
-
-    /// Visibilities of a line that were left out, by reason.
-    pub(super) fn flagged<'a>(&'a self, line: &'a Line) -> impl Iterator<Item = (&'a str, u64)> {
-        let reason = |number: u16| self.reasons.get(usize::from(number)).map_or("", String::as_str);
-        line.flagged.iter().map(move |&(number, count)| (reason(number), u64::from(count)))
     }
 
     /// Takes all lines of another journal; the first packet of visibilities that is in both is refused, and gives
     /// packets of other kinds that are in both.
     pub(super) fn absorb(&mut self, other: Self) -> Result<Vec<(Kind, OtherLine)>, u64> {
-        let Self { visibilities, others, reasons } = other;
+        let Self { visibilities, others } = other;
         if let Some((_, count)) = visibilities.keys().find(|sent| self.visibilities.contains_key(sent)) {
             return Err(*count);
         }
-        for (sent, mut line) in visibilities {
-            for (number, _) in &mut line.flagged {
-                *number = self.number_of(reasons.get(usize::from(*number)).map_or("", String::as_str));
-            }
-            self.visibilities.insert(sent, line);
-        }
+        self.visibilities.extend(visibilities);
         let mut both = Vec::new();
         for (key, line) in others {
             if let Some(ours) = self.others.get_mut(&key) {
@@ -228,8 +179,7 @@ impl Encode for Journal {
         for line in self.visibilities.values() {
             line.encode(encoder)?;
         }
-        self.others.encode(encoder)?;
-        self.reasons.encode(encoder)
+        self.others.encode(encoder)
     }
 }
 
@@ -238,7 +188,7 @@ impl<Context> Decode<Context> for Journal {
         let lines = Vec::<Line>::decode(decoder)?;
         let sent = |line: &Line| (line.entry.made, line.entry.count);
         let visibilities = lines.into_iter().map(|line| (sent(&line), line)).collect();
-        Ok(Self { visibilities, others: Decode::decode(decoder)?, reasons: Decode::decode(decoder)? })
+        Ok(Self { visibilities, others: Decode::decode(decoder)? })
     }
 }
 
@@ -261,35 +211,35 @@ pub(super) fn digest(placed: &PlacedVisibilities) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::downlink::{FORMAT_VERSION, Segment};
+    use crate::downlink::{FORMAT_VERSION, PacketSegment};
 
     fn header(count: u64) -> PacketHeader {
-        let (kind, segment, time) = (Kind::Visibilities, Segment::Whole, CucTime(7 * count));
+        let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(7 * count));
         PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 }
     }
 
-    fn account(reasons: &[(&str, u64)]) -> LedgerReport {
-        let flagged = reasons.iter().map(|(reason, count)| ((*reason).to_owned(), *count)).collect();
-        LedgerReport { accumulated: 5, flagged, ..LedgerReport::default() }
+    const FAR: VisibilityReason = VisibilityReason::BaselineBeyondMap;
+    const BRIGHT: VisibilityReason = VisibilityReason::Interference;
+
+    fn account(reasons: &[(VisibilityReason, u64)]) -> LedgerReport<VisibilityReason> {
+        let left_out = reasons.iter().copied().collect();
+        LedgerReport { accumulated: 5, left_out, ..LedgerReport::default() }
     }
 
-    fn told(journal: &Journal) -> Vec<(u64, Vec<(String, u64)>)> {
-        let flagged =
-            |line: &Line| journal.flagged(line).map(|(reason, count)| (reason.to_owned(), count)).collect();
-        journal.visibilities.values().map(|line| (line.entry.count, flagged(line))).collect()
+    type Told = Vec<(u64, Vec<(VisibilityReason, u32)>)>;
+
+    fn told(journal: &Journal) -> Told {
+        journal.visibilities.values().map(|line| (line.entry.count, line.left_out.clone())).collect()
     }
 
     #[test]
     fn reasons_are_told_again_whatever_was_merged_and_kept() {
         let (mut ours, mut theirs) = (Journal::default(), Journal::default());
-        ours.keep(header(1), 11, None, (0, 0, None), &account(&[("far", 2)]));
-        theirs.keep(header(2), 12, None, (0, 0, None), &account(&[("bright", 3), ("far", 4)]));
+        ours.keep(header(1), 11, None, (0, 0, None), &account(&[(FAR, 2)]));
+        theirs.keep(header(2), 12, None, (0, 0, None), &account(&[(BRIGHT, 3), (FAR, 4)]));
         theirs.keep(header(0), 13, None, (0, 0, None), &account(&[]));
         assert_eq!(ours.absorb(theirs.clone()), Ok(vec![]));
-        let far = |count| ("far".to_owned(), count);
-        let expected = vec![(0, vec![]), (1, vec![far(2)]), (2, vec![("bright".to_owned(), 3), far(4)])];
-        assert_eq!(told(&ours), expected);
-        ours.renumber();
+        let expected: Told = vec![(0, vec![]), (1, vec![(FAR, 2)]), (2, vec![(BRIGHT, 3), (FAR, 4)])];
         assert_eq!(told(&ours), expected);
         let bytes = bincode::encode_to_vec(&ours, bincode::config::standard()).unwrap();
         let (kept, used) =
@@ -297,15 +247,9 @@ mod tests {
         assert_eq!((&kept, used), (&ours, bytes.len()));
         // The other way round the same is told.
         let mut first = Journal::default();
-        first.keep(header(1), 11, None, (0, 0, None), &account(&[("far", 2)]));
+        first.keep(header(1), 11, None, (0, 0, None), &account(&[(FAR, 2)]));
         assert_eq!(theirs.absorb(first.clone()), Ok(vec![]));
-        theirs.renumber();
         assert_eq!((told(&theirs), &theirs), (expected, &ours));
-        // What no line needs any more is forgotten.
-        let mut without = theirs.clone();
-        without.visibilities.retain(|(_, count), _| *count == 1);
-        without.renumber();
-        assert_eq!(without.reasons, ["far"]);
         assert_eq!(theirs.absorb(first), Err(1));
     }
 }

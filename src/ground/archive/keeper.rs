@@ -13,7 +13,9 @@ use super::settings::{compare, settings_of};
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::Calibrator;
 use crate::downlink::{DownlinkError, Kind, PacketHeader};
-use crate::frames::{GroundFrame, Instrument, PlacedFrame, PlacedVisibilities, VisibilityBlock};
+use crate::frames::{
+    GroundFrame, Instrument, PlacedFrame, PlacedVisibilities, VisibilityBlock, VisibilityReason,
+};
 use crate::ground::{Collector, Delivery};
 use crate::pipeline::config::Config;
 use crate::pipeline::ground_segment::{GroundOutcome, stages};
@@ -30,7 +32,7 @@ pub struct Keeper {
     pub(super) journal: Journal,
     pub(super) outcome: GroundOutcome,
     /// What becomes of the packet that is being applied.
-    tally: Ledger,
+    tally: Ledger<VisibilityReason>,
     checkpoint_every: u64,
     since_checkpoint: u64,
 }
@@ -259,7 +261,6 @@ impl Keeper {
 
     pub(super) fn checkpoint(&mut self) -> Result<(), StateError> {
         self.since_checkpoint = 0;
-        self.journal.renumber();
         let head = HeadView {
             settings: &self.settings,
             collector: self.collector.view(),

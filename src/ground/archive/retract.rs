@@ -1,7 +1,6 @@
 //! Taking packets out of a state again.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -10,9 +9,9 @@ use super::error::StateError;
 use super::folder::checkpoints;
 use super::journal::{Line, Sent, digest};
 use super::keeper::Keeper;
-use crate::calibration::DUPLICATE;
-use crate::downlink::{Event, Intake, Kind, PacketHeader};
-use crate::frames::GroundFrame;
+use crate::downlink::receive::EventReader;
+use crate::downlink::{Event, Kind, PacketHeader};
+use crate::frames::{GroundFrame, VisibilityReason};
 use crate::ground::WaitingPacket;
 use crate::pipeline::config::Config;
 use crate::runtime::LedgerReport;
@@ -110,25 +109,12 @@ impl Keeper {
     }
 
     fn retract_file(&mut self, path: &Path, found: &mut Found) -> Result<(), StateError> {
-        let mut file = File::open(path).map_err(StateError::io(path, "open the file"))?;
-        let mut intake = Intake::unjudged();
-        let mut packets = 0_u64;
-        loop {
-            let read = intake.fill_from(&mut file).map_err(StateError::io(path, "read"))?;
-            if read == 0 {
-                intake.finish();
-            }
-            while let Some(event) = intake.next_event() {
-                if let Event::Packet(packet) = event {
-                    packets += 1;
-                    self.retract_packet(WaitingPacket::of(&packet), found)?;
-                }
-            }
-            if read == 0 {
-                break;
-            }
-        }
-        if packets == 0 {
+        let mut events = EventReader::open(path)?.unfiltered();
+        events.for_each(|event| match event {
+            Event::Packet(packet) => self.retract_packet(WaitingPacket::of(packet), found),
+            _ => Ok(()),
+        })?;
+        if events.packets() == 0 {
             let (path, found) = (path.to_owned(), "not one packet".into());
             return Err(StateError::Damaged {
                 path,
@@ -178,7 +164,7 @@ impl Keeper {
         let header = packet.header;
         let sent = (header.time, header.count);
         let Some(line) = self.journal.visibilities.get(&sent).cloned() else { return Ok(()) };
-        let account = self.account_of(&line);
+        let account = Self::account_of(&line);
         let is_double = account.sampled > 0;
         let block = self.collector.read_again(&packet);
         if let Some(block) = block.filter(|_| !is_double) {
@@ -211,13 +197,13 @@ impl Keeper {
     }
 
     /// What a line has posted to the ledger.
-    fn account_of(&self, line: &Line) -> LedgerReport {
+    fn account_of(line: &Line) -> LedgerReport<VisibilityReason> {
         let mut account =
             LedgerReport { accumulated: u64::from(line.accumulated), ..LedgerReport::default() };
-        for (reason, count) in self.journal.flagged(line) {
-            // Doubles have been posted as sampled a second time.
-            account.sampled += if reason == DUPLICATE { count } else { 0 };
-            account.flagged.insert(reason.to_owned(), count);
+        for &(reason, count) in &line.left_out {
+            // Duplicates have been posted as sampled a second time.
+            account.sampled += if reason == VisibilityReason::Duplicate { u64::from(count) } else { 0 };
+            account.left_out.insert(reason, u64::from(count));
         }
         account
     }

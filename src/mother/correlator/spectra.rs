@@ -27,7 +27,7 @@ use super::align::BlockRow;
 use super::kernel::{LANES, ProductSums};
 use crate::array::Array;
 use crate::frames::{Channel, SampleBlock, Samples};
-use crate::response::pixel::kernel::fused;
+use crate::units::arithmetic::fused;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, dot};
 

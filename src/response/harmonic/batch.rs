@@ -1,4 +1,4 @@
-//! One batch of runs, from groups of common alphas to visibilities.
+//! One batch of runs: groups that share alphas, their projection, and the visibilities.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
@@ -6,52 +6,55 @@ use num_complex::{Complex32, Complex64};
 use rayon::prelude::*;
 
 use super::blocked::{BLOCK_NODES, PATTERN_LANES};
-use super::forward::{ALPHAS_MAX, AlphaPart, Group, ORDER_LANES, OrderBlock, RunPlan, project};
+use super::forward::{
+    ALPHAS_MAX, AlphaPart, ORDER_LANES, OrderBlock, Projection, RunGroup, RunPlan, project,
+};
 use super::kernel::LANES;
 use super::model::{ALPHA_TOLERANCE, HarmonicModel, TERMS};
 use super::rotation::orders;
 use super::runs::Run;
 use super::{PairState, chebyshev};
+use crate::units::arithmetic::sinc;
 
-/// Alphas of the grid for which the sky is turned at once.
+/// Alphas of the grid for which the sky is rotated together.
 pub(super) const ALPHA_BLOCK: usize = 64;
-/// Blocks of alphas that are kept, and most that a batch may use.
+/// Blocks of alphas kept, and the most that a batch may use.
 pub(super) const BLOCKS_KEPT: usize = 4;
-/// Most runs of a batch; bounds its memory.
+/// Most runs in a batch; bounds its memory.
 const RUNS_AT_ONCE: usize = 256;
-/// Alphas that groups of several runs aim at.
+/// Target number of alphas in groups of several runs.
 const ALPHAS_AIMED_AT: usize = 4;
 
-/// Groups of runs and how to evaluate them. Runs are numbered in the order of the batch.
+/// Groups of runs and their plans. Indices of runs are those in the batch.
 pub(super) struct Batch {
     runs: Vec<Run>,
-    groups: Vec<Group>,
+    groups: Vec<RunGroup>,
     plans: Vec<RunPlan>,
     blocks: Vec<usize>,
 }
 
-/// A stretch of alpha that a group covers.
+/// The interval of alpha that a group covers.
 #[derive(Clone, Copy)]
-struct Stretch {
+struct AlphaRange {
     low: f64,
     high: f64,
 }
 
 impl Batch {
-    /// As many of the runs `order` (sorted by alpha) as make a batch, and their number.
+    /// Takes a batch from the head of the runs `order` (sorted by alpha), and says how many it took.
     pub(super) fn new(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (Self, usize) {
         let mut batch = Self { runs: Vec::new(), groups: Vec::new(), plans: Vec::new(), blocks: Vec::new() };
         let mut taken = 0;
         while taken < order.len() && taken < RUNS_AT_ONCE {
-            let (stretch, count) = group(model, runs, &order[taken..]);
-            let (group, needs) = batch.alphas(model, stretch);
+            let (range, count) = group(model, runs, &order[taken..]);
+            let (group, needs) = batch.alphas(model, range);
             if needs.len() > BLOCKS_KEPT && taken > 0 {
                 break;
             }
             batch.blocks = needs;
             let mut group = group;
             for &run in &order[taken..taken + count] {
-                let plan = plan(model, &runs[run], stretch, group.alphas.len());
+                let plan = plan(model, &runs[run], range, group.alphas.len());
                 group.runs.push(batch.runs.len());
                 group.blocks.extend(plan.first_block..plan.first_block + plan.blocks);
                 batch.plans.push(plan);
@@ -65,16 +68,16 @@ impl Batch {
         (batch, taken)
     }
 
-    /// A group's alphas, and the blocks that the batch needs with them.
-    fn alphas(&self, model: &HarmonicModel, stretch: Stretch) -> (Group, Vec<usize>) {
+    /// A group with its alphas, and the blocks of alphas that the batch then needs.
+    fn alphas(&self, model: &HarmonicModel, range: AlphaRange) -> (RunGroup, Vec<usize>) {
         let mut needs = self.blocks.clone();
-        let half = 0.5 * (stretch.high - stretch.low);
+        let half = 0.5 * (range.high - range.low);
         let terms = alpha_terms(model, half);
         let per_radian = model.alpha.count as f64 / TAU;
         let alphas = chebyshev::points(terms)
             .into_iter()
             .map(|t| {
-                let x = (0.5 * (stretch.high + stretch.low) + half * t).rem_euclid(TAU) * per_radian;
+                let x = (0.5 * (range.high + range.low) + half * t).rem_euclid(TAU) * per_radian;
                 let (first, lanes) = model.alpha.kernel.spread(x);
                 let mut parts: Vec<AlphaPart> = Vec::new();
                 for (k, &weight) in (first..).zip(&lanes[..model.alpha.kernel.width()]) {
@@ -91,31 +94,31 @@ impl Batch {
                 parts
             })
             .collect();
-        (Group { alphas, runs: Vec::new(), blocks: Vec::new() }, needs)
+        (RunGroup { alphas, runs: Vec::new(), blocks: Vec::new() }, needs)
     }
 }
 
-/// Alphas that carry a stretch of this half width.
+/// Number of alphas for an interval of this half width.
 fn alpha_terms(model: &HarmonicModel, half: f64) -> usize {
     let tolerance = ALPHA_TOLERANCE * model.settings().tolerance;
     let h = half * model.sky.l_max() as f64;
     chebyshev::terms_for(h, tolerance).unwrap_or(ALPHAS_MAX).min(ALPHAS_MAX)
 }
 
-/// The runs at the head of `order` that share alphas, and the stretch they cover.
-fn group(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (Stretch, usize) {
+/// Number of runs at the head of `order` that can share alphas, and the interval they cover.
+fn group(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (AlphaRange, usize) {
     let reach = chebyshev::reach(ALPHAS_AIMED_AT, ALPHA_TOLERANCE * model.settings().tolerance)
         / model.sky.l_max().max(1) as f64;
-    let stretch = |k: usize| {
+    let range = |k: usize| {
         let run = &runs[k];
         let middle = (run.node[0] - FRAC_PI_2).rem_euclid(TAU);
-        Stretch { low: middle - run.node[1].abs(), high: middle + run.node[1].abs() }
+        AlphaRange { low: middle - run.node[1].abs(), high: middle + run.node[1].abs() }
     };
-    let mut whole = stretch(order[0]);
+    let mut whole = range(order[0]);
     let mut count = 1;
     for &k in order[1..].iter().take(RUNS_AT_ONCE / 4) {
-        let next = stretch(k);
-        let joined = Stretch { low: whole.low.min(next.low), high: whole.high.max(next.high) };
+        let next = range(k);
+        let joined = AlphaRange { low: whole.low.min(next.low), high: whole.high.max(next.high) };
         if joined.high - joined.low > 2.0 * reach {
             break;
         }
@@ -125,8 +128,8 @@ fn group(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (Stretch, usiz
     (whole, count)
 }
 
-/// Where a run's Chebyshev coefficients come from.
-fn plan(model: &HarmonicModel, run: &Run, stretch: Stretch, alphas: usize) -> RunPlan {
+/// The weights of a run.
+fn plan(model: &HarmonicModel, run: &Run, range: AlphaRange, alphas: usize) -> RunPlan {
     let tolerance = model.settings().tolerance;
     let drift = TAU * run.u[1].abs() + model.sky.l_max() as f64 * run.node[1].abs();
     let terms = chebyshev::terms_for(drift, tolerance).unwrap_or(TERMS).min(TERMS);
@@ -137,8 +140,8 @@ fn plan(model: &HarmonicModel, run: &Run, stretch: Stretch, alphas: usize) -> Ru
     let last_node = (node(run.u[0] + run.u[1].abs()) + reach).floor().max(0.0) as usize;
     let first_block = first_node / BLOCK_NODES;
     let blocks = last_node.min(grid.count - 1) / BLOCK_NODES + 1 - first_block;
-    let middle = 0.5 * (stretch.high + stretch.low);
-    let half = (0.5 * (stretch.high - stretch.low)).max(1e-300);
+    let middle = 0.5 * (range.high + range.low);
+    let half = (0.5 * (range.high - range.low)).max(1e-300);
     let run_middle = (run.node[0] - FRAC_PI_2).rem_euclid(TAU);
     let mut weights = vec![[0.0_f64; PATTERN_LANES]; terms * blocks * alphas];
     let analysis = chebyshev::analysis(terms);
@@ -166,9 +169,9 @@ fn plan(model: &HarmonicModel, run: &Run, stretch: Stretch, alphas: usize) -> Ru
 impl HarmonicModel {
     /// The visibilities of each run of a batch.
     pub(super) fn evaluate(&mut self, states: &[PairState], batch: &Batch) -> Vec<Vec<Complex64>> {
-        self.turn_sky(&batch.blocks);
+        self.rotate_sky(&batch.blocks);
         let l_max = self.sky.l_max();
-        let groups: Vec<Group> = batch.groups.iter().map(|group| self.located(group)).collect();
+        let groups: Vec<RunGroup> = batch.groups.iter().map(|group| self.located(group)).collect();
         let mut offsets = vec![0];
         for plan in &batch.plans {
             offsets.push(offsets[offsets.len() - 1] + plan.terms);
@@ -178,13 +181,15 @@ impl HarmonicModel {
             .flat_map(|first| [0, 1].map(|parity| OrderBlock { parity, first }))
             .filter(|block| block.order(0) <= l_max)
             .collect();
-        let projected: Vec<Vec<f32>> = tasks
-            .par_iter()
-            .map(|&task| {
-                let tables = (&self.skies[..], &self.patterns);
-                project(task, l_max, tables, (&groups, &batch.plans), &offsets)
-            })
-            .collect();
+        let inputs = Projection {
+            l_max,
+            skies: &self.skies,
+            patterns: &self.patterns,
+            groups: &groups,
+            plans: &batch.plans,
+            offsets: &offsets,
+        };
+        let projected: Vec<Vec<f32>> = tasks.par_iter().map(|&task| project(task, &inputs)).collect();
         batch
             .runs
             .par_iter()
@@ -197,8 +202,8 @@ impl HarmonicModel {
             .collect()
     }
 
-    /// A group with its blocks' places among the skies that are at hand.
-    fn located(&self, group: &Group) -> Group {
+    /// The group with blocks of alphas replaced by their indices among the rotated skies.
+    fn located(&self, group: &RunGroup) -> RunGroup {
         let mut group = group.clone();
         for alpha in group.alphas.iter_mut().flatten() {
             alpha.block = self.blocks.iter().position(|b| *b == alpha.block).unwrap_or_default();
@@ -206,7 +211,7 @@ impl HarmonicModel {
         group
     }
 
-    /// Chebyshev coefficients on the grid in gamma: a row a term, its first values repeated at its end.
+    /// Chebyshev coefficients on the grid in gamma: one row a term, its first values repeated at its end.
     fn rows(
         &self,
         tasks: &[OrderBlock],
@@ -264,9 +269,4 @@ impl HarmonicModel {
             })
             .collect()
     }
-}
-
-/// sin(x) / x.
-fn sinc(x: f64) -> f64 {
-    if x.abs() < 1e-8 { 1.0 } else { x.sin() / x }
 }

@@ -1,32 +1,32 @@
-//! Patterns in the order in which the forward kernel reads them.
+//! Patterns in the order in which the forward kernel reads them: block after block of nodes.
 
 use rayon::prelude::*;
 
 use super::filter::FilteredPatterns;
 use super::pattern::{NodeGrid, degrees};
 
-/// Nodes of a block.
+/// Nodes in a block.
 pub(crate) const BLOCK_NODES: usize = 8;
-/// Values of a block at one degree: both signs of mu at each node.
+/// Values of a block at one degree: both signs of mu at every node.
 pub(crate) const PATTERN_LANES: usize = 2 * BLOCK_NODES;
 
 /// One cache line: a block at one degree.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[repr(align(64))]
-pub(crate) struct Lanes(pub(crate) [f32; PATTERN_LANES]);
+pub(crate) struct PatternLanes(pub(crate) [f32; PATTERN_LANES]);
 
-/// Patterns by blocks of nodes. A block's degrees follow each other in memory: in rows over all nodes they would
-/// lie kilobytes apart, and reading them would take four times as long as the arithmetic.
+/// Patterns by blocks of nodes. The degrees of a block are contiguous in memory: in rows over all nodes they would be
+/// kilobytes apart, and reading them would take four times as long as the arithmetic.
 #[derive(Clone, Debug)]
 pub(crate) struct BlockedPatterns {
     pub(crate) grid: NodeGrid,
     /// By mu: `[block][l]`.
-    orders: Vec<Vec<Lanes>>,
+    orders: Vec<Vec<PatternLanes>>,
     l_max: usize,
 }
 
 impl BlockedPatterns {
-    /// The same patterns, of degrees up to `l_max`.
+    /// Reorders patterns of degrees up to `l_max`.
     pub(crate) fn new(patterns: FilteredPatterns, l_max: usize) -> Self {
         let (grid, orders) = patterns.into_orders();
         let blocks = grid.count.div_ceil(BLOCK_NODES);
@@ -35,7 +35,7 @@ impl BlockedPatterns {
             .enumerate()
             .map(|(mu, values)| {
                 let rows = degrees(l_max, mu);
-                let mut out = vec![Lanes([0.0; PATTERN_LANES]); blocks * rows];
+                let mut out = vec![PatternLanes([0.0; PATTERN_LANES]); blocks * rows];
                 for (row, values) in values.chunks_exact(2 * grid.count).take(rows).enumerate() {
                     for (block, values) in values.chunks(PATTERN_LANES).enumerate() {
                         out[block * rows + row].0[..values.len()].copy_from_slice(values);
@@ -47,9 +47,9 @@ impl BlockedPatterns {
         Self { grid, orders, l_max }
     }
 
-    /// A block of order mu: l = mu, mu + 2, ..
+    /// A block of order mu: one entry for each l = mu, mu + 2, ..
     #[inline]
-    pub(crate) fn block(&self, mu: usize, block: usize) -> &[Lanes] {
+    pub(crate) fn block(&self, mu: usize, block: usize) -> &[PatternLanes] {
         let rows = degrees(self.l_max, mu);
         &self.orders[mu][block * rows..(block + 1) * rows]
     }

@@ -2,10 +2,11 @@
 
 use faer::Mat;
 use faer::prelude::*;
+use rayon::prelude::*;
 
 use super::Real;
 use super::pattern::{NodeGrid, PatternTable, degrees};
-use rayon::prelude::*;
+use crate::units::arithmetic::sinc;
 
 /// Taps on each side of a node.
 const REACH: usize = 10;
@@ -96,8 +97,7 @@ fn fit(
     let response = response(&frequencies);
     let wanted = Mat::from_fn(samples, grid.count, |k, node| {
         let phase = std::f64::consts::PI * width(grid.u(node)) * frequencies[k];
-        let mean = if phase.abs() < 1e-8 { 1.0 } else { phase.sin() / phase };
-        response[k] * mean
+        response[k] * sinc(phase)
     });
     let solution = basis.qr().solve_lstsq(&wanted);
     (0..grid.count).map(|node| std::array::from_fn(|j| solution[(j.abs_diff(REACH), node)] as f32)).collect()

@@ -1,17 +1,17 @@
-//! The inner loops of the forward operator.
+//! Inner loops of the forward operator.
 //!
-//! For each order mu: the sky turned to a group's alphas, its products with the patterns at a run's nodes,
-//! and their reduction to the run's Chebyshev terms.
+//! For each order mu: interpolate the rotated sky to the alphas of a group, multiply it by the patterns at the nodes of
+//! a run, and reduce the products to the run's Chebyshev terms.
 
-use super::blocked::{BlockedPatterns, Lanes, PATTERN_LANES};
+use super::blocked::{BlockedPatterns, PATTERN_LANES, PatternLanes};
 use super::rotation::{RotatedSky, orders};
 
-/// Orders mu that one task takes: a vector of the rotated sky.
+/// Orders mu of one task: a vector of the rotated sky.
 pub(crate) const ORDER_LANES: usize = 16;
-/// Most alphas of a group.
+/// Most alphas in a group.
 pub(crate) const ALPHAS_MAX: usize = 6;
 
-/// A part of one alpha of a group: which rotated sky, from which of its alphas on, and the kernel there.
+/// Part of the interpolation to one alpha: which rotated sky, the first of its alphas, and the kernel from there on.
 #[derive(Clone, Debug)]
 pub(crate) struct AlphaPart {
     pub(crate) block: usize,
@@ -19,33 +19,34 @@ pub(crate) struct AlphaPart {
     pub(crate) weights: Vec<f32>,
 }
 
-/// Products at one block of nodes: the real and the imaginary part at each alpha.
+/// Products at one block of nodes: real and imaginary part at each alpha.
 type Products = [[f32; PATTERN_LANES]; 2 * ALPHAS_MAX];
 
-/// Runs that share their alphas.
+/// Runs that share alphas.
 #[derive(Clone, Debug)]
-pub(crate) struct Group {
-    /// Each alpha in one or two parts.
+pub(crate) struct RunGroup {
+    /// Each alpha, in one or two parts.
     pub(crate) alphas: Vec<Vec<AlphaPart>>,
-    /// Places of its runs among those of the batch.
+    /// Indices of its runs in the batch.
     pub(crate) runs: Vec<usize>,
-    /// The blocks of nodes that its runs need, in order.
+    /// Blocks of nodes that its runs need, in order.
     pub(crate) blocks: Vec<usize>,
 }
 
-/// How a run's Chebyshev coefficients come from products at alphas and nodes.
+/// Weights that reduce products at alphas and nodes to the Chebyshev coefficients of a run.
 #[derive(Clone, Debug)]
 pub(crate) struct RunPlan {
-    /// The first of its blocks of nodes.
+    /// First of its blocks of nodes.
     pub(crate) first_block: usize,
-    /// Their number.
+    /// Number of blocks.
     pub(crate) blocks: usize,
+    /// Number of Chebyshev terms.
     pub(crate) terms: usize,
     /// `[term][block][alpha]`: a weight for each lane of the pattern vector.
     pub(crate) weights: Vec<[f32; PATTERN_LANES]>,
 }
 
-/// A task's slice of orders: mu = parity + 2 (first + lane).
+/// The orders of a task: mu = parity + 2 (first + lane).
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct OrderBlock {
     pub(crate) parity: usize,
@@ -59,20 +60,28 @@ impl OrderBlock {
     }
 }
 
-/// Chebyshev coefficients of a block's orders: for each run, term and lane `A_mu` (re, im) and
-/// `conj(A_{-mu})` (re, im); runs start at `offsets`.
-pub(crate) fn project(
-    block: OrderBlock,
-    l_max: usize,
-    (skies, patterns): (&[RotatedSky<f32>], &BlockedPatterns),
-    (groups, plans): (&[Group], &[RunPlan]),
-    offsets: &[usize],
-) -> Vec<f32> {
+/// The inputs of a projection, shared by all tasks.
+pub(crate) struct Projection<'a> {
+    pub(crate) l_max: usize,
+    /// Rotated skies, as the parts of alphas number them.
+    pub(crate) skies: &'a [RotatedSky<f32>],
+    pub(crate) patterns: &'a BlockedPatterns,
+    pub(crate) groups: &'a [RunGroup],
+    /// By run.
+    pub(crate) plans: &'a [RunPlan],
+    /// First term of each run in the output, and the number of all terms.
+    pub(crate) offsets: &'a [usize],
+}
+
+/// Chebyshev coefficients of a block's orders: for each term of each run and each lane `A_mu` (re, im) and
+/// `conj(A_{-mu})` (re, im).
+pub(crate) fn project(block: OrderBlock, inputs: &Projection<'_>) -> Vec<f32> {
+    let Projection { l_max, skies, patterns, groups, plans, offsets } = *inputs;
     let mut out = vec![0.0; 4 * ORDER_LANES * offsets[plans.len()]];
     let rows = (l_max - block.order(0)) / 2 + 1;
-    let turned: Vec<Vec<f32>> = groups.iter().map(|group| turn(block, l_max, skies, group)).collect();
+    let turned: Vec<Vec<f32>> = groups.iter().map(|group| interpolate(block, l_max, skies, group)).collect();
     let mut products: Vec<Products> = Vec::new();
-    // Order by order: the patterns of one stay in the cache while all runs pass.
+    // Order by order: its patterns stay in the cache for all runs.
     for lane in 0..ORDER_LANES {
         let mu = block.order(lane);
         if mu > l_max {
@@ -105,7 +114,7 @@ pub(crate) fn project(
 }
 
 /// The rotated sky at a group's alphas, `[lane][l][alpha][re, im]`, l from the block's first order in steps of 2.
-fn turn(block: OrderBlock, l_max: usize, skies: &[RotatedSky<f32>], group: &Group) -> Vec<f32> {
+fn interpolate(block: OrderBlock, l_max: usize, skies: &[RotatedSky<f32>], group: &RunGroup) -> Vec<f32> {
     let first_l = block.order(0);
     let rows = (l_max - first_l) / 2 + 1;
     let width = 2 * group.alphas.len();
@@ -148,7 +157,7 @@ fn combine(values: &[f32], stride: usize, lanes: usize, weights: &[f32]) -> [f32
     sums
 }
 
-/// `sums + factor values`, lane by lane; by value, so that the sums stay in a register.
+/// `sums + factor values`, lane by lane; passed by value, so that the sums stay in a register.
 #[inline(always)]
 fn add_scaled(
     sums: [f32; PATTERN_LANES],
@@ -164,10 +173,10 @@ fn add_scaled(
 
 /// `sum_l sky[l][r] pattern[l][lane]` for r < A + B, the rest zero.
 ///
-/// Two short arrays instead of a long one: loops over eight sums are turned into gathers and scatters
-/// instead of being unrolled.
+/// Two short arrays instead of one long one: the compiler turns loops over eight sums into gathers and scatters instead
+/// of unrolling them.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
-fn multiply<const A: usize, const B: usize>(sky: &[f32], pattern: &[Lanes]) -> Products {
+fn multiply<const A: usize, const B: usize>(sky: &[f32], pattern: &[PatternLanes]) -> Products {
     let mut first = [[0.0_f32; PATTERN_LANES]; A];
     let mut second = [[0.0_f32; PATTERN_LANES]; B];
     for (sky, values) in sky.chunks_exact(A + B).zip(pattern) {
@@ -184,7 +193,7 @@ fn multiply<const A: usize, const B: usize>(sky: &[f32], pattern: &[Lanes]) -> P
     out
 }
 
-/// Sums the products into the run's terms; even lanes are +mu, odd ones -mu.
+/// Sums the products into the terms of the run; even lanes hold +mu, odd ones -mu.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
 fn reduce(products: &[Products], alphas: usize, plan: &RunPlan, out: &mut [f32]) {
     for (term, weights) in plan.weights.chunks_exact(alphas * products.len()).enumerate() {

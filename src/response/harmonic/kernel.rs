@@ -11,6 +11,7 @@
 use std::f64::consts::PI;
 
 use super::quadrature::GaussLegendre;
+use crate::units::arithmetic::sinc;
 
 /// Most nodes that a kernel reaches.
 pub(crate) const LANES: usize = 16;
@@ -72,11 +73,7 @@ impl Kernel {
         }
         match self.shape {
             Shape::Semicircle { beta } => (beta * (inside.sqrt() - 1.0)).exp(),
-            Shape::WindowedSinc { beta, middle } => {
-                let turn = PI * x;
-                let sinc = if turn.abs() < 1e-8 { 1.0 } else { turn.sin() / turn };
-                sinc * bessel_i0(beta * inside.sqrt()) / middle
-            }
+            Shape::WindowedSinc { beta, middle } => sinc(PI * x) * bessel_i0(beta * inside.sqrt()) / middle,
         }
     }
 

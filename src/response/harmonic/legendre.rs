@@ -1,8 +1,7 @@
 //! Associated Legendre functions at many colatitudes at once.
 
-use crate::sky::harmonics::scaled::{RESCALE_ABOVE, RESCALE_DOWN};
-
 use super::real::Real;
+use crate::sky::harmonics::scaled::{LaneSlices, ScaledLanes, advance};
 
 /// Orthonormal `lambda_{l mu}(theta) = Y_{l mu}(theta, 0)`, Condon-Shortley phase.
 #[derive(Clone, Debug)]
@@ -15,7 +14,7 @@ pub(crate) struct Legendre {
 }
 
 impl Legendre {
-    /// For `l <= l_max` at the colatitudes with these cosines and sines.
+    /// Prepares `l <= l_max` at colatitudes given by (cosine, sine).
     pub(crate) fn new(l_max: usize, points: impl Iterator<Item = (f64, f64)>) -> Self {
         let (z, ln_sin) = points.map(|(z, sin_theta)| (z, sin_theta.ln())).unzip();
         let mut ln_product = 0.0;
@@ -30,18 +29,13 @@ impl Legendre {
         Self { z, ln_sin, ln_first, l_max }
     }
 
-    /// `weight(theta) lambda_{l mu}(theta)` for l = mu, mu + 2, .. <= l_max: a row of the first colatitudes
-    /// each, as many as there are weights.
+    /// `weight(theta) lambda_{l mu}(theta)` for l = mu, mu + 2, .. <= l_max: one row a degree, over the first
+    /// `weights.len()` colatitudes.
     pub(crate) fn even_rows<T: Real>(&self, mu: usize, weights: &[f64]) -> Vec<T> {
         let points = weights.len().min(self.z.len());
         let mut rows = Vec::with_capacity(points * ((self.l_max - mu) / 2 + 1));
         let sign = if mu.is_multiple_of(2) { 1.0 } else { -1.0 };
-        let mut lanes = Lanes {
-            current: vec![0.0; points],
-            previous: vec![0.0; points],
-            power: vec![0.0; points],
-            value: vec![0.0; points],
-        };
+        let mut lanes = ScaledLanes::zeros(points);
         let ln_512 = 512.0 * std::f64::consts::LN_2;
         for k in 0..points {
             let ln = self.ln_first[mu] + if mu > 0 { mu as f64 * self.ln_sin[k] } else { 0.0 };
@@ -70,28 +64,14 @@ impl Legendre {
     }
 }
 
-struct Lanes {
-    current: Vec<f64>,
-    previous: Vec<f64>,
-    power: Vec<f64>,
-    value: Vec<f64>,
-}
-
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn step(forward: f64, behind: f64, z: &[f64], lanes: &mut Lanes) {
+fn step(forward: f64, behind: f64, z: &[f64], lanes: &mut ScaledLanes) {
     let n = z.len();
-    let current = &mut lanes.current[..n];
-    let previous = &mut lanes.previous[..n];
-    let power = &mut lanes.power[..n];
-    let value = &mut lanes.value[..n];
+    let LaneSlices { current, previous, power, value } = lanes.slices(0..n);
+    let (current, previous) = (&mut current[..n], &mut previous[..n]);
+    let (power, value) = (&mut power[..n], &mut value[..n]);
     for k in 0..n {
         let next = forward * z[k] * current[k] - behind * previous[k];
-        let grown = next.abs() > RESCALE_ABOVE;
-        let scale = if grown { RESCALE_DOWN } else { 1.0 };
-        let now = power[k] + if grown { 1.0 } else { 0.0 };
-        previous[k] = current[k] * scale;
-        current[k] = next * scale;
-        power[k] = now;
-        value[k] = if now == 0.0 { next * scale } else { 0.0 };
+        advance(next, [&mut current[k], &mut previous[k], &mut power[k], &mut value[k]]);
     }
 }

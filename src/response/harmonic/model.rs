@@ -1,4 +1,4 @@
-//! Visibilities of a band-limited sky.
+//! Visibilities of a band-limited sky at any states of a pair.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 use std::sync::Arc;
@@ -17,15 +17,16 @@ use super::sizes::fft_length;
 use super::{HarmonicError, NodeGrid, PairState, PatternGeometry, PatternTable, chebyshev};
 use crate::sky::harmonics::Alm;
 
-/// Nodes in u, a wavelength: 2.25 times what a band of |n_y| <= 1 asks for; a kernel of six then suffices.
+/// Nodes a wavelength of u: 2.25 times the Nyquist density of the band |n_y| <= 1, so that a kernel of six nodes
+/// suffices.
 const NODES_PER_WAVELENGTH: f64 = 4.5;
 /// Chebyshev terms along a run.
 pub(super) const TERMS: usize = 8;
 
-/// How much larger the error in alpha may be at the greatest order m, which few coefficients have.
+/// Factor by which the error in alpha may exceed the tolerance at the greatest order m, which few coefficients have.
 pub(super) const ALPHA_TOLERANCE: f64 = 3.0;
 
-/// What a model is made for.
+/// Parameters of a model.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ModelSettings {
     /// Orbit, Moon, wavelength, antennas.
@@ -87,7 +88,7 @@ impl ModelSettings {
     }
 }
 
-/// A sky as a pair on the orbit sees it, at one frequency.
+/// Visibilities of one sky at one frequency, for pairs on one orbit.
 pub struct HarmonicModel {
     settings: ModelSettings,
     pub(super) sky: Alm,
@@ -97,16 +98,16 @@ pub struct HarmonicModel {
     pub(super) alpha: PeriodicGrid,
     pub(super) gamma: PeriodicGrid,
     pub(super) fft: Arc<dyn Fft<f32>>,
-    /// Which blocks of alphas `skies` holds.
+    /// The blocks of alphas that `skies` holds.
     pub(super) blocks: Vec<usize>,
     pub(super) skies: Vec<RotatedSky<f32>>,
 }
 
-/// A grid on the circle and the kernel over it.
+/// A grid on the circle with its interpolation kernel.
 pub(super) struct PeriodicGrid {
     pub(super) count: usize,
     pub(super) kernel: Kernel,
-    /// One over the kernel's transform at the orders 0, 1, ..
+    /// Reciprocals of the kernel's transform at the orders 0, 1, ..
     pub(super) correction: Vec<f64>,
 }
 
@@ -121,7 +122,7 @@ impl PeriodicGrid {
 }
 
 impl HarmonicModel {
-    /// The model of `sky` (K) for `settings`. Takes seconds at l = 1024.
+    /// Builds the model of `sky` (K); takes seconds at l = 1024.
     ///
     /// # Errors
     /// [`HarmonicError::Parameter`].
@@ -131,8 +132,8 @@ impl HarmonicModel {
         Self::with_rotation(sky, settings, rotation)
     }
 
-    /// The same with a rotation table that other channels share; it must be for the sky's `l_max` and the
-    /// settings' inclination.
+    /// As [`Self::new`], with a rotation table shared between channels. The table must be for the sky's `l_max` and the
+    /// inclination of the settings.
     ///
     /// # Errors
     /// [`HarmonicError::Parameter`].
@@ -183,7 +184,7 @@ impl HarmonicModel {
         })
     }
 
-    /// The settings it was made for.
+    /// Parameters of the model.
     #[must_use]
     pub fn settings(&self) -> &ModelSettings {
         &self.settings
@@ -191,12 +192,11 @@ impl HarmonicModel {
 
     /// Visibilities (K sr) of `states`, in order.
     ///
-    /// Fast for consecutive integrations of a pair, and best for those of many pairs over several
-    /// observing windows at once; any order is correct. At a baseline of zero it is the sky temperature over
-    /// the visible sky, `Int T S A dn`.
+    /// Any order is correct. Consecutive integrations of a pair are fast, and many pairs over several observing windows
+    /// in one call are fastest. At a baseline of zero the result is the auto-correlation power `Int T S A dn`.
     ///
     /// # Errors
-    /// A state that is not finite or beyond the longest baseline; different lengths.
+    /// [`HarmonicError::NotFinite`], [`HarmonicError::Baseline`] beyond the longest baseline, [`HarmonicError::Lengths`].
     pub fn visibilities(
         &mut self,
         states: &[PairState],
@@ -237,8 +237,8 @@ impl HarmonicModel {
         Ok(())
     }
 
-    /// Sky turned to the alphas of the blocks that are asked for, besides some that were used before.
-    pub(super) fn turn_sky(&mut self, needed: &[usize]) {
+    /// Rotates the sky to the alphas of the `needed` blocks; keeps recent blocks.
+    pub(super) fn rotate_sky(&mut self, needed: &[usize]) {
         let missing: Vec<usize> = needed.iter().copied().filter(|b| !self.blocks.contains(b)).collect();
         for block in missing {
             if self.blocks.len() >= BLOCKS_KEPT
@@ -260,7 +260,7 @@ impl HarmonicModel {
         let tolerance = self.settings.tolerance;
         RunLimits {
             l_max: self.sky.l_max() as f64,
-            // More nodes than a block would be read for a few visibilities.
+            // A wider range would read more than a block of nodes for a few visibilities.
             u_half: 0.5 * BLOCK_NODES as f64 / NODES_PER_WAVELENGTH,
             drift_half: chebyshev::reach(TERMS, tolerance),
             node_half: chebyshev::reach(ALPHAS_MAX, ALPHA_TOLERANCE * tolerance)

@@ -1,6 +1,6 @@
-//! The sky in the frame of the orbit's plane.
+//! The sky in the frame of the orbital plane.
 //!
-//! With `alpha = Omega - pi/2` the coefficients of the sky turned into the plane are
+//! With `alpha = Omega - pi/2` the coefficients of the sky rotated into the plane are
 //!
 //! ```text
 //! t_{l mu}(alpha) = sum_m exp(-i m alpha) conj(T_lm) d^l_{m mu}(i)
@@ -8,10 +8,11 @@
 //! d+-_{m mu} = d^l_{m mu} +- (-1)^m d^l_{-m,mu}   (m > 0; at m = 0 both are d^l_{0 mu})
 //! ```
 //!
-//! for a real sky, and `t_{l,-mu} = (-1)^mu conj(t_{l mu})`. Only even l + mu meet a pattern that is
-//! mirror-symmetric in the plane. For each l this is two real matrix products over many alpha at once.
+//! for a real sky, and `t_{l,-mu} = (-1)^mu conj(t_{l mu})`. Only even l + mu matter: patterns are
+//! mirror-symmetric in the plane. For each l this is two real matrix products over many alpha.
 
 use faer::{Accum, MatMut, MatRef, Par};
+use num_complex::Complex64;
 use rayon::prelude::*;
 
 use super::real::Real;
@@ -21,15 +22,15 @@ use crate::sky::harmonics::{Alm, WignerTable};
 #[derive(Clone, Debug)]
 pub struct RotationTable<T> {
     l_max: usize,
-    /// By l: for mu = l mod 2, +2, .. l a row m = 0 ..= l of d+; then the same of d-.
+    /// By l: for each mu = l mod 2, +2, .. l a row m = 0 ..= l of d+; then likewise d-.
     degrees: Vec<Vec<T>>,
 }
 
-/// Orders of one parity that are computed between two copies into place.
+/// Orders computed before their values are copied into place.
 const ORDERS_AT_ONCE: usize = 64;
 
 impl<T: Real> RotationTable<T> {
-    /// For `l <= l_max` and an orbit of this inclination.
+    /// The table for `l <= l_max` and an orbit of this inclination.
     #[must_use]
     pub fn new(l_max: usize, inclination_rad: f64) -> Self {
         let wigner = WignerTable::new(l_max, inclination_rad);
@@ -55,6 +56,44 @@ impl<T: Real> RotationTable<T> {
     }
 }
 
+impl<T: Real> RotationTable<T> {
+    /// Rotates degree l into the orbital plane at several alphas: writes `Re t_{l mu}` for all mu = l mod 2, + 2, .. of
+    /// one alpha after another, then likewise `Im t_{l mu}`.
+    ///
+    /// `coefficient(m)` is `conj(T_lm)`; `turns` holds sine and cosine of m alpha, `[m][alpha]`; `z` is scratch, at least
+    /// (l + 1) values an alpha each; `out` has two values for each alpha and mu.
+    pub(crate) fn rotate_degree(
+        &self,
+        l: usize,
+        coefficient: impl Fn(usize) -> Complex64,
+        turns: &[(f64, f64)],
+        z: [&mut [T]; 2],
+        out: &mut [T],
+    ) {
+        let (rows, columns) = (orders(l), l + 1);
+        let count = out.len() / (2 * rows);
+        for m in 0..=l {
+            let a = coefficient(m);
+            for (k, (sin, cos)) in turns[m * count..(m + 1) * count].iter().enumerate() {
+                z[0][k * columns + m] = T::of(a.re * cos + a.im * sin);
+                z[1][k * columns + m] = T::of(a.im * cos - a.re * sin);
+            }
+        }
+        let (plus, minus) = self.degree(l);
+        let (re, im) = out.split_at_mut(rows * count);
+        for (out, d, z) in [(re, plus, &*z[0]), (im, minus, &*z[1])] {
+            faer::linalg::matmul::matmul(
+                MatMut::from_column_major_slice_mut(out, rows, count),
+                Accum::Replace,
+                MatRef::from_row_major_slice(d, rows, columns),
+                MatRef::from_column_major_slice(&z[..columns * count], columns, count),
+                T::of(1.0),
+                Par::Seq,
+            );
+        }
+    }
+}
+
 /// For l = mu, mu + 2, ..: d+ for m = 0 ..= l, then d-.
 fn folded_rows<T: Real>(wigner: &WignerTable, mu: usize) -> Vec<T> {
     let mut folded = Vec::new();
@@ -74,7 +113,7 @@ fn folded_rows<T: Real>(wigner: &WignerTable, mu: usize) -> Vec<T> {
     folded
 }
 
-/// Number of mu = l mod 2, + 2, .. l.
+/// Number of orders mu = l mod 2, + 2, .. l.
 #[must_use]
 pub fn orders(l: usize) -> usize {
     l / 2 + 1
@@ -87,22 +126,22 @@ impl<T> RotationTable<T> {
         self.l_max
     }
 
-    /// Rows over m = 0 ..= l for mu = l mod 2, + 2, .. l: d+ and d-.
+    /// Rows over m = 0 ..= l, one for each mu = l mod 2, + 2, .. l: d+ and d-.
     #[must_use]
     pub fn degree(&self, l: usize) -> (&[T], &[T]) {
         self.degrees[l].split_at(orders(l) * (l + 1))
     }
 }
 
-/// `t_{l mu}(alpha)` at some alpha.
+/// `t_{l mu}(alpha)` at several alpha.
 #[derive(Clone, Debug)]
 pub(crate) struct RotatedSky<T> {
-    /// By l: for each alpha the real parts of all mu = l mod 2, ..; then the imaginary parts alike.
+    /// By l: for each alpha the real parts at all mu = l mod 2, ..; then likewise the imaginary parts.
     degrees: Vec<Vec<T>>,
 }
 
 impl<T: Real> RotatedSky<T> {
-    /// The sky `alm` times `factor[m]`, seen at each of `alpha` (rad).
+    /// The sky `alm`, coefficients times `factor[m]`, at each of `alpha` (rad).
     pub(crate) fn new(table: &RotationTable<T>, alm: &Alm, factor: &[f64], alpha: &[f64]) -> Self {
         let turns: Vec<(f64, f64)> = (0..=table.l_max)
             .flat_map(|m| alpha.iter().map(move |alpha| (m as f64 * alpha).sin_cos()))
@@ -112,26 +151,9 @@ impl<T: Real> RotatedSky<T> {
             .map(|l| {
                 let count = alpha.len();
                 let mut z = [vec![T::default(); (l + 1) * count], vec![T::default(); (l + 1) * count]];
-                for m in 0..=l {
-                    let a = alm.get(l, m).conj() * factor[m];
-                    for (k, (sin, cos)) in turns[m * count..(m + 1) * count].iter().enumerate() {
-                        z[0][k * (l + 1) + m] = T::of(a.re * cos + a.im * sin);
-                        z[1][k * (l + 1) + m] = T::of(a.im * cos - a.re * sin);
-                    }
-                }
-                let (plus, minus) = table.degree(l);
                 let mut degree = vec![T::default(); 2 * orders(l) * count];
-                let (re, im) = degree.split_at_mut(orders(l) * count);
-                for (out, d, z) in [(re, plus, &z[0]), (im, minus, &z[1])] {
-                    faer::linalg::matmul::matmul(
-                        MatMut::from_column_major_slice_mut(out, orders(l), count),
-                        Accum::Replace,
-                        MatRef::from_row_major_slice(d, orders(l), l + 1),
-                        MatRef::from_column_major_slice(z, l + 1, count),
-                        T::of(1.0),
-                        Par::Seq,
-                    );
-                }
+                let coefficient = |m: usize| alm.get(l, m).conj() * factor[m];
+                table.rotate_degree(l, coefficient, &turns, z.each_mut().map(Vec::as_mut_slice), &mut degree);
                 degree
             })
             .collect();

@@ -12,12 +12,12 @@ use crate::units::vector::{norm, sub};
 /// Error of the average, relative to the power of the sky.
 const ERROR: f64 = 1e-6;
 
-/// A model whose visibilities are averages over a channel in which the sky is the same at all frequencies: the integrand
-/// is multiplied by `sinc(pi n . r_ij dnu / c)`.
+/// A model averaged over a channel in which the sky does not depend on frequency: the integrand is multiplied by
+/// `sinc(pi n . r_ij dnu / c)`.
 ///
-/// Averages over Gauss-Legendre frequencies, as many as the pair's baseline asks for: 2 at 1 km in 8 kHz, 12 at 100 km.
-/// A pair is moved apart to be at another frequency, which moves the Moon's limb by half of what the baseline is longer:
-/// by 1e-5 rad for 100 km at 10 MHz.
+/// Averages over Gauss-Legendre frequencies, as many as the baseline needs: 2 at 1 km in 8 kHz, 12 at 100 km. A scaled
+/// baseline stands for another frequency ([`scaled_baseline`](crate::array::scaled_baseline)), which moves the Moon's
+/// limb by half of the added length: 1e-5 rad for 100 km at 10 MHz.
 pub struct BandAverage {
     model: Box<dyn VisibilityModel>,
     frequency_hz: f64,
@@ -25,26 +25,26 @@ pub struct BandAverage {
 }
 
 impl BandAverage {
-    /// `model`, which is of one frequency, averaged over `width_hz` about it. It must cover baselines longer by
-    /// [`BandAverage::stretch`].
+    /// Averages `model`, which is for one frequency, over `width_hz` about it. The model must cover baselines longer by
+    /// [`BandAverage::baseline_factor`].
     #[must_use]
     pub fn new(model: Box<dyn VisibilityModel>, frequency_hz: f64, width_hz: f64) -> Self {
         Self { model, frequency_hz, width_hz }
     }
 
-    /// By how much baselines are longer, in wavelengths, at the upper end of a channel.
+    /// Factor by which baselines in wavelengths are longer at the upper end of a channel.
     #[must_use]
-    pub fn stretch(frequency_hz: f64, width_hz: f64) -> f64 {
+    pub fn baseline_factor(frequency_hz: f64, width_hz: f64) -> f64 {
         1.0 + 0.5 * width_hz / frequency_hz
     }
 
-    /// Frequencies that a baseline asks for. A rule of K points is wrong by less than `(e x / 4 K)^(2 K)` for a phase that
-    /// goes from -x to x over the channel.
+    /// Number of frequencies that a baseline needs. A rule of K points errs by less than `(e x / 4 K)^(2 K)` for a phase
+    /// that goes from -x to x over the channel.
     #[must_use]
     pub fn frequencies(baseline_m: f64, width_hz: f64) -> usize {
         let x = PI * baseline_m * width_hz / SPEED_OF_LIGHT_M_S;
         let is_enough = |&k: &usize| (E * x / (4 * k) as f64).powi(2 * k as i32) <= ERROR;
-        // Beyond, the terms fall for any x that a pair about the Moon can have.
+        // The terms fall from there on for any baseline about the Moon.
         (1..).find(is_enough).unwrap_or(1)
     }
 }
@@ -55,7 +55,7 @@ impl VisibilityModel for BandAverage {
     }
 
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
-        // A batch at a time, so that what is asked for at once stays bounded.
+        // A batch at a time, to bound memory.
         let batch = self.model.batch().max(1024);
         for (positions, out) in positions.chunks(batch).zip(out.chunks_mut(batch)) {
             self.predict_batch(positions, out)?;
@@ -74,13 +74,13 @@ impl BandAverage {
         let counts: Vec<usize> = positions.iter().map(count).collect();
         let most = counts.iter().copied().max().unwrap_or(0);
         let rules: Vec<GaussLegendre> = (0..=most).map(GaussLegendre::new).collect();
-        // One frequency after the other, so that consecutive integrations of a pair stay together.
+        // Frequency by frequency, so that consecutive integrations of a pair stay together.
         let (mut apart, mut parts) = (Vec::new(), Vec::new());
         for node in 0..most {
             for (place, (pair, &count)) in positions.iter().zip(&counts).enumerate() {
                 if node < count {
                     let offset = (rules[count].abscissae[node] - 0.5) * self.width_hz / self.frequency_hz;
-                    apart.push(pair.stretched(1.0 + offset));
+                    apart.push(pair.scaled(1.0 + offset));
                     parts.push((place, rules[count].weights[node]));
                 }
             }

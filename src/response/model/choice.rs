@@ -1,15 +1,15 @@
-//! Which model predicts a channel's visibilities, and what each would cost.
+//! The choice of the model of a channel, by the cost of each.
 
 use std::f64::consts::TAU;
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// How visibilities are simulated, as a configuration says it.
+/// The model asked for in the configuration.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ModelChoice {
-    /// Direct sums while they take no longer than a minute or so, else whatever is cheaper.
+    /// Direct sums if they take about a minute or less, otherwise the cheaper model.
     #[default]
     Auto,
     /// Sums over the sky's pixels.
@@ -18,7 +18,7 @@ pub enum ModelChoice {
     Harmonic,
 }
 
-/// How visibilities are simulated.
+/// Kind of a visibility model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ModelKind {
@@ -37,7 +37,7 @@ impl fmt::Display for ModelKind {
     }
 }
 
-/// What a channel's model has to do.
+/// The work of a channel's model.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Load {
     /// Visibilities.
@@ -46,51 +46,51 @@ pub struct Load {
     pub sky_nside: usize,
     /// Longest baseline, wavelengths.
     pub baseline_wavelengths_max: f64,
-    /// Greatest band limit; 0 for what the baselines ask for. A map that holds less has less.
+    /// Greatest band limit; 0 for the limit that the baselines need. A map never gets more than it determines.
     pub l_max: usize,
     /// Whether visibilities are averages over their integrations.
     pub smeared: bool,
 }
 
-/// Which model, why, and what each would cost.
+/// The chosen model, the reason, and the cost of each.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ModelPlan {
     /// The model.
     pub kind: ModelKind,
-    /// Why this one.
+    /// Reason for the choice.
     pub why: &'static str,
     /// Band limit of the harmonic model.
     pub l_max: usize,
     /// Longest baseline of the harmonic model, wavelengths.
     pub baseline_wavelengths_max: f64,
-    /// Cost of direct sums in fringes: one a pixel and visibility.
+    /// Cost of direct sums, fringes: one a pixel and visibility.
     pub direct_fringes: f64,
-    /// Cost of the harmonic model before the first visibility, in fringes that take as long.
+    /// Cost of setting up the harmonic model, in fringes that take as long.
     pub set_up_fringes: f64,
-    /// Cost of one visibility of the harmonic model, likewise.
+    /// Cost of one visibility of the harmonic model, in such fringes.
     pub visibility_fringes: f64,
     /// Memory of the chosen model, bytes.
     pub bytes: f64,
 }
 
-/// Greatest band limit that is chosen by itself.
+/// Greatest band limit that is chosen without being asked for.
 const L_MAX: usize = 1024;
-/// Direct sums that need no reason: a minute or so on two cores. They have no band limit.
+/// Direct sums up to this cost are preferred: about a minute on two cores, and they have no band limit.
 const DIRECT_FRINGES_ALLOWED: f64 = 1.2e11;
-/// Most memory that a harmonic model takes without being asked for, bytes.
+/// Most memory of a harmonic model that was not asked for, bytes.
 const BYTES_ALLOWED: f64 = 8e9;
 
-/// Greatest degree that a map's analysis finds exactly, in units of nside, as a fraction.
+/// Greatest degree that the analysis of a map determines exactly, in units of nside, as a fraction.
 const DEGREES_OF_NSIDE: (usize, usize) = (9, 4);
 
 impl ModelPlan {
-    /// The model for `load`. Depends on nothing else, least of all on the machine: results do.
+    /// Chooses the model for `load`. Does not depend on the machine, because results depend on the model.
     #[must_use]
     pub fn new(choice: ModelChoice, load: Load) -> Self {
         let u_max = load.baseline_wavelengths_max;
         let l_max = match load.l_max {
             0 => band_limit(u_max).min(held(load.sky_nside)),
-            // A little more can be asked for than is taken unasked.
+            // The configuration may ask for a little more than the default.
             most => {
                 if most > 5 * load.sky_nside / 2 {
                     held(load.sky_nside)
@@ -138,15 +138,15 @@ impl ModelPlan {
     }
 }
 
-/// Greatest degree to which fringes of `u_max` wavelengths reach: 2 pi u and the width of the Airy function's
-/// fall beyond it; no more than 1024.
+/// Greatest degree that fringes of `u_max` wavelengths reach: 2 pi u plus the width of the Airy function's decay; at
+/// most 1024.
 fn band_limit(u_max: f64) -> usize {
     let turning = TAU * u_max;
     let wanted = (turning + 6.0 * turning.cbrt()).ceil() as usize + 8;
     wanted.min(L_MAX)
 }
 
-/// Greatest degree that a map of `nside` holds well.
+/// Greatest degree that a map of `nside` determines well.
 fn held(nside: usize) -> usize {
     let (of, nsides) = DEGREES_OF_NSIDE;
     of * nside / nsides

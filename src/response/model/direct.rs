@@ -1,4 +1,4 @@
-//! Visibilities by direct sum over a sky's pixels.
+//! Visibilities by direct sum over the pixels of a sky.
 
 use num_complex::Complex64;
 
@@ -10,7 +10,7 @@ use crate::response::pixel::{
 use crate::sky::SkyMap;
 use crate::sky::healpix::pixel_area_sr;
 
-/// A sky summed over its own pixels at their centres; nothing is resampled.
+/// Sums a sky over its own pixels, at their centres, without resampling.
 ///
 /// Costs one fringe a pixel and visibility.
 #[derive(Clone, Debug)]
@@ -25,7 +25,7 @@ pub struct DirectSum {
 }
 
 impl DirectSum {
-    /// The model of `sky` (K, any frame) at `frequency_hz`.
+    /// Builds the model of `sky` (K, any frame) at `frequency_hz`.
     #[must_use]
     pub fn new(sky: &SkyMap, frequency_hz: f64, moon_radius_m: f64, response: AntennaResponse) -> Self {
         Self {
@@ -63,7 +63,7 @@ impl DirectSum {
 impl VisibilityModel for DirectSum {
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
         let pairs = self.pairs(positions)?;
-        // Lengths agree by construction, so there is always an answer.
+        // Lengths agree by construction, so the sums cannot fail.
         let sums = sky_sums(&pairs, &self.directions, &self.values, self.area_sr).unwrap_or_default();
         for (out, sum) in out.iter_mut().zip(sums) {
             *out = sum.visibility_k_sr;

@@ -14,22 +14,22 @@ use crate::response::harmonic::{
 use crate::sky::harmonics::Alm;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// Visibilities at once: some twenty windows of the fiducial array at 10 MHz. Twice as many are no faster.
+/// Visibilities of a batch: some twenty windows of the fiducial array at 10 MHz. Twice as many are no faster.
 const BATCH: usize = 100_000;
 
-/// Greatest degree of the sky for powers of single daughters: the visible sky's own coefficients fall as
-/// l^-1.5, so that what is left out is 1e-4 of it.
+/// Greatest degree of the sky for auto-correlation powers: the coefficients of the visibility mask fall as l^-1.5, so
+/// that the rest contributes 1e-4.
 const POWERS_L_MAX: usize = 96;
 
-/// Positions that one task turns into states.
+/// Positions that one task converts to states.
 const POSITIONS_PER_TASK: usize = 1024;
 
-/// What a harmonic sum is made for.
+/// Parameters of a [`HarmonicSum`].
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct HarmonicSetup {
+pub struct HarmonicSumSetup {
     /// Frequency, Hz.
     pub frequency_hz: f64,
-    /// Radius of the array's circle, m.
+    /// Radius of the array's orbit, m.
     pub orbit_radius_m: f64,
     /// Its inclination, rad.
     pub inclination_rad: f64,
@@ -41,26 +41,26 @@ pub struct HarmonicSetup {
     pub response: AntennaResponse,
 }
 
-/// A sky given by its harmonic coefficients, seen by an array on one circle.
+/// Visibilities of a sky given by harmonic coefficients, for an array on one circular orbit.
 ///
 /// Rms error 1e-5 of the rms visibility of the same coefficients.
 pub struct HarmonicSum {
-    setup: HarmonicSetup,
+    setup: HarmonicSumSetup,
     orbit: NominalOrbit,
     model: HarmonicModel,
     powers: HarmonicModel,
 }
 
 impl HarmonicSum {
-    /// The model of `sky` (K, ecliptic frame). Takes seconds at l = 1024.
+    /// Builds the model of `sky` (K, ecliptic frame); takes seconds at l = 1024.
     ///
-    /// `rotation` may be shared by all channels of one band limit.
+    /// Channels of one band limit can share `rotation`.
     ///
     /// # Errors
     /// [`ModelError::Harmonic`].
     pub fn new(
         sky: Alm,
-        setup: HarmonicSetup,
+        setup: HarmonicSumSetup,
         rotation: Arc<RotationTable<f32>>,
     ) -> Result<Self, ModelError> {
         let refused = |source| harmonic(&setup, source);
@@ -85,7 +85,7 @@ impl HarmonicSum {
         })
     }
 
-    /// States of positions, and whether each is of a pair the other way round.
+    /// The state of each position, and whether satellite j leads.
     fn states(&self, positions: &[PairPosition]) -> Result<Vec<(PairState, bool)>, GeometryRefusal> {
         let wavelength_m = SPEED_OF_LIGHT_M_S / self.setup.frequency_hz;
         positions
@@ -100,11 +100,11 @@ impl HarmonicSum {
     }
 }
 
-fn harmonic(setup: &HarmonicSetup, source: HarmonicError) -> ModelError {
+fn harmonic(setup: &HarmonicSumSetup, source: HarmonicError) -> ModelError {
     ModelError::Harmonic { frequency_hz: setup.frequency_hz, source }
 }
 
-/// The coefficients up to `l_max`.
+/// The coefficients of `sky` up to `l_max`.
 fn truncated(sky: &Alm, l_max: usize) -> Alm {
     let mut few = Alm::zeros(l_max.min(sky.l_max()));
     for m in 0..=few.l_max() {
@@ -174,7 +174,7 @@ mod tests {
             normal_hat: array.orbit_normal_hat(t_s),
         });
         for response in [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal] {
-            let setup = HarmonicSetup {
+            let setup = HarmonicSumSetup {
                 frequency_hz: 1e6,
                 orbit_radius_m: array.orbit_radius_m(),
                 inclination_rad: array.inclination_rad(),

@@ -1,4 +1,8 @@
-//! What the array would measure without noise.
+//! Noise-free visibilities and auto-correlation powers of a given sky.
+//!
+//! [`VisibilityModel`] is the interface, for one sky at one frequency. [`DirectSum`] sums over the sky's pixels,
+//! [`HarmonicSum`] uses spherical harmonics, [`BandAverage`] averages either over a channel, and [`ModelPlan`] chooses
+//! between the two by cost. Equal arguments give equal results, whatever the threads.
 
 mod band_average;
 mod choice;
@@ -8,28 +12,28 @@ mod harmonic;
 pub use band_average::BandAverage;
 pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
 pub use direct::DirectSum;
-pub use harmonic::{HarmonicSetup, HarmonicSum};
+pub use harmonic::{HarmonicSum, HarmonicSumSetup};
 
 use num_complex::Complex64;
 use thiserror::Error;
 
 use super::harmonic::{GeometryRefusal, HarmonicError};
 use super::pixel::Comb;
-use crate::array::stretched;
+use crate::array::scaled_baseline;
 use crate::units::vector::Vec3;
 
-/// Where the two daughters of a pair are.
+/// Positions of the two daughters of a pair.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PairPosition {
     /// Position of daughter i, m.
     pub r_i_m: Vec3,
     /// Position of daughter j, m.
     pub r_j_m: Vec3,
-    /// Orbital phase swept while the visibility is averaged, rad; 0 for an instant.
+    /// Orbital phase swept during the integration, rad; 0 for an instant.
     pub span_rad: f64,
 }
 
-/// Where one daughter is, to be heard by herself.
+/// Position of one daughter, for its auto-correlation power.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DaughterPosition {
     /// Position, m.
@@ -38,40 +42,40 @@ pub struct DaughterPosition {
     pub normal_hat: Vec3,
 }
 
-/// Why visibilities cannot be predicted.
+/// Why a prediction failed.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ModelError {
-    /// A pair off the orbit that the model holds for.
+    /// A pair departs too far from the orbit of the model.
     #[error(
         "visibility model at {frequency_hz} Hz: {refusal}; set spacecraft.model = \"direct\" for such an array"
     )]
     Geometry {
         /// Frequency, Hz.
         frequency_hz: f64,
-        /// What is not covered.
+        /// What departs.
         refusal: GeometryRefusal,
     },
-    /// The harmonic model refused.
+    /// The harmonic model failed.
     #[error("visibility model at {frequency_hz} Hz: {source}")]
     Harmonic {
         /// Frequency, Hz.
         frequency_hz: f64,
-        /// What it said.
+        /// Its error.
         source: HarmonicError,
     },
-    /// Two daughters in one direction from the Moon's centre, with dipoles.
+    /// Two daughters with dipoles in the same or in opposite directions from the Moon's centre.
     #[error(
-        "visibility model at {frequency_hz} Hz: two daughters in one direction from the Moon's centre, or opposite each \
-         other, have no orbital plane for their dipoles to stand on"
+        "visibility model at {frequency_hz} Hz: two daughters in the same or in opposite directions from the Moon's \
+         centre do not define the orbital plane that their dipoles are normal to"
     )]
     NoPlane {
         /// Frequency, Hz.
         frequency_hz: f64,
     },
-    /// Averages over integrations were asked of a model that has instants only.
+    /// A direct sum was asked for an average over integrations.
     #[error(
-        "visibility model at {frequency_hz} Hz: direct sums are of instants; set spacecraft.model = \"harmonic\" \
+        "visibility model at {frequency_hz} Hz: direct sums hold for instants only; set spacecraft.model = \"harmonic\" \
          or spacecraft.smear_integrations = false"
     )]
     Smearing {
@@ -80,33 +84,31 @@ pub enum ModelError {
     },
 }
 
-/// A sky at one frequency, seen by the array: visibilities of any pair.
+/// Predicts the visibilities of one sky at one frequency.
 ///
-/// Equal arguments give equal results, whatever the threads and whatever was asked before.
+/// Equal arguments give equal results, whatever the threads and earlier calls.
 pub trait VisibilityModel: Send + Sync {
-    /// How many visibilities it likes to be asked for at once; fewer cost more each.
+    /// Preferred number of visibilities a call; smaller calls cost more a visibility.
     fn batch(&self) -> usize {
         1
     }
 
-    /// Predicts one visibility V_ij (K sr) without noise for each position; `out` has the length of `positions`. Fastest
-    /// for consecutive integrations of one pair after another.
+    /// Predicts one noise-free visibility V_ij (K sr) for each position; `out` has the length of `positions`. Fastest for
+    /// consecutive integrations of one pair after another.
     ///
     /// # Errors
-    /// [`ModelError`], for positions that the model does not cover.
+    /// [`ModelError`] for positions that the model does not cover.
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError>;
 
-    /// Predicts the power `Int T A S dn` (K sr) that each of the daughters hears by herself; `out` has the length of
-    /// `daughters`.
+    /// Predicts the auto-correlation power `Int T A S dn` (K sr) of each daughter; `out` has the length of `daughters`.
     ///
     /// # Errors
     /// As [`Self::predict`].
     fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError>;
 
-    /// Predicts the visibilities (K sr) of each position at the frequencies of `comb`: `comb.count` for one position
-    /// after another.
+    /// Predicts the visibilities (K sr) of each position at the frequencies of `comb`: `comb.count` values a position.
     ///
-    /// A pair stands in for itself at another frequency by being moved apart, unless the model knows better.
+    /// By default a scaled baseline stands for another frequency.
     ///
     /// # Errors
     /// As [`Self::predict`].
@@ -118,16 +120,16 @@ pub trait VisibilityModel: Send + Sync {
     ) -> Result<(), ModelError> {
         let factors = (0..comb.count).map(|k| 1.0 + comb.first + comb.step * k as f64);
         let apart: Vec<PairPosition> =
-            positions.iter().flat_map(|pair| factors.clone().map(|factor| pair.stretched(factor))).collect();
+            positions.iter().flat_map(|pair| factors.clone().map(|factor| pair.scaled(factor))).collect();
         self.predict(&apart, out)
     }
 }
 
 impl PairPosition {
-    /// The pair moved apart, as [`stretched`] has it.
+    /// The pair with its baseline scaled by `factor`, see [`scaled_baseline`].
     #[must_use]
-    pub fn stretched(&self, factor: f64) -> Self {
-        let (r_i_m, r_j_m) = stretched(self.r_i_m, self.r_j_m, factor);
+    pub fn scaled(&self, factor: f64) -> Self {
+        let (r_i_m, r_j_m) = scaled_baseline(self.r_i_m, self.r_j_m, factor);
         Self { r_i_m, r_j_m, span_rad: self.span_rad }
     }
 }

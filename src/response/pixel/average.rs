@@ -1,17 +1,18 @@
 //! Averages of a fringe over blocks of children in closed form.
 //!
 //! Over a block the phase is `2 pi u . c + alpha x + beta y` plus a small quadratic (see
-//! [`crate::response::pixel::blocks`]). The mean of exp(-i alpha x) over m children is the Dirichlet kernel
+//! [`super::blocks`]). The mean of exp(-i alpha x) over m children is the Dirichlet kernel
 //! `sin(alpha/2) / (m sin(alpha/2m)) = S(t) / S(t/m)`, t = alpha/2, S(t) = sin t / t. The quadratic is
-//! taken to first order, which needs the means of x and x^2 as well: with P(t) = S'(t) / t,
+//! expanded to first order, which also needs the means of x and x^2: with P(t) = S'(t) / t,
 //! `<x e> = (i/2) t P` and `<(x^2 - 1/12) e> = S/6 + P/2`.
 
 use std::f32::consts::PI;
 
 use multiversion::multiversion;
 
-use super::blocks::{GROUP, GX, GY, Group, HALF_PHASE_RAD_MAX, HXX, HXY, HYY};
-use super::kernel::{Prepared, cos_sin_turns, dot32, dot64, fraction, fused, polynomial};
+use super::blocks::{BlockGroup, GROUP, GX, GY, HALF_PHASE_RAD_MAX, HXX, HXY, HYY};
+use super::kernel::{Prepared, dot32, dot64};
+use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused, polynomial};
 
 /// Means over a group of blocks.
 #[derive(Clone, Debug)]
@@ -30,10 +31,10 @@ impl Default for Means {
     }
 }
 
-/// Means of A S_i S_j exp(-2 pi i u . n) over blocks of `children`^2 children. Blocks that a limb may
-/// cut are marked and left to [`crate::response::pixel::edge`]; returns whether there is any.
+/// Means of A S_i S_j exp(-2 pi i u . n) over blocks of `children`^2 children. Marks blocks that a limb may cut, which
+/// [`cut_mean`](super::edge::cut_mean) averages, and returns whether there are any.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn block_means(pair: &Prepared, children: usize, group: &Group, means: &mut Means) -> bool {
+pub(super) fn block_means(pair: &Prepared, children: usize, group: &BlockGroup, means: &mut Means) -> bool {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     if let Some(dipole) = pair.dipole {
@@ -48,16 +49,15 @@ fn means_of<const FMA: bool, const DIPOLE: bool>(
     pair: &Prepared,
     dipole: [f32; 3],
     children: usize,
-    group: &Group,
+    group: &BlockGroup,
     means: &mut Means,
 ) -> bool {
     let mut turns = [0.0_f32; GROUP];
     let mut depth = [0.0_f32; GROUP];
     let [x, y, z] = &group.centre;
     for k in 0..GROUP {
-        turns[k] = fraction(dot64::<FMA>(pair.u, x[k], y[k], z[k]));
-        let depth_i = dot64::<FMA>(pair.i_hat, x[k], y[k], z[k]) + pair.limb_i;
-        let depth_j = dot64::<FMA>(pair.j_hat, x[k], y[k], z[k]) + pair.limb_j;
+        turns[k] = fraction_of_turn(dot64::<FMA>(pair.u, x[k], y[k], z[k]));
+        let (depth_i, depth_j) = pair.depths::<FMA>(x[k], y[k], z[k]);
         depth[k] = depth_i.min(depth_j) as f32;
     }
     let u = pair.u.map(|u| u as f32 * PI);
@@ -70,7 +70,7 @@ fn means_of<const FMA: bool, const DIPOLE: bool>(
         let (sx, px) = sinc::<FMA>(tx);
         let (sy, py) = sinc::<FMA>(ty);
         let second = |s: f32, p: f32| fused::<FMA>(s, 1.0 / 6.0, 0.5 * p);
-        // The quadratic's coefficients carry 2 pi, u only pi.
+        // The quadratic's coefficients include 2 pi, u only pi.
         let quadratic = 2.0 * at(HXX, k, u) * second(sx, px) * sy + 2.0 * at(HYY, k, u) * sx * second(sy, py)
             - 0.5 * at(HXY, k, u) * (tx * px) * (ty * py);
         let sampled = inverse_sinc::<FMA>(tx * per_side) * inverse_sinc::<FMA>(ty * per_side);
@@ -93,8 +93,8 @@ fn means_of<const FMA: bool, const DIPOLE: bool>(
 
 /// S(t) = sin t / t and P(t) = S'(t) / t for |t| <= [`HALF_PHASE_RAD_MAX`], to 6e-7.
 ///
-/// Polynomials in t^2, interpolated at Chebyshev points; the limit of the argument is kept by the
-/// choice of blocks, and clamped here so that nothing can run away.
+/// Polynomials in t^2, interpolated at Chebyshev points. The choice of blocks keeps the argument in range; clamping it
+/// here bounds the result in any case.
 #[inline(always)]
 fn sinc<const FMA: bool>(t: f32) -> (f32, f32) {
     const S: [f32; 11] = [
@@ -129,7 +129,7 @@ fn sinc<const FMA: bool>(t: f32) -> (f32, f32) {
 
 /// 1 / S(t) by its series, to 1e-5 for |t| <= 0.8 and 2 % at 2; t is the half phase over one child.
 ///
-/// It multiplies kernels that are of order (1 / CHILDREN t)^2 or less where t is large.
+/// Where t is large it multiplies kernels of order (1 / CHILDREN t)^2 or less.
 #[inline(always)]
 fn inverse_sinc<const FMA: bool>(t: f32) -> f32 {
     const SERIES: [f32; 5] = [1.0, 1.0 / 6.0, 7.0 / 360.0, 31.0 / 15_120.0, 127.0 / 604_800.0];
@@ -154,7 +154,7 @@ mod tests {
         }
         for k in 1..=200 {
             let t = f64::from(k) / 100.0;
-            // The terms that the series leaves out, from 2.1e-5 t^10 on.
+            // The terms left out of the series, from 2.1e-5 t^10 on.
             let left_out = 4.5e-5 * t.powi(10) + 1e-6;
             assert!((f64::from(inverse_sinc::<false>(t as f32)) - t / t.sin()).abs() < left_out, "{t}");
         }

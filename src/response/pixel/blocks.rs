@@ -1,8 +1,8 @@
-//! Pixels cut into blocks small enough that a fringe over a block has a closed form.
+//! Pixels divided into blocks small enough for the mean of a fringe to have a closed form.
 //!
-//! Over a block of m x m children, at places x, y in (-1/2, 1/2), the children's directions are fitted by
+//! Over a block of m x m children, at positions x, y in (-1/2, 1/2), the children's directions are fitted by
 //! `n = c + gx x + gy y + hxx (x^2 - v) + hxy x y + hyy (y^2 - v)`, `v = (1 - 1/m^2) / 12`. These
-//! functions are orthogonal over the children, so each coefficient is a plain projection.
+//! functions are orthogonal over the children, so each coefficient is a projection.
 
 use rayon::prelude::*;
 
@@ -11,7 +11,7 @@ use super::exact::child_directions;
 use crate::sky::healpix;
 use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
 
-/// Places of the vectors among a block's `f32` coefficients, three components each.
+/// Indices of the vectors among a block's `f32` coefficients, three components each.
 pub(super) const GX: usize = 0;
 pub(super) const GY: usize = 3;
 pub(super) const HXX: usize = 6;
@@ -26,18 +26,18 @@ pub(super) const HALF_PHASE_RAD_MAX: f64 = 10.0;
 /// Greatest half phase (rad) over a child for which the series of the sampling factor holds.
 const HALF_PHASE_RAD_PER_CHILD_MAX: f64 = 2.0;
 
-/// Error of a block's closed form that is accepted. Errors of pixels are not aligned, and this bound is
-/// met only by the worst pixel at a class's longest baseline in the worst direction, so that the mean
-/// over pixels is several times smaller than the 1e-3 that is asked of a row.
+/// Greatest accepted error of a block's closed form. Only the worst pixel, at the longest baseline of a class in the
+/// worst direction, reaches this bound, and errors of pixels are not aligned: the rms over pixels is several times
+/// below the 1e-3 required of a row.
 const ERROR_MAX: f64 = 4e-3;
 
-/// Blocks in a [`Group`].
+/// Blocks in a [`BlockGroup`].
 pub(super) const GROUP: usize = 64;
 
-/// Blocks in the layout that the kernels read. Gaps, and what fills the last group of a set, have no
-/// radius, so that no comparison finds them in sight or cut.
+/// Blocks in the layout that the kernels read. Gaps and the padding of a set's last group have a radius of NaN, so that
+/// no comparison finds them visible or cut.
 #[derive(Clone, Debug)]
-pub(super) struct Group {
+pub(super) struct BlockGroup {
     /// Constant term of the fit.
     pub centre: [[f64; GROUP]; 3],
     /// The other terms; see [`GX`] and the following.
@@ -46,7 +46,7 @@ pub(super) struct Group {
     pub radius: [f32; GROUP],
 }
 
-impl Group {
+impl BlockGroup {
     const EMPTY: Self =
         Self { centre: [[0.0; GROUP]; 3], slopes: [[0.0; GROUP]; SLOPES], radius: [f32::NAN; GROUP] };
 }
@@ -59,12 +59,12 @@ pub(super) struct BlockSet {
     /// RING number of each block's pixel.
     pub pixels: Vec<u32>,
     /// The blocks.
-    pub groups: Vec<Group>,
+    pub groups: Vec<BlockGroup>,
 }
 
 /// One fitted block.
 #[derive(Clone, Copy, Debug)]
-struct Block {
+struct FittedBlock {
     children: usize,
     centre: Vec3,
     slopes: [Vec3; 5],
@@ -77,12 +77,12 @@ impl BlockSet {
         Self { children: CHILDREN / per_side, pixels: Vec::new(), groups: Vec::new() }
     }
 
-    /// Adds a block of a pixel, or a gap.
-    fn push(&mut self, pixel: usize, block: Option<&Block>) {
+    /// Appends a block of a pixel, or a gap.
+    fn push(&mut self, pixel: usize, block: Option<&FittedBlock>) {
         let (group, lane) = (self.pixels.len() / GROUP, self.pixels.len() % GROUP);
         self.pixels.push(pixel as u32);
         if group == self.groups.len() {
-            self.groups.push(Group::EMPTY);
+            self.groups.push(BlockGroup::EMPTY);
         }
         let (Some(block), group) = (block, &mut self.groups[group]) else { return };
         for axis in 0..3 {
@@ -96,22 +96,22 @@ impl BlockSet {
     }
 }
 
-/// The blocks for all baselines up to some length.
+/// The blocks for all baselines up to a given length.
 #[derive(Debug)]
 pub(super) struct BlockClass {
     /// Blocks along a pixel's side in `whole`.
     pub per_side: usize,
     /// Blocks of all pixels in RING order, `per_side`^2 for each, with gaps.
     pub whole: BlockSet,
-    /// Smaller blocks that fill the gaps: where pixels are strongly curved (at the poles) or creased (where
-    /// the polar caps begin).
+    /// Smaller blocks that fill the gaps, where pixels are strongly curved (at the poles) or creased (at the boundary of
+    /// the polar caps).
     pub finer: Vec<BlockSet>,
 }
 
 impl BlockClass {
-    /// Blocks good for baselines of up to `wavelengths_max`, at least `per_side` along a pixel's side.
+    /// Blocks valid for baselines up to `wavelengths_max`, at least `per_side` along a pixel's side.
     pub fn new(nside: usize, per_side: usize, wavelengths_max: f64) -> Self {
-        let cut: Vec<Vec<(usize, Option<Block>)>> = (0..healpix::pixel_count(nside))
+        let cut: Vec<Vec<(usize, Option<FittedBlock>)>> = (0..healpix::pixel_count(nside))
             .into_par_iter()
             .map(|pixel| {
                 let children: Vec<Vec3> = child_directions(nside, CHILDREN, pixel).collect();
@@ -141,14 +141,14 @@ impl BlockClass {
     }
 }
 
-/// Fits the block of `size` children a side at `corner`; if that is not good enough, goes on to its quarters.
-/// A block that was not good stands as `None` before them.
+/// Fits the block of `size` children a side at `corner`; if the fit is not good enough, records a gap (`None`) and
+/// divides the block into quarters.
 fn cut(
     children: &[Vec3],
     corner: (usize, usize),
     size: usize,
     wavelengths_max: f64,
-    blocks: &mut Vec<(usize, Option<Block>)>,
+    blocks: &mut Vec<(usize, Option<FittedBlock>)>,
 ) {
     let mut inside = [[0.0; 3]; CHILDREN * CHILDREN];
     let inside = &mut inside[..size * size];
@@ -166,10 +166,10 @@ fn cut(
     }
 }
 
-impl Block {
-    /// Whether the closed form holds for baselines of up to `wavelengths_max`.
+impl FittedBlock {
+    /// Whether the closed form holds for baselines up to `wavelengths_max`.
     ///
-    /// It takes the fit's quadratic phase to first order and leaves out the fit's residual.
+    /// The closed form expands the fit's quadratic phase to first order and neglects its residual.
     fn is_good(&self, wavelengths_max: f64) -> bool {
         use std::f64::consts::PI;
         let radians = 2.0 * PI * wavelengths_max;
@@ -184,7 +184,7 @@ impl Block {
 }
 
 /// Fits one block of m x m children.
-fn fit(children: &[Vec3], m: usize) -> Block {
+fn fit(children: &[Vec3], m: usize) -> FittedBlock {
     let variance = (1.0 - 1.0 / (m * m) as f64) / 12.0;
     let place = |k: usize| (k as f64 + 0.5) / m as f64 - 0.5;
     let basis = |k: usize| {
@@ -212,7 +212,13 @@ fn fit(children: &[Vec3], m: usize) -> Block {
         let left = basis(k).iter().zip(slopes).fold(off, |left, (value, s)| sub(left, scale(*value, s)));
         residual += dot(left, left);
     }
-    Block { children: m, centre: mean, slopes, radius, residual: (residual / children.len() as f64).sqrt() }
+    FittedBlock {
+        children: m,
+        centre: mean,
+        slopes,
+        radius,
+        residual: (residual / children.len() as f64).sqrt(),
+    }
 }
 
 #[cfg(test)]

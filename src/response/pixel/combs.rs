@@ -1,31 +1,32 @@
 //! Visibilities of a sky at equally spaced frequencies: from one frequency to the next each pixel's fringe turns
-//! by the same angle, so that a product takes the place of a sine.
+//! by the same angle, so a product replaces the sine.
 
 use multiversion::multiversion;
 use num_complex::Complex64;
 
-use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused, total};
+use super::kernel::{CHUNK, ChunkDirections, PaddedChunk, Prepared, dot64, total};
 use super::{Directions, PairGeometry, ResponseError};
+use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 
-/// Equally spaced frequencies.
+/// Equally spaced frequencies `nu (1 + first + k step)`, nu being that of the pair.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Comb {
-    /// The first, as a part of the frequency that the pair listens to, less one.
+    /// Offset of the first, a fraction of the pair's frequency.
     pub first: f64,
-    /// Their distance, as such a part.
+    /// Spacing, as such a fraction.
     pub step: f64,
-    /// Their number.
+    /// Number of frequencies.
     pub count: usize,
 }
 
-/// Pixels of one chunk whose fringes are summed in `f32` before the rest is summed in `f64`.
+/// Partial sums of a chunk in `f32`; their sum is `f64`.
 const LANES: usize = 16;
 
-/// Visibilities (K sr) of a sky (K) at `directions`, `area_sr` each, at the frequencies of `comb`: those of one pair
-/// after another. The Moon hides what it hides at any frequency.
+/// Visibilities (K sr) of a sky (K) at `directions`, `area_sr` each, at the frequencies of `comb`: `comb.count` values
+/// a pair. What the Moon hides does not depend on frequency.
 ///
-/// As [`crate::response::pixel::sky_sums`] in layout and accuracy, but that a fringe loses 1e-7 with each frequency. Runs on the
-/// thread that calls.
+/// Layout and accuracy as in [`sky_sums`](super::sky_sums), but a fringe loses 1e-7 with each frequency. Runs on the
+/// calling thread.
 ///
 /// # Errors
 /// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
@@ -44,7 +45,7 @@ pub fn comb_sums(
         return Ok(sums);
     }
     for (sums, pair) in sums.chunks_exact_mut(comb.count).zip(pairs) {
-        let pair = Prepared::new(pair);
+        let pair = Prepared::pair(pair);
         let axes = [&directions.x, &directions.y, &directions.z];
         for (k, values) in sky_k.chunks(CHUNK).enumerate() {
             let range = k * CHUNK..k * CHUNK + values.len();
@@ -66,14 +67,8 @@ fn add_chunk(pair: &Prepared, comb: Comb, n: [&[f64]; 3], sky_k: &[f32], sums: &
     match (<&[f32; CHUNK]>::try_from(sky_k), n.map(<&[f64; CHUNK]>::try_from)) {
         (Ok(sky_k), [Ok(x), Ok(y), Ok(z)]) => fringes.begin::<FMA>(pair, comb, [x, y, z], sky_k),
         _ => {
-            // The last chunk is filled with pixels of a cold sky.
-            let mut at = [[0.0_f64; CHUNK]; 3];
-            let mut sky = [0.0_f32; CHUNK];
-            sky[..sky_k.len()].copy_from_slice(sky_k);
-            for (at, n) in at.iter_mut().zip(n) {
-                at[..n.len()].copy_from_slice(n);
-            }
-            fringes.begin::<FMA>(pair, comb, [&at[0], &at[1], &at[2]], &sky);
+            let padded = PaddedChunk::new(n, sky_k);
+            fringes.begin::<FMA>(pair, comb, padded.directions(), &padded.sky_k);
         }
     }
     for sum in sums {
@@ -82,7 +77,7 @@ fn add_chunk(pair: &Prepared, comb: Comb, n: [&[f64]; 3], sky_k: &[f32], sums: &
     }
 }
 
-/// What a chunk's pixels add at one frequency, and the turn to the next.
+/// Contributions of a chunk's pixels at one frequency, and the rotation to the next.
 struct Fringes {
     re: [f32; CHUNK],
     im: [f32; CHUNK],
@@ -99,25 +94,19 @@ impl Fringes {
         &mut self,
         pair: &Prepared,
         comb: Comb,
-        [x, y, z]: [&[f64; CHUNK]; 3],
+        n: ChunkDirections<'_>,
         sky_k: &[f32; CHUNK],
     ) {
+        let [x, y, z] = n;
         let mut seen = [0.0_f32; CHUNK];
         let (mut first, mut step) = ([0.0_f32; CHUNK], [0.0_f32; CHUNK]);
         for k in 0..CHUNK {
             let turns = dot64::<FMA>(pair.u, x[k], y[k], z[k]);
-            first[k] = fraction(turns * (1.0 + comb.first));
-            step[k] = fraction(turns * comb.step);
-            let depth_i = dot64::<FMA>(pair.i_hat, x[k], y[k], z[k]) + pair.limb_i;
-            let depth_j = dot64::<FMA>(pair.j_hat, x[k], y[k], z[k]) + pair.limb_j;
-            seen[k] = if (depth_i >= 0.0) & (depth_j >= 0.0) { sky_k[k] } else { 0.0 };
+            first[k] = fraction_of_turn(turns * (1.0 + comb.first));
+            step[k] = fraction_of_turn(turns * comb.step);
+            seen[k] = if pair.sees::<FMA>(x[k], y[k], z[k]) { sky_k[k] } else { 0.0 };
         }
-        if let Some(dipole) = pair.dipole {
-            for k in 0..CHUNK {
-                let along = dot64::<FMA>(dipole, x[k], y[k], z[k]) as f32;
-                seen[k] *= fused::<FMA>(-along, along, 1.0);
-            }
-        }
+        pair.apply_antenna::<FMA>(n, &mut seen);
         for k in 0..CHUNK {
             let (cos, sin) = cos_sin_turns::<FMA>(first[k]);
             self.re[k] = seen[k] * cos;

@@ -1,8 +1,8 @@
 //! Directions in the layout that the kernels read.
 
-use crate::units::vector::Vec3;
+use crate::units::vector::{Vec3, dot};
 
-/// Unit vectors as a structure of arrays; any set of directions, in any frame's axes.
+/// Unit vectors as a structure of arrays, on the axes of any frame.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Directions {
     pub(super) x: Vec<f64>,
@@ -29,10 +29,10 @@ impl Directions {
         [self.x[k], self.y[k], self.z[k]]
     }
 
-    /// The directions turned by a rotation matrix (rows first).
+    /// The directions rotated by a matrix, given by rows.
     #[must_use]
     pub fn rotated(&self, rotation: &[Vec3; 3]) -> Self {
-        (0..self.len()).map(|k| rotation.map(|row| crate::units::vector::dot(row, self.get(k)))).collect()
+        (0..self.len()).map(|k| rotation.map(|row| dot(row, self.get(k)))).collect()
     }
 }
 

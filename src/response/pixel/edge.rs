@@ -1,27 +1,28 @@
 //! Averages over blocks that the limb of the Moon cuts: child by child, but without a sine for each.
 //!
-//! Lanes hold columns of children (several pieces of a column when the block is small); all lanes step
-//! through their children together. The phase along a column is quadratic, so the fringe goes from child
-//! to child by one rotation and the rotation by another.
+//! Lanes hold columns of children (several pieces of a column when the block is small) and step through their children
+//! together. The phase along a column is quadratic, so one rotation takes the fringe from child to child, and a second
+//! one updates the first.
 
 use std::f32::consts::TAU;
 
 use multiversion::multiversion;
 
-use super::blocks::{GX, GY, Group, HXX, HXY, HYY};
-use super::kernel::{Prepared, cos_sin_turns, dot64, fraction, fused};
+use super::blocks::{BlockGroup, GX, GY, HXX, HXY, HYY};
+use super::kernel::{Prepared, dot64};
+use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 
 const LANES: usize = 16;
 
-/// A scalar field over a block: constant, x, y, x^2 - v, x y, y^2 - v.
-type Field = [f32; 6];
+/// Coefficients of a scalar field over a block: constant, x, y, x^2 - v, x y, y^2 - v.
+type BlockField = [f32; 6];
 
 /// Mean of A S_i S_j exp(-2 pi i u . n) over block `lane` of `group`, of `children`^2 children.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn cut_mean(pair: &Prepared, children: usize, group: &Group, lane: usize) -> (f32, f32) {
+pub(super) fn cut_mean(pair: &Prepared, children: usize, group: &BlockGroup, lane: usize) -> (f32, f32) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
-    let field = |v: [f64; 3]| -> Field {
+    let field = |v: [f64; 3]| -> BlockField {
         let term = |term: usize| {
             (0..3).map(|axis| v[axis] * f64::from(group.slopes[term + axis][lane])).sum::<f64>() as f32
         };
@@ -29,12 +30,12 @@ pub(super) fn cut_mean(pair: &Prepared, children: usize, group: &Group, lane: us
     };
     let at_centre =
         |v: [f64; 3]| dot64::<FMA>(v, group.centre[0][lane], group.centre[1][lane], group.centre[2][lane]);
-    let with = |constant: f32, mut field: Field| {
+    let with = |constant: f32, mut field: BlockField| {
         field[0] = constant;
         field
     };
-    let fields = Fields {
-        turns: with(fraction(at_centre(pair.u)), field(pair.u)),
+    let fields = BlockFields {
+        turns: with(fraction_of_turn(at_centre(pair.u)), field(pair.u)),
         depth_i: with((at_centre(pair.i_hat) + pair.limb_i) as f32, field(pair.i_hat)),
         depth_j: with((at_centre(pair.j_hat) + pair.limb_j) as f32, field(pair.j_hat)),
         along: match pair.dipole {
@@ -43,11 +44,11 @@ pub(super) fn cut_mean(pair: &Prepared, children: usize, group: &Group, lane: us
         },
     };
     let columns = children.min(LANES);
-    // Power-of-two children: pieces of columns fill the lanes, or several passes cover the columns.
+    // Children are a power of two: pieces of columns fill the lanes, or several passes cover the columns.
     let pieces = (LANES / columns).min(children);
     let mut sum = [0.0_f32; 2];
     for first_column in (0..children).step_by(columns) {
-        let pass = Pass { children, columns, pieces, first_column };
+        let pass = ColumnPass { children, columns, pieces, first_column };
         let part = fields.sum::<FMA>(pass);
         sum = [sum[0] + part[0], sum[1] + part[1]];
     }
@@ -55,27 +56,27 @@ pub(super) fn cut_mean(pair: &Prepared, children: usize, group: &Group, lane: us
     (sum[0] * per_child, sum[1] * per_child)
 }
 
-/// What is needed of a pair over one block.
-struct Fields {
-    turns: Field,
-    depth_i: Field,
-    depth_j: Field,
-    along: Field,
+/// Phase, depths above the limbs and dipole direction of a pair over one block.
+struct BlockFields {
+    turns: BlockField,
+    depth_i: BlockField,
+    depth_j: BlockField,
+    along: BlockField,
 }
 
 /// Some columns of a block, cut into pieces so that columns times pieces fit the lanes.
 #[derive(Clone, Copy)]
-struct Pass {
+struct ColumnPass {
     children: usize,
     columns: usize,
     pieces: usize,
     first_column: usize,
 }
 
-impl Fields {
+impl BlockFields {
     /// Sum over the children of a pass.
     #[inline(always)]
-    fn sum<const FMA: bool>(&self, pass: Pass) -> [f32; 2] {
+    fn sum<const FMA: bool>(&self, pass: ColumnPass) -> [f32; 2] {
         let per_side = 1.0 / pass.children as f32;
         let variance = (1.0 - per_side * per_side) / 12.0;
         let steps = pass.children / pass.pieces;
@@ -87,7 +88,7 @@ impl Fields {
             y[lane] = ((piece * steps) as f32 + 0.5) * per_side - 0.5;
             active[lane] = if piece < pass.pieces { 1.0 } else { 0.0 };
         }
-        let on = |field: &Field| Columns::new::<FMA>(field, &x, variance);
+        let on = |field: &BlockField| ColumnField::new::<FMA>(field, &x, variance);
         let (turns, depth_i, depth_j, along) =
             (on(&self.turns), on(&self.depth_i), on(&self.depth_j), on(&self.along));
         let (mut re, mut im) = ([0.0_f32; LANES], [0.0_f32; LANES]);
@@ -124,15 +125,15 @@ impl Fields {
 }
 
 /// A field along the lanes' columns: a quadratic in y for each.
-struct Columns {
+struct ColumnField {
     constant: [f32; LANES],
     linear: [f32; LANES],
     square: f32,
 }
 
-impl Columns {
+impl ColumnField {
     #[inline(always)]
-    fn new<const FMA: bool>(field: &Field, x: &[f32; LANES], variance: f32) -> Self {
+    fn new<const FMA: bool>(field: &BlockField, x: &[f32; LANES], variance: f32) -> Self {
         let [constant, fx, fy, fxx, fxy, fyy] = *field;
         let curved = |x: f32| fused::<FMA>(fxx, x * x - variance, constant - fyy * variance);
         Self {
@@ -151,7 +152,7 @@ impl Columns {
 /// exp(-2 pi i turns) for a few turns.
 #[inline(always)]
 fn turn_back<const FMA: bool>(turns: f32) -> (f32, f32) {
-    // As in `fraction`: good for |turns| < 2^21, and a block spans a few.
+    // As in `fraction_of_turn`: exact for |turns| < 2^21, and a block spans a few.
     const MAGIC: f32 = 12_582_912.0;
     let (cos, sin) = cos_sin_turns::<FMA>(turns - ((turns + MAGIC) - MAGIC));
     (cos, -sin)

@@ -1,4 +1,4 @@
-//! The response in `f64`, one direction after another: what the fast path is checked against.
+//! The response in `f64`, one direction after another: the reference for the fast path.
 
 use std::f64::consts::TAU;
 
@@ -10,7 +10,7 @@ use crate::frames::AntennaResponse;
 use crate::sky::healpix;
 use crate::units::vector::{Vec3, dot};
 
-/// A S_i S_j of a pair: 0 where the Moon hides the direction from either satellite.
+/// Envelope A S_i S_j of a pair: 0 where the Moon hides the direction from either satellite.
 #[must_use]
 pub fn envelope(pair: &PairGeometry, n_hat: Vec3) -> f64 {
     let hidden = |r_m| hidden_by_moon(r_m, n_hat, pair.moon_radius_m);
@@ -23,7 +23,7 @@ pub fn envelope(pair: &PairGeometry, n_hat: Vec3) -> f64 {
     }
 }
 
-/// exp(-2 pi i u . n), the phase reduced to a fraction of a turn first.
+/// exp(-2 pi i u . n), from the phase reduced to a fraction of a turn.
 fn fringe(baseline_wavelengths: Vec3, n_hat: Vec3) -> Complex64 {
     let turns = dot(baseline_wavelengths, n_hat);
     Complex64::cis(-TAU * (turns - turns.round()))
@@ -40,8 +40,8 @@ pub fn centre_row(pair: &PairGeometry, directions: &[Vec3]) -> Vec<Complex64> {
     directions.iter().map(at).collect()
 }
 
-/// The row of B averaged over the centres of `children`^2 children of each pixel of `nside`, each with
-/// its own shading; RING order, without the pixel area. `children` need not be a power of two.
+/// The row of B averaged over the centres of the `children`^2 children of each pixel of `nside`, each with
+/// its own envelope; RING order, without the pixel area. `children` need not be a power of two.
 #[must_use]
 pub fn average_row(pair: &PairGeometry, nside: usize, children: usize) -> Vec<Complex64> {
     let u = pair.baseline_wavelengths();
@@ -69,7 +69,7 @@ pub(super) fn child_directions(nside: usize, children: usize, pixel: usize) -> i
 
 /// Visibility and zero-spacing sum of a sky (K) at the given directions, each of `area_sr`.
 ///
-/// Sums are carried in `f64` over blocks of 1024 directions and then over blocks.
+/// Sums over blocks of 1024 directions, then over blocks.
 #[must_use]
 pub fn visibility(pair: &PairGeometry, directions: &[Vec3], sky_k: &[f64], area_sr: f64) -> SkySum {
     const BLOCK: usize = 1024;

@@ -1,30 +1,31 @@
-//! Rows of B by the fast path.
+//! Rows of B by the fast path: at pixel centres, or averaged over blocks in closed form.
 
 use std::sync::OnceLock;
 
 use multiversion::multiversion;
 
 use super::average::{Means, block_means};
-use super::blocks::{BlockClass, BlockSet, GROUP, Group};
+use super::blocks::{BlockClass, BlockGroup, BlockSet, GROUP};
 use super::edge::cut_mean;
 use super::exact::child_directions;
-use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused};
+use super::kernel::{CHUNK, Prepared, dot64};
 use super::{CHILDREN, Directions, PairGeometry, PixelMethod, ResponseError, exact};
 use crate::sky::healpix;
+use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn};
 use crate::units::vector::{Vec3, norm};
 
 /// Greatest nside of rows: blocks of nside 512 take some GB.
 const NSIDE_MAX: usize = 512;
 
-/// Longest baselines of the classes of blocks, times the pixel's width, in wavelengths, and blocks along
-/// a pixel's side at which a class begins. Maps use baselines of up to 2.
+/// Classes of blocks: the longest baseline (wavelengths) times the pixel width, and the least number of blocks along a
+/// pixel's side. Maps use baselines up to 2.
 const CLASSES: [(f64, usize); 5] = [(0.5, 1), (1.0, 1), (2.01, 1), (4.02, 2), (8.04, 4)];
 
-/// A number that rows can be made of.
+/// Element type of a row.
 pub trait RowValue: Copy + Send + Sync + 'static {
-    /// From a kernel's number.
+    /// Converts a value of the fast path.
     fn of_f32(value: f32) -> Self;
-    /// From an exact number.
+    /// Converts a value of the exact path.
     fn of_f64(value: f64) -> Self;
 }
 
@@ -52,11 +53,11 @@ impl RowValue for f64 {
     }
 }
 
-/// Makes rows of B for one pixelisation and method.
+/// Computes rows of B for one pixelisation and method.
 ///
-/// [`PixelMethod::Average`] agrees with the mean over all children to 1e-3 rms. Its blocks are made when
-/// a class of baselines is first asked for (0.1 s at nside 64). A baseline of more than 8 wavelengths a
-/// pixel has no use in a map of that pixelisation; it is averaged child by child, slowly.
+/// [`PixelMethod::Average`] agrees with the mean over all children to 1e-3 rms. It builds the blocks of a class of
+/// baselines on first use (0.1 s at nside 64). Baselines beyond 8 wavelengths a pixel are of no use in a map of that
+/// pixelisation; they are averaged child by child, slowly.
 #[derive(Debug)]
 pub struct RowMaker {
     nside: usize,
@@ -111,12 +112,12 @@ impl RowMaker {
         self.pixel_width_rad
     }
 
-    /// Makes the tables that rows of this pair need. To be called before rows are filled by tasks side by
-    /// side: making tables is parallel too, and tasks that wait for them would keep its workers.
+    /// Builds the tables that rows of this pair need. Call it before parallel tasks fill rows: tables are built in
+    /// parallel too, and tasks waiting for them would block its workers.
     pub fn prepare(&self, pair: &PairGeometry) {
         if self.method == PixelMethod::Average {
             let pixels_long = norm(pair.baseline_wavelengths()) * self.pixel_width_rad;
-            // A little more than that, so that rounding cannot choose a class that was not made.
+            // With a margin, so that rounding cannot select a class that was not built.
             for reach in [pixels_long * (1.0 - 1e-12), pixels_long * (1.0 + 1e-12)] {
                 if let Some(class) = CLASSES.iter().position(|&(longest, _)| reach <= longest) {
                     self.class(class);
@@ -134,12 +135,12 @@ impl RowMaker {
 
     /// Writes the pair's row, real and imaginary parts, times `factor` (pixel area and root of weight).
     ///
-    /// Both slices have [`Self::pixels`] elements; what is beyond the shorter one is left alone.
+    /// Both slices should have [`Self::pixels`] elements; elements beyond the shorter one are left unchanged.
     pub fn fill<R: RowValue>(&self, pair: &PairGeometry, factor: f64, re: &mut [R], im: &mut [R]) {
         let pixels = self.pixels().min(re.len()).min(im.len());
         let (re, im) = (&mut re[..pixels], &mut im[..pixels]);
         match self.method {
-            PixelMethod::Centre => self.fill_centre(&Prepared::new(pair), factor, re, im),
+            PixelMethod::Centre => self.fill_centre(&Prepared::pair(pair), factor, re, im),
             PixelMethod::AverageExact => {
                 let row = exact::average_row(pair, self.nside, CHILDREN);
                 for ((re, im), value) in re.iter_mut().zip(im).zip(row) {
@@ -166,14 +167,14 @@ impl RowMaker {
     }
 
     fn fill_average<R: RowValue>(&self, pair: &PairGeometry, factor: f64, re: &mut [R], im: &mut [R]) {
-        let prepared = Prepared::new(pair);
+        let prepared = Prepared::pair(pair);
         let pixels_long = norm(prepared.u) * self.pixel_width_rad;
         let class = CLASSES.iter().position(|&(longest, _)| pixels_long <= longest);
         let Some(class) = class else {
             return self.fill_children(&prepared, factor, re, im);
         };
         let blocks = self.class(class);
-        // Sums over blocks are kept apart from what is written, which may be anything before.
+        // Sums over blocks need zeros to start from; the output may hold anything.
         let mut row = vec![[0.0_f32; GROUP]; 2 * re.len().div_ceil(GROUP)];
         let (row_re, row_im) = row.as_flattened_mut().split_at_mut(re.len().next_multiple_of(GROUP));
         sum_whole(&prepared, blocks, row_re, row_im);
@@ -184,9 +185,9 @@ impl RowMaker {
         scale(row_im, factor, im);
     }
 
-    /// Averages child by child in the fast path's precision.
+    /// Averages child by child, in the precision of the fast path.
     fn fill_children<R: RowValue>(&self, pair: &Prepared, factor: f64, re: &mut [R], im: &mut [R]) {
-        const { assert!(CHUNK == CHILDREN * CHILDREN, "a chunk is one pixel's children") };
+        const { assert!(CHUNK == CHILDREN * CHILDREN, "a chunk holds the children of one pixel") };
         let mut values = [[0.0_f32; CHUNK]; 2];
         let mut n = [[0.0_f64; CHUNK]; 3];
         for (pixel, (re, im)) in re.iter_mut().zip(im).enumerate() {
@@ -205,8 +206,8 @@ impl RowMaker {
     }
 }
 
-/// Means over a group of blocks, cut or not.
-fn means_of_group(pair: &Prepared, children: usize, group: &Group, means: &mut Means) {
+/// Means over a group of blocks, whether or not the limb cuts them.
+fn means_of_group(pair: &Prepared, children: usize, group: &BlockGroup, means: &mut Means) {
     if block_means(pair, children, group, means) {
         for lane in 0..GROUP {
             if means.cut[lane] != 0.0 {
@@ -216,7 +217,7 @@ fn means_of_group(pair: &Prepared, children: usize, group: &Group, means: &mut M
     }
 }
 
-/// Sums the blocks of all pixels; a whole pixel counts 1.
+/// Averages the blocks of each pixel.
 fn sum_whole(pair: &Prepared, class: &BlockClass, re: &mut [f32], im: &mut [f32]) {
     let mut means = Means::default();
     let per_pixel = class.per_side * class.per_side;
@@ -229,7 +230,7 @@ fn sum_whole(pair: &Prepared, class: &BlockClass, re: &mut [f32], im: &mut [f32]
     }
 }
 
-/// Averages of `per_pixel` blocks after each other.
+/// Averages of `per_pixel` consecutive blocks.
 fn average(blocks: &[f32; GROUP], per_pixel: usize, pixels: &mut [f32]) {
     if per_pixel == 1 {
         return pixels.copy_from_slice(blocks);
@@ -240,7 +241,7 @@ fn average(blocks: &[f32; GROUP], per_pixel: usize, pixels: &mut [f32]) {
     }
 }
 
-/// Adds the blocks that fill gaps.
+/// Adds the smaller blocks that fill gaps.
 fn add_finer(pair: &Prepared, set: &BlockSet, re: &mut [f32], im: &mut [f32]) {
     let mut means = Means::default();
     let share = (set.children * set.children) as f32 / (CHILDREN * CHILDREN) as f32;
@@ -269,17 +270,11 @@ fn fringes(pair: &Prepared, n: &[[f64; CHUNK]; 3], out: &mut [[f32; CHUNK]; 2]) 
     let mut turns = [0.0_f32; CHUNK];
     let mut seen = [0.0_f32; CHUNK];
     for k in 0..CHUNK {
-        turns[k] = fraction(dot64::<FMA>(pair.u, x[k], y[k], z[k]));
-        let depth_i = dot64::<FMA>(pair.i_hat, x[k], y[k], z[k]) + pair.limb_i;
-        let depth_j = dot64::<FMA>(pair.j_hat, x[k], y[k], z[k]) + pair.limb_j;
+        turns[k] = fraction_of_turn(dot64::<FMA>(pair.u, x[k], y[k], z[k]));
+        let (depth_i, depth_j) = pair.depths::<FMA>(x[k], y[k], z[k]);
         seen[k] = if depth_i.min(depth_j) >= 0.0 { 1.0 } else { 0.0 };
     }
-    if let Some(dipole) = pair.dipole {
-        for k in 0..CHUNK {
-            let along = dot64::<FMA>(dipole, x[k], y[k], z[k]) as f32;
-            seen[k] *= fused::<FMA>(-along, along, 1.0);
-        }
-    }
+    pair.apply_antenna::<FMA>([x, y, z], &mut seen);
     let [re, im] = out;
     for k in 0..CHUNK {
         let (cos, sin) = cos_sin_turns::<FMA>(turns[k]);

@@ -4,30 +4,30 @@ use multiversion::multiversion;
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::kernel::{CHUNK, Prepared, cos_sin_turns, dot64, fraction, fused, total};
-use super::{Directions, PairGeometry, ResponseError};
+use super::kernel::{CHUNK, ChunkDirections, PaddedChunk, Prepared, dot64, total};
+use super::{Directions, PairGeometry, ResponseError, SingleGeometry};
+use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 
-/// Pairs that one task takes over a stretch of the sky.
+/// Pairs of one task.
 const PAIRS_PER_TASK: usize = 32;
 
-/// Directions that a task takes over all its pairs before it goes on; they stay in the second-level cache.
-const STRETCH: usize = 32 * CHUNK;
+/// Directions that a task sums for all its pairs before the next ones; they stay in the second-level cache.
+const SECTION: usize = 32 * CHUNK;
 
-/// What a pair measures of a sky.
+/// Sums of a pair over a sky.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct SkySum {
     /// Sum of T A S_i S_j exp(-2 pi i u . n) dOmega, K sr.
     pub visibility_k_sr: Complex64,
-    /// Sum of T A S_i S_j dOmega: the system temperature that the sky makes, K sr.
+    /// Sum of T A S_i S_j dOmega: the sky's part of the system temperature, K sr.
     pub zero_spacing_k_sr: f64,
 }
 
 /// Visibility and zero-spacing sum of each pair, for a sky (K) at `directions`, `area_sr` each.
 ///
-/// Fringes are `f32` to 1e-6; products are summed over 16 pixels apart in `f32` for 16 terms, then in
-/// `f64`. The error is below 1e-6 of the zero-spacing sum whatever the number of pixels (fringe errors
-/// are not correlated from pixel to pixel, so 1e-8 is typical). Runs on the current rayon pool; the
-/// result does not depend on it.
+/// Fringes are `f32`, accurate to 1e-6. Each of 16 partial sums adds 16 products in `f32`; the rest is summed in `f64`.
+/// The error is below 1e-6 of the zero-spacing sum for any number of pixels (1e-8 is typical, as fringe errors are not
+/// correlated between pixels). Runs on the current rayon pool; the result does not depend on it.
 ///
 /// # Errors
 /// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
@@ -37,11 +37,26 @@ pub fn sky_sums(
     sky_k: &[f32],
     area_sr: f64,
 ) -> Result<Vec<SkySum>, ResponseError> {
-    sums_of(pairs, Prepared::new, directions, sky_k, area_sr)
+    sums_of(pairs, Prepared::pair, directions, sky_k, area_sr)
 }
 
-/// As [`sky_sums`] for whatever `prepare` makes ready.
-pub(super) fn sums_of<G: Sync>(
+/// Auto-correlation power `Int T A S dn` of each satellite, K sr, for a sky (K) at `directions`, `area_sr` each.
+/// Accuracy and threads as in [`sky_sums`].
+///
+/// # Errors
+/// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
+pub fn sky_powers(
+    singles: &[SingleGeometry],
+    directions: &Directions,
+    sky_k: &[f32],
+    area_sr: f64,
+) -> Result<Vec<f64>, ResponseError> {
+    let sums = sums_of(singles, Prepared::single, directions, sky_k, area_sr)?;
+    Ok(sums.into_iter().map(|sum| sum.zero_spacing_k_sr).collect())
+}
+
+/// [`sky_sums`] of geometries that `prepare` reduces.
+fn sums_of<G: Sync>(
     geometries: &[G],
     prepare: fn(&G) -> Prepared,
     directions: &Directions,
@@ -68,12 +83,12 @@ fn sum_prepared(
     sky_k: &[f32],
     area_sr: f64,
 ) {
-    for first in (0..sky_k.len()).step_by(STRETCH) {
-        let range = first..sky_k.len().min(first + STRETCH);
+    for first in (0..sky_k.len()).step_by(SECTION) {
+        let range = first..sky_k.len().min(first + SECTION);
         let (x, y, z) =
             (&directions.x[range.clone()], &directions.y[range.clone()], &directions.z[range.clone()]);
         for (sum, pair) in sums.iter_mut().zip(prepared) {
-            let [re, im, zero] = sum_stretch(pair, [x, y, z], &sky_k[range.clone()]);
+            let [re, im, zero] = sum_section(pair, [x, y, z], &sky_k[range.clone()]);
             sum.visibility_k_sr += Complex64::new(re, im);
             sum.zero_spacing_k_sr += zero;
         }
@@ -84,32 +99,24 @@ fn sum_prepared(
     }
 }
 
-/// Sums over one stretch, without the area: real part, imaginary part, zero spacing.
+/// Sums over one section, without the area: real part, imaginary part, zero spacing.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn sum_stretch(pair: &Prepared, n: [&[f64]; 3], sky_k: &[f32]) -> [f64; 3] {
+fn sum_section(pair: &Prepared, n: [&[f64]; 3], sky_k: &[f32]) -> [f64; 3] {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
-    stretch::<FMA>(pair, n, sky_k)
+    section::<FMA>(pair, n, sky_k)
 }
 
 #[inline(always)]
-fn stretch<const FMA: bool>(pair: &Prepared, n: [&[f64]; 3], sky_k: &[f32]) -> [f64; 3] {
+fn section<const FMA: bool>(pair: &Prepared, n: [&[f64]; 3], sky_k: &[f32]) -> [f64; 3] {
     let mut total = [0.0_f64; 3];
-    let mut sky = [0.0_f32; CHUNK];
-    let mut at = [[0.0_f64; CHUNK]; 3];
     for (k, values) in sky_k.chunks(CHUNK).enumerate() {
-        let first = k * CHUNK;
-        let last = first + values.len();
-        let sums = match (values.try_into(), n.map(|c| <&[f64; CHUNK]>::try_from(&c[first..last]))) {
+        let n = n.map(|axis| &axis[k * CHUNK..k * CHUNK + values.len()]);
+        let sums = match (values.try_into(), n.map(<&[f64; CHUNK]>::try_from)) {
             (Ok(values), [Ok(x), Ok(y), Ok(z)]) => chunk::<FMA>(pair, [x, y, z], values),
             _ => {
-                // The last chunk is filled with pixels of a cold sky.
-                sky[..values.len()].copy_from_slice(values);
-                sky[values.len()..].fill(0.0);
-                for (at, n) in at.iter_mut().zip(n) {
-                    at[..values.len()].copy_from_slice(&n[first..last]);
-                }
-                chunk::<FMA>(pair, [&at[0], &at[1], &at[2]], &sky)
+                let padded = PaddedChunk::new(n, values);
+                chunk::<FMA>(pair, padded.directions(), &padded.sky_k)
             }
         };
         for (total, sum) in total.iter_mut().zip(sums) {
@@ -120,21 +127,15 @@ fn stretch<const FMA: bool>(pair: &Prepared, n: [&[f64]; 3], sky_k: &[f32]) -> [
 }
 
 #[inline(always)]
-fn chunk<const FMA: bool>(pair: &Prepared, [x, y, z]: [&[f64; CHUNK]; 3], sky_k: &[f32; CHUNK]) -> [f64; 3] {
+fn chunk<const FMA: bool>(pair: &Prepared, n: ChunkDirections<'_>, sky_k: &[f32; CHUNK]) -> [f64; 3] {
+    let [x, y, z] = n;
     let mut turns = [0.0_f32; CHUNK];
     let mut seen = [0.0_f32; CHUNK];
     for k in 0..CHUNK {
-        turns[k] = fraction(dot64::<FMA>(pair.u, x[k], y[k], z[k]));
-        let depth_i = dot64::<FMA>(pair.i_hat, x[k], y[k], z[k]) + pair.limb_i;
-        let depth_j = dot64::<FMA>(pair.j_hat, x[k], y[k], z[k]) + pair.limb_j;
-        seen[k] = if (depth_i >= 0.0) & (depth_j >= 0.0) { sky_k[k] } else { 0.0 };
+        turns[k] = fraction_of_turn(dot64::<FMA>(pair.u, x[k], y[k], z[k]));
+        seen[k] = if pair.sees::<FMA>(x[k], y[k], z[k]) { sky_k[k] } else { 0.0 };
     }
-    if let Some(dipole) = pair.dipole {
-        for k in 0..CHUNK {
-            let along = dot64::<FMA>(dipole, x[k], y[k], z[k]) as f32;
-            seen[k] *= fused::<FMA>(-along, along, 1.0);
-        }
-    }
+    pair.apply_antenna::<FMA>(n, &mut seen);
     const LANES: usize = 16;
     let mut lanes = [[0.0_f32; LANES]; 3];
     for (turns, seen) in turns.as_chunks::<LANES>().0.iter().zip(seen.as_chunks::<LANES>().0) {
@@ -146,4 +147,71 @@ fn chunk<const FMA: bool>(pair: &Prepared, [x, y, z]: [&[f64; CHUNK]; 3], sky_k:
         }
     }
     [total(&lanes[0]), total(&lanes[1]), total(&lanes[2])]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frames::AntennaResponse;
+    use crate::sky::healpix::{pixel_area_sr, pixel_directions};
+    use crate::units::vector::{cross, scale, unit};
+    use std::f64::consts::PI;
+
+    const MOON_M: f64 = 1.7371e6;
+
+    /// On an orbit whose normal is nowhere near an axis.
+    fn single(response: AntennaResponse) -> SingleGeometry {
+        let normal_hat = unit([0.3, -0.6, 0.5]);
+        let r_m = scale(2.0371e6, unit(cross(normal_hat, [0.2, 0.1, -0.7])));
+        SingleGeometry { r_m, normal_hat, moon_radius_m: MOON_M, response }
+    }
+
+    #[test]
+    fn powers_of_a_uniform_sky_are_the_solid_angles() {
+        const NSIDE: usize = 128;
+        let directions = pixel_directions(NSIDE);
+        let sky_k = vec![3.0_f32; directions.len()];
+        let cos = (1.0 - (MOON_M / 2.0371e6).powi(2)).sqrt();
+        // All but the Moon's cap; of dipoles at right angles to the Moon the integral of 1 - sin^2 t cos^2 p over it.
+        let whole = 2.0 * PI * (1.0 + cos);
+        let dipole = PI * ((1.0 + cos) + (1.0 + cos.powi(3)) / 3.0);
+        for (response, expected) in
+            [(AntennaResponse::Isotropic, whole), (AntennaResponse::DipoleNormal, dipole)]
+        {
+            let one = single(response);
+            let area_sr = pixel_area_sr(NSIDE);
+            let found = sky_powers(&[one], &directions.as_slice().into(), &sky_k, area_sr).unwrap()[0];
+            // Pixels count whole: some 4 x 128 of them lie on the limb, each half too much or too little at random.
+            let limb = 0.5 * 512.0_f64.sqrt() * area_sr / expected;
+            assert!((found / (3.0 * expected) - 1.0).abs() < 4.0 * limb, "{response:?}: {found}");
+            let exact: f64 = directions.iter().map(|&n_hat| one.envelope(n_hat)).sum();
+            // As documented for sums of f32.
+            assert!((found / (3.0 * exact * area_sr) - 1.0).abs() < 1e-6, "{response:?}");
+        }
+    }
+
+    #[test]
+    fn a_pair_that_comes_together_hears_what_one_hears() {
+        let one = single(AntennaResponse::DipoleNormal);
+        let directions = pixel_directions(32);
+        // Brighter to one side, so that a wrong axis shows.
+        let sky_k: Vec<f32> =
+            directions.iter().map(|n| 2.0 + (n[0] + n[2]) as f32 + (n[1] * n[2]) as f32).collect();
+        let area_sr = pixel_area_sr(32);
+        let directions = Directions::from(directions.as_slice());
+        let expected = sky_powers(&[one], &directions, &sky_k, area_sr).unwrap()[0];
+        let pair = |apart_m: f64| PairGeometry {
+            r_i_m: one.r_m,
+            r_j_m: crate::units::vector::add(one.r_m, scale(apart_m, unit(cross(one.normal_hat, one.r_m)))),
+            frequency_hz: 1e6,
+            moon_radius_m: MOON_M,
+            response: AntennaResponse::DipoleNormal,
+        };
+        let near = sky_sums(&[pair(0.5)], &directions, &sky_k, area_sr).unwrap()[0].zero_spacing_k_sr;
+        // Half a metre is 2.5e-7 rad; a plane through the two is known as well as their distance, to 1e-9 m.
+        assert!((near / expected - 1.0).abs() < 3e-6, "{near} {expected}");
+        // In one place they have no plane, and no answer instead of a wrong one.
+        assert_eq!(pair(0.0).orbit_normal(), None);
+        assert!(sky_sums(&[pair(0.0)], &directions, &sky_k, area_sr).unwrap()[0].zero_spacing_k_sr.is_nan());
+    }
 }

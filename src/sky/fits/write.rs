@@ -6,7 +6,7 @@ use std::path::Path;
 use super::card::Card;
 use super::error::{FitsError, FitsProblem};
 use super::header::BLOCK_BYTES;
-use crate::files::{AtomicFile, Unfinished};
+use crate::files::{AtomicFile, IfUnfinished};
 use crate::sky::healpix::{nested_to_ring, nside_of};
 use crate::sky::{Frame, MapError, SkyMap, is_unseen};
 use crate::units::constants::HEALPIX_UNSEEN;
@@ -285,7 +285,7 @@ fn write_whole(
     write: impl FnOnce(&mut AtomicFile) -> Result<(), FitsProblem>,
 ) -> Result<(), FitsProblem> {
     let mut file =
-        AtomicFile::create(path, Unfinished::Remove).map_err(FitsProblem::io("create the file"))?;
+        AtomicFile::create(path, IfUnfinished::Remove).map_err(FitsProblem::io("create the file"))?;
     write(&mut file)?;
     file.finish().map(|_| ()).map_err(FitsProblem::io("put the file in place"))
 }

@@ -1,10 +1,11 @@
-//! What can be chosen about a generated sky.
+//! Configuration of a generated sky.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::sky::harmonics::HarmonicsError;
 use crate::sky::healpix::is_valid_nside;
+use crate::units::{Checks, InvalidValue};
 
 /// Frequencies for which there is a sky, Hz.
 const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=120e6;
@@ -67,16 +68,9 @@ impl Default for GeneratedSky {
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum GeneratedSkyError {
-    /// A parameter outside its range.
-    #[error("generated sky: {key} = {value}; expected {expected}")]
-    Parameter {
-        /// Key of the configuration.
-        key: &'static str,
-        /// Value found.
-        value: f64,
-        /// Range that is accepted.
-        expected: &'static str,
-    },
+    /// A value of the configuration that is not accepted.
+    #[error(transparent)]
+    Invalid(#[from] InvalidValue),
     /// A frequency for which there is no model.
     #[error("no generated sky at {frequency_hz} Hz; expected 1e5 to 1.2e8 Hz")]
     Frequency {
@@ -95,9 +89,10 @@ pub enum GeneratedSkyError {
 }
 
 impl GeneratedSky {
-    /// Everything that is wrong with these values.
+    /// Everything that is wrong with the section; empty if it is good.
     #[must_use]
-    pub fn problems(&self) -> Vec<GeneratedSkyError> {
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("sky.generated");
         let rules = [
             ("small_scale_amplitude", self.small_scale_amplitude, 0.0..=10.0, "0 to 10"),
             ("small_scale_fwhm_deg", self.small_scale_fwhm_deg, 0.1..=30.0, "0.1 to 30 degrees"),
@@ -118,19 +113,12 @@ impl GeneratedSky {
             ),
             ("source_spectral_index", self.source_spectral_index, -3.0..=3.0, "-3 to 3"),
         ];
-        let mut problems: Vec<_> = rules
-            .into_iter()
-            .filter(|(_, value, range, _)| !range.contains(value))
-            .map(|(key, value, _, expected)| GeneratedSkyError::Parameter { key, value, expected })
-            .collect();
-        if self.source_flux_jy_max <= self.source_flux_jy_min {
-            problems.push(GeneratedSkyError::Parameter {
-                key: "source_flux_jy_max",
-                value: self.source_flux_jy_max,
-                expected: "more than source_flux_jy_min",
-            });
+        for (key, value, range, expected) in rules {
+            checks.number(key, value, range.contains(&value), expected);
         }
-        problems
+        let (least_jy, most_jy) = (self.source_flux_jy_min, self.source_flux_jy_max);
+        checks.require("source_flux_jy_max", most_jy, most_jy > least_jy, "more than source_flux_jy_min");
+        checks.finish()
     }
 }
 

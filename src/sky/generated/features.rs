@@ -1,8 +1,8 @@
-//! Near things on the smooth sky: radio loops in front of most of the gas, nebulae that hide what is behind.
+//! Nearby features of the sky: radio loops in front of most of the gas, and nebulae that hide what is behind them.
 
 use crate::units::vector::{Vec3, dot, unit};
 
-use super::galaxy::{ELECTRON_K, Galaxy, OPACITY_INDEX, REFERENCE_HZ};
+use super::galaxy::{ELECTRON_K, Galaxy, OPACITY_INDEX, REFERENCE_HZ, direction_of};
 
 /// A spherical shell of synchrotron emission with the Sun outside or just inside it.
 struct Loop {
@@ -29,8 +29,8 @@ const LOOP_INDEX: f64 = 2.9;
 const LOOP_DEPTH: f64 = 0.0037;
 /// Distance of the loops, kpc.
 const LOOP_KPC: f64 = 0.13;
-/// The loops are brightest around here, the North Polar Spur: longitude, latitude, degrees; and
-/// how sharply they fade away from it.
+/// Longitude and latitude of the North Polar Spur, where the loops are brightest, degrees, and how sharply they fade
+/// away from it.
 const SPUR_DEG: [f64; 2] = [25.0, 50.0];
 const SPUR_SHARPNESS: f64 = 4.4;
 
@@ -54,8 +54,7 @@ const fn nebula(place_deg: [f64; 2], radius_deg: f64, distance_kpc: f64, emissio
     }
 }
 
-/// Well-known nebulae at their places, sizes and distances, with emission measures as their
-/// H-alpha brightness asks, all rounded.
+/// Well-known nebulae: rounded positions, sizes and distances, and emission measures from their H-alpha brightness.
 const NEBULAE: [Nebula; 11] = [
     nebula([258.0, -2.0], 14.0, 0.45, 150.0), // Gum
     nebula([6.3, 23.6], 5.0, 0.12, 80.0),     // zeta Ophiuchi, Sh 2-27
@@ -94,12 +93,12 @@ pub(super) struct Features {
     screens: Vec<Screen>,
 }
 
-/// What the features make of a line of sight.
+/// A line of sight with loops and nebulae.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Seen {
+pub(super) struct FeatureSight {
     /// Temperature with loops and nebulae, K.
     pub temperature_k: f64,
-    /// Optical depth that nebulae add for what lies behind everything.
+    /// Optical depth that nebulae add to the whole line of sight.
     pub depth: f64,
 }
 
@@ -141,7 +140,7 @@ impl Features {
 
     /// Adds loops and nebulae to a smooth sky of `diffuse_k` in a Galactic direction; the gas in
     /// front of the loops has `opacity_factor` times its mean opacity.
-    pub fn seen(&self, direction: Vec3, diffuse_k: f64, opacity_factor: f64) -> Seen {
+    pub fn seen(&self, direction: Vec3, diffuse_k: f64, opacity_factor: f64) -> FeatureSight {
         let mut temperature = diffuse_k;
         let mut added = 0.0;
         let mut loops_pending = true;
@@ -163,7 +162,7 @@ impl Features {
         if loops_pending {
             temperature += self.loops_k(direction, opacity_factor);
         }
-        Seen { temperature_k: temperature, depth: added }
+        FeatureSight { temperature_k: temperature, depth: added }
     }
 
     fn loops_k(&self, direction: Vec3, opacity_factor: f64) -> f64 {
@@ -189,7 +188,7 @@ fn shell_path(cos: f64, radius: f64) -> f64 {
 }
 
 fn place(longitude_deg: f64, latitude_deg: f64) -> Vec3 {
-    unit(crate::sky::generated::direction_of(longitude_deg.to_radians(), latitude_deg.to_radians()))
+    unit(direction_of(longitude_deg.to_radians(), latitude_deg.to_radians()))
 }
 
 #[cfg(test)]

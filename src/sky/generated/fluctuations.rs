@@ -1,4 +1,4 @@
-//! Gaussian fields on the sphere: the same field at every nside.
+//! Gaussian random fields on the sphere, the same at every nside.
 
 use rand::RngExt;
 use rand_distr::StandardNormal;
@@ -13,16 +13,16 @@ const SMALL_SCALE_ALPHA: f64 = 0.0599;
 const SMALL_SCALE_BETA: f64 = 0.782;
 /// Resolution of the 408 MHz map beyond which that paper's field has unit variance: FWHM 56'.
 const HASLAM_FWHM_RAD: f64 = 56.0 / 60.0 * std::f64::consts::PI / 180.0;
-/// Degrees over which that variance is counted: those of nside 1024.
+/// Degrees over which that variance is summed: those of nside 1024.
 const NORMALISED_TO: usize = 3071;
 
 /// Slope and degrees of the large fields: clouds of the absorber, variations of the index.
 const LARGE_SCALE_SLOPE: f64 = -2.7;
 const LARGE_SCALE_DEGREES: std::ops::RangeInclusive<usize> = 4..=383;
 
-/// What a field is for; each has a random stream of its own.
+/// The random fields; each has its own random stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Field {
+pub(super) enum RandomField {
     /// G of Remazeilles et al.
     SmallScales = 0,
     /// Logarithm of the opacity of the warm gas.
@@ -38,10 +38,10 @@ pub(super) fn small_scale_fraction(g: f64, kelvin_408: f64) -> f64 {
 }
 
 /// Power C_l, l = 0..=`l_max`, of G: l^gamma (1 - exp(-l^2 sigma^2)) with sigma that of `fwhm_rad`,
-/// the resolution of what the field is put on.
+/// the resolution of the template.
 ///
-/// The scale is that of the paper, unit variance beyond 56', whatever `fwhm_rad`: a coarser template
-/// gets the same small scales and the missing middle ones.
+/// The scale is that of the paper, unit variance beyond 56', for any `fwhm_rad`: a coarser template
+/// gets the same small scales and the intermediate ones that it lacks.
 pub(super) fn small_scale_power(l_max: usize, fwhm_rad: f64) -> Vec<f64> {
     let shape = |l: usize, fwhm_rad: f64| {
         let l = l as f64;
@@ -75,7 +75,7 @@ pub(super) fn gaussian_field(
     power: &[f64],
     nside: usize,
     seed: u64,
-    field: Field,
+    field: RandomField,
 ) -> Result<Vec<f64>, HarmonicsError> {
     let mut stream = random_stream(seed, StreamKind::SkyFluctuations, [field as u64, 0]);
     let mut alm = Alm::zeros(power.len().saturating_sub(1));

@@ -1,9 +1,8 @@
 //! The smooth Galaxy: synchrotron emission and free-free absorption along lines of sight.
 //!
-//! Disks of emission and of warm ionised gas with the Sun a little above their plane, inside a cavity.
-//! The forms are the usual ones of Galactic models (exponential in radius, sech^2 in height, a ring of
-//! dense gas at 4 kpc); the numbers were chosen so that the sky's statistics are those published
-//! for ULSA (see [`super`]), not to follow any map.
+//! Disks of emission and of warm ionised gas, with the Sun slightly above their plane inside a cavity. The profiles are
+//! the usual ones of Galactic models (exponential in radius, sech^2 in height, a ring of dense gas at 4 kpc). The numbers
+//! reproduce the published statistics of ULSA (see [`super`]); they do not follow any map.
 
 use std::f64::consts::PI;
 
@@ -43,8 +42,8 @@ const RING_PER_KPC: f64 = 1.02;
 const RING_RADIUS_KPC: f64 = 4.0;
 const RING_WIDTH_KPC: f64 = 1.8;
 const RING_HEIGHT_KPC: f64 = 0.14;
-/// The cavity around the Sun: its radius, kpc, how much longer it reaches to the north (a fraction
-/// at the pole), and the opacity inside, 1/kpc.
+/// The cavity around the Sun: its radius, kpc, its relative extension towards the north pole, and the opacity inside,
+/// 1/kpc.
 const CAVITY_KPC: f64 = 0.227;
 const CAVITY_NORTH: f64 = 0.63;
 const CAVITY_PER_KPC: f64 = 0.0071;
@@ -92,9 +91,9 @@ fn step_edges() -> [f64; STEPS + 1] {
     std::array::from_fn(|k| FIRST_KPC * (top * k as f64 / STEPS as f64).exp_m1())
 }
 
-/// What leaves a line of sight, before scaling with frequency of the emission.
+/// Result of the transfer along a line of sight, before the emission is scaled to the frequency.
 struct Ray {
-    /// Synchrotron temperature at [`REFERENCE_HZ`] if nothing absorbed, K.
+    /// Synchrotron temperature at [`REFERENCE_HZ`] without absorption, K.
     unabsorbed_k: f64,
     /// Optical depth at [`REFERENCE_HZ`].
     depth: f64,
@@ -143,10 +142,10 @@ pub(super) struct Galaxy {
 
 /// The smooth Galaxy in one direction.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Sight {
+pub(super) struct GalaxySight {
     /// Absorbed synchrotron temperature, K.
     pub synchrotron_k: f64,
-    /// Synchrotron temperature at the reference frequency if nothing absorbed, K.
+    /// Synchrotron temperature at the reference frequency without absorption, K.
     pub unabsorbed_reference_k: f64,
     /// Optical depth of the whole line of sight.
     pub depth: f64,
@@ -165,7 +164,7 @@ impl Galaxy {
             .map(|node| {
                 let latitude = node_latitude(node / LONGITUDES);
                 let longitude = PI * (node % LONGITUDES) as f64 / (LONGITUDES - 1) as f64;
-                transfer(crate::sky::generated::direction_of(longitude, latitude), &edges, &scales)
+                transfer(direction_of(longitude, latitude), &edges, &scales)
             })
             .collect();
         Self {
@@ -178,9 +177,8 @@ impl Galaxy {
         }
     }
 
-    /// What is seen in a Galactic direction through gas of cloudiness `cloud` (a standard normal
-    /// number).
-    pub fn sight(&self, direction: Vec3, cloud: f64) -> Sight {
+    /// The smooth Galaxy in a Galactic direction, through gas of cloudiness `cloud` (a standard normal number).
+    pub fn sight(&self, direction: Vec3, cloud: f64) -> GalaxySight {
         let latitude = direction[2].atan2(direction[0].hypot(direction[1]));
         let longitude = direction[1].atan2(direction[0]).abs();
         let (row0, row_weights) = cubic(latitude_node(latitude), LATITUDES);
@@ -202,7 +200,7 @@ impl Galaxy {
                 absorbed += weight * along;
             }
         }
-        Sight {
+        GalaxySight {
             synchrotron_k: self.emission_scale * absorbed.exp(),
             unabsorbed_reference_k: unabsorbed.exp(),
             depth: self.opacity_scale * self.opacity_factor(cloud) * depth.exp(),
@@ -222,6 +220,13 @@ impl Galaxy {
         let scales = [self.opacity_scale; CLOUDS];
         self.emission_scale * transfer(direction, &edges, &scales).absorbed_k[0]
     }
+}
+
+/// Unit vector of a longitude and latitude.
+pub(super) fn direction_of(longitude_rad: f64, latitude_rad: f64) -> Vec3 {
+    let (sin_longitude, cos_longitude) = longitude_rad.sin_cos();
+    let (sin_latitude, cos_latitude) = latitude_rad.sin_cos();
+    [cos_latitude * cos_longitude, cos_latitude * sin_longitude, sin_latitude]
 }
 
 fn cloudiness(cloud_rms: f64, cloud: f64) -> f64 {
@@ -261,7 +266,7 @@ fn clamped(before: usize, k: usize, nodes: usize) -> usize {
     (before + k).saturating_sub(1).min(nodes - 1)
 }
 
-/// As [`clamped`], but the table goes on beyond its ends as its mirror image.
+/// As [`clamped`], but the table is mirrored at its ends.
 fn mirrored(before: usize, k: usize, nodes: usize) -> usize {
     let node = (before + k).abs_diff(1);
     if node < nodes { node } else { 2 * (nodes - 1) - node }
@@ -278,7 +283,7 @@ mod tests {
         for k in 0..400_u32 {
             let longitude = f64::from(k) * 2.399_963;
             let latitude = (2.0 * (f64::from(k) + 0.5) / 400.0 - 1.0).asin();
-            let direction = crate::sky::generated::direction_of(longitude, latitude);
+            let direction = direction_of(longitude, latitude);
             let cloud = 1.7 * f64::from(k).sin();
             let scales = [galaxy.opacity_scale * galaxy.opacity_factor(cloud); CLOUDS];
             let ray = transfer(direction, &edges, &scales);
@@ -293,7 +298,7 @@ mod tests {
 
     #[test]
     fn thin_gas_lets_everything_through_and_thick_gas_little() {
-        let direction = crate::sky::generated::direction_of(0.3, 0.0);
+        let direction = direction_of(0.3, 0.0);
         let clear = Galaxy::new(1e12, 0.0).sight(direction, 0.0);
         let scale = (1e12_f64 / REFERENCE_HZ).powf(-SYNCHROTRON_INDEX);
         assert!((clear.synchrotron_k / (scale * clear.unabsorbed_reference_k) - 1.0).abs() < 3e-3);

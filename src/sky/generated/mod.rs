@@ -1,15 +1,14 @@
-//! A sky from a formula: diffuse Galactic emission behind and among absorbing gas, fluctuations,
-//! point sources, at any frequency of 0.1-120 MHz.
+//! A sky from a formula: diffuse Galactic emission, absorbing gas, fluctuations and point sources, at any frequency of
+//! 0.1-120 MHz.
 //!
-//! The transfer of synchrotron emission through warm ionised gas is solved along lines of sight through
-//! a smooth Galaxy, so the plane goes dark below about 10 MHz while near things - the radio loops, the
-//! emission inside the local cavity - stay bright. An isotropic extragalactic background lies behind everything
-//! (Cane 1979), opaque nebulae hide what they cover, gas and spectral index vary over the sky,
-//! small scales follow Remazeilles et al. (2015) and point sources the GLEAM counts of Franzen et al. (2019).
-//! The model lives in Galactic coordinates; maps come out on ecliptic axes.
+//! Radiative transfer of synchrotron emission through warm ionised gas is solved along lines of sight through a smooth
+//! Galaxy, so the plane goes dark below about 10 MHz while nearby emission, from the radio loops and the local cavity,
+//! stays bright. Behind everything lies an isotropic extragalactic background (Cane 1979). Opaque nebulae hide what they
+//! cover. Gas and spectral index vary over the sky, small scales follow Remazeilles et al. (2015), and point sources the
+//! GLEAM counts of Franzen et al. (2019). The model uses Galactic coordinates; maps are on ecliptic axes.
 //!
 //! Published statistics of ULSA (Cong et al. 2021, direction-dependent index; their map at nside 64,
-//! measured in Galactic coordinates, K), which the model's numbers were chosen to meet:
+//! measured in Galactic coordinates, K), to which the model's numbers were fitted:
 //!
 //! | MHz | mean | 5 % | 50 % | 95 % | b > 60 deg | b < -60 deg | abs(b) < 5 deg |
 //! |---|---|---|---|---|---|---|---|
@@ -32,10 +31,10 @@ use super::harmonics::HarmonicsError;
 use super::healpix::{pixel_area_sr, pixel_count, pixel_of, ring, ring_to_nested};
 use crate::units::vector::Vec3;
 use features::Features;
-use fluctuations::{Field, gaussian_field, large_scale_power, small_scale_fraction, small_scale_power};
+use fluctuations::{RandomField, gaussian_field, large_scale_power, small_scale_fraction, small_scale_power};
 use galaxy::{ELECTRON_K, Galaxy, REFERENCE_HZ, SYNCHROTRON_INDEX};
 
-/// Coarser maps than this are averages of one of this nside, which resolves the dark plane.
+/// Coarser maps are averages of one of this nside, which resolves the dark plane.
 const NSIDE_MIN: usize = 64;
 
 /// Frequency of the small-scale formula, Hz (Remazeilles et al. 2015).
@@ -46,16 +45,16 @@ const HASLAM_HZ: f64 = 408e6;
 const EXTRAGALACTIC_K: f64 = 5.468e4;
 const EXTRAGALACTIC_INDEX: f64 = 2.80;
 
-/// Least fraction of the diffuse emission that fluctuations leave.
+/// Least factor of the fluctuations on the diffuse emission.
 const FLUCTUATION_FLOOR: f64 = 0.05;
 
 /// A sky at `frequency_hz`: K in RING order on ecliptic axes, `12 nside^2` values, all positive.
 ///
-/// Equal seeds give the same sky at every frequency and every nside, up to what a pixel averages over and the
-/// degrees above `3 nside - 1` that a map cannot hold. Point sources fill the one pixel they lie in.
+/// Equal seeds give the same sky at every frequency and nside, up to pixel averaging and the degrees above
+/// `3 nside - 1` that a map cannot represent. A point source fills the pixel that holds it.
 ///
 /// # Errors
-/// If the configuration is wrong (its first problem), the frequency lies outside 0.1-120 MHz, or `nside` is not a
+/// If the configuration is invalid (its first problem), the frequency lies outside 0.1-120 MHz, or `nside` is not a
 /// power of two between 1 and 1024.
 pub fn generate(
     config: &GeneratedSky,
@@ -65,11 +64,11 @@ pub fn generate(
 ) -> Result<Vec<f64>, GeneratedSkyError> {
     config::check_request(frequency_hz, nside)?;
     if let Some(problem) = config.problems().into_iter().next() {
-        return Err(problem);
+        return Err(problem.into());
     }
     let fine = nside.max(NSIDE_MIN);
-    let scene = Scene::new(config, frequency_hz);
-    let fields = Fields::new(config, fine, seed)?;
+    let diffuse_sky = DiffuseSky::new(config, frequency_hz);
+    let fields = RandomFields::new(config, fine, seed)?;
     let mut kelvin = vec![0.0; pixel_count(fine)];
     let mut depth = vec![0.0; pixel_count(fine)];
     let mut rings: Vec<(usize, &mut [f64], &mut [f64])> = Vec::with_capacity(4 * fine);
@@ -86,7 +85,7 @@ pub fn generate(
             let longitude = ring.phi0_rad + std::f64::consts::TAU * p as f64 / ring.len as f64;
             let (sin, cos) = longitude.sin_cos();
             let direction = [ring.sin_theta * cos, ring.sin_theta * sin, ring.z];
-            (kelvin[p], depth[p]) = scene.look(direction, fields.at(ring.first + p));
+            (kelvin[p], depth[p]) = diffuse_sky.line_of_sight(direction, fields.at(ring.first + p));
         }
     });
     if config.point_sources {
@@ -100,24 +99,24 @@ pub fn generate(
     Ok(if fine == nside { kelvin } else { averaged(&kelvin, fine, nside) })
 }
 
-/// The deterministic sky at one frequency.
-struct Scene<'a> {
+/// The diffuse sky at one frequency.
+struct DiffuseSky<'a> {
     config: &'a GeneratedSky,
     to_galactic: Rotation,
     galaxy: Galaxy,
     features: Features,
-    /// The part of the background that is not drawn as sources, K.
+    /// Background other than the sources drawn one by one, K.
     background_k: f64,
-    /// ln(nu / reference), by which variations of the index act.
+    /// ln(nu / reference), the factor of variations of the index.
     log_ratio: f64,
 }
 
-impl<'a> Scene<'a> {
+impl<'a> DiffuseSky<'a> {
     fn new(config: &'a GeneratedSky, frequency_hz: f64) -> Self {
         let galaxy = Galaxy::new(frequency_hz, config.cloud_log_rms);
         let features = Features::new(frequency_hz, &galaxy, config.loops, config.nebulae);
         let background = EXTRAGALACTIC_K * (frequency_hz / REFERENCE_HZ).powf(-EXTRAGALACTIC_INDEX);
-        // The sources are part of the background: what is drawn one by one is taken from the rest.
+        // The sources are part of the background: subtract those that are drawn one by one.
         let drawn = if config.point_sources { sources::mean_k(config, frequency_hz) } else { 0.0 };
         Self {
             config,
@@ -129,8 +128,8 @@ impl<'a> Scene<'a> {
         }
     }
 
-    /// Temperature, K, and optical depth to the outside in an ecliptic direction.
-    fn look(&self, ecliptic: Vec3, fields: FieldValues) -> (f64, f64) {
+    /// Temperature, K, and optical depth of the whole line of sight in an ecliptic direction.
+    fn line_of_sight(&self, ecliptic: Vec3, fields: FieldValues) -> (f64, f64) {
         let direction = rotate(&self.to_galactic, ecliptic);
         let sight = self.galaxy.sight(direction, fields.cloud);
         let index_factor = (-self.config.index_rms * fields.index * self.log_ratio).exp();
@@ -158,17 +157,17 @@ struct FieldValues {
     index: f64,
 }
 
-/// The random fields of a sky; empty where switched off.
-struct Fields {
+/// The random fields of a sky; empty where disabled.
+struct RandomFields {
     small: Vec<f64>,
     cloud: Vec<f64>,
     index: Vec<f64>,
 }
 
-impl Fields {
+impl RandomFields {
     fn new(config: &GeneratedSky, nside: usize, seed: u64) -> Result<Self, HarmonicsError> {
         let l_max = 3 * nside - 1;
-        let field = |wanted: bool, power: &dyn Fn() -> Vec<f64>, field: Field| {
+        let field = |wanted: bool, power: &dyn Fn() -> Vec<f64>, field: RandomField| {
             if wanted { gaussian_field(&power(), nside, seed, field) } else { Ok(Vec::new()) }
         };
         let small = || {
@@ -176,9 +175,9 @@ impl Fields {
             small_scale_power(l_max, config.small_scale_fwhm_deg.to_radians())
         };
         Ok(Self {
-            small: field(config.small_scales, &small, Field::SmallScales)?,
-            cloud: field(config.cloud_log_rms > 0.0, &|| large_scale_power(l_max), Field::Clouds)?,
-            index: field(config.index_rms > 0.0, &|| large_scale_power(l_max), Field::Index)?,
+            small: field(config.small_scales, &small, RandomField::SmallScales)?,
+            cloud: field(config.cloud_log_rms > 0.0, &|| large_scale_power(l_max), RandomField::Clouds)?,
+            index: field(config.index_rms > 0.0, &|| large_scale_power(l_max), RandomField::Index)?,
         })
     }
 
@@ -201,12 +200,6 @@ fn averaged(kelvin: &[f64], from: usize, to: usize) -> Vec<f64> {
             nested[first..first + children].iter().sum::<f64>() / children as f64
         })
         .collect()
-}
-
-fn direction_of(longitude_rad: f64, latitude_rad: f64) -> Vec3 {
-    let (sin_longitude, cos_longitude) = longitude_rad.sin_cos();
-    let (sin_latitude, cos_latitude) = latitude_rad.sin_cos();
-    [cos_latitude * cos_longitude, cos_latitude * sin_longitude, sin_latitude]
 }
 
 #[cfg(test)]

@@ -35,7 +35,7 @@ struct Counts {
     step: f64,
     /// Sources per sr fainter than each node.
     below: Vec<f64>,
-    /// Flux of all of them together, Jy/sr.
+    /// Their total flux, Jy/sr.
     flux_jy_sr: f64,
 }
 
@@ -55,7 +55,7 @@ impl Counts {
         Self { first, step, below, flux_jy_sr }
     }
 
-    /// Flux at which a fraction `u` of the sources is fainter, Jy.
+    /// The flux below which a fraction `u` of the sources lies, Jy.
     fn flux_jy(&self, u: f64) -> f64 {
         let target = u * self.below[INTERVALS];
         let node = self.below.partition_point(|&n| n <= target).clamp(1, INTERVALS);
@@ -67,15 +67,15 @@ impl Counts {
 
 /// A point source.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Source {
-    /// Where, unit vector.
+pub(super) struct PointSource {
+    /// Direction, unit vector.
     pub direction: Vec3,
     /// Flux at 154 MHz, Jy.
     pub flux_jy: f64,
 }
 
 /// The sources of a sky: a Poisson number of them, uniform on the sphere.
-pub(super) fn draw(config: &GeneratedSky, seed: u64) -> Vec<Source> {
+pub(super) fn draw(config: &GeneratedSky, seed: u64) -> Vec<PointSource> {
     let counts = Counts::new(config.source_flux_jy_min, config.source_flux_jy_max);
     let mut stream = random_stream(seed, StreamKind::SkySources, [0, 0]);
     let mean = 4.0 * PI * counts.below[INTERVALS];
@@ -86,7 +86,7 @@ pub(super) fn draw(config: &GeneratedSky, seed: u64) -> Vec<Source> {
             let (sin, cos) = (2.0 * PI * stream.random::<f64>()).sin_cos();
             let across = ((1.0 - z) * (1.0 + z)).sqrt();
             let flux_jy = counts.flux_jy(stream.random());
-            Source { direction: [across * cos, across * sin, z], flux_jy }
+            PointSource { direction: [across * cos, across * sin, z], flux_jy }
         })
         .collect()
 }

@@ -138,7 +138,7 @@ fn small_scales_have_the_slope_of_the_formula() {
     let slope = (power[180] / power[120]).ln() / (180.0_f64 / 120.0).ln();
     assert!((slope + 2.703).abs() < 0.01, "{slope}");
     // A realisation's variance against the sum over its power: 2 / sum (2l + 1) C_l^2 weights, a few percent.
-    let field = gaussian_field(&power, 64, 11, Field::SmallScales).unwrap();
+    let field = gaussian_field(&power, 64, 11, RandomField::SmallScales).unwrap();
     let variance = mean(&field.iter().map(|v| v * v).collect::<Vec<_>>());
     let expected = power.iter().enumerate().map(|(l, c)| (2 * l + 1) as f64 * c).sum::<f64>()
         / (4.0 * std::f64::consts::PI);

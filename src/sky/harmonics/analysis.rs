@@ -1,44 +1,44 @@
 //! Coefficients of a map.
 //!
-//! HEALPix pixels are no exact quadrature: sum over pixels of map conj(Y_lm) errs by 15 % for white
-//! coefficients up to l = 3 nside - 1, and healpy's three improvements leave 14 % at nside 128. The
-//! coefficients whose synthesis comes nearest the map (least squares) are exact for a band-limited map, and
-//! conjugate gradients on the normal equations find them. Measured, for white coefficients and a relative
+//! HEALPix pixels are not an exact quadrature: the sum over pixels of map conj(Y_lm) errs by 15 % for white
+//! coefficients up to l = 3 nside - 1, and healpy's three iterations leave 14 % at nside 128. The least-squares
+//! coefficients, whose synthesis is nearest to the map, are exact for a band-limited map; conjugate gradients on
+//! the normal equations find them. Measured, for white coefficients and a relative
 //! error of 1e-6: 5 iterations for l_max up to 2.25 nside and 8 up to 2.5 nside, at any nside from 16 to 256;
-//! at l_max = 3 nside - 1, 33 at nside 16 and 170 at nside 32 (where the map is met to 1e-6, the coefficients
-//! to 2e-5). Beyond, no method can: the pixel lattice near the poles and along the faces' meridians is too
-//! coarse in one direction for l > 2.5 nside or so, so that some waves hardly differ from others in any
-//! pixel, by factors that fall exponentially with nside.
+//! at l_max = 3 nside - 1, 33 at nside 16 and 170 at nside 32 (where the map is accurate to 1e-6, the coefficients
+//! to 2e-5). Beyond that no method works: the pixel lattice near the poles and along the faces' meridians is too
+//! coarse in one direction for l > 2.5 nside or so, so that some waves differ from others in every pixel only
+//! by factors that fall exponentially with nside.
 
 use num_complex::Complex64;
 
 use super::{Alm, HarmonicsError, Transform};
 
-/// How coefficients are found.
+/// Method of the analysis.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Method {
     /// Least squares by conjugate gradients, to a residual.
     LeastSquares {
-        /// Norm of the normal equations' residual relative to that of their right side; the coefficients'
-        /// own relative error is up to a few times this.
+        /// Norm of the residual of the normal equations relative to that of their right-hand side; the relative error
+        /// of the coefficients is up to a few times this.
         tolerance: f64,
-        /// Most iterations before giving up.
+        /// Greatest number of iterations.
         iterations_max: usize,
     },
-    /// Quadrature, improved this many times by the quadrature of what is left (healpy's `iter`).
+    /// Quadrature, corrected this many times by the quadrature of the residual (healpy's `iter`).
     Jacobi {
-        /// Number of improvements.
+        /// Number of corrections.
         iterations: usize,
     },
 }
 
 impl Method {
-    /// Least squares to 3e-7 in at most 200 iterations, which leaves a relative error of some 1e-7 where that
-    /// can be had: for l_max up to 2.5 nside.
+    /// Least squares to 3e-7 in at most 200 iterations: a relative error of some 1e-7 for l_max up to 2.5 nside, where
+    /// that is possible.
     pub const ACCURATE: Self = Self::LeastSquares { tolerance: 3e-7, iterations_max: 200 };
 }
 
-/// Three improvements, as healpy does by default: what spectra in the literature mean.
+/// Three corrections, as in healpy by default and so in spectra of the literature.
 impl Default for Method {
     fn default() -> Self {
         Self::Jacobi { iterations: 3 }
@@ -48,18 +48,18 @@ impl Default for Method {
 /// Options of an analysis.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct AnalysisOptions {
-    /// How coefficients are found.
+    /// Method.
     pub method: Method,
 }
 
-/// Coefficients and what it took to find them.
+/// Coefficients, and the convergence of the iteration.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Analysis {
     /// The coefficients.
     pub alm: Alm,
     /// Iterations done.
     pub iterations: usize,
-    /// Relative norm of the residual of the normal equations, before the last improvement for
+    /// Relative norm of the residual of the normal equations, before the last correction for
     /// [`Method::Jacobi`].
     pub residual: f64,
 }

@@ -12,13 +12,13 @@ pub struct Alm {
 }
 
 impl Alm {
-    /// All zero, for `l <= l_max`.
+    /// Zeros, for `l <= l_max`.
     #[must_use]
     pub fn zeros(l_max: usize) -> Self {
         Self { l_max, values: vec![Complex64::ZERO; Self::len_for(l_max)] }
     }
 
-    /// From values in healpy's order; `None` if their number does not fit `l_max`.
+    /// From values in healpy's order; `None` if their number does not match `l_max`.
     #[must_use]
     pub fn from_values(l_max: usize, values: Vec<Complex64>) -> Option<Self> {
         (values.len() == Self::len_for(l_max)).then_some(Self { l_max, values })
@@ -36,7 +36,7 @@ impl Alm {
         self.l_max
     }
 
-    /// Place of `(l, m)`, `m <= l <= l_max`, among the values.
+    /// Index of `(l, m)`, `m <= l <= l_max`, among the values.
     #[inline]
     #[must_use]
     pub fn index(&self, l: usize, m: usize) -> usize {
@@ -51,7 +51,7 @@ impl Alm {
         self.values[self.index(l, m)]
     }
 
-    /// `a_lm` for `m >= 0`, to be changed.
+    /// Mutable `a_lm` for `m >= 0`.
     #[inline]
     pub fn get_mut(&mut self, l: usize, m: usize) -> &mut Complex64 {
         let index = self.index(l, m);
@@ -65,7 +65,7 @@ impl Alm {
         &self.values[first..=first + self.l_max - m]
     }
 
-    /// The coefficients l = m .. l_max of order `m`, to be changed.
+    /// Mutable coefficients l = m .. l_max of order `m`.
     pub fn order_mut(&mut self, m: usize) -> &mut [Complex64] {
         let first = self.index(m, m);
         let last = first + self.l_max - m;
@@ -78,7 +78,7 @@ impl Alm {
         &self.values
     }
 
-    /// All values in healpy's order, to be changed.
+    /// Mutable values in healpy's order.
     pub fn values_mut(&mut self) -> &mut [Complex64] {
         &mut self.values
     }

@@ -1,21 +1,21 @@
-//! What can be wrong with a transform.
+//! Errors of transforms.
 
 use thiserror::Error;
 
 use crate::sky::healpix::NSIDE_MAX;
 
-/// Why a transform cannot be made or used.
+/// Why a transform failed.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum HarmonicsError {
-    /// Not an nside.
+    /// Invalid nside.
     #[error("nside {nside} is not allowed; expected a power of two from 1 to {NSIDE_MAX}")]
     Nside {
         /// Value found.
         nside: usize,
     },
-    /// A degree beyond what the transforms can do, or what the map can determine.
-    #[error("l_max {l_max} is too great; expected at most {most}")]
+    /// A degree beyond the range of the transforms, or beyond what the map determines.
+    #[error("l_max {l_max} is too large; expected at most {most}")]
     Degree {
         /// Value found.
         l_max: usize,
@@ -38,7 +38,7 @@ pub enum HarmonicsError {
         /// The transform's nside.
         nside: usize,
     },
-    /// A pixel that is not a finite number.
+    /// A pixel value that is not a finite number.
     #[error("RING pixel {pixel} is {value}; expected finite values everywhere")]
     NotFinite {
         /// RING number.
@@ -46,10 +46,10 @@ pub enum HarmonicsError {
         /// Its value.
         value: f64,
     },
-    /// An iteration that did not reach its tolerance.
+    /// The iteration did not reach its tolerance.
     #[error(
         "after {iterations} iterations the residual is {residual:e}; expected {tolerance:e}: allow more \
-         iterations, or lower l_max, as beyond 2.5 nside pixels hardly tell harmonics apart"
+         iterations or lower l_max: beyond 2.5 nside the pixels hardly distinguish harmonics"
     )]
     NotConverged {
         /// Iterations done.

@@ -1,37 +1,28 @@
-//! The sums over degrees, the hot part of the transforms: SIMD over rings.
+//! Sums over degrees, the inner loops of the transforms: SIMD over rings.
 //!
-//! A block of ring pairs (a ring and its mirror image south of the equator) shares the recurrence. Functions
-//! start as small as (sin theta)^m, far below the least f64; each ring carries a scale until its function
-//! has grown to 2^-100, below which a term is left out.
+//! The ring pairs of a block (a ring and its mirror image south of the equator) share the recurrence. Functions start
+//! as small as (sin theta)^m, far below the least f64, so each ring carries a scale until its function has grown to
+//! 2^-100; smaller terms are neglected.
 #![expect(clippy::needless_range_loop, reason = "arrays of registers are walked in step")]
 
 use std::ops::Range;
 
 use pulp::{Simd, WithSimd};
 
-use super::lanes::RingLanes;
+use super::lanes::{RingLanes, SCALE_EXPONENT, power_of_two};
 use super::recurrence::Order;
 
-/// A value counts 2^`SCALE_EXPONENT` for each unit of its scale.
-pub(super) const SCALE_EXPONENT: i32 = 400;
-/// Functions below this, times their scale, do not count.
+/// Functions below this, times their scale, are neglected.
 const LEAST: f64 = power_of_two(-100);
-/// Functions above this have their scale raised: `LEAST` times 2^400.
+/// The scale of functions above this is raised: `LEAST` times 2^400.
 const GREATEST: f64 = power_of_two(300);
-/// Steps between looks at the scales. A step multiplies by less than 2^16 for any l up to 8191.
-const STEPS_BETWEEN_LOOKS: usize = 4;
+/// Steps between checks of the scales. A step multiplies by less than 2^16 for any l up to 8191.
+const STEPS_BETWEEN_CHECKS: usize = 4;
 
-/// Most ring pairs of a block; tables of rings are padded to a multiple of it.
-pub(super) const BLOCK_MAX: usize = 32;
-
-/// Ring pairs of an even and an odd part are passed between stages in groups of this.
+/// Ring pairs are passed between stages in groups of this size.
 pub(super) const GROUP: usize = 8;
 
-pub(super) const fn power_of_two(exponent: i32) -> f64 {
-    f64::from_bits(((1023 + exponent) as u64) << 52)
-}
-
-/// Greatest order that matters on a ring: beyond, all functions up to `l_max` are below 1e-30 or so
+/// Greatest order that matters on a ring: beyond it all functions up to `l_max` are below 1e-30 or so
 /// (libsharp's rule).
 pub(super) fn greatest_order(l_max: usize, sin_theta: f64) -> usize {
     let l = l_max as f64;
@@ -39,9 +30,9 @@ pub(super) fn greatest_order(l_max: usize, sin_theta: f64) -> usize {
     (reach as usize).min(l_max)
 }
 
-/// Sums over degrees of one order for all rings: `out` is four planes (north real, imaginary; south real,
-/// imaginary) of `stride` values each; rings that the order does not reach are left alone.
-pub(super) struct Synthesis<'a> {
+/// Sums over the degrees of one order, on all rings: `out` has four planes (north real, imaginary; south real,
+/// imaginary) of `stride` values each; rings that the order does not reach are left unchanged.
+pub(super) struct SynthesisTask<'a> {
     pub order: &'a Order,
     pub l_max: usize,
     pub mixed: &'a [[f64; 4]],
@@ -52,8 +43,8 @@ pub(super) struct Synthesis<'a> {
     pub stride: usize,
 }
 
-/// The transpose: sums over rings for every formed function, added to `sums`.
-pub(super) struct Adjoint<'a> {
+/// The transpose: sums over rings for every function of the recurrence.
+pub(super) struct AdjointTask<'a> {
     pub order: &'a Order,
     pub l_max: usize,
     pub rings: &'a RingLanes,
@@ -68,12 +59,12 @@ pub(super) struct Adjoint<'a> {
     pub sums: &'a mut Vec<[f64; 4]>,
 }
 
-/// What is done with the functions of a block of rings.
-trait Sink<S: Simd, const U: usize> {
+/// Consumes the functions of a block of rings.
+trait FunctionSink<S: Simd, const U: usize> {
     fn take(&mut self, j: usize, q: &[S::f64s; U]);
 }
 
-struct Block<S: Simd, const U: usize> {
+struct RingBlock<S: Simd, const U: usize> {
     simd: S,
     x2: [S::f64s; U],
     below: [S::f64s; U],
@@ -81,7 +72,7 @@ struct Block<S: Simd, const U: usize> {
     scale: [S::f64s; U],
 }
 
-impl<S: Simd, const U: usize> Block<S, U> {
+impl<S: Simd, const U: usize> RingBlock<S, U> {
     #[inline(always)]
     fn new(simd: S, order: &Order, rings: &RingLanes, at: usize) -> Self {
         let lanes = at..at + U * S::F64_LANES;
@@ -160,23 +151,23 @@ impl<S: Simd, const U: usize> Block<S, U> {
         next
     }
 
-    /// Runs through all functions and hands those that count to `sink`.
+    /// Computes all functions and passes those that count to `sink`.
     #[inline(always)]
-    fn run(mut self, steps: &[[f64; 2]], sink: &mut impl Sink<S, U>) {
+    fn run(mut self, steps: &[[f64; 2]], sink: &mut impl FunctionSink<S, U>) {
         let simd = self.simd;
         let zero = simd.splat_f64s(0.0);
         let mut j = 0;
         let (mut least, mut greatest) = self.scales();
-        while greatest < 0.0 && j + STEPS_BETWEEN_LOOKS <= steps.len() {
-            for &step in &steps[j..j + STEPS_BETWEEN_LOOKS] {
+        while greatest < 0.0 && j + STEPS_BETWEEN_CHECKS <= steps.len() {
+            for &step in &steps[j..j + STEPS_BETWEEN_CHECKS] {
                 self.step(step);
             }
-            j += STEPS_BETWEEN_LOOKS;
+            j += STEPS_BETWEEN_CHECKS;
             self.lower(GREATEST);
             (least, greatest) = self.scales();
         }
         while least < 0.0 && j < steps.len() {
-            for _ in 0..STEPS_BETWEEN_LOOKS.min(steps.len() - j) {
+            for _ in 0..STEPS_BETWEEN_CHECKS.min(steps.len() - j) {
                 let mut counting = self.q;
                 for u in 0..U {
                     let counts = simd.greater_than_or_equal_f64s(self.scale[u], zero);
@@ -189,7 +180,7 @@ impl<S: Simd, const U: usize> Block<S, U> {
             self.lower(GREATEST);
             least = self.scales().0;
         }
-        // Two steps a turn, so that nothing has to be moved.
+        // Two steps an iteration, so that nothing has to be moved.
         let (mut even, mut odd) = (self.q, self.below);
         let (pairs, rest) = steps[j..].as_chunks::<2>();
         for pair in pairs {
@@ -211,7 +202,7 @@ struct SumDegrees<'a, S: Simd, const U: usize> {
     sums: [[S::f64s; U]; 4],
 }
 
-impl<S: Simd, const U: usize> Sink<S, U> for SumDegrees<'_, S, U> {
+impl<S: Simd, const U: usize> FunctionSink<S, U> for SumDegrees<'_, S, U> {
     #[inline(always)]
     fn take(&mut self, j: usize, q: &[S::f64s; U]) {
         let simd = self.simd;
@@ -231,7 +222,7 @@ struct SumRings<'a, S: Simd, const U: usize> {
     lanes: &'a mut [[S::f64s; 4]],
 }
 
-impl<S: Simd, const U: usize> Sink<S, U> for SumRings<'_, S, U> {
+impl<S: Simd, const U: usize> FunctionSink<S, U> for SumRings<'_, S, U> {
     #[inline(always)]
     fn take(&mut self, j: usize, q: &[S::f64s; U]) {
         let simd = self.simd;
@@ -256,7 +247,7 @@ fn load<S: Simd, const U: usize>(values: &[f64]) -> [S::f64s; U] {
     )
 }
 
-impl Synthesis<'_> {
+impl SynthesisTask<'_> {
     #[inline(always)]
     fn run<S: Simd, const U: usize>(self, simd: S) {
         let width = U * S::F64_LANES;
@@ -267,7 +258,7 @@ impl Synthesis<'_> {
             }
             let zero = simd.splat_f64s(0.0);
             let mut sink = SumDegrees { simd, mixed: self.mixed, sums: [[zero; U]; 4] };
-            Block::new(simd, self.order, self.rings, at).run(&self.order.steps, &mut sink);
+            RingBlock::new(simd, self.order, self.rings, at).run(&self.order.steps, &mut sink);
             let cos = load::<S, U>(&self.rings.cos[at..at + width]);
             for part in 0..2 {
                 for u in 0..U {
@@ -283,7 +274,7 @@ impl Synthesis<'_> {
     }
 }
 
-impl Adjoint<'_> {
+impl AdjointTask<'_> {
     #[inline(always)]
     fn run<S: Simd, const U: usize>(self, simd: S) {
         let width = U * S::F64_LANES;
@@ -305,7 +296,7 @@ impl Adjoint<'_> {
                 }
             }
             let mut sink = SumRings { simd, parts, lanes: &mut *lanes };
-            Block::new(simd, self.order, self.rings, at).run(&self.order.steps, &mut sink);
+            RingBlock::new(simd, self.order, self.rings, at).run(&self.order.steps, &mut sink);
         }
         self.sums.clear();
         for vectors in lanes.iter() {
@@ -318,7 +309,7 @@ impl Adjoint<'_> {
     }
 }
 
-impl WithSimd for Synthesis<'_> {
+impl WithSimd for SynthesisTask<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -328,7 +319,7 @@ impl WithSimd for Synthesis<'_> {
     }
 }
 
-impl WithSimd for Adjoint<'_> {
+impl WithSimd for AdjointTask<'_> {
     type Output = ();
 
     #[inline(always)]

@@ -1,7 +1,12 @@
-//! Rings as SIMD lanes: their geometry and the powers of sin theta that recurrences start from.
+//! Rings as SIMD lanes: their geometry, and the powers of sin theta that recurrences start from.
 
-use super::kernel::{BLOCK_MAX, SCALE_EXPONENT, power_of_two};
 use crate::sky::healpix::ring;
+
+/// A unit of scale stands for a factor 2^`SCALE_EXPONENT`.
+pub(super) const SCALE_EXPONENT: i32 = 400;
+
+/// Most ring pairs in a block; tables of rings are padded to a multiple of it.
+pub(super) const BLOCK_MAX: usize = 32;
 
 /// Powers are products of one of the first `LOW` and one of every `LOW`-th.
 const LOW: usize = 32;
@@ -59,13 +64,18 @@ impl RingLanes {
         Self { len, cos, sin, low, high, high_scale }
     }
 
-    /// sin^m for `lanes` as a product of two numbers, of which the second has scales.
+    /// sin^m for `lanes` as the product of two numbers, and the scale of the second.
     #[inline(always)]
     pub(super) fn powers(&self, m: usize, lanes: std::ops::Range<usize>) -> (&[f64], &[f64], &[f64]) {
         let (low, high) = (m % LOW * self.len, m / LOW * self.len);
         let of = |plane: usize| plane + lanes.start..plane + lanes.end;
         (&self.low[of(low)], &self.high[of(high)], &self.high_scale[of(high)])
     }
+}
+
+/// 2^`exponent`.
+pub(super) const fn power_of_two(exponent: i32) -> f64 {
+    f64::from_bits(((1023 + exponent) as u64) << 52)
 }
 
 fn multiply(values: &mut [f64], by: &[f64]) {

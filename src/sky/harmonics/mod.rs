@@ -1,4 +1,13 @@
-//! Spherical harmonics: orthonormal, Condon-Shortley phase.
+//! Spherical harmonics, orthonormal with Condon-Shortley phase: coefficients, transforms, rotations.
+//!
+//! | entry point | does |
+//! |---|---|
+//! | [`Transform`] | synthesis of HEALPix maps and its transpose, after libsharp |
+//! | [`analysis`] | coefficients of a map |
+//! | [`Alm`] | coefficients of a real field; [`Alm::rotated`] takes them to another frame |
+//! | [`WignerTable`] | Wigner's d-functions |
+//!
+//! Uses [`super::healpix`]. Results do not depend on the number of threads.
 
 mod analysis;
 mod coefficients;

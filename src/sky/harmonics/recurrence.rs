@@ -2,15 +2,15 @@
 //!
 //! With eps_l = sqrt((l^2 - m^2) / (4 l^2 - 1)) the orthonormal functions p_l (Y_lm = p_l(theta) e^{i m phi})
 //! obey x p_l = eps_{l+1} p_{l+1} + eps_l p_{l-1}, x = cos theta. Used twice it links degrees l - 2, l, l + 2
-//! through x^2 alone, so that only every other function has to be formed, and those of a ring and its
+//! through x^2 alone, so that only every other function has to be computed, and those of a ring and its
 //! mirror image are the same. The functions in between follow from the same relation: a sum over them is x
-//! times a sum over the formed ones with other coefficients. This halving, and the scaling that reduces a
+//! times a sum over the computed ones with other coefficients. This halving, and the scaling that reduces a
 //! step to two multiply-adds, are those of Reinecke & Seljebotn 2013 (libsharp) and Ishioka 2018.
 
 use num_complex::Complex64;
 use std::f64::consts::PI;
 
-/// What one order m needs: formed functions j stand for degrees m + 2 j.
+/// Tables of one order m; computed function j is that of degree m + 2 j.
 pub(super) struct Order {
     /// The order.
     pub m: usize,
@@ -50,8 +50,8 @@ impl Order {
         let mut steps = Vec::with_capacity(count);
         let mut scale = Vec::with_capacity(count);
         let mut between = Vec::with_capacity(count);
-        // Scales of the function at hand and of the next; the free choice of the second keeps the scaled
-        // functions of even and odd j of one size. The sign makes the recurrence a sum.
+        // Scales of this function and of the next; the second is free, and chosen so that the scaled functions of
+        // even and odd j are of one size. The sign makes the recurrence a sum.
         let (mut this, mut next) =
             (1.0, (eps[1] * eps[2] / (eps[3.min(2 * count)] * eps[4.min(2 * count)])).sqrt());
         for j in 0..count {
@@ -68,13 +68,13 @@ impl Order {
         Self { m, start, steps, scale, between }
     }
 
-    /// Number of formed functions.
+    /// Number of computed functions.
     pub(super) fn len(&self) -> usize {
         self.steps.len()
     }
 
-    /// Coefficients of the scaled functions for coefficients `alm` of l = m, m + 1, ..: real and imaginary
-    /// part of what multiplies q_j, and of what multiplies x q_j.
+    /// Coefficients of the scaled functions for coefficients `alm` of l = m, m + 1, ..: real and imaginary part of
+    /// the factor of q_j, then of the factor of x q_j.
     pub(super) fn mix(&self, alm: &[Complex64], out: &mut Vec<[f64; 4]>) {
         out.clear();
         out.resize(self.len(), [0.0; 4]);

@@ -1,6 +1,6 @@
 //! Between orders and pixels: a Fourier transform on every ring.
 //!
-//! A ring of n pixels sees order m as m modulo n; orders beyond n/2 are folded onto what they look like there.
+//! On a ring of n pixels order m is the same as m modulo n; orders beyond n/2 are folded onto their aliases.
 
 use std::f64::consts::PI;
 use std::sync::{Arc, OnceLock};
@@ -18,7 +18,7 @@ const LOW: usize = 32;
 pub(super) struct RingFourier {
     nside: usize,
     l_max: usize,
-    /// For n = 4 k pixels with the first at pi / n: exp(i m pi / n) for m < `LOW`, then for every `LOW`-th m.
+    /// For n = 4 k pixels, the first at longitude pi / n: exp(i m pi / n) for m < `LOW`, then for every `LOW`-th m.
     phases: Vec<Vec<Complex64>>,
     inverse: OnceLock<Vec<Arc<dyn ComplexToReal<f64>>>>,
     forward: OnceLock<Vec<Arc<dyn RealToComplex<f64>>>>,
@@ -30,7 +30,7 @@ pub(super) struct RingPair<P> {
     pub south: P,
 }
 
-/// Room for the transform of one ring.
+/// Buffers for the transform of one ring.
 pub(super) struct Scratch {
     phase: Vec<Complex64>,
     spectrum: Vec<Complex64>,
@@ -100,7 +100,7 @@ impl RingFourier {
         }
     }
 
-    /// Pixels of a ring pair from its sums over degrees: plane `p` (north real, imaginary; south real,
+    /// Computes the pixels of a ring pair from its sums over degrees: plane `p` (north real, imaginary; south real,
     /// imaginary) of order m at `planes[(4 m + p) stride]`.
     pub(super) fn synthesise(
         &self,
@@ -129,8 +129,8 @@ impl RingFourier {
         }
     }
 
-    /// Parts of a ring pair that sums over rings want, times the pixel area: even part (real, imaginary) and
-    /// cos theta times odd part of order m at `out[(4 m + p) GROUP]`.
+    /// Computes the parts of a ring pair that enter sums over rings, times the pixel area: even part (real, imaginary)
+    /// and cos theta times odd part of order m at `out[(4 m + p) GROUP]`.
     pub(super) fn analyse(
         &self,
         pair: usize,

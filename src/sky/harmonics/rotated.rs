@@ -1,14 +1,14 @@
-//! Coefficients in another frame.
+//! Rotation of coefficients to another frame.
 //!
-//! For a rotation `R = Rz(alpha) Ry(beta) Rz(gamma)` of directions, the field that has at `R n` the value that the
-//! old one had at n has the coefficients (Varshalovich et al. 1988, 4.1)
+//! For a rotation `R = Rz(alpha) Ry(beta) Rz(gamma)`, the field whose value at `R n` is that of the old field at n has
+//! the coefficients (Varshalovich et al. 1988, 4.1)
 //!
 //! ```text
 //! a'_lm = exp(-i m alpha) sum_mu d^l_{m mu}(beta) b_mu,    b_mu = exp(-i mu gamma) a_{l mu}
 //!       = exp(-i m alpha) sum_{mu >= 0} d^l_{m mu} b_mu + (-1)^m d^l_{-m,mu} conj(b_mu)
 //! ```
 //!
-//! (the second term from mu = 1 on) for a real field. A band-limited field stays one, and nothing is lost but
+//! (the second term from mu = 1 on) for a real field. A band-limited field stays band-limited: the only error is
 //! rounding.
 
 use num_complex::Complex64;
@@ -21,7 +21,7 @@ use crate::sky::frame::Rotation;
 const PARTS: usize = 8;
 
 impl Alm {
-    /// The coefficients of the field turned by `rotation`, which takes old directions to new ones.
+    /// The coefficients of the field rotated by `rotation`, which takes old directions to new ones.
     #[must_use]
     pub fn rotated(&self, rotation: &Rotation) -> Self {
         let [alpha, beta, gamma] = euler_angles(rotation);
@@ -36,19 +36,19 @@ impl Alm {
                 sum
             })
             .collect();
-        let mut turned = Self::zeros(self.l_max());
+        let mut rotated_alm = Self::zeros(self.l_max());
         for m in 0..=self.l_max() {
             let turn = Complex64::cis(-(m as f64) * alpha);
             for l in m..=self.l_max() {
                 let total: Complex64 = parts.iter().map(|part| part.get(l, m)).sum();
-                // The zeroth order of a real field is real; rounding is left out.
-                *turned.get_mut(l, m) = if m == 0 { total.re.into() } else { total * turn };
+                // The zeroth order of a real field is real; drop the rounding error.
+                *rotated_alm.get_mut(l, m) = if m == 0 { total.re.into() } else { total * turn };
             }
         }
-        turned
+        rotated_alm
     }
 
-    /// What the coefficients of order mu, and -mu, add to those of all orders m >= 0.
+    /// Adds the contribution of orders mu and -mu to all orders m >= 0.
     fn add_order(&self, sum: &mut Self, table: &WignerTable, mu: usize, gamma: f64) {
         let turn = Complex64::cis(-(mu as f64) * gamma);
         let mut rows = table.rows(mu);

@@ -4,23 +4,23 @@ use num_complex::Complex64;
 use pulp::Arch;
 use rayon::prelude::*;
 
-use super::kernel::{Adjoint, BLOCK_MAX, GROUP, Synthesis};
-use super::lanes::RingLanes;
+use super::kernel::{AdjointTask, GROUP, SynthesisTask};
+use super::lanes::{BLOCK_MAX, RingLanes};
 use super::recurrence::{Order, all_orders};
 use super::rings::{RingFourier, RingPair, Scratch};
 use super::{Alm, HarmonicsError};
 use crate::sky::healpix::{is_valid_nside, pixel_count, ring};
 
-/// Greatest degree: bounds the tables (0.7 GB) and the growth of a step of the recurrence.
+/// Greatest degree: bounds the tables (0.7 GB) and the growth in one step of the recurrence.
 pub const L_MAX: usize = 8191;
 
-/// Ring pairs whose sums are held at once: bounds memory to 130 kB for each order.
+/// Ring pairs summed together: bounds memory to 130 kB an order.
 const CHUNK: usize = 512;
 
 /// The transforms between coefficients up to `l_max` and maps of `nside`, with their tables.
 ///
-/// Making one costs about as much as using it once; keep it for repeated use. The same input gives the same
-/// bytes whatever the number of threads.
+/// Building one costs about as much as one transform; keep it for repeated use. Results do not depend on the number of
+/// threads.
 pub struct Transform {
     nside: usize,
     l_max: usize,
@@ -40,7 +40,7 @@ impl std::fmt::Debug for Transform {
 }
 
 impl Transform {
-    /// Tables for maps of `nside` and coefficients up to `l_max`, which may be beyond 3 nside - 1.
+    /// Builds the tables for maps of `nside` and coefficients up to `l_max`, which may exceed 3 nside - 1.
     ///
     /// # Errors
     /// [`HarmonicsError::Nside`], [`HarmonicsError::Degree`].
@@ -73,7 +73,7 @@ impl Transform {
         self.l_max
     }
 
-    /// The map of a real field at pixel centres, RING order: sum of a_lm Y_lm.
+    /// The map of a real field at pixel centres, RING order: the sum of a_lm Y_lm.
     ///
     /// # Errors
     /// [`HarmonicsError::Coefficients`] unless `alm` has the transform's `l_max`.
@@ -86,14 +86,14 @@ impl Transform {
         for (chunk, pairs) in pairs.chunks_mut(CHUNK).enumerate() {
             let first = chunk * CHUNK;
             let lanes = first..(first + pairs.len()).next_multiple_of(BLOCK_MAX);
-            // Rows that are no power of two long spread over the cache's sets.
+            // A row length that is not a power of two spreads rows over the sets of the cache.
             let stride = lanes.len() + GROUP;
             let mut planes = vec![0.0; 4 * stride * (self.l_max + 1)];
             let order_planes = planes.par_chunks_mut(4 * stride);
             order_planes.zip(&self.orders).for_each_init(Vec::new, |mixed, (out, order)| {
                 order.mix(alm.order(order.m), mixed);
                 let (rings, chunk) = (&self.lanes, lanes.clone());
-                let task = Synthesis { order, l_max: self.l_max, mixed, rings, chunk, out, stride };
+                let task = SynthesisTask { order, l_max: self.l_max, mixed, rings, chunk, out, stride };
                 self.arch.dispatch(task);
             });
             pairs.par_chunks_mut(GROUP).enumerate().for_each_init(Scratch::new, |scratch, (group, pairs)| {
@@ -134,7 +134,7 @@ impl Transform {
             orders.into_par_iter().zip(&self.orders).for_each_init(room, |(by_lane, sums), (out, order)| {
                 let (rings, chunk) = (&self.lanes, lanes.clone());
                 let parts = &parts[4 * GROUP * order.m..];
-                self.arch.dispatch(Adjoint {
+                self.arch.dispatch(AdjointTask {
                     order,
                     l_max: self.l_max,
                     rings,
@@ -150,7 +150,7 @@ impl Transform {
         Ok(alm)
     }
 
-    /// The rings of a map as pairs, from the poles to the equator.
+    /// The rings of a map in pairs, from the poles to the equator.
     fn ring_pairs<'a>(&self, map: &'a [f64]) -> Vec<RingPair<&'a [f64]>> {
         let of = |k: usize| {
             let ring = ring(self.nside, k);

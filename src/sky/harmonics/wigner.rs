@@ -14,11 +14,11 @@
 //! `d^l_{l mu} = sqrt(C(2l, l-mu)) cos^{l+mu}(beta/2) (-sin(beta/2))^{l-mu}` and its mirror images. Upwards it
 //! first grows out of the classically forbidden region and then oscillates, so it is stable; its starting
 //! values lie below the range of f64 (0.5^1000 at l = 1000 and 30 deg), so every lane carries a power of
-//! 2^512 until it comes back into range.
+//! 2^512 until it is back in range.
 
-use super::scaled::{RESCALE_ABOVE, RESCALE_DOWN, Scaled};
+use super::scaled::{LaneSlices, Scaled, ScaledLanes, advance};
 
-/// What the recurrences at every mu share: `sqrt(l^2 - m^2)`, its inverse, powers of the half angle.
+/// Tables shared by the recurrences at all mu: `sqrt(l^2 - m^2)`, its inverse, powers of the half angle.
 #[derive(Clone, Debug)]
 pub struct WignerTable {
     l_max: usize,
@@ -32,7 +32,7 @@ pub struct WignerTable {
 }
 
 impl WignerTable {
-    /// Tables for `l <= l_max` at the angle `beta_rad` between 0 and pi.
+    /// Builds the tables for `l <= l_max` at the angle `beta_rad` between 0 and pi.
     #[must_use]
     pub fn new(l_max: usize, beta_rad: f64) -> Self {
         let (sin, cos) = (0.5 * beta_rad).sin_cos();
@@ -78,33 +78,19 @@ pub struct WignerRows<'a> {
     next_l: usize,
     /// `sqrt(C(2l, l - mu))` of the current l.
     binomial: Scaled,
-    lanes: Lanes,
-}
-
-/// Recurrence state by order, m = -l_max ..= l_max; the true value is `current * 2^(512 power)`.
-#[derive(Clone, Debug)]
-struct Lanes {
-    current: Vec<f64>,
-    previous: Vec<f64>,
-    power: Vec<f64>,
-    value: Vec<f64>,
+    /// By order, m = -l_max ..= l_max.
+    lanes: ScaledLanes,
 }
 
 impl<'a> WignerRows<'a> {
     fn new(table: &'a WignerTable, mu: usize) -> Self {
-        let width = 2 * table.l_max + 1;
-        let lanes = Lanes {
-            current: vec![0.0; width],
-            previous: vec![0.0; width],
-            power: vec![0.0; width],
-            value: vec![0.0; width],
-        };
+        let lanes = ScaledLanes::zeros(2 * table.l_max + 1);
         Self { table, mu, next_l: mu, binomial: Scaled::ONE, lanes }
     }
 
     /// The next degree and its values for m = -l ..= l; `None` after `l_max`.
     ///
-    /// Values below 2^-256 come out as zero.
+    /// Values below 2^-256 are given as zero.
     pub fn next_row(&mut self) -> Option<(usize, &[f64])> {
         let l = self.next_l;
         if l > self.table.l_max {
@@ -147,7 +133,7 @@ impl<'a> WignerRows<'a> {
         self.lanes.set(centre - l, self.binomial.product(cos[l - mu]).product(sin[l + mu]));
     }
 
-    /// Takes the orders |m| < l from l - 1 to l.
+    /// Advances the orders |m| < l from l - 1 to l.
     fn step(&mut self, l: usize) {
         let (table, mu, centre) = (self.table, self.mu, self.table.l_max);
         let from = l - 1;
@@ -160,52 +146,27 @@ impl<'a> WignerRows<'a> {
             let inverse = 1.0 / from as f64;
             (mu as f64 * inverse / l as f64, l as f64 * inverse * table.root[at(from, mu)] * by_mu)
         };
-        let span = centre - from..=centre + from;
-        let lanes = &mut self.lanes;
         step_lanes(
             [first * table.cos_beta, first * slope, behind, -(from as f64)],
             [&table.inverse_root[l * l + 1..(l + 1) * (l + 1) - 1], &table.root[from * from..l * l]],
-            &mut lanes.current[span.clone()],
-            &mut lanes.previous[span.clone()],
-            &mut lanes.power[span.clone()],
-            &mut lanes.value[span],
+            self.lanes.slices(centre - from..centre + from + 1),
         );
     }
 }
 
-impl Lanes {
-    fn set(&mut self, lane: usize, start: Scaled) {
-        self.current[lane] = start.mantissa;
-        self.previous[lane] = 0.0;
-        self.power[lane] = start.power;
-        self.value[lane] = start.value();
-    }
-}
-
-/// One step of the recurrence on all lanes. `factors`: first cos beta, first slope, behind, first order.
+/// One step of the recurrence on all lanes. `factors`: first cos beta, first slope, behind, first order; `roots`:
+/// `1 / e_l(m)` and `e_{l-1}(m)`.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn step_lanes(
-    factors: [f64; 4],
-    roots: [&[f64]; 2],
-    current: &mut [f64],
-    previous: &mut [f64],
-    power: &mut [f64],
-    value: &mut [f64],
-) {
+fn step_lanes(factors: [f64; 4], roots: [&[f64]; 2], lanes: LaneSlices<'_>) {
     let [at_zero, by_order, behind, first_order] = factors;
+    let LaneSlices { current, previous, power, value } = lanes;
     let n = current.len();
     let (inverse, root) = (&roots[0][..n], &roots[1][..n]);
     let (previous, power, value) = (&mut previous[..n], &mut power[..n], &mut value[..n]);
     for k in 0..n {
         let m = first_order + k as f64;
         let next = inverse[k] * ((at_zero - by_order * m) * current[k] - behind * root[k] * previous[k]);
-        let grown = next.abs() > RESCALE_ABOVE;
-        let scale = if grown { RESCALE_DOWN } else { 1.0 };
-        let now = power[k] + if grown { 1.0 } else { 0.0 };
-        previous[k] = current[k] * scale;
-        current[k] = next * scale;
-        power[k] = now;
-        value[k] = if now == 0.0 { next * scale } else { 0.0 };
+        advance(next, [&mut current[k], &mut previous[k], &mut power[k], &mut value[k]]);
     }
 }
 

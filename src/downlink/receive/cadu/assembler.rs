@@ -29,7 +29,7 @@ const ORIGIN: u64 = 1 << 40;
 
 /// Where a piece ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Reach {
+enum PieceEnd {
     /// With its packet: another begins after it.
     Packet,
     /// With its frame; the packet may go on.
@@ -40,7 +40,7 @@ enum Reach {
 #[derive(Debug, Default)]
 struct Pieces {
     /// The end, or a middle, of a packet that an earlier frame began.
-    tail: Option<(Vec<u8>, Reach)>,
+    tail: Option<(Vec<u8>, PieceEnd)>,
     /// The beginning of a packet that runs on.
     head: Option<Vec<u8>>,
 }
@@ -95,9 +95,9 @@ impl Assembler {
         let pointer = u16::from_be_bytes([frame[ZONE_START - 2], frame[ZONE_START - 1]]) & 0x7FF;
         let (tail, body) = match pointer {
             IDLE_ZONE => return,
-            NO_HEADER => ((zone, Reach::Frame), &zone[zone.len()..]),
+            NO_HEADER => ((zone, PieceEnd::Frame), &zone[zone.len()..]),
             at => match zone.split_at_checked(usize::from(at)) {
-                Some((tail, body)) => ((tail, Reach::Packet), body),
+                Some((tail, body)) => ((tail, PieceEnd::Packet), body),
                 None => {
                     account.frames_malformed += 1;
                     return;
@@ -158,7 +158,7 @@ impl Assembler {
         for at in (count.saturating_sub(FRAMES_A_PACKET_MAX)..count).rev() {
             match self.pieces.get(&at) {
                 Some(Pieces { head: Some(_), .. }) => return self.complete_from(at, account, out),
-                Some(Pieces { tail: Some((_, Reach::Frame)), .. }) => {}
+                Some(Pieces { tail: Some((_, PieceEnd::Frame)), .. }) => {}
                 _ => return,
             }
         }
@@ -197,7 +197,7 @@ impl Assembler {
             found += piece.len();
             match packet_bytes(&header) {
                 Some(bytes) if found >= bytes => return Some((at, found == bytes)),
-                _ if at > count && self.reach(at) == Some(Reach::Packet) => return Some((at, false)),
+                _ if at > count && self.reach(at) == Some(PieceEnd::Packet) => return Some((at, false)),
                 _ => {}
             }
             at += 1;
@@ -205,7 +205,7 @@ impl Assembler {
         }
     }
 
-    fn reach(&self, at: u64) -> Option<Reach> {
+    fn reach(&self, at: u64) -> Option<PieceEnd> {
         self.pieces.get(&at)?.tail.as_ref().map(|(_, reach)| *reach)
     }
 

@@ -29,7 +29,7 @@ const FAULTS_OF_NO_IMAGE: usize = 2;
 
 /// A frame that could be corrected.
 #[derive(Clone, Copy, Debug)]
-struct Found {
+struct LocatedFrame {
     /// Bit of the buffer where its marker begins, or should.
     at: usize,
     code: ReedSolomon,
@@ -44,7 +44,7 @@ struct Found {
 /// What a place in the stream holds.
 #[derive(Clone, Copy, Debug)]
 enum Place {
-    Frame(Found),
+    Frame(LocatedFrame),
     Nothing,
     /// More bytes will tell.
     Unsure,
@@ -366,7 +366,7 @@ impl CaduReceiver {
     }
 
     /// Corrects the block behind the marker at bit `at` into `self.block`.
-    fn correct(&mut self, at: usize, code: ReedSolomon, polarity: Polarity) -> Option<Found> {
+    fn correct(&mut self, at: usize, code: ReedSolomon, polarity: Polarity) -> Option<LocatedFrame> {
         if at + frame_bits(code) > 8 * self.buffer.len() {
             return None;
         }
@@ -380,7 +380,7 @@ impl CaduReceiver {
         let corrected = code.decode(&mut self.block).ok()?;
         let wrong = marker_errors(word_at(&self.buffer, at), polarity) as usize;
         let faults = corrected + wrong + usize::from(self.header().is_none());
-        Some(Found { at, code, polarity, corrected, faults })
+        Some(LocatedFrame { at, code, polarity, corrected, faults })
     }
 
     /// The header of the frame in `self.block`, if it is one of ours.
@@ -390,7 +390,7 @@ impl CaduReceiver {
     }
 
     /// Takes the frame in `self.block`.
-    fn deliver(&mut self, found: Found, out: &mut Vec<u8>) {
+    fn deliver(&mut self, found: LocatedFrame, out: &mut Vec<u8>) {
         self.turn(found.polarity);
         self.account.frames += 1;
         self.account.frames_corrected += u64::from(found.corrected > 0);

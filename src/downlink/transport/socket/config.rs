@@ -1,8 +1,8 @@
-//! What senders may do.
+//! Configuration of a ground that listens: limits of its senders.
 
 use serde::{Deserialize, Serialize};
 
-use super::error::SocketError;
+use crate::units::{Checks, InvalidValue};
 
 /// The `[downlink.listen]` section: limits of a ground that listens. Memory for senders stays below
 /// `connections_max` times `memory_bytes_max` and twice 64 KiB, and `backlog_bytes_max`.
@@ -42,30 +42,25 @@ impl Default for ListenConfig {
 impl ListenConfig {
     /// Everything that is wrong with the limits; empty if they are good.
     #[must_use]
-    pub fn problems(&self) -> Vec<SocketError> {
-        let mut found = Vec::new();
-        let mut require = |key, value: f64, good: bool, expected| {
-            if !good {
-                found.push(SocketError::Limit { key, value, expected });
-            }
-        };
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("downlink.listen");
         let Self { connections_max: connections, bytes_per_s_max: rate, .. } = *self;
-        require("connections_max", connections as f64, (1..=1024).contains(&connections), "1 to 1024");
+        checks.require("connections_max", connections, (1..=1024).contains(&connections), "1 to 1024");
         for (key, value) in [("first_packet_s_max", self.first_packet_s_max), ("idle_s_max", self.idle_s_max)]
         {
-            require(key, value, (0.0..=1e9).contains(&value), "0 s to 1e9 s");
+            checks.require(key, value, (0.0..=1e9).contains(&value), "0 s to 1e9 s");
         }
         let good = rate == 0.0 || (1e3..=1e12).contains(&rate);
-        require("bytes_per_s_max", rate, good, "1e3 to 1e12 bytes a second, or 0 for no limit");
+        checks.require("bytes_per_s_max", rate, good, "1e3 to 1e12 bytes a second, or 0 for no limit");
         for (key, value, least, expected) in [
             ("garbage_bytes_max", self.garbage_bytes_max, 1 << 16, "65536 to 2^40 bytes"),
             ("memory_bytes_max", self.memory_bytes_max, 1 << 21, "2097152 to 2^40 bytes"),
             ("backlog_bytes_max", self.backlog_bytes_max, 1 << 17, "131072 to 2^30 bytes"),
         ] {
             let most = if key == "backlog_bytes_max" { 1 << 30 } else { 1 << 40 };
-            require(key, value as f64, (least..=most).contains(&value), expected);
+            checks.require(key, value, (least..=most).contains(&value), expected);
         }
-        found
+        checks.finish()
     }
 }
 

@@ -10,9 +10,9 @@ use tokio::net::TcpStream;
 use tokio::task::spawn_blocking;
 use tokio::time::{Instant, sleep_until, timeout};
 
-use super::account::{Ended, SenderReport};
-use super::line::Line;
-use super::listener::{Delivery, First, Shared, first};
+use super::listener::{First, ListenContext, PacketBatch, first};
+use super::report::{ConnectionEnd, SenderReport};
+use super::sender_intake::SenderIntake;
 use crate::downlink::receive::ReceptionCounters;
 
 /// Bytes read at a time; fewer where the rate is so low that they would take longer than a tenth of a second.
@@ -27,14 +27,14 @@ const ANSWER: Duration = Duration::from_secs(1);
 const NEVER: Duration = Duration::from_secs(1 << 29);
 
 /// A connection's receiver and the bytes between it and the socket.
-struct Work {
-    line: Line,
+struct ConnectionState {
+    line: SenderIntake,
     chunk: Vec<u8>,
     packets: Vec<u8>,
 }
 
 /// Takes all that a sender sends.
-pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<Shared>) {
+pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<ListenContext>) {
     let status = &shared.listening.status;
     status.open.fetch_add(1, Ordering::Relaxed);
     shared.listening.write().connections += 1;
@@ -52,7 +52,7 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<S
         && let Ok(mut work) = finished.await
     {
         if !hand_on(std::mem::take(&mut work.packets), &shared).await {
-            ended = Ended::Stopped;
+            ended = ConnectionEnd::Stopped;
         }
         (packets, refused) = work.line.packets();
         format = work.line.format();
@@ -60,7 +60,7 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<S
         status.done.fetch_add(u64::from(work.line.is_alive()), Ordering::Relaxed);
     }
     let answer = match ended {
-        Ended::Whole => format!("taken {bytes} bytes\n"),
+        ConnectionEnd::Whole => format!("taken {bytes} bytes\n"),
         other => format!("closed after {bytes} bytes: {other}\n"),
     };
     // Whether it is heard is no concern of ours.
@@ -72,14 +72,18 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<S
 }
 
 /// Reads until the end, whosever it is. Without its work if that has failed.
-async fn exchange(stream: &mut TcpStream, shared: &Shared, bytes: &mut u64) -> (Option<Work>, Ended) {
+async fn exchange(
+    stream: &mut TcpStream,
+    shared: &ListenContext,
+    bytes: &mut u64,
+) -> (Option<ConnectionState>, ConnectionEnd) {
     let rate = shared.config.bytes_per_s_max;
     let read_bytes = match rate > 0.0 {
         true => ((rate / READS_PER_S) as usize).clamp(READ_BYTES_MIN, READ_BYTES),
         false => READ_BYTES,
     };
-    let line = Line::new(shared.mission.clone());
-    let mut work = Work { line, chunk: vec![0; read_bytes], packets: Vec::new() };
+    let line = SenderIntake::new(shared.mission.clone());
+    let mut work = ConnectionState { line, chunk: vec![0; read_bytes], packets: Vec::new() };
     // Time spent waiting for the sender alone.
     let mut silence = Duration::ZERO;
     let mut due = Instant::now();
@@ -95,7 +99,7 @@ async fn exchange(stream: &mut TcpStream, shared: &Shared, bytes: &mut u64) -> (
             let found = work.line.take(&work.chunk[..read], &mut work.packets);
             (work, found)
         });
-        let Ok((back, found)) = found.await else { return (None, Ended::Failed) };
+        let Ok((back, found)) = found.await else { return (None, ConnectionEnd::Failed) };
         work = back;
         if matches!(found, Ok(true)) {
             silence = Duration::ZERO;
@@ -103,7 +107,7 @@ async fn exchange(stream: &mut TcpStream, shared: &Shared, bytes: &mut u64) -> (
         }
         let packets = std::mem::take(&mut work.packets);
         if !hand_on(packets, shared).await {
-            return (Some(work), Ended::Stopped);
+            return (Some(work), ConnectionEnd::Stopped);
         }
         if let Err(ended) = found.and(within_limits(&work.line, shared)) {
             return (Some(work), ended);
@@ -118,13 +122,13 @@ async fn exchange(stream: &mut TcpStream, shared: &Shared, bytes: &mut u64) -> (
 /// The next bytes, into the chunk; or why there are none.
 async fn read(
     stream: &mut TcpStream,
-    shared: &Shared,
-    work: &mut Work,
+    shared: &ListenContext,
+    work: &mut ConnectionState,
     silence: &mut Duration,
-) -> Result<usize, Ended> {
+) -> Result<usize, ConnectionEnd> {
     let (limit_s, ended) = match work.line.is_alive() {
-        true => (shared.config.idle_s_max, Ended::Idle),
-        false => (shared.config.first_packet_s_max, Ended::FirstPacket),
+        true => (shared.config.idle_s_max, ConnectionEnd::Idle),
+        false => (shared.config.first_packet_s_max, ConnectionEnd::FirstPacket),
     };
     let limit = if limit_s > 0.0 { Duration::from_secs_f64(limit_s) } else { NEVER };
     let since = Instant::now();
@@ -132,31 +136,31 @@ async fn read(
     let read = first(shared.stopped(), reading).await;
     *silence += since.elapsed();
     match read {
-        First::A(()) => Err(Ended::Stopped),
+        First::A(()) => Err(ConnectionEnd::Stopped),
         First::B(Err(_)) => Err(ended),
-        First::B(Ok(Err(_))) => Err(Ended::Broken),
-        First::B(Ok(Ok(0))) => Err(Ended::Whole),
+        First::B(Ok(Err(_))) => Err(ConnectionEnd::Broken),
+        First::B(Ok(Ok(0))) => Err(ConnectionEnd::Whole),
         First::B(Ok(Ok(read))) => Ok(read),
     }
 }
 
-fn within_limits(line: &Line, shared: &Shared) -> Result<bool, Ended> {
+fn within_limits(line: &SenderIntake, shared: &ListenContext) -> Result<bool, ConnectionEnd> {
     if line.held_bytes() as u64 > shared.config.memory_bytes_max {
-        return Err(Ended::Memory);
+        return Err(ConnectionEnd::Memory);
     }
     if line.bytes_in_vain() > shared.config.garbage_bytes_max {
-        return Err(Ended::Garbage);
+        return Err(ConnectionEnd::Garbage);
     }
     Ok(true)
 }
 
 /// Hands packets to the ground once there is room; whether it still takes any.
-async fn hand_on(bytes: Vec<u8>, shared: &Shared) -> bool {
+async fn hand_on(bytes: Vec<u8>, shared: &ListenContext) -> bool {
     if bytes.is_empty() {
         return true;
     }
     let status = &shared.listening.status;
-    let all = Shared::room_bytes(&shared.config);
+    let all = ListenContext::room_bytes(&shared.config);
     let needed = u32::try_from(bytes.len().min(all)).unwrap_or(u32::MAX);
     status.waiting.fetch_add(1, Ordering::Relaxed);
     // Room is given out in the order of asking, so that a fast sender does not crowd out a slow one.
@@ -169,5 +173,5 @@ async fn hand_on(bytes: Vec<u8>, shared: &Shared) -> bool {
         let mut account = shared.listening.write();
         account.backlog_bytes_max = account.backlog_bytes_max.max(backlog);
     }
-    shared.deliveries.send(Delivery { bytes, room }).is_ok()
+    shared.deliveries.send(PacketBatch { bytes, room }).is_ok()
 }

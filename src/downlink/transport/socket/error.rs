@@ -78,14 +78,4 @@ pub enum SocketError {
         "downlink.link has faults, and their truth goes beside the downlink file; name one with --out FILE"
     )]
     TruthNowhere,
-    /// A limit that cannot be.
-    #[error("downlink.listen.{key} = {value}: expected {expected}")]
-    Limit {
-        /// Key in the `[downlink.listen]` section.
-        key: &'static str,
-        /// Value found.
-        value: f64,
-        /// Range that is accepted.
-        expected: &'static str,
-    },
 }

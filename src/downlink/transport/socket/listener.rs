@@ -13,10 +13,10 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep, timeout};
 
-use super::account::Listening;
 use super::config::ListenConfig;
 use super::connection::serve;
-use super::line::Mission;
+use super::report::Listening;
+use super::sender_intake::Mission;
 
 /// Between two looks at whether it is enough.
 const TICK: Duration = Duration::from_millis(50);
@@ -37,19 +37,19 @@ pub struct Until {
 }
 
 /// Packets for the ground, and the room that they take until it has them.
-pub(super) struct Delivery {
+pub(super) struct PacketBatch {
     pub(super) bytes: Vec<u8>,
     pub(super) room: OwnedSemaphorePermit,
 }
 
 /// What all connections share.
-pub(super) struct Shared {
+pub(super) struct ListenContext {
     pub(super) config: ListenConfig,
     pub(super) until: Until,
     pub(super) mission: Mission,
     pub(super) listening: Listening,
     pub(super) room: Arc<Semaphore>,
-    pub(super) deliveries: Sender<Delivery>,
+    pub(super) deliveries: Sender<PacketBatch>,
     /// True once nothing more is to be read.
     pub(super) stop: Arc<watch::Sender<bool>>,
     pub(super) notes: Notes,
@@ -57,7 +57,7 @@ pub(super) struct Shared {
     pub(super) sign: Mutex<Instant>,
 }
 
-impl Shared {
+impl ListenContext {
     /// Room for all packets that may wait.
     pub(super) fn room_bytes(config: &ListenConfig) -> usize {
         (config.backlog_bytes_max as usize).min(Semaphore::MAX_PERMITS)
@@ -96,7 +96,7 @@ impl Shared {
 }
 
 /// Listens until it is over, then until all connections have ended.
-pub(super) async fn listen(listener: TcpListener, shared: Arc<Shared>) {
+pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
     let mut connections = JoinSet::new();
     shared.note_sign();
     while !shared.is_over() {

@@ -20,20 +20,20 @@
 //! Packets bear no signature: whoever can connect can add to the maps. That is why other addresses than those of the
 //! machine itself must be asked for.
 
-mod account;
 mod config;
 mod connection;
 mod error;
-mod line;
 mod listener;
-mod sender;
+mod report;
+mod sender_intake;
+mod sink;
 mod source;
 mod url;
 
-pub use account::{Ended, ListenAccount, ListenStatus, Listening, SenderReport};
 pub use config::ListenConfig;
 pub use error::SocketError;
 pub use listener::{Teller, Until};
-pub use sender::{SendOptions, SocketSink};
+pub use report::{ConnectionEnd, ListenReport, ListenStatus, Listening, SenderReport};
+pub use sink::{SendOptions, SocketSink};
 pub use source::SocketSource;
 pub use url::TcpUrl;

@@ -9,11 +9,11 @@ use std::time::Duration;
 use crossbeam_channel::{Receiver, RecvTimeoutError, unbounded};
 use tokio::sync::{Semaphore, watch};
 
-use super::account::Listening;
 use super::config::ListenConfig;
 use super::error::SocketError;
-use super::line::Mission;
-use super::listener::{Delivery, Notes, Shared, Teller, Until, listen};
+use super::listener::{ListenContext, Notes, PacketBatch, Teller, Until, listen};
+use super::report::Listening;
+use super::sender_intake::Mission;
 use super::url::TcpUrl;
 use crate::downlink::error::DownlinkError;
 use crate::frames::Instrument;
@@ -29,7 +29,7 @@ pub struct SocketSource {
     until: Until,
     /// Until the run begins.
     waiting: Option<(std::net::TcpListener, Mission, Teller)>,
-    running: Option<(Receiver<Delivery>, JoinHandle<()>)>,
+    running: Option<(Receiver<PacketBatch>, JoinHandle<()>)>,
     room: Arc<Semaphore>,
     stop: Arc<watch::Sender<bool>>,
     listening: Listening,
@@ -59,7 +59,7 @@ impl SocketSource {
             until,
             waiting: Some((listener, Mission::default(), Box::new(|_| {}))),
             running: None,
-            room: Arc::new(Semaphore::new(Shared::room_bytes(config))),
+            room: Arc::new(Semaphore::new(ListenContext::room_bytes(config))),
             stop: Arc::new(watch::Sender::new(false)),
             listening,
             bytes: 0,
@@ -113,7 +113,7 @@ impl SocketSource {
         };
         // Bounded by the room that deliveries take.
         let (deliveries, receiver) = unbounded();
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(ListenContext {
             config: self.config.clone(),
             until: self.until,
             mission,
@@ -130,7 +130,7 @@ impl SocketSource {
         Ok(())
     }
 
-    fn give(&mut self, delivery: Delivery, out: &mut Outlet<Vec<u8>>) {
+    fn give(&mut self, delivery: PacketBatch, out: &mut Outlet<Vec<u8>>) {
         self.bytes += delivery.bytes.len() as u64;
         out.push(delivery.bytes);
         drop(delivery.room);

@@ -15,7 +15,7 @@ const LOG_OF_ZERO: u16 = 511;
 
 /// Tables of the field.
 #[derive(Debug)]
-pub(super) struct Field {
+pub(super) struct GaloisField {
     /// Powers of the primitive element, twice over, so that sums of two logarithms need no reduction; then zeros.
     exp: [u8; 1024],
     /// Logarithms; that of 0 is so great that its sum with any other leads to a zero.
@@ -27,9 +27,9 @@ pub(super) struct Field {
 }
 
 /// The tables, made when the program is compiled.
-pub(super) static FIELD: Field = tables();
+pub(super) static FIELD: GaloisField = tables();
 
-const fn tables() -> Field {
+const fn tables() -> GaloisField {
     let (mut exp, mut log) = ([0; 1024], [LOG_OF_ZERO; 256]);
     let (mut power, mut element) = (0, 1_u8);
     while power < ORDER {
@@ -53,7 +53,7 @@ const fn tables() -> Field {
         to_conventional[dual as usize] = symbol as u8;
         symbol += 1;
     }
-    Field { exp, log, to_dual, to_conventional }
+    GaloisField { exp, log, to_dual, to_conventional }
 }
 
 /// `element` times the primitive element.
@@ -61,7 +61,7 @@ pub(super) const fn times_primitive(element: u8) -> u8 {
     (element << 1) ^ (POLYNOMIAL & (element >> 7).wrapping_neg())
 }
 
-impl Field {
+impl GaloisField {
     pub(super) fn multiply(&self, a: u8, b: u8) -> u8 {
         self.exp[self.log(a) + self.log(b)]
     }

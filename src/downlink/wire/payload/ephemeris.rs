@@ -18,7 +18,7 @@ const NODES_MAX: usize = 100_000;
 const COORDINATE_M_MAX: f64 = 1e9;
 
 #[derive(Encode, Decode)]
-struct Record {
+struct EphemerisRecord {
     start_ticks: i64,
     step_ticks: u32,
     satellites: u8,
@@ -31,7 +31,7 @@ pub(crate) fn encode(
     out: &mut Vec<u8>,
 ) -> Result<(), PayloadFault> {
     check(segment, instrument)?;
-    let record = Record {
+    let record = EphemerisRecord {
         start_ticks: segment.start.0,
         step_ticks: segment.step_ticks,
         satellites: segment.satellites,
@@ -43,7 +43,7 @@ pub(crate) fn encode(
 }
 
 pub(crate) fn decode(bytes: &[u8], instrument: &Instrument) -> Result<EphemerisSegment, PayloadFault> {
-    let (record, rest) = take_record::<Record>("ephemeris", bytes)?;
+    let (record, rest) = take_record::<EphemerisRecord>("ephemeris", bytes)?;
     let positions = (record.nodes as usize).saturating_mul(usize::from(record.satellites));
     require_length("ephemeris positions", positions.saturating_mul(24), rest.len())?;
     let segment = EphemerisSegment {

@@ -9,7 +9,7 @@ use crate::frames::Housekeeping;
 use crate::units::MissionTime;
 
 #[derive(Encode, Decode)]
-struct Record {
+struct HousekeepingRecord {
     time_ticks: i64,
     sampled: u64,
     dropped: u64,
@@ -18,13 +18,13 @@ struct Record {
 pub(crate) fn encode(counts: &Housekeeping, out: &mut Vec<u8>) -> Result<(), PayloadFault> {
     check(counts)?;
     let Housekeeping { time, sampled, dropped } = *counts;
-    put_record("housekeeping", Record { time_ticks: time.0, sampled, dropped }, out)
+    put_record("housekeeping", HousekeepingRecord { time_ticks: time.0, sampled, dropped }, out)
 }
 
 pub(crate) fn decode(bytes: &[u8]) -> Result<Housekeeping, PayloadFault> {
-    let (record, rest) = take_record::<Record>("housekeeping", bytes)?;
+    let (record, rest) = take_record::<HousekeepingRecord>("housekeeping", bytes)?;
     require_length("housekeeping", 0, rest.len())?;
-    let Record { time_ticks, sampled, dropped } = record;
+    let HousekeepingRecord { time_ticks, sampled, dropped } = record;
     let counts = Housekeeping { time: MissionTime(time_ticks), sampled, dropped };
     check(&counts)?;
     Ok(counts)

@@ -22,7 +22,7 @@ const SPECTRUM_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=1e9;
 const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=30e6;
 
 #[derive(Encode, Decode)]
-struct Record {
+struct InstrumentRecord {
     name: String,
     epoch_tai_s: f64,
     moon_radius_m: f64,
@@ -35,7 +35,7 @@ struct Record {
 
 pub(crate) fn encode(instrument: &Instrument, out: &mut Vec<u8>) -> Result<(), PayloadFault> {
     check(instrument)?;
-    let record = Record {
+    let record = InstrumentRecord {
         name: instrument.name.clone(),
         epoch_tai_s: instrument.epoch_tai_s,
         moon_radius_m: instrument.moon_radius_m,
@@ -59,7 +59,7 @@ pub(crate) fn encode(instrument: &Instrument, out: &mut Vec<u8>) -> Result<(), P
 }
 
 pub(crate) fn decode(bytes: &[u8]) -> Result<Instrument, PayloadFault> {
-    let (record, rest) = take_record::<Record>("instrument", bytes)?;
+    let (record, rest) = take_record::<InstrumentRecord>("instrument", bytes)?;
     let channels = usize::from(record.channels);
     let more = if rest.len() == 16 * channels + SPECTROMETER_BYTES { SPECTROMETER_BYTES } else { 0 };
     require_length("instrument channels", 16 * channels + more, rest.len())?;

@@ -23,7 +23,7 @@ const RECORD_BYTES: usize = 16;
 pub(crate) const VISIBILITY_BYTES: usize = 21;
 
 #[derive(Encode, Decode)]
-struct Record {
+struct VisibilityRecord {
     channel: u16,
     i: u8,
     j: u8,
@@ -42,7 +42,7 @@ pub(crate) fn encode(
     range: Range<usize>,
     out: &mut Vec<u8>,
 ) -> Result<(), PayloadFault> {
-    let record = Record {
+    let record = VisibilityRecord {
         channel: block.channel.0,
         i: block.pair.i,
         j: block.pair.j,
@@ -61,7 +61,7 @@ pub(crate) fn encode(
 /// The block of a payload without its bad visibilities, and how many those were: not finite, of weight or
 /// duration zero or less.
 pub(crate) fn decode(bytes: &[u8], instrument: &Instrument) -> Result<(VisibilityBlock, u64), PayloadFault> {
-    let (record, rest) = take_record::<Record>("visibility", bytes)?;
+    let (record, rest) = take_record::<VisibilityRecord>("visibility", bytes)?;
     let count = record.count as usize;
     require_length("visibility arrays", count.saturating_mul(VISIBILITY_BYTES), rest.len())?;
     let mut arrays = Arrays(rest);
@@ -82,13 +82,13 @@ pub(crate) fn decode(bytes: &[u8], instrument: &Instrument) -> Result<(Visibilit
 
 /// How many visibilities a payload says it has, for the account of a payload that is refused.
 pub(crate) fn count(bytes: &[u8]) -> u64 {
-    take_record::<Record>("visibility", bytes)
+    take_record::<VisibilityRecord>("visibility", bytes)
         .map_or(0, |(record, rest)| u64::from(record.count).min((rest.len() / VISIBILITY_BYTES) as u64))
 }
 
 /// First and last instant of the visibilities that a payload says it has, as far as it can be read.
 pub(crate) fn span(bytes: &[u8]) -> Option<[MissionTime; 2]> {
-    let (record, rest) = take_record::<Record>("visibility", bytes).ok()?;
+    let (record, rest) = take_record::<VisibilityRecord>("visibility", bytes).ok()?;
     let count = record.count as usize;
     require_length("visibility arrays", count.saturating_mul(VISIBILITY_BYTES), rest.len()).ok()?;
     let mut arrays = Arrays(rest);

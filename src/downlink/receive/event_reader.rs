@@ -1,0 +1,137 @@
+//! The bytes of a file, or of any reader, to events.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use super::{Event, Intake};
+use crate::downlink::error::{DownlinkError, io_error, require_packets};
+
+/// Feeds a source to an intake, chunk by chunk, and names the source in errors.
+#[derive(Debug)]
+pub struct ByteFeed<R = File> {
+    path: PathBuf,
+    source: R,
+    at_end: bool,
+}
+
+impl ByteFeed<File> {
+    /// Opens a file.
+    ///
+    /// # Errors
+    /// The file cannot be opened.
+    pub fn open(path: &Path) -> Result<Self, DownlinkError> {
+        Ok(Self::new(File::open(path).map_err(io_error(path, "open the file"))?, path))
+    }
+}
+
+impl<R: Read> ByteFeed<R> {
+    /// Reads from any source; `path` names it in errors.
+    #[must_use]
+    pub fn new(source: R, path: &Path) -> Self {
+        Self { path: path.to_owned(), source, at_end: false }
+    }
+
+    /// Feeds the next chunk, or the end of the source. Returns false if the end was fed before.
+    ///
+    /// # Errors
+    /// The source cannot be read.
+    pub fn feed(&mut self, intake: &mut Intake) -> Result<bool, DownlinkError> {
+        if self.at_end {
+            return Ok(false);
+        }
+        if intake.fill_from(&mut self.source).map_err(io_error(&self.path, "read"))? == 0 {
+            intake.finish();
+            self.at_end = true;
+        }
+        Ok(true)
+    }
+}
+
+/// Reads the events of one source, in bounded memory.
+#[derive(Debug)]
+pub struct EventReader<R = File> {
+    feed: ByteFeed<R>,
+    intake: Intake,
+    packets: u64,
+}
+
+impl EventReader<File> {
+    /// Opens a file.
+    ///
+    /// # Errors
+    /// The file cannot be opened.
+    pub fn open(path: &Path) -> Result<Self, DownlinkError> {
+        Ok(Self::of(ByteFeed::open(path)?))
+    }
+}
+
+impl<R: Read> EventReader<R> {
+    /// Reads from any source; `path` names it in errors.
+    #[must_use]
+    pub fn new(source: R, path: &Path) -> Self {
+        Self::of(ByteFeed::new(source, path))
+    }
+
+    fn of(feed: ByteFeed<R>) -> Self {
+        Self { feed, intake: Intake::new(), packets: 0 }
+    }
+
+    /// The same source through [`Intake::unfiltered`]: every sound packet, duplicates too.
+    #[must_use]
+    pub fn unfiltered(self) -> Self {
+        Self { intake: Intake::unfiltered(), ..self }
+    }
+
+    /// Reads on until `take` returns something; `None` at the end of the source.
+    ///
+    /// # Errors
+    /// The source cannot be read.
+    pub fn find<T>(
+        &mut self,
+        mut take: impl FnMut(&Event<'_>) -> Option<T>,
+    ) -> Result<Option<T>, DownlinkError> {
+        loop {
+            while let Some(event) = self.intake.next_event() {
+                self.packets += u64::from(matches!(event, Event::Packet(_)));
+                if let Some(found) = take(&event) {
+                    return Ok(Some(found));
+                }
+            }
+            if !self.feed.feed(&mut self.intake)? {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Reads to the end of the source and gives `take` every event.
+    ///
+    /// # Errors
+    /// The source cannot be read; the first error of `take`.
+    pub fn for_each<E: From<DownlinkError>>(
+        &mut self,
+        mut take: impl FnMut(&Event<'_>) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.find(|event| take(event).err())?.map_or(Ok(()), Err)
+    }
+
+    /// Requires that a packet has been read.
+    ///
+    /// # Errors
+    /// [`DownlinkError::Empty`] for a source without a byte, [`DownlinkError::Foreign`] for one without a packet.
+    pub fn require_packets(&self) -> Result<(), DownlinkError> {
+        require_packets(&self.feed.path, self.intake.bytes(), self.packets)
+    }
+
+    /// Packets read so far.
+    #[must_use]
+    pub fn packets(&self) -> u64 {
+        self.packets
+    }
+
+    /// The intake, for what it has found out about the stream.
+    #[must_use]
+    pub fn intake(&self) -> &Intake {
+        &self.intake
+    }
+}

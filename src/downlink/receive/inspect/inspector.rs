@@ -1,0 +1,349 @@
+//! Reads a downlink file and gathers its contents.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use super::contents::{
+    ChannelContents, Contents, DamagedEntry, EphemerisSummary, FaultEntry, GapEntry, GarbageEntry,
+    HousekeepingSummary, InstrumentSummary, KindSummary, PairSummary, TimeSpan, VisibilityCounts,
+};
+use super::tai_text;
+use crate::downlink::error::{DownlinkError, io_error};
+use crate::downlink::receive::{Decoder, Event, EventReader, LISTED_MAX, Listing, ReceptionCounters};
+use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
+use crate::frames::{
+    AntennaResponse, EphemerisSegment, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
+};
+use crate::units::{ChannelId, IntervalSet, MissionTime, Pair, TICKS_PER_SECOND};
+
+/// TAI - UTC since 2017-01-01 (IERS Bulletin C).
+const LEAP_S: f64 = 37.0;
+
+/// Rows of the table by pair and channel: all 28 pairs in every channel of the band. Rows beyond them count in the
+/// sums alone.
+const ROWS_MAX: usize = 1 << 17;
+
+/// Intervals of ephemeris coverage that are kept apart: as many as observing windows in three precession periods.
+/// Beyond them, holes are bridged.
+const COVERED_MAX: usize = 1 << 14;
+
+impl Contents {
+    /// Inspects a file.
+    ///
+    /// # Errors
+    /// The file cannot be read, is empty, or holds no packet at all. Damage is reported in the result.
+    pub fn read(path: &Path) -> Result<Self, DownlinkError> {
+        Self::read_with(path, &mut |_| {})
+    }
+
+    /// Inspects a file and gives every frame to `see`.
+    ///
+    /// # Errors
+    /// Those of [`Contents::read`].
+    pub fn read_with(path: &Path, see: &mut dyn FnMut(&GroundFrame)) -> Result<Self, DownlinkError> {
+        Self::read_from(File::open(path).map_err(io_error(path, "open the file"))?, path, see)
+    }
+
+    /// Inspects any source, which `path` names, and gives every frame to `see`.
+    ///
+    /// # Errors
+    /// Those of [`Contents::read`].
+    pub fn read_from(
+        source: impl Read,
+        path: &Path,
+        see: &mut dyn FnMut(&GroundFrame),
+    ) -> Result<Self, DownlinkError> {
+        let mut events = EventReader::new(source, path);
+        let mut decoder = Decoder::new();
+        let mut inspector = Inspector::default();
+        events.for_each(|event| {
+            inspector.see_event(event);
+            if let Some(frame) = decoder.accept(event) {
+                inspector.see_frame(&frame);
+                see(&frame);
+            }
+            if let Some((offset, fault)) = decoder.take_fault() {
+                inspector.faults.push(FaultEntry { offset, reason: fault.to_string() });
+            }
+            Ok::<(), DownlinkError>(())
+        })?;
+        decoder.finish();
+        events.require_packets()?;
+        let intake = events.intake();
+        let mut reception = ReceptionCounters { frames: intake.frames(), ..decoder.counters().clone() };
+        for kind in Kind::ALL {
+            reception.kind_mut(kind).restarts = intake.restarts(kind);
+        }
+        Ok(inspector.conclude(path, intake.bytes(), &reception))
+    }
+}
+
+/// Running counts of visibilities.
+#[derive(Clone, Copy, Debug, Default)]
+struct Tally {
+    count: u64,
+    ticks: u64,
+    flagged: u64,
+}
+
+impl Tally {
+    fn add(&mut self, other: Self) {
+        self.count += other.count;
+        self.ticks += other.ticks;
+        self.flagged += other.flagged;
+    }
+
+    fn counts(self) -> VisibilityCounts {
+        let integration_s = self.ticks as f64 / TICKS_PER_SECOND as f64;
+        VisibilityCounts { count: self.count, integration_s, flagged: self.flagged }
+    }
+}
+
+/// Extent of the packets of one kind: counts, and the latest creation time.
+#[derive(Clone, Copy, Debug, Default)]
+struct KindExtent {
+    first: Option<u64>,
+    last: Option<u64>,
+    time: Option<CucTime>,
+}
+
+/// What has been read of a file so far.
+#[derive(Debug, Default)]
+struct Inspector {
+    instrument: Option<Instrument>,
+    span: Option<[MissionTime; 2]>,
+    rows: BTreeMap<(Pair, ChannelId), Tally>,
+    by_channel: BTreeMap<ChannelId, Tally>,
+    total: Tally,
+    segments: u64,
+    nodes: u64,
+    covered: EphemerisCoverage,
+    housekeeping: Option<Housekeeping>,
+    seen: [KindExtent; Kind::ALL.len()],
+    gaps: Listing<(GapEntry, Option<CucTime>, CucTime)>,
+    damaged: Listing<(DamagedEntry, CucTime)>,
+    garbage: Listing<GarbageEntry>,
+    faults: Listing<FaultEntry>,
+}
+
+impl Inspector {
+    fn see_event(&mut self, event: &Event<'_>) {
+        match *event {
+            Event::Packet(packet) => self.see_packet(packet.header),
+            Event::Gap { offset, header, expected } => {
+                let PacketHeader { kind, count: found, time, .. } = header;
+                let after = self.seen[kind.index()].time;
+                let entry = GapEntry {
+                    kind,
+                    apid: kind.apid(),
+                    from: expected,
+                    to: found.saturating_sub(1),
+                    count: found.saturating_sub(expected),
+                    offset,
+                    after_s: None,
+                    before_s: None,
+                };
+                self.gaps.push((entry, after, time));
+            }
+            Event::Damaged { offset, header, .. } => {
+                let PacketHeader { kind, count, time, bytes, .. } = header;
+                let apid = kind.apid();
+                let entry = DamagedEntry { offset, kind, apid, count, bytes: bytes as u64, time_s: None };
+                self.damaged.push((entry, time));
+            }
+            Event::Garbage { offset, bytes } => self.garbage.push(GarbageEntry { offset, bytes }),
+            Event::Duplicate { .. } | Event::Restart { .. } | Event::Truncated { .. } => {}
+        }
+    }
+
+    fn see_packet(&mut self, header: PacketHeader) {
+        let seen = &mut self.seen[header.kind.index()];
+        seen.first.get_or_insert(header.count);
+        seen.last = seen.last.max(Some(header.count));
+        seen.time = seen.time.max(Some(header.time));
+    }
+
+    fn see_frame(&mut self, frame: &GroundFrame) {
+        match frame {
+            GroundFrame::Instrument(instrument) => self.instrument = Some(instrument.clone()),
+            GroundFrame::Ephemeris(segment) => self.see_segment(segment),
+            GroundFrame::Visibilities(block) => self.see_block(block),
+            GroundFrame::Housekeeping(counts) => {
+                let newest = self.housekeeping.filter(|known| known.time > counts.time);
+                self.housekeeping = newest.or(Some(*counts));
+            }
+        }
+    }
+
+    fn see_segment(&mut self, segment: &EphemerisSegment) {
+        self.segments += 1;
+        self.nodes += segment.nodes() as u64;
+        self.covered.add(segment.start, segment.end());
+    }
+
+    fn see_block(&mut self, block: &VisibilityBlock) {
+        let (Some(first), Some(last)) = (block.offset_ticks.first(), block.offset_ticks.last()) else {
+            return;
+        };
+        let duration = block.duration_ticks.last().copied().unwrap_or_default();
+        let start = block.start.plus_ticks(i64::from(*first));
+        let end = block.start.plus_ticks(i64::from(*last) + i64::from(duration));
+        let [from, to] = self.span.unwrap_or([start, end]);
+        self.span = Some([from.min(start), to.max(end)]);
+        let tally = Tally {
+            count: block.len() as u64,
+            ticks: block.duration_ticks.iter().map(|ticks| u64::from(*ticks)).sum(),
+            flagged: block.flags.iter().map(|flags| u64::from(!flags.is_good())).sum(),
+        };
+        self.total.add(tally);
+        self.by_channel.entry(block.channel).or_default().add(tally);
+        let key = (block.pair, block.channel);
+        if self.rows.len() < ROWS_MAX || self.rows.contains_key(&key) {
+            self.rows.entry(key).or_default().add(tally);
+        }
+    }
+
+    /// The contents of the file, once all of it has been read.
+    fn conclude(self, path: &Path, bytes: u64, reception: &ReceptionCounters) -> Contents {
+        let epoch_tai_s = self.instrument.as_ref().map(|instrument| instrument.epoch_tai_s);
+        let mission_s = |time: CucTime| epoch_tai_s.map(|epoch_tai_s| time.tai_s() - epoch_tai_s);
+        let place_gap = |(gap, after, before): (GapEntry, Option<CucTime>, CucTime)| GapEntry {
+            after_s: after.and_then(mission_s),
+            before_s: mission_s(before),
+            ..gap
+        };
+        let place_damaged =
+            |(entry, time): (DamagedEntry, CucTime)| DamagedEntry { time_s: mission_s(time), ..entry };
+        let packets = Kind::ALL.map(|kind| {
+            let (counts, seen) = (reception.kind(kind), self.seen[kind.index()]);
+            KindSummary {
+                kind,
+                apid: kind.apid(),
+                packets: counts.packets,
+                bytes: counts.bytes,
+                first_count: seen.first,
+                last_count: seen.last,
+            }
+        });
+        let pair = |((pair, channel), row): (&(Pair, ChannelId), &Tally)| PairSummary {
+            pair: pair.to_string(),
+            channel: channel.0,
+            visibilities: row.counts(),
+        };
+        Contents {
+            file: path.display().to_string(),
+            bytes,
+            format: if reception.frames.is_some() { Format::Cadu } else { Format::Packets },
+            span: self.span.zip(epoch_tai_s).map(|(span, epoch_tai_s)| span_of(span, epoch_tai_s)),
+            channels: self.channels(),
+            instrument: self.instrument.as_ref().map(instrument_summary),
+            packets: packets.into(),
+            visibilities: self.total.counts(),
+            baselines: self.rows.iter().map(pair).collect(),
+            ephemeris: self.covered.summary(self.segments, self.nodes),
+            housekeeping: self.housekeeping.map(|counts| HousekeepingSummary {
+                time_s: counts.time.seconds(),
+                sampled: counts.sampled,
+                dropped: counts.dropped,
+            }),
+            gaps: map_listing(self.gaps, place_gap),
+            bad_checksums: map_listing(self.damaged, place_damaged),
+            garbage: self.garbage,
+            faults: self.faults,
+            truncated_bytes: reception.bytes_truncated,
+            reception: reception.clone(),
+        }
+    }
+
+    fn channels(&self) -> Vec<ChannelContents> {
+        let channels = self.instrument.iter().flat_map(|instrument| &instrument.channels);
+        let summary = |(k, channel): (usize, &crate::frames::Channel)| {
+            let row = self.by_channel.get(&ChannelId(k as u16)).copied().unwrap_or_default();
+            ChannelContents {
+                channel: k as u16,
+                frequency_hz: channel.frequency_hz,
+                width_hz: channel.width_hz,
+                visibilities: row.counts(),
+            }
+        };
+        channels.enumerate().map(summary).collect()
+    }
+}
+
+fn map_listing<A, B>(listing: Listing<A>, map: impl FnMut(A) -> B) -> Listing<B> {
+    Listing { count: listing.count, listed: listing.listed.into_iter().map(map).collect() }
+}
+
+fn instrument_summary(instrument: &Instrument) -> InstrumentSummary {
+    InstrumentSummary {
+        name: instrument.name.clone(),
+        epoch_tai_s: instrument.epoch_tai_s,
+        epoch_tai: tai_text(instrument.epoch_tai_s),
+        satellites: instrument.satellites,
+        moon_radius_m: instrument.moon_radius_m,
+        response: match instrument.response {
+            AntennaResponse::Isotropic => "isotropic".to_owned(),
+            AntennaResponse::DipoleNormal => "dipole along the orbit normal".to_owned(),
+        },
+        seed: instrument.seed,
+        configuration_hash: format!("{:016x}", instrument.configuration_hash),
+        spectrometer: instrument.spectrometer.map(|own| {
+            let (low, high) = (own.low_hz, own.low_hz + own.width_hz * f64::from(own.channels));
+            format!("{:.3} to {:.3} MHz in {} channels", low / 1e6, high / 1e6, own.channels)
+        }),
+    }
+}
+
+fn span_of([start, end]: [MissionTime; 2], epoch_tai_s: f64) -> TimeSpan {
+    let (start_s, end_s) = (start.seconds(), end.seconds());
+    let tai = |time_s| tai_text(epoch_tai_s + time_s);
+    TimeSpan {
+        start_s,
+        end_s,
+        start_tai: tai(start_s),
+        end_tai: tai(end_s),
+        start_utc: tai(start_s - LEAP_S),
+        end_utc: tai(end_s - LEAP_S),
+    }
+}
+
+/// The intervals of time that ephemeris segments cover, both ends included; segments a tick apart are joined.
+#[derive(Debug, Default)]
+struct EphemerisCoverage(IntervalSet<MissionTime>);
+
+impl EphemerisCoverage {
+    fn add(&mut self, start: MissionTime, end: MissionTime) {
+        self.0.insert_bridging(start..end.plus_ticks(1), COVERED_MAX);
+    }
+
+    fn summary(&self, segments: u64, nodes: u64) -> EphemerisSummary {
+        let each =
+            || self.0.iter().map(|covered| [covered.start.seconds(), covered.end.plus_ticks(-1).seconds()]);
+        EphemerisSummary {
+            segments,
+            nodes,
+            // An empty sum of f64 is -0.
+            covered_s: each().fold(0.0, |sum, [start_s, end_s]| sum + (end_s - start_s)),
+            covered: Listing { count: self.0.intervals() as u64, listed: each().take(LISTED_MAX).collect() },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn segments_a_tick_apart_are_joined() {
+        let mut coverage = EphemerisCoverage::default();
+        for (start, end) in [(0, 10), (20, 30), (50, 60), (11, 15), (18, 20), (55, 57), (29, 52)] {
+            coverage.add(MissionTime(start), MissionTime(end));
+        }
+        let summary = coverage.summary(7, 70);
+        let ticks = |s: f64| (s * TICKS_PER_SECOND as f64).round() as i64;
+        let covered: Vec<_> = summary.covered.listed.iter().map(|span| span.map(ticks)).collect();
+        assert_eq!(covered, [[0, 15], [18, 60]]);
+    }
+}

@@ -1,0 +1,30 @@
+//! Lists of bounded length.
+
+use serde::Serialize;
+
+/// Number of entries that a listing keeps; further ones are only counted.
+pub const LISTED_MAX: usize = 1_000;
+
+/// The first entries of a list, and the number of all of them.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Listing<T> {
+    /// Number of entries, listed or not.
+    pub count: u64,
+    /// The first [`LISTED_MAX`] entries.
+    pub listed: Vec<T>,
+}
+
+impl<T> Default for Listing<T> {
+    fn default() -> Self {
+        Self { count: 0, listed: Vec::new() }
+    }
+}
+
+impl<T> Listing<T> {
+    pub(in crate::downlink) fn push(&mut self, entry: T) {
+        self.count += 1;
+        if self.listed.len() < LISTED_MAX {
+            self.listed.push(entry);
+        }
+    }
+}

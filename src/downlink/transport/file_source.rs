@@ -1,0 +1,215 @@
+//! Downlink files as a source of bytes.
+
+use std::collections::VecDeque;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use crate::downlink::error::{DownlinkError, io_error};
+use crate::downlink::receive::{Event, EventReader, Intake};
+use crate::downlink::wire::Format;
+use crate::runtime::{Flow, Outlet, Source, Units};
+
+/// Bytes read from a file at a time.
+const READ_BYTES: usize = 1 << 18;
+
+/// Interval at which a followed file is checked for growth.
+const POLL: Duration = Duration::from_millis(100);
+
+/// How long to wait for a followed file to grow.
+#[derive(Debug)]
+struct Patience {
+    /// Polls without growth after which the file counts as complete; `None` for no limit.
+    polls_max: Option<u64>,
+    polls: u64,
+}
+
+/// Reads downlink files one after the other. All must have the same format.
+#[derive(Debug)]
+pub struct FileSource {
+    /// Files still to read; already open if they can be opened only once.
+    files: VecDeque<(PathBuf, Option<File>)>,
+    current: Option<OpenFile>,
+    bytes: u64,
+    /// The first file with a packet, and its format.
+    format: Option<(PathBuf, Format)>,
+    /// Set if the last file is followed.
+    patience: Option<Patience>,
+}
+
+/// The file that is being read.
+#[derive(Debug)]
+struct OpenFile {
+    path: PathBuf,
+    file: File,
+    /// Bytes read so far.
+    bytes: u64,
+    /// Searches for the first packet in a file that could not be probed when the source was opened.
+    probe: Option<Box<Intake>>,
+}
+
+impl FileSource {
+    /// Opens the files. Probes each regular file for a packet at once, and a pipe as it is read.
+    ///
+    /// # Errors
+    /// A file cannot be opened, is empty, holds no packet, or differs in format from the first.
+    pub fn open(paths: &[PathBuf]) -> Result<Self, DownlinkError> {
+        let mut source =
+            Self { files: VecDeque::new(), current: None, bytes: 0, format: None, patience: None };
+        for path in paths {
+            let file = File::open(path).map_err(io_error(path, "open the file"))?;
+            if is_regular(&file) {
+                source.note_format(path, format_of(path, file)?)?;
+                source.files.push_back((path.clone(), None));
+            } else {
+                source.files.push_back((path.clone(), Some(file)));
+            }
+        }
+        Ok(source)
+    }
+
+    /// Requires one format for the whole stream.
+    fn note_format(&mut self, path: &Path, format: Format) -> Result<(), DownlinkError> {
+        match &self.format {
+            Some((other, expected)) if *expected != format => {
+                Err(DownlinkError::Mixed { path: path.to_owned(), other: other.clone() })
+            }
+            Some(_) => Ok(()),
+            None => {
+                self.format = Some((path.to_owned(), format));
+                Ok(())
+            }
+        }
+    }
+
+    /// Opens the next file.
+    fn begin(&mut self) -> Result<Option<OpenFile>, DownlinkError> {
+        let Some((path, file)) = self.files.pop_front() else { return Ok(None) };
+        let is_followed = self.patience.is_some() && self.files.is_empty();
+        let probe = (is_followed || file.is_some()).then(Box::default);
+        let file = match file {
+            Some(file) => file,
+            None => File::open(&path).map_err(io_error(&path, "open the file"))?,
+        };
+        Ok(Some(OpenFile { path, file, bytes: 0, probe }))
+    }
+
+    /// Searches the bytes just read for the first packet of the file, until one is found.
+    fn probe(&mut self, open: &mut OpenFile, bytes: &[u8]) -> Result<(), DownlinkError> {
+        let Some(probe) = &mut open.probe else { return Ok(()) };
+        probe.push(bytes);
+        while let Some(event) = probe.next_event() {
+            if matches!(event, Event::Packet(_)) {
+                let format = probe.format().unwrap_or_default();
+                open.probe = None;
+                return self.note_format(&open.path, format);
+            }
+        }
+        Ok(())
+    }
+
+    /// As [`FileSource::open`], but follows the last file as it grows: until it has not grown for `idle_s` seconds, or,
+    /// if that is 0, until the run is ended. The last file may be empty at first.
+    ///
+    /// # Errors
+    /// Those of [`FileSource::open`] for all files but the last, which need only exist.
+    pub fn follow(paths: &[PathBuf], idle_s: f64) -> Result<Self, DownlinkError> {
+        let Some((last, others)) = paths.split_last() else { return Self::open(paths) };
+        let file = File::open(last).map_err(io_error(last, "open the file"))?;
+        let mut source = Self::open(others)?;
+        source.files.push_back((last.clone(), Some(file)));
+        let polls_max = (idle_s > 0.0).then(|| (idle_s / POLL.as_secs_f64()).ceil() as u64);
+        source.patience = Some(Patience { polls_max, polls: 0 });
+        Ok(source)
+    }
+
+    /// Waits one poll interval for the followed file to grow. Returns whether to read again.
+    fn wait(&mut self, open: &OpenFile) -> Result<bool, DownlinkError> {
+        let Some(patience) = self.patience.as_mut().filter(|_| self.files.is_empty()) else {
+            return Ok(false);
+        };
+        open.check_place()?;
+        patience.polls += 1;
+        if patience.polls_max.is_some_and(|most| patience.polls > most) {
+            return Ok(false);
+        }
+        std::thread::sleep(POLL);
+        Ok(true)
+    }
+}
+
+impl OpenFile {
+    /// Checks that the path still leads to the same file and that it has not shrunk. Bytes written over those that were
+    /// read would go unnoticed.
+    fn check_place(&self) -> Result<(), DownlinkError> {
+        let path = &self.path;
+        let Ok(there) = std::fs::metadata(path) else {
+            return Err(DownlinkError::Replaced { path: path.clone(), read: self.bytes });
+        };
+        let here = self.file.metadata().map_err(io_error(path, "examine the file"))?;
+        if there.is_file() && (there.len() < self.bytes || !is_same(&here, &there)) {
+            return Err(DownlinkError::Replaced { path: path.clone(), read: self.bytes });
+        }
+        Ok(())
+    }
+}
+
+/// Whether the file can be opened again with the same content; a pipe cannot.
+fn is_regular(file: &File) -> bool {
+    file.metadata().is_ok_and(|found| found.is_file())
+}
+
+/// Whether an open file is the one that its path leads to.
+#[cfg(unix)]
+fn is_same(here: &std::fs::Metadata, there: &std::fs::Metadata) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    (here.dev(), here.ino()) == (there.dev(), there.ino())
+}
+
+/// Whether an open file is the one that its path leads to; unknown on this system.
+#[cfg(not(unix))]
+fn is_same(_: &std::fs::Metadata, _: &std::fs::Metadata) -> bool {
+    true
+}
+
+/// The format of a file, by its first packet. Reads all of a foreign file, in bounded memory.
+fn format_of(path: &Path, file: File) -> Result<Format, DownlinkError> {
+    let mut events = EventReader::new(file, path);
+    if events.find(|event| matches!(event, Event::Packet(_)).then_some(()))?.is_none() {
+        events.require_packets()?;
+    }
+    Ok(events.intake().format().unwrap_or_default())
+}
+
+impl Source for FileSource {
+    type Out = Vec<u8>;
+    type Error = DownlinkError;
+
+    fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, DownlinkError> {
+        let current = match self.current.take() {
+            Some(open) => Some(open),
+            None => self.begin()?,
+        };
+        let Some(mut open) = current else { return Ok(Flow::Done) };
+        let mut bytes = Vec::with_capacity(READ_BYTES);
+        let read = Read::by_ref(&mut open.file).take(READ_BYTES as u64).read_to_end(&mut bytes);
+        if read.map_err(io_error(&open.path, "read"))? > 0 {
+            self.bytes += bytes.len() as u64;
+            open.bytes += bytes.len() as u64;
+            self.probe(&mut open, &bytes)?;
+            out.push(bytes);
+            self.current = Some(open);
+            if let Some(patience) = &mut self.patience {
+                patience.polls = 0;
+            }
+        } else if self.wait(&open)? {
+            self.current = Some(open);
+        }
+        Ok(Flow::Continue)
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.bytes, "bytes")
+    }
+}

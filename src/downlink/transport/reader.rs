@@ -1,0 +1,72 @@
+//! Reads downlink files of either format.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use crate::downlink::error::DownlinkError;
+use crate::downlink::receive::cadu::FrameCounters;
+use crate::downlink::receive::{Decoder, EventReader, ReceptionCounters};
+use crate::frames::GroundFrame;
+
+/// Reads ground frames from a file of either format, in bounded memory.
+#[derive(Debug)]
+pub struct DownlinkReader<R = File> {
+    events: EventReader<R>,
+    decoder: Decoder,
+}
+
+impl DownlinkReader<File> {
+    /// Opens a file.
+    ///
+    /// # Errors
+    /// The file cannot be opened.
+    pub fn open(path: &Path) -> Result<Self, DownlinkError> {
+        Ok(Self { events: EventReader::open(path)?, decoder: Decoder::new() })
+    }
+}
+
+impl<R: Read> DownlinkReader<R> {
+    /// Reads from any source; `path` names it in errors.
+    #[must_use]
+    pub fn new(source: R, path: &Path) -> Self {
+        Self { events: EventReader::new(source, path), decoder: Decoder::new() }
+    }
+
+    /// Continues with the decoder of an earlier file: its instrument description and its counters.
+    #[must_use]
+    pub fn with_decoder(self, decoder: Decoder) -> Self {
+        Self { decoder, ..self }
+    }
+
+    /// The decoder, for the next file.
+    #[must_use]
+    pub fn into_decoder(self) -> Decoder {
+        self.decoder
+    }
+
+    /// The next frame; `None` at the end of the file.
+    ///
+    /// # Errors
+    /// The file cannot be read, is empty, or holds no packet at all. Damage is counted instead.
+    pub fn next_frame(&mut self) -> Result<Option<GroundFrame>, DownlinkError> {
+        let frame = self.events.find(|event| self.decoder.accept(event))?;
+        if frame.is_none() {
+            self.decoder.finish();
+            self.events.require_packets()?;
+        }
+        Ok(frame)
+    }
+
+    /// The counters so far.
+    #[must_use]
+    pub fn counters(&self) -> &ReceptionCounters {
+        self.decoder.counters()
+    }
+
+    /// The counters of the coded frames, if the file holds any.
+    #[must_use]
+    pub fn frames(&self) -> Option<FrameCounters> {
+        self.events.intake().frames()
+    }
+}

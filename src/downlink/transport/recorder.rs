@@ -1,0 +1,80 @@
+//! Writes the bytes that pass through it to a file.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use crate::downlink::error::{DownlinkError, io_error};
+use crate::files::{AtomicFile, IfUnfinished};
+use crate::runtime::{Outlet, Sink, Stage, Units};
+
+/// Records a byte stream in a file. As a stage it passes the bytes on, as a sink it consumes them.
+#[derive(Debug)]
+pub struct Recorder {
+    path: PathBuf,
+    /// `None` once finished.
+    file: Option<AtomicFile>,
+    bytes: u64,
+}
+
+impl Recorder {
+    /// Creates the file.
+    ///
+    /// # Errors
+    /// The file cannot be created.
+    pub fn create(path: &Path) -> Result<Self, DownlinkError> {
+        let file = AtomicFile::create(path, IfUnfinished::Keep).map_err(io_error(path, "create the file"))?;
+        Ok(Self { path: path.to_owned(), file: Some(file), bytes: 0 })
+    }
+
+    fn record(&mut self, bytes: &[u8]) -> Result<(), DownlinkError> {
+        self.bytes += bytes.len() as u64;
+        match &mut self.file {
+            Some(file) => file.write_all(bytes).map_err(io_error(&self.path, "write")),
+            None => Ok(()),
+        }
+    }
+
+    fn close(&mut self) -> Result<(), DownlinkError> {
+        match self.file.take() {
+            Some(file) => file.finish().map(|_| ()).map_err(io_error(&self.path, "finish the file")),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Stage for Recorder {
+    type In = Vec<u8>;
+    type Out = Vec<u8>;
+    type Error = DownlinkError;
+
+    fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
+        self.record(&bytes)?;
+        out.push(bytes);
+        Ok(())
+    }
+
+    fn finish(&mut self, _: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
+        self.close()
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.bytes, "bytes")
+    }
+}
+
+impl Sink for Recorder {
+    type In = Vec<u8>;
+    type Error = DownlinkError;
+
+    fn take(&mut self, bytes: Vec<u8>) -> Result<(), DownlinkError> {
+        self.record(&bytes)
+    }
+
+    fn finish(&mut self) -> Result<(), DownlinkError> {
+        self.close()
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.bytes, "bytes")
+    }
+}

@@ -1,0 +1,39 @@
+//! Flags of a visibility.
+
+use super::VisibilityReason;
+
+/// Why a visibility should not be used; a set of bits, 0 for a good one.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Flags(pub u8);
+
+impl Flags {
+    /// No flag.
+    pub const GOOD: Self = Self(0);
+    /// Radio interference.
+    pub const INTERFERENCE: Self = Self(1);
+    /// Samples are missing for part of the integration.
+    pub const INCOMPLETE: Self = Self(2);
+    /// A receiver was saturated.
+    pub const SATURATED: Self = Self(4);
+    /// Calibration rejected it.
+    pub const UNCALIBRATED: Self = Self(8);
+
+    /// Whether no bit is set.
+    #[must_use]
+    pub fn is_good(self) -> bool {
+        self.0 == 0
+    }
+
+    /// The reason that the lowest bit stands for; `None` for a good visibility.
+    #[must_use]
+    pub fn reason(self) -> Option<VisibilityReason> {
+        match Self(self.0 & self.0.wrapping_neg()) {
+            Self::GOOD => None,
+            Self::INTERFERENCE => Some(VisibilityReason::Interference),
+            Self::INCOMPLETE => Some(VisibilityReason::Incomplete),
+            Self::SATURATED => Some(VisibilityReason::Saturated),
+            Self::UNCALIBRATED => Some(VisibilityReason::Uncalibrated),
+            _ => Some(VisibilityReason::UnknownFlag),
+        }
+    }
+}

@@ -1,0 +1,156 @@
+//! Why samples and visibilities do not reach the result: the entries of the two ledgers.
+
+use crate::units::Reason;
+
+/// Why a visibility is not in the sums.
+///
+/// Checkpoints store a reason as its place in this list: append new ones at the end, and change the version of
+/// checkpoints when one goes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, bincode::Encode, bincode::Decode)]
+#[non_exhaustive]
+pub enum VisibilityReason {
+    /// Its flags name radio interference.
+    Interference,
+    /// Its flags say that samples are missing for part of the integration.
+    Incomplete,
+    /// Its flags say that a receiver was saturated.
+    Saturated,
+    /// Its flags say that calibration rejected it.
+    Uncalibrated,
+    /// It has a flag that this version does not know.
+    UnknownFlag,
+    /// Its block has been used already.
+    Duplicate,
+    /// No instrument description has its channel.
+    NoInstrument,
+    /// No ephemeris covers its time.
+    NoEphemeris,
+    /// A gain is zero, not finite, or out of range.
+    UnusableGain,
+    /// An auto-correlation, where none are kept.
+    Auto,
+    /// An auto-correlation, and the table of them is full.
+    AutoTableFull,
+    /// An auto-correlation of an integration that has one already.
+    AutoRepeated,
+    /// Its baseline is longer than the configuration of the map allows.
+    BaselineBeyondMap,
+    /// The engine refused it: a position is not finite.
+    PositionNotFinite,
+    /// The engine refused it: its satellites are in one place, or opposite each other.
+    NoDirection,
+    /// The engine refused it: the plane of its satellites is not that of the orbit.
+    OutOfPlane,
+    /// The engine refused it: its satellites are too high or too low.
+    OffAltitude,
+    /// The engine refused it: one satellite is much higher than the other.
+    UnequalAltitudes,
+    /// The engine refused it: its baseline is longer than the engine was made for.
+    BaselineBeyondEngine,
+    /// The engine refused it: its value or weight cannot be summed.
+    ValueNotFinite,
+    /// The engine refused it: its weight, or its value in units of its noise, is out of the range of the sums.
+    WeightOutOfRange,
+    /// The engine refused it: the sums have no room for more weight.
+    SumsFull,
+    /// The onboard store dropped it.
+    StoreFull,
+    /// It was sent and did not arrive.
+    NotReceived,
+}
+
+impl Reason for VisibilityReason {
+    fn text(self) -> &'static str {
+        match self {
+            Self::Interference => "interference",
+            Self::Incomplete => "incomplete integration",
+            Self::Saturated => "saturated receiver",
+            Self::Uncalibrated => "uncalibrated",
+            Self::UnknownFlag => "unknown flag",
+            Self::Duplicate => "duplicate",
+            Self::NoInstrument => "no instrument description",
+            Self::NoEphemeris => "no ephemeris",
+            Self::UnusableGain => "unusable gain",
+            Self::Auto => "auto-correlation",
+            Self::AutoTableFull => "auto-correlation beyond the table",
+            Self::AutoRepeated => "auto-correlation of an integration that has one",
+            Self::BaselineBeyondMap => "baseline beyond the map's limit",
+            Self::PositionNotFinite => "refused by the engine: a position is not finite",
+            Self::NoDirection => "refused by the engine: the baseline has no direction",
+            Self::OutOfPlane => "refused by the engine: out of the orbit's plane",
+            Self::OffAltitude => "refused by the engine: off the orbit's altitude",
+            Self::UnequalAltitudes => "refused by the engine: unequal altitudes of a pair",
+            Self::BaselineBeyondEngine => "refused by the engine: baseline beyond its limit",
+            Self::ValueNotFinite => {
+                "refused by the engine: value or weight not finite, or weight not positive"
+            }
+            Self::WeightOutOfRange => {
+                "refused by the engine: weight above map.weight_max, or value far above its noise"
+            }
+            Self::SumsFull => "refused by the engine: sums full at this map.weight_max",
+            Self::StoreFull => "full",
+            Self::NotReceived => "not received",
+        }
+    }
+
+    fn lost_in(self) -> Option<&'static str> {
+        match self {
+            Self::StoreFull => Some("store"),
+            Self::NotReceived => Some("downlink"),
+            _ => None,
+        }
+    }
+}
+
+/// Why a sample of a daughter was not correlated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[non_exhaustive]
+pub enum SampleReason {
+    /// The link to the mother had no room, or no time left in the window.
+    LinkOverrun,
+    /// Its block arrived after the others had been correlated.
+    Late,
+    /// Its block is malformed.
+    Malformed,
+    /// Its block belongs to no window.
+    OutsideWindow,
+}
+
+impl Reason for SampleReason {
+    fn text(self) -> &'static str {
+        match self {
+            Self::LinkOverrun => "no room or no time",
+            Self::Late => "late",
+            Self::Malformed => "malformed",
+            Self::OutsideWindow => "outside any window",
+        }
+    }
+
+    fn lost_in(self) -> Option<&'static str> {
+        match self {
+            Self::LinkOverrun => Some("link"),
+            Self::Late | Self::Malformed | Self::OutsideWindow => Some("correlate"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn every_reason_has_its_own_text_and_place_in_checkpoints() {
+        let stored = |place: u8| {
+            let decoded = bincode::decode_from_slice(&[place], bincode::config::standard());
+            decoded.ok().map(|(reason, _): (VisibilityReason, usize)| reason)
+        };
+        let all: Vec<VisibilityReason> = (0..=250).map_while(stored).collect();
+        let texts: BTreeSet<_> = all.iter().map(|reason| (reason.lost_in(), reason.text())).collect();
+        assert_eq!(texts.len(), all.len());
+        // Some of the places, so that none moves unseen.
+        assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
+        assert_eq!((all.len(), all.last()), (24, Some(&VisibilityReason::NotReceived)));
+    }
+}

@@ -1,0 +1,84 @@
+//! Arithmetic for the inner loops of several folders: branch-free, so that loops over it become vector code.
+//!
+//! A kernel that `multiversion` compiles for several targets sets `FMA` where the hardware has fused multiply-adds;
+//! elsewhere they would be calls into the C library.
+
+/// `a b + c`, fused if `FMA`.
+#[inline(always)]
+pub(crate) fn fused<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
+    if FMA { a.mul_add(b, c) } else { a * b + c }
+}
+
+/// `a b + c`, fused if `FMA`.
+#[inline(always)]
+pub(crate) fn fused64<const FMA: bool>(a: f64, b: f64, c: f64) -> f64 {
+    if FMA { a.mul_add(b, c) } else { a * b + c }
+}
+
+/// `turns` minus the nearest whole number.
+///
+/// Rounds by adding 1.5 2^52, which leaves no bits for a fraction: exact for |turns| < 2^51, without a library call on
+/// any target.
+#[inline(always)]
+pub(crate) fn fraction_of_turn(turns: f64) -> f32 {
+    const MAGIC: f64 = 6_755_399_441_055_744.0;
+    (turns - ((turns + MAGIC) - MAGIC)) as f32
+}
+
+/// A polynomial by Horner's rule, constant term first.
+#[inline(always)]
+pub(crate) fn polynomial<const FMA: bool, const N: usize>(coefficients: &[f32; N], x: f32) -> f32 {
+    let mut sum = coefficients[N - 1];
+    for k in (0..N - 1).rev() {
+        sum = fused::<FMA>(sum, x, coefficients[k]);
+    }
+    sum
+}
+
+/// cos and sin of 2 pi `turns`, |turns| <= 1/2, to 1e-6.
+///
+/// From the half angle: sin(pi t)/t and cos(pi t) as polynomials in t^2, interpolated at Chebyshev
+/// points of 0 <= t^2 <= 1/4; then the formulas for the double angle.
+#[inline(always)]
+pub(crate) fn cos_sin_turns<const FMA: bool>(turns: f32) -> (f32, f32) {
+    const SIN: [f32; 5] = [std::f32::consts::PI, -5.167_710_3, 2.550_077_4, -0.598_291_3, 0.077_657_66];
+    const COS: [f32; 6] = [1.0, -4.934_802, 4.058_709, -1.335_212, 0.234_937_2, -0.024_396_325];
+    let square = turns * turns;
+    let sin = turns * polynomial::<FMA, 5>(&SIN, square);
+    let cos = polynomial::<FMA, 6>(&COS, square);
+    let twice = sin + sin;
+    (fused::<FMA>(-twice, sin, 1.0), twice * cos)
+}
+
+/// sin(x) / x.
+#[inline]
+pub(crate) fn sinc(x: f64) -> f64 {
+    if x.abs() < 1e-8 { 1.0 } else { x.sin() / x }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f64::consts::TAU;
+
+    #[test]
+    fn sines_of_turns_are_right() {
+        for k in -5000..=5000 {
+            let turns = k as f32 / 1e4;
+            let (cos, sin) = cos_sin_turns::<false>(turns);
+            let angle = TAU * f64::from(turns);
+            // The documented accuracy of the polynomials in f32.
+            assert!((f64::from(cos) - angle.cos()).abs() < 1e-6, "{turns}");
+            assert!((f64::from(sin) - angle.sin()).abs() < 1e-6, "{turns}");
+        }
+    }
+
+    #[test]
+    fn fractions_of_many_turns_keep_their_bits() {
+        // 100 km at 30 MHz is 1e4 turns.
+        for turns in [0.0, 0.25, -0.25, 10_006.922_9, -10_006.499_9, 1e9 + 0.125] {
+            let expected = turns - f64::round(turns);
+            assert!((f64::from(fraction_of_turn(turns)) - expected).abs() < 1e-7, "{turns}");
+        }
+    }
+}

@@ -1,0 +1,209 @@
+//! The commands as a user runs them: their output, and their messages for invalid input.
+
+use crate::common;
+
+use std::path::Path;
+
+use assert_cmd::Command;
+use lunarray::sky::fits::{Precision, WriteOptions, write_map};
+use serde_json::Value;
+
+fn lunarray() -> Command {
+    Command::cargo_bin("lunarray").unwrap()
+}
+
+/// Standard error of a command that must fail.
+fn complaint(args: &[&str]) -> String {
+    let output = lunarray().args(args).output().unwrap();
+    assert!(!output.status.success(), "{args:?} should have failed");
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert!(!text.contains("panicked"), "{text}");
+    text
+}
+
+fn write(folder: &Path, name: &str, text: &str) -> String {
+    let path = folder.join(name);
+    std::fs::write(&path, text).unwrap();
+    path.to_str().unwrap().to_owned()
+}
+
+#[test]
+fn every_command_has_help_that_teaches() {
+    for command in [
+        "run", "simulate", "replay", "inspect", "compare", "geometry", "predict", "check", "sky", "corrupt",
+        "gaps", "merge", "retract", "bench",
+    ] {
+        let output = lunarray().args([command, "--help"]).output().unwrap();
+        assert!(output.status.success());
+        let text = String::from_utf8(output.stdout).unwrap();
+        assert!(text.lines().count() > 8, "{command}: {text}");
+    }
+}
+
+#[test]
+fn geometry_speaks_json() {
+    let output = lunarray().args(["geometry", "--at", "0", "12345.6", "--json"]).output().unwrap();
+    let lines: Vec<Value> = String::from_utf8(output.stdout)
+        .unwrap()
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    assert_eq!(lines.len(), 2);
+    assert_eq!(lines[0]["satellites_m"].as_array().unwrap().len(), 8);
+    assert_eq!(lines[0]["pairs"].as_array().unwrap().len(), 28);
+    assert_eq!(lines[0]["pairs"][0]["pair"], "1-2");
+    // The formation starts at its widest: R_2 x 100 m of arc, which the chord equals to 1e-8.
+    assert!((lines[0]["pairs"][0]["length_m"].as_f64().unwrap() - 600.0).abs() < 1e-4);
+    assert_eq!(lines[1]["t_s"], 12345.6);
+}
+
+#[test]
+fn geometry_agrees_with_independent_values() {
+    let Some(path) = common::shared("reference/formation.json") else { return };
+    let reference: Value = serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
+    for epoch in reference["epochs"].as_array().unwrap() {
+        let at = epoch["t_s"].to_string();
+        let output = lunarray().args(["geometry", "--at", &at, "--json"]).output().unwrap();
+        let found: Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(found["observing"], epoch["observing"]);
+        for n in 0..8 {
+            for k in 0..3 {
+                let difference =
+                    found["satellites_m"][n][k].as_f64().unwrap() - epoch["sat_m"][n][k].as_f64().unwrap();
+                assert!(difference.abs() < 1e-6, "t = {at}, daughter {n}: {difference} m");
+            }
+        }
+    }
+}
+
+/// The sky of the reference visibilities: see their README.
+fn test_sky(n: [f64; 3]) -> f64 {
+    let near = |s: [f64; 3]| lunarray::units::vector::dot(n, s) - 1.0;
+    let [x, y, z] = n;
+    let smooth = 1.0 + 0.3 * x - 0.2 * y * z + 0.1 * (7.0 * z + 3.0 * x).sin();
+    let spots =
+        2.0 * (near([0.36, 0.48, 0.8]) / 0.01).exp() + 1.5 * (near([-0.6, 0.64, -0.48]) / 0.004).exp();
+    3e5 * (smooth + spots)
+}
+
+#[test]
+fn predict_agrees_with_independent_values() {
+    let Some(path) = common::shared("reference/visibilities_nside64.json") else { return };
+    let reference: Value = serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
+    let values = reference["values"].as_array().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let sky: Vec<f64> = lunarray::sky::healpix::pixel_directions(64).into_iter().map(test_sky).collect();
+    let file = folder.path().join("sky.fits");
+    let map = lunarray::sky::SkyMap::new(lunarray::sky::Frame::Ecliptic, sky).unwrap();
+    let options = WriteOptions { precision: Precision::Double, ..WriteOptions::default() };
+    write_map(&file, &map, &options).unwrap();
+    let mut csv = "t_s,i,j,freq_hz\n".to_owned();
+    for value in values {
+        let row = ["t_s", "i", "j", "nu_hz"].map(|key| value[key].to_string());
+        csv += &format!("{}\n", row.join(","));
+    }
+    let output = lunarray()
+        .args(["predict", "--sky", file.to_str().unwrap(), "--json"])
+        .write_stdin(csv)
+        .output()
+        .unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(text.lines().count(), values.len());
+    for (line, value) in text.lines().zip(values) {
+        let found: Value = serde_json::from_str(line).unwrap();
+        assert_eq!((&found["i"], &found["j"]), (&value["i"], &value["j"]));
+        let number = |of: &Value, key: &str| of[key].as_f64().unwrap();
+        let difference =
+            (number(&found, "re") - number(value, "re")).hypot(number(&found, "im") - number(value, "im"));
+        // Rounding of a sum over 49152 pixels, most of which cancel in the fringes, and positions to 1e-6 m.
+        let scale = number(value, "re").hypot(number(value, "im"));
+        assert!(difference < 1e-9 * scale, "{difference} of {scale}");
+    }
+}
+
+#[test]
+fn bad_pipelines_are_refused_with_the_key() {
+    let folder = tempfile::tempdir().unwrap();
+    let cases = [
+        ("unknown.toml", "[map]\nnsides = 16\n", vec!["unknown.toml", "nsides", "nside"]),
+        ("band.toml", "[spacecraft]\nchannels_hz = [31e6]\n", vec!["channels_hz[0]", "31000000", "30000000"]),
+        ("nside.toml", "[map]\nnside = 12\n", vec!["map.nside = 12", "power of two"]),
+        ("type.toml", "[map]\nnside = \"big\"\n", vec!["type.toml", "nside", "line 2"]),
+        ("syntax.toml", "[map\n", vec!["syntax.toml", "line 1"]),
+    ];
+    for (name, text, expected) in cases {
+        let path = write(folder.path(), name, text);
+        let complaint = complaint(&["check", &path]);
+        for part in expected {
+            assert!(complaint.contains(part), "{name}: `{part}` is not in: {complaint}");
+        }
+    }
+}
+
+#[test]
+fn all_errors_come_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = "[spacecraft]\nchannels_hz = [1e3]\nduration_s = -1.0\n[map]\nnside = 3\nepsilon = 0.0\n";
+    let complaint = complaint(&["check", &write(folder.path(), "bad.toml", text)]);
+    for part in ["channels_hz[0]", "duration_s", "map.nside", "map.epsilon"] {
+        assert!(complaint.contains(part), "`{part}` is not in: {complaint}");
+    }
+}
+
+#[test]
+fn check_reads_the_files_that_a_pipeline_names() {
+    let set = ["--set", "sky.file=/nowhere/sky.fits", "--set", "spacecraft.channels_hz=[1e7]"];
+    let rest = ["--set", "map.epsilon=1e-4", "--set", "spacecraft.every_nth_integration=1"];
+    let complaint = complaint(&[&["check"], &set[..], &rest[..]].concat());
+    assert!(complaint.contains("/nowhere/sky.fits"), "{complaint}");
+}
+
+#[test]
+fn bad_files_are_named_with_what_was_expected() {
+    let folder = tempfile::tempdir().unwrap();
+    let empty = write(folder.path(), "empty", "");
+    let foreign = write(folder.path(), "foreign.txt", &"This is a letter, not a downlink. ".repeat(100));
+    let out = folder.path().join("maps");
+    let out = out.to_str().unwrap();
+    for file in [&empty, &foreign] {
+        for args in [vec!["inspect", file.as_str()], vec!["replay", file, "--out", out]] {
+            let complaint = complaint(&args);
+            assert!(complaint.contains(file.as_str()), "{args:?}: {complaint}");
+            assert!(complaint.contains("expected"), "{args:?}: {complaint}");
+        }
+    }
+    let at = ["--freq-hz", "1e7", "--at", "0", "--pair", "1-2"];
+    for file in [&empty, &foreign, &"/nowhere/map.fits".to_owned()] {
+        let complaint = complaint(&[&["predict", "--sky", file.as_str()], &at[..]].concat());
+        assert!(complaint.contains(file.as_str()), "{complaint}");
+    }
+}
+
+#[test]
+fn skies_with_holes_are_refused() {
+    use lunarray::sky::{Frame, SkyMap};
+    let folder = tempfile::tempdir().unwrap();
+    for hole in [f64::NAN, lunarray::units::constants::HEALPIX_UNSEEN] {
+        let mut values = vec![1.0; 768];
+        values[5] = hole;
+        let file = folder.path().join("holed.fits");
+        let map = SkyMap::new(Frame::Ecliptic, values).unwrap();
+        write_map(&file, &map, &WriteOptions::default()).unwrap();
+        let file = file.to_str().unwrap();
+        let set = format!("sky.file={file:?}");
+        let out = folder.path().join("out");
+        let run = ["run", "--out", out.to_str().unwrap(), "--set", "spacecraft.channels_hz=[1e7]"];
+        let map = ["--set", "map.epsilon=1e-4", "--set", "spacecraft.every_nth_integration=1"];
+        let complaint = complaint(&[&run[..], &map[..], &["--set", &set]].concat());
+        assert!(complaint.contains("holed.fits") && complaint.contains("pixel 5"), "{complaint}");
+    }
+}
+
+#[test]
+fn an_unwritable_output_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let blocker = write(folder.path(), "file", "");
+    let inside = format!("{blocker}/below");
+    let complaint = complaint(&["run", "--out", &inside]);
+    assert!(complaint.contains(&inside), "{complaint}");
+}

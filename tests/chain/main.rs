@@ -1,0 +1,12 @@
+//! The whole chain through the command line.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking; helpers are tests too.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod bench;
+mod coded;
+mod command_line;
+mod harmonic;
+mod paper;
+mod run;

@@ -1,0 +1,229 @@
+//! Downlink files: written, cut short, damaged, looked through.
+
+use std::fs;
+use std::path::Path;
+
+use lunarray::array::{Array, ArrayConfig, Ephemeris, segments_for};
+use lunarray::downlink::{
+    Contents, DownlinkConfig, DownlinkError, DownlinkReader, DownlinkWriter, PacketHeader,
+};
+use lunarray::frames::{
+    AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
+};
+use lunarray::units::{ChannelId, MissionTime, Pair};
+use num_complex::Complex32;
+
+const VISIBILITIES: u32 = 2_000;
+
+fn frames() -> Vec<GroundFrame> {
+    let array = Array::new(&ArrayConfig::default()).unwrap();
+    let mut frames = vec![GroundFrame::Instrument(Instrument {
+        name: "files".to_owned(),
+        // 2037-01-01T00:00:00 UTC with 37 leap seconds: 28855 days after 1958-01-01.
+        epoch_tai_s: 28_855.0 * 86_400.0 + 37.0,
+        moon_radius_m: 1_737_100.0,
+        satellites: 8,
+        channels: vec![
+            Channel { frequency_hz: 3e6, width_hz: 8e3 },
+            Channel { frequency_hz: 1e7, width_hz: 8e3 },
+        ],
+        response: AntennaResponse::Isotropic,
+        seed: 1,
+        configuration_hash: 0xABCD,
+        spectrometer: None,
+    })];
+    for window in 0..2 {
+        let start = MissionTime(8_248_680_000 * window);
+        let end = start.plus_ticks(2_750_000_000);
+        frames.extend(segments_for(&array, start, end, 60.0).into_iter().map(GroundFrame::Ephemeris));
+        for channel in 0..2 {
+            frames.push(GroundFrame::Visibilities(VisibilityBlock {
+                channel: ChannelId(channel),
+                pair: Pair { i: 0, j: 1 + channel as u8 },
+                start,
+                offset_ticks: (0..VISIBILITIES).map(|k| 1_000_000 * k).collect(),
+                duration_ticks: vec![500_000; VISIBILITIES as usize],
+                value_k_sr: vec![Complex32::new(1.0, -1.0); VISIBILITIES as usize],
+                weight: vec![1.0; VISIBILITIES as usize],
+                flags: (0..VISIBILITIES).map(|k| Flags(u8::from(k % 100 == 0))).collect(),
+            }));
+        }
+        let sampled = 2 * u64::from(VISIBILITIES) * (window as u64 + 1);
+        frames.push(GroundFrame::Housekeeping(Housekeeping { time: end, sampled, dropped: 0 }));
+    }
+    frames
+}
+
+fn write(path: &Path) -> u64 {
+    let mut writer = DownlinkWriter::create(path, &DownlinkConfig::default()).unwrap();
+    for frame in frames() {
+        writer.write(&frame).unwrap();
+    }
+    writer.finish().unwrap()
+}
+
+#[test]
+fn a_file_has_its_name_only_when_it_is_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pass.ccsds");
+    let partial = folder.path().join("pass.ccsds.partial");
+    fs::write(&path, "an older file").unwrap();
+    let mut writer = DownlinkWriter::create(&path, &DownlinkConfig::default()).unwrap();
+    for frame in frames() {
+        writer.write(&frame).unwrap();
+    }
+    assert!(partial.exists());
+    assert_eq!(fs::read(&path).unwrap(), b"an older file");
+    let bytes = writer.bytes();
+    assert_eq!(writer.finish().unwrap(), bytes);
+    assert!(!partial.exists());
+    assert_eq!(fs::metadata(&path).unwrap().len(), bytes);
+}
+
+#[test]
+fn every_visibility_is_read_and_placed() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pass.ccsds");
+    write(&path);
+    let mut reader = DownlinkReader::open(&path).unwrap();
+    let mut ephemeris = Ephemeris::default();
+    let (mut placed, mut flagged, mut channels) = (0, 0, Vec::new());
+    while let Some(frame) = reader.next_frame().unwrap() {
+        match frame {
+            GroundFrame::Instrument(instrument) => channels = instrument.channels,
+            GroundFrame::Ephemeris(segment) => {
+                ephemeris.insert(segment);
+            }
+            GroundFrame::Visibilities(block) => {
+                let frequency_hz = channels[usize::from(block.channel.0)].frequency_hz;
+                let (_, counts) = ephemeris.place(&block, frequency_hz);
+                assert_eq!(counts.without_ephemeris, 0);
+                placed += counts.placed;
+                flagged += counts.flagged.values().sum::<u64>();
+            }
+            GroundFrame::Housekeeping(counts) => assert_eq!(placed + flagged, counts.sampled),
+        }
+    }
+    assert_eq!((placed, flagged), (4 * 1_980, 4 * 20));
+    assert_eq!(reader.counters().visibilities_decoded, 8_000);
+}
+
+#[test]
+fn a_second_file_goes_on_with_what_the_first_has_taught() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pass.ccsds");
+    write(&path);
+    let mut first = DownlinkReader::open(&path).unwrap();
+    while first.next_frame().unwrap().is_some() {}
+    let mut bytes = fs::read(&path).unwrap();
+    bytes.drain(..PacketHeader::parse(&bytes).unwrap().bytes);
+    let mut second =
+        DownlinkReader::new(bytes.as_slice(), Path::new("again")).with_decoder(first.into_decoder());
+    while second.next_frame().unwrap().is_some() {}
+    assert_eq!(second.counters().visibilities_decoded, 16_000);
+}
+
+#[test]
+fn a_sound_file_is_said_to_be_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pass.ccsds");
+    let bytes = write(&path);
+    let contents = Contents::read(&path).unwrap();
+    assert!(contents.is_sound());
+    let json = serde_json::to_value(&contents).unwrap();
+    assert_eq!(json["bytes"], bytes);
+    let of_kinds: u64 = contents.packets.iter().map(|row| row.bytes).sum();
+    assert_eq!(of_kinds, bytes);
+    assert_eq!(json["span"]["start_utc"], "2037-01-01T00:00:00.000");
+    // The last integration begins 1999 s into the second window and lasts half a second.
+    assert_eq!(json["span"]["end_s"], 8_248.68 + 1_999.5);
+    assert_eq!(json["visibilities"]["count"], 8_000);
+    assert_eq!(json["visibilities"]["integration_s"], 4_000.0);
+    assert_eq!(json["baselines"][1]["pair"], "1-3");
+    assert_eq!(json["baselines"][1]["channel"], 1);
+    assert_eq!(json["baselines"][1]["flagged"], 40);
+    assert_eq!(json["channels"][0]["frequency_hz"], 3e6);
+    assert_eq!(json["channels"][0]["count"], 4_000);
+    assert_eq!(json["ephemeris"]["covered"]["count"], 2);
+    // Nodes are whole microseconds apart: the last is less than as many ticks late as there are nodes.
+    let covered_s = json["ephemeris"]["covered_s"].as_f64().unwrap();
+    assert!((0.0..1e-4).contains(&(covered_s - 5_500.0)), "{covered_s}");
+    assert_eq!(json["housekeeping"]["sampled"], 8_000);
+    let text = contents.to_string();
+    for part in ["pass.ccsds", "sound", "1-2", "10.000 MHz", "visibilities  8000", "0x103"] {
+        assert!(text.contains(part), "{part}: {text}");
+    }
+}
+
+#[test]
+fn damage_is_told_with_its_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pass.ccsds");
+    write(&path);
+    let bytes = fs::read(&path).unwrap();
+    let mut packets = Vec::new();
+    let mut at = 0;
+    while let Some(header) = PacketHeader::parse(&bytes[at..]) {
+        packets.push((at, header));
+        at += header.bytes;
+    }
+    let whole: Vec<(usize, PacketHeader)> =
+        packets.iter().filter(|(_, header)| header.kind.apid() == 0x103).copied().collect();
+    let [(bad, bad_header), (lost, lost_header)] = [whole[2], whole[5]];
+    let mut damaged = bytes.clone();
+    damaged[bad + 100] ^= 1;
+    damaged.drain(lost..lost + lost_header.bytes);
+    damaged.splice(lost..lost, [0xAA; 33]);
+    damaged.truncate(damaged.len() - 1);
+    fs::write(&path, damaged).unwrap();
+
+    let contents = Contents::read(&path).unwrap();
+    assert!(!contents.is_sound());
+    let bad_entry = &contents.bad_checksums.listed[0];
+    assert_eq!((bad_entry.offset, bad_entry.count), (bad as u64, bad_header.count));
+    let gap = &contents.gaps.listed[0];
+    assert_eq!((gap.from, gap.to, gap.count), (lost_header.count, lost_header.count, 1));
+    assert!(gap.after_s <= gap.before_s && gap.after_s > Some(0.0));
+    let garbage = &contents.garbage.listed[0];
+    assert_eq!((garbage.offset, garbage.bytes), (lost as u64, 33));
+    let cut = packets.last().unwrap().1.bytes as u64 - 1;
+    assert_eq!(contents.truncated_bytes, cut);
+    assert_eq!([contents.gaps.count, contents.bad_checksums.count, contents.garbage.count], [1, 1, 1]);
+    let text = contents.to_string();
+    for part in ["gaps: 1", "bad checksums: 1", "garbage: 1", "33 bytes", "cut off"] {
+        assert!(text.contains(part), "{part}: {text}");
+    }
+}
+
+#[test]
+fn empty_foreign_and_missing_files_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("some.file");
+    let said = |path: &Path| {
+        let error = Contents::read(path).unwrap_err();
+        let same = DownlinkReader::open(path).and_then(|mut reader| reader.next_frame()).unwrap_err();
+        assert_eq!(error.to_string(), same.to_string());
+        assert!(error.to_string().contains("some.file"));
+        error
+    };
+    assert!(matches!(said(&path), DownlinkError::Io { .. }));
+    fs::write(&path, "").unwrap();
+    assert!(matches!(said(&path), DownlinkError::Empty { .. }));
+    fs::write(&path, "SIMPLE  =                    T".repeat(96)).unwrap();
+    assert!(matches!(said(&path), DownlinkError::Foreign { bytes: 2880, .. }));
+    assert!(said(&path).to_string().contains("expected CCSDS space packets"));
+}
+
+#[test]
+fn an_output_that_cannot_be_written_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    // Folders are made; a file in the way of one is an error.
+    let path = folder.path().join("no such folder");
+    fs::write(&path, "").unwrap();
+    let path = path.join("pass.ccsds");
+    let error = DownlinkWriter::create(&path, &DownlinkConfig::default()).unwrap_err();
+    assert!(error.to_string().contains("no such folder"), "{error}");
+    let config = DownlinkConfig { packet_bytes_max: 10, repeat_bytes: 0, ..DownlinkConfig::default() };
+    assert_eq!(config.problems().len(), 2);
+    assert!(DownlinkWriter::create(&folder.path().join("x"), &config).is_err());
+}

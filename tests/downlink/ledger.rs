@@ -1,0 +1,371 @@
+//! The whole chain over links with any mix of faults, onboard store and all: nothing is summed twice, and every
+//! visibility is accounted for, on the ground as in the link's truth.
+//!
+//! A few dozen cases; `PROPTEST_CASES` asks for more.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, LazyLock, Mutex, PoisonError};
+
+use lunarray::accumulation::{Accumulator, MapConfig};
+use lunarray::array::{Array, ArrayConfig, ObservingWindows, segments_for};
+use lunarray::calibration::{CalibrationConfig, Calibrator};
+use lunarray::downlink::link::{LinkConfig, LinkSimulator, LinkTruth, PacketRange};
+use lunarray::downlink::wire::cadu::INTERLEAVES;
+use lunarray::downlink::{
+    Decoder, DownlinkConfig, Event, Format, Intake, Kind, ReceptionCounters, Transmission,
+};
+use lunarray::frames::{
+    AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, PlacedFrame,
+    VisibilityBlock, VisibilityReason,
+};
+use lunarray::ground::{Collector, Delivery, Reception};
+use lunarray::mother::{PacedLink, SpacecraftConfig, Store, StoreDrop};
+use lunarray::runtime::{Ledger, LedgerReport, Outlet, Stage};
+use lunarray::units::{ChannelId, all_pairs};
+use num_complex::Complex32;
+use proptest::prelude::*;
+
+const WINDOWS: usize = 5;
+const SATELLITES: usize = 4;
+/// Visibilities of a channel and pair in a window.
+const INTEGRATIONS: u32 = 30;
+const BLOCKS: usize = 2 * 6;
+const SAMPLED: u64 = WINDOWS as u64 * BLOCKS as u64 * INTEGRATIONS as u64;
+
+static ARRAY: LazyLock<Arc<Array>> = LazyLock::new(|| {
+    Arc::new(Array::new(&ArrayConfig { satellites: SATELLITES, ..ArrayConfig::default() }).unwrap())
+});
+
+/// What the mother makes: every visibility has a number for its value, and positions that the map can use.
+static FRAMES: LazyLock<Vec<GroundFrame>> = LazyLock::new(|| {
+    let channel = |frequency_hz| Channel { frequency_hz, width_hz: 8e3 };
+    let instrument = Instrument {
+        name: "test".to_owned(),
+        epoch_tai_s: 2_493_072_037.25,
+        moon_radius_m: ARRAY.moon_radius_m(),
+        satellites: SATELLITES as u8,
+        channels: vec![channel(3e6), channel(1e7)],
+        response: AntennaResponse::Isotropic,
+        seed: 7,
+        configuration_hash: 1,
+        spectrometer: None,
+    };
+    let mut frames = Vec::new();
+    let mut sampled = 0;
+    for window in ObservingWindows::new(&ARRAY, 0.0, 1e6).take(WINDOWS) {
+        frames.push(GroundFrame::Instrument(instrument.clone()));
+        let segments = segments_for(&ARRAY, window.start, window.end, 300.0);
+        frames.extend(segments.into_iter().map(GroundFrame::Ephemeris));
+        for channel in 0..2 {
+            for pair in all_pairs(SATELLITES) {
+                let mut block = block(window, sampled);
+                (block.channel, block.pair) = (ChannelId(channel), pair);
+                sampled += u64::from(INTEGRATIONS);
+                frames.push(GroundFrame::Visibilities(block));
+            }
+        }
+        let time = window.end;
+        frames.push(GroundFrame::Housekeeping(Housekeeping { time, sampled, dropped: 0 }));
+    }
+    assert_eq!(sampled, SAMPLED);
+    frames
+});
+
+/// Of pairs of other lengths too: longer ones have shorter integrations, as the adaptive rule has it.
+fn block(window: ObservingWindow, first: u64) -> VisibilityBlock {
+    let length = 5_000_000 + 1_000_000 * (first / u64::from(INTEGRATIONS) % 7) as u32;
+    VisibilityBlock {
+        start: window.start,
+        offset_ticks: (0..INTEGRATIONS).map(|k| length * k).collect(),
+        duration_ticks: vec![length; INTEGRATIONS as usize],
+        // Integers below 2^24 are exact in single precision.
+        value_k_sr: (0..INTEGRATIONS).map(|k| Complex32::new((first + u64::from(k)) as f32, 0.0)).collect(),
+        weight: vec![1e-7 * length as f32; INTEGRATIONS as usize],
+        flags: (0..INTEGRATIONS).map(|k| Flags(u8::from(k % 20 == 3))).collect(),
+        ..VisibilityBlock::default()
+    }
+}
+
+/// Everything that can be asked of the spacecraft and the link.
+#[derive(Clone, Debug)]
+struct Case {
+    seed: u64,
+    downlink: DownlinkConfig,
+    spacecraft: SpacecraftConfig,
+}
+
+/// What was sent, what arrived, and the truth.
+struct Sent {
+    sound: Vec<u8>,
+    arrived: Vec<u8>,
+    truth: LinkTruth,
+}
+
+fn send(case: &Case) -> Sent {
+    let paced = |bytes_per_s| PacedLink { array: Arc::clone(&ARRAY), bytes_per_s };
+    let mut store = Store::new(&case.spacecraft, case.downlink.payload_bytes_per_s().map(paced));
+    let mut frames = Outlet::collect();
+    for frame in FRAMES.iter() {
+        store.step(frame.clone(), &mut frames).unwrap();
+    }
+    store.finish(&mut frames).unwrap();
+    let mut transmission = Transmission::new(&case.downlink).unwrap();
+    let mut sound = Vec::new();
+    for frame in frames.items() {
+        transmission.send(frame, &mut sound).unwrap();
+    }
+    transmission.finish(&mut sound);
+    let mut link = LinkSimulator::new(&case.downlink.link, case.seed, case.downlink.code()).unwrap();
+    let mut arrived = Vec::new();
+    for part in sound.chunks(9_000) {
+        link.push(part, &mut arrived).unwrap();
+    }
+    let truth = link.finish(&mut arrived).unwrap().clone();
+    Sent { sound, arrived, truth }
+}
+
+/// The numbers of a block's visibilities.
+fn numbers(block: &VisibilityBlock) -> Vec<u64> {
+    block.value_k_sr.iter().map(|value| value.re as u64).collect()
+}
+
+/// The numbers of the visibilities in each packet, by its count.
+fn visibilities_by_packet(sound: &[u8]) -> BTreeMap<u64, Vec<u64>> {
+    let (mut intake, mut decoder, mut found) = (Intake::new(), Decoder::new(), BTreeMap::new());
+    intake.push(sound);
+    intake.finish();
+    while let Some(event) = intake.next_event() {
+        let header = if let Event::Packet(packet) = &event { Some(packet.header) } else { None };
+        if let Some(GroundFrame::Visibilities(block)) = decoder.accept(&event) {
+            found.insert(header.unwrap().count, numbers(&block));
+        }
+    }
+    found
+}
+
+/// What the ground makes of it.
+struct Received {
+    ledger: LedgerReport<VisibilityReason>,
+    reception: ReceptionCounters,
+    /// Numbers of the visibilities that went into the sums, in order.
+    summed: Vec<u64>,
+}
+
+fn receive(arrived: &[u8]) -> Received {
+    let account = Arc::new(Mutex::new(ReceptionCounters::default()));
+    // All that waits fits.
+    let mut reception = Reception::new(1 << 24, 1024, Arc::clone(&account));
+    let mut frames = Outlet::collect();
+    for part in arrived.chunks(7_000) {
+        reception.step(part.to_vec(), &mut frames).unwrap();
+    }
+    reception.finish(&mut frames).unwrap();
+    let ledger = Ledger::new();
+    let hook = CalibrationConfig::default().build(std::path::Path::new("")).unwrap();
+    let mut calibrator = Calibrator::new(hook, ledger.clone());
+    let mut placed = Outlet::collect();
+    for frame in frames.into_vec() {
+        calibrator.step(frame, &mut placed).unwrap();
+    }
+    calibrator.finish(&mut placed).unwrap();
+    // All baselines and weights: what is placed is summed.
+    let map = MapConfig { nside: 1, baseline_bp_max: 1e6, weight_max: 1e3, ..MapConfig::default() };
+    let mut accumulator = Accumulator::new(map, ledger.clone());
+    let (mut summed, mut maps) = (Vec::new(), Outlet::collect());
+    for frame in placed.into_vec() {
+        if let PlacedFrame::Visibilities(block) = &frame {
+            summed.extend(block.value_k_sr.iter().map(|value| value.re as u64));
+        }
+        accumulator.step(frame, &mut maps).unwrap();
+    }
+    accumulator.finish(&mut maps).unwrap();
+    let ledger = ledger.close().unwrap();
+    let reception = account.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    Received { ledger, reception, summed }
+}
+
+fn counts_of(ranges: &[PacketRange], kind: Kind) -> BTreeSet<u64> {
+    ranges.iter().filter(|range| range.apid == kind.apid()).flat_map(PacketRange::counts).collect()
+}
+
+/// Holds a ground without a memory to the truth.
+fn hold_to_the_truth(sent: &Sent) {
+    let Sent { sound, arrived, truth } = sent;
+    let by_packet = visibilities_by_packet(sound);
+    let packets_lost = counts_of(&truth.packets_lost, Kind::Visibilities);
+    let all_sent: BTreeSet<u64> = by_packet.values().flatten().copied().collect();
+    let of_lost = |count: &u64| by_packet[count].iter().copied();
+    let lost_on_link: BTreeSet<u64> = packets_lost.iter().flat_map(of_lost).collect();
+    // The truth about the spacecraft: what is not sent has been dropped, and counted.
+    assert_eq!(truth.visibilities_sampled, SAMPLED);
+    assert_eq!(truth.visibilities_sent, all_sent.len() as u64);
+    assert_eq!(truth.visibilities_sent + truth.visibilities_dropped, SAMPLED);
+    assert_eq!(truth.visibilities_lost, lost_on_link.len() as u64);
+
+    let received = receive(arrived);
+    let (ledger, reception) = (&received.ledger, &received.reception);
+    let summed: BTreeSet<u64> = received.summed.iter().copied().collect();
+    assert_eq!(summed.len(), received.summed.len(), "a visibility was summed twice");
+    assert_eq!(ledger.accumulated, summed.len() as u64);
+    // What was recovered and did not go into the sums was flagged, unless nobody could read anything.
+    let unread = reception.visibilities_before_instrument;
+    assert!(unread == 0 || reception.instrument.packets == 0);
+    let recovered = &all_sent - &lost_on_link;
+    assert!(summed.is_subset(&recovered));
+    let flagged = ledger.flagged_total() as u64;
+    assert_eq!(ledger.accumulated + flagged + unread, recovered.len() as u64, "{ledger:?}");
+    // Each for its reason: every twentieth has a flag, others no positions.
+    let without_ephemeris = ledger.count(VisibilityReason::NoEphemeris);
+    assert_eq!(flagged, ledger.count(VisibilityReason::Interference) + without_ephemeris);
+    if unread == 0 && without_ephemeris == 0 {
+        let good: BTreeSet<u64> =
+            recovered.iter().copied().filter(|number| number % u64::from(INTEGRATIONS) % 20 != 3).collect();
+        assert_eq!(summed, good);
+    }
+    // What the ground says is lost, as far as the spacecraft's last word about it has come.
+    let reports_lost = counts_of(&truth.packets_lost, Kind::Housekeeping);
+    let last_report_came = !reports_lost.contains(&(WINDOWS as u64 - 1));
+    if last_report_came && reception.instrument.packets > 0 {
+        assert_eq!(ledger.sampled, SAMPLED);
+        assert_eq!(ledger.count(VisibilityReason::StoreFull), truth.visibilities_dropped);
+        assert_eq!(ledger.count(VisibilityReason::NotReceived), truth.visibilities_lost);
+    }
+    assert!(ledger.count(VisibilityReason::StoreFull) <= truth.visibilities_dropped);
+    assert!(ledger.sampled <= SAMPLED);
+}
+
+/// Holds a ground with a memory to the truth: packets by number.
+fn hold_the_collector_to_the_truth(sent: &Sent) {
+    let by_packet = visibilities_by_packet(&sent.sound);
+    let mut collector = Collector::new(20_000);
+    let mut frames = Vec::new();
+    for part in sent.arrived.chunks(5_000) {
+        collector.push(part);
+        while let Some(frame) = collector.next_delivery(&|_| true).unwrap() {
+            frames.push(frame);
+        }
+    }
+    collector.finish();
+    while let Some(frame) = collector.next_delivery(&|_| true).unwrap() {
+        frames.push(frame);
+    }
+    while let Some(frame) = collector.next_waiting() {
+        frames.push(frame);
+    }
+    let mut seen = BTreeSet::new();
+    for Delivery { packets, frame } in &frames {
+        if let Some(GroundFrame::Visibilities(block)) = frame {
+            assert_eq!(numbers(block), by_packet[&packets[0].0.count]);
+            assert!(numbers(block).into_iter().all(|number| seen.insert(number)), "taken twice");
+        }
+    }
+    if !frames.iter().any(|found| matches!(found.frame, Some(GroundFrame::Instrument(_)))) {
+        return; // Nothing could be read.
+    }
+    let state = collector.into_state();
+    for kind in Kind::ALL {
+        let Some(taken) = state.taken(kind).filter(|taken| !taken.is_empty()) else { continue };
+        let missing: BTreeSet<u64> = taken.eras().into_iter().flat_map(|era| era.missing).flatten().collect();
+        let mut expected = counts_of(&sent.truth.packets_lost, kind);
+        // Behind the last that came nothing is known.
+        let end = taken.len() + missing.len() as u64;
+        expected.retain(|count| *count < end);
+        assert_eq!(missing, expected, "{kind}");
+    }
+}
+
+fn any_case() -> impl Strategy<Value = Case> {
+    let some = |most: f64| prop_oneof![Just(0.0), 0.0..most];
+    let bits =
+        (prop_oneof![Just(0.0), 1e-6..4e-3], prop_oneof![Just(0.0), 1e4..1e6], 1.0..30_000.0, some(0.5));
+    let frames = (some(0.2), some(0.3), some(0.3), 0_u64..60, 0_u64..40);
+    let passes = (some(0.3), some(0.3), some(0.5), some(0.05));
+    // A window's visibilities are 7.5 kB and its positions 2 kB, and the Earth is in sight for 5500 s.
+    let onboard = (
+        prop_oneof![Just(0_u64), 500_u64..40_000],
+        prop_oneof![Just(StoreDrop::Newest), Just(StoreDrop::Oldest), Just(StoreDrop::LowestValue)],
+        prop_oneof![Just(0.0), 1.0..40.0_f64],
+    );
+    let format = (any::<bool>(), proptest::sample::select(&INTERLEAVES), 256_usize..3_000, 1_u32..3);
+    (any::<u64>(), bits, frames, passes, onboard, format).prop_map(
+        |(seed, bits, frames, passes, onboard, (coded, interleave, packet_bytes_max, idle_frames))| {
+            let link = LinkConfig {
+                bit_error_rate: bits.0,
+                burst_every_bits: bits.1,
+                burst_bits: bits.2,
+                burst_bit_error_rate: bits.3,
+                frame_loss: frames.0,
+                duplicate: frames.1,
+                reorder: frames.2,
+                reorder_frames: frames.3,
+                second_station_frames: frames.4,
+                pass_loss: passes.0,
+                pass_cut: passes.1,
+                pass_swap: passes.2,
+                bit_slip: if coded { passes.3 } else { 0.0 },
+            };
+            let downlink = DownlinkConfig {
+                format: if coded { Format::Cadu } else { Format::Packets },
+                packet_bytes_max,
+                interleave,
+                idle_frames,
+                rate_bits_per_s_max: onboard.2,
+                link,
+                ..DownlinkConfig::default()
+            };
+            let store_bytes_max = if onboard.0 == 0 { u64::MAX } else { onboard.0 };
+            let spacecraft =
+                SpacecraftConfig { store_bytes_max, store_drop: onboard.1, ..SpacecraftConfig::default() };
+            Case { seed, downlink, spacecraft }
+        },
+    )
+}
+
+fn cases() -> u32 {
+    std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(48)
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(cases()) })]
+
+    #[test]
+    fn every_visibility_is_accounted_for_whatever_goes_wrong(case in any_case()) {
+        let sent = send(&case);
+        prop_assert_eq!(&case.downlink.link, &sent.truth.link);
+        hold_to_the_truth(&sent);
+        hold_the_collector_to_the_truth(&sent);
+    }
+}
+
+/// A link that is too slow for the store before it.
+fn crowded(drop: StoreDrop) -> Case {
+    let downlink =
+        DownlinkConfig { rate_bits_per_s_max: 9.0, packet_bytes_max: 512, ..DownlinkConfig::default() };
+    let spacecraft =
+        SpacecraftConfig { store_bytes_max: 9_000, store_drop: drop, ..SpacecraftConfig::default() };
+    Case { seed: 1, downlink, spacecraft }
+}
+
+#[test]
+fn a_slow_link_and_a_small_store_lose_what_the_policy_says() {
+    let mut integrations_s = Vec::new();
+    for drop in [StoreDrop::Newest, StoreDrop::Oldest, StoreDrop::LowestValue] {
+        let sent = send(&crowded(drop));
+        assert!(sent.truth.visibilities_dropped > SAMPLED / 10, "{:?}", sent.truth);
+        assert!(sent.truth.visibilities_lost == 0 && sent.arrived == sent.sound);
+        hold_to_the_truth(&sent);
+        hold_the_collector_to_the_truth(&sent);
+        let numbers: Vec<u64> = visibilities_by_packet(&sent.sound).into_values().flatten().collect();
+        let length_s = |number: &u64| 5.0 + (number / u64::from(INTEGRATIONS) % 7) as f64;
+        integrations_s.push(numbers.iter().map(length_s).sum::<f64>());
+        // Of the last window the newest are dropped, of the first the oldest.
+        let (first, last) = (numbers.contains(&0), numbers.contains(&(SAMPLED - 1)));
+        match drop {
+            StoreDrop::Newest => assert!(first && !last),
+            StoreDrop::Oldest => assert!(last),
+            StoreDrop::LowestValue => {}
+        }
+    }
+    // As many bytes hold more integration time where the least worthy are dropped.
+    assert!(integrations_s[2] > integrations_s[0].max(integrations_s[1]), "{integrations_s:?}");
+}

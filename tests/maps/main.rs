@@ -1,0 +1,10 @@
+//! From visibilities to maps: normal equations, engines, solutions.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking; helpers are tests too.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod closed_loop;
+mod engines;
+mod exact_sums;
+mod tikhonov;

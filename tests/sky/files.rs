@@ -1,0 +1,258 @@
+//! Map files: round trips, and what hostile files do.
+
+use std::fs;
+use std::io::Cursor;
+
+use lunarray::sky::fits::{
+    Card, CardValue, Column, FitsError, FitsProblem, MapFile, Ordering, Precision, ReadOptions, WriteOptions,
+    read_map, read_map_file, read_map_from, read_whole_map, write_columns, write_map,
+};
+use lunarray::sky::{Frame, MapError, SkyMap};
+use lunarray::units::constants::HEALPIX_UNSEEN;
+use proptest::prelude::*;
+
+/// Values that single precision holds exactly.
+fn map(nside: usize) -> SkyMap {
+    SkyMap::new(Frame::Galactic, (0..12 * nside * nside).map(|p| 0.5 + p as f64).collect()).unwrap()
+}
+
+fn bytes_of(map: &SkyMap, options: &WriteOptions) -> Vec<u8> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("map.fits");
+    write_map(&path, map, options).unwrap();
+    fs::read(path).unwrap()
+}
+
+fn parse(bytes: &[u8]) -> Result<MapFile, FitsProblem> {
+    read_map_from(&mut Cursor::new(bytes), bytes.len() as u64, &ReadOptions::default())
+}
+
+fn all_options() -> Vec<WriteOptions> {
+    let mut all = Vec::new();
+    for precision in [Precision::Single, Precision::Double] {
+        for ordering in [Ordering::Ring, Ordering::Nested] {
+            for partial in [false, true] {
+                all.push(WriteOptions { precision, ordering, partial, cards: vec![] });
+            }
+        }
+    }
+    all
+}
+
+/// The bytes with the card of a keyword replaced.
+fn forged(bytes: &[u8], card: &str) -> Vec<u8> {
+    let mut bytes = bytes.to_vec();
+    let card = format!("{card:<80}");
+    let key = &card.as_bytes()[..8];
+    let at = bytes.as_chunks::<80>().0.iter().rposition(|c| c.starts_with(key)).unwrap() * 80;
+    bytes[at..at + 80].copy_from_slice(card.as_bytes());
+    bytes
+}
+
+#[test]
+fn maps_come_back_as_they_were_written() {
+    for nside in [1, 2, 8, 16, 64] {
+        for options in all_options() {
+            let map = map(nside);
+            let bytes = bytes_of(&map, &options);
+            assert_eq!(bytes.len() % 2880, 0);
+            let file = parse(&bytes).unwrap();
+            assert_eq!(file.map, map, "{nside} {options:?}");
+            assert_eq!((file.name.as_str(), file.unit.as_str()), ("TEMPERATURE", "K"));
+            assert!(!file.frame_assumed);
+        }
+    }
+}
+
+#[test]
+fn unseen_pixels_stay_unseen() {
+    let mut map = map(64);
+    for pixel in [0, 77, 40_000] {
+        map.values_mut()[pixel] = HEALPIX_UNSEEN;
+    }
+    for options in all_options() {
+        let read = parse(&bytes_of(&map, &options)).unwrap().map;
+        assert_eq!(read, map, "{options:?}");
+        let expected = MapError::BadPixels { count: 3, total: 49_152, first: 0, value: HEALPIX_UNSEEN };
+        assert_eq!(read.check_whole(), Err(expected));
+    }
+}
+
+#[test]
+fn several_columns_and_provenance_are_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("maps.fits");
+    let (one, two) = (map(16), SkyMap::constant(16, Frame::Galactic, 0.25).unwrap());
+    let hash = "0123456789abcdef".repeat(7);
+    let cards = vec![
+        Card::text("CFGHASH", &hash, "cut if long"),
+        Card::integer("SEED", 17, "seed"),
+        Card::real("FREQ", 1e7, "Hz"),
+    ];
+    let options = WriteOptions { cards: cards.clone(), ..WriteOptions::default() };
+    let columns = [
+        Column { name: "TEMPERATURE", unit: "K", values: one.values() },
+        Column { name: "NOISE", unit: "", values: two.values() },
+    ];
+    write_columns(&path, Frame::Galactic, &columns, &options).unwrap();
+    let second = read_map_file(&path, &ReadOptions { column: 1, ..ReadOptions::default() }).unwrap();
+    assert_eq!((second.map, second.name.as_str(), second.unit.as_str()), (two, "NOISE", ""));
+    assert_eq!(second.header.get("CFGHASH"), Some(&CardValue::Text(hash)));
+    assert!(second.header.cards().ends_with(&cards));
+    let third = read_map(&path, &ReadOptions { column: 2, ..ReadOptions::default() });
+    assert!(matches!(*third.unwrap_err().problem, FitsProblem::NoColumn { column: 2, columns: 2 }));
+}
+
+#[test]
+fn a_failed_write_leaves_the_old_file_and_nothing_else() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("map.fits");
+    write_map(&path, &map(4), &WriteOptions::default()).unwrap();
+    let before = fs::read(&path).unwrap();
+    let bad = WriteOptions { cards: vec![Card::text("lower", "", "")], ..WriteOptions::default() };
+    assert!(write_map(&path, &map(2), &bad).is_err());
+    let huge = SkyMap::constant(2, Frame::Ecliptic, 1e300).unwrap();
+    let error = write_map(&path, &huge, &WriteOptions::default()).unwrap_err();
+    assert!(matches!(*error.problem, FitsProblem::Overflow { pixel: 0, .. }));
+    assert!(write_map(&path.join("such.fits"), &map(2), &WriteOptions::default()).is_err());
+    // A folder cannot be replaced by a file.
+    let taken = folder.path().join("folder");
+    fs::create_dir(&taken).unwrap();
+    assert!(write_map(&taken, &map(2), &WriteOptions::default()).is_err());
+    assert_eq!(fs::read(&path).unwrap(), before);
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2);
+}
+
+#[test]
+fn messages_name_file_finding_and_expectation() {
+    let folder = tempfile::tempdir().unwrap();
+    let good = bytes_of(&map(16), &WriteOptions::default());
+    let message = |bytes: &[u8]| {
+        let path = folder.path().join("sky.fits");
+        fs::write(&path, bytes).unwrap();
+        let text = read_whole_map(&path, &ReadOptions::default()).unwrap_err().to_string();
+        assert!(text.contains("sky.fits"), "{text}");
+        text
+    };
+    assert!(message(b"").contains("empty"));
+    assert!(message(b"%PDF-1.4 etc").contains("%PDF-1.4"));
+    assert!(message(&[0x1f, 0x8b, 8, 0]).contains("gzip"));
+    assert!(message(&good[..2880]).contains("BINTABLE"));
+    assert!(message(&good[..4000]).contains("truncated"));
+    assert!(message(&good[..10_000]).contains("truncated"));
+    assert!(message(&forged(&good, "NSIDE   = 17")).contains("NSIDE is 17"));
+    assert!(message(&forged(&good, "NSIDE   = 32")).contains("12288"));
+    assert!(message(&forged(&good, "ORDERING= 'SPIRAL'")).contains("SPIRAL"));
+    assert!(message(&forged(&good, "COORDSYS= 'X'")).contains("'X'"));
+    assert!(message(&forged(&good, "COORDSYS")).contains("COORDSYS is missing"));
+    assert!(message(&forged(&good, "NAXIS2")).contains("NAXIS2 is missing"));
+    let mut nan = map(16);
+    nan.values_mut()[5] = f64::NAN;
+    assert!(message(&bytes_of(&nan, &WriteOptions::default())).contains("pixel 5"));
+    let missing: FitsError =
+        read_map(&folder.path().join("absent.fits"), &ReadOptions::default()).unwrap_err();
+    assert!(missing.to_string().contains("absent.fits") && std::error::Error::source(&missing).is_some());
+}
+
+#[test]
+fn a_file_without_a_frame_needs_one_named() {
+    let bytes = forged(&bytes_of(&map(16), &WriteOptions::default()), "COORDSYS");
+    assert!(matches!(parse(&bytes), Err(FitsProblem::NoFrame)));
+    let options = ReadOptions { frame_if_missing: Some(Frame::Equatorial), ..ReadOptions::default() };
+    let file = read_map_from(&mut Cursor::new(&bytes), bytes.len() as u64, &options).unwrap();
+    assert_eq!((file.map.frame(), file.frame_assumed), (Frame::Equatorial, true));
+}
+
+#[test]
+fn forged_sizes_neither_panic_nor_allocate() {
+    let whole = bytes_of(&map(16), &WriteOptions::default());
+    let partial = bytes_of(&map(16), &WriteOptions { partial: true, ..WriteOptions::default() });
+    // Any of these, believed, would ask for terabytes and abort.
+    let huge = ["1000000000000000", "9223372036854775807", "-1", "99999999999999999999999", "1E300", "'x'"];
+    let keys = ["NAXIS1", "NAXIS2", "TFIELDS", "NSIDE", "PCOUNT", "GCOUNT"];
+    for bytes in [&whole, &partial] {
+        for key in keys {
+            for value in huge {
+                let result = parse(&forged(bytes, &format!("{key:<8}= {value}")));
+                // Nothing of a fixed-width table depends on these two.
+                assert!(result.is_err() || key == "PCOUNT" || key == "GCOUNT", "{key} = {value}");
+            }
+        }
+        for form in ["1000000000000E", "99999999999999999999E", "0E", "PE(5)", "7", "", "1Z", "4X"] {
+            for column in 1..=2 {
+                let card = format!("TFORM{column}  = '{form}'");
+                if bytes.as_chunks::<80>().0.iter().any(|c| c.starts_with(&card.as_bytes()[..9])) {
+                    assert!(parse(&forged(bytes, &card)).is_err(), "{card}");
+                }
+            }
+        }
+    }
+    let sparse = parse(&forged(&partial, "NSIDE   = 8192"));
+    assert!(matches!(sparse, Err(FitsProblem::Sparse { nside: 8192, .. })));
+}
+
+#[test]
+fn pixels_given_twice_or_out_of_range_are_refused() {
+    let partial = bytes_of(&map(4), &WriteOptions { partial: true, ..WriteOptions::default() });
+    let rows = partial.len() - 2880;
+    for number in [[0, 1], [0xff, 0xff], [0, 192]] {
+        let mut bytes = partial.clone();
+        bytes[rows..rows + 2].copy_from_slice(&number);
+        // Pixel 1 given first makes its own row, the second, the repetition.
+        assert!(matches!(parse(&bytes), Err(FitsProblem::Pixel { .. })), "{number:?}");
+    }
+}
+
+proptest! {
+    #[test]
+    fn truncation_is_an_error(cut in 0.0..1.0_f64, form in 0_usize..8) {
+        let bytes = bytes_of(&map(16), &all_options()[form]);
+        // The last block's padding may go without loss.
+        let data_end = bytes.len() - 2880;
+        prop_assert!(parse(&bytes[..(cut * data_end as f64) as usize]).is_err());
+    }
+
+    #[test]
+    fn flipped_bits_do_not_panic(flips in prop::collection::vec((0.0..1.0_f64, 0_u8..8), 1..20), form in 0_usize..8) {
+        let mut bytes = bytes_of(&map(2), &all_options()[form]);
+        // Mostly in the headers, where they matter.
+        for (place, bit) in flips {
+            let at = (place * bytes.len() as f64) as usize;
+            bytes[at] ^= 1 << bit;
+        }
+        if let Ok(file) = parse(&bytes) {
+            prop_assert!(file.map.values().len() == 12 * file.map.nside().pow(2));
+        }
+    }
+
+    #[test]
+    fn arbitrary_bytes_do_not_panic(tail in prop::collection::vec(any::<u8>(), 0..6000)) {
+        let mut bytes = b"SIMPLE  =                    T".to_vec();
+        bytes.extend(tail);
+        prop_assert!(parse(&bytes).is_err());
+    }
+}
+
+#[test]
+fn temperatures_come_in_kelvin_whatever_their_unit() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("map.fits");
+    let map = map(2);
+    let bytes = bytes_of(&map, &WriteOptions { precision: Precision::Double, ..WriteOptions::default() });
+    let read = |unit: &str| {
+        fs::write(&path, forged(&bytes, &format!("TUNIT1  = '{unit}'"))).unwrap();
+        read_whole_map(&path, &ReadOptions::default())
+    };
+    for (unit, factor) in
+        [("K", 1.0), ("", 1.0), ("K_RJ", 1.0), ("Kelvin", 1.0), ("mK", 1e-3), ("uK_CMB", 1e-6), ("MK", 1e6)]
+    {
+        let found = read(unit).unwrap();
+        for (found, value) in found.values().iter().zip(map.values()) {
+            assert_eq!(*found, factor * value, "{unit}");
+        }
+    }
+    for unit in ["MJy/sr", "Jy/beam", "counts", "mJy"] {
+        let refused = read(unit).unwrap_err().to_string();
+        assert!(refused.contains(&format!("`{unit}`")) && refused.contains("expected K"), "{refused}");
+    }
+}

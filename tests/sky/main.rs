@@ -1,0 +1,10 @@
+//! Sky maps: files and spherical harmonics, alone and against healpy.
+#![allow(clippy::unwrap_used, clippy::panic)] // A test fails by panicking; helpers are tests too.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod files;
+mod harmonics;
+mod python_files;
+mod python_harmonics;
