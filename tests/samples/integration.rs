@@ -195,5 +195,5 @@ fn integrations_shorter_than_the_correlators_sums_are_refused() {
         ..lunarray::pipeline::ConfigSource::default()
     };
     let said = source.load().unwrap_err().to_string();
-    assert!(said.contains("the correlator sums 2.000e-3 s at once"), "{said}");
+    assert!(said.contains("dumps of 2.000e-3 s"), "{said}");
 }
