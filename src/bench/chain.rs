@@ -1,4 +1,4 @@
-//! The chain as a graph, and its packets through the ground segment, with queues watched.
+//! Runs the chain, and its packets through the ground segment, as graphs whose queues are sampled.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -20,9 +20,9 @@ use crate::pipeline::{SampleCounts, sample_stages};
 use crate::runtime::{Cancel, Flow, Graph, Metrics, Outlet, Report, Sink, Source, StageProgress, Units};
 use crate::sky::SkyMap;
 
-/// Time between two looks at the queues.
+/// Interval at which queue depths are sampled.
 const LOOK_EVERY: Duration = Duration::from_millis(5);
-/// Looks that are kept.
+/// Maximum number of samples kept.
 const LOOKS_MAX: usize = 512;
 
 /// One run of a chain of stages.
@@ -30,24 +30,24 @@ const LOOKS_MAX: usize = 512;
 pub struct ChainRun {
     /// Shares of time, latencies since the source, rates.
     pub report: Report,
-    /// When queues were looked at, s since the start.
+    /// Times at which queue depths were sampled, s since the start.
     pub times_s: Vec<f64>,
-    /// The queue before each stage but the source.
+    /// The queue before each stage except the source.
     pub queues: Vec<QueueDepths>,
 }
 
-/// Items in the queue before a stage, as time went on: a value each time that was looked.
+/// Depth of the queue before a stage, in items, over time.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct QueueDepths {
-    /// Stage.
+    /// Name of the stage.
     pub stage: String,
-    /// Exceeded nine times of ten.
+    /// 10 % quantile.
     pub p10: u64,
     /// Median.
     pub p50: u64,
-    /// Exceeded one time of ten.
+    /// 90 % quantile.
     pub p90: u64,
-    /// All of them.
+    /// All samples.
     pub series: Vec<u64>,
 }
 
@@ -70,7 +70,7 @@ pub(super) fn run(plan: &Plan, skies: &[SkyMap]) -> Result<ChainRun, PipelineErr
 /// Runs packets through the ground segment, up to the sums.
 pub(super) fn run_ground(config: &Config, packets: &[Vec<u8>]) -> Result<ChainRun, PipelineError> {
     let mut graph = Graph::new();
-    // Taken from the end.
+    // The source pops from the end.
     let packets = Packets(packets.iter().rev().cloned().collect());
     let bytes = graph.source("packets", config.runtime.queue_capacity, packets);
     let sums = add_sums(&mut graph, bytes, config, &GroundOutcome::default(), WAIT_BYTES)?;
@@ -78,7 +78,7 @@ pub(super) fn run_ground(config: &Config, packets: &[Vec<u8>]) -> Result<ChainRu
     watched(graph, config.runtime.shutdown_s)
 }
 
-/// Runs a chain, and looks at its queues while it runs.
+/// Runs a graph, and samples its queue depths while it runs.
 fn watched(graph: Graph, shutdown_s: f64) -> Result<ChainRun, PipelineError> {
     let (metrics, done) = (graph.metrics(), AtomicBool::new(false));
     let since = Instant::now();
@@ -111,26 +111,26 @@ fn watched(graph: Graph, shutdown_s: f64) -> Result<ChainRun, PipelineError> {
     Ok(ChainRun { queues: queues.collect(), times_s: looks.times_s, report })
 }
 
-/// Looks at all queues.
+/// Samples of all queue depths.
 #[derive(Default)]
 struct Looks {
-    /// Ticks from one look to the next.
+    /// Number of intervals from one sample to the next.
     step: usize,
     times_s: Vec<f64>,
-    /// By look and stage, but for the source.
+    /// By sample, then by stage except the source.
     depths: Vec<Vec<u64>>,
 }
 
 impl Looks {
     fn add(&mut self, time_s: f64, metrics: &Metrics) {
         let stages = metrics.snapshot();
-        // The chain is in order, so that a queue holds what one stage gave and the next did not take. Counters move while
-        // they are read.
+        // Stages are in chain order, so a queue holds what one stage has emitted and the next has not received. The counters
+        // change while they are read.
         let depth = |pair: &[StageProgress]| pair[0].items_out.saturating_sub(pair[1].items_in);
         self.times_s.push(time_s);
         self.depths.push(stages.windows(2).map(depth).collect());
         if self.times_s.len() >= LOOKS_MAX {
-            // Every other one, so that a long run fits as well.
+            // Keep every other sample, so that a long run fits.
             let mut keep = (0..LOOKS_MAX).map(|k| k % 2 == 0);
             self.times_s.retain(|_| keep.next().unwrap_or(false));
             let mut keep = (0..LOOKS_MAX).map(|k| k % 2 == 0);
@@ -140,7 +140,7 @@ impl Looks {
     }
 }
 
-/// Gives packets that are in memory.
+/// A source of packets from memory.
 struct Packets(Vec<Vec<u8>>);
 
 impl Source for Packets {
@@ -154,7 +154,7 @@ impl Source for Packets {
     }
 }
 
-/// Forgets sums.
+/// A sink that drops sums.
 struct Drop;
 
 impl Sink for Drop {
@@ -166,7 +166,7 @@ impl Sink for Drop {
     }
 }
 
-/// Counts visibilities and forgets them.
+/// A sink that counts visibilities and drops them.
 struct Forget(u64);
 
 impl Sink for Forget {

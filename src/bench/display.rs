@@ -1,8 +1,8 @@
-//! What was measured, as text.
+//! The results of a benchmark as text.
 
 use std::fmt;
 
-use super::{Bench, ChainRun, Machine};
+use super::{Bench, ChainRun, Machine, QueueDepths};
 
 impl fmt::Display for Bench {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -13,39 +13,15 @@ impl fmt::Display for Bench {
             "{:.1} s of {} channels x {} daughters, {} bits, blocks of {}, {} sky pixels\n",
             self.mission_s, self.channels, self.daughters, self.bits, self.block_samples, self.sky_pixels
         )?;
-        writeln!(
-            f,
-            "{:<10} {:>11} {:>23} {:>15} {:>12} {:>16} {:>20}",
-            "stage",
-            "samples/s",
-            "slowest .. fastest",
-            "visibilities/s",
-            "bytes/s",
-            "times real time",
-            "core s / mission s"
-        )?;
-        for rate in &self.rates {
-            let [slow, fast] = rate.samples_per_s_range;
-            let range = format!("{slow:.2e} .. {fast:.2e}");
-            writeln!(
-                f,
-                "{:<10} {:>11.3e} {range:>23} {:>15.3e} {:>12.3e} {:>16.1} {:>20}",
-                rate.stage,
-                rate.samples_per_s,
-                rate.visibilities_per_s,
-                rate.bytes_per_s,
-                rate.times_real_time,
-                core_seconds(rate.core_s_per_mission_s)
-            )?;
-        }
+        self.write_rates(f)?;
         if let Some(chain) = &self.chain {
-            writeln!(f, "\nThe chain's last run; \"since source\" is from sample to what the stage made")?;
+            writeln!(f, "\nLast run of the chain; \"since source\" is from sample to the stage's output")?;
             write_run(f, chain)?;
         }
         if let Some(ground) = &self.ground {
             writeln!(
                 f,
-                "\nIts packets on the ground; \"since source\" is from packet to what the stage made"
+                "\nIts packets through the ground segment; \"since source\" is from packet to the stage's output"
             )?;
             write_run(f, ground)?;
         }
@@ -60,35 +36,72 @@ impl fmt::Display for Bench {
 }
 
 impl Bench {
+    fn write_rates(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let columns = [
+            ("stage     ", 10),
+            ("samples/s", 11),
+            ("slowest .. fastest", 23),
+            ("visibilities/s", 15),
+            ("bytes/s", 12),
+            ("times real time", 16),
+            ("core s / mission s", 20),
+        ];
+        let rows = self.rates.iter().map(|rate| {
+            [
+                format!("{:<10}", rate.stage),
+                format!("{:.3e}", rate.samples_per_s),
+                range(rate.samples_per_s_range),
+                format!("{:.3e}", rate.visibilities_per_s),
+                format!("{:.3e}", rate.bytes_per_s),
+                format!("{:.1}", rate.times_real_time),
+                core_seconds(rate.core_s_per_mission_s),
+            ]
+        });
+        write_table(f, columns, rows)
+    }
+
     fn write_growth(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "\nThe chain at other sizes; real time is that of the size")?;
-        writeln!(
-            f,
-            "{:>8} {:>9} {:>6} {:>11} {:>23} {:>16} {:>20}",
-            "channels",
-            "daughters",
-            "block",
-            "samples/s",
-            "slowest .. fastest",
-            "times real time",
-            "core s / mission s"
-        )?;
-        for row in &self.growth {
-            let [slow, fast] = row.samples_per_s_range;
-            let range = format!("{slow:.2e} .. {fast:.2e}");
-            writeln!(
-                f,
-                "{:>8} {:>9} {:>6} {:>11.3e} {range:>23} {:>16.1} {:>20}",
-                row.channels,
-                row.daughters,
-                row.block_samples,
-                row.samples_per_s,
-                row.times_real_time,
-                core_seconds(row.core_s_per_mission_s)
-            )?;
-        }
-        Ok(())
+        let columns = [
+            ("channels", 8),
+            ("daughters", 9),
+            ("block", 6),
+            ("samples/s", 11),
+            ("slowest .. fastest", 23),
+            ("times real time", 16),
+            ("core s / mission s", 20),
+        ];
+        let rows = self.growth.iter().map(|row| {
+            [
+                row.channels.to_string(),
+                row.daughters.to_string(),
+                row.block_samples.to_string(),
+                format!("{:.3e}", row.samples_per_s),
+                range(row.samples_per_s_range),
+                format!("{:.1}", row.times_real_time),
+                core_seconds(row.core_s_per_mission_s),
+            ]
+        });
+        write_table(f, columns, rows)
     }
+}
+
+/// Writes a table with right-aligned columns of the given titles and widths.
+fn write_table<const N: usize>(
+    f: &mut fmt::Formatter<'_>,
+    columns: [(&str, usize); N],
+    rows: impl Iterator<Item = [String; N]>,
+) -> fmt::Result {
+    let header = columns.map(|(title, _)| title.to_owned());
+    for row in std::iter::once(header).chain(rows) {
+        let cells = row.iter().zip(columns).map(|(cell, (_, width))| format!("{cell:>width$}"));
+        writeln!(f, "{}", cells.collect::<Vec<_>>().join(" "))?;
+    }
+    Ok(())
+}
+
+fn range([slow, fast]: [f64; 2]) -> String {
+    format!("{slow:.2e} .. {fast:.2e}")
 }
 
 fn core_seconds(value: Option<f64>) -> String {
@@ -97,9 +110,7 @@ fn core_seconds(value: Option<f64>) -> String {
 
 fn write_run(f: &mut fmt::Formatter<'_>, run: &ChainRun) -> fmt::Result {
     writeln!(f, "{}", run.report)?;
-    let depths = |queue: &crate::bench::QueueDepths| {
-        format!("{} {}/{}/{}", queue.stage, queue.p10, queue.p50, queue.p90)
-    };
+    let depths = |queue: &QueueDepths| format!("{} {}/{}/{}", queue.stage, queue.p10, queue.p50, queue.p90);
     let queues: Vec<String> = run.queues.iter().map(depths).collect();
-    writeln!(f, "queued over {} looks, p10/p50/p90: {}", run.times_s.len(), queues.join(", "))
+    writeln!(f, "queue depths, p10/p50/p90 of {} samples: {}", run.times_s.len(), queues.join(", "))
 }

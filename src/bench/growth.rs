@@ -15,31 +15,31 @@ pub struct GrowthRow {
     pub channels: usize,
     /// Number of daughters.
     pub daughters: usize,
-    /// Samples of a block.
+    /// Samples per block.
     pub block_samples: usize,
-    /// Complex samples a second, median over runs.
+    /// Complex samples per second, median over runs.
     pub samples_per_s: f64,
-    /// The slowest run and the fastest.
+    /// Rates of the slowest and of the fastest run.
     pub samples_per_s_range: [f64; 2],
-    /// Seconds of the mission in one second, at this size.
+    /// Rate relative to real time at this size.
     pub times_real_time: f64,
-    /// Seconds of processor time for one second of the mission at this size, median over runs.
+    /// Processor time per second of mission time at this size, s, median over runs.
     pub core_s_per_mission_s: Option<f64>,
 }
 
-/// Numbers of daughters that are tried.
+/// Numbers of daughters to run with.
 const DAUGHTERS: [usize; 3] = [4, 8, 16];
-/// Blocks that are tried, samples.
+/// Block sizes to run with, samples.
 const BLOCKS: [usize; 4] = [256, 1024, 4096, 16_384];
 
-/// Runs of the chain with a third, two thirds and all of the channels, and with other daughters and blocks.
+/// Runs the chain with a third, two thirds and all of the channels, and with other numbers of daughters and block sizes.
 pub(super) fn rows(plan: &Plan, skies: &[SkyMap], runs: usize) -> Result<Vec<GrowthRow>, PipelineError> {
     let all = plan.config.spacecraft.channels_hz.len();
     let mut rows = Vec::new();
     for channels in [all.div_ceil(3), (2 * all).div_ceil(3), all] {
         let mut config = plan.config.clone();
         config.spacecraft.channels_hz.truncate(channels);
-        // Files and priors are given channel by channel; the chain needs none of them.
+        // Lists of files and priors may now be longer than the channels; the chain uses neither.
         rows.push(row(config, plan, &skies[..channels], runs)?);
     }
     for daughters in DAUGHTERS {
@@ -56,24 +56,24 @@ pub(super) fn rows(plan: &Plan, skies: &[SkyMap], runs: usize) -> Result<Vec<Gro
 }
 
 fn row(config: Config, plan: &Plan, skies: &[SkyMap], runs: usize) -> Result<GrowthRow, PipelineError> {
-    let own = Plan::new(config)?;
-    let windows = own.windows.iter().take(plan.windows.len()).copied().collect();
-    let own = Plan { windows, ..own };
-    let mission_s = seconds_of(&own);
+    let sized = Plan::new(config)?;
+    let windows = sized.windows.iter().take(plan.windows.len()).copied().collect();
+    let sized = Plan { windows, ..sized };
+    let mission_s = seconds_of(&sized);
     let (mut rates, mut core_seconds) = (Vec::new(), Vec::new());
     for _ in 0..runs.max(1) {
-        let (spent, run) = timed(|| chain::run(&own, skies));
+        let (spent, run) = timed(|| chain::run(&sized, skies));
         let samples = run?.report.stage("sample").map_or(0, |stage| stage.units);
         rates.push(samples as f64 / spent.seconds);
         core_seconds.extend(spent.core_seconds);
     }
     let samples_per_s = median(&mut rates);
-    let (channels, daughters) = (own.instrument.channels.len(), own.array.satellites());
-    let width_hz = own.instrument.channels.first().map_or(1.0, |channel| channel.width_hz);
+    let (channels, daughters) = (sized.instrument.channels.len(), sized.array.satellites());
+    let width_hz = sized.instrument.channels.first().map_or(1.0, |channel| channel.width_hz);
     Ok(GrowthRow {
         channels,
         daughters,
-        block_samples: own.config.daughters.block_samples,
+        block_samples: sized.config.daughters.block_samples,
         samples_per_s,
         samples_per_s_range: [rates[0], rates[rates.len() - 1]],
         times_real_time: samples_per_s / ((channels * daughters) as f64 * width_hz),

@@ -1,4 +1,7 @@
-//! How fast the stages of sample fidelity are, each alone and all in a chain.
+//! Speed of the stages of sample fidelity, each alone and all in a chain: the library behind `lunarray bench`.
+//!
+//! Every stage is fed from memory with the output of the stage before it, so that each is measured alone; `chain` runs
+//! them all with their queues, `growth` repeats that at other sizes. May use every folder but [`crate::cli`].
 
 mod chain;
 mod display;
@@ -25,53 +28,53 @@ use crate::sky::SkyMap;
 pub use chain::{ChainRun, QueueDepths};
 pub use growth::GrowthRow;
 
-/// Stages that can be measured alone, and the chain of them.
+/// The stages that can be measured alone, and the chain.
 pub const BENCH_STAGES: [&str; 6] = ["sample", "link", "correlate", "transmit", "receive", "chain"];
 
-/// Samples a second of the design: eight daughters, 30 channels of 8 kHz.
+/// Samples per second of the design: eight daughters, 30 channels of 8 kHz.
 const DESIGN_SAMPLES_PER_S: f64 = 8.0 * 30.0 * 8000.0;
 
-/// What is measured.
+/// What to measure.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BenchSettings {
     /// One of [`BENCH_STAGES`]; `None` for all.
     pub stage: Option<String>,
-    /// Runs of each.
+    /// Number of runs of each stage.
     pub runs: usize,
-    /// Whether the chain is also run with other numbers of channels and daughters, and other blocks.
+    /// Whether to run the chain also with other numbers of channels and daughters, and other block sizes.
     pub growth: bool,
 }
 
 /// The rate of one stage over several runs.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Rate {
-    /// Stage.
+    /// Name of the stage.
     pub stage: &'static str,
-    /// Complex samples a second, median over runs.
+    /// Complex samples per second, median over runs.
     pub samples_per_s: f64,
-    /// The slowest run and the fastest.
+    /// Rates of the slowest and of the fastest run.
     pub samples_per_s_range: [f64; 2],
-    /// Visibilities a second that the stage makes or passes; 0 if none.
+    /// Visibilities per second that the stage makes or passes; 0 if none.
     pub visibilities_per_s: f64,
-    /// Bytes a second that the stage passes: samples on the links, packets on the downlink.
+    /// Bytes per second that the stage passes: samples on the links, packets on the downlink.
     pub bytes_per_s: f64,
-    /// Median rate over that of eight daughters with 30 channels of 8 kHz.
+    /// Median rate relative to that of eight daughters with 30 channels of 8 kHz.
     pub times_real_time: f64,
-    /// Seconds of processor time for one second of the mission, median over runs: what does not depend on who else works
-    /// on the machine. `None` where the system does not tell.
+    /// Processor time per second of mission time, s, median over runs; it hardly depends on the other load of the machine.
+    /// `None` where the system does not report it.
     pub core_s_per_mission_s: Option<f64>,
 }
 
 /// The machine.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Machine {
-    /// Processor, as the system names it.
+    /// Name of the processor as reported by the system.
     pub processor: String,
-    /// Worker threads.
+    /// Number of worker threads.
     pub threads: usize,
 }
 
-/// All that was measured.
+/// The results of a benchmark.
 #[derive(Clone, Debug, Serialize)]
 pub struct Bench {
     /// The machine.
@@ -82,25 +85,25 @@ pub struct Bench {
     pub channels: usize,
     /// Number of daughters.
     pub daughters: usize,
-    /// Bits of a part of a sample.
+    /// Bits per real or imaginary part.
     pub bits: u32,
-    /// Samples of a block.
+    /// Samples per block.
     pub block_samples: usize,
-    /// Pixels of the sky, all summed for each prediction.
+    /// Pixels of the sky; each prediction sums over all of them.
     pub sky_pixels: usize,
-    /// Stage by stage.
+    /// Rates by stage.
     pub rates: Vec<Rate>,
-    /// The last run of the chain: shares of time, latencies since sampling, queues.
+    /// The last run of the chain: shares of time, latencies since sampling, queue depths.
     pub chain: Option<ChainRun>,
-    /// The last run of its packets through the ground segment, up to the sums: latencies since the packet.
+    /// Its packets through the ground segment, up to the sums: latencies since the packet.
     pub ground: Option<ChainRun>,
-    /// The stage that worked most of the chain's time.
+    /// The stage with the longest working time in the chain.
     pub saturates_first: Option<String>,
-    /// The chain at other sizes; empty unless asked for.
+    /// The chain at other sizes; empty unless requested.
     pub growth: Vec<GrowthRow>,
 }
 
-/// The pipeline that is measured when none is named: the design's 30 channels, 8 bits, a small sky.
+/// The default pipeline: the design's 30 channels, 8 bits, a small sky.
 #[must_use]
 pub fn bench_config() -> Config {
     let mut config = Config { name: "bench".to_owned(), ..Config::default() };
@@ -112,7 +115,7 @@ pub fn bench_config() -> Config {
     config
 }
 
-/// Everything that is made of one window, kept so that each stage can be fed alone.
+/// The outputs of all stages for one window, from which each stage is fed alone.
 struct Material {
     samples: Vec<SpaceFrame>,
     visibilities: Vec<GroundFrame>,
@@ -123,10 +126,10 @@ struct Material {
     sample_bytes: f64,
 }
 
-/// Measures a plan's first window in sample fidelity; what waits between stages is kept in memory.
+/// Measures the first window of a plan in sample fidelity, with the data between stages in memory.
 ///
 /// # Errors
-/// A sky or downlink that cannot be; a chain that fails.
+/// An invalid sky or downlink; a chain that fails.
 pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineError> {
     let plan = Plan { windows: plan.windows.iter().take(1).copied().collect(), ..plan.clone() };
     let skies = space_segment::skies(&plan)?;
@@ -187,11 +190,11 @@ fn median(values: &mut [f64]) -> f64 {
     values[values.len() / 2]
 }
 
-/// Processor time of all threads of this process, s, to a hundredth. Linux counts it in ticks of 10 ms for programs to
-/// read, whatever its own clock (proc(5), fields 14 and 15 of stat).
+/// Processor time of all threads of this process, s. Linux reports it in ticks of 10 ms (proc(5), fields 14 and 15 of
+/// stat).
 fn core_seconds_used() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/self/stat").ok()?;
-    // The name, in parentheses, may hold spaces.
+    // The name, in parentheses, may contain spaces.
     let mut fields = text.rsplit_once(')')?.1.split_whitespace().skip(11);
     let mut ticks = || fields.next()?.parse::<f64>().ok();
     Some((ticks()? + ticks()?) / 100.0)
@@ -247,7 +250,7 @@ fn samples_of(frames: &[SpaceFrame]) -> impl Iterator<Item = &Samples> {
     blocks.map(|block| &block.samples)
 }
 
-/// What one run of a stage alone takes.
+/// Runs one stage alone and measures the time.
 fn time_stage(
     plan: &Plan,
     skies: &[SkyMap],
@@ -256,7 +259,7 @@ fn time_stage(
 ) -> Result<Spent, PipelineError> {
     let (sampler, link, correlator) =
         sample_stages(plan, models::build(plan, skies)?, &SampleCounts::default());
-    // Input is copied before the clock starts, and output dropped after it has stopped.
+    // Input is copied before the clock starts, and output is dropped after it stops.
     Ok(match name {
         "sample" => {
             let (spent, sampled) = timed(|| source(sampler));
@@ -287,10 +290,10 @@ fn time_stage(
     })
 }
 
-/// Time that some work took.
+/// Time spent on a piece of work.
 struct Spent {
     seconds: f64,
-    /// Processor time of the whole process, s; `None` where the system does not tell.
+    /// Processor time of the whole process, s; `None` where the system does not report it.
     core_seconds: Option<f64>,
 }
 
@@ -324,7 +327,7 @@ impl Material {
     }
 }
 
-/// The processor's name where the system tells it.
+/// Name of the processor, or else its architecture.
 fn processor() -> String {
     let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let named = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));

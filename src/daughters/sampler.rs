@@ -10,7 +10,7 @@ use super::covariance::{CovarianceRequest, Covariances, Epochs, Tables};
 use super::disturbances::BlockTones;
 use super::quantiser::Quantiser;
 use super::repair::Repairs;
-use super::synthesis::{Draft, DrawKey, Planes, Response, SampleSynthesis};
+use super::synthesis::{Draft, DrawKey, Planes, Response, SampleSlot, SampleSynthesis};
 use crate::array::Array;
 use crate::frames::{Channel, ObservingWindow, SampleBlock, SpaceFrame};
 use crate::response::model::{ModelError, VisibilityModel};
@@ -57,12 +57,12 @@ pub struct Sampler {
     synthesis: SampleSynthesis,
     tables: Tables,
     /// Workspaces that no thread uses at the moment.
-    spare: Mutex<Vec<Workspace>>,
+    spare: Mutex<Vec<ChannelWorkspace>>,
     counts: Arc<Mutex<SamplerCounts>>,
 }
 
 /// Memory for the samples of one channel.
-struct Workspace {
+struct ChannelWorkspace {
     covariances: Covariances,
     draft: Draft,
     planes: Vec<Planes>,
@@ -174,12 +174,12 @@ impl Sampler {
     }
 
     /// A spare workspace or a new one; its contents are undefined, and it returns to `spare` after use.
-    fn workspace(&self) -> Workspace {
+    fn workspace(&self) -> ChannelWorkspace {
         let spare = self.spare.lock().unwrap_or_else(PoisonError::into_inner).pop();
         spare.unwrap_or_else(|| {
             let (daughters, samples) = (self.scene.array.satellites(), self.config.block_samples);
             let planes = || [vec![0.0; samples], vec![0.0; samples]];
-            Workspace {
+            ChannelWorkspace {
                 covariances: Covariances::default(),
                 draft: self.synthesis.draft(daughters),
                 planes: std::iter::repeat_with(planes).take(daughters).collect(),
@@ -243,16 +243,16 @@ impl ChannelWork<'_> {
             tables: &sampler.tables,
         };
         let mut workspace = sampler.workspace();
-        let Workspace { covariances, draft, planes } = &mut workspace;
+        let ChannelWorkspace { covariances, draft, planes } = &mut workspace;
         covariances.predict(model, &request)?;
         let daughters = quantisers.len();
         let block_samples = sampler.config.block_samples;
         // The epoch before the first sample contributes its second half only.
-        let mut repairs = self.draw(covariances, 0, draft, (planes, 0));
+        let mut repairs = self.draw(covariances, 0, draft, SampleSlot { planes, first: 0 });
         let mut blocks = Vec::with_capacity(self.samples.div_ceil(block_samples) * daughters);
         for hop in 0..self.samples / HOP {
             let at = hop * HOP % block_samples;
-            repairs.add(self.draw(covariances, hop + 1, draft, (planes, at)));
+            repairs.add(self.draw(covariances, hop + 1, draft, SampleSlot { planes, first: at }));
             let (length, made) = (at + HOP, (hop + 1) * HOP);
             if length == block_samples || made == self.samples {
                 for (daughter, ([re, im], quantiser)) in planes.iter_mut().zip(&mut *quantisers).enumerate() {
@@ -270,7 +270,7 @@ impl ChannelWork<'_> {
         covariances: &Covariances,
         epoch: usize,
         draft: &mut Draft,
-        planes: (&mut [Planes], usize),
+        out: SampleSlot<'_>,
     ) -> Repairs {
         let Sampler { scene, config, synthesis, .. } = self.sampler;
         let time = self.sampler.time(self.window.start, self.first + epoch * HOP);
@@ -282,7 +282,7 @@ impl ChannelWork<'_> {
         } else {
             Vec::new()
         };
-        synthesis.draw(covariances, (epoch, key), &responses, draft, planes)
+        synthesis.draw(covariances, epoch, key, &responses, draft, out)
     }
 
     /// The block of one daughter that ends `made` samples into the chunk.

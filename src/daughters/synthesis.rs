@@ -50,6 +50,14 @@ pub struct Response {
 /// Samples of one daughter: real parts, imaginary parts.
 pub type Planes = [Vec<f32>; 2];
 
+/// Where samples of all daughters are written.
+pub struct SampleSlot<'a> {
+    /// Planes by daughter.
+    pub planes: &'a mut [Planes],
+    /// Index of the first sample.
+    pub first: usize,
+}
+
 /// Memory for the samples of all daughters, and the overlap from one epoch to the next.
 pub struct Draft {
     daughters: usize,
@@ -110,17 +118,17 @@ impl SampleSynthesis {
         }
     }
 
-    /// Draws the segment of an epoch, and writes the `HOP` samples before the epoch (sqrt(K sr)) into the planes of each
-    /// daughter, starting at `first`.
+    /// Draws the segment of an epoch, and writes the `HOP` samples before the epoch (sqrt(K sr)) to `out`.
     ///
     /// `responses` is empty, or has one response per daughter.
     pub fn draw(
         &self,
         covariances: &Covariances,
-        (epoch, key): (usize, DrawKey),
+        epoch: usize,
+        key: DrawKey,
         responses: &[Response],
         draft: &mut Draft,
-        (planes, first): (&mut [Planes], usize),
+        out: SampleSlot<'_>,
     ) -> Repairs {
         let mut rng =
             random_stream(key.seed, StreamKind::Samples, [u64::from(key.channel), key.ticks.cast_unsigned()]);
@@ -141,6 +149,7 @@ impl SampleSynthesis {
         }
         self.fft.process_with_scratch(&mut draft.spectra, &mut draft.scratch);
         let segments = draft.spectra.as_chunks::<BINS>().0.iter().zip(&mut draft.tails);
+        let SampleSlot { planes, first } = out;
         for ((segment, tail), [re, im]) in segments.zip(planes) {
             blend(segment, &self.window, tail, [&mut re[first..], &mut im[first..]]);
         }

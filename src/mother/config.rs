@@ -164,17 +164,17 @@ impl Default for SpacecraftConfig {
     }
 }
 
-/// Integrations that are shorter than the shortest sum of the correlator.
+/// Integrations that are shorter than a dump of the correlator.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[error(
-    "spacecraft.motion_wavelengths_max and spacecraft.integration_s_max leave integrations of {shortest_s:.3e} s, but \
-     the correlator sums {dump_s:.3e} s at once: expected longer ones, or baselines kept short by \
-     spacecraft.baseline_wavelengths_max"
+    "spacecraft.motion_wavelengths_max and spacecraft.integration_s_max give integrations of {shortest_s:.3e} s, shorter \
+     than the correlator's dumps of {dump_s:.3e} s: expected longer integrations, or shorter baselines \
+     (spacecraft.baseline_wavelengths_max)"
 )]
 pub struct IntegrationTooShort {
     /// The shortest integration, s.
     pub shortest_s: f64,
-    /// The shortest sum, s.
+    /// Length of a dump, s.
     pub dump_s: f64,
 }
 
@@ -205,7 +205,7 @@ impl SpacecraftConfig {
         self.channels_hz.iter().enumerate().map(schedule).collect()
     }
 
-    /// Integrations of samples in an array that are shorter than one sum of the correlator.
+    /// Sample fidelity only: integrations of this array that are shorter than a dump of the correlator.
     #[must_use]
     pub fn dump_problem(&self, array: &Array) -> Option<IntegrationTooShort> {
         let schedules = self.schedules();
@@ -230,7 +230,7 @@ impl SpacecraftConfig {
         Division { sub_bands: self.sub_bands.max(1), delay_centre }
     }
 
-    /// Checks channels, and lists by channel.
+    /// Checks the channels, and the settings with a value per channel.
     fn check_channels(&self, checks: &mut Checks) {
         let channels = self.channels_hz.len();
         let count = format!("({channels} channels)");
@@ -279,7 +279,7 @@ impl SpacecraftConfig {
         }
     }
 
-    /// Checks what is simulated and how, with delays and sub-bands.
+    /// Checks the fidelity, and the model, delays and sub-bands that it allows.
     fn check_fidelity(&self, checks: &mut Checks) {
         let samples = self.fidelity == Fidelity::Samples;
         let direct = self.model != ModelChoice::Harmonic && !self.smear_integrations && !self.smear_bandwidth;
@@ -316,7 +316,7 @@ impl SpacecraftConfig {
         checks.require("thermal_noise", false, noisy, "true with fidelity = \"samples\": samples are noise");
     }
 
-    /// The rule of the adaptive integration.
+    /// The rule for adaptive integration times.
     #[must_use]
     pub fn rule(&self) -> IntegrationRule {
         IntegrationRule {
@@ -325,7 +325,7 @@ impl SpacecraftConfig {
         }
     }
 
-    /// Everything that is wrong with the configuration; empty if it is good.
+    /// All problems of the section; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("spacecraft");
@@ -346,7 +346,7 @@ impl SpacecraftConfig {
             "seconds, above 0 and at most 1e9",
         );
         let window = self.window_s_max;
-        checks.number("window_s_max", window, window >= 0.0, "seconds, or 0 for all of a window");
+        checks.number("window_s_max", window, window >= 0.0, "seconds, or 0 for whole windows");
         let width = self.channel_width_hz;
         checks.number("channel_width_hz", width, width > 0.0 && width <= 1e6, "above 0 Hz and at most 1 MHz");
         let moving = self.fidelity == Fidelity::Visibilities || width >= SAMPLES_WIDTH_HZ_MIN;
@@ -380,7 +380,7 @@ impl SpacecraftConfig {
             checks.number("baseline_wavelengths_max", limit, limit >= 0.0, "wavelengths, or 0 for no limit");
         }
         let epoch = self.epoch_tai_s;
-        // Four octets of whole seconds are what the time code holds.
+        // The time code holds four octets of whole seconds.
         checks.number("epoch_tai_s", epoch, (0.0..=3.0e9).contains(&epoch), "0 to 3e9 s");
     }
 }

@@ -1,9 +1,9 @@
-//! `lunarray bench`: every stage is measured, in units that fit each other, on a machine that is named.
+//! `lunarray bench`: every stage is measured in consistent units, on a named machine.
 
 use assert_cmd::Command;
 use serde_json::Value;
 
-/// Two channels for 125 hops of 64 samples and a bit more, which is left out.
+/// Two channels for 125 hops of 64 samples, and a remainder that is not sampled.
 const PIPELINE: &str = r#"
 name = "bench"
 sky.nside = 4
@@ -32,16 +32,16 @@ fn json(more: &[&str]) -> Value {
 }
 
 fn number(value: &Value) -> f64 {
-    value.as_f64().unwrap_or_else(|| panic!("{value} is no number"))
+    value.as_f64().unwrap_or_else(|| panic!("{value} is not a number"))
 }
 
 fn close(found: f64, expected: f64) -> bool {
-    // Quotients of the same numbers, written with all their digits.
+    // Quotients of the same numbers, printed with all digits.
     (found / expected - 1.0).abs() < 1e-9
 }
 
 #[test]
-fn every_stage_is_measured_in_units_that_fit_each_other() {
+fn every_stage_is_measured_in_consistent_units() {
     let found = json(&["--runs", "3"]);
     assert!(!found["machine"]["processor"].as_str().unwrap().is_empty());
     assert!(number(&found["machine"]["threads"]) >= 1.0);
@@ -68,8 +68,8 @@ fn every_stage_is_measured_in_units_that_fit_each_other() {
             _ => assert!(bytes_a_sample > 0.0, "{rate}"),
         }
         if let Some(core_s) = rate["core_s_per_mission_s"].as_f64() {
-            // No second has more processor time than there are processors. A dozen threads may each be counted a tick of
-            // 10 ms too much.
+            // Processor time is at most elapsed time times the number of processors. A dozen threads may each be counted a
+            // tick of 10 ms too much.
             let processors = std::thread::available_parallelism().unwrap().get() as f64;
             let longest_s = 2.0 * 8.0 * 8e3 / slow;
             assert!(core_s >= 0.0 && core_s * 1.004 <= longest_s * processors + 0.12, "{rate}");
@@ -89,7 +89,7 @@ fn every_stage_is_measured_in_units_that_fit_each_other() {
 }
 
 #[test]
-fn one_stage_is_measured_alone_and_others_are_refused() {
+fn one_stage_is_measured_alone_and_unknown_ones_are_refused() {
     let found = json(&["--runs", "1", "--stage", "link"]);
     assert_eq!(found["rates"].as_array().unwrap().len(), 1);
     assert_eq!(found["rates"][0]["stage"], "link");

@@ -1,4 +1,4 @@
-//! The commands as a user gives them: answers, and messages for what is wrong.
+//! The commands as a user runs them: their output, and their messages for invalid input.
 
 use crate::common;
 
@@ -12,7 +12,7 @@ fn lunarray() -> Command {
     Command::cargo_bin("lunarray").unwrap()
 }
 
-/// Standard error of a command that has to fail.
+/// Standard error of a command that must fail.
 fn complaint(args: &[&str]) -> String {
     let output = lunarray().args(args).output().unwrap();
     assert!(!output.status.success(), "{args:?} should have failed");
@@ -31,7 +31,7 @@ fn write(folder: &Path, name: &str, text: &str) -> String {
 fn every_command_has_help_that_teaches() {
     for command in [
         "run", "simulate", "replay", "inspect", "compare", "geometry", "predict", "check", "sky", "corrupt",
-        "gaps", "merge",
+        "gaps", "merge", "retract", "bench",
     ] {
         let output = lunarray().args([command, "--help"]).output().unwrap();
         assert!(output.status.success());
@@ -52,7 +52,7 @@ fn geometry_speaks_json() {
     assert_eq!(lines[0]["satellites_m"].as_array().unwrap().len(), 8);
     assert_eq!(lines[0]["pairs"].as_array().unwrap().len(), 28);
     assert_eq!(lines[0]["pairs"][0]["pair"], "1-2");
-    // The formation starts at its widest: R_2 x 100 m of arc, a chord to 1e-8 of it.
+    // The formation starts at its widest: R_2 x 100 m of arc, which the chord equals to 1e-8.
     assert!((lines[0]["pairs"][0]["length_m"].as_f64().unwrap() - 600.0).abs() < 1e-4);
     assert_eq!(lines[1]["t_s"], 12345.6);
 }
@@ -115,8 +115,7 @@ fn predict_agrees_with_independent_values() {
         let number = |of: &Value, key: &str| of[key].as_f64().unwrap();
         let difference =
             (number(&found, "re") - number(value, "re")).hypot(number(&found, "im") - number(value, "im"));
-        // Relative to the sky's whole flux in view, of which a visibility is what fringes leave over:
-        // 49152 roundings of a sum, and positions to 1e-6 m.
+        // Rounding of a sum over 49152 pixels, most of which cancel in the fringes, and positions to 1e-6 m.
         let scale = number(value, "re").hypot(number(value, "im"));
         assert!(difference < 1e-9 * scale, "{difference} of {scale}");
     }

@@ -1,5 +1,5 @@
-//! The whole chain through the command: space and ground apart give what they give together, and
-//! nothing but the seed and the configuration changes a byte.
+//! The whole chain through the command: space and ground segment run separately give the same result as together, and
+//! the output depends on the seed and the configuration alone.
 
 use crate::common;
 
@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use common::workplace::{Workplace, fail, files, succeed};
 use serde_json::Value;
 
-/// A mission of a few minutes of work at most: real geometry, small maps.
+/// A small mission: real geometry, small maps, at most a few minutes of work.
 const SMALL: &str = r#"
 name = "small"
 seed = 7
@@ -43,7 +43,7 @@ fn assert_same(one: &BTreeMap<PathBuf, Vec<u8>>, other: &BTreeMap<PathBuf, Vec<u
 }
 
 #[test]
-fn space_and_ground_apart_give_what_they_give_together() {
+fn space_and_ground_give_the_same_apart_as_together() {
     let place = Workplace::new(SMALL);
     let whole = run(&place, "whole", &[]);
     let downlink = place.simulate("small.ccsds", &[]);
@@ -55,7 +55,7 @@ fn space_and_ground_apart_give_what_they_give_together() {
         files.iter().filter(|(path, _)| path.extension().is_some_and(|e| e == "fits")).count()
     };
     assert!(maps(&ground) >= 4, "a map and a noise map for each of two channels");
-    // The ground does not know the truth, so it leaves fewer pictures; what it leaves is the same.
+    // The ground segment does not know the truth, so it draws fewer pictures; the others are the same.
     for (path, bytes) in &ground {
         if path.extension().is_some_and(|e| e == "fits") {
             assert!(bytes == &whole[path], "{} differs", path.display());
@@ -84,7 +84,7 @@ fn the_seed_changes_the_noise() {
 }
 
 #[test]
-fn the_ledger_closes_and_the_summary_tells() {
+fn the_ledger_closes_and_the_summary_is_complete() {
     let place = Workplace::new(SMALL);
     let out = place.path("out");
     let text = succeed(&["run", &place.pipeline, "--out", &out, "--json"]);
@@ -106,7 +106,7 @@ fn the_ledger_closes_and_the_summary_tells() {
 }
 
 #[test]
-fn a_lost_stretch_is_counted_and_the_rest_is_used() {
+fn a_lost_span_is_counted_and_the_rest_is_used() {
     let place = Workplace::new(SMALL);
     let downlink = place.simulate("small.ccsds", &[]);
     let mut bytes = std::fs::read(&downlink).unwrap();
@@ -123,7 +123,7 @@ fn a_lost_stretch_is_counted_and_the_rest_is_used() {
 }
 
 #[test]
-fn a_channel_without_usable_data_leaves_the_others_alone() {
+fn a_channel_without_usable_data_does_not_affect_others() {
     let place = Workplace::new(SMALL);
     let out = place.path("out");
     // At nside 1, 10 MHz, no baseline is short enough.
@@ -155,7 +155,7 @@ fn files_out_of_order_lose_nothing_but_the_cut_packet() {
     assert_eq!(whole["sampled"], swapped["sampled"]);
     let lost: u64 =
         swapped["lost"].as_array().unwrap().iter().map(|loss| loss["count"].as_u64().unwrap()).sum();
-    // A packet of 8192 bytes holds 21 bytes a visibility.
+    // A packet of 8192 bytes holds visibilities of 21 bytes.
     assert!(lost <= 8192 / 21, "{lost}");
 }
 
@@ -189,13 +189,13 @@ fn an_interrupt_leaves_maps_of_the_data_so_far() {
     let binary = assert_cmd::cargo::cargo_bin("lunarray");
     let mut child = std::process::Command::new(binary)
         .args(["run", &place.pipeline, "--out", &out, "--json"])
-        // Far more than the test waits for.
+        // Far longer than the test runs.
         .args(["--set", "spacecraft.every_nth_window=1", "--set", "sky.nside=64"])
         .stdout(std::process::Stdio::piped())
         .stderr(std::process::Stdio::null())
         .spawn()
         .unwrap();
-    // Until there is more of the downlink than queues hold, so that some of it is in the sums, however busy the machine.
+    // Wait until the downlink has more than the queues hold, so that some of it is in the sums, however busy the machine.
     let (since, partial) = (Instant::now(), Path::new(&out).join("downlink.ccsds.partial"));
     while std::fs::metadata(&partial).map_or(0, |found| found.len()) < 4 << 20 {
         assert!(since.elapsed() < Duration::from_secs(300), "no four megabytes in five minutes");
@@ -230,7 +230,7 @@ fn a_run_without_a_map_fails_and_says_why() {
         fail(&["check", &place.pipeline, "--set", "spacecraft.duration_s=100"])
             .contains("no observing window")
     );
-    // Weights above the limit: nothing is taken, and the ledger says so.
+    // Weights above the limit: nothing is accumulated, and the ledger says so.
     let refused =
         fail(&[&none[..], &["--set", "map.weight_max=1e-30", "--set", "map.snapshot_every_s=0"]].concat());
     assert!(refused.contains("no pair's visibility could be used"), "{refused}");
@@ -238,7 +238,7 @@ fn a_run_without_a_map_fails_and_says_why() {
 }
 
 #[test]
-fn a_used_folder_holds_the_products_of_its_last_run_alone() {
+fn a_reused_folder_holds_only_the_products_of_its_last_run() {
     let place = Workplace::new(SMALL);
     run(&place, "used", &NO_PICTURES);
     let own = place.file("used/3.000MHz/notes.txt", b"mine");
@@ -252,11 +252,11 @@ fn a_used_folder_holds_the_products_of_its_last_run_alone() {
 }
 
 #[test]
-fn the_sky_command_gives_the_sky_of_a_run() {
+fn the_sky_command_writes_the_sky_of_a_run() {
     let place = Workplace::new(SMALL);
     let sky = place.path("sky.fits");
     succeed(&["sky", &place.pipeline, "--freq-hz", "3e6", "--nside", "8", "--no-picture", "--out", &sky]);
-    // A run draws its sky at sky.nside and averages; here it is drawn at once.
+    // A run generates its sky at sky.nside and averages; the command generates it directly.
     let found = run(&place, "out", &[&NO_PICTURES[..], &["--set", "sky.nside=8"]].concat());
     let read = |path: &str| {
         let options = lunarray::sky::fits::ReadOptions::default();

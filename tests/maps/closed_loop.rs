@@ -1,9 +1,9 @@
-//! A known sky comes back: the published ULSA maps and the generated sky, seen by the fiducial array over a precession and solved
-//! for at nside 16.
+//! Closed loop: known skies (the published ULSA maps and the generated sky), observed by the fiducial array over one
+//! precession period and solved for at nside 16.
 //!
-//! No noise is added, so what rho_l lacks is the instrument's and the method's: coverage, regularisation and
-//! the way rows of B are taken over pixels. The sky is used at its own resolution (nside 64, its own pixel
-//! centres), four times as fine as the map, so that small scales have the chance to alias.
+//! There is no noise, so the loss of rho_l is due to instrument and method: coverage, regularisation and
+//! the integration of rows of B over pixels. The sky has its own resolution (nside 64, its own pixel
+//! centres), four times that of the map, so that small scales can alias.
 
 use crate::common;
 
@@ -44,7 +44,7 @@ struct Run {
     count: usize,
 }
 
-/// Integrations of the mother's own lengths, evenly thinned to `VISIBILITIES`, all below `baseline_m_max`.
+/// Integrations of the mother's schedule with baselines below `baseline_m_max`, evenly thinned to `VISIBILITIES`.
 fn observations(array: &Array, frequency_hz: f64, baseline_m_max: f64) -> Vec<Observation> {
     let rule = IntegrationRule::default();
     let mut runs = Vec::new();
@@ -84,7 +84,7 @@ fn observations(array: &Array, frequency_hz: f64, baseline_m_max: f64) -> Vec<Ob
     taken
 }
 
-/// What an engine with rows of one method makes of the observations.
+/// The map from the observations, with rows of one method.
 fn map(
     observed: &[(Observation, Complex64, f64)],
     array: &Array,
@@ -121,7 +121,7 @@ fn map(
     SkyMap::new(Frame::Ecliptic, solution.map_k).unwrap()
 }
 
-/// rho_l of the map that each method makes of an ULSA map.
+/// rho_l of each method's map of an ULSA sky.
 fn correlations<const N: usize>(
     sky: &SkyMap,
     frequency_hz: f64,
@@ -141,7 +141,7 @@ fn correlations<const N: usize>(
         .into_iter()
         .zip(sums)
         .map(|(observation, sum)| {
-            // sigma = T_sys / sqrt(2 dnu dt), the sky dominating T_sys.
+            // sigma = T_sys / sqrt(2 dnu dt); the sky dominates T_sys.
             let weight = 2.0 * CHANNEL_WIDTH_HZ * observation.duration_s
                 / (sum.zero_spacing_k_sr * sum.zero_spacing_k_sr);
             (observation, sum.visibility_k_sr, weight)
@@ -165,32 +165,32 @@ fn generated_sky(frequency_hz: f64) -> SkyMap {
     SkyMap::new(Frame::Ecliptic, values).unwrap()
 }
 
-/// The worst rho_l of a range of degrees.
+/// The lowest rho_l of a range of degrees.
 fn worst(rho: &[f64]) -> f64 {
     rho.iter().fold(1.0_f64, |min, &rho| min.min(rho))
 }
 
 #[test]
-fn the_real_sky_comes_back_at_10_mhz_but_not_with_rows_at_pixel_centres() {
+fn the_real_sky_is_recovered_at_10_mhz_but_not_with_rows_at_pixel_centres() {
     let methods = [PixelMethod::Average, PixelMethod::Centre];
     let Some(sky) = published_sky("sky/ulsa_10mhz_galactic_nside64.fits") else { return };
     let [average, centre] = correlations(&sky, 10e6, 1e-4, methods);
     // The shortest baselines miss degrees below 18 at this frequency (the paper, Sect. 4.2).
     assert!(worst(&average[20..=32]) >= 0.98, "{average:.3?}");
-    // Aliasing: baselines beyond b_p/2 see structure that pixel centres mistake (the paper, Sect. 4.1).
+    // Aliasing: baselines beyond b_p/2 see structure that pixel centres do not sample (the paper, Sect. 4.1).
     let mean = centre[20..=32].iter().sum::<f64>() / 13.0;
     assert!(mean < 0.9, "{mean}");
 }
 
 #[test]
-fn the_real_sky_comes_back_at_3_mhz() {
+fn the_real_sky_is_recovered_at_3_mhz() {
     let Some(sky) = published_sky("sky/ulsa_3mhz_galactic_nside64.fits") else { return };
     let [average] = correlations(&sky, 3e6, 1e-4, [PixelMethod::Average]);
     assert!(worst(&average[5..=32]) >= 0.98, "{average:.3?}");
 }
 
 #[test]
-fn the_generated_sky_comes_back() {
+fn the_generated_sky_is_recovered() {
     for (frequency_hz, degrees) in [(10e6, 20..=32), (3e6, 5..=32)] {
         let sky = generated_sky(frequency_hz);
         let [average] = correlations(&sky, frequency_hz, 1e-4, [PixelMethod::Average]);

@@ -1,4 +1,4 @@
-//! Powers of the daughters by themselves.
+//! Auto-correlations.
 
 use std::f64::consts::PI;
 use std::path::Path;
@@ -20,7 +20,7 @@ fn is_auto(block: &&VisibilityBlock) -> bool {
 }
 
 #[test]
-fn powers_are_those_of_sky_and_receiver_with_their_own_noise() {
+fn auto_correlations_have_the_power_and_noise_of_sky_and_receiver() {
     let mut craft = Spacecraft::new(ArrayConfig::default(), vec![1e6, 5e6], constant(0.2), 16.384);
     craft.receiver_noise_k_sr = 1.0;
     craft.auto_integration_s = 0.5;
@@ -41,7 +41,7 @@ fn powers_are_those_of_sky_and_receiver_with_their_own_noise() {
                 assert!(block.duration_ticks[k] <= 500_000 && block.duration_ticks[k] >= 128_000);
                 let (value, own) = (f64::from(block.value_k_sr[k].re), f64::from(block.weight[k]));
                 assert_eq!(block.value_k_sr[k].im, 0.0);
-                // P^2 / n, with the power that was found.
+                // P^2 / n, with the measured power.
                 let samples = f64::from(block.duration_ticks[k]) * 1e-6 * WIDTH_HZ / bands as f64;
                 assert!(bits == 2 || (own * value * value / samples - 1.0).abs() < 1e-3, "{own}");
                 sum += value * samples;
@@ -52,25 +52,25 @@ fn powers_are_those_of_sky_and_receiver_with_their_own_noise() {
         }
         assert_eq!(count, 43.0 * 16.0 * bands as f64);
         let (mean, error) = (sum / weight, 2.0 / weight.sqrt());
-        // Daughters share 0.1 of their power, so a hundredth of their powers' noise. The level control of two bits
-        // tells powers by its own measure of the first seconds: within 3 % of 2.
+        // Daughters share 0.1 of their power, so 0.01 of the noise of their powers. With two bits, powers are relative to
+        // the level control's estimate of the first seconds: within 3 % of 2.
         let level = if bits == 2 { 0.06 } else { 0.0 };
         assert!((mean - 2.0).abs() < 4.0 * 1.05 * error + level, "{bits} bits, {bands}: {mean} +- {error}");
-        // Two bits have less noise in their power: most samples have one of two levels.
+        // Two bits have less noise in their power, because most samples have one of two levels.
         let chi = squares / count;
         assert!(bits == 2 || (chi - 1.0).abs() < 4.0 * (2.0 / count).sqrt(), "{bands}: {chi}");
     }
 }
 
 #[test]
-fn means_of_powers_are_of_all_samples_alike_however_few_an_integration_has() {
-    // A second in a band of 16 Hz, and every third integration cut to half of that.
+fn means_of_powers_weight_all_samples_equally_however_short_an_integration() {
+    // 1 s in a band of 16 Hz; every third integration is cut to half.
     let (count, mut samples, power_k_sr) = (30_000_u32, 0.0, 3.0);
     let mut rng = random_stream(5, StreamKind::Spectrometer, [0, 0]);
     let mut power = |k: u32| {
         let n = if k.is_multiple_of(3) { 8 } else { 16 };
         samples += f64::from(n);
-        // |x|^2 of a complex Gaussian; its power's noise is told by the power that was found, as the mother does.
+        // |x|^2 of a complex Gaussian; its noise is estimated from the measured power, as the mother does.
         let sum: f64 = (0..n).map(|_| -> f64 { Exp1.sample(&mut rng) }).sum();
         let found_k_sr = power_k_sr * sum / f64::from(n);
         AutoPower {
@@ -87,9 +87,9 @@ fn means_of_powers_are_of_all_samples_alike_however_few_an_integration_has() {
     let [own] = &summaries[..] else { panic!("{summaries:?}") };
     let sigma_k_sr = power_k_sr / samples.sqrt();
     assert!((own.mean_k_sr - power_k_sr).abs() < 4.0 * sigma_k_sr, "{own:?}");
-    // The mean's own error.
+    // Standard error of the mean.
     assert!((own.sigma_k_sr / sigma_k_sr - 1.0).abs() < 4.0 / samples.sqrt(), "{own:?}");
-    // The mean of n such squares has a kurtosis of 3 + 6 / n.
+    // The mean of n such squares has kurtosis 3 + 6 / n.
     let error = ((2.0 + 6.0 / 8.0) / f64::from(count)).sqrt();
     assert!((own.chi_square - 1.0).abs() < 4.0 * error, "{own:?}");
 }
@@ -106,7 +106,7 @@ fn powers_with_missing_blocks_are_flagged_and_weigh_less() {
     let autos: Vec<&VisibilityBlock> = blocks.iter().filter(is_auto).collect();
     assert_eq!(autos.len(), 8);
     for block in autos {
-        // Two blocks an integration; one without any is not told of.
+        // Two blocks per integration; an integration without blocks is omitted.
         let lost = block.pair.i == 3;
         assert_eq!(block.len(), if lost { 7 } else { 8 }, "{}", block.pair);
         for k in 0..block.len() {
@@ -137,7 +137,7 @@ const RECEIVER_K_SR: f64 = 1e6;
 const MAP: [&str; 4] =
     ["map.nside=4", "map.epsilon=1e-2", "map.snapshot_every_s=0.0", "calibration.sub_bands=2"];
 
-/// Samples of a uniform sky with some antennas, in two sub-bands; the power that daughters should have is `expected_k_sr`.
+/// Checks samples of a uniform sky with one antenna, in two sub-bands; the expected power of a daughter is `expected_k_sr`.
 fn check_uniform(folder: &Path, antenna: &str, expected_k_sr: f64) {
     let sky = folder.join("sky.fits");
     let map = SkyMap::new(Frame::Ecliptic, vec![TEMPERATURE_K; 12 * 32 * 32]).unwrap();
@@ -166,8 +166,8 @@ fn check_uniform(folder: &Path, antenna: &str, expected_k_sr: f64) {
         let at = |key: &str| own[key].as_f64().unwrap();
         assert_eq!((at("frequency_hz"), at("width_hz")), (2e6 - 2e3 + 4e3 * (k / 8) as f64, 4e3));
         assert_eq!(at("daughter"), (k % 8 + 1) as f64);
-        // A sky of nside 32 counts the limb's pixels whole: some 100 of 12288, half of them too many or too few at
-        // random, 5 in the mean square.
+        // At nside 32, pixels on the limb count whole: some 100 of 12288, each wrong by half a pixel at random, 5 in the
+        // mean square.
         let (mean, sigma) = (at("mean_k_sr"), at("sigma_k_sr"));
         assert!((mean - expected_k_sr).abs() < 4.0 * sigma + 2e-3 * expected_k_sr, "{own} {expected_k_sr}");
         // 32000 frames of two samples.
@@ -176,9 +176,9 @@ fn check_uniform(folder: &Path, antenna: &str, expected_k_sr: f64) {
     assert!(out.join("autos.png").exists());
     let table_k = table(&out);
     let head = "frequency_hz,width_hz,daughter,time_s,power_k_sr,sigma_k_sr";
-    // Seven blocks an integration, 62.5 in the window.
+    // Seven blocks per integration, 62.5 in the window.
     assert_eq!((table_k.lines().next(), table_k.lines().count()), (Some(head), 1 + 16 * 9));
-    // The ground alone has it from the bytes that came down.
+    // The ground segment alone gets it from the downlink bytes.
     let ground = folder.join("ground");
     let downlink = out.join("downlink.ccsds");
     lunarray(&["replay", downlink.to_str().unwrap()], &ground, &MAP.map(str::to_owned));
@@ -186,13 +186,13 @@ fn check_uniform(folder: &Path, antenna: &str, expected_k_sr: f64) {
 }
 
 #[test]
-fn the_mean_of_a_uniform_sky_comes_down_as_a_table() {
+fn the_mean_of_a_uniform_sky_arrives_as_a_table() {
     let folder = tempfile::tempdir().unwrap();
-    // All but the Moon's cap, of sin a = R / r.
+    // The sphere without the Moon's cap, sin a = R / r.
     let sin = 1737.1_f64 / 2037.1;
     let cos = (1.0 - sin * sin).sqrt();
     check_uniform(folder.path(), "isotropic", TEMPERATURE_K * 2.0 * PI * (1.0 + cos) + RECEIVER_K_SR);
-    // Dipoles across the orbit's plane, at right angles to the Moon: the integral of 1 - sin^2 t cos^2 p.
+    // Dipoles normal to the orbit, perpendicular to the Moon's direction: the integral of 1 - sin^2 t cos^2 p.
     let dipole = PI * ((1.0 + cos) + (1.0 + cos.powi(3)) / 3.0);
     check_uniform(folder.path(), "dipole-normal", TEMPERATURE_K * dipole + RECEIVER_K_SR);
 }

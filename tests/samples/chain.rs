@@ -7,7 +7,7 @@ use lunarray::units::vector::unit;
 use crate::craft::{Spacecraft, frequencies, point};
 
 #[test]
-fn the_same_seed_gives_the_same_samples_whatever_the_threads() {
+fn the_same_seed_gives_the_same_samples_with_any_number_of_threads() {
     let sky = point(unit([1.0, 2.0, 3.0]));
     let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies(5), sky, 6.0);
     craft.receiver_noise_k_sr = 1.0;
@@ -21,10 +21,10 @@ fn the_same_seed_gives_the_same_samples_whatever_the_threads() {
     assert_ne!(first, with(1, 8));
 }
 
-/// A run of the whole chain with a name and settings of its own: map, noise-only map.
+/// Runs the whole chain with a name and settings; returns map and noise-only map.
 fn mapped(folder: &std::path::Path, name: &str, more: &[&str]) -> (Vec<f64>, Vec<f64>) {
-    // Rows at the pixels' centres hold all of a sky that is summed over the same centres: what the sky has between
-    // a map's pixels goes into a map as the (u, v) points have it, and would tell points from others, not noise.
+    // With rows at pixel centres and a sky summed over the same centres the map is complete. Structure between the map's
+    // pixels would enter the map depending on the (u, v) points, and so differ for reasons other than noise.
     const PIPELINE: &str = r#"
         name = "small"
         seed = 3
@@ -83,18 +83,18 @@ fn a_map_of_samples_is_the_map_of_visibilities_within_its_noise() {
         eprintln!(
             "{bands} sub-bands: noise {noise:.3e} and {own:.3e}, difference {difference:.3e}, sky {sky:.3e} K"
         );
-        // Noise of the two, which a regularised map has some 100 degrees of freedom of: 7 % of an rms. On top of it
-        // motion within integrations and the channel's width cost up to 3 % of visibilities of 20 times their noise.
+        // Noise of both maps, with some 100 degrees of freedom after regularisation: 7 % of an rms. In addition, motion
+        // within integrations and the channel's width cost up to 3 % of visibilities of 20 times their noise.
         let ratio = difference / (2.0_f64.sqrt() * noise);
         assert!((0.75..1.35).contains(&ratio), "{bands}: {ratio}");
-        // The noise that the ground draws is one for each sub-band: as large as for whole channels, within 3 times
-        // 10 %, 7 % of each. One for all of them would be twice that where their integrations keep step.
+        // The ground draws independent noise for each sub-band: as large as for whole channels, within 3 times 10 %, from
+        // 7 % of each. Common noise would be twice as large where integrations are in step.
         assert!((0.7..1.3).contains(&(own / noise)), "{bands}: {own} {noise}");
     }
 }
 
 #[test]
-fn the_harmonic_model_is_refused_for_samples_with_the_way_out() {
+fn the_harmonic_model_is_refused_for_samples_with_a_remedy() {
     let folder = tempfile::tempdir().unwrap();
     let pipeline = folder.path().join("samples.toml");
     std::fs::write(&pipeline, "name = \"refused\"\n[spacecraft]\nfidelity = \"samples\"\n").unwrap();

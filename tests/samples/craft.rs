@@ -1,4 +1,4 @@
-//! A spacecraft in sample fidelity without a chain around it, skies of which everything is known, and moments.
+//! Shared parts: a spacecraft in sample fidelity without a chain, skies with known visibilities, and moments.
 
 use std::f64::consts::TAU;
 use std::sync::Arc;
@@ -20,7 +20,7 @@ use num_complex::Complex64;
 
 pub const WIDTH_HZ: f64 = 8e3;
 
-/// Any pair but a daughter with itself sees `cross`, and each daughter power one.
+/// Every pair has visibility `cross`, and every daughter power one.
 pub struct Constant {
     pub cross: f64,
 }
@@ -37,7 +37,7 @@ impl VisibilityModel for Constant {
     }
 }
 
-/// A source of flux one in one direction that nothing hides.
+/// A point source of unit flux that nothing occults.
 pub struct Point {
     pub n_hat: Vec3,
     pub frequency_hz: f64,
@@ -61,7 +61,7 @@ impl VisibilityModel for Point {
     }
 }
 
-/// The model of a channel at some frequency, Hz.
+/// The model of a channel at a frequency, Hz.
 pub type Sky = Box<dyn Fn(f64) -> Box<dyn VisibilityModel> + Send + Sync>;
 
 pub fn constant(cross: f64) -> Sky {
@@ -107,7 +107,7 @@ impl Spacecraft {
         self.frequencies_hz.iter().map(|&frequency_hz| Channel { frequency_hz, width_hz: WIDTH_HZ }).collect()
     }
 
-    /// Everything that the daughters send.
+    /// All frames of the daughters.
     pub fn sample(&self, seed: u64) -> (Vec<SpaceFrame>, SamplerCounts) {
         let scene = Scene {
             array: Arc::clone(&self.array),
@@ -176,7 +176,7 @@ pub fn frequencies(count: usize) -> Vec<f64> {
     (0..count).map(|k| 1e6 * (k + 1) as f64).collect()
 }
 
-/// Values of all visibilities that last exactly `dt_s`.
+/// Values of all visibilities with an integration time of exactly `dt_s`.
 pub fn values(blocks: &[VisibilityBlock], dt_s: f64) -> Vec<Complex64> {
     let ticks = (dt_s * 1e6).round() as u32;
     let each = |block: &VisibilityBlock| {
@@ -187,7 +187,7 @@ pub fn values(blocks: &[VisibilityBlock], dt_s: f64) -> Vec<Complex64> {
     blocks.iter().flat_map(each).collect()
 }
 
-/// Mean, and variance about it of the real and imaginary parts together.
+/// Mean, and variance about it of real and imaginary parts together.
 pub fn moments(values: &[Complex64]) -> (Complex64, f64) {
     let n = values.len() as f64;
     let mean = values.iter().sum::<Complex64>() / n;
@@ -216,7 +216,7 @@ pub fn smeared(
     sum / (TIMES * OFFSETS) as f64
 }
 
-/// Samples of one daughter, one block after another.
+/// Samples of one daughter, blocks concatenated.
 pub fn stream(frames: &[SpaceFrame], daughter: u8) -> Vec<Complex64> {
     let mut all = Vec::new();
     for block in blocks(frames).filter(|block| block.daughter == daughter) {
@@ -227,7 +227,7 @@ pub fn stream(frames: &[SpaceFrame], daughter: u8) -> Vec<Complex64> {
     all
 }
 
-/// All blocks of frames, in their order.
+/// All blocks of frames, in order.
 pub fn blocks(frames: &[SpaceFrame]) -> impl Iterator<Item = &SampleBlock> {
     frames.iter().flat_map(|frame| match frame {
         SpaceFrame::Samples(blocks) => blocks.as_slice(),
@@ -235,7 +235,7 @@ pub fn blocks(frames: &[SpaceFrame]) -> impl Iterator<Item = &SampleBlock> {
     })
 }
 
-/// Frames of one block each, as `change` leaves them; `None` for a block that is lost.
+/// Frames of one block each, modified by `change`, which returns `None` for a lost block.
 pub fn block_by_block(
     frames: Vec<SpaceFrame>,
     mut change: impl FnMut(SampleBlock) -> Option<SampleBlock>,

@@ -1,4 +1,4 @@
-//! Delays between daughters: what they cost over a channel's width, and what brings it back.
+//! Delays between daughters: decorrelation over a channel's width, and how delays and sub-bands recover it.
 
 use std::f64::consts::{PI, TAU};
 
@@ -12,13 +12,13 @@ use num_complex::Complex64;
 
 use crate::craft::{Spacecraft, WIDTH_HZ, block_by_block, constant, point, stream};
 
-/// An array that hardly moves and does not breathe, at its greatest extent.
+/// An array that hardly moves and does not breathe, at its largest extent.
 fn still() -> ArrayConfig {
     let breathing = BreathingConfig { period_s: 1e12, ..BreathingConfig::default() };
     ArrayConfig { orbital_period_s: 8e8, breathing, ..ArrayConfig::default() }
 }
 
-/// From the last daughter to the first when the array first observes: the direction of the longest delays.
+/// Direction from the last daughter to the first when the array first observes, which has the longest delays.
 fn along_track(config: &ArrayConfig) -> Vec3 {
     let array = Array::new(config).unwrap();
     let t_s = ObservingWindows::new(&array, 0.0, 1e9).next().unwrap().start.seconds();
@@ -48,12 +48,12 @@ fn delays_decorrelate_as_a_sinc_and_offsets_restore() {
         let delay = delay_samples(&craft.array, pair, n_hat, t_s);
         greatest = greatest.max(delay);
         for lag in [0, delay.floor() as usize, delay.round() as usize] {
-            // The daughter nearer to the source is ahead: x_i(t) = x_j(t + tau).
+            // The daughter nearer to the source receives the wave first: x_i(t) = x_j(t + tau).
             let pairs = streams[i].iter().zip(&streams[j][lag..]);
             let count = streams[i].len() - lag;
             let amplitude = (pairs.map(|(a, b)| a * b.conj()).sum::<Complex64>() / count as f64).norm();
             let expected = sinc(PI * (delay - lag as f64)).abs();
-            // Noise of 1/sqrt(n) a complex mean; 1 - cos(pi lag / 128) of synthesis.
+            // Noise 1/sqrt(n) of a complex mean; 1 - cos(pi lag / 128) from synthesis.
             let error = (1.0 / count as f64).sqrt();
             assert!(
                 (amplitude - expected).abs() < 4.0 * error + 3e-3,
@@ -65,15 +65,15 @@ fn delays_decorrelate_as_a_sinc_and_offsets_restore() {
     assert!((greatest - 333.5e-6 * WIDTH_HZ).abs() < 1e-2, "{greatest}");
 }
 
-/// By how many samples the first of a pair is read later than the second, so that they meet for waves from `n_hat`.
+/// Number of samples by which the first daughter of a pair is read later than the second, to align waves from `n_hat`.
 fn lag(array: &Array, pair: Pair, n_hat: Vec3, t_s: f64) -> i32 {
     -delay_samples(array, pair, n_hat, t_s).round() as i32
 }
 
-/// What sub-band `k` of `bands` of a point source of flux one should be. Daughters' samples correlate as
+/// Expected visibility of a point source of unit flux in sub-band `k` of `bands`. Daughters' samples correlate as
 /// `<x_i(t + l) conj x_j(t)> = exp(-2 pi i nu tau) sinc(pi (W tau + l))`; a frame of N samples has N - |l| products
-/// at lag l; and samples of daughter i read `lag` later than those of j have gone through as many turns of the sub-band's
-/// own frequency, which are put back.
+/// at lag l; and samples of daughter i read `lag` later than those of j have advanced by that many turns of the sub-band's
+/// frequency, which the correlator removes.
 pub fn expected(delay: f64, lag: i32, [k, bands]: [usize; 2], frequency_hz: f64) -> Complex64 {
     let turns = (k as f64 + 0.5) / bands as f64 - 0.5;
     let carrier = Complex64::cis(-TAU * (frequency_hz / WIDTH_HZ * delay).fract());
@@ -85,7 +85,7 @@ pub fn expected(delay: f64, lag: i32, [k, bands]: [usize; 2], frequency_hz: f64)
     carrier * frame.sum::<Complex64>()
 }
 
-/// Weighted means over time of found visibilities over expected ones, with the error that weights give.
+/// Weighted mean over time of measured over expected visibilities, with its error from the weights.
 fn ratio(
     blocks: &[VisibilityBlock],
     (channel, pair): (usize, Pair),
@@ -104,7 +104,7 @@ fn ratio(
 }
 
 #[test]
-fn sub_bands_and_delays_keep_what_they_should_on_every_baseline() {
+fn sub_bands_and_delays_keep_the_expected_fraction_on_every_baseline() {
     let n_hat = along_track(&still());
     let frequency_hz = 1e6;
     let mut craft = Spacecraft::new(still(), vec![frequency_hz], point(n_hat), 40.0);
@@ -124,9 +124,9 @@ fn sub_bands_and_delays_keep_what_they_should_on_every_baseline() {
                 let (found, error) = ratio(&blocks, (k, pair), |_| wanted);
                 greatest_error = greatest_error.max(error * wanted.norm());
                 amplitudes += (found * wanted).norm() / bands as f64;
-                // 1.5: the source's own noise is common to both daughters. 3e-3 of one: synthesis, as documented.
-                // 5.5: of 2604 complex numbers the worst is beyond 4 errors about every time, exp(-4^2 / 2) each, and
-                // beyond 5.5 once in a thousand.
+                // 1.5: the source's noise is common to both daughters. 3e-3: synthesis, as documented.
+                // 5.5: the worst of 2604 complex numbers exceeds 4 errors almost always, exp(-4^2 / 2) each, and 5.5 errors
+                // once in a thousand.
                 assert!(
                     (found - 1.0).norm() * wanted.norm() < 5.5 * 1.5 * error * wanted.norm() + 3e-3,
                     "{bands} {centred} {pair} {k}: {found} of {wanted} +- {error}"
@@ -135,8 +135,8 @@ fn sub_bands_and_delays_keep_what_they_should_on_every_baseline() {
             least = least.min(amplitudes);
         }
         eprintln!("{bands} sub-bands, delays {centred}: {least:.3} left, errors to {greatest_error:.4}");
-        // Half a sample of rounding, or 2.67 samples without delays, as parts of a frame; amplitudes of the rim's
-        // sub-bands are lower by their aliases.
+        // Half a sample of rounding, or 2.67 samples without delays, as fractions of a frame; aliasing lowers the outermost
+        // sub-bands.
         let floor = match (bands, centred) {
             (1, false) => 0.0,
             (1, true) => 0.63,
@@ -146,13 +146,13 @@ fn sub_bands_and_delays_keep_what_they_should_on_every_baseline() {
             _ => 0.93,
         };
         assert!(least > floor, "{bands} {centred}: {least}");
-        // Of a full channel nothing is left where the delay is two samples, and 0.10 of the longest.
+        // Of a whole channel nothing is left at a delay of two samples, and 0.10 at the longest.
         assert!(bands > 1 || centred || least < 0.12, "{least}");
     }
 }
 
 #[test]
-fn fringes_of_sub_bands_turn_as_their_own_frequency_does() {
+fn fringes_of_sub_bands_rotate_at_their_own_frequency() {
     // The fiducial array in motion; a source well off the delay centre.
     let (frequency_hz, bands) = (10e6, 8);
     let (n_hat, centre) = (unit([0.3, -0.8, 0.4]), unit([0.2, -0.9, 0.1]));
@@ -188,13 +188,13 @@ fn weights_of_sub_bands_add_up_to_the_frames_that_arrived_whole() {
         Some(SampleBlock { samples, ..block })
     });
     let blocks = craft.correlate(frames).0;
-    // The first daughter is ahead of all: the others are read later, by whole samples below or above.
+    // The first daughter receives the wave first; the others are read later, by samples rounded down or up.
     let later =
         |n: u8| delay_samples(&craft.array, Pair { i: 0, j: n }, n_hat, craft.window.start.seconds() + 6.0);
     assert!(lost.len() > 10 && later(7) > 2.0);
     let whole = |daughter: u8, late: u64, number: u64| {
         let (here, next) = (!lost.contains(&(daughter, number)), !lost.contains(&(daughter, number + 1)));
-        // The last block has none after it.
+        // No block follows the last one.
         let samples = 1024 - if next && number < 95 { 0 } else { late };
         if here { samples / bands as u64 } else { 0 }
     };
@@ -209,7 +209,7 @@ fn weights_of_sub_bands_add_up_to_the_frames_that_arrived_whole() {
             let of_band = |b: &&VisibilityBlock| b.pair == pair && b.channel == ChannelId(k as u16);
             let weights = blocks.iter().filter(of_band).flat_map(|block| &block.weight);
             let found: f64 = weights.map(|weight| f64::from(*weight)).sum();
-            // The power of samples that are all one in a frame's sub-band.
+            // Power of a sub-band when all samples are one.
             let turns = PI * ((k as f64 + 0.5) / bands as f64 - 0.5);
             let power = ((bands as f64 * turns).sin() / turns.sin()).powi(2) / bands as f64;
             let ratio = 0.5 * found * power * power / expected as f64;

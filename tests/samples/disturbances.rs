@@ -1,4 +1,4 @@
-//! What is wrong with daughters, and what is put in on purpose, against closed forms.
+//! Instrumental errors and artificial signals of the daughters, compared with closed forms.
 
 use std::f64::consts::TAU;
 
@@ -17,7 +17,7 @@ use num_complex::Complex64;
 use crate::craft::{Spacecraft, WIDTH_HZ, constant, stream};
 use crate::delays::expected;
 
-/// Pairs of time, value and weight of one pair and channel.
+/// Time, value and weight of all visibilities of one pair and channel.
 fn measured(
     blocks: &[VisibilityBlock],
     pair: lunarray::units::Pair,
@@ -45,15 +45,15 @@ fn ratio(all: &[(f64, Complex64, f64)], expected: impl Fn(f64) -> Complex64) -> 
     (product / power, power.sqrt().recip())
 }
 
-/// Daughters' noise is partly common: with a correlation of 0.5 each part of a product has
-/// `1 + r^2` of the noise that weights tell of at most; and both parts count.
+/// The daughters' noise is partly common: with a correlation r = 0.5 each part of a product has at most `1 + r^2` times
+/// the noise of its weight, and both parts count.
 const COMMON: f64 = 1.6;
 
 #[test]
-fn gains_and_phases_scale_visibilities_and_calibration_brings_them_back() {
+fn gains_and_phases_scale_visibilities_and_calibration_corrects_them() {
     let mut craft = Spacecraft::new(ArrayConfig::default(), vec![1e6], constant(0.5), 16.0);
     let start_s = craft.window.start.seconds();
-    // Drifts count from the epoch: so much that they turn by a radian and grow by a quarter in the window.
+    // Drifts since the epoch: phases change by a radian and gains by a quarter over the window.
     let drift = |n: usize| [0.25, 1.0].map(|most| most * (n as f64 - 3.5) / 3.5 / 16.0);
     let amplitude = |n: usize| 0.1 * (n as f64 - 4.0) - drift(n)[0] * start_s;
     let phase = |n: usize| 0.8 * n as f64 - drift(n)[1] * start_s;
@@ -102,24 +102,24 @@ fn gains_and_phases_scale_visibilities_and_calibration_brings_them_back() {
             (0..found.len()).map(|k| (placed.time_s[k], placed.value_k_sr[k], placed.weight[k])).collect();
         let (mean, error) = ratio(&restored, |_| Complex64::new(0.5, 0.0));
         assert!((mean - 1.0).norm() < 4.0 * COMMON * error + 1e-3, "{pair}: {mean} +- {error}");
-        // Calibrated weights are those of noise of power one, whatever the gains were.
+        // Calibrated weights are those of unit noise power, whatever the gains.
         for (_, value, weight) in restored {
             squares += (value - 0.5).norm_sqr() * weight;
             count += 2.0;
         }
     }
-    // (1 - r^2) + (1 + r^2) over two parts: the mean of both is one. Powers that weights are made of lag behind gains that
-    // drift within their ten seconds: 10 %.
+    // (1 - r^2) + (1 + r^2) over two parts: the mean is one. The powers in the weights are averaged over ten seconds and lag
+    // behind drifting gains: 10 %.
     let mean = squares / count;
     assert!((mean - 1.0).abs() < 0.15, "{mean}");
 }
 
 #[test]
-fn late_clocks_turn_each_frequency_by_its_own_phase() {
+fn late_clocks_shift_each_frequency_by_its_own_phase() {
     let (frequency_hz, bands) = (1e6, 8);
     let mut craft = Spacecraft::new(ArrayConfig::default(), vec![frequency_hz], constant(0.5), 16.0);
     let start_s = craft.window.start.seconds();
-    // Up to 60 us, 0.48 samples; and drifts that turn 1 MHz by half a turn in the window.
+    // Offsets up to 60 us, 0.48 samples; drifts of half a turn at 1 MHz over the window.
     let late_us = [0.0, 5.0, -20.0, 60.0, 1.3, -60.0, 33.0, 0.1];
     let drift = [0.0, 3e-8, -3e-8, 0.0, 1e-8, 0.0, 2e-8, 0.0];
     craft.daughters.disturbances = Disturbances {
@@ -136,7 +136,7 @@ fn late_clocks_turn_each_frequency_by_its_own_phase() {
             of(pair.i.into()) - of(pair.j.into())
         };
         for k in 0..bands {
-            // Waves that are heard later by a clock are heard as from farther away.
+            // A late clock has the effect of a longer path.
             let wanted = |t_s: f64| 0.5 * expected(late_s(t_s) * WIDTH_HZ, 0, [k, bands], frequency_hz);
             let (found, error) = ratio(&measured(&blocks, pair, k as u16), wanted);
             // 2e-3: a frequency's phase turns by 0.05 in an integration of 0.25 s; 3e-3 of one: synthesis.
@@ -146,7 +146,7 @@ fn late_clocks_turn_each_frequency_by_its_own_phase() {
 }
 
 #[test]
-fn a_calibration_tone_comes_out_with_the_amplitude_and_phase_that_went_in() {
+fn a_calibration_tone_keeps_its_amplitude_and_phase() {
     let mut craft = Spacecraft::new(ArrayConfig::default(), vec![2e6], constant(0.0), 8.0);
     craft.rule.duration_s_max = 0.5;
     let (power, offset_hz, phase_rad) = (0.3, 1.3e3, 2.1);
@@ -159,7 +159,7 @@ fn a_calibration_tone_comes_out_with_the_amplitude_and_phase_that_went_in() {
         ..Disturbances::default()
     };
     let frames = craft.sample(23).0;
-    // What daughter n does to the tone: its phase, and its clock at the tone's own frequency.
+    // Response of daughter n to the tone: its phase, and its clock at the tone's frequency.
     let turned = |n: f64| 0.5 * n - TAU * (2e6 + offset_hz) * 1e-5 * n;
     for n in 0..8_u8 {
         let samples = stream(&frames, n);
@@ -167,20 +167,20 @@ fn a_calibration_tone_comes_out_with_the_amplitude_and_phase_that_went_in() {
         let turn = |k: usize| Complex64::cis(TAU * (offset_hz / WIDTH_HZ * k as f64).fract());
         let mean = samples.iter().enumerate().map(|(k, x)| x * turn(k)).sum::<Complex64>() / count;
         let expected = Complex64::from_polar(power.sqrt(), phase_rad + turned(f64::from(n)));
-        // Noise of power one.
+        // Unit noise power.
         assert!((mean - expected).norm() < 4.0 / count.sqrt(), "{n}: {mean} {expected}");
     }
     let blocks = craft.correlate(frames).0;
     for pair in all_pairs(8) {
         let expected = Complex64::from_polar(power, turned(pair.i.into()) - turned(pair.j.into()));
         let (found, error) = ratio(&measured(&blocks, pair, 0), |_| expected);
-        // Weights are those of all power; a tone's own part of it is no noise.
+        // Weights are those of the total power, but the tone is not noise.
         assert!((found - 1.0).norm() < 4.0 * 2.0_f64.sqrt() * error, "{pair}: {found} +- {error}");
     }
 }
 
 #[test]
-fn the_earths_leak_is_at_the_limb_and_at_its_frequency() {
+fn interference_from_the_earth_is_at_the_limb_and_at_its_frequency() {
     let mut craft = Spacecraft::new(ArrayConfig::default(), vec![5e6], constant(0.0), 24.0);
     craft.rule.duration_s_max = 0.5;
     let (power, offset_hz, depth_m) = (100.0, -2.1e3, 2e3);
@@ -194,7 +194,7 @@ fn the_earths_leak_is_at_the_limb_and_at_its_frequency() {
     let leak =
         |n: u8, t_s: f64| power * (-craft.array.earth_depth_of_m(n.into(), t_s).max(0.0) / depth_m).exp();
     let start_s = craft.window.start.seconds();
-    // The first daughter hears it fade; the last, 100 km behind, still sees the Earth at the end.
+    // It fades for the first daughter; the last one, 100 km behind, still sees the Earth at the end.
     for n in [0, 1, 7] {
         let samples = stream(&frames, n);
         for (k, block) in samples.chunks_exact(4096).enumerate() {
@@ -202,14 +202,14 @@ fn the_earths_leak_is_at_the_limb_and_at_its_frequency() {
             let expected: f64 =
                 (0..64).map(|m| leak(n, seconds(64.0 * f64::from(m) + 32.0))).sum::<f64>() / 64.0;
             let found = block.iter().map(|x| x.norm_sqr()).sum::<f64>() / 4096.0 - 1.0;
-            // Noise of power one and its beat with the tone. A block's power stands for its first sample: 0.13 s at
-            // 1.3 km/s or less, 4 % of a mean.
+            // Unit noise power and its beat with the tone. A block has the power at its first sample: 0.13 s at 1.3 km/s or
+            // less, 4 % of a mean.
             let error = ((1.0 + 2.0 * expected) / 4096.0).sqrt();
             assert!((found - expected).abs() < 4.5 * error + 0.06 * expected, "{n} {k}: {found} {expected}");
         }
     }
     assert!(leak(0, start_s + 24.0) < 1e-3 && leak(7, start_s + 24.0) > 99.0);
-    // Its frequency: that of the offset, and the Doppler shift of the daughter's motion.
+    // Its frequency: the offset plus the Doppler shift of the daughter's motion.
     let samples = &stream(&frames, 7)[..8192];
     let along_m = |t_s: f64| dot(craft.array.earth_hat(t_s), craft.array.position_m(7, t_s));
     let speed_m_s = along_m(start_s + 1.0) - along_m(start_s);
@@ -219,13 +219,13 @@ fn the_earths_leak_is_at_the_limb_and_at_its_frequency() {
             |(k, x): (usize, &Complex64)| x * Complex64::cis(TAU * frequency_hz / WIDTH_HZ * k as f64);
         (samples.iter().enumerate().map(turned).sum::<Complex64>() / 8192.0).norm()
     };
-    // A spectrum's line is 1 Hz wide; its peak stands within a tenth of that.
+    // The spectral line is 1 Hz wide, and its peak is found within a tenth of that.
     let peak = (-40..=40)
         .map(|k| 0.1 * f64::from(k))
         .max_by(|a, b| amplitude(expected_hz + a).total_cmp(&amplitude(expected_hz + b)));
     assert!(peak.unwrap().abs() < 0.15, "{peak:?}");
     assert!((amplitude(expected_hz) / power.sqrt() - 1.0).abs() < 0.01, "{}", amplitude(expected_hz));
-    // And it correlates as a source in the Earth's direction while both hear it.
+    // It correlates like a source in the Earth's direction while both receive it.
     let blocks = craft.correlate(frames).0;
     for pair in all_pairs(8).into_iter().filter(|pair| pair.i >= 4) {
         let fringe = |t_s: f64| {

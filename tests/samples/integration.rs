@@ -1,4 +1,4 @@
-//! Lengths and weights of integrations.
+//! Durations and weights of integrations.
 
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{Flags, SampleBlock, Samples, SpaceFrame};
@@ -16,7 +16,7 @@ fn no_baseline_moves_more_than_an_eighth_of_a_wavelength() {
     let frequencies_hz = vec![3e6, 10e6, 30e6];
     let craft = Spacecraft::new(ArrayConfig::default(), frequencies_hz, constant(0.0), 60.0);
     for (channel, frequency_hz) in craft.frequencies_hz.iter().enumerate() {
-        // Silence costs nothing to correlate: what is missing is integrated all the same.
+        // Missing samples cost nothing to correlate, and are integrated all the same.
         let ends = vec![SpaceFrame::WindowStart(craft.window), SpaceFrame::WindowEnd(craft.window)];
         let (blocks, _) = craft.correlate(ends);
         for pair in all_pairs(8) {
@@ -37,7 +37,7 @@ fn no_baseline_moves_more_than_an_eighth_of_a_wavelength() {
                         norm(sub(baseline(until_s), baseline(from_s))) * frequency_hz / SPEED_OF_LIGHT_M_S;
                     assert!(moved <= 0.125 * (1.0 + 1e-6), "{pair} {frequency_hz}: {moved}");
                     let last = i64::from(expected_ticks) == craft.window.end.0 - craft.window.start.0;
-                    // Whole dumps, of an eighth of the shortest integration or 2 ms: up to so much shorter.
+                    // Whole dumps of an eighth of the shortest integration, or of 2 ms, shorten integrations by at most that.
                     let longest = block.duration_ticks[k] > 24_992_000;
                     assert!(last || longest || moved > 0.125 * 0.87, "{pair} {frequency_hz}: {moved}");
                 }
@@ -54,7 +54,7 @@ fn weights_add_up_to_the_samples_that_arrived() {
         let length = block.samples.len();
         SampleBlock { samples: Samples::Float { re: vec![1.0; length], im: vec![0.0; length] }, ..block }
     };
-    // Some blocks are lost, some come again, and some come too late.
+    // Some blocks are lost, some duplicated, and some late.
     let (mut frames, mut late, mut arrived) = (Vec::new(), Vec::new(), std::collections::HashMap::new());
     let (mut lost, mut again) = (0, 0);
     for frame in block_by_block(craft.sample(6).0, |block| Some(ones(block))) {
@@ -103,7 +103,7 @@ fn weights_add_up_to_the_samples_that_arrived() {
                     assert_eq!(block.flags[k] == Flags::GOOD, complete, "{pair} {k}");
                     flagged += u64::from(!complete);
                     if complete {
-                        // What is missing is left out of the mean, and not counted as nothing.
+                        // Missing samples are omitted from the mean, not counted as zero.
                         assert!((block.value_k_sr[k].re - 1.0).abs() < 1e-6, "{}", block.value_k_sr[k]);
                     }
                 }
@@ -116,7 +116,7 @@ fn weights_add_up_to_the_samples_that_arrived() {
 }
 
 #[test]
-fn the_first_weights_of_a_window_are_as_good_as_those_that_follow() {
+fn the_first_weights_of_a_window_are_as_accurate_as_later_ones() {
     for (bands, block_samples) in [(64, 1024), (64, 256), (1, 256)] {
         let mut craft = Spacecraft::new(ArrayConfig::default(), vec![1e6], constant(0.0), 16.384);
         craft.division = Division { sub_bands: bands, delay_centre: None };
@@ -137,13 +137,13 @@ fn the_first_weights_of_a_window_are_as_good_as_those_that_follow() {
             }
         }
         assert_eq!(count, 28.0 * bands as f64);
-        // Powers of 1024 samples are good to a thirty-second part; there are 8 of each band, and a weight has two of them.
-        // In the mean inverse powers are 1/1024 too large. Later ones are of 10 s, 1250 samples and more.
+        // Powers of 1024 samples are accurate to 1/32; there are 8 of each band, and a weight has two of them. The mean of
+        // inverse powers is 1/1024 too large. Later powers are averages of 10 s, 1250 samples and more.
         let (mean, error) = (sum / count, 1.0 / 32.0);
         let expected = 1.0 + 2.0 / 1024.0;
         let common = 2.0 * error / (8.0 * bands as f64).sqrt();
         assert!((mean - expected).abs() < 4.0 * common, "{bands} bands, {block_samples}: {mean}");
-        // 1792 products at a time, at some ten times that are not the same: five sigma.
+        // 1792 products at each of some ten independent times: five sigma.
         assert!(worst < 5.0 * error * 2.0_f64.sqrt() + 0.02, "{bands} bands, {block_samples}: {worst}");
     }
 }
@@ -195,5 +195,5 @@ fn integrations_shorter_than_the_correlators_sums_are_refused() {
         ..lunarray::pipeline::ConfigSource::default()
     };
     let said = source.load().unwrap_err().to_string();
-    assert!(said.contains("the correlator sums 2.000e-3 s at once"), "{said}");
+    assert!(said.contains("dumps of 2.000e-3 s"), "{said}");
 }

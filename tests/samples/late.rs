@@ -1,4 +1,4 @@
-//! Blocks that come late, through the whole chain.
+//! Late blocks, through the whole chain.
 
 use lunarray::downlink::Transmitter;
 use lunarray::frames::{GroundFrame, SampleBlock, Samples, SpaceFrame};
@@ -27,14 +27,14 @@ const PIPELINE: &str = r#"
 /// Blocks of a window of 32,000 samples: 31 of 1024 and one of 256.
 const BLOCKS: u64 = 32;
 
-/// A link that holds some blocks of daughter 4 back until others have come that are so many numbers ahead, or the window
-/// ends. Samples are made ones, so that powers are one and weights twice the number of samples.
+/// A link that holds back some blocks of daughter 4 until blocks a given number ahead have passed, or the window ends. It
+/// sets all samples to one, so that powers are one and weights are twice the number of samples.
 #[derive(Default)]
 struct Slow {
     held: Vec<(u64, SampleBlock)>,
 }
 
-/// By how many numbers a block is held back.
+/// Number of blocks by which a block is held back.
 fn held_back(daughter: u8, number: u64) -> u64 {
     match (daughter, number % 11, number % 5) {
         (3, 3, _) => 7,
@@ -43,7 +43,7 @@ fn held_back(daughter: u8, number: u64) -> u64 {
     }
 }
 
-/// Whether a block comes when the mother, who waits for 4 numbers, has gone on.
+/// Whether a block arrives after the mother, which waits for 4 blocks, has given it up.
 fn is_late(daughter: u8, number: u64) -> bool {
     held_back(daughter, number) > 4 && number + 4 < BLOCKS
 }

@@ -1,4 +1,4 @@
-//! Links from the daughters that are slower than their samples.
+//! Links from the daughters that are slower than the sample rate.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -29,7 +29,7 @@ const PIPELINE: &str = r#"
     pictures = false
 "#;
 
-/// Runs the program with these settings; what it said.
+/// Runs the program with these settings; returns its standard output.
 fn lunarray(folder: &Path, command: &str, sets: &[&str]) -> String {
     let pipeline = folder.join("links.toml");
     std::fs::write(&pipeline, PIPELINE).unwrap();
@@ -39,7 +39,7 @@ fn lunarray(folder: &Path, command: &str, sets: &[&str]) -> String {
         run.args(["--out", folder.to_str().unwrap()]);
     }
     let done = run.output().unwrap();
-    // A link that loses too much leaves no map: then, and only then, the run fails, and says so.
+    // The run fails, with that reason, if and only if the link loses so much that there is no map.
     let said = String::from_utf8_lossy(&done.stderr);
     let summary = std::fs::read_to_string(folder.join("summary.json")).unwrap_or_else(|_| "null".to_owned());
     let summary: Value = serde_json::from_str(&summary).unwrap();
@@ -48,7 +48,7 @@ fn lunarray(folder: &Path, command: &str, sets: &[&str]) -> String {
     String::from_utf8(done.stdout).unwrap()
 }
 
-/// What became of the samples of a run.
+/// The sample counters of a run.
 fn samples(folder: &Path, sets: &[&str]) -> Value {
     lunarray(folder, "run", sets);
     let text = std::fs::read_to_string(folder.join("summary.json")).unwrap();
@@ -110,7 +110,7 @@ fn a_full_buffer_costs_all_channels_the_same() {
     let channels = 4;
     let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies(channels), constant(0.0), 8.192);
     craft.daughters.bits = 8;
-    // Four channels of 128 kbit/s on a link for less than two and a half, before a buffer of two blocks each.
+    // Four channels of 128 kbit/s on a link for less than two and a half, with a buffer of two blocks each.
     craft.daughters.link_bits_per_s_max = 300e3;
     craft.daughters.link_buffer_bytes = 8 * 2048;
     let frames = craft.sample(41).0;
@@ -125,8 +125,8 @@ fn a_full_buffer_costs_all_channels_the_same() {
         for block in blocks(&out.into_vec()).filter(|block| block.daughter == 5) {
             sent[usize::from(block.channel.0)] += 1;
         }
-        // 64 times, 150 of 256 blocks and the buffer at the end. One time more or less for each of the channels, and of
-        // each the two that wait at the end.
+        // 64 times: 150 of 256 blocks are sent, plus the buffer at the end. Channels differ by one turn at most, and by the
+        // two blocks that are queued at the end.
         let share = 64.0 * 300.0 / 512.0;
         for sent in &sent {
             assert!((f64::from(*sent) - share).abs() <= 3.0, "{policy:?}: {sent} of {share}");
@@ -135,7 +135,7 @@ fn a_full_buffer_costs_all_channels_the_same() {
 }
 
 #[test]
-fn check_names_settings_of_samples_where_there_are_none() {
+fn check_reports_sample_settings_that_have_no_effect() {
     let folder = tempfile::tempdir().unwrap();
     let samples = ["daughters.bits=2", "spacecraft.wait_blocks=4"];
     let said = lunarray(folder.path(), "check", &samples);

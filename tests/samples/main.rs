@@ -1,5 +1,5 @@
-//! Sample by sample: what comes out of daughters and correlator is what the model, the radiometer equation and
-//! the literature on quantisers say.
+//! Sample fidelity: the output of daughters and correlator agrees with the model, the radiometer equation and
+//! the literature on quantisers.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // A test fails by panicking.
 
 #[path = "../common/mod.rs"]

@@ -36,7 +36,7 @@ fn config() -> NinthConfig {
     }
 }
 
-/// Her blocks of the first window's first seconds, under a uniform sky.
+/// Its blocks of the first seconds of the first window, for a uniform sky.
 fn uniform(seed: Option<u64>, response: AntennaResponse, seconds: f64) -> Vec<VisibilityBlock> {
     let array = Arc::new(Array::new(&ArrayConfig::default()).unwrap());
     let start = ObservingWindows::new(&array, 0.0, 1e9).next().unwrap().start;
@@ -68,7 +68,7 @@ fn uniform(seed: Option<u64>, response: AntennaResponse, seconds: f64) -> Vec<Vi
     ninth.step(GroundFrame::Housekeeping(report), &mut out).unwrap();
     ninth.finish(&mut out).unwrap();
     let mut frames = out.into_vec();
-    // What she adds is counted, and stands before the frame that closes the window.
+    // Its powers are counted, and precede the frame that closes the window.
     let Some(GroundFrame::Housekeeping(report)) = frames.pop() else { panic!("no report") };
     assert_eq!(frames.remove(0), GroundFrame::Instrument(instrument.clone()));
     let blocks: Vec<VisibilityBlock> = frames
@@ -88,7 +88,7 @@ fn uniform(seed: Option<u64>, response: AntennaResponse, seconds: f64) -> Vec<Vi
     blocks
 }
 
-/// Where she is: a circle, with the formulas of the paper.
+/// Its position on the circle, by the formulas of the paper.
 fn position(t_s: f64) -> Vec3 {
     let f = TAU * t_s / 8248.68 - 110e3 / RADIUS_M;
     let node = -TAU * t_s / (1.3 * 365.25 * 86_400.0);
@@ -98,10 +98,10 @@ fn position(t_s: f64) -> Vec3 {
 }
 
 #[test]
-fn a_uniform_sky_is_its_temperature_times_the_solid_angle_that_the_moon_leaves() {
+fn a_uniform_sky_gives_its_temperature_times_the_unocculted_solid_angle() {
     let directions = pixel_directions(NSIDE);
     let (cos, area_sr) = ((1.0 - (MOON_M / RADIUS_M).powi(2)).sqrt(), 4.0 * PI / directions.len() as f64);
-    // All but the Moon's cap; of dipoles across the orbit the integral of 1 - sin^2 t cos^2 p over it.
+    // The sphere without the Moon's cap; for dipoles normal to the orbit, the integral of 1 - sin^2 t cos^2 p over it.
     let dipole = PI * ((1.0 + cos) + (1.0 + cos.powi(3)) / 3.0);
     for (response, solid_sr) in
         [(AntennaResponse::Isotropic, 2.0 * PI * (1.0 + cos)), (AntennaResponse::DipoleNormal, dipole)]
@@ -113,11 +113,11 @@ fn a_uniform_sky_is_its_temperature_times_the_solid_angle_that_the_moon_leaves()
             for k in 0..block.len() {
                 assert_eq!(block.duration_ticks[k], if k == 10 { 250_000 } else { 500_000 });
                 let found = (f64::from(block.value_k_sr[k].re) - RECEIVER_K_SR) / sky_k;
-                // Pixels on the limb, 4 nside, count whole: half a pixel too much or too little each, at random.
+                // The 4 nside pixels on the limb count whole: each is wrong by half a pixel at random.
                 let limb = 0.5 * (4.0 * NSIDE as f64).sqrt() * area_sr;
                 assert!((found - solid_sr).abs() < 4.0 * limb, "{response:?} {k}: {found} {solid_sr}");
                 if response == AntennaResponse::Isotropic {
-                    // The pixels that she sees, counted one by one.
+                    // The visible pixels, counted one by one.
                     let r_m = position(block.middle_s(k));
                     let sees = |n: &&Vec3| dot(**n, r_m) / norm(r_m) >= -cos;
                     let counted = directions.iter().filter(sees).count() as f64 * area_sr;
@@ -134,8 +134,8 @@ fn a_uniform_sky_is_its_temperature_times_the_solid_angle_that_the_moon_leaves()
 }
 
 #[test]
-fn what_is_left_of_a_window_is_not_an_integration_of_a_few_samples() {
-    // 300 kHz: 1e4 samples are 33 ms. Of 5.03 s the last 30 ms go with the half second before them.
+fn the_rest_of_a_window_is_not_an_integration_of_a_few_samples() {
+    // At 300 kHz 1e4 samples are 33 ms. The last 30 ms of 5.03 s join the half second before them.
     for (seconds, count, last) in [(5.03, 10, 530_000), (5.04, 11, 40_000), (0.03, 0, 0)] {
         for block in uniform(Some(9), AntennaResponse::Isotropic, seconds) {
             assert_eq!(block.len(), count, "{seconds}");
@@ -174,7 +174,7 @@ fn noise_is_that_of_the_radiometer_equation() {
 }
 
 #[test]
-fn between_its_maps_a_generated_sky_is_what_it_is_there() {
+fn a_generated_sky_is_interpolated_correctly_between_its_maps() {
     let model = |frequency_hz: f64| {
         let values = generate(&GeneratedSky::default(), frequency_hz, 64, 9).unwrap();
         let sky = SkyMap::new(Frame::Ecliptic, values).unwrap();
@@ -227,7 +227,7 @@ fn map(out: &Path) -> Vec<f64> {
 }
 
 #[test]
-fn spectra_come_down_with_the_visibilities_of_either_fidelity() {
+fn spectra_are_sent_with_the_visibilities_of_either_fidelity() {
     let folder = tempfile::tempdir().unwrap();
     let pipeline = folder.path().join("nine.toml");
     std::fs::write(&pipeline, PIPELINE).unwrap();
@@ -260,7 +260,7 @@ fn spectra_come_down_with_the_visibilities_of_either_fidelity() {
             let (frequency_hz, width_hz, power, sigma) = (row[0], row[1], row[4], row[5]);
             assert!((30e6..120e6).contains(&frequency_hz) && (width_hz - 1e6).abs() < 1e-3);
             let cos = (1.0 - (MOON_M / RADIUS_M).powi(2)).sqrt();
-            // From the file of 2 MHz, the highest channel.
+            // Extrapolated from the file of 2 MHz, the highest channel.
             let expected = 1e6 * (frequency_hz / 2e6).powf(-2.5) * 2.0 * PI * (1.0 + cos);
             // Noise of 2e6 samples, and pixels on the limb as above.
             let error = (1.0_f64 / 2e6).sqrt().hypot(2.1e-4);
@@ -273,7 +273,7 @@ fn spectra_come_down_with_the_visibilities_of_either_fidelity() {
             "{inspected}"
         );
         assert!(!inspected.contains("9-9"), "{inspected}");
-        // The ground alone has it from the bytes that came down, and its map knows nothing of it.
+        // The ground segment alone gets it from the downlink bytes, and its map does not use it.
         let (ground, alone) = (folder.path().join("ground"), folder.path().join("alone"));
         let downlink = out.join("downlink.ccsds");
         let settings =
@@ -289,7 +289,7 @@ fn spectra_come_down_with_the_visibilities_of_either_fidelity() {
 }
 
 #[test]
-fn check_tells_her_data_rate_and_what_cannot_be() {
+fn check_reports_its_data_rate_and_invalid_settings() {
     let folder = tempfile::tempdir().unwrap();
     let pipeline = folder.path().join("nine.toml");
     std::fs::write(&pipeline, PIPELINE).unwrap();

@@ -1,4 +1,4 @@
-//! Noise of correlations, of perfect samples and of quantised ones.
+//! Noise of correlations of unquantised and of quantised samples.
 
 use std::collections::HashMap;
 use std::f64::consts::FRAC_2_PI;
@@ -16,13 +16,13 @@ use lunarray::units::Pair;
 use crate::craft::{Spacecraft, WIDTH_HZ, constant, frequencies, moments, values};
 
 #[test]
-fn noise_is_what_the_radiometer_equation_says_for_any_integration_time() {
+fn noise_follows_the_radiometer_equation_for_any_integration_time() {
     // An empty sky and receivers of 2 K sr.
     let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies(30), constant(0.0), 4.0);
     craft.receiver_noise_k_sr = 1.0;
     let frames = craft.sample(1).0;
     for dt_s in [0.008, 0.08, 0.16, 0.4] {
-        // No baseline of these moves far enough in this time to shorten it, or it is left out by `values`.
+        // None of these baselines moves far enough to shorten the integration; `values` omits those that do.
         craft.rule.duration_s_max = dt_s;
         let values = values(&craft.correlate(frames.clone()).0, dt_s);
         let (mean, variance) = moments(&values);
@@ -38,14 +38,14 @@ fn noise_is_what_the_radiometer_equation_says_for_any_integration_time() {
         );
         assert!(values.len() > 2_000, "{}", values.len());
         assert!((variance / expected - 1.0).abs() < 3.0 * error);
-        // The empty sky: nothing is there.
+        // The mean of an empty sky is zero.
         assert!(mean.norm() < 4.0 * (2.0 * expected / values.len() as f64).sqrt(), "{mean}");
     }
 }
 
 #[test]
-fn quantisers_lose_what_they_are_known_to_lose() {
-    // Signal to noise of a correlation of 0.05, against that of perfect samples (Thompson, Moran & Swenson).
+fn quantisers_have_their_published_efficiency() {
+    // Signal-to-noise ratio of a correlation of 0.05, relative to unquantised samples (Thompson, Moran & Swenson).
     for (bits, efficiency) in [(1, FRAC_2_PI), (2, 0.881), (4, 0.9881), (8, 1.0), (32, 1.0)] {
         let sky = constant(0.05);
         let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies(30), sky, 4.0);
@@ -55,7 +55,7 @@ fn quantisers_lose_what_they_are_known_to_lose() {
         let values = values(&craft.run(2), dt_s);
         let (mean, variance) = moments(&values);
         let (n, samples) = (values.len() as f64, WIDTH_HZ * dt_s);
-        // At a correlation of 0.05 in power, 0.05 of a power of one; perfect noise has 1 / (2 samples).
+        // A correlation of 0.05 of unit power; the noise variance without quantisation is 1 / (2 samples).
         let found = mean.re / 0.05 / (2.0 * samples * variance).sqrt();
         // Errors of the mean of the real part and of the deviation. Each pair shares a daughter with 12 others,
         // and with it 0.05 of its noise.
@@ -67,7 +67,7 @@ fn quantisers_lose_what_they_are_known_to_lose() {
     }
 }
 
-/// Of the real or the imaginary parts: mean square about zero, as a part of what is expected.
+/// Mean square about zero of real or imaginary parts, relative to the expected value.
 fn part_ratio(parts: impl Iterator<Item = f64>, expected: f64) -> (f64, f64) {
     let (sum, count) = parts.fold((0.0, 0.0), |(sum, count), x| (sum + x * x, count + 1.0));
     (sum / count / expected, count)
@@ -76,11 +76,11 @@ fn part_ratio(parts: impl Iterator<Item = f64>, expected: f64) -> (f64, f64) {
 #[test]
 fn quantised_noise_is_the_radiometers_over_the_efficiency_for_any_integration_time() {
     // The efficiency is that of a signal-to-noise ratio (Thompson, Emerson & Schwab 2007; Thompson, Moran & Swenson
-    // 2017, Sect. 8.3), in amplitudes: the variance of a correlation that is told right grows with its square.
-    // Table 8.2, for even steps: 2/pi, 0.88115 and 0.98846.
+    // 2017, Sect. 8.3), in amplitudes: the variance of a corrected correlation grows with its inverse square.
+    // Table 8.2, for uniform steps: 2/pi, 0.88115 and 0.98846.
     for (bits, efficiency) in [(1, FRAC_2_PI), (2, 0.88115), (4, 0.98846), (32, 1.0)] {
         let relation = VanVleck::new(bits).ok();
-        // No baseline of these moves far enough in 0.4 s to shorten it.
+        // None of these baselines moves far enough in 0.4 s to shorten the integration.
         let frequencies_hz = (0..30).map(|k| 3e5 + 1e4 * f64::from(k)).collect();
         let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies_hz, constant(0.0), 4.096);
         craft.receiver_noise_k_sr = 1.0;
@@ -102,9 +102,9 @@ fn quantised_noise_is_the_radiometers_over_the_efficiency_for_any_integration_ti
             for (name, (ratio, count)) in [("real", real), ("imaginary", imaginary)] {
                 // As above; a quantiser's products have less kurtosis.
                 let error = ((2.0 + 3.0 / samples) / count).sqrt();
-                // A quantiser tells powers by its level, known from the 8192 samples of a first block to 1.1 %: of 240
-                // of them, each in both factors of a variance, 0.15 %. The curved relation takes 2.5 / (2 n) off the
-                // variance of one bit's noise at n samples, less of the others'.
+                // Quantised powers are relative to the level, which the 8192 samples of a first block determine to 1.1 %; 240
+                // of them, each in both factors of a variance, give 0.15 %. The nonlinear relation lowers the variance of
+                // one-bit noise at n samples by 2.5 / (2 n), and that of more bits by less.
                 let level = if bits < 32 { 3.0 * 0.0015 + 1.25 / samples } else { 0.0 };
                 eprintln!("{bits} bits, {dt_s} s, {name}: {count} values, {ratio:.4} +- {error:.4}");
                 assert!(count > 7_000.0, "{count}");
@@ -120,7 +120,7 @@ fn van_vleck_returns_the_amplitude_of_weak_and_strong_correlations() {
         let relation = VanVleck::new(bits).unwrap();
         for cross in [0.01, 0.1, 0.3, 0.6, 0.9] {
             let sky = constant(cross);
-            // All integrations are of the same 0.4 s: no baseline moves far enough in it at these frequencies.
+            // All integrations last 0.4 s: no baseline moves far enough at these frequencies to shorten them.
             let frequencies_hz = (0..16).map(|k| 3e5 + 1e4 * f64::from(k)).collect();
             let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies_hz, sky, 4.0);
             craft.rule.duration_s_max = 0.4;
@@ -136,10 +136,10 @@ fn van_vleck_returns_the_amplitude_of_weak_and_strong_correlations() {
                 }
             }
             let found = sum / weight;
-            // Each pair shares a daughter with 12 others, and all have the common signal's own noise.
+            // Each pair shares a daughter with 12 others, and all share the noise of the common signal.
             let samples = 16.0 * 4.0 * WIDTH_HZ;
             let error = ((1.0 + 12.0 * cross) / weight + cross * cross / samples).sqrt();
-            // Noise passes a curved relation: 3200 samples leave half its curvature times a variance of 1/6400.
+            // The relation is nonlinear: noise leaves a bias of half its curvature times a variance of 1/6400, from 3200 samples.
             let curvature = 2e-4 * cross;
             assert!(
                 (found - cross).abs() < 4.0 * error + curvature,
@@ -149,8 +149,8 @@ fn van_vleck_returns_the_amplitude_of_weak_and_strong_correlations() {
     }
 }
 
-/// What comes down at 10 MHz from two windows of a minute each, with `sky` in them.
-fn come_down(sky: &Path, fidelity: &str, seed: u64) -> Vec<VisibilityBlock> {
+/// The downlink's visibilities at 10 MHz of two windows of a minute each, under `sky`.
+fn downlinked(sky: &Path, fidelity: &str, seed: u64) -> Vec<VisibilityBlock> {
     const PIPELINE: &str = r#"
         name = "noise"
         [spacecraft]
@@ -184,7 +184,7 @@ fn come_down(sky: &Path, fidelity: &str, seed: u64) -> Vec<VisibilityBlock> {
     found
 }
 
-/// Weight a second of each pair.
+/// Weight per second of each pair.
 fn weights(blocks: &[VisibilityBlock]) -> HashMap<Pair, f64> {
     let mut sums: HashMap<Pair, [f64; 2]> = HashMap::new();
     for block in blocks {
@@ -195,7 +195,7 @@ fn weights(blocks: &[VisibilityBlock]) -> HashMap<Pair, f64> {
     sums.into_iter().map(|(pair, [weights, seconds])| (pair, weights / seconds)).collect()
 }
 
-/// Mean square of the differences of two runs, in units of what their weights say, and the number of parts.
+/// Mean square difference of two runs in units of the variance from their weights, and the number of parts.
 fn chi_square(first: &[VisibilityBlock], second: &[VisibilityBlock]) -> (f64, f64) {
     let (mut sum, mut count) = (0.0, 0.0);
     assert_eq!(first.len(), second.len());
@@ -212,7 +212,7 @@ fn chi_square(first: &[VisibilityBlock], second: &[VisibilityBlock]) -> (f64, f6
 
 type Runs = [Vec<VisibilityBlock>; 2];
 
-/// Visibilities of pairs, and the daughters' own powers in the order of daughters.
+/// Visibilities of pairs, and auto-correlations in the order of daughters.
 fn split(runs: Runs) -> (Runs, Runs) {
     let parts = runs.map(|run| run.into_iter().partition::<Vec<_>, _>(|block| block.pair.i != block.pair.j));
     let [(first, mut first_own), (second, mut second_own)] = parts;
@@ -222,15 +222,16 @@ fn split(runs: Runs) -> (Runs, Runs) {
     ([first, second], [first_own, second_own])
 }
 
-/// Holds powers of two seeds of samples to those of visibilities: shapes, means, noise and weights.
+/// Compares auto-correlations of sample fidelity (two seeds) with those of visibility fidelity: shapes, means, noise and
+/// weights.
 fn check_powers(powers: &[Runs]) {
     let [samples, visibilities] = powers else { panic!("two fidelities") };
     for runs in powers {
         assert_eq!((runs[0].len(), runs[1].len()), (16, 16));
-        // Visibilities have noise in each of two parts; powers in one.
+        // Visibilities have noise in both parts, auto-correlations in one.
         let (found, parts) = chi_square(&runs[0], &runs[1]);
         let (found, count) = (2.0 * found, 0.5 * parts);
-        // A weight goes with the power that was found, good to 1/8192 in the square: nothing here.
+        // A weight uses the measured power, accurate to 1/8192 in the square, which is negligible here.
         assert!((found - 1.0).abs() < 4.0 * (2.0 / count).sqrt(), "{found} of {count}");
     }
     for (sampled, drawn) in samples[0].iter().zip(&visibilities[0]) {
@@ -249,7 +250,7 @@ fn check_powers(powers: &[Runs]) {
             let of = |k: usize| seconds(block, k) * f64::from(block.value_k_sr[k].re);
             (0..block.len()).map(of).sum::<f64>() / 60.0
         };
-        // Both have the noise of a minute. Samples are of eight bits: a thousandth of a power at most.
+        // Both have the noise of a minute. Eight bits change a power by at most a thousandth.
         let error = (2.0 / (60.0 * WIDTH_HZ)).sqrt();
         let ratio = mean(sampled) / mean(drawn);
         assert!((ratio - 1.0).abs() < 4.0 * error + 1e-3, "{}: {ratio} +- {error}", sampled.pair);
@@ -262,22 +263,22 @@ fn weights_and_noise_are_the_same_in_both_fidelities() {
     let sky = folder.path().join("sky.fits");
     let map = SkyMap::new(Frame::Ecliptic, generate(&GeneratedSky::default(), 1e7, 32, 1).unwrap()).unwrap();
     write_map(&sky, &map, &WriteOptions::default()).unwrap();
-    let of = |fidelity: &&str| [1, 2].map(|seed| come_down(&sky, fidelity, seed));
+    let of = |fidelity: &&str| [1, 2].map(|seed| downlinked(&sky, fidelity, seed));
     let (runs, powers): (Vec<_>, Vec<_>) = ["samples", "visibilities"].iter().map(of).map(split).unzip();
     check_powers(&powers);
     let [samples, visibilities] = [&runs[0], &runs[1]].map(|[first, _]| weights(first));
     assert_eq!(samples.len(), 28);
     for (pair, expected) in &visibilities {
         let ratio = samples[pair] / expected;
-        // Two powers of two minutes of samples. A weight is of those before it, as far as they go back: integrations of the
-        // windows' first seconds share one power, so that a sixth of the samples counts twice.
+        // Two powers of two minutes of samples. A weight uses earlier samples, as far as they go back: the integrations of a
+        // window's first seconds share one power, so that a sixth of the samples counts twice.
         let error = (2.0 / (2.0 * 60.0 * WIDTH_HZ) * 1.5_f64).sqrt();
-        // In the mean inverse powers of 1024 samples and more are up to 2e-3 too large, for the first seconds.
+        // The mean of inverse powers of 1024 samples and more is up to 2e-3 too large in the first seconds.
         assert!((ratio - 1.0).abs() < 4.0 * error + 1e-3, "{pair}: {ratio} +- {error}");
     }
     for [first, second] in &runs {
         let (found, count) = chi_square(first, second);
-        // As above; pairs share daughters, but not their noise; weights follow powers that are good to half a percent.
+        // As above; pairs share daughters, but not their noise; weights use powers accurate to half a percent.
         let error = ((2.0 + 3.0 / 400.0) / count).sqrt();
         eprintln!("chi square {found:.4} +- {error:.4} of {count} parts");
         assert!(count > 2e4 && (found - 1.0).abs() < 4.0 * error + 5e-3, "{found} +- {error}");

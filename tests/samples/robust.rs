@@ -1,4 +1,4 @@
-//! Runs that lose blocks, last long, stall or fall.
+//! Runs that lose blocks, last long, stall or fail.
 
 use std::path::Path;
 use std::sync::mpsc;
@@ -36,7 +36,7 @@ fn pipeline(folder: &Path) -> std::path::PathBuf {
     path
 }
 
-/// A run of the whole chain: its summary, and the greatest memory that the process had, kB.
+/// Runs the whole chain; returns its summary and the peak memory of the process, kB.
 fn run(folder: &Path, name: &str, sets: &[&str]) -> (serde_json::Value, u64) {
     let out = folder.join(name);
     let mut command = std::process::Command::new(assert_cmd::cargo::cargo_bin("lunarray"));
@@ -56,7 +56,7 @@ fn run(folder: &Path, name: &str, sets: &[&str]) -> (serde_json::Value, u64) {
     let done = child.wait_with_output().unwrap();
     let text = std::fs::read_to_string(out.join("summary.json")).unwrap();
     let summary: serde_json::Value = serde_json::from_str(&text).unwrap();
-    // A link that loses too much leaves no map: then, and only then, the run fails, and says so.
+    // The run fails, with that reason, if and only if the link loses so much that there is no map.
     let said = String::from_utf8_lossy(&done.stderr);
     let has_map = !summary["channels"].as_array().unwrap().is_empty();
     assert_eq!((done.status.success(), said.contains("so there is no map")), (has_map, !has_map), "{said}");
@@ -68,36 +68,36 @@ fn count(value: &serde_json::Value) -> u64 {
 }
 
 /// Sampled, accumulated, flagged and lost of a ledger.
-fn accounts(ledger: &serde_json::Value) -> [u64; 4] {
+fn ledger_counts(ledger: &serde_json::Value) -> [u64; 4] {
     let flagged = ledger["flagged"].as_object().unwrap().values().map(count).sum();
     let lost = ledger["lost"].as_array().unwrap().iter().map(|loss| count(&loss["count"])).sum();
     [count(&ledger["sampled"]), count(&ledger["accumulated"]), flagged, lost]
 }
 
 #[test]
-fn lost_blocks_are_in_the_accounts_of_samples_and_of_visibilities() {
+fn lost_blocks_are_in_the_ledgers_of_samples_and_of_visibilities() {
     let folder = tempfile::tempdir().unwrap();
     // Eight bits need 128 kbit/s; a block is 2 kB.
     let sets = ["daughters.link_bits_per_s_max=110e3", "daughters.link_buffer_bytes=4096"];
     let (summary, _) = run(folder.path(), "slow", &sets);
     let samples = &summary["samples"];
-    let [sampled, used, flagged, lost] = accounts(&samples["ledger"]);
+    let [sampled, used, flagged, lost] = ledger_counts(&samples["ledger"]);
     // Three windows of 4 s, eight daughters.
     assert_eq!(sampled, 3 * 4 * 8_000 * 8);
     assert_eq!((sampled, flagged), (used + lost, 0));
     let dropped = count(&samples["link"]["dropped_samples"]);
-    // 18 of 128 kbit/s do not fit, less what the buffer holds at the end.
+    // 18 of 128 kbit/s exceed the link, except what the buffer holds at the end.
     assert!(lost == dropped && dropped > sampled / 20, "{samples}");
     let blocks = &samples["blocks"];
     assert_eq!(count(&blocks["missing"]), count(&samples["link"]["dropped"]));
-    let [sampled, accumulated, flagged, lost] = accounts(&summary["ledger"]);
+    let [sampled, accumulated, flagged, lost] = ledger_counts(&summary["ledger"]);
     assert_eq!(sampled, count(&samples["visibilities"]));
     assert_eq!(sampled, accumulated + flagged + lost);
     let incomplete = count(&summary["ledger"]["flagged"]["incomplete integration"]);
     assert!(incomplete > 0 && accumulated + flagged == sampled, "{}", summary["ledger"]);
-    // Nothing is lost on a link that is fast enough.
+    // A fast enough link loses nothing.
     let (summary, _) = run(folder.path(), "fast", &["daughters.link_bits_per_s_max=128e3"]);
-    let [sampled, used, ..] = accounts(&summary["samples"]["ledger"]);
+    let [sampled, used, ..] = ledger_counts(&summary["samples"]["ledger"]);
     assert_eq!((sampled, count(&summary["samples"]["blocks"]["missing"])), (used, 0));
 }
 
@@ -111,17 +111,17 @@ fn an_hour_takes_the_memory_of_ten_minutes() {
     // Two windows of half an hour, and of five minutes.
     let sets = |seconds: &'static str| ["spacecraft.duration_s=17e3", seconds];
     let (summary, short_kb) = run(folder.path(), "short", &sets("spacecraft.window_s_max=300"));
-    assert_eq!(accounts(&summary["samples"]["ledger"])[0], 2 * 300 * 8_000 * 8);
+    assert_eq!(ledger_counts(&summary["samples"]["ledger"])[0], 2 * 300 * 8_000 * 8);
     let (summary, long_kb) = run(folder.path(), "long", &sets("spacecraft.window_s_max=1800"));
-    assert_eq!(accounts(&summary["samples"]["ledger"])[0], 2 * 1800 * 8_000 * 8);
+    assert_eq!(ledger_counts(&summary["samples"]["ledger"])[0], 2 * 1800 * 8_000 * 8);
     eprintln!("{short_kb} kB in ten minutes, {long_kb} kB in an hour");
-    // What grows are visibilities and powers, 21 bytes each in the store and some hundred in the final table: 29000
-    // powers in an hour, some thousand visibilities. Buffers that double and the allocator make 16 MB a cautious bound;
-    // the samples alone, of one byte a part, are 77 MB and 461 MB.
+    // Visibilities and auto-correlations grow, by 21 bytes each in the store and some hundred in the final table: 29000
+    // auto-correlations in an hour and some thousand visibilities. With doubling buffers and the allocator 16 MB is a
+    // cautious bound; the samples alone, of one byte per part, are 77 MB and 461 MB.
     assert!(long_kb < short_kb + 16_384, "{short_kb} kB, {long_kb} kB");
 }
 
-/// Hands frames on until it has seen so many; then it falls, or waits for ever.
+/// Passes a number of frames through; then it panics, or blocks for ever.
 struct Faulty {
     left: u32,
     hold: Option<mpsc::Receiver<()>>,
@@ -143,8 +143,8 @@ impl Stage for Faulty {
     }
 }
 
-/// The space segment with a stage that is faulty in its last window; its error, and what can be read of its
-/// unfinished file.
+/// Runs the space segment with a stage that fails in the last window; returns the error, and how much of the unfinished
+/// file is readable.
 fn broken(hold: Option<mpsc::Receiver<()>>) -> (RuntimeError, usize) {
     let folder = tempfile::tempdir().unwrap();
     let source = ConfigSource { file: Some(pipeline(folder.path())), ..ConfigSource::default() };
@@ -154,7 +154,7 @@ fn broken(hold: Option<mpsc::Receiver<()>>) -> (RuntimeError, usize) {
     let mut graph = Graph::new();
     let sent = graph.source("sample", 8, sampler);
     let received = graph.stage("link", 8, sent, link);
-    // To write down where it fell takes a thread seconds on a busy machine: no stall, unless one is made.
+    // Printing the backtrace of a panic takes seconds on a busy machine, so the deadline is long unless a stall is wanted.
     let stall_s = if hold.is_some() { 2 } else { 60 };
     // A window of 4 s has 32 blocks of each daughter, a start and an end.
     let passed = graph.stage("faulty", 8, received, Faulty { left: 2 * (32 * 8 + 2) + 100, hold });
@@ -183,16 +183,16 @@ fn broken(hold: Option<mpsc::Receiver<()>>) -> (RuntimeError, usize) {
 }
 
 #[test]
-fn a_stage_that_falls_leaves_its_name_and_a_file_that_can_be_read() {
+fn a_stage_that_panics_is_named_and_leaves_a_readable_file() {
     let (error, windows) = broken(None);
     let RuntimeError::Panicked { stage, message, .. } = &error else { panic!("{error:?}") };
     assert_eq!((stage.as_str(), message.as_str()), ("faulty", "a bit of radiation"));
-    // The second window may still be on its way between stages.
+    // The second window may still be in the queues.
     assert!((1..=2).contains(&windows), "{windows}");
 }
 
 #[test]
-fn a_stage_that_stalls_leaves_its_name_and_a_file_that_can_be_read() {
+fn a_stage_that_stalls_is_named_and_leaves_a_readable_file() {
     let (release, hold) = mpsc::channel();
     let (error, windows) = broken(Some(hold));
     drop(release);

@@ -1,4 +1,4 @@
-//! What is in the sky comes out as the model says, averaged over integrations and channels.
+//! Measured visibilities agree with the model, averaged over integrations and channels.
 
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{AntennaResponse, VisibilityBlock};
@@ -44,21 +44,21 @@ fn a_point_source_has_the_visibilities_of_the_model() {
                 }
             }
             let ratio = product / power;
-            // The weights are those of the noise; 2e-3 is what interpolation may leave, as documented.
+            // Weights are those of the noise; 2e-3 is the documented error of interpolation.
             let error = (1.0 / weight).sqrt();
             assert!((ratio - 1.0).norm() < 4.0 * 1.5 * error + 2e-3, "{channel} {pair}: {ratio} +- {error}");
         }
     }
-    // The source's own noise: half of the power is common to all, so that parts differ; on the mean they have
-    // P_i P_j / (2 n). A quarter of a square is the source's own, the same for all pairs, and half of it is of the source
-    // with one daughter's receiver, the same for seven: in 30 s and three channels, counting how integrations overlap, that
-    // leaves 1.3 % of the mean, of three runs 0.75 %.
+    // Self-noise of the source: half of the power is common to all daughters, so the two parts differ; their mean variance
+    // is P_i P_j / (2 n). A quarter of a square is due to the source alone, the same for all pairs, and half of it to the
+    // source and one receiver, the same for seven: with 30 s and three channels, and the overlap of integrations, that
+    // leaves 1.3 % of the mean, and 0.75 % for three runs.
     let mean = squares / count;
     eprintln!("{count} parts, mean square {mean:.4}");
     assert!((mean - 1.0).abs() < 4.0 * 0.0075, "{mean}");
 }
 
-/// What a model expects of integrations: means over four instants of each and 16 frequencies of the channel.
+/// The model's visibilities: means over four instants of each integration and 16 frequencies of the channel.
 fn expectations(
     array: &Array,
     blocks: &[VisibilityBlock],
@@ -82,7 +82,7 @@ fn expectations(
     }
     let mut expected = vec![Complex64::ZERO; positions.len() / 4];
     let mut predicted = vec![Complex64::ZERO; positions.len()];
-    // Frequencies over the channel as channels of their own.
+    // Frequencies within the channel, as separate channels.
     for k in 0..16 {
         let at_hz = frequency_hz + WIDTH_HZ * ((f64::from(k) + 0.5) / 16.0 - 0.5);
         model(at_hz).predict(&positions, &mut predicted).unwrap();
@@ -93,7 +93,7 @@ fn expectations(
     expected
 }
 
-/// The published sky at some MHz, so many seconds of it; `signal` standard errors of it should at least be there.
+/// Observes the published sky at `mhz` for `seconds`; the signal must be at least `signal` standard errors.
 fn check_real_sky(mhz: u32, seconds: f64, signal: f64) {
     let Some(path) = common::shared(&format!("sky/ulsa_{mhz}mhz_galactic_nside64.fits")) else { return };
     let sky: SkyMap = read_map(&path, &ReadOptions::default()).unwrap();
@@ -126,10 +126,10 @@ fn check_real_sky(mhz: u32, seconds: f64, signal: f64) {
     }
     let (ratio, error) = (product / power, power.sqrt().recip());
     eprintln!("{mhz} MHz: {count} parts, mean square {:.3}, {ratio:.4} +- {error:.4}", squares / count);
-    // All of it together is as strong as it should be, and turned by nothing.
+    // The whole signal has the right amplitude and no phase error.
     assert!((ratio - 1.0).norm() < 4.0 * error + 2e-3, "{mhz} MHz: {ratio} +- {error}");
     assert!(error < 1.0 / signal, "{mhz} MHz: {error}");
-    // Parts are correlated from pair to pair; a quarter of them as independent is cautious.
+    // Parts are correlated between pairs; a quarter of them as independent is cautious.
     assert!((squares / count - 1.0).abs() < 4.0 * (2.0 / (count / 4.0)).sqrt(), "{}", squares / count);
 }
 

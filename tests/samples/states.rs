@@ -1,4 +1,4 @@
-//! A ground that remembers, of samples of two bits: the same maps and own powers as without a memory.
+//! A ground segment with a state, for samples of two bits: the same maps and auto-correlations as without a state.
 
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -31,7 +31,7 @@ nside = 4
 epsilon = 1e-2
 "#;
 
-/// The tables, figures and pictures of own powers, and all maps, of a session.
+/// The tables, statistics and pictures of auto-correlations, and all maps, of a session.
 fn products(place: &Workplace, out: &str) -> Vec<Vec<u8>> {
     let file = |name: &str| std::fs::read(place.path(&format!("{out}/{name}"))).unwrap();
     let mut found: Vec<Vec<u8>> = ["autos.csv", "autos.json", "autos.png"].map(file).to_vec();
@@ -49,7 +49,7 @@ fn plain(place: &Workplace, out: &str, file: &str, sets: &[&str]) -> Vec<Vec<u8>
     products(place, out)
 }
 
-/// Arguments of a session that goes on with a state.
+/// Arguments of a session that continues a state.
 fn session(place: &Workplace, state: &str, files: &[&str]) -> Vec<String> {
     let (out, state) = (place.path(&format!("{state}.out")), place.path(state));
     let fixed = ["--map", &place.pipeline, "--out", &out, "--state", &state, "--checkpoint-every", "300"];
@@ -62,13 +62,13 @@ fn kept(place: &Workplace, state: &str, files: &[&str]) -> Vec<Vec<u8>> {
     products(place, &format!("{state}.out"))
 }
 
-/// Lines of a table of own powers.
+/// Number of lines of a table of auto-correlations.
 fn lines(products: &[Vec<u8>]) -> usize {
     products[0].iter().filter(|octet| **octet == b'\n').count()
 }
 
 #[test]
-fn a_state_has_the_maps_and_own_powers_of_a_plain_replay() {
+fn a_state_has_the_maps_and_auto_correlations_of_a_plain_replay() {
     let place = Workplace::new(PIPELINE);
     let file = place.simulate("all.ccsds", &[]);
     let whole = plain(&place, "plain", &file, &[]);
@@ -77,10 +77,10 @@ fn a_state_has_the_maps_and_own_powers_of_a_plain_replay() {
         "two windows of eight half seconds, in two channels, of eight daughters"
     );
     assert!(kept(&place, "state", &[&file]) == whole);
-    // The correction is no small matter: without it the maps and powers are others.
+    // The correction matters: without it maps and auto-correlations differ.
     let uncorrected = plain(&place, "uncorrected", &file, &["calibration.quantiser_bits=0"]);
     assert!(whole.iter().zip(&uncorrected).all(|(one, other)| one != other));
-    // What has been corrected for two bits is not gone on with for others.
+    // A state corrected for two bits cannot continue with other numbers of bits.
     for bits in ["0", "1"] {
         let mut args = session(&place, "state", &[&file]);
         args.extend(["--set".to_owned(), format!("calibration.quantiser_bits={bits}")]);
@@ -90,7 +90,7 @@ fn a_state_has_the_maps_and_own_powers_of_a_plain_replay() {
 }
 
 #[test]
-fn own_powers_are_kept_once_whatever_happens() {
+fn auto_correlations_are_kept_once_whatever_happens() {
     let place = Workplace::new(PIPELINE);
     let file = place.simulate("all.ccsds", &[]);
     let since = Instant::now();
@@ -101,14 +101,14 @@ fn own_powers_are_kept_once_whatever_happens() {
         serde_json::from_slice::<serde_json::Value>(&text).unwrap()["ledger"].clone()
     };
 
-    // Twice, in disorder, in two sessions.
+    // Twice, out of order, in two sessions.
     let bad = place.path("bad.ccsds");
     succeed(&["corrupt", &file, "--out", &bad, "--duplicate", "0.3", "--reorder", "0.3", "--seed", "5"]);
     assert!(kept(&place, "disordered", &[&bad]) == whole);
     assert!(kept(&place, "disordered", &[&file]) == whole);
     assert_eq!(ledger("disordered"), ledger("whole"));
 
-    // Killed at moments spread over a session, and gone on with.
+    // Killed at moments spread over a session, and resumed.
     for k in 0..4 {
         let args = session(&place, "killed", &[&file]);
         let mut command = Command::new(assert_cmd::cargo::cargo_bin("lunarray"));
@@ -122,7 +122,7 @@ fn own_powers_are_kept_once_whatever_happens() {
     assert!(kept(&place, "killed", &[&file]) == whole);
     assert_eq!(ledger("killed"), ledger("whole"));
 
-    // Two grounds of which each hears every second packet of visibilities, merged.
+    // Two ground segments that each receive every second packet of visibilities, merged.
     let packets = packets_of(&std::fs::read(&file).unwrap());
     let of_visibilities = |packet: &[u8]| packet[1] == 3;
     let heard = |station: u8| -> Vec<u8> {
@@ -138,7 +138,7 @@ fn own_powers_are_kept_once_whatever_happens() {
     assert!(kept(&place, "merged", &[&file]) == whole);
     assert_eq!(ledger("merged"), ledger("whole"));
 
-    // Taken out again, to the very powers of the ground that never heard them; and put in once more.
+    // Retracted, to exactly the auto-correlations of the ground segment that never received them; then replayed again.
     let only_odd: Vec<u8> = packets
         .iter()
         .filter(|packet| of_visibilities(packet) && packet[3] % 2 == 1)

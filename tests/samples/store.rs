@@ -1,4 +1,4 @@
-//! A store that a window is too much for.
+//! A store that is smaller than a window.
 
 use lunarray::frames::{Flags, GroundFrame, Housekeeping, VisibilityBlock};
 use lunarray::mother::{SpacecraftConfig, Store, StoreDrop, VISIBILITY_BYTES};
@@ -9,7 +9,7 @@ use num_complex::Complex32;
 const CHANNELS: u16 = 3;
 const TICKS: u32 = 2_400_000_000;
 
-/// Back to back through the window, the longer the baseline the shorter.
+/// Contiguous integrations through the window, shorter for longer baselines.
 fn block(channel: u16, pair: Pair) -> VisibilityBlock {
     let duration = 2_000_000 / u32::from(pair.j - pair.i);
     let count = (TICKS / duration) as usize;
@@ -57,8 +57,8 @@ fn a_window_is_cut_at_one_time_in_all_channels_and_pairs() {
             let (first, last) = (block.offset_ticks[0], block.offset_ticks[block.len() - 1]);
             let end = f64::from(last + block.duration_ticks[0]) / f64::from(TICKS);
             let from = f64::from(first) / f64::from(TICKS);
-            // A thirty-second part of a block goes at a time: one may be cut so much farther than others, or not yet. And
-            // whole integrations of 2 s at most.
+            // Blocks are cut in steps of 1/32: one may be ahead of or behind the others by one step, plus a whole integration
+            // of 2 s at most.
             let (from, end) = match drop {
                 StoreDrop::Oldest => (1.0 - from, 1.0 - end),
                 _ => (end, from),

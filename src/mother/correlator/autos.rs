@@ -41,7 +41,8 @@ impl AutoIntegrator {
     /// An integrator of `lanes` channels from `first_channel` on, over `duration_s` or one row, whichever is longer.
     #[must_use]
     pub fn new(
-        (first_channel, lanes): (usize, usize),
+        first_channel: usize,
+        lanes: usize,
         daughters: usize,
         window: ObservingWindow,
         duration_s: f64,

@@ -91,7 +91,8 @@ impl GroupIntegrator {
         schedules: &[Schedule],
         rule: DumpRule,
         array: &Array,
-        (window, dumps): (ObservingWindow, u64),
+        window: ObservingWindow,
+        dumps: u64,
     ) -> Self {
         let pairs = all_pairs(array.satellites()).into_iter().map(PairLanes::new).collect();
         let schedules = schedules[..schedules.len().min(LANES)].to_vec();

@@ -143,10 +143,10 @@ impl Correlator {
         let dumps = aligner.samples() / (rule.dump_samples * setup.division.sub_bands) as u64;
         let group = |(k, schedules): (usize, &[Schedule])| ChannelGroup {
             first: k * LANES,
-            integrator: GroupIntegrator::new(k * LANES, schedules, *rule, &setup.array, (window, dumps)),
+            integrator: GroupIntegrator::new(k * LANES, schedules, *rule, &setup.array, window, dumps),
             autos: (setup.auto_integration_s > 0.0).then(|| {
-                let lanes = (k * LANES, schedules.len());
-                AutoIntegrator::new(lanes, streams.daughters, window, setup.auto_integration_s)
+                let (daughters, integration_s) = (streams.daughters, setup.auto_integration_s);
+                AutoIntegrator::new(k * LANES, schedules.len(), daughters, window, integration_s)
             }),
             packed: Packed::new(streams.daughters),
             powers: vec![[0.0; LANES]; streams.daughters],
@@ -185,7 +185,7 @@ impl Correlator {
         });
         for (index, group) in running.groups.iter_mut().enumerate() {
             match &spectra {
-                Some(spectra) => self.process_spectra(group, row, (spectra, index), &mut made),
+                Some(spectra) => self.process_spectra(group, row, spectra, index, &mut made),
                 None => self.process_group(group, row, &mut made),
             }
         }
@@ -238,7 +238,8 @@ impl Correlator {
         &self,
         group: &mut ChannelGroup,
         row: &BlockRow,
-        (spectra, index): (&Spectra, usize),
+        spectra: &Spectra,
+        index: usize,
         made: &mut Vec<VisibilityBlock>,
     ) {
         let daughters = self.setup.array.satellites();

@@ -177,7 +177,7 @@ fn draw_plot(canvas: &mut Canvas, share: Rect, plot: &Plot) {
     }
     canvas.set_clip(None);
     canvas.outline(frame, Stroke::solid(INK, 1.0, 1.2));
-    write_axes(canvas, frame, plot, (&x_ticks, &y_ticks), &to_page);
+    write_axes(canvas, frame, plot, &x_ticks, &y_ticks, &to_page);
     legend(canvas, frame, plot, &drawn);
 }
 
@@ -208,7 +208,8 @@ fn write_axes(
     canvas: &mut Canvas,
     frame: Rect,
     plot: &Plot,
-    (x_ticks, y_ticks): (&Ticks, &Ticks),
+    x_ticks: &Ticks,
+    y_ticks: &Ticks,
     to_page: &impl Fn(f64, f64) -> (f64, f64),
 ) {
     let thin = Stroke::solid(INK, 1.0, 1.2);
