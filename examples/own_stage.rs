@@ -95,7 +95,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     graph.sink("strongest", powers, Strongest::default());
     let report = graph.run(&Cancel::new(), Duration::from_secs(10))?;
     for stage in &report.stages {
-        println!("{}: {} {}", stage.name, stage.units, stage.unit);
+        println!("{}: {} items in, {} out", stage.name, stage.items_in, stage.items_out);
     }
     Ok(())
 }
