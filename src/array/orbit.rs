@@ -143,6 +143,18 @@ impl Array {
     }
 
     /// Position of daughter `n` (from 0), m.
+    ///
+    /// ```
+    /// use lunarray::array::{Array, ArrayConfig, ObservingWindows};
+    /// use lunarray::units::vector::{norm, sub};
+    ///
+    /// let array = Array::new(&ArrayConfig::default())?;
+    /// let window = ObservingWindows::new(&array, 0.0, 1e5).next().expect("an orbit takes 8249 s");
+    /// let middle_s = 0.5 * (window.start.seconds() + window.end.seconds());
+    /// let baseline_m = norm(sub(array.position_m(0, middle_s), array.position_m(1, middle_s)));
+    /// assert!(baseline_m > 100.0 && baseline_m < 600.0);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     #[must_use]
     pub fn position_m(&self, n: usize, t_s: f64) -> Vec3 {
         self.state(n, t_s).position_m

@@ -26,6 +26,53 @@ pub struct Link<T> {
 }
 
 /// Sources, stages and sinks, each to run on a thread of its own.
+///
+/// ```
+/// use std::convert::Infallible;
+/// use std::time::Duration;
+///
+/// use lunarray::runtime::{Cancel, Flow, Graph, Outlet, Sink, Source, Stage};
+///
+/// struct Numbers(std::ops::Range<u32>);
+/// impl Source for Numbers {
+///     type Out = u32;
+///     type Error = Infallible;
+///     fn next(&mut self, out: &mut Outlet<u32>) -> Result<Flow, Infallible> {
+///         let Some(number) = self.0.next() else { return Ok(Flow::Done) };
+///         out.push(number);
+///         Ok(Flow::Continue)
+///     }
+/// }
+///
+/// struct Squares;
+/// impl Stage for Squares {
+///     type In = u32;
+///     type Out = u32;
+///     type Error = Infallible;
+///     fn step(&mut self, number: u32, out: &mut Outlet<u32>) -> Result<(), Infallible> {
+///         out.push(number * number);
+///         Ok(())
+///     }
+/// }
+///
+/// struct Print;
+/// impl Sink for Print {
+///     type In = u32;
+///     type Error = Infallible;
+///     fn take(&mut self, square: u32) -> Result<(), Infallible> {
+///         println!("{square}");
+///         Ok(())
+///     }
+/// }
+///
+/// let mut graph = Graph::new();
+/// let numbers = graph.source("numbers", 8, Numbers(0..100));
+/// let squares = graph.stage("squares", 8, numbers, Squares);
+/// graph.sink("print", squares, Print);
+/// let report = graph.run(&Cancel::new(), Duration::from_secs(1))?;
+/// assert_eq!(report.stages[1].items_out, 100);
+/// # Ok::<(), lunarray::runtime::RuntimeError>(())
+/// ```
 pub struct Graph {
     nodes: Vec<StageNode>,
     metrics: Arc<Metrics>,
