@@ -152,7 +152,7 @@ impl Calibrator {
     /// # Errors
     /// As [`Calibrator::step`].
     pub fn place_again(&mut self, block: VisibilityBlock) -> Result<PlacedVisibilities, CalibrationError> {
-        let aside = std::mem::replace(&mut self.ledger, Ledger::new());
+        let aside = std::mem::take(&mut self.ledger);
         let placed = self.place(block);
         self.ledger = aside;
         Ok(placed?.unwrap_or_default())
@@ -163,7 +163,7 @@ impl Calibrator {
     /// # Errors
     /// As [`Calibrator::step`].
     pub fn take_out_powers(&mut self, block: VisibilityBlock) -> Result<u64, CalibrationError> {
-        let aside = std::mem::replace(&mut self.ledger, Ledger::new());
+        let aside = std::mem::take(&mut self.ledger);
         let placed = self.own_powers(block);
         self.ledger = aside;
         Ok(placed?.map_or(0, |placed| self.powers.remove(&placed)))

@@ -243,9 +243,8 @@ impl SpacecraftConfig {
             checks.require(&key, value, inside, format!("{low_hz} Hz to {high_hz} Hz"));
             let half_hz = 0.5 * self.channel_width_hz;
             // Sub-bands are channels of the downlink, which lie within the band; others must only stay above zero.
-            let out = value - half_hz < low_hz || value + half_hz > high_hz;
-            let reaches_zero = half_hz >= value;
-            let fits = !reaches_zero && !(self.sub_bands > 1 && out);
+            let inside = value - half_hz >= low_hz && value + half_hz <= high_hz;
+            let fits = half_hz < value && (self.sub_bands == 1 || inside);
             let expected = format!(
                 "a channel of channel_width_hz = {} Hz that stays above zero, and with sub-bands within {low_hz} Hz to \
                  {high_hz} Hz",

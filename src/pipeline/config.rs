@@ -140,7 +140,7 @@ impl Config {
     }
 }
 
-/// What stands for a file in a hash: a checksum of its content, or its name if it cannot be read. Such a file ends the
+/// Replaces the path of a file in a hash: a checksum of its content, or its name if it cannot be read. Such a file ends the
 /// run when it is needed.
 fn contents(path: &Path) -> PathBuf {
     let sum = crc_fast::checksum_file(crc_fast::CrcAlgorithm::Crc64Nvme, &path.to_string_lossy(), None);

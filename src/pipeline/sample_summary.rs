@@ -1,4 +1,4 @@
-//! What became of the samples of a run in sample fidelity.
+//! Counters and ledger of samples, for runs with sample fidelity.
 
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -45,7 +45,7 @@ pub struct SampleSummary {
     pub repair_max: f32,
     /// What the links carried and dropped.
     pub link: LinkCounts,
-    /// What became of blocks at the mother.
+    /// Blocks at the mother.
     pub blocks: BlockSummary,
     /// Visibilities made of the samples.
     pub visibilities: u64,
@@ -74,7 +74,7 @@ impl SampleSummary {
     /// Closes the ledger of samples: sampled = correlated + lost.
     ///
     /// # Errors
-    /// [`LedgerImbalance`] if what was sampled is not what became of it.
+    /// [`LedgerImbalance`] unless sampled = correlated + lost.
     pub fn close(counts: &SampleCounts) -> Result<Self, LedgerImbalance<SampleReason>> {
         fn read<T: Clone>(counts: &Mutex<T>) -> T {
             counts.lock().unwrap_or_else(PoisonError::into_inner).clone()

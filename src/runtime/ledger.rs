@@ -10,7 +10,7 @@ use thiserror::Error;
 
 use crate::units::Reason;
 
-/// Counts what came into being and what became of it. Clones share one set of counts.
+/// Counts samples, and whether each was accumulated, flagged or lost. Clones share one set of counts.
 ///
 /// Counts saturate at `u64::MAX`. Posting takes a lock: post by block, not by sample.
 #[derive(Clone, Debug)]
@@ -33,7 +33,7 @@ impl<R: Reason> Ledger<R> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Posts `count` samples that came into being.
+    /// Posts `count` new samples.
     pub fn sampled(&self, count: u64) {
         add(&mut self.counts().sampled, count);
     }
@@ -86,7 +86,7 @@ impl<R: Reason> Ledger<R> {
     /// All counts, which must balance.
     ///
     /// # Errors
-    /// [`LedgerImbalance`] if what came into being is not what became of it.
+    /// [`LedgerImbalance`] unless sampled = accumulated + flagged + lost.
     pub fn close(&self) -> Result<LedgerReport<R>, LedgerImbalance<R>> {
         let report = self.report();
         if report.unaccounted() == 0 { Ok(report) } else { Err(LedgerImbalance { report }) }
@@ -100,7 +100,7 @@ fn add(entry: &mut u64, count: u64) {
 /// The counts of a ledger; shown as a table.
 #[derive(Clone, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 pub struct LedgerReport<R: Reason> {
-    /// Samples that came into being.
+    /// New samples.
     pub sampled: u64,
     /// Samples that reached the result.
     pub accumulated: u64,

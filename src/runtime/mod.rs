@@ -11,7 +11,7 @@
 //! - A stage fails or panics. The supervisor keeps the first error with the name and position of the stage, and wakes all
 //!   other stages, which stop without `finish`. The error names the stages that do not end by the deadline.
 //!
-//! A [`Ledger`] counts what became of every sample; it must balance at the end of a run.
+//! A [`Ledger`] counts samples that were accumulated, flagged or lost; it must balance at the end of a run.
 
 mod cancel;
 mod config;
