@@ -6,6 +6,7 @@
 //! quantisers of few bits do to correlations; after it, [`SubBands`] brings sub-bands of a channel together.
 
 mod autos;
+mod blocks;
 mod config;
 mod error;
 mod gains;
@@ -15,11 +16,12 @@ mod sub_bands;
 mod van_vleck;
 
 pub use autos::{AUTOS_MAX, AutoTable};
+pub use blocks::{BlockKey, ReceivedBlocks};
 pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 pub use gains::AntennaGains;
 pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation};
-pub use stage::{Calibrator, CalibratorState, DUPLICATE};
+pub use stage::{Calibrator, DUPLICATE};
 pub use sub_bands::SubBands;
 pub use van_vleck::{QuantiserBitsError, VanVleck};
 

@@ -8,6 +8,7 @@ use clap::Args;
 use super::{CommandResult, Outcome, print_json_line, print_text};
 use crate::downlink::Kind;
 use crate::ground::archive::{GapReport, Gaps, RestartReport, Survey};
+use crate::products::draw_coverage;
 
 /// List packets that are missing, and what they would add to the map.
 ///
@@ -40,7 +41,7 @@ pub(super) fn execute(args: &GapsArgs) -> CommandResult {
     }
     let gaps = survey.gaps();
     if let Some(path) = &args.picture {
-        survey.picture(&gaps)?.write(path)?;
+        draw_coverage(&survey, &gaps)?.write(path)?;
     }
     if args.json {
         print_json_line(&gaps)?;

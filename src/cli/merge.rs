@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::{CommandResult, Outcome, print_text};
-use crate::ground::archive::Keeper;
+use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::{ConfigSource, use_threads};
 
 /// Put the states of several grounds together.
@@ -34,7 +34,7 @@ pub(super) fn execute(args: &MergeArgs) -> CommandResult {
     let source = ConfigSource { file: args.map.clone(), overrides: args.overrides.clone(), seed: None };
     let config = source.load_ground()?;
     use_threads(&config.runtime)?;
-    let whole = Keeper::merge(&args.out, &args.states, &config)?;
+    let whole = Ground::merge(&args.out, &args.states, &config.ground(WAIT_BYTES))?;
     for note in whole.notes() {
         eprintln!("note: {note}");
     }

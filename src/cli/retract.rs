@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::{CommandResult, Outcome, print_json_line, print_text};
-use crate::ground::archive::Keeper;
+use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::{ConfigSource, use_threads};
 use crate::units::MissionTime;
 
@@ -51,8 +51,9 @@ pub(super) fn execute(args: &RetractArgs) -> CommandResult {
         (None, None) => None,
         (from_s, to_s) => Some([ticks(from_s, i64::MIN), ticks(to_s, i64::MAX)]),
     };
-    let (keeper, found) = Keeper::retract(&args.state, &args.files, span, &config)?;
-    for note in keeper.notes() {
+    let config = config.ground(WAIT_BYTES);
+    let (found, notes) = Ground::retract(&args.state, &args.files, span, &config)?;
+    for note in notes {
         eprintln!("note: {note}");
     }
     for refused in &found.named {

@@ -54,8 +54,8 @@ pub use error::DownlinkError;
 pub use link::LinkConfig;
 pub use receive::contents::{self, Contents};
 pub use receive::{
-    Decoder, DecoderState, Era, Event, FaultCounts, Intake, KindCounts, Packet, Receiver, ReceptionCounters,
-    Taken,
+    Decoder, DecoderState, Era, Event, FaultCounts, Intake, KindCounts, Packet, ReceivedSet, Receiver,
+    ReceptionCounters,
 };
 pub use transport::{
     DownlinkReader, DownlinkWriter, FileSource, Pace, Paced, Recorder, Steps, Transmitter, socket,

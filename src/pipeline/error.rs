@@ -51,9 +51,9 @@ pub enum PipelineError {
     /// Products cannot be written.
     #[error(transparent)]
     Products(#[from] crate::products::ProductsError),
-    /// The state of the ground cannot be kept.
+    /// The ground.
     #[error(transparent)]
-    State(#[from] crate::ground::archive::StateError),
+    Ground(#[from] crate::ground::GroundError),
     /// Nothing to make a map of.
     #[error(
         "no pair's visibility could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",

@@ -6,7 +6,7 @@ pub(crate) mod config;
 mod cost;
 mod engine_cost;
 pub(crate) mod error;
-pub(crate) mod ground_segment;
+mod ground_segment;
 pub(crate) mod models;
 mod notes;
 pub(crate) mod plan;
@@ -19,7 +19,6 @@ mod summary;
 pub use config::{Config, ConfigError, ConfigSource, Problems, QUICKLOOK};
 pub use cost::{ChannelCost, Cost};
 pub use error::PipelineError;
-pub use ground_segment::{Receiving, WAIT_BYTES};
 pub use plan::{Expected, Plan};
 pub use run::{
     Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, simulate, use_threads,

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::config::Config;
 use super::error::PipelineError;
-use super::ground_segment::{GroundOutcome, Receiving, WAIT_BYTES};
+use super::ground_segment::{Mapping, SegmentOutcome};
 use super::plan::Plan;
 use super::sample_summary::SampleSummary;
 use super::sampling::SampleCounts;
@@ -16,6 +16,7 @@ use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
+use crate::ground::{Ground, WAIT_BYTES};
 use crate::products::{ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::solve::SolveWatch;
@@ -105,12 +106,13 @@ pub fn run(plan: &Plan, out: &Path, cancel: &Cancel, watch: Watcher<'_>) -> Resu
     };
     drop(skies);
     let solving = SolveWatch::new(cancel.clone());
-    let receiving = Receiving::Once { wait_bytes: WAIT_BYTES };
-    let outcome =
-        ground_segment::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()), receiving)?;
+    let ground = Ground::new(&plan.config.ground(WAIT_BYTES))?;
+    let mapping = Mapping { out, truth, watch: solving.clone() };
+    let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: None };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
-    conclude(Segment::Whole, &plan.config, out, report, (outcome, None, counts.close(plan)?))
+    let ended = Ended { report, outcome, listening: None, samples: counts.close(plan)? };
+    conclude(Segment::Whole, &plan.config, out, ended)
 }
 
 /// The space segment alone, to a downlink file, a ground that listens, or both.
@@ -152,14 +154,14 @@ pub fn simulate(
     Ok(report)
 }
 
-/// The ground segment alone, from downlink files or senders.
+/// The ground segment alone: `ground`, made with the same configuration, takes downlink files or what senders send.
 ///
 /// # Errors
 /// A file that cannot be read; the first failure of any stage; no visibility for any map.
 pub fn replay<S: GroundSource + 'static>(
     source: S,
     config: &Config,
-    receiving: Receiving,
+    ground: Ground,
     out: &Path,
     cancel: &Cancel,
     watch: Watcher<'_>,
@@ -169,11 +171,11 @@ pub fn replay<S: GroundSource + 'static>(
     let listening = source.listening();
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
     let solving = SolveWatch::new(cancel.clone());
-    let watching = (Truth::unknown(), solving.clone());
-    let outcome = ground_segment::add(&mut graph, bytes, config, out, watching, receiving)?;
+    let mapping = Mapping { out, truth: Truth::unknown(), watch: solving.clone() };
+    let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone() };
     let report = start(graph, &config.runtime, cancel, (watched, watch))?;
-    conclude(Segment::Ground, config, out, report, (outcome, listening, None))
+    conclude(Segment::Ground, config, out, Ended { report, outcome, listening, samples: None })
 }
 
 /// The link's faults, if any are asked for; the truth about them goes beside the downlink file.
@@ -208,21 +210,25 @@ fn start(
     Ok(graph.run(cancel, Duration::from_secs_f64(config.shutdown_s))?)
 }
 
-fn conclude(
-    segment: Segment,
-    config: &Config,
-    out: &Path,
+/// A run that has ended well.
+struct Ended {
     report: Report,
-    (outcome, listening, samples): (GroundOutcome, Option<Listening>, Option<SampleSummary>),
-) -> Result<Summary, PipelineError> {
-    let mut reception = outcome.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let channels = outcome.channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = outcome.ledger.close()?;
+    outcome: SegmentOutcome,
+    listening: Option<Listening>,
+    samples: Option<SampleSummary>,
+}
+
+fn conclude(segment: Segment, config: &Config, out: &Path, ended: Ended) -> Result<Summary, PipelineError> {
+    let Ended { report, outcome, listening, samples } = ended;
+    let SegmentOutcome { ground, channels } = outcome;
+    let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let channels = channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let ledger = ground.ledger.close()?;
     let listening = listening.map(|listening| listening.account());
     if let Some(account) = &listening {
         account.complete(&mut reception);
     }
-    let mut autos = outcome.autos.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut autos = ground.autos.lock().unwrap_or_else(PoisonError::into_inner);
     write_autos(&mut autos, out, config.products.pictures)?;
     let mut summary = Summary::new(segment, config, report, ledger, reception, channels);
     (summary.listening, summary.samples) = (listening, samples);

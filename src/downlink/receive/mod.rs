@@ -5,12 +5,12 @@ pub mod contents;
 mod counters;
 mod decoder;
 mod intake;
+mod received_set;
 mod receiver;
 mod sequence;
-mod taken;
 
-pub use counters::{FaultCounts, KindCounts, ReceptionCounters};
+pub use counters::{FaultCounts, FaultKind, KindCounts, PacketReading, PayloadOutcome, ReceptionCounters};
 pub use decoder::{Decoder, DecoderState};
 pub use intake::Intake;
+pub use received_set::{Era, ReceivedSet};
 pub use receiver::{Event, Packet, Receiver};
-pub use taken::{Era, Taken};

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-use super::Taken;
+use super::ReceivedSet;
 use crate::downlink::wire::CucTime;
 
 /// Stretches that are remembered: of packets that came, and of missing ones in case they arrive late. Fifteen times the
@@ -43,7 +43,7 @@ pub(crate) struct Sequence {
     /// Time of the latest good packet.
     newest: CucTime,
     /// Good packets that came.
-    taken: Taken,
+    received: ReceivedSet,
     /// Missing counts below `next`: beginning and end (one beyond the last) of at most [`STRETCHES_MAX`] stretches.
     missing: BTreeMap<u64, u64>,
 }
@@ -58,8 +58,8 @@ impl Sequence {
             Arrival::Duplicate => return arrival,
         }
         self.newest = self.newest.max(time);
-        self.taken.take(count, time);
-        self.taken.forget_oldest(STRETCHES_MAX);
+        self.received.insert(count, time);
+        self.received.remove_oldest(STRETCHES_MAX);
         arrival
     }
 
@@ -76,12 +76,12 @@ impl Sequence {
 
     /// Times that the spacecraft has begun to count anew.
     pub(crate) fn restarts(&self) -> u64 {
-        self.taken.restarts()
+        self.received.restarts()
     }
 
     fn judge(&mut self, count: u64, time: CucTime) -> Arrival {
         let expected = self.next;
-        if self.taken.contains(count, time) {
+        if self.received.contains(count, time) {
             return Arrival::Duplicate;
         }
         if !std::mem::replace(&mut self.begun, true) {

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::journal::JournalEntry;
 use super::packet_order::{Schedule, Stream, Streams};
-use crate::downlink::{CucTime, Era, Kind, Taken};
+use crate::downlink::{CucTime, Era, Kind, ReceivedSet};
 use crate::units::MissionTime;
 
 /// Packets of the same channel and pair on either side of one that tell what the map would take of it.
@@ -21,7 +21,7 @@ pub struct Received {
     /// Every packet of positions that could be read, in the order of sending.
     pub positions: Vec<Positions>,
     /// Packets by kind.
-    pub taken: Vec<(Kind, Taken)>,
+    pub sets: Vec<(Kind, ReceivedSet)>,
     /// Frequencies of the instrument's channels, Hz.
     pub frequencies_hz: Vec<f64>,
 }
@@ -135,8 +135,8 @@ pub struct Gaps {
 #[must_use]
 pub fn find_gaps(received: &Received) -> Gaps {
     let mut found = Gaps::default();
-    for (kind, taken) in &received.taken {
-        let eras = taken.eras();
+    for (kind, set) in &received.sets {
+        let eras = set.eras();
         for (k, era) in eras.iter().enumerate() {
             let until = eras.get(k + 1).map(|era| era.from);
             if until.is_some() {
@@ -311,20 +311,20 @@ mod tests {
 
     /// What is found when packets are left out, and what they held by channel and pair.
     fn without(lost: &[Range<u64>]) -> (Gaps, BTreeMap<(u16, String), f64>) {
-        let mut taken = Taken::default();
+        let mut set = ReceivedSet::default();
         let mut held = BTreeMap::new();
         let mut kept = Vec::new();
         for entry in journal() {
             if lost.iter().any(|range| range.contains(&entry.count)) {
                 *held.entry((entry.channel.0, entry.pair.to_string())).or_default() += entry.integration_s;
             } else {
-                taken.take(entry.count, entry.made);
+                set.insert(entry.count, entry.made);
                 kept.push(entry);
             }
         }
         let readings = kept.into_iter().map(read).collect();
-        let taken = vec![(Kind::Visibilities, taken)];
-        (find_gaps(&Received { readings, taken, ..Received::default() }), held)
+        let sets = vec![(Kind::Visibilities, set)];
+        (find_gaps(&Received { readings, sets, ..Received::default() }), held)
     }
 
     #[test]
@@ -375,7 +375,7 @@ mod tests {
     #[test]
     fn nothing_missing_and_nothing_received() {
         assert!(without(&[]).0.gaps.is_empty());
-        let taken = vec![(Kind::Visibilities, Taken::default())];
-        assert_eq!(find_gaps(&Received { taken, ..Received::default() }), Gaps::default());
+        let sets = vec![(Kind::Visibilities, ReceivedSet::default())];
+        assert_eq!(find_gaps(&Received { sets, ..Received::default() }), Gaps::default());
     }
 }

@@ -1,4 +1,4 @@
-//! A line on every packet that has been read, and what became of it.
+//! The journal: a record of every packet that was applied, and what became of it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -7,8 +7,12 @@ use bincode::enc::Encoder;
 use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 
+use super::draft::Draft;
+use crate::downlink::receive::PacketReading;
+use crate::downlink::wire::{COUNT_MAX, PACKET_BYTES_MAX};
 use crate::downlink::{CucTime, Kind, PacketHeader};
-use crate::frames::{PlacedVisibilities, VisibilityBlock};
+use crate::frames::{Housekeeping, VisibilityBlock};
+use crate::ground::DeliveredPacket;
 use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime, Pair};
 
@@ -41,12 +45,10 @@ impl JournalEntry {
         (self.made, self.count)
     }
 
-    /// The line on a packet: of none, if it holds no visibilities or has been refused.
-    pub(super) fn of(header: PacketHeader, block: Option<&VisibilityBlock>) -> Self {
-        let none = Self { count: header.count, made: header.time, ..Self::default() };
-        let Some((block, last)) = block.and_then(|block| Some((block, block.len().checked_sub(1)?))) else {
-            return none;
-        };
+    /// The entry of a packet with a block of visibilities.
+    pub(super) fn of(made: CucTime, count: u64, block: &VisibilityBlock) -> Self {
+        let nothing = Self { count, made, ..Self::default() };
+        let Some(last) = block.len().checked_sub(1) else { return nothing };
         let end = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);
         let ticks: u64 = block.duration_ticks.iter().map(|&ticks| u64::from(ticks)).sum();
         let good = block.weight.iter().zip(&block.flags).filter(|(_, flags)| flags.is_good());
@@ -58,21 +60,28 @@ impl JournalEntry {
             visibilities: block.len() as u32,
             integration_s: ticks as f64 * 1e-6,
             weight: good.map(|(&weight, _)| f64::from(weight)).sum(),
-            ..none
+            ..nothing
         }
     }
 }
 
-/// Order of sending within a kind.
+/// Order of sending within a kind: creation time and count.
 pub(super) type Sent = (CucTime, u64);
 
 /// A packet of visibilities, and what became of them.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
-pub(super) struct Line {
+pub(super) struct VisibilityRecord {
     pub(super) entry: JournalEntry,
-    /// The packet's check.
+    /// Start of the window of the visibilities.
+    pub(super) window: MissionTime,
+    /// The packet's checksum.
     pub(super) check: u32,
-    /// Of what was handed to the sums: places, values, weights.
+    /// The packet's bytes.
+    pub(super) bytes: u32,
+    pub(super) reading: PacketReading,
+    /// Whether its block had been received already, in another packet.
+    pub(super) is_duplicate: bool,
+    /// Digest of what was offered to the sums: positions, values, weights.
     pub(super) digest: u32,
     /// Visibilities that could be placed and were offered to the sums.
     pub(super) offered: u32,
@@ -80,61 +89,84 @@ pub(super) struct Line {
     pub(super) accumulated: u32,
     /// Visibilities left out, by number of the reason in [`Journal`].
     pub(super) flagged: Vec<(u16, u32)>,
-    /// First and last mission time, s, of those that were offered to the sums.
+    /// First and last mission time, s, of those that were offered to an engine.
     pub(super) used_s: Option<[f64; 2]>,
 }
 
 /// A packet of another kind.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
-pub(super) struct OtherLine {
-    /// The packet's check.
+pub(super) struct OtherRecord {
+    /// The packet's checksum.
     pub(super) check: u32,
+    /// The packet's bytes.
     pub(super) bytes: u32,
+    pub(super) reading: PacketReading,
     /// First and last count of the packets of its payload.
     pub(super) payload: [u64; 2],
-    /// Beginning of the positions in it, if they are those that hold.
+    /// Start of the positions in it, if they are those that are used.
     pub(super) segment: Option<MissionTime>,
+    /// The spacecraft's report in it.
+    pub(super) report: Option<Housekeeping>,
 }
 
-/// All packets that have been read, in the order of sending.
+/// Records of all packets that were applied, in the order of sending.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Journal {
-    pub(super) visibilities: BTreeMap<Sent, Line>,
-    pub(super) others: BTreeMap<(Kind, Sent), OtherLine>,
+    pub(super) visibilities: BTreeMap<Sent, VisibilityRecord>,
+    pub(super) others: BTreeMap<(Kind, Sent), OtherRecord>,
     /// Why visibilities were left out, as the ledger has it.
     reasons: Vec<String>,
 }
 
 impl Journal {
-    /// Lines on packets with visibilities.
-    pub(super) fn entries(&self) -> impl Iterator<Item = &JournalEntry> {
-        self.visibilities.values().map(|line| &line.entry).filter(|entry| entry.visibilities > 0)
+    /// Whether no packet was applied.
+    pub(super) fn is_empty(&self) -> bool {
+        self.visibilities.is_empty() && self.others.is_empty()
     }
 
-    /// Packets with visibilities, each with the share of what was offered to the sums that they have taken.
-    pub(super) fn shares(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
-        let share =
-            |line: &Line| (line.offered > 0).then(|| f64::from(line.accumulated) / f64::from(line.offered));
-        let with = |line: &&Line| line.entry.visibilities > 0;
-        self.visibilities.values().filter(with).map(move |line| (&line.entry, share(line)))
+    /// Whether it has records of packets that can exist; a forged checkpoint may hold anything.
+    pub(super) fn is_sound(&self) -> bool {
+        let can_exist =
+            |(_, count): &Sent, bytes: u32| *count <= COUNT_MAX && bytes <= PACKET_BYTES_MAX as u32;
+        self.visibilities.iter().all(|(sent, record)| can_exist(sent, record.bytes))
+            && self.others.iter().all(|((_, sent), record)| can_exist(sent, record.bytes))
     }
 
-    /// Keeps a line on a packet of visibilities that became what `account` says.
-    pub(super) fn keep(
-        &mut self,
-        header: PacketHeader,
-        check: u32,
-        block: Option<&VisibilityBlock>,
-        (digest, offered, used_s): (u32, u32, Option<[f64; 2]>),
-        account: &LedgerReport,
-    ) {
-        let mut flagged = Vec::new();
-        for (reason, &count) in &account.flagged {
-            flagged.push((self.number_of(reason), count as u32));
+    /// Whether there is a record of a packet.
+    pub(super) fn contains(&self, header: &PacketHeader) -> bool {
+        let sent = (header.time, header.count);
+        match header.kind {
+            Kind::Visibilities => self.visibilities.contains_key(&sent),
+            kind => self.others.contains_key(&(kind, sent)),
         }
-        let (entry, accumulated) = (JournalEntry::of(header, block), account.accumulated as u32);
-        let line = Line { entry, check, digest, offered, accumulated, flagged, used_s };
-        self.visibilities.insert((header.time, header.count), line);
+    }
+
+    /// Records a packet of visibilities that became what the ledger's `posts` say.
+    pub(super) fn record_visibilities(
+        &mut self,
+        packet: &DeliveredPacket,
+        draft: Draft,
+        posts: &LedgerReport,
+    ) {
+        let DeliveredPacket { header, check, reading } = *packet;
+        let entry = JournalEntry { count: header.count, made: header.time, ..draft.entry };
+        let flagged =
+            posts.flagged.iter().map(|(reason, &count)| (self.number_of(reason), count as u32)).collect();
+        let record = VisibilityRecord {
+            entry,
+            window: draft.window,
+            check,
+            bytes: header.bytes as u32,
+            reading,
+            // The first of its blocks is counted as sampled at the end.
+            is_duplicate: posts.sampled > 0,
+            digest: draft.digest,
+            offered: draft.offered,
+            accumulated: posts.accumulated as u32,
+            flagged,
+            used_s: draft.used_s,
+        };
+        self.visibilities.insert((header.time, header.count), record);
     }
 
     fn number_of(&mut self, reason: &str) -> u16 {
@@ -146,9 +178,10 @@ impl Journal {
         number as u16
     }
 
-    /// Numbers the reasons that occur in the order of their names, so that lines do not tell in which order they came.
+    /// Numbers the reasons that occur in the order of their names, so that records do not depend on their order.
     pub(super) fn renumber(&mut self) {
-        let used = self.visibilities.values().flat_map(|line| line.flagged.iter().map(|(number, _)| *number));
+        let used =
+            self.visibilities.values().flat_map(|record| record.flagged.iter().map(|(number, _)| *number));
         let used: BTreeSet<u16> = used.collect();
         let mut names: Vec<(String, u16)> = Vec::new();
         for number in used {
@@ -161,72 +194,50 @@ impl Journal {
             return;
         }
         let new: BTreeMap<u16, u16> = names.iter().zip(0..).map(|((_, old), new)| (*old, new)).collect();
-        for line in self.visibilities.values_mut() {
-            for (number, _) in &mut line.flagged {
+        for record in self.visibilities.values_mut() {
+            for (number, _) in &mut record.flagged {
                 *number = new.get(number).copied().unwrap_or(u16::MAX);
             }
-            line.flagged.sort_unstable();
+            record.flagged.sort_unstable();
         }
         self.reasons = names.into_iter().map(|(name, _)| name).collect();
     }
 
-    /// Visibilities of a line that were left out, by reason.
-    pub(super) fn flagged<'a>(&'a self, line: &'a Line) -> impl Iterator<Item = (&'a str, u64)> {
+    /// Visibilities of a record that were left out, by reason.
+    pub(super) fn flagged<'a>(
+        &'a self,
+        record: &'a VisibilityRecord,
+    ) -> impl Iterator<Item = (&'a str, u64)> {
         let reason = |number: u16| self.reasons.get(usize::from(number)).map_or("", String::as_str);
-        line.flagged.iter().map(move |&(number, count)| (reason(number), u64::from(count)))
+        record.flagged.iter().map(move |&(number, count)| (reason(number), u64::from(count)))
     }
 
-    /// Takes all lines of another journal; the first packet of visibilities that is in both is refused, and gives
-    /// packets of other kinds that are in both.
-    pub(super) fn absorb(&mut self, other: Self) -> Result<Vec<(Kind, OtherLine)>, u64> {
+    /// Adds the records of another journal. A packet of visibilities that is in both is an error: its count.
+    pub(super) fn merge(&mut self, other: Self) -> Result<(), u64> {
         let Self { visibilities, others, reasons } = other;
         if let Some((_, count)) = visibilities.keys().find(|sent| self.visibilities.contains_key(sent)) {
             return Err(*count);
         }
-        for (sent, mut line) in visibilities {
-            for (number, _) in &mut line.flagged {
+        for (sent, mut record) in visibilities {
+            for (number, _) in &mut record.flagged {
                 *number = self.number_of(reasons.get(usize::from(*number)).map_or("", String::as_str));
             }
-            self.visibilities.insert(sent, line);
+            self.visibilities.insert(sent, record);
         }
-        let mut both = Vec::new();
-        for (key, line) in others {
-            if let Some(ours) = self.others.get_mut(&key) {
-                both.push((key.0, line));
-                ours.segment = ours.segment.or(line.segment);
-            } else {
-                self.others.insert(key, line);
-            }
+        for (key, record) in others {
+            let ours = self.others.entry(key).or_insert(record);
+            ours.segment = ours.segment.or(record.segment);
         }
-        Ok(both)
-    }
-
-    /// First and last mission time, s, of what is in the sums of each channel.
-    pub(super) fn spans_s(&self) -> BTreeMap<ChannelId, [f64; 2]> {
-        let mut spans: BTreeMap<ChannelId, [f64; 2]> = BTreeMap::new();
-        for line in self.visibilities.values() {
-            let Some([first, last]) = line.used_s else { continue };
-            let span = spans.entry(line.entry.channel).or_insert([first, last]);
-            *span = [span[0].min(first), span[1].max(last)];
-        }
-        spans
-    }
-
-    /// Whether visibilities with positions of a stretch of time are in the sums; daughters' own powers have none.
-    pub(super) fn uses(&self, [from, to]: [MissionTime; 2]) -> bool {
-        let within = |Line { entry, accumulated, .. }: &Line| {
-            *accumulated > 0 && entry.pair.i != entry.pair.j && entry.start <= to && entry.end >= from
-        };
-        self.visibilities.values().any(within)
+        Ok(())
     }
 }
 
-/// As a list of lines: a line names its packet itself.
+/// As a list of records: a record of visibilities names its packet itself.
 impl Encode for Journal {
     fn encode<E: Encoder>(&self, encoder: &mut E) -> Result<(), EncodeError> {
         (self.visibilities.len() as u64).encode(encoder)?;
-        for line in self.visibilities.values() {
-            line.encode(encoder)?;
+        for record in self.visibilities.values() {
+            record.encode(encoder)?;
         }
         self.others.encode(encoder)?;
         self.reasons.encode(encoder)
@@ -235,57 +246,44 @@ impl Encode for Journal {
 
 impl<Context> Decode<Context> for Journal {
     fn decode<D: Decoder<Context = Context>>(decoder: &mut D) -> Result<Self, DecodeError> {
-        let lines = Vec::<Line>::decode(decoder)?;
-        let sent = |line: &Line| (line.entry.made, line.entry.count);
-        let visibilities = lines.into_iter().map(|line| (sent(&line), line)).collect();
+        let records = Vec::<VisibilityRecord>::decode(decoder)?;
+        let visibilities = records.into_iter().map(|record| (record.entry.sent(), record)).collect();
         Ok(Self { visibilities, others: Decode::decode(decoder)?, reasons: Decode::decode(decoder)? })
     }
 }
 
 bincode::impl_borrow_decode!(Journal);
 
-/// A checksum over everything that sums are made of.
-pub(super) fn digest(placed: &PlacedVisibilities) -> u32 {
-    let mut crc = crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi);
-    let mut bytes = Vec::with_capacity(80 * placed.len());
-    for k in 0..placed.len() {
-        let ([a, b, c], [d, e, f], v) = (placed.r_i_m[k], placed.r_j_m[k], placed.value_k_sr[k]);
-        for number in [placed.time_s[k], a, b, c, d, e, f, v.re, v.im, placed.weight[k]] {
-            bytes.extend_from_slice(&number.to_le_bytes());
-        }
-    }
-    crc.update(&bytes);
-    crc.finalize() as u32
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::downlink::{FORMAT_VERSION, Segment};
 
-    fn header(count: u64) -> PacketHeader {
+    fn packet(count: u64, check: u32) -> DeliveredPacket {
         let (kind, segment, time) = (Kind::Visibilities, Segment::Whole, CucTime(7 * count));
-        PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 }
+        let header = PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 };
+        DeliveredPacket { header, check, reading: PacketReading::default() }
     }
 
-    fn account(reasons: &[(&str, u64)]) -> LedgerReport {
+    fn posts(reasons: &[(&str, u64)]) -> LedgerReport {
         let flagged = reasons.iter().map(|(reason, count)| ((*reason).to_owned(), *count)).collect();
         LedgerReport { accumulated: 5, flagged, ..LedgerReport::default() }
     }
 
     fn told(journal: &Journal) -> Vec<(u64, Vec<(String, u64)>)> {
-        let flagged =
-            |line: &Line| journal.flagged(line).map(|(reason, count)| (reason.to_owned(), count)).collect();
-        journal.visibilities.values().map(|line| (line.entry.count, flagged(line))).collect()
+        let flagged = |record: &VisibilityRecord| {
+            journal.flagged(record).map(|(reason, count)| (reason.to_owned(), count)).collect()
+        };
+        journal.visibilities.values().map(|record| (record.entry.count, flagged(record))).collect()
     }
 
     #[test]
     fn reasons_are_told_again_whatever_was_merged_and_kept() {
         let (mut ours, mut theirs) = (Journal::default(), Journal::default());
-        ours.keep(header(1), 11, None, (0, 0, None), &account(&[("far", 2)]));
-        theirs.keep(header(2), 12, None, (0, 0, None), &account(&[("bright", 3), ("far", 4)]));
-        theirs.keep(header(0), 13, None, (0, 0, None), &account(&[]));
-        assert_eq!(ours.absorb(theirs.clone()), Ok(vec![]));
+        ours.record_visibilities(&packet(1, 11), Draft::default(), &posts(&[("far", 2)]));
+        theirs.record_visibilities(&packet(2, 12), Draft::default(), &posts(&[("bright", 3), ("far", 4)]));
+        theirs.record_visibilities(&packet(0, 13), Draft::default(), &posts(&[]));
+        assert_eq!(ours.merge(theirs.clone()), Ok(()));
         let far = |count| ("far".to_owned(), count);
         let expected = vec![(0, vec![]), (1, vec![far(2)]), (2, vec![("bright".to_owned(), 3), far(4)])];
         assert_eq!(told(&ours), expected);
@@ -297,15 +295,35 @@ mod tests {
         assert_eq!((&kept, used), (&ours, bytes.len()));
         // The other way round the same is told.
         let mut first = Journal::default();
-        first.keep(header(1), 11, None, (0, 0, None), &account(&[("far", 2)]));
-        assert_eq!(theirs.absorb(first.clone()), Ok(vec![]));
+        first.record_visibilities(&packet(1, 11), Draft::default(), &posts(&[("far", 2)]));
+        assert_eq!(theirs.merge(first.clone()), Ok(()));
         theirs.renumber();
         assert_eq!((told(&theirs), &theirs), (expected, &ours));
-        // What no line needs any more is forgotten.
+        // Reasons without a record go.
         let mut without = theirs.clone();
         without.visibilities.retain(|(_, count), _| *count == 1);
         without.renumber();
         assert_eq!(without.reasons, ["far"]);
-        assert_eq!(theirs.absorb(first), Err(1));
+        assert_eq!(theirs.merge(first), Err(1));
+    }
+    #[test]
+    fn records_of_packets_that_cannot_exist_are_not_sound() {
+        let with = |count: u64, bytes: usize| {
+            let mut packet = packet(1, 5);
+            (packet.header.count, packet.header.bytes) = (count, bytes);
+            let mut journal = Journal::default();
+            journal.record_visibilities(&packet, Draft::default(), &posts(&[]));
+            journal
+        };
+        assert!(Journal::default().is_sound() && with(COUNT_MAX, PACKET_BYTES_MAX).is_sound());
+        assert!(!with(COUNT_MAX + 1, 60).is_sound() && !with(u64::MAX, 60).is_sound());
+        assert!(!with(1, PACKET_BYTES_MAX + 1).is_sound());
+        let (mut others, of) = (Journal::default(), with(1, 60));
+        let (check, bytes, reading) = (1, 60, PacketReading::default());
+        let record = OtherRecord { check, bytes, reading, payload: [1, 1], segment: None, report: None };
+        others.others.insert((Kind::Ephemeris, (CucTime(1), COUNT_MAX)), record);
+        assert!(others.is_sound() && of.is_sound());
+        others.others.insert((Kind::Ephemeris, (CucTime(1), COUNT_MAX + 1)), record);
+        assert!(!others.is_sound());
     }
 }

@@ -1,13 +1,13 @@
-//! Why a state cannot be kept or gone on with.
+//! Errors of the ground and its archive.
 
 use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// Why a state cannot be kept or gone on with.
+/// Errors of the ground and its archive.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum StateError {
+pub enum GroundError {
     /// A state that is to be put together with itself.
     #[error("{}: named twice; expected each state once", path.display())]
     NamedTwice {
@@ -52,7 +52,7 @@ pub enum StateError {
         /// How many there are.
         checkpoints: usize,
         /// What is wrong with the newest.
-        newest: Box<StateError>,
+        newest: Box<GroundError>,
     },
     /// The state was summed with other settings.
     #[error(
@@ -100,9 +100,9 @@ pub enum StateError {
     Accumulation(#[from] crate::accumulation::AccumulationError),
 }
 
-impl StateError {
+impl GroundError {
     /// A folder that is no state's.
-    pub(super) fn without_checkpoint(path: &std::path::Path) -> Self {
+    pub(in crate::ground) fn without_checkpoint(path: &std::path::Path) -> Self {
         Self::Damaged {
             path: path.to_owned(),
             found: "no checkpoint".into(),
@@ -111,7 +111,7 @@ impl StateError {
     }
 
     /// Names what was tried when the operating system refused.
-    pub(super) fn io(
+    pub(in crate::ground) fn io(
         path: &std::path::Path,
         action: &'static str,
     ) -> impl FnOnce(std::io::Error) -> Self + use<> {
