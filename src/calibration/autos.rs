@@ -16,7 +16,7 @@ pub const AUTOS_MAX: usize = 2_000_000;
 const HALF_TICKS_A_SECOND: f64 = 2e6;
 
 /// Channel, daughter, and the middle of the integration in half ticks.
-type Key = (ChannelId, u8, i64);
+type AutoKey = (ChannelId, u8, i64);
 
 /// A calibrated power and the standard deviation of its noise, K sr.
 type Power = [f64; 2];
@@ -34,7 +34,7 @@ pub(super) struct AutoInsertion {
 /// Auto-correlations by channel, daughter and time: at most two million, more only after a merge.
 #[derive(Clone, Debug, Default, PartialEq, Encode, Decode)]
 pub struct AutoTable {
-    powers: BTreeMap<Key, Power>,
+    powers: BTreeMap<AutoKey, Power>,
 }
 
 impl AutoTable {
@@ -77,7 +77,7 @@ impl AutoTable {
     /// All of them, by channel, daughter and time.
     #[must_use]
     pub fn list(&self, instrument: &Instrument) -> Vec<AutoPower> {
-        let power = |(&(channel, daughter, half_ticks), &[power_k_sr, sigma_k_sr]): (&Key, &Power)| {
+        let power = |(&(channel, daughter, half_ticks), &[power_k_sr, sigma_k_sr]): (&AutoKey, &Power)| {
             let channel = instrument.channel_of(channel, Pair { i: daughter, j: daughter })?;
             Some(AutoPower {
                 daughter,
@@ -92,7 +92,7 @@ impl AutoTable {
     }
 }
 
-fn powers(placed: &PlacedVisibilities) -> impl Iterator<Item = (Key, Power)> {
+fn powers(placed: &PlacedVisibilities) -> impl Iterator<Item = (AutoKey, Power)> {
     let Pair { i: daughter, .. } = placed.pair;
     (0..placed.len()).map(move |k| {
         // Times are exact to a hundredth of that after centuries.

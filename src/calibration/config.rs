@@ -1,4 +1,4 @@
-//! What can be chosen about calibration.
+//! Configuration of calibration.
 
 use std::path::{Path, PathBuf};
 
@@ -31,7 +31,7 @@ pub struct CalibrationConfig {
     pub gains_file: Option<PathBuf>,
     /// Bits of the samples whose correlations are corrected: 1, 2 or 4; 0 for no correction.
     pub quantiser_bits: u32,
-    /// Successive channels of the downlink, sub-bands of one, that go into one map.
+    /// Number of successive downlink channels that are sub-bands of one channel, and go into one map.
     pub sub_bands: usize,
 }
 
@@ -42,7 +42,7 @@ impl Default for CalibrationConfig {
 }
 
 impl CalibrationConfig {
-    /// Everything that is wrong with the configuration; empty if it is good. Does not open the file.
+    /// All invalid values; empty if there are none. Does not open the gains file.
     #[must_use]
     pub fn problems(&self) -> Vec<CalibrationError> {
         let mut found = Vec::new();
@@ -76,7 +76,7 @@ impl CalibrationConfig {
     /// The correction of quantised correlations, if there is one.
     ///
     /// # Errors
-    /// A number of bits that none is made for.
+    /// A number of bits without a correction.
     pub fn van_vleck(&self) -> Result<Option<VanVleck>, CalibrationError> {
         if self.quantiser_bits == 0 {
             return Ok(None);
@@ -91,7 +91,7 @@ impl CalibrationConfig {
     /// The calibration; `folder` is where the configuration lies.
     ///
     /// # Errors
-    /// The first of [`CalibrationConfig::problems`], or what is wrong with the gains file.
+    /// The first of [`CalibrationConfig::problems`], or an invalid gains file.
     pub fn build(&self, folder: &Path) -> Result<Box<dyn Calibration>, CalibrationError> {
         if let Some(problem) = self.problems().into_iter().next() {
             return Err(problem);

@@ -7,14 +7,14 @@ use serde::{Deserialize, Serialize};
 use super::CalibrationError;
 use crate::units::MAX_SATELLITES;
 
-/// How gains go from one solution to the next.
+/// Interpolation of gains between solutions.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Interpolation {
     /// Log amplitude and phase change linearly, the phase by the shorter way round.
     #[default]
     LogLinear,
-    /// The solution that is nearer in time holds; the earlier one half-way.
+    /// The solution that is nearest in time; the earlier one half-way.
     Nearest,
 }
 
@@ -24,15 +24,15 @@ pub enum Interpolation {
 #[doc = include_str!("gains_example.toml")]
 /// ```
 ///
-/// Before the first and after the last solution that one holds. A gain of zero or (in TOML) `nan`
-/// says that a satellite is of no use at that time.
+/// Before the first and after the last solution, that one is used. A gain of zero or (in TOML) `nan` excludes a satellite
+/// at that time.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GainsFile {
-    /// How gains go from one solution to the next.
+    /// Interpolation between solutions.
     #[serde(default)]
     pub interpolation: Interpolation,
-    /// Largest distance of a channel from the frequency whose gains it takes, Hz.
+    /// Largest difference between the frequencies of a channel and of its gains, Hz.
     #[serde(default = "half_a_channel_hz")]
     pub frequency_tolerance_hz: f64,
     /// Gains by channel, in any order.
@@ -65,7 +65,7 @@ pub struct GainSolution {
 }
 
 impl GainsFile {
-    /// Reads a file: JSON if its name ends so, TOML otherwise. Its values are not looked at.
+    /// Reads a file: JSON if its name ends in `.json`, TOML otherwise. Does not check its values.
     ///
     /// # Errors
     /// [`CalibrationError::Read`] and [`CalibrationError::Syntax`].
@@ -83,7 +83,7 @@ impl GainsFile {
     /// Everything that is wrong with the values; empty if they are good.
     #[must_use]
     pub fn problems(&self) -> Vec<CalibrationError> {
-        let mut found = Problems(Vec::new());
+        let mut found = GainProblems(Vec::new());
         let tolerance_hz = self.frequency_tolerance_hz;
         if !(tolerance_hz.is_finite() && tolerance_hz >= 0.0) {
             found.add("frequency_tolerance_hz", tolerance_hz, "a finite number of at least 0");
@@ -115,7 +115,7 @@ impl GainsFile {
 }
 
 impl ChannelGains {
-    fn add_problems(&self, key: &str, satellites: usize, found: &mut Problems) {
+    fn add_problems(&self, key: &str, satellites: usize, found: &mut GainProblems) {
         if self.solutions.is_empty() {
             found.add(&format!("{key}.solutions"), "[]", "at least one solution");
         }
@@ -138,9 +138,9 @@ impl ChannelGains {
     }
 }
 
-struct Problems(Vec<CalibrationError>);
+struct GainProblems(Vec<CalibrationError>);
 
-impl Problems {
+impl GainProblems {
     fn add(&mut self, key: &str, value: impl ToString, expected: &'static str) {
         self.0.push(CalibrationError::Parameter { key: key.to_owned(), value: value.to_string(), expected });
     }

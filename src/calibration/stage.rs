@@ -91,6 +91,12 @@ impl Calibrator {
         &self.ephemeris
     }
 
+    /// Blocks received.
+    #[must_use]
+    pub fn blocks(&self) -> &ReceivedBlocks {
+        &self.blocks
+    }
+
     /// Removes a segment of positions.
     pub fn remove_segment(&mut self, start: MissionTime) {
         self.ephemeris.remove(start);

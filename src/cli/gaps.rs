@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::{CommandResult, Outcome, print_json_line, print_text};
 use crate::downlink::Kind;
-use crate::ground::archive::{GapReport, Gaps, RestartReport, Survey};
+use crate::ground::archive::{CoverageSurvey, GapReport, Gaps, RestartReport};
 use crate::products::draw_coverage;
 
 /// List packets that are missing, and what they would add to the map.
@@ -35,7 +35,7 @@ pub(super) struct GapsArgs {
 }
 
 pub(super) fn execute(args: &GapsArgs) -> CommandResult {
-    let survey = Survey::of(&args.path)?;
+    let survey = CoverageSurvey::of(&args.path)?;
     for note in survey.notes() {
         eprintln!("note: {note}");
     }

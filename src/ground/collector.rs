@@ -181,10 +181,10 @@ impl Collector {
             }
             match self.take_event(placed)? {
                 // Once for all positions of a piece of the stream: much may be held.
-                Step::Nothing if self.reconsider() => {}
-                Step::Nothing => return Ok(None),
-                Step::Event => {}
-                Step::Delivery(found) => return Ok(Some(found)),
+                Handled::Nothing if self.reconsider() => {}
+                Handled::Nothing => return Ok(None),
+                Handled::Event => {}
+                Handled::Delivery(found) => return Ok(Some(found)),
             }
         }
     }
@@ -220,12 +220,6 @@ impl Collector {
             take(found);
         }
         require_packets(path, self.bytes(), self.received.iter().map(ReceivedSet::len).sum())
-    }
-
-    /// Whether a packet has been received, be it delivered or held.
-    #[must_use]
-    pub fn has_received(&self, header: &PacketHeader) -> bool {
-        self.received[header.kind.index()].contains(header.count, header.time)
     }
 
     /// Packets received of each kind.
@@ -355,11 +349,11 @@ impl Collector {
     }
 
     /// Takes one event of the stream.
-    fn take_event(&mut self, placed: Placed<'_>) -> Result<Step, DownlinkError> {
-        let Some(event) = self.intake.next_event() else { return Ok(Step::Nothing) };
+    fn take_event(&mut self, placed: Placed<'_>) -> Result<Handled, DownlinkError> {
+        let Some(event) = self.intake.next_event() else { return Ok(Handled::Nothing) };
         let Event::Packet(packet) = event else {
             self.link.accept(&event);
-            return Ok(Step::Event);
+            return Ok(Handled::Event);
         };
         let (offset, header) = (packet.offset, packet.header);
         let describes = header.kind == Kind::Instrument;
@@ -368,7 +362,7 @@ impl Collector {
         }
         if !self.received[header.kind.index()].insert(header.count, header.time) {
             self.link.accept(&Event::Duplicate { offset, header });
-            return Ok(Step::Event);
+            return Ok(Handled::Event);
         }
         // As nearly all are: never copied into the hold buffer.
         if header.kind == Kind::Visibilities
@@ -377,17 +371,17 @@ impl Collector {
         {
             let (frame, reading) = self.decoder.decode(packet, false);
             let packets = vec![DeliveredPacket { header, check: packet.check, reading }];
-            return Ok(Step::Delivery(Delivery { packets, frame }));
+            return Ok(Handled::Delivery(Delivery { packets, frame }));
         }
         self.held.insert(HeldPacket::of(&packet));
         if !describes && !self.knows_instrument() {
-            return Ok(Step::Event);
+            return Ok(Handled::Event);
         }
         if header.kind == Kind::Visibilities {
             self.candidates.push_back(header);
-            return Ok(Step::Event);
+            return Ok(Handled::Event);
         }
-        let Some(payload) = self.held.take_payload(&header) else { return Ok(Step::Event) };
+        let Some(payload) = self.held.take_payload(&header) else { return Ok(Handled::Event) };
         if describes {
             let whole: Vec<u8> = payload.iter().flat_map(|packet| packet.payload.iter().copied()).collect();
             if self.decoder.contradicts(&whole) {
@@ -398,12 +392,12 @@ impl Collector {
             // Everything else is held until then.
             self.candidates = headers(&self.held);
         }
-        Ok(Step::Delivery(self.deliver(&payload)))
+        Ok(Handled::Delivery(self.deliver(&payload)))
     }
 }
 
 /// What one event of a stream leads to.
-enum Step {
+enum Handled {
     /// No event.
     Nothing,
     /// Nothing to deliver yet.

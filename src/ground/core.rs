@@ -2,7 +2,7 @@
 
 use std::sync::{Mutex, PoisonError};
 
-use super::archive::{Archive, Draft};
+use super::archive::{Archive, RecordDraft};
 use super::{Collector, Delivery, GroundConfig, GroundError, GroundOutcome};
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::Calibrator;
@@ -72,7 +72,7 @@ impl Ground {
             }
             return Ok(());
         };
-        let mut draft = Draft::of(frame.as_ref());
+        let mut draft = RecordDraft::of(frame.as_ref());
         if let Some(placed) = placed(&mut self.calibrator, frame)? {
             draft.offer(&placed);
             draft.used_s = self.accumulator.accept(placed, out)?;

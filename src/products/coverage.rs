@@ -2,7 +2,7 @@
 
 use super::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
 use crate::downlink::Kind;
-use crate::ground::archive::{ChannelCoverage, Gaps, JournalEntry, Survey};
+use crate::ground::archive::{ChannelCoverage, CoverageSurvey, Gaps, JournalEntry};
 use crate::units::constants::DAY_S;
 
 /// Time steps of a plot.
@@ -44,7 +44,7 @@ impl TimeBins {
 ///
 /// # Errors
 /// [`PictureError::Size`] if nothing has been received. Of more than 64 channels the first are shown.
-pub fn draw_coverage(survey: &Survey, gaps: &Gaps) -> Result<Picture, PictureError> {
+pub fn draw_coverage(survey: &CoverageSurvey, gaps: &Gaps) -> Result<Picture, PictureError> {
     let readings = &survey.received().readings;
     let bins = TimeBins::of(readings.iter().map(|reading| &reading.entry));
     let most = if readings.is_empty() { 0 } else { PLOTS_MAX };
@@ -53,7 +53,7 @@ pub fn draw_coverage(survey: &Survey, gaps: &Gaps) -> Result<Picture, PictureErr
     draw_plots("Integration time received", &plots, 1 + usize::from(plots.len() > 3))
 }
 
-fn plot(survey: &Survey, gaps: &Gaps, coverage: &ChannelCoverage, bins: &TimeBins) -> Plot {
+fn plot(survey: &CoverageSurvey, gaps: &Gaps, coverage: &ChannelCoverage, bins: &TimeBins) -> Plot {
     let mut received_s = vec![0.0; BINS];
     for entry in survey.received().readings.iter().map(|reading| &reading.entry) {
         if entry.channel.0 == coverage.channel && entry.pair.i != entry.pair.j {
@@ -79,7 +79,7 @@ fn plot(survey: &Survey, gaps: &Gaps, coverage: &ChannelCoverage, bins: &TimeBin
 }
 
 /// Spreads the missing integration time of a channel over the observed parts of its gaps.
-fn add_missing(survey: &Survey, gaps: &Gaps, channel: u16, bins: &TimeBins, sums_s: &mut [f64]) {
+fn add_missing(survey: &CoverageSurvey, gaps: &Gaps, channel: u16, bins: &TimeBins, sums_s: &mut [f64]) {
     for gap in gaps.gaps.iter().filter(|gap| gap.kind == Kind::Visibilities) {
         let of_channel = gap.lost.iter().filter(|lost| lost.channel == channel);
         let lost_s: f64 = of_channel.map(|lost| lost.integration_s).sum();

@@ -32,7 +32,7 @@ const MEMORY_A_BYTE: usize = 16;
 
 /// A checkpoint without its engines: data, and the journal.
 #[derive(Clone, Debug, PartialEq, Decode)]
-pub(super) struct Head {
+pub(super) struct ArchiveHead {
     /// Keys and values of the settings that shape sums.
     pub(super) settings: Vec<(String, String)>,
     pub(super) collector: CollectorState,
@@ -42,9 +42,9 @@ pub(super) struct Head {
     pub(super) journal: Journal,
 }
 
-/// A [`Head`] to be written: field by field the same, without copies of what is large.
+/// A [`ArchiveHead`] to be written: field by field the same, without copies of what is large.
 #[derive(Encode)]
-pub(super) struct HeadView<'a> {
+pub(super) struct ArchiveHeadView<'a> {
     pub(super) settings: &'a Vec<(String, String)>,
     pub(super) collector: CollectorView<'a>,
     pub(super) ephemeris: Vec<&'a EphemerisSegment>,
@@ -54,12 +54,12 @@ pub(super) struct HeadView<'a> {
 }
 
 /// Forms a checksum of what is written.
-struct Summed<'a, W> {
+struct ChecksumWriter<'a, W> {
     inner: &'a mut W,
     crc: Digest,
 }
 
-impl<W: Write> Write for Summed<'_, W> {
+impl<W: Write> Write for ChecksumWriter<'_, W> {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         let written = self.inner.write(bytes)?;
         self.crc.update(&bytes[..written]);
@@ -75,7 +75,7 @@ impl<W: Write> Write for Summed<'_, W> {
 pub(super) fn write(
     out: &mut impl Write,
     path: &Path,
-    head: &HeadView<'_>,
+    head: &ArchiveHeadView<'_>,
     engines: impl FnOnce(&mut dyn Write) -> Result<(), GroundError>,
 ) -> Result<(), GroundError> {
     let failed = || GroundError::io(path, "write");
@@ -88,7 +88,7 @@ pub(super) fn write(
     let mut size = SizeWriter::default();
     let refused = |error: EncodeError| damaged(error.to_string());
     bincode::encode_into_writer(head, &mut size, config).map_err(refused)?;
-    let mut summed = Summed { inner: out, crc: Digest::new(CrcAlgorithm::Crc64Nvme) };
+    let mut summed = ChecksumWriter { inner: out, crc: Digest::new(CrcAlgorithm::Crc64Nvme) };
     summed.write_all(MAGIC).map_err(failed())?;
     summed.write_all(&(size.bytes_written as u64).to_le_bytes()).map_err(failed())?;
     // Many small pieces.
@@ -115,7 +115,7 @@ pub(super) fn is_checkpoint(path: &Path) -> Result<bool, GroundError> {
 /// Reads a checkpoint; `rest` makes something of the head and the engines.
 pub(super) fn read<T>(
     path: &Path,
-    rest: impl FnOnce(Head, &mut dyn Read) -> Result<T, GroundError>,
+    rest: impl FnOnce(ArchiveHead, &mut dyn Read) -> Result<T, GroundError>,
 ) -> Result<T, GroundError> {
     read_from(&mut File::open(path).map_err(GroundError::io(path, "read"))?, path, rest)
 }
@@ -126,7 +126,7 @@ pub(super) fn read<T>(
 pub(super) fn read_from<T>(
     from: &mut (impl Read + Seek),
     path: &Path,
-    rest: impl FnOnce(Head, &mut dyn Read) -> Result<T, GroundError>,
+    rest: impl FnOnce(ArchiveHead, &mut dyn Read) -> Result<T, GroundError>,
 ) -> Result<T, GroundError> {
     let failed = || GroundError::io(path, "read");
     let damaged = |found: String, expected| GroundError::Damaged { path: path.to_owned(), found, expected };
@@ -162,7 +162,7 @@ pub(super) fn read_from<T>(
 
 /// A head, and the bytes of it. Lengths that a forger claims are held against a limit, before memory is reserved, that
 /// follows from the bytes that are there: the least of some that the decoder knows, at most four times as much.
-fn decode(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
+fn decode(bytes: &[u8]) -> Result<(ArchiveHead, usize), DecodeError> {
     let most = bytes.len().saturating_mul(MEMORY_A_BYTE);
     match usize::BITS - most.leading_zeros() {
         0..=20 => decode_within::<{ 1 << 20 }>(bytes),
@@ -177,7 +177,7 @@ fn decode(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
     }
 }
 
-fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
+fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(ArchiveHead, usize), DecodeError> {
     bincode::decode_from_slice(bytes, bincode::config::standard().with_limit::<LIMIT>())
 }
 
@@ -224,13 +224,13 @@ mod tests {
     use crate::frames::{
         AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock,
     };
-    use crate::ground::archive::draft::Draft;
+    use crate::ground::archive::draft::RecordDraft;
     use crate::ground::{Collector, DeliveredPacket};
     use crate::runtime::{Ledger, Outlet, Stage};
     use crate::units::MissionTime;
 
     /// Every part of a head has something in it.
-    fn with_head<T>(take: impl FnOnce(&HeadView<'_>) -> T) -> T {
+    fn with_head<T>(take: impl FnOnce(&ArchiveHeadView<'_>) -> T) -> T {
         let channels = vec![Channel { frequency_hz: 3e6, width_hz: 8e3 }];
         let instrument = Instrument {
             name: "test".to_owned(),
@@ -278,9 +278,9 @@ mod tests {
         let header = PacketHeader { kind, segment, count: 3, time, version: FORMAT_VERSION, bytes: 60 };
         let mut journal = Journal::default();
         let packet = DeliveredPacket { header, check: 1, reading: PacketReading::default() };
-        journal.record_visibilities(&packet, Draft::default(), &ledger.report());
+        journal.record_visibilities(&packet, RecordDraft::default(), &ledger.report());
         let settings = vec![("map.nside".to_owned(), "4".to_owned())];
-        take(&HeadView {
+        take(&ArchiveHeadView {
             settings: &settings,
             collector: collector.view(),
             ephemeris: calibrator.ephemeris().segments().collect(),
@@ -290,7 +290,7 @@ mod tests {
         })
     }
 
-    fn written(head: &HeadView<'_>) -> Vec<u8> {
+    fn written(head: &ArchiveHeadView<'_>) -> Vec<u8> {
         let mut bytes = Vec::new();
         let engines =
             |out: &mut dyn Write| out.write_all(b"engines").map_err(GroundError::io(Path::new("x"), "write"));
@@ -298,7 +298,7 @@ mod tests {
         bytes
     }
 
-    fn read_back(bytes: &[u8]) -> Result<Head, GroundError> {
+    fn read_back(bytes: &[u8]) -> Result<ArchiveHead, GroundError> {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), bytes).unwrap();
         read(file.path(), |head, engines| {
@@ -308,7 +308,7 @@ mod tests {
     }
 
     /// Where each field stands, in the order in which they are written.
-    fn fields(head: &HeadView<'_>, bytes: usize) -> Vec<(&'static str, Range<usize>)> {
+    fn fields(head: &ArchiveHeadView<'_>, bytes: usize) -> Vec<(&'static str, Range<usize>)> {
         let length = |size: Result<Vec<u8>, EncodeError>| size.unwrap().len();
         let config = bincode::config::standard();
         let lengths = [

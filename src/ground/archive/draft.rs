@@ -3,23 +3,25 @@
 use super::journal::JournalEntry;
 use crate::downlink::CucTime;
 use crate::frames::{EphemerisSegment, GroundFrame, Housekeeping, PlacedFrame, PlacedVisibilities};
-use crate::units::MissionTime;
+use crate::units::{ChannelId, MissionTime};
 
 /// What is known of a delivery while it is being applied.
 #[derive(Debug, Default)]
-pub(in crate::ground) struct Draft {
+pub(in crate::ground) struct RecordDraft {
     /// What was received, but for the packet.
     pub(super) entry: JournalEntry,
     pub(super) window: MissionTime,
     pub(super) segment: Option<EphemerisSegment>,
     pub(super) report: Option<Housekeeping>,
+    /// Channel of the sums.
+    pub(super) channel: ChannelId,
     pub(super) digest: u32,
     pub(super) offered: u32,
     /// First and last mission time, s, of what was offered to an engine.
     pub(in crate::ground) used_s: Option<[f64; 2]>,
 }
 
-impl Draft {
+impl RecordDraft {
     /// What a frame holds.
     pub(in crate::ground) fn of(frame: Option<&GroundFrame>) -> Self {
         let nothing = Self::default();
@@ -37,7 +39,7 @@ impl Draft {
     /// Notes what is offered to the sums.
     pub(in crate::ground) fn offer(&mut self, placed: &PlacedFrame) {
         if let PlacedFrame::Visibilities(placed) = placed {
-            (self.digest, self.offered) = (digest(placed), placed.len() as u32);
+            (self.channel, self.digest, self.offered) = (placed.channel, digest(placed), placed.len() as u32);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The folder of a state: numbered checkpoints, of which the newest two are kept.
+//! The folder of an archive: numbered checkpoints, of which the newest two are kept.
 
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
@@ -9,18 +9,18 @@ use crate::ground::GroundError;
 const PREFIX: &str = "checkpoint-";
 const SUFFIX: &str = ".lunarray";
 
-/// A folder that no other process keeps a state in at the same time.
+/// A folder that one process uses at a time.
 #[derive(Debug)]
 pub(super) struct StateFolder {
     path: PathBuf,
     /// Number of the newest checkpoint.
     newest: u64,
-    /// Locked as long as it is open, by the system, which unlocks it whatever becomes of the process.
+    /// Locked while it is open; the system unlocks it however the process ends.
     _lock: File,
 }
 
 impl StateFolder {
-    /// Makes the folder if it is not there, and locks it.
+    /// Creates the folder if needed, and locks it.
     pub(super) fn open(path: &Path) -> Result<Self, GroundError> {
         fs::create_dir_all(path).map_err(GroundError::io(path, "make the folder"))?;
         let lock_path = path.join("lock");
@@ -36,8 +36,8 @@ impl StateFolder {
         Ok(folder)
     }
 
-    /// The newest checkpoint that `read` can read, and what is to be said of those that it cannot, which get
-    /// another name if they are to be set aside; `None` if there is none at all.
+    /// The newest checkpoint that `read` can read, or `None` if there is no checkpoint; and notes on newer ones that it
+    /// cannot, which are renamed if `sets_aside`.
     pub(super) fn load<T>(
         &mut self,
         sets_aside: bool,
@@ -74,7 +74,7 @@ impl StateFolder {
         }
     }
 
-    /// Writes a checkpoint, whole or not at all, and removes those before the last.
+    /// Writes a checkpoint, whole or not at all, and removes all but the newest two.
     pub(super) fn save(
         &mut self,
         write: impl FnOnce(&mut AtomicFile, &Path) -> Result<(), GroundError>,
@@ -97,7 +97,7 @@ impl StateFolder {
     }
 }
 
-/// What is to be said of a checkpoint that does not hold when another is used.
+/// A note on a checkpoint that cannot be used when an older one is.
 pub(super) fn note(error: &GroundError, used: &Path) -> String {
     format!("{error}; going on from the one before, {}", used.display())
 }
@@ -111,7 +111,7 @@ fn name(folder: &Path, number: u64) -> PathBuf {
     folder.join(format!("{PREFIX}{number:08}{SUFFIX}"))
 }
 
-/// Numbers of the checkpoints that are there, in order.
+/// Numbers of the checkpoints, in order.
 fn numbers(folder: &Path) -> Result<Vec<u64>, GroundError> {
     let mut numbers = Vec::new();
     for entry in fs::read_dir(folder).map_err(GroundError::io(folder, "read the folder"))? {

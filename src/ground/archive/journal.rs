@@ -7,12 +7,13 @@ use bincode::enc::Encoder;
 use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 
-use super::draft::Draft;
+use super::draft::RecordDraft;
 use crate::downlink::receive::PacketReading;
 use crate::downlink::wire::{COUNT_MAX, PACKET_BYTES_MAX};
 use crate::downlink::{CucTime, Kind, PacketHeader};
 use crate::frames::{Housekeeping, VisibilityBlock};
 use crate::ground::DeliveredPacket;
+pub(super) use crate::ground::hold_buffer::Sent;
 use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime, Pair};
 
@@ -65,9 +66,6 @@ impl JournalEntry {
     }
 }
 
-/// Order of sending within a kind: creation time and count.
-pub(super) type Sent = (CucTime, u64);
-
 /// A packet of visibilities, and what became of them.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
 pub(super) struct VisibilityRecord {
@@ -89,8 +87,15 @@ pub(super) struct VisibilityRecord {
     pub(super) accumulated: u32,
     /// Visibilities left out, by number of the reason in [`Journal`].
     pub(super) flagged: Vec<(u16, u32)>,
-    /// First and last mission time, s, of those that were offered to an engine.
-    pub(super) used_s: Option<[f64; 2]>,
+    /// What was offered to an engine.
+    pub(super) used: Option<Used>,
+}
+
+/// Channel of the sums, which sub-bands share, and first and last mission time, s, of what was offered to its engine.
+#[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
+pub(super) struct Used {
+    pub(super) channel: ChannelId,
+    pub(super) span_s: [f64; 2],
 }
 
 /// A packet of another kind.
@@ -145,7 +150,7 @@ impl Journal {
     pub(super) fn record_visibilities(
         &mut self,
         packet: &DeliveredPacket,
-        draft: Draft,
+        draft: RecordDraft,
         posts: &LedgerReport,
     ) {
         let DeliveredPacket { header, check, reading } = *packet;
@@ -164,7 +169,7 @@ impl Journal {
             offered: draft.offered,
             accumulated: posts.accumulated as u32,
             flagged,
-            used_s: draft.used_s,
+            used: draft.used_s.map(|span_s| Used { channel: draft.channel, span_s }),
         };
         self.visibilities.insert((header.time, header.count), record);
     }
@@ -280,9 +285,13 @@ mod tests {
     #[test]
     fn reasons_are_told_again_whatever_was_merged_and_kept() {
         let (mut ours, mut theirs) = (Journal::default(), Journal::default());
-        ours.record_visibilities(&packet(1, 11), Draft::default(), &posts(&[("far", 2)]));
-        theirs.record_visibilities(&packet(2, 12), Draft::default(), &posts(&[("bright", 3), ("far", 4)]));
-        theirs.record_visibilities(&packet(0, 13), Draft::default(), &posts(&[]));
+        ours.record_visibilities(&packet(1, 11), RecordDraft::default(), &posts(&[("far", 2)]));
+        theirs.record_visibilities(
+            &packet(2, 12),
+            RecordDraft::default(),
+            &posts(&[("bright", 3), ("far", 4)]),
+        );
+        theirs.record_visibilities(&packet(0, 13), RecordDraft::default(), &posts(&[]));
         assert_eq!(ours.merge(theirs.clone()), Ok(()));
         let far = |count| ("far".to_owned(), count);
         let expected = vec![(0, vec![]), (1, vec![far(2)]), (2, vec![("bright".to_owned(), 3), far(4)])];
@@ -295,7 +304,7 @@ mod tests {
         assert_eq!((&kept, used), (&ours, bytes.len()));
         // The other way round the same is told.
         let mut first = Journal::default();
-        first.record_visibilities(&packet(1, 11), Draft::default(), &posts(&[("far", 2)]));
+        first.record_visibilities(&packet(1, 11), RecordDraft::default(), &posts(&[("far", 2)]));
         assert_eq!(theirs.merge(first.clone()), Ok(()));
         theirs.renumber();
         assert_eq!((told(&theirs), &theirs), (expected, &ours));
@@ -312,7 +321,7 @@ mod tests {
             let mut packet = packet(1, 5);
             (packet.header.count, packet.header.bytes) = (count, bytes);
             let mut journal = Journal::default();
-            journal.record_visibilities(&packet, Draft::default(), &posts(&[]));
+            journal.record_visibilities(&packet, RecordDraft::default(), &posts(&[]));
             journal
         };
         assert!(Journal::default().is_sound() && with(COUNT_MAX, PACKET_BYTES_MAX).is_sound());

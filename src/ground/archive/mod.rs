@@ -55,11 +55,12 @@ mod store;
 mod survey;
 mod views;
 
-pub(super) use draft::Draft;
+pub(super) use draft::RecordDraft;
 pub use gaps::{
-    ChannelCoverage, GapReport, Gaps, LostStream, Positions, Reading, Received, RestartReport, find_gaps,
+    ChannelCoverage, GapReport, Gaps, LostStream, PositionsPacket, ReceivedPackets, RestartReport,
+    VisibilityPacket, find_gaps,
 };
 pub use journal::JournalEntry;
-pub use retract::{Refused, Retracted};
+pub use retract::{RefusedPacket, Retracted};
 pub(super) use store::Archive;
-pub use survey::Survey;
+pub use survey::CoverageSurvey;

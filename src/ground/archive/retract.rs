@@ -18,7 +18,7 @@ const REFUSED_LISTED: usize = 20;
 
 /// A packet that stays in the archive.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Refused {
+pub struct RefusedPacket {
     /// Kind.
     pub kind: Kind,
     /// Packet count.
@@ -45,11 +45,11 @@ pub struct Retracted {
     /// Packets that stay because their removal would remove something else.
     pub refused: u64,
     /// The first of those.
-    pub named: Vec<Refused>,
+    pub named: Vec<RefusedPacket>,
 }
 
 /// Place of a packet in the journal.
-type Key = (Kind, Sent);
+type RecordKey = (Kind, Sent);
 
 /// A retraction under way. Records are removed and their visibilities subtracted; the views of the journal are folded
 /// again by whoever opens the checkpoint.
@@ -60,9 +60,9 @@ struct Retraction {
     /// Only visibilities within this span of time, if it is given.
     span: Option<[MissionTime; 2]>,
     /// Packets that were considered.
-    done: BTreeSet<Key>,
+    done: BTreeSet<RecordKey>,
     /// Packets of other kinds that were applied.
-    others: BTreeSet<Key>,
+    others: BTreeSet<RecordKey>,
 }
 
 impl Ground {
@@ -166,7 +166,7 @@ impl Retraction {
     fn refuse(&mut self, header: &PacketHeader, reason: &'static str) {
         self.report.refused += 1;
         if self.report.named.len() < REFUSED_LISTED {
-            self.report.named.push(Refused { kind: header.kind, count: header.count, reason });
+            self.report.named.push(RefusedPacket { kind: header.kind, count: header.count, reason });
         }
     }
 
@@ -203,7 +203,7 @@ impl Retraction {
 
     /// Removes payloads of other kinds of which all packets were found and that nothing else depends on.
     fn retract_others(&mut self) {
-        let mut payloads: BTreeMap<(Kind, Sent), (OtherRecord, Vec<Key>)> = BTreeMap::new();
+        let mut payloads: BTreeMap<(Kind, Sent), (OtherRecord, Vec<RecordKey>)> = BTreeMap::new();
         for key @ (kind, (time, _)) in &self.others {
             let Some(record) = self.journal.others.get(key) else { continue };
             let first = (*kind, (*time, record.payload[0]));

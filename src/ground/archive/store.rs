@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use super::checkpoint::{self, HeadView};
-use super::draft::Draft;
+use super::checkpoint::{self, ArchiveHeadView};
+use super::draft::RecordDraft;
 use super::folder::StateFolder;
 use super::journal::{Journal, OtherRecord};
 use super::settings::{compare, settings_of};
@@ -37,7 +37,7 @@ impl Archive {
     pub(in crate::ground) fn record(
         &mut self,
         packets: &[DeliveredPacket],
-        draft: Draft,
+        draft: RecordDraft,
         ephemeris: &Ephemeris,
     ) -> LedgerReport {
         let posts = self.take_posts();
@@ -83,7 +83,7 @@ impl Archive {
         self.since_checkpoint = 0;
         self.journal.renumber();
         let no_autos = AutoTable::default();
-        let head = HeadView {
+        let head = ArchiveHeadView {
             settings: &self.settings,
             collector: collector.view(),
             ephemeris: calibrator.ephemeris().segments().collect(),
@@ -100,7 +100,7 @@ impl Archive {
 }
 
 /// All that a checkpoint holds: data, and the journal.
-pub(super) struct Contents {
+pub(super) struct ArchiveContents {
     pub(super) collector: CollectorState,
     pub(super) ephemeris: Vec<EphemerisSegment>,
     pub(super) autos: AutoTable,
@@ -108,7 +108,7 @@ pub(super) struct Contents {
     pub(super) journal: Journal,
 }
 
-impl Contents {
+impl ArchiveContents {
     /// Of a ground that has received nothing.
     pub(super) fn empty(config: &GroundConfig, posts: &Ledger) -> Self {
         Self {
@@ -140,7 +140,7 @@ impl Contents {
 /// A folder that is open, and what its newest usable checkpoint holds.
 pub(super) struct Opened {
     pub(super) folder: StateFolder,
-    contents: Option<Contents>,
+    contents: Option<ArchiveContents>,
     notes: Vec<String>,
     settings: Vec<(String, String)>,
     posts: Ledger,
@@ -157,7 +157,7 @@ impl Opened {
                 compare(path, &head.settings, &settings)?;
                 let accumulator = config.accumulator(&posts).resume(head.accumulator, engines)?;
                 let (collector, ephemeris, autos) = (head.collector, head.ephemeris, head.autos);
-                Ok(Contents { collector, ephemeris, autos, accumulator, journal: head.journal })
+                Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal: head.journal })
             })
         })?;
         Ok(Self { folder, contents, notes, settings, posts })
@@ -177,8 +177,8 @@ impl Opened {
     /// A ground that resumes from these contents.
     pub(super) fn resume(self, config: &GroundConfig, interval: u64) -> Result<Ground, GroundError> {
         let Self { folder, contents, notes, settings, posts } = self;
-        let contents = contents.unwrap_or_else(|| Contents::empty(config, &posts));
-        let Contents { collector, ephemeris, autos, mut accumulator, journal } = contents;
+        let contents = contents.unwrap_or_else(|| ArchiveContents::empty(config, &posts));
+        let ArchiveContents { collector, ephemeris, autos, mut accumulator, journal } = contents;
         let outcome = GroundOutcome::default();
         outcome.ledger.post_report(&journal.ledger());
         accumulator.set_spans(&journal.spans_s());

@@ -4,9 +4,9 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use super::checkpoint;
-use super::checkpoint::Head;
+use super::checkpoint::ArchiveHead;
 use super::folder::{checkpoints, note};
-use super::gaps::{Gaps, Positions, Reading, Received, find_gaps};
+use super::gaps::{Gaps, PositionsPacket, ReceivedPackets, VisibilityPacket, find_gaps};
 use super::journal::JournalEntry;
 use crate::accumulation::{Accumulator, MapConfig};
 use crate::array::Ephemeris;
@@ -22,14 +22,14 @@ const SEGMENTS_MAX: usize = 1 << 14;
 
 /// What has been received.
 #[derive(Clone, Debug, Default)]
-pub struct Survey {
-    received: Received,
-    /// Positions that are known.
+pub struct CoverageSurvey {
+    received: ReceivedPackets,
+    /// Known positions.
     ephemeris: Ephemeris,
     notes: Vec<String>,
 }
 
-impl Survey {
+impl CoverageSurvey {
     /// Surveys an archive's folder, one of its checkpoints, or a downlink file.
     ///
     /// # Errors
@@ -75,7 +75,7 @@ impl Survey {
     }
 
     fn of_checkpoint(path: &Path) -> Result<Self, GroundError> {
-        let head: Head = checkpoint::read(path, |head, engines| {
+        let head: ArchiveHead = checkpoint::read(path, |head, engines| {
             std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
             Ok(head)
         })?;
@@ -87,7 +87,7 @@ impl Survey {
     /// # Errors
     /// A damaged checkpoint.
     pub fn of_bytes(bytes: &[u8], map: &MapConfig) -> Result<Self, GroundError> {
-        let head: Head =
+        let head: ArchiveHead =
             checkpoint::read_from(&mut Cursor::new(bytes), Path::new("memory"), |head, engines| {
                 let accumulator = Accumulator::new(map.clone(), Ledger::default());
                 accumulator.resume(head.accumulator.clone(), engines)?;
@@ -96,18 +96,23 @@ impl Survey {
         Ok(Self::of_head(head))
     }
 
-    fn of_head(head: Head) -> Self {
-        let Head { journal, ephemeris, collector, .. } = head;
+    fn of_head(head: ArchiveHead) -> Self {
+        let ArchiveHead { journal, ephemeris, collector, .. } = head;
         let mut survey = Self { ephemeris: Ephemeris::new(SEGMENTS_MAX), ..Self::default() };
         for segment in ephemeris {
             survey.ephemeris.insert(segment);
         }
-        let readings = journal.shares().map(|(entry, share)| Reading { entry: *entry, waits: false, share });
+        let readings =
+            journal.shares().map(|(entry, share)| VisibilityPacket { entry: *entry, waits: false, share });
         survey.received.readings = readings.collect();
         for ((_, (made, count)), record) in &journal.others {
             let segment = record.segment.and_then(|start| survey.ephemeris.segment(start));
             let span = segment.map(|segment| [segment.start, segment.end()]);
-            survey.received.positions.extend(span.map(|span| Positions { count: *count, made: *made, span }));
+            survey.received.positions.extend(span.map(|span| PositionsPacket {
+                count: *count,
+                made: *made,
+                span,
+            }));
         }
         // Held packets were received too, and are not in the journal.
         let counters = ReceptionCounters::default();
@@ -128,12 +133,12 @@ impl Survey {
                 let entry = packets
                     .first()
                     .map(|packet| JournalEntry::of(packet.header.time, packet.header.count, &block));
-                let reading = entry.map(|entry| Reading { entry, waits: false, share: None });
+                let reading = entry.map(|entry| VisibilityPacket { entry, waits: false, share: None });
                 self.received.readings.extend(reading);
             }
             Some(GroundFrame::Ephemeris(segment)) => {
                 let span = [segment.start, segment.end()];
-                let positions = |packet: &DeliveredPacket| Positions {
+                let positions = |packet: &DeliveredPacket| PositionsPacket {
                     count: packet.header.count,
                     made: packet.header.time,
                     span,
@@ -158,7 +163,7 @@ impl Survey {
 
     /// What has been received.
     #[must_use]
-    pub fn received(&self) -> &Received {
+    pub fn received(&self) -> &ReceivedPackets {
         &self.received
     }
 
@@ -189,7 +194,7 @@ mod tests {
 
     #[test]
     fn what_is_missing_was_observed_where_positions_tell() {
-        let mut survey = Survey::default();
+        let mut survey = CoverageSurvey::default();
         // Windows of 2400 s in every 9000 s; of the fourth no positions came.
         for window in [0, 1, 2, 4] {
             survey.ephemeris.insert(EphemerisSegment {
