@@ -11,17 +11,17 @@ use std::marker::PhantomData;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use lunarray::accumulation::{Accumulator, EngineKind, MapConfig};
+use lunarray::accumulation::{EngineKind, MapConfig};
 use lunarray::array::{Array, ArrayConfig, Ephemeris, segments_for};
 use lunarray::calibration::{CalibrationConfig, Calibrator};
 use lunarray::downlink::receive::cadu::CaduReceiver;
 use lunarray::downlink::wire::cadu::{CaduEncoder, ReedSolomon, randomize};
 use lunarray::downlink::{DownlinkConfig, DownlinkReader, FileSource, PacketReceiver, Packetizer};
 use lunarray::frames::{
-    AntennaResponse, Channel, Flags, GroundFrame, Instrument, VisibilityBlock, VisibilityReason,
+    AntennaResponse, Channel, Flags, GroundFrame, Instrument, PlacedFrame, VisibilityBlock,
 };
-use lunarray::ground::Reception;
-use lunarray::runtime::{Cancel, Graph, Ledger, Sink, Units};
+use lunarray::ground::{Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
+use lunarray::runtime::{Cancel, Graph, Ledger, Outlet, Sink, Stage, Units};
 use lunarray::units::{ChannelId, MissionTime, Pair, StreamKind, all_pairs, random_stream};
 use num_complex::Complex32;
 use rand::{Rng, RngExt};
@@ -267,6 +267,36 @@ impl<T: Send> Sink for End<T> {
     }
 }
 
+/// The ground up to its sums, as [`Ground`] does it: collects packets, places and calibrates visibilities.
+struct Door {
+    collector: Collector,
+    calibrator: Calibrator,
+}
+
+impl Stage for Door {
+    type In = Vec<u8>;
+    type Out = PlacedFrame;
+    type Error = GroundError;
+
+    fn step(&mut self, bytes: Vec<u8>, _: &mut Outlet<PlacedFrame>) -> Result<(), GroundError> {
+        self.collector.push(&bytes);
+        loop {
+            let ephemeris = self.calibrator.ephemeris();
+            let Some(delivery) = self.collector.next_delivery(&|span| ephemeris.covers(span))? else {
+                return Ok(());
+            };
+            if let Some(frame) = delivery.frame {
+                black_box(self.calibrator.accept(frame)?);
+            }
+        }
+    }
+
+    fn finish(&mut self, _: &mut Outlet<PlacedFrame>) -> Result<(), GroundError> {
+        self.calibrator.close();
+        Ok(())
+    }
+}
+
 /// A replay, stages on threads as `lunarray replay` has them: from the file to the engines' door, and through the
 /// engines; beside one thread that reads the same file and forms a checksum.
 fn replay(bytes: &[u8], sent: u64) {
@@ -281,32 +311,34 @@ fn replay(bytes: &[u8], sent: u64) {
         }
         digest.finalize()
     };
-    let placed = |graph: &mut Graph, ledger: &Ledger<VisibilityReason>| {
-        let read = graph.source("read", 64, FileSource::open(std::slice::from_ref(&path)).unwrap());
-        let frames =
-            graph.stage("receive", 64, read, Reception::new(1 << 28, 8192, std::sync::Arc::default()));
-        let hook = CalibrationConfig::default().build(Path::new("")).unwrap();
-        graph.stage("calibrate", 64, frames, Calibrator::new(hook, ledger.clone()))
-    };
+    let read =
+        |graph: &mut Graph| graph.source("read", 64, FileSource::open(std::slice::from_ref(&path)).unwrap());
     let run = |graph: Graph| {
         graph.run(&Cancel::new(), Duration::from_secs(10)).unwrap();
     };
     let to_door = || {
         let (mut graph, ledger) = (Graph::new(), Ledger::new());
-        let placed = placed(&mut graph, &ledger);
+        let bytes = read(&mut graph);
+        let hook = CalibrationConfig::default().build(Path::new("")).unwrap();
+        let calibrator = Calibrator::new(hook, ledger.clone()).with_segments(8192);
+        let placed =
+            graph.stage("ground", 64, bytes, Door { collector: Collector::new(WAIT_BYTES), calibrator });
         graph.sink("door", placed, End(0, PhantomData));
         run(graph);
         assert_eq!((ledger.report().sampled, ledger.report().flagged_total()), (sent, 0));
         sent
     };
     let through = || {
-        let (mut graph, ledger) = (Graph::new(), Ledger::new());
-        let placed = placed(&mut graph, &ledger);
+        let mut graph = Graph::new();
+        let bytes = read(&mut graph);
         let map = MapConfig { engine: EngineKind::Harmonic, ..MapConfig::default() };
-        let sums = graph.stage("accumulate", 1, placed, Accumulator::new(map, ledger.clone()));
+        let calibration = CalibrationConfig::default();
+        let ground = Ground::new(&GroundConfig { calibration, map, wait_bytes: WAIT_BYTES }).unwrap();
+        let outcome = ground.outcome();
+        let sums = graph.stage("ground", 1, bytes, ground);
         graph.sink("end", sums, End(0, PhantomData));
         run(graph);
-        ledger.close().unwrap().accumulated
+        outcome.ledger.close().unwrap().accumulated
     };
     let time = |run: &dyn Fn() -> u64| {
         let start = Instant::now();

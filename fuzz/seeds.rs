@@ -13,7 +13,7 @@ use lunarray::frames::{
     AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, PlacedVisibilities,
     VisibilityBlock,
 };
-use lunarray::ground::archive::Keeper;
+use lunarray::ground::Ground;
 use lunarray::pipeline::{Config, ConfigSource};
 use lunarray::response::harmonic::NominalOrbit;
 use lunarray::response::pixel::PixelMethod;
@@ -176,10 +176,10 @@ fn state() {
     let overrides = ["map.nside=1", "map.baseline_bp_max=1000.0"].map(str::to_owned).to_vec();
     let source = ConfigSource { overrides, ..ConfigSource::default() };
     let config = source.parse_text("").expect("good");
-    let mut keeper = Keeper::open(&folder, &config, 300, u64::MAX).expect("a new state");
+    let mut ground = Ground::open(&folder, &config.ground(300), u64::MAX).expect("a new state");
     let bytes = transmit(&DownlinkConfig { packet_bytes_max: 256, ..DownlinkConfig::default() });
-    keeper.step(bytes, &mut Outlet::collect()).expect("sound");
-    keeper.finish(&mut Outlet::collect()).expect("sound");
+    ground.step(bytes, &mut Outlet::collect()).expect("sound");
+    ground.finish(&mut Outlet::collect()).expect("sound");
     let file = fs::read(folder.join("checkpoint-00000001.lunarray")).expect("written");
     let head = u64::from_le_bytes(file[8..16].try_into().expect("8")) as u16;
     let mut seed = vec![0];

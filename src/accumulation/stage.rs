@@ -1,5 +1,6 @@
 //! The ground stage that sums normal equations: an engine for each channel.
 
+use std::collections::BTreeMap;
 use std::io::{Read, Write};
 use std::sync::Arc;
 
@@ -95,15 +96,17 @@ impl Engine {
     }
 }
 
-/// State of an accumulator besides its engines and ledger, from which another can resume. Snapshots are numbered from 1
-/// again: their times depend on how the data arrived.
+/// State of an accumulator besides its engines, spans and ledger, from which another can resume. Snapshots are numbered
+/// from 1 again: their times depend on how the data arrived.
 #[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct AccumulatorState {
     instrument: Option<Instrument>,
-    /// First and last mission time of each channel that has an engine, s.
-    channels: Vec<Option<[f64; 2]>>,
-    accumulated: u64,
+    /// Whether each channel has an engine.
+    channels: Vec<bool>,
 }
+
+/// First and last time of no data.
+const NO_SPAN_S: [f64; 2] = [f64::INFINITY, f64::NEG_INFINITY];
 
 /// The engine of one channel, and the span of its data.
 struct ChannelSums {
@@ -120,32 +123,21 @@ pub struct Accumulator {
     channels: Vec<Option<ChannelSums>>,
     next_snapshot_s: Option<f64>,
     accumulated: u64,
-    /// First and last mission time of the block that was added last, s.
-    latest_s: Option<[f64; 2]>,
 }
 
 impl Accumulator {
     /// A stage that reports to `ledger`.
     #[must_use]
     pub fn new(config: MapConfig, ledger: Ledger<VisibilityReason>) -> Self {
-        Self {
-            config,
-            ledger,
-            instrument: None,
-            channels: Vec::new(),
-            next_snapshot_s: None,
-            accumulated: 0,
-            latest_s: None,
-        }
+        Self { config, ledger, instrument: None, channels: Vec::new(), next_snapshot_s: None, accumulated: 0 }
     }
 
-    /// Its state besides the engines.
+    /// Its state besides the engines and spans.
     #[must_use]
     pub fn state(&self) -> AccumulatorState {
         AccumulatorState {
             instrument: self.instrument.as_deref().cloned(),
-            channels: self.channels.iter().map(|slot| slot.as_ref().map(|sums| sums.span_s)).collect(),
-            accumulated: self.accumulated,
+            channels: self.channels.iter().map(Option::is_some).collect(),
         }
     }
 
@@ -163,32 +155,32 @@ impl Accumulator {
         Ok(())
     }
 
-    /// Resumes from a state and from engines that [`Accumulator::write_engines`] wrote.
+    /// Resumes from a state and its engines, as [`Accumulator::write_engines`] wrote them. The channels' spans are not
+    /// part of it: see [`Accumulator::set_spans`].
     ///
     /// # Errors
     /// Engines that are damaged, or of another kind than configured.
     pub fn resume(self, state: AccumulatorState, from: &mut dyn Read) -> Result<Self, AccumulationError> {
-        let AccumulatorState { instrument, channels: kept, accumulated } = state;
         let mut channels = Vec::new();
-        for kept in kept {
-            let Some(span_s) = kept else {
+        for has_engine in state.channels {
+            if !has_engine {
                 channels.push(None);
                 continue;
-            };
+            }
             let engine = match self.config.engine {
                 EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
                 EngineKind::Harmonic => Engine::Harmonic(Box::new(HarmonicEngine::restore(from)?)),
             };
-            channels.push(Some(ChannelSums { engine, span_s, snapshots: 0 }));
+            channels.push(Some(ChannelSums { engine, span_s: NO_SPAN_S, snapshots: 0 }));
         }
-        Ok(Self { instrument: instrument.map(Arc::new), channels, accumulated, ..self })
+        Ok(Self { instrument: state.instrument.map(Arc::new), channels, ..self })
     }
 
-    /// Adds what another holds, channel by channel.
+    /// Adds the sums of another accumulator, channel by channel.
     ///
     /// # Errors
     /// Engines of different setups.
-    pub fn absorb(&mut self, other: Self) -> Result<(), AccumulationError> {
+    pub fn merge(&mut self, other: Self) -> Result<(), AccumulationError> {
         if self.instrument.is_none() {
             self.instrument = other.instrument;
         }
@@ -210,13 +202,12 @@ impl Accumulator {
                 }
             }
         }
-        self.accumulated += other.accumulated;
         Ok(())
     }
 
-    /// Takes visibilities out of the sums of their channel again; the ledger is the caller's affair.
+    /// Subtracts visibilities from the sums of their channel; posts nothing to the ledger.
     ///
-    /// Those beyond the map's longest baseline never were in the sums: they are neither taken out nor refused.
+    /// Those beyond the map's longest baseline never were in the sums: they are neither subtracted nor refused.
     ///
     /// # Errors
     /// A channel that holds nothing, or as [`NormalEngine::remove`].
@@ -227,23 +218,40 @@ impl Accumulator {
         }
         let slot = self.channels.get_mut(usize::from(placed.channel.0)).and_then(Option::as_mut);
         let sums = slot.ok_or(AccumulationError::NothingHeld(placed.channel))?;
-        let removed = sums.engine.remove(&near)?;
-        self.accumulated = self.accumulated.saturating_sub(removed.visibilities);
-        Ok(removed)
+        sums.engine.remove(&near)
     }
 
-    /// First and last mission time, s, of what has been added since this was asked last; of the last block.
-    pub fn take_latest_s(&mut self) -> Option<[f64; 2]> {
-        self.latest_s.take()
-    }
-
-    /// Says what a channel spans after visibilities have been taken out; nothing is left of a channel without.
-    pub fn set_span(&mut self, channel: ChannelId, span_s: Option<[f64; 2]>) {
-        let Some(slot) = self.channels.get_mut(usize::from(channel.0)) else { return };
-        match (slot.as_mut(), span_s) {
-            (Some(sums), Some(span_s)) => sums.span_s = span_s,
-            _ => *slot = None,
+    /// Sets the first and last mission time, s, of the data in each channel; drops the sums of all others.
+    pub fn set_spans(&mut self, spans_s: &BTreeMap<ChannelId, [f64; 2]>) {
+        for (slot, channel) in self.channels.iter_mut().zip(0..) {
+            match (slot.as_mut(), spans_s.get(&ChannelId(channel))) {
+                (Some(sums), Some(&span_s)) => sums.span_s = span_s,
+                _ => *slot = None,
+            }
         }
+    }
+
+    /// Takes the next frame, and emits snapshots that are due; returns the first and last mission time, s, of the
+    /// visibilities that were offered to an engine.
+    ///
+    /// # Errors
+    /// As [`NormalEngine::add`]; an instrument that the map's settings do not fit.
+    pub fn accept(
+        &mut self,
+        frame: PlacedFrame,
+        out: &mut Outlet<Snapshot>,
+    ) -> Result<Option<[f64; 2]>, AccumulationError> {
+        match frame {
+            PlacedFrame::Instrument(instrument) => self.open(instrument)?,
+            PlacedFrame::Visibilities(placed) => {
+                if let Some(&time_s) = placed.time_s.first() {
+                    self.emit_if_due(time_s, out);
+                }
+                return self.add(&placed);
+            }
+            PlacedFrame::Housekeeping(_) => {}
+        }
+        Ok(None)
     }
 
     fn open(&mut self, instrument: Instrument) -> Result<(), AccumulationError> {
@@ -265,33 +273,33 @@ impl Accumulator {
         let slot = self.channels.get_mut(index).ok_or_else(unknown)?;
         if slot.is_none() {
             let Some(engine) = engine(&self.config, instrument, placed)? else { return Ok(None) };
-            *slot = Some(ChannelSums { engine, span_s: [f64::INFINITY, f64::NEG_INFINITY], snapshots: 0 });
+            *slot = Some(ChannelSums { engine, span_s: NO_SPAN_S, snapshots: 0 });
         }
         Ok(slot.as_mut())
     }
 
-    fn add(&mut self, placed: &PlacedVisibilities) -> Result<(), AccumulationError> {
+    fn add(&mut self, placed: &PlacedVisibilities) -> Result<Option<[f64; 2]>, AccumulationError> {
         let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
         self.ledger.left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - near.len()) as u64);
         if near.is_empty() {
             // A channel without usable data has no sums, and no map.
-            return Ok(());
+            return Ok(None);
         }
         let Some(sums) = self.sums(&near)? else {
             self.ledger.left_out(VisibilityReason::NoDirection, near.len() as u64);
-            return Ok(());
+            return Ok(None);
         };
         let Added { visibilities, refused } = sums.engine.add(&near)?;
-        if let (Some(first), Some(last)) = (near.time_s.first(), near.time_s.last()) {
-            sums.span_s = [sums.span_s[0].min(*first), sums.span_s[1].max(*last)];
-            self.latest_s = Some([*first, *last]);
+        let offered_s = near.time_s.first().zip(near.time_s.last()).map(|(&first, &last)| [first, last]);
+        if let Some([first, last]) = offered_s {
+            sums.span_s = [sums.span_s[0].min(first), sums.span_s[1].max(last)];
         }
         self.accumulated += visibilities;
         self.ledger.accumulated(visibilities);
         for (reason, count) in refused {
             self.ledger.left_out(reason.into(), count);
         }
-        Ok(())
+        Ok(offered_s)
     }
 
     /// Emits a snapshot of each channel.
@@ -397,17 +405,7 @@ impl Stage for Accumulator {
     type Error = AccumulationError;
 
     fn step(&mut self, frame: PlacedFrame, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
-        match frame {
-            PlacedFrame::Instrument(instrument) => self.open(instrument)?,
-            PlacedFrame::Visibilities(placed) => {
-                if let Some(&time_s) = placed.time_s.first() {
-                    self.emit_if_due(time_s, out);
-                }
-                self.add(&placed)?;
-            }
-            PlacedFrame::Housekeeping(_) => {}
-        }
-        Ok(())
+        self.accept(frame, out).map(drop)
     }
 
     fn finish(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {

@@ -10,10 +10,10 @@ use serde::Serialize;
 use crate::accumulation::Snapshot;
 use crate::downlink::Transmitter;
 use crate::frames::GroundFrame;
+use crate::ground::{Ground, Reception, WAIT_BYTES};
 use crate::mother::Store;
 use crate::pipeline::config::Config;
 use crate::pipeline::error::PipelineError;
-use crate::pipeline::ground_segment::{GroundOutcome, WAIT_BYTES, add_sums, reception};
 use crate::pipeline::models;
 use crate::pipeline::plan::Plan;
 use crate::pipeline::{SampleCounts, sample_stages};
@@ -62,9 +62,17 @@ pub(super) fn run(plan: &Plan, skies: &[SkyMap]) -> Result<ChainRun, PipelineErr
     let visibilities = graph.stage("correlate", capacity, samples, correlator);
     let passes = graph.stage("store", capacity, visibilities, Store::new(&plan.config.spacecraft, None));
     let packets = graph.stage("transmit", capacity, passes, Transmitter::new(&plan.config.downlink)?);
-    let received = graph.stage("receive", capacity, packets, reception(WAIT_BYTES, Arc::default()));
+    let received = graph.stage("receive", capacity, packets, reception());
     graph.sink("drop", received, Forget(0));
     watched(graph, plan.config.runtime.shutdown_s)
+}
+
+/// Segments of positions that a stage alone knows.
+const SEGMENTS_MAX: usize = 8192;
+
+/// The ground's receiving alone.
+pub(super) fn reception() -> Reception {
+    Reception::new(WAIT_BYTES, SEGMENTS_MAX, Arc::default())
 }
 
 /// Runs packets through the ground segment, up to the sums.
@@ -73,7 +81,7 @@ pub(super) fn run_ground(config: &Config, packets: &[Vec<u8>]) -> Result<ChainRu
     // The source pops from the end.
     let packets = Packets(packets.iter().rev().cloned().collect());
     let bytes = graph.source("packets", config.runtime.queue_capacity, packets);
-    let sums = add_sums(&mut graph, bytes, config, &GroundOutcome::default(), WAIT_BYTES)?;
+    let sums = graph.stage("ground", 1, bytes, Ground::new(&config.ground(WAIT_BYTES))?);
     graph.sink("drop", sums, Drop);
     watched(graph, config.runtime.shutdown_s)
 }

@@ -8,7 +8,6 @@ mod display;
 mod growth;
 
 use std::convert::Infallible;
-use std::sync::Arc;
 use std::time::Instant;
 
 use serde::Serialize;
@@ -18,7 +17,6 @@ use crate::frames::{GroundFrame, Samples, SpaceFrame};
 use crate::mother::Fidelity;
 use crate::pipeline::config::Config;
 use crate::pipeline::error::PipelineError;
-use crate::pipeline::ground_segment::{WAIT_BYTES, reception};
 use crate::pipeline::plan::Plan;
 use crate::pipeline::{SampleCounts, sample_stages};
 use crate::pipeline::{models, space_segment};
@@ -282,7 +280,7 @@ fn time_stage(
             spent
         }
         _ => {
-            let (input, reception) = (material.packets.clone(), reception(WAIT_BYTES, Arc::default()));
+            let (input, reception) = (material.packets.clone(), chain::reception());
             let (spent, received) = timed(|| stage(reception, input));
             received?;
             spent

@@ -1,4 +1,4 @@
-//! The daughters' own powers, each once, whatever the order in which they came.
+//! Auto-correlations of the daughters, each once, in any order.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -8,54 +8,54 @@ use bincode::{Decode, Encode};
 use crate::frames::{AutoPower, Instrument, PlacedVisibilities};
 use crate::units::{ChannelId, Pair};
 
-/// Most powers that are taken: 130 MB of memory and 60 MB of a checkpoint, more than two hours of every second of 30
+/// Capacity of a table: 130 MB of memory and 60 MB of a checkpoint, more than two hours of every second of 30
 /// channels.
 pub const AUTOS_MAX: usize = 2_000_000;
 
 /// Half ticks in a second: middles of integrations are whole numbers of them.
 const HALF_TICKS_A_SECOND: f64 = 2e6;
 
-/// Where, whose, and the middle of the integration in halves of ticks.
-type Key = (ChannelId, u8, i64);
+/// Channel, daughter, and the middle of the integration in half ticks.
+type AutoKey = (ChannelId, u8, i64);
 
 /// A calibrated power and the standard deviation of its noise, K sr.
 type Power = [f64; 2];
 
-/// What has become of some powers.
+/// What became of the auto-correlations of one block.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Account {
+pub(super) struct AutoInsertion {
     pub(super) kept: u64,
     /// Of an integration that is in the table already.
-    pub(super) twice: u64,
-    /// More than the table takes.
+    pub(super) duplicates: u64,
+    /// Beyond the capacity of the table.
     pub(super) beyond: u64,
 }
 
-/// Powers by channel, daughter and time. It takes two million; tables that are put together keep what both have.
+/// Auto-correlations by channel, daughter and time: at most two million, more only after a merge.
 #[derive(Clone, Debug, Default, PartialEq, Encode, Decode)]
 pub struct AutoTable {
-    powers: BTreeMap<Key, Power>,
+    powers: BTreeMap<AutoKey, Power>,
 }
 
 impl AutoTable {
-    /// Takes powers of a daughter.
-    pub(super) fn take(&mut self, placed: &PlacedVisibilities, most: usize) -> Account {
-        let mut account = Account::default();
+    /// Inserts those of a daughter.
+    pub(super) fn insert(&mut self, placed: &PlacedVisibilities, most: usize) -> AutoInsertion {
+        let mut insertion = AutoInsertion::default();
         for (key, power) in powers(placed) {
             let is_full = self.powers.len() >= most;
             match self.powers.entry(key) {
-                Entry::Occupied(_) => account.twice += 1,
-                Entry::Vacant(_) if is_full => account.beyond += 1,
+                Entry::Occupied(_) => insertion.duplicates += 1,
+                Entry::Vacant(_) if is_full => insertion.beyond += 1,
                 Entry::Vacant(place) => {
                     place.insert(power);
-                    account.kept += 1;
+                    insertion.kept += 1;
                 }
             }
         }
-        account
+        insertion
     }
 
-    /// Takes powers out again; how many of them were there.
+    /// Removes those that are equal; returns how many there were.
     pub(super) fn remove(&mut self, placed: &PlacedVisibilities) -> u64 {
         let mut removed = 0;
         for (key, power) in powers(placed) {
@@ -67,17 +67,17 @@ impl AutoTable {
         removed
     }
 
-    /// Takes what another has too; of the same integration its own stays.
-    pub fn absorb(&mut self, other: Self) {
+    /// Inserts those of another table; of the same integration its own stays.
+    pub fn merge(&mut self, other: Self) {
         for (key, power) in other.powers {
             self.powers.entry(key).or_insert(power);
         }
     }
 
-    /// The powers by channel, daughter and time.
+    /// All of them, by channel, daughter and time.
     #[must_use]
     pub fn list(&self, instrument: &Instrument) -> Vec<AutoPower> {
-        let power = |(&(channel, daughter, half_ticks), &[power_k_sr, sigma_k_sr]): (&Key, &Power)| {
+        let power = |(&(channel, daughter, half_ticks), &[power_k_sr, sigma_k_sr]): (&AutoKey, &Power)| {
             let channel = instrument.channel_of(channel, Pair { i: daughter, j: daughter })?;
             Some(AutoPower {
                 daughter,
@@ -92,7 +92,7 @@ impl AutoTable {
     }
 }
 
-fn powers(placed: &PlacedVisibilities) -> impl Iterator<Item = (Key, Power)> {
+fn powers(placed: &PlacedVisibilities) -> impl Iterator<Item = (AutoKey, Power)> {
     let Pair { i: daughter, .. } = placed.pair;
     (0..placed.len()).map(move |k| {
         // Times are exact to a hundredth of that after centuries.
@@ -127,18 +127,18 @@ mod tests {
         let mut table = AutoTable::default();
         // Half a tick apart, far from the epoch.
         let first = own(3, &[3e8, 3e8 + 0.5e-6, 3e8 + 1.0], 7.0);
-        assert_eq!(table.take(&first, 5), Account { kept: 3, ..Account::default() });
-        assert_eq!(table.take(&first, 5), Account { twice: 3, ..Account::default() });
+        assert_eq!(table.insert(&first, 5), AutoInsertion { kept: 3, ..AutoInsertion::default() });
+        assert_eq!(table.insert(&first, 5), AutoInsertion { duplicates: 3, ..AutoInsertion::default() });
         let other = own(2, &[1.0, 2.0, 3e8], 8.0);
-        assert_eq!(table.take(&other, 5), Account { kept: 2, beyond: 1, twice: 0 });
+        assert_eq!(table.insert(&other, 5), AutoInsertion { kept: 2, beyond: 1, duplicates: 0 });
         // What differs stays, as does what never came in.
         assert_eq!(table.remove(&own(3, &[3e8], 7.5)), 0);
         assert_eq!(table.remove(&other), 2);
 
         let mut both = AutoTable::default();
-        let _ = both.take(&own(4, &[5.0], 9.0), 1);
-        both.absorb(table.clone());
-        both.absorb(table);
+        let _ = both.insert(&own(4, &[5.0], 9.0), 1);
+        both.merge(table.clone());
+        both.merge(table);
         let channel = |frequency_hz| Channel { frequency_hz, width_hz: 4e3 };
         let instrument = Instrument {
             name: "test".to_owned(),

@@ -46,7 +46,7 @@ impl Default for CalibrationConfig {
 }
 
 impl CalibrationConfig {
-    /// Everything that is wrong with the configuration; empty if it is good. Does not open the file.
+    /// All invalid values; empty if there are none. Does not open the gains file.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("calibration");
@@ -91,7 +91,7 @@ impl CalibrationConfig {
     /// The calibration; `folder` is that of the configuration.
     ///
     /// # Errors
-    /// The first of [`CalibrationConfig::problems`], or what is wrong with the gains file.
+    /// The first of [`CalibrationConfig::problems`], or an invalid gains file.
     pub fn build(&self, folder: &Path) -> Result<Box<dyn Calibration>, CalibrationError> {
         if let Some(problem) = self.problems().into_iter().next() {
             return Err(problem.into());

@@ -1,4 +1,4 @@
-//! What can be wrong with a calibration.
+//! Errors of calibration.
 
 use std::path::PathBuf;
 
@@ -6,7 +6,7 @@ use thiserror::Error;
 
 use crate::units::{InvalidValue, Pair};
 
-/// Why a calibration cannot be made or applied.
+/// Errors of calibration.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum CalibrationError {
@@ -29,7 +29,7 @@ pub enum CalibrationError {
         /// Where and what, from the parser.
         message: String,
     },
-    /// The gains file holds impossible values.
+    /// The gains file holds invalid values.
     #[error("gains file {}: {}", path.display(), list(problems))]
     Values {
         /// The file.
@@ -37,7 +37,7 @@ pub enum CalibrationError {
         /// Everything that is wrong with it.
         problems: Vec<InvalidValue>,
     },
-    /// Values that cannot be gains, not from a file.
+    /// Invalid gains, not from a file.
     #[error("gains: {}", list(problems))]
     Gains {
         /// Everything that is wrong with them.
@@ -56,13 +56,13 @@ pub enum CalibrationError {
         /// Largest distance that is accepted, Hz.
         tolerance_hz: f64,
     },
-    /// Channels that are not sub-bands side by side.
+    /// Channels that are not adjoining sub-bands.
     #[error(
         "calibration.sub_bands = {sub_bands}: expected the number of adjoining sub-bands of each channel in the \
          downlink, which has {channels} channels"
     )]
     SubBands {
-        /// Number asked for.
+        /// Number configured.
         sub_bands: usize,
         /// Channels of the downlink.
         channels: usize,

@@ -44,7 +44,7 @@ impl AntennaGains {
     /// Reads a file of gains.
     ///
     /// # Errors
-    /// [`CalibrationError`]: the file cannot be read or parsed, or everything wrong with its values.
+    /// [`CalibrationError`]: the file cannot be read or parsed, or all invalid values.
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
         Self::new(&GainsFile::read(path)?).map_err(|error| match error {
             CalibrationError::Gains { problems } => {
@@ -57,7 +57,7 @@ impl AntennaGains {
     /// Gains that are already in memory.
     ///
     /// # Errors
-    /// [`CalibrationError::Gains`] with everything that is wrong with them.
+    /// [`CalibrationError::Gains`] with all invalid values.
     pub fn new(file: &GainsFile) -> Result<Self, CalibrationError> {
         let problems = file.problems();
         if !problems.is_empty() {

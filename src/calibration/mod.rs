@@ -1,11 +1,15 @@
-//! The place of calibration: between decoding and accumulation.
+//! Calibration: from received visibilities to placed, corrected and weighted ones.
 //!
-//! A [`Calibration`] turns measured visibilities into what ideal antennas would have measured, and
-//! gives each the weight that is left to it. [`Identity`] does nothing; [`AntennaGains`] divides by
-//! complex gains from a file. [`CalibrationConfig`] chooses. Before either, [`VanVleck`] takes out what
-//! quantisers of few bits do to correlations; after it, [`SubBands`] brings sub-bands of a channel together.
+//! The [`Calibrator`] gives visibilities their positions and applies corrections in order: [`VanVleck`] undoes the effect
+//! of coarse quantisers on correlations; a [`Calibration`] turns them into what ideal antennas would have measured
+//! ([`Identity`] changes nothing, [`AntennaGains`] divides by complex gains from a file); [`SubBands`] combines sub-bands
+//! of a channel. [`CalibrationConfig`] chooses.
+//!
+//! Uses [`crate::frames`] and [`crate::array`]. Every block is used once; every visibility that is left out is in the
+//! ledger with its reason.
 
 mod autos;
+mod blocks;
 mod config;
 mod error;
 mod gains;
@@ -15,11 +19,12 @@ mod sub_bands;
 mod van_vleck;
 
 pub use autos::{AUTOS_MAX, AutoTable};
+pub use blocks::{BlockKey, ReceivedBlocks};
 pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 pub use gains::AntennaGains;
 pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation};
-pub use stage::{Calibrator, CalibratorState};
+pub use stage::Calibrator;
 pub use sub_bands::SubBands;
 pub use van_vleck::{QuantiserBitsError, VanVleck};
 
@@ -30,20 +35,20 @@ pub trait Calibration: Send {
     /// Name as in the configuration.
     fn name(&self) -> &'static str;
 
-    /// Hears of the instrument that measured what will come, and says what it looks like afterwards.
+    /// Takes the description of the instrument; returns the description after calibration.
     ///
     /// # Errors
-    /// [`CalibrationError`] if it is none that this calibration was made for.
+    /// [`CalibrationError`] if the calibration was not made for this instrument.
     fn describe(&mut self, instrument: &Instrument) -> Result<Instrument, CalibrationError> {
         Ok(instrument.clone())
     }
 
-    /// Corrects values and weights of a block, and takes out what cannot be corrected; order and
-    /// equal lengths of the arrays are kept.
+    /// Corrects values and weights of a block, and removes what cannot be corrected. Keeps the order and the equal
+    /// lengths of the arrays.
     ///
     /// # Errors
-    /// [`CalibrationError`] if the block is none that this calibration was made for. Bad data is not
-    /// an error but counted in the report.
+    /// [`CalibrationError`] if the calibration was not made for this block. Bad data is not an error but counted in the
+    /// report.
     fn apply(&mut self, block: &mut PlacedVisibilities) -> Result<CalibrationReport, CalibrationError>;
 }
 
@@ -53,19 +58,19 @@ pub trait Calibration: Send {
 pub struct CalibrationReport {
     /// Corrected, or good as they were.
     pub kept: usize,
-    /// Taken out: a gain is zero, not finite, or so small or large that nothing is left.
+    /// Removed: a gain is zero, not finite, or so small or large that nothing is left.
     pub unusable_gain: usize,
 }
 
 impl CalibrationReport {
-    /// Reason and number of those taken out, for a ledger; zeros included.
+    /// Reason and number of those removed, for a ledger; zeros included.
     #[must_use]
     pub fn removed(&self) -> [(VisibilityReason, usize); 1] {
         [(VisibilityReason::UnusableGain, self.unusable_gain)]
     }
 }
 
-/// Leaves everything as it is.
+/// Changes nothing.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Identity;
 

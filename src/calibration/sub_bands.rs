@@ -1,15 +1,15 @@
-//! Sub-bands of a channel, as one channel.
+//! Combines the sub-bands of a channel.
 
 use super::{Calibration, CalibrationError, CalibrationReport};
 use crate::array::scaled_baseline;
 use crate::frames::{Channel, Instrument, PlacedVisibilities};
 use crate::units::ChannelId;
 
-/// Takes successive channels of the downlink for sub-bands of one, after another calibration.
+/// Combines successive channels of the downlink into one, after another calibration.
 ///
 /// A visibility depends on the baseline in wavelengths: at nu_k and baseline b it is that of the channel's centre nu
 /// with a baseline b nu_k / nu. The two positions are moved apart, or together, on their circle about the Moon until
-/// the chord is that long. The Moon's limb then stands wrong by half of what was added, `|b| W / (4 nu r)` at most
+/// the chord is that long. The Moon's limb is then displaced by half of what was added, `|b| W / (4 nu r)` at most
 /// for a channel of width W: 1e-5 rad for 100 km at 10 MHz, 5e-4 rad at 0.2 MHz.
 pub struct SubBands {
     inner: Box<dyn Calibration>,
@@ -54,7 +54,7 @@ impl Calibration for SubBands {
     fn apply(&mut self, block: &mut PlacedVisibilities) -> Result<CalibrationReport, CalibrationError> {
         let report = self.inner.apply(block)?;
         if block.pair.i == block.pair.j {
-            // A daughter's own power is kept by sub-band: a spectrum.
+            // Auto-correlations are kept by sub-band: a spectrum.
             return Ok(report);
         }
         let index = usize::from(block.channel.0) / self.count;

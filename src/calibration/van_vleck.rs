@@ -1,4 +1,4 @@
-//! What a quantiser of few bits does to a correlation, and back.
+//! The effect of coarse quantisers on correlations, and its correction.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
@@ -9,7 +9,7 @@ use crate::frames::VisibilityBlock;
 /// Steps of the table over the angle whose sine is a correlation.
 const STEPS: usize = 512;
 
-/// Bits that no correction is made for.
+/// A number of bits without a correction.
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
 #[error("calibration.quantiser_bits = {0}: expected 0 for none, 1, 2 or 4")]
 pub struct QuantiserBitsError(pub u32);
@@ -22,14 +22,14 @@ pub struct QuantiserBitsError(pub u32);
 /// `2/pi asin rho`). With rho = sin(theta) the integrand has no pole.
 #[derive(Clone, Debug)]
 pub struct VanVleck {
-    /// Correlation of the quantised, a part of their power, at equal steps of theta from 0 to pi/2.
+    /// Correlation after quantising, as a fraction of the power, at equal steps of theta from 0 to pi/2.
     quantised: Vec<f64>,
-    /// Power of the quantised as a part of the power before.
+    /// Power after quantising as a fraction of the power before.
     power_ratio: f64,
 }
 
 impl VanVleck {
-    /// The relation for 1, 2 or 4 bits at the levels that lose least: steps of 0.9957 and 0.3352 standard
+    /// The relation for 1, 2 or 4 bits at the levels of least loss: steps of 0.9957 and 0.3352 standard
     /// deviations (Thompson, Moran & Swenson, Table 8.2); for one bit, levels of one deviation.
     ///
     /// # Errors

@@ -7,7 +7,8 @@ use clap::Args;
 
 use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::downlink::Kind;
-use crate::ground::archive::{GapReport, Gaps, RestartReport, Survey};
+use crate::ground::archive::{CoverageSurvey, GapReport, Gaps, RestartReport};
+use crate::products::draw_coverage;
 
 /// List missing packets, and what they would add to the map.
 ///
@@ -36,11 +37,11 @@ pub(super) struct GapsArgs {
 }
 
 pub(super) fn execute(args: &GapsArgs) -> CommandResult {
-    let survey = Survey::of(&args.path)?;
+    let survey = CoverageSurvey::of(&args.path)?;
     print_notes(survey.notes());
     let gaps = survey.gaps();
     if let Some(path) = &args.picture {
-        survey.picture(&gaps)?.write(path)?;
+        draw_coverage(&survey, &gaps)?.write(path)?;
     }
     if args.json {
         print_json_line(&gaps)?;

@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::arguments::StateMapArgs;
 use super::output::{CommandResult, Completion, print_notes, print_text};
-use crate::ground::archive::Keeper;
+use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::use_threads;
 
 /// Merge the states of several ground segments.
@@ -32,7 +32,7 @@ pub(super) struct MergeArgs {
 pub(super) fn execute(args: &MergeArgs) -> CommandResult {
     let config = args.map.source().load_ground()?;
     use_threads(&config.runtime)?;
-    let whole = Keeper::merge(&args.out, &args.states, &config)?;
+    let whole = Ground::merge(&args.out, &args.states, &config.ground(WAIT_BYTES))?;
     print_notes(whole.notes());
     let (packets, out) = (whole.packets(), args.out.display());
     let states = match args.states.len() {

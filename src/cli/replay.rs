@@ -10,10 +10,9 @@ use super::output::{CommandError, CommandResult, Completion, print_json_line, pr
 use super::progress::{Progress, cancel_on_interrupt};
 use crate::downlink::transport::socket::{SocketError, SocketSource, TcpUrl, Until};
 use crate::downlink::{FileSource, Pace, Paced, Steps};
-use crate::ground::archive::Keeper;
+use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::{
-    Config, ConfigSource, GroundSource, PipelineError, READ, Receiving, RunSummary, WAIT_BYTES, replay,
-    use_threads,
+    Config, ConfigSource, GroundSource, PipelineError, READ, RunSummary, replay, use_threads,
 };
 use crate::runtime::Cancel;
 
@@ -120,17 +119,19 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     }
     let config = ConfigSource { file: args.map.clone(), overrides, seed: None }.load_ground()?;
     use_threads(&config.runtime)?;
-    let keeper = match &args.state {
-        Some(folder) => {
-            let wait_bytes = args.wait_bytes.unwrap_or(WAIT_BYTES);
-            Some(Keeper::open(folder, &config, wait_bytes, args.checkpoint_every)?)
-        }
-        None => None,
+    let wait_bytes = match (&args.state, &args.listen) {
+        (None, Some(_)) => WAIT_BYTES_LIVE,
+        _ => WAIT_BYTES,
     };
-    print_notes(keeper.iter().flat_map(Keeper::notes));
+    let settings = config.ground(args.wait_bytes.unwrap_or(wait_bytes));
+    let ground = match &args.state {
+        Some(folder) => Ground::open(folder, &settings, args.checkpoint_every)?,
+        None => Ground::new(&settings)?,
+    };
+    print_notes(ground.notes());
     let summary = match &args.listen {
-        Some(url) => from_senders(args, url, &config, keeper)?,
-        None => from_files(args, &config, keeper)?,
+        Some(url) => from_senders(args, url, &config, ground)?,
+        None => from_files(args, &config, ground)?,
     };
     if args.json {
         print_json_line(&summary)?;
@@ -144,7 +145,7 @@ fn from_senders(
     args: &ReplayArgs,
     url: &TcpUrl,
     config: &Config,
-    keeper: Option<Keeper>,
+    ground: Ground,
 ) -> Result<RunSummary, CommandError> {
     let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
     let until = Until { idle_s: args.idle_s, connections: args.connections };
@@ -153,51 +154,39 @@ fn from_senders(
             SocketError::Listen { source, .. } => SocketError::Listen { url: url.clone(), source },
             other => other,
         })?
-        .knowing(keeper.as_ref().and_then(Keeper::instrument).cloned())
+        .knowing(ground.instrument().cloned())
         .telling(Box::new(|note| eprintln!("note: {note}")));
     let cancel = cancel_on_interrupt()?;
     eprintln!("listening on {}", source.url());
-    let receiving = match keeper {
-        Some(keeper) => Receiving::Kept(Box::new(keeper)),
-        None => Receiving::Once { wait_bytes: args.wait_bytes.unwrap_or(WAIT_BYTES_LIVE) },
-    };
-    Ok(watched(source, args, config, receiving, &cancel)?)
+    Ok(watched(source, args, config, ground, &cancel)?)
 }
 
-fn from_files(
-    args: &ReplayArgs,
-    config: &Config,
-    keeper: Option<Keeper>,
-) -> Result<RunSummary, CommandError> {
+fn from_files(args: &ReplayArgs, config: &Config, ground: Ground) -> Result<RunSummary, CommandError> {
     let files = match args.follow {
         true => FileSource::follow(&args.files, args.idle_s)?,
         false => FileSource::open(&args.files)?,
     };
     let cancel = cancel_on_interrupt()?;
-    let receiving = match keeper {
-        Some(keeper) => Receiving::Kept(Box::new(keeper)),
-        None => Receiving::Once { wait_bytes: args.wait_bytes.unwrap_or(WAIT_BYTES) },
-    };
     let pace = match (args.step, args.speed) {
         (Some(StepLength(every_s)), _) => {
             let tell = Box::new(|note: &str| eprintln!("{note}"));
             Pace::Steps(Steps { every_s, go: lines_of_input(), tell })
         }
         (None, Speed(Some(times))) => Pace::Speed(times),
-        (None, Speed(None)) => return Ok(watched(files, args, config, receiving, &cancel)?),
+        (None, Speed(None)) => return Ok(watched(files, args, config, ground, &cancel)?),
     };
-    Ok(watched(Paced::new(files, pace), args, config, receiving, &cancel)?)
+    Ok(watched(Paced::new(files, pace), args, config, ground, &cancel)?)
 }
 
 fn watched<S: GroundSource + 'static>(
     source: S,
     args: &ReplayArgs,
     config: &Config,
-    receiving: Receiving,
+    ground: Ground,
     cancel: &Cancel,
 ) -> Result<RunSummary, PipelineError> {
     let mut progress = None;
-    replay(source, config, receiving, &args.out, cancel, &mut |watched| {
+    replay(source, config, ground, &args.out, cancel, &mut |watched| {
         progress = Some(Progress::watch(watched, READ, 0));
     })
 }

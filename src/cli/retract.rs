@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::arguments::StateMapArgs;
 use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
-use crate::ground::archive::Keeper;
+use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::use_threads;
 use crate::units::MissionTime;
 
@@ -48,8 +48,9 @@ pub(super) fn execute(args: &RetractArgs) -> CommandResult {
         (None, None) => None,
         (from_s, to_s) => Some([ticks(from_s, i64::MIN), ticks(to_s, i64::MAX)]),
     };
-    let (keeper, found) = Keeper::retract(&args.state, &args.files, span, &config)?;
-    print_notes(keeper.notes());
+    let config = config.ground(WAIT_BYTES);
+    let (found, notes) = Ground::retract(&args.state, &args.files, span, &config)?;
+    print_notes(notes.iter().map(String::as_str));
     for refused in &found.named {
         eprintln!("note: packet {} of {} was not removed: {}", refused.count, refused.kind, refused.reason);
     }

@@ -62,7 +62,7 @@ pub mod wire;
 pub use config::DownlinkConfig;
 pub use error::DownlinkError;
 pub use receive::inspect::Contents;
-pub use receive::{Decoder, Era, Event, Intake, PacketReceiver, ReceptionCounters, Taken};
+pub use receive::{Decoder, Era, Event, Intake, PacketReceiver, ReceivedSet, ReceptionCounters};
 pub use transport::{DownlinkReader, DownlinkWriter, FileSource, Pace, Paced, Recorder, Steps, Transmitter};
 pub use wire::{
     CucTime, FORMAT_VERSION, Format, HEADER_BYTES, Kind, PACKET_BYTES_MAX, PacketHeader, PacketSegment,

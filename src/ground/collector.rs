@@ -1,162 +1,160 @@
-//! Packets to frames, each once, across files and sessions.
+//! Bytes to frames: every packet once, across files and sessions.
 
 use std::collections::VecDeque;
 use std::path::Path;
 
 use bincode::{Decode, Encode};
 
-use super::hold_buffer::{Waiting, WaitingPacket};
+use super::hold_buffer::{HeldPacket, HoldBuffer, Sent};
 use crate::downlink::error::{DownlinkError, require_packets};
-use crate::downlink::receive::{ByteFeed, Decoder, DecoderState, Event, Intake, ReceptionCounters, Taken};
+use crate::downlink::receive::{
+    ByteFeed, Decoder, DecoderState, Event, Intake, PacketReading, ReceivedSet, ReceptionCounters,
+};
 use crate::downlink::wire::payload::visibilities_span;
-use crate::downlink::wire::{CucTime, Kind, PacketHeader, PacketSegment};
+use crate::downlink::wire::{Kind, PacketHeader, PacketSegment};
 use crate::frames::{GroundFrame, Instrument, VisibilityBlock};
 use crate::units::MissionTime;
 
-/// What a collector knows, for another to go on with.
-#[derive(Clone, Debug, PartialEq, Encode, Decode)]
+/// What a checkpoint keeps of a collector: the packets it holds, and its instrument. Packets that were delivered are in
+/// the journal.
+#[derive(Clone, Debug, Default, PartialEq, Encode, Decode)]
 pub struct CollectorState {
-    taken: Vec<Taken>,
-    waiting: Waiting,
+    held: HoldBuffer,
     decoder: DecoderState,
 }
 
-/// What a collector knows, to be written as a [`CollectorState`] is, without a copy of what waits.
+/// A [`CollectorState`] to be written, without a copy of the held packets.
 #[derive(Clone, Debug, PartialEq, Encode)]
 pub struct CollectorView<'a> {
-    taken: Vec<Taken>,
-    waiting: &'a Waiting,
+    held: &'a HoldBuffer,
     decoder: DecoderState,
 }
 
 impl CollectorState {
-    /// The packets of a kind that have been taken.
+    /// Of a collector that has received nothing.
     #[must_use]
-    pub fn taken(&self, kind: Kind) -> Option<&Taken> {
-        self.taken.get(kind.index())
+    pub(super) fn new(wait_bytes: u64) -> Self {
+        Self { held: HoldBuffer::new(wait_bytes), decoder: DecoderState::default() }
     }
 
-    /// Packets that wait.
-    #[must_use]
-    pub fn waiting(&self) -> &Waiting {
-        &self.waiting
+    /// The instrument, if it is known.
+    pub(super) fn instrument(&self) -> Option<&Instrument> {
+        self.decoder.instrument()
     }
 
-    /// Whether a collector can have left it, which of one that was read is not sure.
+    /// Adds what another collector holds, but for packets that were delivered.
+    pub(super) fn merge(
+        &mut self,
+        other: Self,
+        is_delivered: impl Fn(&PacketHeader) -> bool,
+    ) -> Result<(), DownlinkError> {
+        if !self.decoder.merge(other.decoder) {
+            return Err(DownlinkError::OtherInstrument { offset: 0 });
+        }
+        for packet in other.held.packets() {
+            if self.held.get(&packet.header).is_none() {
+                self.held.insert(packet.clone());
+            }
+        }
+        for header in headers(&self.held).iter().filter(|header| is_delivered(header)) {
+            self.held.remove(header);
+        }
+        Ok(())
+    }
+
+    /// Whether a collector can have left it; a forged checkpoint may hold anything.
     #[must_use]
     pub fn is_sound(&self) -> bool {
-        self.taken.len() <= Kind::ALL.len()
-            && self.taken.iter().all(Taken::is_sound)
-            && self.waiting.is_sound()
+        self.held.is_sound()
     }
 }
 
-/// Packets that have been read, and what they say.
+/// A packet that was delivered.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DeliveredPacket {
+    /// Its headers.
+    pub header: PacketHeader,
+    /// Its checksum.
+    pub check: u32,
+    /// What it added to the counters.
+    pub reading: PacketReading,
+}
+
+/// Packets that have been decoded, and what they say.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Delivery {
-    /// Headers and check of each: one, or all those of a payload in segments.
-    pub packets: Vec<(PacketHeader, u32)>,
-    /// `None` if they say nothing new, or nothing that can be understood.
+    /// One packet, or all those of a payload in segments.
+    pub packets: Vec<DeliveredPacket>,
+    /// `None` if they say nothing new, or cannot be understood.
     pub frame: Option<GroundFrame>,
 }
 
-/// Whether positions are known over a stretch of time.
+/// Whether positions are known over a span of time.
 pub type Placed<'a> = &'a dyn Fn([MissionTime; 2]) -> bool;
 
-/// Takes bytes of a downlink as they come, and gives what every packet says once: visibilities as soon as their positions
-/// are known, as far as [`Waiting`] reaches, everything else as soon as it is there.
+/// Takes bytes of a downlink as they arrive, and delivers what every packet says once: visibilities as soon as their
+/// positions are known, as far as the [`HoldBuffer`] reaches, everything else at once.
 ///
-/// Until the description of the instrument has come, nobody can read anything, and all packets wait.
+/// Until the description of the instrument arrives, nothing can be decoded, and all packets are held.
 #[derive(Debug)]
 pub struct Collector {
     intake: Intake,
-    taken: [Taken; Kind::ALL.len()],
-    waiting: Waiting,
+    received: [ReceivedSet; Kind::ALL.len()],
+    held: HoldBuffer,
     decoder: Decoder,
-    /// Keeps the account of what is no new packet: of this session alone.
+    /// Counts what is no new packet, in this session alone.
     link: Decoder,
-    /// Packets that may wait although nothing keeps them from being read.
-    again: VecDeque<PacketHeader>,
-    /// Whether positions have come since visibilities that wait were looked at.
+    /// Held packets that may be due.
+    candidates: VecDeque<PacketHeader>,
+    /// Whether positions have arrived since held visibilities were last considered.
     has_new_positions: bool,
 }
 
 impl Collector {
-    /// A collector that knows nothing; visibilities wait for their positions until so many bytes do.
+    /// A collector at the beginning of a stream; `wait_bytes` of visibilities may wait for their positions.
     #[must_use]
     pub fn new(wait_bytes: u64) -> Self {
         Self {
             intake: Intake::unfiltered(),
-            taken: Default::default(),
-            waiting: Waiting::new(wait_bytes),
+            received: Default::default(),
+            held: HoldBuffer::new(wait_bytes),
             decoder: Decoder::new(),
             link: Decoder::new(),
-            again: VecDeque::new(),
+            candidates: VecDeque::new(),
             has_new_positions: false,
         }
     }
 
-    /// A collector at the beginning of a stream that knows what another knew.
+    /// Resumes at the beginning of a stream, with packets that were delivered in earlier sessions and their counters.
     #[must_use]
-    pub fn resume(state: CollectorState) -> Self {
-        let CollectorState { mut taken, waiting, decoder } = state;
-        taken.resize(Kind::ALL.len(), Taken::default());
-        let taken = taken.try_into().unwrap_or_default();
-        let decoder = Decoder::resume(decoder);
-        let again = headers(&waiting);
-        Self { taken, waiting, decoder, again, ..Self::new(0) }
+    pub fn resume(
+        state: CollectorState,
+        delivered: impl Iterator<Item = (Kind, Sent)>,
+        counters: ReceptionCounters,
+    ) -> Self {
+        let CollectorState { held, decoder } = state;
+        let candidates = headers(&held);
+        let decoder = Decoder::resume(decoder, counters);
+        let mut collector = Self { held, decoder, candidates, ..Self::new(0) };
+        let waiting = collector.candidates.iter().map(|header| (header.kind, (header.time, header.count)));
+        for (kind, (time, count)) in delivered.chain(waiting) {
+            collector.received[kind.index()].insert(count, time);
+        }
+        collector
     }
 
-    /// What it knows; the bytes of an unfinished packet left out, which are no packet yet.
+    /// What a checkpoint keeps; the bytes of an unfinished packet are not part of it.
     #[must_use]
     pub fn view(&self) -> CollectorView<'_> {
-        CollectorView { taken: self.taken.to_vec(), waiting: &self.waiting, decoder: self.decoder.state() }
+        CollectorView { held: &self.held, decoder: self.decoder.state() }
     }
 
-    /// What it knows, as [`Collector::view`].
-    #[must_use]
-    pub fn into_state(self) -> CollectorState {
-        CollectorState { taken: self.taken.to_vec(), waiting: self.waiting, decoder: self.decoder.state() }
-    }
-
-    /// Takes all that another knows, of which no visibilities have been read by both.
-    ///
-    /// # Errors
-    /// Another instrument.
-    pub fn absorb(&mut self, other: CollectorState) -> Result<(), DownlinkError> {
-        let CollectorState { taken: mut theirs, waiting: mut their_waiting, decoder } = other;
-        theirs.resize(Kind::ALL.len(), Taken::default());
-        // What one has read need not wait in the other; what waits in both does so once.
-        for header in headers(&self.waiting) {
-            let has_come = theirs[header.kind.index()].contains(header.count, header.time);
-            if has_come && their_waiting.get(&header).is_none() {
-                self.waiting.take_out(&header);
-            }
-        }
-        for header in headers(&their_waiting) {
-            if self.has_taken(&header) {
-                their_waiting.take_out(&header);
-            }
-        }
-        for kind in Kind::ALL {
-            self.taken[kind.index()].absorb(&theirs[kind.index()]);
-        }
-        if !self.decoder.absorb(decoder) {
-            return Err(DownlinkError::OtherInstrument { offset: 0 });
-        }
-        for packet in their_waiting.packets() {
-            self.waiting.put(packet.clone());
-        }
-        self.again = headers(&self.waiting);
-        Ok(())
-    }
-
-    /// Takes the next bytes of the stream.
+    /// Appends the next bytes of the stream.
     pub fn push(&mut self, bytes: &[u8]) {
         self.intake.push(bytes);
     }
 
-    /// Says that the stream is at its end.
+    /// Ends the stream.
     pub fn finish(&mut self) {
         self.intake.finish();
     }
@@ -167,7 +165,7 @@ impl Collector {
         self.intake.bytes()
     }
 
-    /// What is to be read next; `None` until more bytes come.
+    /// The next delivery; `None` until more bytes arrive.
     ///
     /// # Errors
     /// [`DownlinkError::OtherInstrument`].
@@ -178,28 +176,28 @@ impl Collector {
                     return Ok(Some(found));
                 }
             } else {
-                self.set_aside_unread();
+                self.drop_unreadable();
             }
             match self.take_event(placed)? {
-                // Looked at once for all positions of a piece of the stream: of what waits there may be much.
-                Taking::Nothing if self.look_again() => {}
-                Taking::Nothing => return Ok(None),
-                Taking::Event => {}
-                Taking::Delivery(found) => return Ok(Some(found)),
+                // Once for all positions of a piece of the stream: much may be held.
+                Handled::Nothing if self.reconsider() => {}
+                Handled::Nothing => return Ok(None),
+                Handled::Event => {}
+                Handled::Delivery(found) => return Ok(Some(found)),
             }
         }
     }
 
-    /// The next of what still waits; not to be followed by a [`Collector::view`] that is kept.
-    pub fn next_waiting(&mut self) -> Option<Delivery> {
-        if let Some(packet) = self.waiting.first_visibilities() {
-            return Some(self.read(&[packet]));
+    /// Delivers the next held packet, due or not. A checkpoint must be written before.
+    pub fn flush_next(&mut self) -> Option<Delivery> {
+        if let Some(packet) = self.held.pop_visibilities() {
+            return Some(self.deliver(&[packet]));
         }
-        let packet = self.waiting.first_other()?;
+        let packet = self.held.pop_other()?;
         Some(self.give_up(packet))
     }
 
-    /// Takes all of a file and gives everything to `take`, what waits at its end too.
+    /// Delivers all of a file to `take`; what is held at its end too.
     ///
     /// # Errors
     /// A file that cannot be read, is empty, or does not hold a packet of ours.
@@ -210,78 +208,42 @@ impl Collector {
                 take(found);
             }
         }
-        while let Some(found) = self.next_waiting() {
+        while let Some(found) = self.flush_next() {
             take(found);
         }
-        require_packets(path, self.bytes(), self.taken.iter().map(Taken::len).sum())
+        require_packets(path, self.bytes(), self.received.iter().map(ReceivedSet::len).sum())
     }
 
-    /// Whether a packet has come, be it read or waiting.
+    /// Packets received of each kind.
+    pub fn received(&self) -> impl Iterator<Item = (Kind, &ReceivedSet)> {
+        Kind::ALL.into_iter().map(|kind| (kind, &self.received[kind.index()]))
+    }
+
+    /// Packets held.
     #[must_use]
-    pub fn has_taken(&self, header: &PacketHeader) -> bool {
-        self.taken[header.kind.index()].contains(header.count, header.time)
+    pub fn held(&self) -> &HoldBuffer {
+        &self.held
     }
 
-    /// Packets that wait.
+    /// Removes a held packet, as if it had never been received.
+    pub fn remove_held(&mut self, header: &PacketHeader) -> Option<HeldPacket> {
+        let removed = self.held.remove(header)?;
+        self.received[header.kind.index()].remove(header.count, header.time);
+        Some(removed)
+    }
+
+    /// The visibilities of a packet; changes nothing.
     #[must_use]
-    pub fn waiting(&self) -> &Waiting {
-        &self.waiting
-    }
-
-    /// Lets go of a packet that waits.
-    pub fn take_out(&mut self, header: &PacketHeader) -> Option<WaitingPacket> {
-        self.waiting.take_out(header)
-    }
-
-    /// The visibilities of a packet, of no account.
-    #[must_use]
-    pub fn read_again(&self, packet: &WaitingPacket) -> Option<VisibilityBlock> {
-        match self.decoder.uncounted().accept(&packet.event()) {
+    pub fn decoded(&self, packet: &HeldPacket) -> Option<VisibilityBlock> {
+        let mut decoder = Decoder::resume(self.decoder.state(), ReceptionCounters::default());
+        match decoder.decode(packet.packet(), true).0 {
             Some(GroundFrame::Visibilities(block)) if !block.is_empty() => Some(block),
             _ => None,
         }
     }
 
-    /// Takes packets that were read together off the account; what they said. To be concluded by [`Collector::retake`].
-    pub fn take_back(&mut self, packets: &[WaitingPacket]) -> Option<GroundFrame> {
-        let mut reader = self.decoder.uncounted();
-        let mut frame = None;
-        for packet in packets {
-            frame = reader.accept(&packet.event()).or(frame);
-        }
-        reader.finish();
-        self.decoder.uncount(reader.counters());
-        frame
-    }
-
-    /// Takes packets that another collector has read as well, and counted, off the account.
-    pub fn uncount(&mut self, kind: Kind, packets: u64, bytes: u64) {
-        let mut counters = ReceptionCounters { bytes, ..ReceptionCounters::default() };
-        (counters.kind_mut(kind).packets, counters.kind_mut(kind).bytes) = (packets, bytes);
-        self.decoder.uncount(&counters);
-    }
-
-    /// Says anew which packets of a kind have been read; those that wait have come too.
-    pub fn retake(&mut self, kind: Kind, read: impl Iterator<Item = (CucTime, u64)>) {
-        let waiting = self.waiting.packets().map(|packet| packet.header).filter(|header| header.kind == kind);
-        let mut taken = Taken::default();
-        for (time, count) in read.chain(waiting.map(|header| (header.time, header.count))) {
-            taken.take(count, time);
-        }
-        self.taken[kind.index()] = taken;
-    }
-
-    /// Forgets the instrument and everything else if no packet is left.
-    pub fn begin_anew_if_empty(&mut self) -> bool {
-        let is_empty = self.taken.iter().all(Taken::is_empty);
-        if is_empty {
-            self.decoder = Decoder::new();
-        }
-        is_empty
-    }
-
-    /// The account: of packets that were read at any time, of gaps in all that was taken, and of what else was in
-    /// the streams of this session.
+    /// Counters: of packets delivered in any session, of gaps in the received set, and of what else was in the streams of
+    /// this session.
     #[must_use]
     pub fn counters(&self) -> ReceptionCounters {
         let mut counters = self.decoder.counters().clone();
@@ -297,7 +259,7 @@ impl Collector {
             let counts = counters.kind_mut(kind);
             counts.duplicates = link.kind(kind).duplicates;
             counts.damaged = link.kind(kind).damaged;
-            let eras = self.taken[kind.index()].eras();
+            let eras = self.received[kind.index()].eras();
             counts.restarts = eras.len().saturating_sub(1) as u64;
             let gaps = eras.into_iter().flat_map(|era| era.missing);
             (counts.gaps, counts.missing) =
@@ -306,7 +268,7 @@ impl Collector {
         counters
     }
 
-    /// The instrument that it knows.
+    /// The instrument, once it is known.
     #[must_use]
     pub fn instrument(&self) -> Option<&Instrument> {
         self.decoder.instrument()
@@ -316,98 +278,102 @@ impl Collector {
         self.decoder.instrument().is_some()
     }
 
-    /// What waits and need not, once the instrument is known.
+    /// The next held packets that are due; the instrument is known.
     fn next_due(&mut self, placed: Placed<'_>) -> Option<Delivery> {
         loop {
-            while let Some(header) = self.again.pop_front() {
+            while let Some(header) = self.candidates.pop_front() {
                 let found = match header.kind {
-                    Kind::Visibilities => {
-                        self.waiting.placed_visibilities(&header, placed).map(|packet| vec![packet])
-                    }
-                    _ => self.waiting.payload_of(&header),
+                    Kind::Visibilities => self.held.release(&header, placed).map(|packet| vec![packet]),
+                    _ => self.held.take_payload(&header),
                 };
                 if let Some(packets) = found {
-                    return Some(self.read(&packets));
+                    return Some(self.deliver(&packets));
                 }
             }
-            if !self.waiting.is_full() {
-                let packet = self.waiting.next_given_up()?;
+            if !self.held.is_full() {
+                let packet = self.held.pop_excess_segment()?;
                 return Some(self.give_up(packet));
             }
-            if !self.look_again() {
-                let packet = self.waiting.first_visibilities()?;
-                return Some(self.read(&[packet]));
+            if !self.reconsider() {
+                let packet = self.held.pop_visibilities()?;
+                return Some(self.deliver(&[packet]));
             }
         }
     }
 
-    /// Whether visibilities that wait are to be looked at again.
-    fn look_again(&mut self) -> bool {
+    /// Makes all held packets candidates if positions have arrived; returns whether.
+    fn reconsider(&mut self) -> bool {
         let is_due = std::mem::take(&mut self.has_new_positions) && self.knows_instrument();
         if is_due {
-            self.again = headers(&self.waiting);
+            self.candidates = headers(&self.held);
         }
         is_due
     }
 
-    /// Nobody can read what has waited too long for a description; it may come again when somebody can.
-    fn set_aside_unread(&mut self) {
-        while let Some(packet) = self.waiting.next_unread() {
+    /// Drops packets beyond the capacity while no instrument is known; they may be received again later.
+    fn drop_unreadable(&mut self) {
+        while let Some(packet) = self.held.pop_unreadable() {
             let header = packet.header;
-            self.taken[header.kind.index()].forget(header.count, header.time);
-            self.decoder.accept(&packet.event());
+            self.received[header.kind.index()].remove(header.count, header.time);
+            self.decoder.decode(packet.packet(), true);
         }
     }
 
-    fn read(&mut self, packets: &[WaitingPacket]) -> Delivery {
-        let mut frame = None;
+    fn deliver(&mut self, packets: &[HeldPacket]) -> Delivery {
+        self.decode(packets, false)
+    }
+
+    /// Delivers a segment without the rest of its payload.
+    fn give_up(&mut self, packet: HeldPacket) -> Delivery {
+        self.decode(&[packet], true)
+    }
+
+    fn decode(&mut self, packets: &[HeldPacket], is_given_up: bool) -> Delivery {
+        let mut delivery = Delivery { packets: Vec::with_capacity(packets.len()), frame: None };
         for packet in packets {
-            frame = self.decoder.accept(&packet.event()).or(frame);
+            let (frame, reading) = self.decoder.decode(packet.packet(), is_given_up);
+            let (header, check) = (packet.header, packet.check);
+            delivery.packets.push(DeliveredPacket { header, check, reading });
+            delivery.frame = frame.or(delivery.frame);
         }
-        self.has_new_positions |= matches!(frame, Some(GroundFrame::Ephemeris(_)));
-        Delivery { packets: packets.iter().map(|packet| (packet.header, packet.check)).collect(), frame }
-    }
-
-    /// Reads a segment without those that it needs.
-    fn give_up(&mut self, packet: WaitingPacket) -> Delivery {
-        let found = self.read(&[packet]);
-        self.decoder.finish();
-        found
+        self.has_new_positions |= matches!(delivery.frame, Some(GroundFrame::Ephemeris(_)));
+        delivery
     }
 
     /// Takes one event of the stream.
-    fn take_event(&mut self, placed: Placed<'_>) -> Result<Taking, DownlinkError> {
-        let Some(event) = self.intake.next_event() else { return Ok(Taking::Nothing) };
+    fn take_event(&mut self, placed: Placed<'_>) -> Result<Handled, DownlinkError> {
+        let Some(event) = self.intake.next_event() else { return Ok(Handled::Nothing) };
         let Event::Packet(packet) = event else {
             self.link.accept(&event);
-            return Ok(Taking::Event);
+            return Ok(Handled::Event);
         };
         let (offset, header) = (packet.offset, packet.header);
         let describes = header.kind == Kind::Instrument;
         if describes && header.segment == PacketSegment::Whole && self.decoder.contradicts(packet.payload) {
             return Err(DownlinkError::OtherInstrument { offset });
         }
-        if !self.taken[header.kind.index()].take(header.count, header.time) {
+        if !self.received[header.kind.index()].insert(header.count, header.time) {
             self.link.accept(&Event::Duplicate { offset, header });
-            return Ok(Taking::Event);
+            return Ok(Handled::Event);
         }
-        // As nearly all are: not kept even for a moment.
+        // As nearly all are: never copied into the hold buffer.
         if header.kind == Kind::Visibilities
             && self.decoder.instrument().is_some()
             && visibilities_span(packet.payload).is_none_or(placed)
         {
-            let frame = self.decoder.accept(&event);
-            return Ok(Taking::Delivery(Delivery { packets: vec![(header, packet.check)], frame }));
+            let (frame, reading) = self.decoder.decode(packet, false);
+            let packets = vec![DeliveredPacket { header, check: packet.check, reading }];
+            return Ok(Handled::Delivery(Delivery { packets, frame }));
         }
-        self.waiting.put(WaitingPacket::of(&packet));
+        self.held.insert(HeldPacket::of(&packet));
         if !describes && !self.knows_instrument() {
-            return Ok(Taking::Event);
+            return Ok(Handled::Event);
         }
         if header.kind == Kind::Visibilities {
-            self.again.push_back(header);
-            return Ok(Taking::Event);
+            self.candidates.push_back(header);
+            return Ok(Handled::Event);
         }
-        let Some(payload) = self.waiting.payload_of(&header) else { return Ok(Taking::Event) };
+        let Some(payload) = self.held.take_payload(&header) else { return Ok(Handled::Event) };
         if describes {
             let whole: Vec<u8> = payload.iter().flat_map(|packet| packet.payload.iter().copied()).collect();
             if self.decoder.contradicts(&whole) {
@@ -415,22 +381,22 @@ impl Collector {
             }
         }
         if !self.knows_instrument() {
-            // Everything else has waited for it.
-            self.again = headers(&self.waiting);
+            // Everything else is held until then.
+            self.candidates = headers(&self.held);
         }
-        Ok(Taking::Delivery(self.read(&payload)))
+        Ok(Handled::Delivery(self.deliver(&payload)))
     }
 }
 
-/// What an event of a stream comes to.
-enum Taking {
-    /// There is none.
+/// What one event of a stream leads to.
+enum Handled {
+    /// No event.
     Nothing,
-    /// Nothing to be read yet.
+    /// Nothing to deliver yet.
     Event,
     Delivery(Delivery),
 }
 
-fn headers(waiting: &Waiting) -> VecDeque<PacketHeader> {
-    waiting.packets().map(|packet| packet.header).collect()
+fn headers(held: &HoldBuffer) -> VecDeque<PacketHeader> {
+    held.packets().map(|packet| packet.header).collect()
 }

@@ -1,10 +1,24 @@
-//! The ground: every packet once, in order of use, and what is kept from one session to the next.
+//! The ground, from the bytes of a downlink to sums: every packet once, in any order, over any number of sessions.
+//!
+//! [`Ground`] is one stage: the [`Collector`] finds packets and delivers each once, calibration places and corrects
+//! visibilities, the accumulator adds them up. An [`archive`] keeps all of it from one session to the next.
+//!
+//! Uses [`crate::downlink`], [`crate::calibration`] and [`crate::accumulation`]; knows nothing of the spacecraft, of
+//! solving, or of the pipeline.
 
 pub mod archive;
 mod collector;
+mod config;
+mod core;
+mod error;
 mod hold_buffer;
+mod outcome;
 mod reception;
 
-pub use collector::{Collector, CollectorState, CollectorView, Delivery, Placed};
-pub use hold_buffer::{Waiting, WaitingPacket};
+pub use self::core::Ground;
+pub use collector::{Collector, CollectorState, CollectorView, DeliveredPacket, Delivery, Placed};
+pub use config::{GroundConfig, WAIT_BYTES};
+pub use error::GroundError;
+pub use hold_buffer::{HeldPacket, HoldBuffer};
+pub use outcome::GroundOutcome;
 pub use reception::Reception;

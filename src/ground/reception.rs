@@ -1,4 +1,4 @@
-//! The ground's receiving stage where nothing is kept for later sessions.
+//! Bytes to frames, for those who want frames and no sums.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -9,39 +9,41 @@ use crate::downlink::receive::ReceptionCounters;
 use crate::frames::GroundFrame;
 use crate::runtime::{Outlet, Stage, Units};
 
-/// Finds packets in what arrives, from one sender or several, and makes frames of them: each once, behind the
-/// instrument's description, visibilities behind their positions as far as its reach goes.
+/// Finds packets in what arrives, from one sender or several, and emits their frames: each once, after the
+/// instrument's description, visibilities after their positions as far as the hold buffer reaches.
+///
+/// [`super::Ground`] does the same on the way to its sums.
 #[derive(Debug)]
 pub struct Reception {
     collector: Collector,
-    /// What has been passed on, to know which visibilities can be placed.
+    /// Positions that were emitted.
     ephemeris: Ephemeris,
-    account: Arc<Mutex<ReceptionCounters>>,
+    counters: Arc<Mutex<ReceptionCounters>>,
 }
 
 impl Reception {
-    /// Visibilities wait for positions until `wait_bytes` do; positions of `segments_max` segments are known, as whoever
-    /// places them should. Leaves its account in `account` at the end.
+    /// At most `wait_bytes` of visibilities wait for their positions; positions of `segments_max` segments are known.
+    /// Leaves its counters in `counters` at the end.
     #[must_use]
-    pub fn new(wait_bytes: u64, segments_max: usize, account: Arc<Mutex<ReceptionCounters>>) -> Self {
-        Self { collector: Collector::new(wait_bytes), ephemeris: Ephemeris::new(segments_max), account }
+    pub fn new(wait_bytes: u64, segments_max: usize, counters: Arc<Mutex<ReceptionCounters>>) -> Self {
+        Self { collector: Collector::new(wait_bytes), ephemeris: Ephemeris::new(segments_max), counters }
     }
 
-    fn pass_on(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), DownlinkError> {
+    fn advance(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), DownlinkError> {
         loop {
             let ephemeris = &self.ephemeris;
-            let Some(found) = self.collector.next_delivery(&|stretch| ephemeris.covers(stretch))? else {
+            let Some(delivery) = self.collector.next_delivery(&|span| ephemeris.covers(span))? else {
                 return Ok(());
             };
-            self.give(found, out);
+            self.emit(delivery, out);
         }
     }
 
-    fn give(&mut self, found: Delivery, out: &mut Outlet<GroundFrame>) {
-        if let Some(GroundFrame::Ephemeris(segment)) = &found.frame {
+    fn emit(&mut self, delivery: Delivery, out: &mut Outlet<GroundFrame>) {
+        if let Some(GroundFrame::Ephemeris(segment)) = &delivery.frame {
             self.ephemeris.insert(segment.clone());
         }
-        if let Some(frame) = found.frame {
+        if let Some(frame) = delivery.frame {
             out.push(frame);
         }
     }
@@ -54,16 +56,16 @@ impl Stage for Reception {
 
     fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<GroundFrame>) -> Result<(), DownlinkError> {
         self.collector.push(&bytes);
-        self.pass_on(out)
+        self.advance(out)
     }
 
     fn finish(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), DownlinkError> {
         self.collector.finish();
-        self.pass_on(out)?;
-        while let Some(found) = self.collector.next_waiting() {
-            self.give(found, out);
+        self.advance(out)?;
+        while let Some(delivery) = self.collector.flush_next() {
+            self.emit(delivery, out);
         }
-        *self.account.lock().unwrap_or_else(PoisonError::into_inner) = self.collector.counters();
+        *self.counters.lock().unwrap_or_else(PoisonError::into_inner) = self.collector.counters();
         Ok(())
     }
 

@@ -55,9 +55,9 @@ pub enum PipelineError {
     /// Products cannot be written.
     #[error(transparent)]
     Products(#[from] crate::products::ProductsError),
-    /// The state of the ground cannot be read or written.
+    /// The ground failed.
     #[error(transparent)]
-    State(#[from] crate::ground::archive::StateError),
+    Ground(#[from] crate::ground::GroundError),
     /// No data for any map.
     #[error(
         "no visibility of a pair could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",

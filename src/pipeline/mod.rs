@@ -8,7 +8,7 @@ mod cost;
 mod engine_cost;
 pub(crate) mod error;
 mod file_problems;
-pub(crate) mod ground_segment;
+mod ground_segment;
 pub(crate) mod models;
 mod notes;
 pub(crate) mod plan;
@@ -23,7 +23,6 @@ pub use config::{Config, Problems};
 pub use config_source::{ConfigError, ConfigSource, QUICKLOOK};
 pub use cost::{ChannelCost, Cost};
 pub use error::PipelineError;
-pub use ground_segment::{Receiving, WAIT_BYTES};
 pub use plan::{Expected, Plan};
 pub use run::{
     Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, simulate, use_threads,

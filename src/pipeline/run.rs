@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::config::Config;
 use super::error::PipelineError;
-use super::ground_segment::{GroundOutcome, Receiving, WAIT_BYTES};
+use super::ground_segment::{Mapping, SegmentOutcome};
 use super::plan::Plan;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
@@ -15,6 +15,7 @@ use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
+use crate::ground::{Ground, WAIT_BYTES};
 use crate::products::{ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::solve::SolveWatch;
@@ -109,12 +110,13 @@ pub fn run(
     };
     drop(skies);
     let solving = SolveWatch::new(cancel.clone());
-    let receiving = Receiving::Once { wait_bytes: WAIT_BYTES };
-    let outcome =
-        ground_segment::add(&mut graph, bytes, &plan.config, out, (truth, solving.clone()), receiving)?;
+    let ground = Ground::new(&plan.config.ground(WAIT_BYTES))?;
+    let mapping = Mapping { out, truth, watch: solving.clone() };
+    let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: None };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
-    conclude(RunScope::Whole, &plan.config, out, report, (outcome, None, counts.close(plan)?))
+    let ended = Ended { report, outcome, listening: None, samples: counts.close(plan)? };
+    conclude(RunScope::Whole, &plan.config, out, ended)
 }
 
 /// The space segment alone, to a downlink file, a ground that listens, or both.
@@ -156,14 +158,14 @@ pub fn simulate(
     Ok(report)
 }
 
-/// The ground segment alone, from downlink files or senders.
+/// The ground segment alone: `ground`, made with the same configuration, takes downlink files or what senders send.
 ///
 /// # Errors
 /// A file that cannot be read; the first failure of any stage; no visibility for any map.
 pub fn replay<S: GroundSource + 'static>(
     source: S,
     config: &Config,
-    receiving: Receiving,
+    ground: Ground,
     out: &Path,
     cancel: &Cancel,
     watch: Watcher<'_>,
@@ -173,11 +175,11 @@ pub fn replay<S: GroundSource + 'static>(
     let listening = source.listening();
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
     let solving = SolveWatch::new(cancel.clone());
-    let watching = (Truth::unknown(), solving.clone());
-    let outcome = ground_segment::add(&mut graph, bytes, config, out, watching, receiving)?;
+    let mapping = Mapping { out, truth: Truth::unknown(), watch: solving.clone() };
+    let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone() };
     let report = start(graph, &config.runtime, cancel, (watched, watch))?;
-    conclude(RunScope::Ground, config, out, report, (outcome, listening, None))
+    conclude(RunScope::Ground, config, out, Ended { report, outcome, listening, samples: None })
 }
 
 /// The link's faults, if any are asked for; the truth about them goes beside the downlink file.
@@ -212,21 +214,30 @@ fn start(
     Ok(graph.run(cancel, Duration::from_secs_f64(config.shutdown_s))?)
 }
 
+/// Results of a run that ended without a failure.
+struct Ended {
+    report: Report,
+    outcome: SegmentOutcome,
+    listening: Option<Listening>,
+    samples: Option<SampleSummary>,
+}
+
 fn conclude(
     segment: RunScope,
     config: &Config,
     out: &Path,
-    report: Report,
-    (outcome, listening, samples): (GroundOutcome, Option<Listening>, Option<SampleSummary>),
+    ended: Ended,
 ) -> Result<RunSummary, PipelineError> {
-    let mut reception = outcome.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let channels = outcome.channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = outcome.ledger.close()?;
+    let Ended { report, outcome, listening, samples } = ended;
+    let SegmentOutcome { ground, channels } = outcome;
+    let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let channels = channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let ledger = ground.ledger.close()?;
     let listening = listening.map(|listening| listening.report());
     if let Some(account) = &listening {
         account.complete(&mut reception);
     }
-    let mut autos = outcome.autos.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut autos = ground.autos.lock().unwrap_or_else(PoisonError::into_inner);
     write_autos(&mut autos, out, config.products.pictures)?;
     let mut summary = RunSummary::new(segment, config, report, ledger, reception, channels);
     (summary.listening, summary.samples) = (listening, samples);

@@ -9,6 +9,7 @@
 mod autos;
 mod channel;
 mod config;
+mod coverage;
 mod error;
 pub mod pictures;
 mod provenance;
@@ -19,6 +20,7 @@ mod truth;
 pub use autos::{AutoSummary, summarise, write_autos};
 pub use channel::{draw_comparison, draw_relative_error};
 pub use config::ProductsConfig;
+pub use coverage::draw_coverage;
 pub use error::ProductsError;
 pub use provenance::Provenance;
 pub use publisher::Publisher;

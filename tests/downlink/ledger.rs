@@ -249,26 +249,25 @@ fn hold_the_collector_to_the_truth(sent: &Sent) {
     while let Some(frame) = collector.next_delivery(&|_| true).unwrap() {
         frames.push(frame);
     }
-    while let Some(frame) = collector.next_waiting() {
+    while let Some(frame) = collector.flush_next() {
         frames.push(frame);
     }
     let mut seen = BTreeSet::new();
     for Delivery { packets, frame } in &frames {
         if let Some(GroundFrame::Visibilities(block)) = frame {
-            assert_eq!(numbers(block), by_packet[&packets[0].0.count]);
+            assert_eq!(numbers(block), by_packet[&packets[0].header.count]);
             assert!(numbers(block).into_iter().all(|number| seen.insert(number)), "taken twice");
         }
     }
     if !frames.iter().any(|found| matches!(found.frame, Some(GroundFrame::Instrument(_)))) {
         return; // Nothing could be read.
     }
-    let state = collector.into_state();
-    for kind in Kind::ALL {
-        let Some(taken) = state.taken(kind).filter(|taken| !taken.is_empty()) else { continue };
-        let missing: BTreeSet<u64> = taken.eras().into_iter().flat_map(|era| era.missing).flatten().collect();
+    for (kind, received) in collector.received().filter(|(_, received)| !received.is_empty()) {
+        let missing: BTreeSet<u64> =
+            received.eras().into_iter().flat_map(|era| era.missing).flatten().collect();
         let mut expected = counts_of(&sent.truth.packets_lost, kind);
         // Nothing is known after the last packet received.
-        let end = taken.len() + missing.len() as u64;
+        let end = received.len() + missing.len() as u64;
         expected.retain(|count| *count < end);
         assert_eq!(missing, expected, "{kind}");
     }

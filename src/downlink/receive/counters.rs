@@ -44,15 +44,73 @@ pub struct FaultCounts {
     pub order: u64,
 }
 
+/// Why a payload was refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]
+pub enum FaultKind {
+    /// Unknown format version.
+    Version,
+    /// Malformed record.
+    Record,
+    /// Length other than the record asks for.
+    Length,
+    /// Value out of range.
+    Value,
+    /// Times that do not increase.
+    Order,
+}
+
+impl From<&PayloadFault> for FaultKind {
+    fn from(fault: &PayloadFault) -> Self {
+        match fault {
+            PayloadFault::Version { .. } => Self::Version,
+            PayloadFault::Record { .. } => Self::Record,
+            PayloadFault::Length { .. } => Self::Length,
+            PayloadFault::Value { .. } => Self::Value,
+            PayloadFault::Order => Self::Order,
+        }
+    }
+}
+
+/// What became of the payload that a packet completed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
+pub enum PayloadOutcome {
+    /// It was decoded, or the packet completed none.
+    #[default]
+    Decoded,
+    /// It was malformed.
+    Refused(FaultKind),
+    /// No instrument was known.
+    BeforeInstrument,
+    /// It followed a contradictory instrument description.
+    Foreign,
+    /// It is a contradictory instrument description.
+    Contradictory,
+}
+
+/// What decoding one packet adds to the counters, beside the packet and its bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
+pub struct PacketReading {
+    /// What became of the payload.
+    pub payload: PayloadOutcome,
+    /// Visibilities decoded.
+    pub visibilities_decoded: u32,
+    /// Visibilities of bad value.
+    pub visibilities_bad_value: u32,
+    /// Visibilities of a payload that was not decoded.
+    pub visibilities_unread: u32,
+    /// Payloads given up with this packet, and segments that belong to none.
+    pub orphans: u32,
+}
+
 impl FaultCounts {
-    pub(crate) fn add(&mut self, fault: &PayloadFault) {
-        *match fault {
-            PayloadFault::Version { .. } => &mut self.version,
-            PayloadFault::Record { .. } => &mut self.record,
-            PayloadFault::Length { .. } => &mut self.length,
-            PayloadFault::Value { .. } => &mut self.value,
-            PayloadFault::Order => &mut self.order,
-        } += 1;
+    fn of_mut(&mut self, fault: FaultKind) -> &mut u64 {
+        match fault {
+            FaultKind::Version => &mut self.version,
+            FaultKind::Record => &mut self.record,
+            FaultKind::Length => &mut self.length,
+            FaultKind::Value => &mut self.value,
+            FaultKind::Order => &mut self.order,
+        }
     }
 
     /// All of them.
@@ -135,39 +193,34 @@ impl ReceptionCounters {
         }
     }
 
-    /// Adds another decoder's counters of packets and payloads, but not those of bytes between packets.
-    pub(crate) fn add(&mut self, other: &Self) {
-        self.combine(other, u64::saturating_add);
-    }
-
-    /// The inverse of [`ReceptionCounters::add`].
-    pub(crate) fn subtract(&mut self, other: &Self) {
-        self.combine(other, u64::saturating_sub);
-    }
-
-    fn combine(&mut self, other: &Self, with: fn(u64, u64) -> u64) {
-        let combine = |ours: &mut u64, theirs: u64| *ours = with(*ours, theirs);
-        combine(&mut self.bytes, other.bytes);
-        for kind in Kind::ALL {
-            let (ours, theirs) = (self.kind_mut(kind), other.kind(kind));
-            combine(&mut ours.packets, theirs.packets);
-            combine(&mut ours.bytes, theirs.bytes);
-            combine(&mut ours.orphans, theirs.orphans);
+    /// Adds a good packet that is no duplicate.
+    pub(crate) fn add_packet(&mut self, kind: Kind, bytes: u32, reading: &PacketReading) {
+        let PacketReading { payload, orphans, visibilities_unread: unread, .. } = *reading;
+        // A forged journal may claim anything: sums saturate.
+        let add = |count: &mut u64, more: u32| *count = count.saturating_add(u64::from(more));
+        add(&mut self.bytes, bytes);
+        let counts = self.kind_mut(kind);
+        add(&mut counts.packets, 1);
+        add(&mut counts.bytes, bytes);
+        add(&mut counts.orphans, orphans);
+        add(&mut self.visibilities_decoded, reading.visibilities_decoded);
+        add(&mut self.visibilities_bad_value, reading.visibilities_bad_value);
+        match payload {
+            PayloadOutcome::Decoded => {}
+            PayloadOutcome::Refused(fault) => {
+                add(self.faults.of_mut(fault), 1);
+                add(&mut self.visibilities_refused, unread);
+            }
+            PayloadOutcome::BeforeInstrument => {
+                add(&mut self.payloads_before_instrument, 1);
+                add(&mut self.visibilities_before_instrument, unread);
+            }
+            PayloadOutcome::Foreign => {
+                add(&mut self.payloads_foreign, 1);
+                add(&mut self.visibilities_foreign, unread);
+            }
+            PayloadOutcome::Contradictory => add(&mut self.instruments_contradictory, 1),
         }
-        let FaultCounts { version, record, length, value, order } = other.faults;
-        combine(&mut self.faults.version, version);
-        combine(&mut self.faults.record, record);
-        combine(&mut self.faults.length, length);
-        combine(&mut self.faults.value, value);
-        combine(&mut self.faults.order, order);
-        combine(&mut self.instruments_contradictory, other.instruments_contradictory);
-        combine(&mut self.payloads_foreign, other.payloads_foreign);
-        combine(&mut self.payloads_before_instrument, other.payloads_before_instrument);
-        combine(&mut self.visibilities_decoded, other.visibilities_decoded);
-        combine(&mut self.visibilities_bad_value, other.visibilities_bad_value);
-        combine(&mut self.visibilities_refused, other.visibilities_refused);
-        combine(&mut self.visibilities_before_instrument, other.visibilities_before_instrument);
-        combine(&mut self.visibilities_foreign, other.visibilities_foreign);
     }
 
     /// Adds a stream's counters of everything but sound packets: garbage, damage, a truncated end, and frames.

@@ -1,6 +1,6 @@
 //! Packets to ground frames.
 
-use super::{Event, Packet, ReceptionCounters};
+use super::{Event, Packet, PacketReading, PayloadOutcome, ReceptionCounters};
 use crate::downlink::wire::payload::{
     PayloadFault, count_visibilities, decode_ephemeris, decode_housekeeping, decode_instrument,
     decode_visibilities,
@@ -29,19 +29,29 @@ enum Standing {
     Contradicted,
 }
 
-/// The state of a decoder, from which another can resume: instrument and counters, without unfinished payloads.
-#[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
+/// What a decoder knows of the instrument; its counters and the segments of unfinished payloads are not part of it.
+#[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct DecoderState {
     instrument: Option<Instrument>,
     standing: Standing,
-    counters: ReceptionCounters,
 }
 
 impl DecoderState {
-    /// The counters.
+    /// Takes the other's instrument if it knows none; returns whether both know the same.
     #[must_use]
-    pub fn counters(&self) -> &ReceptionCounters {
-        &self.counters
+    pub fn merge(&mut self, other: Self) -> bool {
+        match (&self.instrument, &other.instrument) {
+            (Some(ours), Some(theirs)) => return ours == theirs,
+            (None, Some(_)) => *self = other,
+            _ => {}
+        }
+        true
+    }
+
+    /// The instrument.
+    #[must_use]
+    pub fn instrument(&self) -> Option<&Instrument> {
+        self.instrument.as_ref()
     }
 }
 
@@ -55,6 +65,8 @@ pub struct Decoder {
     standing: Standing,
     partial: [Option<Partial>; Kind::ALL.len()],
     counters: ReceptionCounters,
+    /// Of the packet that is being decoded, or was decoded last.
+    reading: PacketReading,
     fault: Option<(u64, PayloadFault)>,
 }
 
@@ -65,43 +77,20 @@ impl Decoder {
         Self::default()
     }
 
-    /// Its state.
+    /// What it knows of the instrument.
     #[must_use]
     pub fn state(&self) -> DecoderState {
-        let Self { instrument, standing, counters, .. } = self;
-        DecoderState { instrument: instrument.clone(), standing: *standing, counters: counters.clone() }
+        DecoderState { instrument: self.instrument.clone(), standing: self.standing }
     }
 
-    /// A decoder that resumes from a state.
+    /// Resumes with a known instrument, and counters of what was decoded before.
     #[must_use]
-    pub fn resume(state: DecoderState) -> Self {
-        let DecoderState { instrument, standing, counters } = state;
+    pub fn resume(state: DecoderState, counters: ReceptionCounters) -> Self {
+        let DecoderState { instrument, standing } = state;
         Self { instrument, standing, counters, ..Self::new() }
     }
 
-    /// A decoder with the same instrument and zero counters.
-    pub(crate) fn uncounted(&self) -> Self {
-        Self { instrument: self.instrument.clone(), standing: self.standing, ..Self::new() }
-    }
-
-    /// Takes what another has counted off its account.
-    pub(crate) fn uncount(&mut self, counters: &ReceptionCounters) {
-        self.counters.subtract(counters);
-    }
-
-    /// Merges the state of another decoder. Returns false, and changes nothing, if the instruments differ.
-    pub fn absorb(&mut self, other: DecoderState) -> bool {
-        let DecoderState { instrument, standing, counters, .. } = other;
-        match (&self.instrument, instrument) {
-            (Some(ours), Some(theirs)) if *ours != theirs => return false,
-            (None, Some(theirs)) => (self.instrument, self.standing) = (Some(theirs), standing),
-            _ => {}
-        }
-        self.counters.add(&counters);
-        true
-    }
-
-    /// Whether a payload describes another instrument than the known one.
+    /// Whether this is the payload of another instrument's description than the one that holds.
     #[must_use]
     pub fn contradicts(&self, payload: &[u8]) -> bool {
         let known = self.instrument.as_ref();
@@ -112,7 +101,7 @@ impl Decoder {
     pub fn accept(&mut self, event: &Event<'_>) -> Option<GroundFrame> {
         let counters = &mut self.counters;
         match *event {
-            Event::Packet(packet) => return self.take_packet(packet),
+            Event::Packet(packet) => return self.decode(packet, false).0,
             Event::Duplicate { header, .. } => {
                 counters.bytes += header.bytes as u64;
                 counters.bytes_duplicate += header.bytes as u64;
@@ -145,8 +134,28 @@ impl Decoder {
     /// Ends the stream: discards incomplete payloads. Another stream may follow.
     pub fn finish(&mut self) {
         for kind in Kind::ALL {
+            let orphans = self.drop_partial(kind);
+            self.counters.kind_mut(kind).orphans += u64::from(orphans);
+        }
+    }
+
+    /// Decodes a packet; returns the frame that it completes and what it adds to the counters.
+    ///
+    /// If `is_last`, the stream ends with it: the payload is given up if it lacks a segment.
+    pub(crate) fn decode(
+        &mut self,
+        packet: Packet<'_>,
+        is_last: bool,
+    ) -> (Option<GroundFrame>, PacketReading) {
+        self.reading = PacketReading::default();
+        let PacketHeader { kind, bytes, .. } = packet.header;
+        let frame = self.decode_packet(packet);
+        if is_last {
             self.give_up(kind);
         }
+        self.counters.add_packet(kind, bytes as u32, &self.reading);
+        self.counters.kind_mut(kind).late += u64::from(packet.late);
+        (frame, self.reading)
     }
 
     /// The counters so far.
@@ -166,22 +175,17 @@ impl Decoder {
         self.fault.take()
     }
 
-    fn take_packet(&mut self, packet: Packet<'_>) -> Option<GroundFrame> {
-        let PacketHeader { kind, segment, version, bytes, .. } = packet.header;
-        self.counters.bytes += bytes as u64;
-        let counts = self.counters.kind_mut(kind);
-        counts.packets += 1;
-        counts.bytes += bytes as u64;
-        counts.late += u64::from(packet.late);
+    fn decode_packet(&mut self, packet: Packet<'_>) -> Option<GroundFrame> {
+        let PacketHeader { kind, segment, version, .. } = packet.header;
         if version != FORMAT_VERSION {
             return self.refuse(packet, PayloadFault::Version { found: version, expected: FORMAT_VERSION });
         }
         if segment == PacketSegment::Whole {
             self.give_up(kind);
-            return self.take_payload(packet, packet.payload);
+            return self.decode_payload(packet, packet.payload);
         }
         let whole = self.assemble(packet)?;
-        self.take_payload(packet, &whole)
+        self.decode_payload(packet, &whole)
     }
 
     /// Adds a segment; returns the payload if it is complete.
@@ -200,7 +204,7 @@ impl Decoder {
         };
         let Some(mut partial) = self.partial[kind.index()].take_if(|partial| fits(partial)) else {
             self.give_up(kind);
-            self.counters.kind_mut(kind).orphans += 1;
+            self.reading.orphans += 1;
             return None;
         };
         partial.bytes.extend_from_slice(packet.payload);
@@ -214,12 +218,15 @@ impl Decoder {
 
     /// Discards an incomplete payload and counts it.
     fn give_up(&mut self, kind: Kind) {
-        if self.partial[kind.index()].take().is_some() {
-            self.counters.kind_mut(kind).orphans += 1;
-        }
+        self.reading.orphans += self.drop_partial(kind);
     }
 
-    fn take_payload(&mut self, packet: Packet<'_>, payload: &[u8]) -> Option<GroundFrame> {
+    /// Drops the segments of an unfinished payload; returns how many payloads there were.
+    fn drop_partial(&mut self, kind: Kind) -> u32 {
+        u32::from(self.partial[kind.index()].take().is_some())
+    }
+
+    fn decode_payload(&mut self, packet: Packet<'_>, payload: &[u8]) -> Option<GroundFrame> {
         let kind = packet.header.kind;
         let decoded = match kind {
             Kind::Instrument => decode_instrument(payload).map(|found| self.take_instrument(found)),
@@ -236,7 +243,7 @@ impl Decoder {
         };
         decoded.unwrap_or_else(|fault| {
             if kind == Kind::Visibilities {
-                self.counters.visibilities_refused += count_visibilities(payload);
+                self.reading.visibilities_unread = count_visibilities(payload) as u32;
             }
             self.refuse(packet, fault)
         })
@@ -248,7 +255,7 @@ impl Decoder {
             Some(known) if *known == found => false,
             Some(_) => {
                 self.standing = Standing::Contradicted;
-                self.counters.instruments_contradictory += 1;
+                self.reading.payload = PayloadOutcome::Contradictory;
                 return None;
             }
         };
@@ -268,26 +275,23 @@ impl Decoder {
     fn take_visibilities(&mut self, payload: &[u8]) -> Result<GroundFrame, PayloadFault> {
         let instrument = self.instrument.as_ref().ok_or(PayloadFault::Record { what: "instrument" })?;
         let (block, bad) = decode_visibilities(payload, instrument)?;
-        self.counters.visibilities_bad_value += bad;
-        self.counters.visibilities_decoded += block.len() as u64;
+        self.reading.visibilities_bad_value = bad as u32;
+        self.reading.visibilities_decoded = block.len() as u32;
         Ok(GroundFrame::Visibilities(block))
     }
 
     /// Counts a payload that cannot be decoded because its instrument description is missing.
     fn set_aside(&mut self, kind: Kind, payload: &[u8]) {
-        let visibilities = if kind == Kind::Visibilities { count_visibilities(payload) } else { 0 };
-        let counters = &mut self.counters;
-        if self.standing == Standing::Unknown {
-            counters.payloads_before_instrument += 1;
-            counters.visibilities_before_instrument += visibilities;
-        } else {
-            counters.payloads_foreign += 1;
-            counters.visibilities_foreign += visibilities;
-        }
+        self.reading.visibilities_unread =
+            if kind == Kind::Visibilities { count_visibilities(payload) as u32 } else { 0 };
+        self.reading.payload = match self.standing {
+            Standing::Unknown => PayloadOutcome::BeforeInstrument,
+            _ => PayloadOutcome::Foreign,
+        };
     }
 
     fn refuse(&mut self, packet: Packet<'_>, fault: PayloadFault) -> Option<GroundFrame> {
-        self.counters.faults.add(&fault);
+        self.reading.payload = PayloadOutcome::Refused((&fault).into());
         self.fault = Some((packet.offset, fault));
         None
     }

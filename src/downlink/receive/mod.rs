@@ -19,14 +19,14 @@ mod event_reader;
 pub mod inspect;
 mod intake;
 mod listing;
+mod received_set;
 mod receiver;
 mod sequence;
-mod taken;
 
-pub use counters::{FaultCounts, KindCounts, ReceptionCounters};
+pub use counters::{FaultCounts, FaultKind, KindCounts, PacketReading, PayloadOutcome, ReceptionCounters};
 pub use decoder::{Decoder, DecoderState};
 pub use event_reader::{ByteFeed, EventReader};
 pub use intake::Intake;
 pub use listing::{LISTED_MAX, Listing};
+pub use received_set::{Era, ReceivedSet};
 pub use receiver::{Event, Packet, PacketReceiver};
-pub use taken::{Era, Taken};

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::Taken;
+use super::ReceivedSet;
 use crate::downlink::wire::CucTime;
 use crate::units::IntervalSet;
 
@@ -43,7 +43,7 @@ pub(super) struct Sequence {
     /// Latest time of a sound packet.
     newest: CucTime,
     /// Sound packets received.
-    taken: Taken,
+    received: ReceivedSet,
     /// Missing counts below `next`, in at most [`INTERVALS_MAX`] intervals.
     missing: IntervalSet<u64>,
 }
@@ -58,8 +58,8 @@ impl Sequence {
             Arrival::Duplicate => return arrival,
         }
         self.newest = self.newest.max(time);
-        self.taken.take(count, time);
-        self.taken.forget_oldest(INTERVALS_MAX);
+        self.received.insert(count, time);
+        self.received.remove_oldest(INTERVALS_MAX);
         arrival
     }
 
@@ -74,13 +74,13 @@ impl Sequence {
     }
 
     /// Restarts of the count.
-    pub(super) fn restarts(&self) -> u64 {
-        self.taken.restarts()
+    pub(crate) fn restarts(&self) -> u64 {
+        self.received.restarts()
     }
 
     fn classify(&mut self, count: u64, time: CucTime) -> Arrival {
         let expected = self.next;
-        if self.taken.contains(count, time) {
+        if self.received.contains(count, time) {
             return Arrival::Duplicate;
         }
         if !std::mem::replace(&mut self.begun, true) {

@@ -9,61 +9,57 @@ use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 use crc_fast::{CrcAlgorithm, Digest};
 
-use super::error::StateError;
 use super::journal::Journal;
 use crate::accumulation::AccumulatorState;
-use crate::calibration::{AutoTable, CalibratorState};
-use crate::frames::VisibilityReason;
-use crate::ground::{CollectorState, CollectorView};
-use crate::runtime::LedgerReport;
+use crate::calibration::AutoTable;
+use crate::frames::EphemerisSegment;
+use crate::ground::{CollectorState, CollectorView, GroundError};
 
-const MAGIC: &[u8; 8] = b"LNRSTA04";
+const MAGIC: &[u8; 8] = b"LNRSTA05";
 /// Beginning of the magic in every version.
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of the ground's state, version 04; earlier versions do not know at which times \
-                       packets were made: replay their files into a new folder";
+const VERSION: &str = "a checkpoint of the ground's state, version 05; earlier versions keep less in their journal: \
+                       replay their files into a new folder";
 /// Bytes of magic, length of the head, and checksum.
 const FIXED_BYTES: u64 = 24;
 
 /// Bytes read at a time.
 const PIECE_BYTES: u64 = 1 << 20;
 
-/// Most memory that a decoded head may take for each of its bytes on disk: the hungriest of what it is made of, a line
-/// on a packet of positions, takes 80 bytes for at least 9.
+/// Most memory that a decoded head may take for each of its bytes on disk: of its parts, a record of a packet of
+/// positions needs most, 136 bytes for at least 14.
 const MEMORY_A_BYTE: usize = 16;
 
-/// A checkpoint without its engines.
+/// A checkpoint without its engines: data, and the journal.
 #[derive(Clone, Debug, PartialEq, Decode)]
-pub(super) struct Head {
+pub(super) struct ArchiveHead {
     /// Keys and values of the settings that shape sums.
     pub(super) settings: Vec<(String, String)>,
     pub(super) collector: CollectorState,
-    pub(super) calibrator: CalibratorState,
-    pub(super) powers: AutoTable,
+    pub(super) ephemeris: Vec<EphemerisSegment>,
+    pub(super) autos: AutoTable,
     pub(super) accumulator: AccumulatorState,
-    pub(super) ledger: LedgerReport<VisibilityReason>,
     pub(super) journal: Journal,
 }
 
-/// A [`Head`] to be written: field by field the same, without copies of what is large.
+/// A [`ArchiveHead`] to be written: field by field the same, without copies of what is large.
 #[derive(Encode)]
-pub(super) struct HeadView<'a> {
+pub(super) struct ArchiveHeadView<'a> {
     pub(super) settings: &'a Vec<(String, String)>,
     pub(super) collector: CollectorView<'a>,
-    pub(super) calibrator: CalibratorState,
-    pub(super) powers: &'a AutoTable,
+    pub(super) ephemeris: Vec<&'a EphemerisSegment>,
+    pub(super) autos: &'a AutoTable,
     pub(super) accumulator: AccumulatorState,
-    pub(super) ledger: LedgerReport<VisibilityReason>,
     pub(super) journal: &'a Journal,
 }
 
-/// Sums up what is written.
-struct Summed<'a, W> {
+/// Forms a checksum of what is written.
+struct ChecksumWriter<'a, W> {
     inner: &'a mut W,
     crc: Digest,
 }
 
-impl<W: Write> Write for Summed<'_, W> {
+impl<W: Write> Write for ChecksumWriter<'_, W> {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         let written = self.inner.write(bytes)?;
         self.crc.update(&bytes[..written]);
@@ -79,11 +75,11 @@ impl<W: Write> Write for Summed<'_, W> {
 pub(super) fn write(
     out: &mut impl Write,
     path: &Path,
-    head: &HeadView<'_>,
-    engines: impl FnOnce(&mut dyn Write) -> Result<(), StateError>,
-) -> Result<(), StateError> {
-    let failed = || StateError::io(path, "write");
-    let damaged = |found: String| StateError::Damaged {
+    head: &ArchiveHeadView<'_>,
+    engines: impl FnOnce(&mut dyn Write) -> Result<(), GroundError>,
+) -> Result<(), GroundError> {
+    let failed = || GroundError::io(path, "write");
+    let damaged = |found: String| GroundError::Damaged {
         path: path.to_owned(),
         found,
         expected: "a state that can be written",
@@ -92,7 +88,7 @@ pub(super) fn write(
     let mut size = SizeWriter::default();
     let refused = |error: EncodeError| damaged(error.to_string());
     bincode::encode_into_writer(head, &mut size, config).map_err(refused)?;
-    let mut summed = Summed { inner: out, crc: Digest::new(CrcAlgorithm::Crc64Nvme) };
+    let mut summed = ChecksumWriter { inner: out, crc: Digest::new(CrcAlgorithm::Crc64Nvme) };
     summed.write_all(MAGIC).map_err(failed())?;
     summed.write_all(&(size.bytes_written as u64).to_le_bytes()).map_err(failed())?;
     // Many small pieces.
@@ -109,19 +105,19 @@ pub(super) fn write(
 }
 
 /// Whether a file begins as a checkpoint of any version does.
-pub(super) fn is_checkpoint(path: &Path) -> Result<bool, StateError> {
+pub(super) fn is_checkpoint(path: &Path) -> Result<bool, GroundError> {
     let mut magic = Vec::new();
-    let file = File::open(path).map_err(StateError::io(path, "open the file"))?;
-    file.take(MAGIC.len() as u64).read_to_end(&mut magic).map_err(StateError::io(path, "read"))?;
+    let file = File::open(path).map_err(GroundError::io(path, "open the file"))?;
+    file.take(MAGIC.len() as u64).read_to_end(&mut magic).map_err(GroundError::io(path, "read"))?;
     Ok(magic.len() == MAGIC.len() && magic.starts_with(ANY_VERSION))
 }
 
 /// Reads a checkpoint; `rest` makes something of the head and the engines.
 pub(super) fn read<T>(
     path: &Path,
-    rest: impl FnOnce(Head, &mut dyn Read) -> Result<T, StateError>,
-) -> Result<T, StateError> {
-    read_from(&mut File::open(path).map_err(StateError::io(path, "read"))?, path, rest)
+    rest: impl FnOnce(ArchiveHead, &mut dyn Read) -> Result<T, GroundError>,
+) -> Result<T, GroundError> {
+    read_from(&mut File::open(path).map_err(GroundError::io(path, "read"))?, path, rest)
 }
 
 /// Reads a checkpoint from anything; messages call it `path`.
@@ -130,10 +126,10 @@ pub(super) fn read<T>(
 pub(super) fn read_from<T>(
     from: &mut (impl Read + Seek),
     path: &Path,
-    rest: impl FnOnce(Head, &mut dyn Read) -> Result<T, StateError>,
-) -> Result<T, StateError> {
-    let failed = || StateError::io(path, "read");
-    let damaged = |found: String, expected| StateError::Damaged { path: path.to_owned(), found, expected };
+    rest: impl FnOnce(ArchiveHead, &mut dyn Read) -> Result<T, GroundError>,
+) -> Result<T, GroundError> {
+    let failed = || GroundError::io(path, "read");
+    let damaged = |found: String, expected| GroundError::Damaged { path: path.to_owned(), found, expected };
     let bytes = checked_length(from, path)?;
     from.rewind().map_err(failed())?;
     let mut from = BufReader::with_capacity(bytes.min(PIECE_BYTES) as usize, from);
@@ -153,8 +149,8 @@ pub(super) fn read_from<T>(
     if used as u64 != length {
         return Err(damaged("bytes behind the head".into(), "none"));
     }
-    if !head.collector.is_sound() {
-        return Err(damaged("packets that cannot have come".into(), "those that a ground has taken"));
+    if !head.collector.is_sound() || !head.journal.is_sound() {
+        return Err(damaged("packets that cannot exist".into(), "packets that were received"));
     }
     let mut engines = from.take(bytes - FIXED_BYTES - length);
     let found = rest(head, &mut engines)?;
@@ -166,7 +162,7 @@ pub(super) fn read_from<T>(
 
 /// A head, and the bytes of it. Lengths that a forger claims are held against a limit, before memory is reserved, that
 /// follows from the bytes that are there: the least of some that the decoder knows, at most four times as much.
-fn decode(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
+fn decode(bytes: &[u8]) -> Result<(ArchiveHead, usize), DecodeError> {
     let most = bytes.len().saturating_mul(MEMORY_A_BYTE);
     match usize::BITS - most.leading_zeros() {
         0..=20 => decode_within::<{ 1 << 20 }>(bytes),
@@ -181,14 +177,14 @@ fn decode(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
     }
 }
 
-fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(Head, usize), DecodeError> {
+fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(ArchiveHead, usize), DecodeError> {
     bincode::decode_from_slice(bytes, bincode::config::standard().with_limit::<LIMIT>())
 }
 
 /// Length of a checkpoint whose checksum holds.
-fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, StateError> {
-    let failed = || StateError::io(path, "read");
-    let damaged = |found: String, expected| StateError::Damaged { path: path.to_owned(), found, expected };
+fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, GroundError> {
+    let failed = || GroundError::io(path, "read");
+    let damaged = |found: String, expected| GroundError::Damaged { path: path.to_owned(), found, expected };
     let bytes = from.seek(SeekFrom::End(0)).map_err(failed())?;
     if bytes < FIXED_BYTES {
         return Err(damaged(format!("{bytes} bytes"), "at least 24"));
@@ -221,18 +217,21 @@ mod tests {
     use super::*;
     use crate::accumulation::Accumulator;
     use crate::calibration::{Calibrator, Identity};
+    use crate::downlink::receive::PacketReading;
     use crate::downlink::{
         CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PacketHeader, PacketSegment, Transmission,
     };
     use crate::frames::{
         AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock,
+        VisibilityReason,
     };
-    use crate::ground::Collector;
+    use crate::ground::archive::draft::RecordDraft;
+    use crate::ground::{Collector, DeliveredPacket};
     use crate::runtime::{Ledger, Outlet, Stage};
     use crate::units::MissionTime;
 
     /// Every part of a head has something in it.
-    fn with_head<T>(take: impl FnOnce(&HeadView<'_>) -> T) -> T {
+    fn with_head<T>(take: impl FnOnce(&ArchiveHeadView<'_>) -> T) -> T {
         let channels = vec![Channel { frequency_hz: 3e6, width_hz: 8e3 }];
         let instrument = Instrument {
             name: "test".to_owned(),
@@ -253,16 +252,18 @@ mod tests {
             flags: vec![Flags::GOOD],
             ..VisibilityBlock::default()
         };
+        let positions_m = vec![[0.0; 3]; 8 * 8];
+        let segment = EphemerisSegment { start: MissionTime(0), step_ticks: 9, satellites: 8, positions_m };
         let frames = [
             GroundFrame::Instrument(instrument.clone()),
             GroundFrame::Visibilities(own),
+            GroundFrame::Ephemeris(segment),
             GroundFrame::Housekeeping(Housekeeping { time: MissionTime(5), sampled: 9, dropped: 1 }),
         ];
         let ledger = Ledger::new();
         ledger.left_out(VisibilityReason::BaselineBeyondMap, 4);
         let mut accumulator = Accumulator::new(Default::default(), ledger.clone());
-        let mut calibrator =
-            Calibrator::new(Box::new(Identity), ledger.clone()).with_autos(Default::default());
+        let mut calibrator = Calibrator::new(Box::new(Identity), ledger.clone()).with_autos();
         let mut collector = Collector::new(1000);
         let mut transmission = Transmission::new(&DownlinkConfig::default()).unwrap();
         let mut bytes = Vec::new();
@@ -277,38 +278,38 @@ mod tests {
         let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(3));
         let header = PacketHeader { kind, segment, count: 3, time, version: FORMAT_VERSION, bytes: 60 };
         let mut journal = Journal::default();
-        journal.keep(header, 1, None, (2, 3, Some([1.0, 2.0])), &ledger.report());
+        let packet = DeliveredPacket { header, check: 1, reading: PacketReading::default() };
+        journal.record_visibilities(&packet, RecordDraft::default(), &ledger.report());
         let settings = vec![("map.nside".to_owned(), "4".to_owned())];
-        take(&HeadView {
+        take(&ArchiveHeadView {
             settings: &settings,
             collector: collector.view(),
-            calibrator: calibrator.state(),
-            powers: calibrator.powers(),
+            ephemeris: calibrator.ephemeris().segments().collect(),
+            autos: calibrator.autos().unwrap(),
             accumulator: accumulator.state(),
-            ledger: ledger.report(),
             journal: &journal,
         })
     }
 
-    fn written(head: &HeadView<'_>) -> Vec<u8> {
+    fn written(head: &ArchiveHeadView<'_>) -> Vec<u8> {
         let mut bytes = Vec::new();
         let engines =
-            |out: &mut dyn Write| out.write_all(b"engines").map_err(StateError::io(Path::new("x"), "write"));
+            |out: &mut dyn Write| out.write_all(b"engines").map_err(GroundError::io(Path::new("x"), "write"));
         write(&mut bytes, Path::new("x"), head, engines).unwrap();
         bytes
     }
 
-    fn read_back(bytes: &[u8]) -> Result<Head, StateError> {
+    fn read_back(bytes: &[u8]) -> Result<ArchiveHead, GroundError> {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), bytes).unwrap();
         read(file.path(), |head, engines| {
-            std::io::copy(engines, &mut std::io::sink()).map_err(StateError::io(file.path(), "read"))?;
+            std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(file.path(), "read"))?;
             Ok(head)
         })
     }
 
     /// Where each field stands, in the order in which they are written.
-    fn fields(head: &HeadView<'_>, bytes: usize) -> Vec<(&'static str, Range<usize>)> {
+    fn fields(head: &ArchiveHeadView<'_>, bytes: usize) -> Vec<(&'static str, Range<usize>)> {
         let length = |size: Result<Vec<u8>, EncodeError>| size.unwrap().len();
         let config = bincode::config::standard();
         let lengths = [
@@ -316,10 +317,9 @@ mod tests {
             ("length", 8),
             ("settings", length(bincode::encode_to_vec(head.settings, config))),
             ("collector", length(bincode::encode_to_vec(&head.collector, config))),
-            ("calibrator", length(bincode::encode_to_vec(&head.calibrator, config))),
-            ("powers", length(bincode::encode_to_vec(head.powers, config))),
+            ("ephemeris", length(bincode::encode_to_vec(&head.ephemeris, config))),
+            ("autos", length(bincode::encode_to_vec(head.autos, config))),
             ("accumulator", length(bincode::encode_to_vec(&head.accumulator, config))),
-            ("ledger", length(bincode::encode_to_vec(&head.ledger, config))),
             ("journal", length(bincode::encode_to_vec(head.journal, config))),
             ("engines", 7),
             ("checksum", 8),
@@ -344,7 +344,7 @@ mod tests {
                 for at in range {
                     let mut bad = good.clone();
                     bad[at] ^= 0x11;
-                    assert!(matches!(read_back(&bad), Err(StateError::Damaged { .. })), "{name}, byte {at}");
+                    assert!(matches!(read_back(&bad), Err(GroundError::Damaged { .. })), "{name}, byte {at}");
                 }
             }
         });
@@ -397,11 +397,28 @@ mod tests {
         with_head(|head| {
             let found = read_back(&written(head)).unwrap();
             assert_eq!(found.journal, *head.journal);
-            assert_eq!((found.ledger, found.calibrator), (head.ledger.clone(), head.calibrator.clone()));
+            assert_eq!(found.ephemeris.iter().collect::<Vec<_>>(), head.ephemeris);
             assert_eq!(found.accumulator, head.accumulator);
-            assert!(found.powers == *head.powers && found.powers != AutoTable::default());
-            let again = Collector::resume(found.collector);
+            assert!(found.autos == *head.autos && found.autos != AutoTable::default());
+            let delivered = found.journal.delivered();
+            let again = Collector::resume(found.collector, delivered, found.journal.reception());
             assert_eq!(again.view(), head.collector);
+        });
+    }
+
+    #[test]
+    fn an_earlier_version_is_refused_and_says_what_to_do() {
+        with_head(|head| {
+            let mut old = written(head);
+            old[..8].copy_from_slice(b"LNRSTA04");
+            let body = old.len() - 8;
+            let crc = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &old[..body]);
+            old[body..].copy_from_slice(&crc.to_le_bytes());
+            let said = read_back(&old).unwrap_err().to_string();
+            assert!(
+                said.contains("version 05") && said.contains("replay their files into a new folder"),
+                "{said}"
+            );
         });
     }
 }

@@ -1,50 +1,50 @@
-//! The folder of a state: numbered checkpoints, of which the newest two are kept.
+//! The folder of an archive: numbered checkpoints, of which the newest two are kept.
 
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 
-use super::error::StateError;
 use crate::files::{AtomicFile, IfUnfinished};
+use crate::ground::GroundError;
 
 const PREFIX: &str = "checkpoint-";
 const SUFFIX: &str = ".lunarray";
 
-/// A folder that no other process keeps a state in at the same time.
+/// A folder that one process uses at a time.
 #[derive(Debug)]
 pub(super) struct StateFolder {
     path: PathBuf,
     /// Number of the newest checkpoint.
     newest: u64,
-    /// Locked as long as it is open, by the system, which unlocks it whatever becomes of the process.
+    /// Locked while it is open; the system unlocks it however the process ends.
     _lock: File,
 }
 
 impl StateFolder {
-    /// Makes the folder if it is not there, and locks it.
-    pub(super) fn open(path: &Path) -> Result<Self, StateError> {
-        fs::create_dir_all(path).map_err(StateError::io(path, "make the folder"))?;
+    /// Creates the folder if needed, and locks it.
+    pub(super) fn open(path: &Path) -> Result<Self, GroundError> {
+        fs::create_dir_all(path).map_err(GroundError::io(path, "make the folder"))?;
         let lock_path = path.join("lock");
         let lock = File::options().create(true).append(true).open(&lock_path);
-        let lock = lock.map_err(StateError::io(&lock_path, "open the lock"))?;
+        let lock = lock.map_err(GroundError::io(&lock_path, "open the lock"))?;
         match lock.try_lock() {
             Ok(()) => {}
-            Err(TryLockError::WouldBlock) => return Err(StateError::Locked { path: path.to_owned() }),
-            Err(TryLockError::Error(source)) => return Err(StateError::io(&lock_path, "lock")(source)),
+            Err(TryLockError::WouldBlock) => return Err(GroundError::Locked { path: path.to_owned() }),
+            Err(TryLockError::Error(source)) => return Err(GroundError::io(&lock_path, "lock")(source)),
         }
         let mut folder = Self { path: path.to_owned(), newest: 0, _lock: lock };
         folder.newest = numbers(&folder.path)?.last().copied().unwrap_or(0);
         Ok(folder)
     }
 
-    /// The newest checkpoint that `read` can read, and what is to be said of those that it cannot, which get
-    /// another name if they are to be set aside; `None` if there is none at all.
+    /// The newest checkpoint that `read` can read, or `None` if there is no checkpoint; and notes on newer ones that it
+    /// cannot, which are renamed if `sets_aside`.
     pub(super) fn load<T>(
         &mut self,
         sets_aside: bool,
-        read: impl Fn(&Path) -> Result<T, StateError>,
-    ) -> Result<(Option<T>, Vec<String>), StateError> {
+        read: impl Fn(&Path) -> Result<T, GroundError>,
+    ) -> Result<(Option<T>, Vec<String>), GroundError> {
         let numbers = numbers(&self.path)?;
-        let mut bad: Vec<(PathBuf, StateError)> = Vec::new();
+        let mut bad: Vec<(PathBuf, GroundError)> = Vec::new();
         for &number in numbers.iter().rev() {
             let path = self.name(number);
             match read(&path) {
@@ -53,12 +53,14 @@ impl StateFolder {
                     for (path, _) in bad.iter().filter(|_| sets_aside) {
                         let mut aside = path.clone().into_os_string();
                         aside.push(".damaged");
-                        fs::rename(path, aside).map_err(StateError::io(path, "rename"))?;
+                        fs::rename(path, aside).map_err(GroundError::io(path, "rename"))?;
                     }
                     let used = self.name(number);
                     return Ok((Some(found), bad.iter().map(|(_, error)| note(error, &used)).collect()));
                 }
-                Err(error @ (StateError::Damaged { .. } | StateError::Io { .. })) => bad.push((path, error)),
+                Err(error @ (GroundError::Damaged { .. } | GroundError::Io { .. })) => {
+                    bad.push((path, error))
+                }
                 Err(error) => return Err(error),
             }
         }
@@ -67,25 +69,25 @@ impl StateFolder {
             None => Ok((None, Vec::new())),
             Some((_, newest)) => {
                 let (path, newest) = (self.path.clone(), Box::new(newest));
-                Err(StateError::NoneHolds { path, checkpoints, newest })
+                Err(GroundError::NoneHolds { path, checkpoints, newest })
             }
         }
     }
 
-    /// Writes a checkpoint, whole or not at all, and removes those before the last.
+    /// Writes a checkpoint, whole or not at all, and removes all but the newest two.
     pub(super) fn save(
         &mut self,
-        write: impl FnOnce(&mut AtomicFile, &Path) -> Result<(), StateError>,
-    ) -> Result<(), StateError> {
+        write: impl FnOnce(&mut AtomicFile, &Path) -> Result<(), GroundError>,
+    ) -> Result<(), GroundError> {
         let path = self.name(self.newest + 1);
         let file = AtomicFile::create(&path, IfUnfinished::Remove);
-        let mut file = file.map_err(StateError::io(&path, "create the file"))?;
+        let mut file = file.map_err(GroundError::io(&path, "create the file"))?;
         write(&mut file, &path)?;
-        file.finish().map_err(StateError::io(&path, "finish the file"))?;
+        file.finish().map_err(GroundError::io(&path, "finish the file"))?;
         self.newest += 1;
         for number in numbers(&self.path)?.into_iter().filter(|number| number + 1 < self.newest) {
             let old = self.name(number);
-            fs::remove_file(&old).map_err(StateError::io(&old, "remove the file"))?;
+            fs::remove_file(&old).map_err(GroundError::io(&old, "remove the file"))?;
         }
         Ok(())
     }
@@ -95,13 +97,13 @@ impl StateFolder {
     }
 }
 
-/// What is to be said of a checkpoint that does not hold when another is used.
-pub(super) fn note(error: &StateError, used: &Path) -> String {
+/// A note on a checkpoint that cannot be used when an older one is.
+pub(super) fn note(error: &GroundError, used: &Path) -> String {
     format!("{error}; going on from the one before, {}", used.display())
 }
 
 /// The checkpoints in a folder, oldest first.
-pub(super) fn checkpoints(folder: &Path) -> Result<Vec<PathBuf>, StateError> {
+pub(super) fn checkpoints(folder: &Path) -> Result<Vec<PathBuf>, GroundError> {
     Ok(numbers(folder)?.into_iter().map(|number| name(folder, number)).collect())
 }
 
@@ -109,11 +111,11 @@ fn name(folder: &Path, number: u64) -> PathBuf {
     folder.join(format!("{PREFIX}{number:08}{SUFFIX}"))
 }
 
-/// Numbers of the checkpoints that are there, in order.
-fn numbers(folder: &Path) -> Result<Vec<u64>, StateError> {
+/// Numbers of the checkpoints, in order.
+fn numbers(folder: &Path) -> Result<Vec<u64>, GroundError> {
     let mut numbers = Vec::new();
-    for entry in fs::read_dir(folder).map_err(StateError::io(folder, "read the folder"))? {
-        let name = entry.map_err(StateError::io(folder, "read the folder"))?.file_name();
+    for entry in fs::read_dir(folder).map_err(GroundError::io(folder, "read the folder"))? {
+        let name = entry.map_err(GroundError::io(folder, "read the folder"))?.file_name();
         let name = name.to_string_lossy();
         let number = name.strip_prefix(PREFIX).and_then(|name| name.strip_suffix(SUFFIX));
         numbers.extend(number.and_then(|number| number.parse::<u64>().ok()));

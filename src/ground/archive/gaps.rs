@@ -6,40 +6,40 @@ use std::ops::Range;
 use serde::Serialize;
 
 use super::journal::JournalEntry;
-use super::packet_order::{Schedule, Stream, Streams};
-use crate::downlink::{CucTime, Era, Kind, Taken};
+use super::packet_order::{PacketStreams, SendingOrder, Stream};
+use crate::downlink::{CucTime, Era, Kind, ReceivedSet};
 use crate::units::MissionTime;
 
 /// Packets of the same channel and pair on either side of one that tell what the map would take of it.
 const NEAR: u64 = 4;
 
-/// What has been received, as far as gaps are found from it.
+/// What has been received, as input to [`find_gaps`].
 #[derive(Clone, Debug, Default)]
-pub struct Received {
-    /// Every packet of visibilities that could be read, in the order of sending.
-    pub readings: Vec<Reading>,
-    /// Every packet of positions that could be read, in the order of sending.
-    pub positions: Vec<Positions>,
-    /// Packets by kind.
-    pub taken: Vec<(Kind, Taken)>,
+pub struct ReceivedPackets {
+    /// Every packet of visibilities that was decoded, in the order of sending.
+    pub readings: Vec<VisibilityPacket>,
+    /// Every packet of positions that was decoded, in the order of sending.
+    pub positions: Vec<PositionsPacket>,
+    /// Packets received, by kind.
+    pub sets: Vec<(Kind, ReceivedSet)>,
     /// Frequencies of the instrument's channels, Hz.
     pub frequencies_hz: Vec<f64>,
 }
 
 /// A packet of visibilities.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Reading {
+pub struct VisibilityPacket {
     /// What it held.
     pub entry: JournalEntry,
-    /// Whether its positions have not come.
+    /// Whether its positions are missing.
     pub waits: bool,
-    /// Share of those of its visibilities that could be placed which the map has taken; `None` if that is not known.
+    /// Share of its placed visibilities that are in the map; `None` if it is not known.
     pub share: Option<f64>,
 }
 
 /// A packet of positions.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Positions {
+pub struct PositionsPacket {
     /// Count of the packet.
     pub count: u64,
     /// Time at which the packet was made.
@@ -55,11 +55,11 @@ pub struct RestartReport {
     pub kind: Kind,
     /// Application process identifier.
     pub apid: u16,
-    /// Count of the last packet before it that came. What was sent behind that one is not known.
+    /// Count of the last packet received before it. What was sent after that one is not known.
     pub last: u64,
 }
 
-/// What the missing packets of one channel and pair held, estimated; or packets that came and wait for the missing ones.
+/// An estimate of what the missing packets of one channel and pair held; or held packets that wait for missing positions.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct LostStream {
     /// Channel, from 0.
@@ -70,11 +70,11 @@ pub struct LostStream {
     pub packets: u64,
     /// Integration time in them, s.
     pub integration_s: f64,
-    /// Sum of weights in them that the map would take, (K sr)^-2.
+    /// Sum of their weights in the map, (K sr)^-2.
     pub weight: f64,
 }
 
-/// A stretch of missing packets, to be asked for again.
+/// A run of missing packets, to be requested again.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GapReport {
     /// Kind.
@@ -85,14 +85,14 @@ pub struct GapReport {
     pub from: u64,
     /// Count of the last missing packet.
     pub to: u64,
-    /// Mission time of the last visibility before it and the first behind it, s, where there are such.
+    /// Mission time of the last visibility before it and the first after it, s, if there are any.
     pub between_s: [Option<f64>; 2],
     /// Integration time in it, s, over all channels and pairs.
     pub integration_s: f64,
     /// What it would add: its weight over that in the map of the same channel, summed over channels; 1 for a channel of
     /// which the map has nothing.
     pub gain: f64,
-    /// By channel and pair: of visibilities what is missing, of positions what waits for them.
+    /// By channel and pair: missing visibilities, or those that wait for missing positions.
     pub lost: Vec<LostStream>,
 }
 
@@ -118,7 +118,7 @@ pub struct ChannelCoverage {
 /// All that is missing.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Gaps {
-    /// The instrument's channels, whether anything came of them or not.
+    /// The instrument's channels, with or without data.
     pub channels: Vec<ChannelCoverage>,
     /// Gaps: the one whose recovery adds most first.
     pub gaps: Vec<GapReport>,
@@ -126,17 +126,18 @@ pub struct Gaps {
     pub restarts: Vec<RestartReport>,
 }
 
-/// Finds what is missing between the packets that came.
+/// Finds what is missing between the packets received.
 ///
 /// Every pass sends channel after channel and pair after pair, each in as many packets as it takes. The order and the
-/// usual number of packets are learnt from what was received; a gap is filled along them from the packet before
-/// it, with packets as the same channel and pair has sent about that time, of which the map takes as much as of those. Missing positions are worth what waits between the positions on either side. What was sent after the last
-/// packet that came is not known to be missing.
+/// usual number of packets are learnt from what was received. A gap is filled in that order, starting from the packet
+/// before it, with packets like those that the same channel and pair sent about that time. Missing positions are worth
+/// the visibilities that wait between the positions on either side. What was sent after the last packet received is not
+/// known to be missing.
 #[must_use]
-pub fn find_gaps(received: &Received) -> Gaps {
+pub fn find_gaps(received: &ReceivedPackets) -> Gaps {
     let mut found = Gaps::default();
-    for (kind, taken) in &received.taken {
-        let eras = taken.eras();
+    for (kind, set) in &received.sets {
+        let eras = set.eras();
         for (k, era) in eras.iter().enumerate() {
             let until = eras.get(k + 1).map(|era| era.from);
             if until.is_some() {
@@ -169,7 +170,7 @@ pub fn find_gaps(received: &Received) -> Gaps {
 }
 
 fn gaps_of_era(
-    received: &Received,
+    received: &ReceivedPackets,
     kind: Kind,
     era: &Era,
     in_era: &dyn Fn(CucTime) -> bool,
@@ -178,11 +179,11 @@ fn gaps_of_era(
         return Vec::new();
     }
     let visibilities = received.readings.iter().filter(|reading| in_era(reading.entry.made));
-    let schedule = Schedule::learn(match kind {
+    let schedule = SendingOrder::learn(match kind {
         Kind::Visibilities => visibilities.copied().collect(),
         _ => Vec::new(),
     });
-    let mut positions: Vec<Positions> = match kind {
+    let mut positions: Vec<PositionsPacket> = match kind {
         Kind::Ephemeris => received.positions.iter().filter(|known| in_era(known.made)).copied().collect(),
         _ => Vec::new(),
     };
@@ -194,15 +195,17 @@ fn gaps_of_era(
     era.missing.iter().map(report).collect()
 }
 
-/// The instrument's channels, and what came of them.
-fn coverage(received: &Received) -> BTreeMap<u16, ChannelCoverage> {
+/// What was received of each of the instrument's channels.
+fn coverage(received: &ReceivedPackets) -> BTreeMap<u16, ChannelCoverage> {
     let frequencies = received.frequencies_hz.iter().zip(0..);
     let mut channels: BTreeMap<u16, ChannelCoverage> = frequencies
         .map(|(&hz, channel)| {
             (channel, ChannelCoverage { channel, frequency_hz: Some(hz), ..ChannelCoverage::default() })
         })
         .collect();
-    for Reading { entry, waits, share } in received.readings.iter().filter(|reading| !reading.is_own()) {
+    for VisibilityPacket { entry, waits, share } in
+        received.readings.iter().filter(|reading| !reading.is_auto())
+    {
         let channel = entry.channel.0;
         let new = || ChannelCoverage { channel, ..ChannelCoverage::default() };
         let coverage = channels.entry(channel).or_insert_with(new);
@@ -213,21 +216,25 @@ fn coverage(received: &Received) -> BTreeMap<u16, ChannelCoverage> {
     channels
 }
 
-/// What waits for the positions in missing packets: between those of the last packet before that came and the next
-/// ones that came.
-fn positions_missing(readings: &[Reading], positions: &[Positions], gap: &Range<u64>) -> GapReport {
+/// The visibilities that wait for positions in missing packets: between those of the last packet before and of the next
+/// received.
+fn positions_missing(
+    readings: &[VisibilityPacket],
+    positions: &[PositionsPacket],
+    gap: &Range<u64>,
+) -> GapReport {
     let next = positions.partition_point(|known| known.count < gap.start);
     let before = next.checked_sub(1).map(|at| positions[at].span);
     // What follows may be a repeat of what came before.
     let mut behind = positions[next..].iter().map(|known| known.span);
     let after = behind.find(|[start, _]| before.is_none_or(|[from, _]| *start > from));
-    let waits = |reading: &&Reading| {
+    let waits = |reading: &&VisibilityPacket| {
         let entry = &reading.entry;
         reading.waits
             && before.is_none_or(|[from, _]| entry.end > from)
             && after.is_none_or(|[from, _]| entry.start < from)
     };
-    let streams = Streams::of(readings.iter().filter(|reading| reading.share.is_some()).copied());
+    let streams = PacketStreams::of(readings.iter().filter(|reading| reading.share.is_some()).copied());
     let mut lost: BTreeMap<Stream, LostStream> = BTreeMap::new();
     for reading in readings.iter().filter(waits) {
         let stream = reading.stream();
@@ -240,13 +247,13 @@ fn positions_missing(readings: &[Reading], positions: &[Positions], gap: &Range<
     GapReport::new(Kind::Ephemeris, gap, between_s, lost.into_values().collect())
 }
 
-impl Reading {
+impl VisibilityPacket {
     pub(super) fn stream(&self) -> Stream {
         (self.entry.channel, self.entry.pair)
     }
 
-    /// Whether it holds a daughter's own powers, which are in no map.
-    fn is_own(&self) -> bool {
+    /// Whether it holds auto-correlations, which are in no map.
+    fn is_auto(&self) -> bool {
         self.entry.pair.i == self.entry.pair.j
     }
 }
@@ -305,26 +312,26 @@ mod tests {
         entries
     }
 
-    fn read(entry: JournalEntry) -> Reading {
-        Reading { entry, waits: false, share: Some(1.0) }
+    fn read(entry: JournalEntry) -> VisibilityPacket {
+        VisibilityPacket { entry, waits: false, share: Some(1.0) }
     }
 
     /// What is found when packets are left out, and what they held by channel and pair.
     fn without(lost: &[Range<u64>]) -> (Gaps, BTreeMap<(u16, String), f64>) {
-        let mut taken = Taken::default();
+        let mut set = ReceivedSet::default();
         let mut held = BTreeMap::new();
         let mut kept = Vec::new();
         for entry in journal() {
             if lost.iter().any(|range| range.contains(&entry.count)) {
                 *held.entry((entry.channel.0, entry.pair.to_string())).or_default() += entry.integration_s;
             } else {
-                taken.take(entry.count, entry.made);
+                set.insert(entry.count, entry.made);
                 kept.push(entry);
             }
         }
         let readings = kept.into_iter().map(read).collect();
-        let taken = vec![(Kind::Visibilities, taken)];
-        (find_gaps(&Received { readings, taken, ..Received::default() }), held)
+        let sets = vec![(Kind::Visibilities, set)];
+        (find_gaps(&ReceivedPackets { readings, sets, ..ReceivedPackets::default() }), held)
     }
 
     #[test]
@@ -353,7 +360,7 @@ mod tests {
         let missing = ((1 << 46) - last - 5) / 12 * 12 + 4;
         let far = JournalEntry { count: last + missing, start: MissionTime::from_seconds(1e9), ..entries[0] };
         let far = JournalEntry { end: MissionTime::from_seconds(1e9 + 600.0), ..far };
-        let schedule = Schedule::learn([entries, vec![far]].concat().into_iter().map(read).collect());
+        let schedule = SendingOrder::learn([entries, vec![far]].concat().into_iter().map(read).collect());
         let report = schedule.report(Kind::Visibilities, &(last..last + missing));
         let packets: Vec<u64> = report.lost.iter().map(|lost| lost.packets).collect();
         let passes = missing / 12;
@@ -375,7 +382,7 @@ mod tests {
     #[test]
     fn nothing_missing_and_nothing_received() {
         assert!(without(&[]).0.gaps.is_empty());
-        let taken = vec![(Kind::Visibilities, Taken::default())];
-        assert_eq!(find_gaps(&Received { taken, ..Received::default() }), Gaps::default());
+        let sets = vec![(Kind::Visibilities, ReceivedSet::default())];
+        assert_eq!(find_gaps(&ReceivedPackets { sets, ..ReceivedPackets::default() }), Gaps::default());
     }
 }

@@ -1,4 +1,4 @@
-//! A line on every packet that has been read, and what became of it.
+//! The journal: a record of every packet that was applied, and what became of it.
 
 use std::collections::BTreeMap;
 
@@ -7,8 +7,13 @@ use bincode::enc::Encoder;
 use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 
+use super::draft::RecordDraft;
+use crate::downlink::receive::PacketReading;
+use crate::downlink::wire::{COUNT_MAX, PACKET_BYTES_MAX};
 use crate::downlink::{CucTime, Kind, PacketHeader};
-use crate::frames::{PlacedVisibilities, VisibilityBlock, VisibilityReason};
+use crate::frames::{Housekeeping, VisibilityBlock, VisibilityReason};
+use crate::ground::DeliveredPacket;
+pub(super) use crate::ground::hold_buffer::Sent;
 use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime, Pair};
 
@@ -41,12 +46,10 @@ impl JournalEntry {
         (self.made, self.count)
     }
 
-    /// The line on a packet: of none, if it holds no visibilities or has been refused.
-    pub(super) fn of(header: PacketHeader, block: Option<&VisibilityBlock>) -> Self {
-        let none = Self { count: header.count, made: header.time, ..Self::default() };
-        let Some((block, last)) = block.and_then(|block| Some((block, block.len().checked_sub(1)?))) else {
-            return none;
-        };
+    /// The entry of a packet with a block of visibilities.
+    pub(super) fn of(made: CucTime, count: u64, block: &VisibilityBlock) -> Self {
+        let nothing = Self { count, made, ..Self::default() };
+        let Some(last) = block.len().checked_sub(1) else { return nothing };
         let end = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);
         let ticks: u64 = block.duration_ticks.iter().map(|&ticks| u64::from(ticks)).sum();
         let good = block.weight.iter().zip(&block.flags).filter(|(_, flags)| flags.is_good());
@@ -58,21 +61,25 @@ impl JournalEntry {
             visibilities: block.len() as u32,
             integration_s: ticks as f64 * 1e-6,
             weight: good.map(|(&weight, _)| f64::from(weight)).sum(),
-            ..none
+            ..nothing
         }
     }
 }
 
-/// Order of sending within a kind.
-pub(super) type Sent = (CucTime, u64);
-
 /// A packet of visibilities, and what became of them.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
-pub(super) struct Line {
+pub(super) struct VisibilityRecord {
     pub(super) entry: JournalEntry,
-    /// The packet's check.
+    /// Start of the window of the visibilities.
+    pub(super) window: MissionTime,
+    /// The packet's checksum.
     pub(super) check: u32,
-    /// Of what was handed to the sums: places, values, weights.
+    /// The packet's bytes.
+    pub(super) bytes: u32,
+    pub(super) reading: PacketReading,
+    /// Whether its block had been received already, in another packet.
+    pub(super) is_duplicate: bool,
+    /// Digest of what was offered to the sums: positions, values, weights.
     pub(super) digest: u32,
     /// Visibilities that could be placed and were offered to the sums.
     pub(super) offered: u32,
@@ -80,104 +87,111 @@ pub(super) struct Line {
     pub(super) accumulated: u32,
     /// Visibilities flagged or lost, by reason.
     pub(super) left_out: Vec<(VisibilityReason, u32)>,
-    /// First and last mission time, s, of those that were offered to the sums.
-    pub(super) used_s: Option<[f64; 2]>,
+    /// What was offered to an engine.
+    pub(super) used: Option<Used>,
+}
+
+/// Channel of the sums, which sub-bands share, and first and last mission time, s, of what was offered to its engine.
+#[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
+pub(super) struct Used {
+    pub(super) channel: ChannelId,
+    pub(super) span_s: [f64; 2],
 }
 
 /// A packet of another kind.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
-pub(super) struct OtherLine {
-    /// The packet's check.
+pub(super) struct OtherRecord {
+    /// The packet's checksum.
     pub(super) check: u32,
+    /// The packet's bytes.
     pub(super) bytes: u32,
+    pub(super) reading: PacketReading,
     /// First and last count of the packets of its payload.
     pub(super) payload: [u64; 2],
-    /// Beginning of the positions in it, if they are those that hold.
+    /// Start of the positions in it, if they are those that are used.
     pub(super) segment: Option<MissionTime>,
+    /// The spacecraft's report in it.
+    pub(super) report: Option<Housekeeping>,
 }
 
-/// All packets that have been read, in the order of sending.
+/// Records of all packets that were applied, in the order of sending.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Journal {
-    pub(super) visibilities: BTreeMap<Sent, Line>,
-    pub(super) others: BTreeMap<(Kind, Sent), OtherLine>,
+    pub(super) visibilities: BTreeMap<Sent, VisibilityRecord>,
+    pub(super) others: BTreeMap<(Kind, Sent), OtherRecord>,
 }
 
 impl Journal {
-    /// Lines on packets with visibilities.
-    pub(super) fn entries(&self) -> impl Iterator<Item = &JournalEntry> {
-        self.visibilities.values().map(|line| &line.entry).filter(|entry| entry.visibilities > 0)
+    /// Whether no packet was applied.
+    pub(super) fn is_empty(&self) -> bool {
+        self.visibilities.is_empty() && self.others.is_empty()
     }
 
-    /// Packets with visibilities, each with the share of what was offered to the sums that they have taken.
-    pub(super) fn shares(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
-        let share =
-            |line: &Line| (line.offered > 0).then(|| f64::from(line.accumulated) / f64::from(line.offered));
-        let with = |line: &&Line| line.entry.visibilities > 0;
-        self.visibilities.values().filter(with).map(move |line| (&line.entry, share(line)))
+    /// Whether it has records of packets that can exist; a forged checkpoint may hold anything.
+    pub(super) fn is_sound(&self) -> bool {
+        let can_exist =
+            |(_, count): &Sent, bytes: u32| *count <= COUNT_MAX && bytes <= PACKET_BYTES_MAX as u32;
+        self.visibilities.iter().all(|(sent, record)| can_exist(sent, record.bytes))
+            && self.others.iter().all(|((_, sent), record)| can_exist(sent, record.bytes))
     }
 
-    /// Keeps a line on a packet of visibilities that became what `account` says.
-    pub(super) fn keep(
+    /// Whether there is a record of a packet.
+    pub(super) fn contains(&self, header: &PacketHeader) -> bool {
+        let sent = (header.time, header.count);
+        match header.kind {
+            Kind::Visibilities => self.visibilities.contains_key(&sent),
+            kind => self.others.contains_key(&(kind, sent)),
+        }
+    }
+
+    /// Records a packet of visibilities that became what the ledger's `posts` say.
+    pub(super) fn record_visibilities(
         &mut self,
-        header: PacketHeader,
-        check: u32,
-        block: Option<&VisibilityBlock>,
-        (digest, offered, used_s): (u32, u32, Option<[f64; 2]>),
-        account: &LedgerReport<VisibilityReason>,
+        packet: &DeliveredPacket,
+        draft: RecordDraft,
+        posts: &LedgerReport<VisibilityReason>,
     ) {
-        let left_out = account.left_out.iter().map(|(&reason, &count)| (reason, count as u32)).collect();
-        let (entry, accumulated) = (JournalEntry::of(header, block), account.accumulated as u32);
-        let line = Line { entry, check, digest, offered, accumulated, left_out, used_s };
-        self.visibilities.insert((header.time, header.count), line);
+        let DeliveredPacket { header, check, reading } = *packet;
+        let entry = JournalEntry { count: header.count, made: header.time, ..draft.entry };
+        let left_out = posts.left_out.iter().map(|(&reason, &count)| (reason, count as u32)).collect();
+        let record = VisibilityRecord {
+            entry,
+            window: draft.window,
+            check,
+            bytes: header.bytes as u32,
+            reading,
+            // The first of its blocks is counted as sampled at the end.
+            is_duplicate: posts.sampled > 0,
+            digest: draft.digest,
+            offered: draft.offered,
+            accumulated: posts.accumulated as u32,
+            left_out,
+            used: draft.used_s.map(|span_s| Used { channel: draft.channel, span_s }),
+        };
+        self.visibilities.insert((header.time, header.count), record);
     }
 
-    /// Takes all lines of another journal; the first packet of visibilities that is in both is refused, and gives
-    /// packets of other kinds that are in both.
-    pub(super) fn absorb(&mut self, other: Self) -> Result<Vec<(Kind, OtherLine)>, u64> {
+    /// Adds the records of another journal. A packet of visibilities that is in both is an error: its count.
+    pub(super) fn merge(&mut self, other: Self) -> Result<(), u64> {
         let Self { visibilities, others } = other;
         if let Some((_, count)) = visibilities.keys().find(|sent| self.visibilities.contains_key(sent)) {
             return Err(*count);
         }
         self.visibilities.extend(visibilities);
-        let mut both = Vec::new();
-        for (key, line) in others {
-            if let Some(ours) = self.others.get_mut(&key) {
-                both.push((key.0, line));
-                ours.segment = ours.segment.or(line.segment);
-            } else {
-                self.others.insert(key, line);
-            }
+        for (key, record) in others {
+            let ours = self.others.entry(key).or_insert(record);
+            ours.segment = ours.segment.or(record.segment);
         }
-        Ok(both)
-    }
-
-    /// First and last mission time, s, of what is in the sums of each channel.
-    pub(super) fn spans_s(&self) -> BTreeMap<ChannelId, [f64; 2]> {
-        let mut spans: BTreeMap<ChannelId, [f64; 2]> = BTreeMap::new();
-        for line in self.visibilities.values() {
-            let Some([first, last]) = line.used_s else { continue };
-            let span = spans.entry(line.entry.channel).or_insert([first, last]);
-            *span = [span[0].min(first), span[1].max(last)];
-        }
-        spans
-    }
-
-    /// Whether visibilities with positions of a stretch of time are in the sums; daughters' own powers have none.
-    pub(super) fn uses(&self, [from, to]: [MissionTime; 2]) -> bool {
-        let within = |Line { entry, accumulated, .. }: &Line| {
-            *accumulated > 0 && entry.pair.i != entry.pair.j && entry.start <= to && entry.end >= from
-        };
-        self.visibilities.values().any(within)
+        Ok(())
     }
 }
 
-/// As a list of lines: a line names its packet itself.
+/// As a list of records: a record of visibilities names its packet itself.
 impl Encode for Journal {
     fn encode<E: Encoder>(&self, encoder: &mut E) -> Result<(), EncodeError> {
         (self.visibilities.len() as u64).encode(encoder)?;
-        for line in self.visibilities.values() {
-            line.encode(encoder)?;
+        for record in self.visibilities.values() {
+            record.encode(encoder)?;
         }
         self.others.encode(encoder)
     }
@@ -185,43 +199,29 @@ impl Encode for Journal {
 
 impl<Context> Decode<Context> for Journal {
     fn decode<D: Decoder<Context = Context>>(decoder: &mut D) -> Result<Self, DecodeError> {
-        let lines = Vec::<Line>::decode(decoder)?;
-        let sent = |line: &Line| (line.entry.made, line.entry.count);
-        let visibilities = lines.into_iter().map(|line| (sent(&line), line)).collect();
+        let records = Vec::<VisibilityRecord>::decode(decoder)?;
+        let visibilities = records.into_iter().map(|record| (record.entry.sent(), record)).collect();
         Ok(Self { visibilities, others: Decode::decode(decoder)? })
     }
 }
 
 bincode::impl_borrow_decode!(Journal);
 
-/// A checksum over everything that sums are made of.
-pub(super) fn digest(placed: &PlacedVisibilities) -> u32 {
-    let mut crc = crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi);
-    let mut bytes = Vec::with_capacity(80 * placed.len());
-    for k in 0..placed.len() {
-        let ([a, b, c], [d, e, f], v) = (placed.r_i_m[k], placed.r_j_m[k], placed.value_k_sr[k]);
-        for number in [placed.time_s[k], a, b, c, d, e, f, v.re, v.im, placed.weight[k]] {
-            bytes.extend_from_slice(&number.to_le_bytes());
-        }
-    }
-    crc.update(&bytes);
-    crc.finalize() as u32
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::downlink::{FORMAT_VERSION, PacketSegment};
 
-    fn header(count: u64) -> PacketHeader {
+    fn packet(count: u64, check: u32) -> DeliveredPacket {
         let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(7 * count));
-        PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 }
+        let header = PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 };
+        DeliveredPacket { header, check, reading: PacketReading::default() }
     }
 
     const FAR: VisibilityReason = VisibilityReason::BaselineBeyondMap;
     const BRIGHT: VisibilityReason = VisibilityReason::Interference;
 
-    fn account(reasons: &[(VisibilityReason, u64)]) -> LedgerReport<VisibilityReason> {
+    fn posts(reasons: &[(VisibilityReason, u64)]) -> LedgerReport<VisibilityReason> {
         let left_out = reasons.iter().copied().collect();
         LedgerReport { accumulated: 5, left_out, ..LedgerReport::default() }
     }
@@ -229,17 +229,18 @@ mod tests {
     type Told = Vec<(u64, Vec<(VisibilityReason, u32)>)>;
 
     fn told(journal: &Journal) -> Told {
-        journal.visibilities.values().map(|line| (line.entry.count, line.left_out.clone())).collect()
+        journal.visibilities.values().map(|record| (record.entry.count, record.left_out.clone())).collect()
     }
 
     #[test]
     fn reasons_are_told_again_whatever_was_merged_and_kept() {
         let (mut ours, mut theirs) = (Journal::default(), Journal::default());
-        ours.keep(header(1), 11, None, (0, 0, None), &account(&[(FAR, 2)]));
-        theirs.keep(header(2), 12, None, (0, 0, None), &account(&[(BRIGHT, 3), (FAR, 4)]));
-        theirs.keep(header(0), 13, None, (0, 0, None), &account(&[]));
-        assert_eq!(ours.absorb(theirs.clone()), Ok(vec![]));
+        ours.record_visibilities(&packet(1, 11), RecordDraft::default(), &posts(&[(FAR, 2)]));
+        theirs.record_visibilities(&packet(2, 12), RecordDraft::default(), &posts(&[(BRIGHT, 3), (FAR, 4)]));
+        theirs.record_visibilities(&packet(0, 13), RecordDraft::default(), &posts(&[]));
+        assert_eq!(ours.merge(theirs.clone()), Ok(()));
         let expected: Told = vec![(0, vec![]), (1, vec![(FAR, 2)]), (2, vec![(BRIGHT, 3), (FAR, 4)])];
+        assert_eq!(told(&ours), expected);
         assert_eq!(told(&ours), expected);
         let bytes = bincode::encode_to_vec(&ours, bincode::config::standard()).unwrap();
         let (kept, used) =
@@ -247,9 +248,29 @@ mod tests {
         assert_eq!((&kept, used), (&ours, bytes.len()));
         // The other way round the same is told.
         let mut first = Journal::default();
-        first.keep(header(1), 11, None, (0, 0, None), &account(&[(FAR, 2)]));
-        assert_eq!(theirs.absorb(first.clone()), Ok(vec![]));
+        first.record_visibilities(&packet(1, 11), RecordDraft::default(), &posts(&[(FAR, 2)]));
+        assert_eq!(theirs.merge(first.clone()), Ok(()));
         assert_eq!((told(&theirs), &theirs), (expected, &ours));
-        assert_eq!(theirs.absorb(first), Err(1));
+        assert_eq!(theirs.merge(first), Err(1));
+    }
+    #[test]
+    fn records_of_packets_that_cannot_exist_are_not_sound() {
+        let with = |count: u64, bytes: usize| {
+            let mut packet = packet(1, 5);
+            (packet.header.count, packet.header.bytes) = (count, bytes);
+            let mut journal = Journal::default();
+            journal.record_visibilities(&packet, RecordDraft::default(), &posts(&[]));
+            journal
+        };
+        assert!(Journal::default().is_sound() && with(COUNT_MAX, PACKET_BYTES_MAX).is_sound());
+        assert!(!with(COUNT_MAX + 1, 60).is_sound() && !with(u64::MAX, 60).is_sound());
+        assert!(!with(1, PACKET_BYTES_MAX + 1).is_sound());
+        let (mut others, of) = (Journal::default(), with(1, 60));
+        let (check, bytes, reading) = (1, 60, PacketReading::default());
+        let record = OtherRecord { check, bytes, reading, payload: [1, 1], segment: None, report: None };
+        others.others.insert((Kind::Ephemeris, (CucTime(1), COUNT_MAX)), record);
+        assert!(others.is_sound() && of.is_sound());
+        others.others.insert((Kind::Ephemeris, (CucTime(1), COUNT_MAX + 1)), record);
+        assert!(!others.is_sound());
     }
 }

@@ -1,64 +1,66 @@
-//! What the ground knows, kept from one session to the next.
+//! The archive: everything that the ground knows, kept from one session to the next.
 //!
-//! One stage, the [`Keeper`], goes from bytes to sums and owns all that a later session needs: so a checkpoint, written
-//! between two packets, is of one moment without a word between stages. It holds the sums of all channels, the set of
-//! packets that have come, those of them that wait, the instrument, the ephemeris, the ledger's and the reception's
-//! counts, and the journal: a line on every packet that has been read.
+//! An archive is a folder of checkpoints. A checkpoint holds data and a journal. Data: the sums, auto-correlations,
+//! positions, the instrument, packets in the hold buffer. The journal has a record of every packet that was applied.
+//! Everything else is a fold over the journal and is not stored: the ledger, the reception counters, the received set,
+//! the blocks that were used, the spans of the maps. The [`crate::ground::Ground`] stage owns all of it, so a
+//! checkpoint between two packets is consistent.
 //!
 //! # Order
-//! Every packet is applied once. The description of the instrument comes first; until it has come, everything waits.
-//! Positions and the spacecraft's own counts are read as soon as they are there. A packet of visibilities goes into the
-//! sums as soon as positions over its whole time are known; gaps make nothing wait. Until then it waits, or until more
-//! than `wait_bytes` do: then those that were sent first go on, and are flagged for want of positions, for good.
+//! Every packet is applied once. The description of the instrument comes first; until it arrives, everything is held.
+//! Positions and the spacecraft's reports are applied at once. Visibilities are applied as soon as positions are known
+//! over their whole span; gaps hold nothing back. Beyond `wait_bytes` of held visibilities, those that were sent first
+//! are applied and flagged for want of positions, for good.
 //!
-//! Unless that happens, doubles and disorder leave no trace, however late: sums, journal and accounts are a function
-//! of the set of packets that have come, bit for bit, not of their order. The sums are exact, and snapshots on the way
-//! are no part of a state. What the spacecraft has sent twice under different counts is not covered: of such
-//! blocks the one that comes first is used.
+//! Unless that happens, sums and journal are a function of the set of packets received, bit for bit, not of their order.
+//! Snapshots are not part of an archive. Blocks that the spacecraft sent twice, in different packets, are an exception:
+//! the one that arrives first is used.
 //!
-//! The maps at the end of a session hold what waits as well; the checkpoint keeps it waiting.
+//! The maps at the end of a session include held packets; the checkpoint keeps them held.
 //!
 //! # Merging
-//! Packets that one state has read and that still wait in the other are taken once; visibilities that both have summed
-//! are refused. Packets whose positions another state knows wait no longer. The sums are the same in whichever order
-//! states are named.
+//! The journals are united, the sums added. Visibilities that are in both journals are an error. Held packets that the
+//! other journal has are dropped; those whose positions the other archive knows are applied. The result does not depend
+//! on the order.
 //!
-//! # Taking out again
-//! [`Keeper::retract`] takes packets out of the sums, the set of packets that have come, the journal and all accounts,
-//! as if they had never come: in the ledger they are lost on the way down until they come again. The journal has the
-//! check of every packet and a digest of what it brought into the sums; a packet that differs from the one that was
-//! read, or whose positions have changed since, stays, and is told. Positions by which other visibilities were placed
-//! stay as well, and parts of payloads. A block that was flagged as a double of one that is taken out stays flagged. The
-//! sums forget an addition to the bit. Both checkpoints of the folder are
-//! written anew, so that a damaged one does not bring the packets back.
+//! # Retraction
+//! [`crate::ground::Ground::retract`] subtracts packets from the sums, exactly, and deletes their records: in the ledger
+//! they are lost on the way down until they are received again. A record has the packet's checksum and a digest of what
+//! was offered to the sums; a packet that differs from the one applied, or whose positions have changed since, stays and
+//! is reported. Positions by which other visibilities were placed stay as well, and parts of payloads. A block that was
+//! flagged as a duplicate of one that is removed stays flagged. Both checkpoints of the folder are written again, so
+//! that a damaged one does not bring the packets back.
 //!
 //! # Size
-//! The journal takes some 80 bytes a packet of visibilities in a checkpoint and 250 in memory: of 26 million, in packets
-//! of 215 as windows give them, 10 MB and 30 MB a channel, of 550 MB that came down. Waiting packets take up to
-//! `wait_bytes` in either. The set of packets that have come grows with the number of times at which they were made; positions of
-//! 8192 windows, more than two years, take 72 MB.
+//! The journal takes some 90 bytes a packet of visibilities in a checkpoint and 300 in memory: of 26 million, in packets
+//! of 215 as windows give them, 11 MB and 36 MB a channel, of 550 MB of downlink. Held packets take up to `wait_bytes` in
+//! either. The received set grows with the number of creation times; positions of 8192 windows, more than two years,
+//! take 72 MB.
 //!
 //! # A checkpoint
-//! Magic `LNRSTA04`; length of the head (u64 LE); head (bincode); the channels' engines as they write
-//! themselves; CRC-64/NVME of all that (u64 LE). It is written under another name, put on the disk and renamed; the
-//! one before is kept, and used, with a message, if the newest does not hold.
+//! Magic `LNRSTA05`; length of the head (u64 LE); head (bincode); the channels' engines as they write
+//! themselves; CRC-64/NVME of all that (u64 LE). It is written under another name, synced and renamed; the previous one
+//! is kept, and used, with a note, if the newest is damaged.
 
 mod checkpoint;
-mod error;
+mod draft;
 mod folder;
 mod gaps;
 mod journal;
-mod keeper;
 mod packet_order;
 mod retract;
+mod sessions;
 mod settings;
+mod store;
 mod survey;
+mod views;
 
-pub use error::StateError;
+pub(super) use draft::RecordDraft;
 pub use gaps::{
-    ChannelCoverage, GapReport, Gaps, LostStream, Positions, Reading, Received, RestartReport, find_gaps,
+    ChannelCoverage, GapReport, Gaps, LostStream, PositionsPacket, ReceivedPackets, RestartReport,
+    VisibilityPacket, find_gaps,
 };
 pub use journal::JournalEntry;
-pub use keeper::Keeper;
-pub use retract::{Refused, Retracted};
-pub use survey::Survey;
+pub use retract::{RefusedPacket, Retracted};
+pub(super) use store::Archive;
+pub use survey::CoverageSurvey;

@@ -1,32 +1,32 @@
-//! How packets of visibilities follow each other, and what they usually hold.
+//! The order in which packets of visibilities are sent, and what they usually hold.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-use super::gaps::{GapReport, LostStream, Reading};
+use super::gaps::{GapReport, LostStream, VisibilityPacket};
 use super::journal::{JournalEntry, Sent};
 use crate::downlink::{CucTime, Kind};
 use crate::units::{ChannelId, Pair};
 
-/// What sends packets in its turn, pass by pass.
+/// Channel and pair: each sends its packets in turn, pass by pass.
 pub(super) type Stream = (ChannelId, Pair);
 
-/// Passes on either side of a gap that tell how many packets one has.
+/// Passes on either side of a gap from which the number of packets a pass is estimated.
 const PASSES: usize = 2;
 
-/// What a channel and pair sends: means over packets.
+/// Means over packets of a channel and pair.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Usual {
     integration_s: f64,
     weight: f64,
-    /// Share of the weight that the map takes, if it is known.
+    /// Share of the weight that is in the map, if it is known.
     share: Option<f64>,
 }
 
 impl Usual {
-    fn of(readings: &[Reading]) -> Self {
+    fn of(readings: &[VisibilityPacket]) -> Self {
         let packets = readings.len().max(1) as f64;
-        let mean = |of: &dyn Fn(&Reading) -> f64| readings.iter().map(of).sum::<f64>() / packets;
+        let mean = |of: &dyn Fn(&VisibilityPacket) -> f64| readings.iter().map(of).sum::<f64>() / packets;
         let weight = mean(&|reading| reading.entry.weight);
         let known = mean(&|reading| reading.share.map_or(0.0, |_| reading.entry.weight));
         let taken = mean(&|reading| reading.share.unwrap_or(0.0) * reading.entry.weight);
@@ -34,18 +34,18 @@ impl Usual {
         Self { integration_s: mean(&|reading| reading.entry.integration_s), weight, share }
     }
 
-    /// Share of the weight that the map takes, as far as anyone knows.
+    /// Share of the weight that is in the map; 1 if it is not known.
     pub(super) fn share(&self) -> f64 {
         self.share.unwrap_or(1.0)
     }
 }
 
 /// Packets by channel and pair, in the order of sending.
-pub(super) struct Streams(BTreeMap<Stream, Vec<Reading>>);
+pub(super) struct PacketStreams(BTreeMap<Stream, Vec<VisibilityPacket>>);
 
-impl Streams {
-    pub(super) fn of(readings: impl Iterator<Item = Reading>) -> Self {
-        let mut streams: BTreeMap<Stream, Vec<Reading>> = BTreeMap::new();
+impl PacketStreams {
+    pub(super) fn of(readings: impl Iterator<Item = VisibilityPacket>) -> Self {
+        let mut streams: BTreeMap<Stream, Vec<VisibilityPacket>> = BTreeMap::new();
         for reading in readings {
             streams.entry(reading.stream()).or_default().push(reading);
         }
@@ -53,15 +53,15 @@ impl Streams {
         Self(streams)
     }
 
-    /// What is usual in so many packets on either side of a place in the order of sending: the formation breathes, so
-    /// that others tell less.
+    /// Means over `packets` packets on either side of a place in the order of sending: the formation breathes, so farther
+    /// ones are less alike.
     pub(super) fn usual(&self, stream: Stream, place: Sent, packets: u64) -> Usual {
         let all = self.0.get(&stream).map_or(&[][..], Vec::as_slice);
         let at = all.partition_point(|reading| reading.entry.sent() < place);
         let packets = usize::try_from(packets).unwrap_or(usize::MAX);
         let near = Usual::of(&all[at.saturating_sub(packets)..all.len().min(at.saturating_add(packets))]);
         let share = match stream.1.i == stream.1.j {
-            // A daughter's own powers are in no map.
+            // Auto-correlations are in no map.
             true => Some(0.0),
             false => near.share.or_else(|| Usual::of(all).share),
         };
@@ -69,20 +69,20 @@ impl Streams {
     }
 }
 
-/// How packets follow each other in an era, learnt from those that came.
-pub(super) struct Schedule {
+/// The order of packets in an era, learnt from those received.
+pub(super) struct SendingOrder {
     /// By count.
     entries: Vec<JournalEntry>,
     /// In the order of sending within a pass.
     order: Vec<Stream>,
     /// Pass by pass, the count of the first packet of each and the number of packets.
     passes: BTreeMap<Stream, Vec<(u64, u64)>>,
-    streams: Streams,
+    streams: PacketStreams,
 }
 
-impl Schedule {
-    pub(super) fn learn(readings: Vec<Reading>) -> Self {
-        let streams = Streams::of(readings.iter().copied());
+impl SendingOrder {
+    pub(super) fn learn(readings: Vec<VisibilityPacket>) -> Self {
+        let streams = PacketStreams::of(readings.iter().copied());
         let mut entries: Vec<JournalEntry> = readings.into_iter().map(|reading| reading.entry).collect();
         entries.sort_by_key(|entry| entry.count);
         let mut order: Vec<Stream> = Vec::new();

@@ -1,28 +1,24 @@
-//! Taking packets out of a state again.
+//! Removing packets from an archive.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::error::StateError;
+use super::draft::digest;
 use super::folder::checkpoints;
-use super::journal::{Line, Sent, digest};
-use super::keeper::Keeper;
+use super::journal::{Journal, OtherRecord, Sent};
 use crate::downlink::receive::EventReader;
 use crate::downlink::{Event, Kind, PacketHeader};
-use crate::frames::{GroundFrame, VisibilityReason};
-use crate::ground::WaitingPacket;
-use crate::pipeline::config::Config;
-use crate::runtime::LedgerReport;
-use crate::units::{ChannelId, MissionTime};
+use crate::ground::{Collector, Ground, GroundConfig, GroundError, HeldPacket};
+use crate::units::MissionTime;
 
-/// Packets that are named of those that stay.
-const REFUSED_NAMED: usize = 20;
+/// Most packets that are listed as refused.
+const REFUSED_LISTED: usize = 20;
 
-/// A packet that stays in the state.
+/// A packet that stays in the archive.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Refused {
+pub struct RefusedPacket {
     /// Kind.
     pub kind: Kind,
     /// Packet count.
@@ -31,92 +27,96 @@ pub struct Refused {
     pub reason: &'static str,
 }
 
-/// What has become of the packets of some files.
+/// What became of the packets of the files.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Retracted {
-    /// Packets taken out, those that waited among them.
+    /// Packets removed, held ones included.
     pub packets: u64,
-    /// Packets taken out that waited.
+    /// Packets removed that were held.
     pub waited: u64,
-    /// Visibilities in packets taken out that had been read.
+    /// Visibilities in the packets removed that had been applied.
     pub visibilities: u64,
     /// Those of them that were in the sums.
     pub accumulated: u64,
-    /// Packets that are not in the state.
+    /// Packets that are not in the archive.
     pub absent: u64,
-    /// Packets of positions that others were placed by, and parts of payloads: they stay.
+    /// Packets of positions by which other visibilities were placed, and parts of payloads: they stay.
     pub kept: u64,
-    /// Packets that stay because taking them out would take out something else.
+    /// Packets that stay because their removal would remove something else.
     pub refused: u64,
     /// The first of those.
-    pub named: Vec<Refused>,
+    pub named: Vec<RefusedPacket>,
 }
 
-/// Packets found in files on the way.
-struct Found {
+/// Place of a packet in the journal.
+type RecordKey = (Kind, Sent);
+
+/// A retraction under way. Records are removed and their visibilities subtracted; the views of the journal are folded
+/// again by whoever opens the checkpoint.
+struct Retraction {
+    ground: Ground,
+    journal: Journal,
     report: Retracted,
-    /// Visibilities within this stretch of time alone, if it is given.
+    /// Only visibilities within this span of time, if it is given.
     span: Option<[MissionTime; 2]>,
-    /// Packets of which was decided.
-    done: BTreeSet<(Kind, Sent)>,
-    /// Packets other than visibilities that have been read.
-    others: BTreeMap<(Kind, Sent), WaitingPacket>,
-    channels: BTreeSet<ChannelId>,
+    /// Packets that were considered.
+    done: BTreeSet<RecordKey>,
+    /// Packets of other kinds that were applied.
+    others: BTreeSet<RecordKey>,
 }
 
-impl Found {
-    fn refuse(&mut self, header: &PacketHeader, reason: &'static str) {
-        self.report.refused += 1;
-        if self.report.named.len() < REFUSED_NAMED {
-            self.report.named.push(Refused { kind: header.kind, count: header.count, reason });
-        }
-    }
-}
-
-impl Keeper {
-    /// Takes every packet of `files` out of the state in `folder`, or, of a stretch of mission time, the packets of
-    /// visibilities that lie in it. The state is the new one as a whole, or the old one.
+impl Ground {
+    /// Removes every packet of `files` from the archive in `folder`, or, with a span of mission time, only the packets
+    /// of visibilities within it. Returns what became of them, and notes on checkpoints that could not be used. The
+    /// archive holds the new contents as a whole, or the old ones.
     ///
     /// # Errors
-    /// Those of [`Keeper::open`]; a folder without a state; a file that cannot be read; sums that do not hold what the
-    /// journal says.
+    /// Those of [`Ground::open`]; a folder without an archive; a file that cannot be read; sums that do not hold what
+    /// the journal says.
     pub fn retract(
         folder: &Path,
         files: &[PathBuf],
         span: Option<[MissionTime; 2]>,
-        config: &Config,
-    ) -> Result<(Self, Retracted), StateError> {
+        config: &GroundConfig,
+    ) -> Result<(Retracted, Vec<String>), GroundError> {
         if !folder.is_dir() || checkpoints(folder)?.is_empty() {
-            return Err(StateError::without_checkpoint(folder));
+            return Err(GroundError::without_checkpoint(folder));
         }
-        let mut keeper = Self::open(folder, config, 0, u64::MAX)?;
-        let report = Retracted::default();
-        let (done, others, channels) = Default::default();
-        let mut found = Found { report, span, done, others, channels };
+        let mut ground = Self::open(folder, config, u64::MAX)?;
+        let notes = ground.notes().map(str::to_owned).collect();
+        let journal = ground.archive.as_mut().map(|archive| std::mem::take(&mut archive.journal));
+        let mut retraction = Retraction {
+            ground,
+            journal: journal.unwrap_or_default(),
+            report: Retracted::default(),
+            span,
+            done: BTreeSet::new(),
+            others: BTreeSet::new(),
+        };
         for file in files {
-            keeper.retract_file(file, &mut found)?;
+            retraction.retract_file(file)?;
         }
         if span.is_none() {
-            keeper.retract_others(&mut found);
+            retraction.retract_others();
         }
-        keeper.settle_after(&found, config)?;
-        if found.report.packets > 0 {
-            // Twice, so that the checkpoint before the newest does not bring the packets back.
-            keeper.checkpoint()?;
-            keeper.checkpoint()?;
+        let report = retraction.report.clone();
+        if report.packets > 0 {
+            retraction.write(config)?;
         }
-        Ok((keeper, found.report))
+        Ok((report, notes))
     }
+}
 
-    fn retract_file(&mut self, path: &Path, found: &mut Found) -> Result<(), StateError> {
+impl Retraction {
+    fn retract_file(&mut self, path: &Path) -> Result<(), GroundError> {
         let mut events = EventReader::open(path)?.unfiltered();
         events.for_each(|event| match event {
-            Event::Packet(packet) => self.retract_packet(WaitingPacket::of(packet), found),
+            Event::Packet(packet) => self.retract_packet(&HeldPacket::of(packet)),
             _ => Ok(()),
         })?;
         if events.packets() == 0 {
             let (path, found) = (path.to_owned(), "not one packet".into());
-            return Err(StateError::Damaged {
+            return Err(GroundError::Damaged {
                 path,
                 found,
                 expected: "a downlink file, as `lunarray replay` takes",
@@ -125,173 +125,137 @@ impl Keeper {
         Ok(())
     }
 
-    fn retract_packet(&mut self, packet: WaitingPacket, found: &mut Found) -> Result<(), StateError> {
+    fn retract_packet(&mut self, packet: &HeldPacket) -> Result<(), GroundError> {
         let header = packet.header;
-        let (kind, sent) = (header.kind, (header.time, header.count));
-        if found.span.is_some_and(|span| !lies_in(&packet, span)) || found.done.contains(&(kind, sent)) {
+        let key = (header.kind, (header.time, header.count));
+        if self.span.is_some_and(|span| !lies_in(packet, span)) || !self.done.insert(key) {
             return Ok(());
         }
-        found.done.insert((kind, sent));
-        if !self.collector.has_taken(&header) {
-            found.report.absent += 1;
-            return Ok(());
-        }
-        if let Some(waiting) = self.collector.waiting().get(&header) {
-            if waiting.check != packet.check {
-                found.refuse(&header, OTHER_CONTENT);
-                return Ok(());
-            }
-            self.collector.take_out(&header);
-            found.report.packets += 1;
-            found.report.waited += 1;
-            return Ok(());
-        }
-        let check = match kind {
-            Kind::Visibilities => self.journal.visibilities.get(&sent).map(|line| line.check),
-            _ => self.journal.others.get(&(kind, sent)).map(|line| line.check),
-        };
+        let held = self.ground.collector.held().get(&header).map(|held| held.check);
+        let check = held.or_else(|| match header.kind {
+            Kind::Visibilities => self.journal.visibilities.get(&key.1).map(|record| record.check),
+            _ => self.journal.others.get(&key).map(|record| record.check),
+        });
         match check {
-            None => found.report.absent += 1,
-            Some(check) if check != packet.check => found.refuse(&header, OTHER_CONTENT),
-            Some(_) if kind == Kind::Visibilities => return self.retract_visibilities(packet, found),
-            Some(_) => drop(found.others.insert((kind, sent), packet)),
+            None => self.report.absent += 1,
+            Some(check) if check != packet.check => self.refuse(&header, OTHER_CONTENT),
+            Some(_) if held.is_some() => {
+                self.ground.collector.remove_held(&header);
+                self.report.packets += 1;
+                self.report.waited += 1;
+            }
+            Some(_) if header.kind == Kind::Visibilities => return self.retract_visibilities(packet),
+            Some(_) => drop(self.others.insert(key)),
         }
         Ok(())
     }
 
-    /// Takes out a packet of visibilities that has been read, with this content.
-    fn retract_visibilities(&mut self, packet: WaitingPacket, found: &mut Found) -> Result<(), StateError> {
+    fn refuse(&mut self, header: &PacketHeader, reason: &'static str) {
+        self.report.refused += 1;
+        if self.report.named.len() < REFUSED_LISTED {
+            self.report.named.push(RefusedPacket { kind: header.kind, count: header.count, reason });
+        }
+    }
+
+    /// Removes a packet of visibilities that was applied with this content.
+    fn retract_visibilities(&mut self, packet: &HeldPacket) -> Result<(), GroundError> {
         let header = packet.header;
         let sent = (header.time, header.count);
-        let Some(line) = self.journal.visibilities.get(&sent).cloned() else { return Ok(()) };
-        let account = Self::account_of(&line);
-        let is_double = account.sampled > 0;
-        let block = self.collector.read_again(&packet);
-        if let Some(block) = block.filter(|_| !is_double) {
-            if line.accumulated > 0 {
-                let removed = if block.pair.i == block.pair.j {
-                    self.calibrator.take_out_powers(block.clone())?
-                } else {
-                    let placed = self.calibrator.place_again(block.clone())?;
-                    if digest(&placed) != line.digest {
-                        found.refuse(&header, OTHER_POSITIONS);
-                        return Ok(());
-                    }
-                    self.accumulator.remove(&placed)?.visibilities
-                };
-                if removed != u64::from(line.accumulated) {
-                    let (expected, found) = (line.accumulated, removed);
-                    return Err(StateError::NotInSums { count: header.count, found, expected });
+        let Some(record) = self.journal.visibilities.get(&sent) else { return Ok(()) };
+        let (visibilities, accumulated) = (record.entry.visibilities, record.accumulated);
+        if accumulated > 0 {
+            let Ground { collector, calibrator, accumulator, .. } = &mut self.ground;
+            let block = collector.decoded(packet).unwrap_or_default();
+            let removed = if block.pair.i == block.pair.j {
+                calibrator.remove_autos(block)?
+            } else {
+                let placed = calibrator.calibrated(block)?;
+                if digest(&placed) != record.digest {
+                    self.refuse(&header, OTHER_POSITIONS);
+                    return Ok(());
                 }
+                accumulator.remove(&placed)?.visibilities
+            };
+            if removed != u64::from(accumulated) {
+                let (count, found, expected) = (header.count, removed, accumulated);
+                return Err(GroundError::NotInSums { count, found, expected });
             }
-            self.calibrator.forget_block(&block);
         }
-        self.collector.take_back(&[packet]);
-        self.outcome.ledger.withdraw(&account);
         self.journal.visibilities.remove(&sent);
-        found.channels.insert(line.entry.channel);
-        found.report.packets += 1;
-        found.report.visibilities += u64::from(line.entry.visibilities);
-        found.report.accumulated += u64::from(line.accumulated);
+        self.report.packets += 1;
+        self.report.visibilities += u64::from(visibilities);
+        self.report.accumulated += u64::from(accumulated);
         Ok(())
     }
 
-    /// What a line has posted to the ledger.
-    fn account_of(line: &Line) -> LedgerReport<VisibilityReason> {
-        let mut account =
-            LedgerReport { accumulated: u64::from(line.accumulated), ..LedgerReport::default() };
-        for &(reason, count) in &line.left_out {
-            // Duplicates have been posted as sampled a second time.
-            account.sampled += if reason == VisibilityReason::Duplicate { u64::from(count) } else { 0 };
-            account.left_out.insert(reason, u64::from(count));
+    /// Removes payloads of other kinds of which all packets were found and that nothing else depends on.
+    fn retract_others(&mut self) {
+        let mut payloads: BTreeMap<(Kind, Sent), (OtherRecord, Vec<RecordKey>)> = BTreeMap::new();
+        for key @ (kind, (time, _)) in &self.others {
+            let Some(record) = self.journal.others.get(key) else { continue };
+            let first = (*kind, (*time, record.payload[0]));
+            payloads.entry(first).or_insert_with(|| (*record, Vec::new())).1.push(*key);
         }
-        account
-    }
-
-    /// Takes out payloads of which all packets have been found and nothing else is made.
-    fn retract_others(&mut self, found: &mut Found) {
-        let lines: Vec<_> =
-            found.others.keys().filter_map(|key| Some((*key, *self.journal.others.get(key)?))).collect();
-        let mut payloads: BTreeMap<(Kind, Sent), Vec<(Kind, Sent)>> = BTreeMap::new();
-        for ((kind, (time, count)), line) in &lines {
-            payloads.entry((*kind, (*time, line.payload[0]))).or_default().push((*kind, (*time, *count)));
-        }
-        let kept = self.segments_kept(found);
-        for keys in payloads.into_values() {
-            let Some(line) = keys.first().and_then(|key| self.journal.others.get(key)).copied() else {
-                continue;
-            };
-            let [first, last] = line.payload;
-            if keys.len() as u64 != last - first + 1
-                || line.segment.is_some_and(|start| kept.contains(&start))
-            {
-                found.report.kept += keys.len() as u64;
+        let needed = self.segments_needed();
+        for (record, keys) in payloads.into_values() {
+            let [first, last] = record.payload;
+            let is_whole = keys.len() as u64 == last - first + 1;
+            if !is_whole || record.segment.is_some_and(|start| needed.contains(&start)) {
+                self.report.kept += keys.len() as u64;
                 continue;
             }
-            let packets: Vec<WaitingPacket> =
-                keys.iter().filter_map(|key| found.others.remove(key)).collect();
-            found.report.packets += packets.len() as u64;
-            match self.collector.take_back(&packets) {
-                Some(GroundFrame::Housekeeping(report)) => self.calibrator.forget_report(&report),
-                Some(GroundFrame::Ephemeris(segment)) if line.segment.is_some() => {
-                    let others = keys.iter().collect::<BTreeSet<_>>();
-                    let brought =
-                        |(key, other): (&(Kind, Sent), &crate::ground::archive::journal::OtherLine)| {
-                            other.segment == line.segment && !others.contains(key)
-                        };
-                    if !self.journal.others.iter().any(brought) {
-                        self.calibrator.forget_segment(segment.start);
-                    }
-                }
-                _ => {}
-            }
+            self.report.packets += keys.len() as u64;
             for key in &keys {
                 self.journal.others.remove(key);
             }
-        }
-    }
-
-    /// Beginnings of the positions that nothing but packets of the files has brought, and by which visibilities that
-    /// stay were placed.
-    fn segments_kept(&self, found: &Found) -> BTreeSet<MissionTime> {
-        let starts = |is_found: bool| -> BTreeSet<MissionTime> {
-            let lines = self.journal.others.iter();
-            let lines = lines.filter(|(key, _)| found.others.contains_key(key) == is_found);
-            lines.filter_map(|(_, line)| line.segment).collect()
-        };
-        let (mut only_found, others) = (starts(true), starts(false));
-        only_found.retain(|start| {
-            let segment = self.calibrator.ephemeris().segment(*start);
-            !others.contains(start)
-                && segment.is_some_and(|segment| self.journal.uses([segment.start, segment.end()]))
-        });
-        only_found
-    }
-
-    /// Makes everything else what it would be without the packets.
-    fn settle_after(&mut self, found: &Found, config: &Config) -> Result<(), StateError> {
-        for kind in Kind::ALL {
-            let others = self.journal.others.keys().filter(|(of, _)| *of == kind).map(|(_, sent)| *sent);
-            match kind {
-                Kind::Visibilities => self.collector.retake(kind, self.journal.visibilities.keys().copied()),
-                _ => self.collector.retake(kind, others),
+            if let Some(start) = record.segment
+                && !self.journal.others.values().any(|other| other.segment == Some(start))
+            {
+                self.ground.calibrator.remove_segment(start);
             }
         }
-        let spans_s = self.journal.spans_s();
-        for channel in &found.channels {
-            self.accumulator.set_span(*channel, spans_s.get(channel).copied());
+    }
+
+    /// Starts of the positions that no packets but those found have brought, and by which visibilities that stay were
+    /// placed.
+    fn segments_needed(&self) -> BTreeSet<MissionTime> {
+        let starts = |is_found: bool| -> BTreeSet<MissionTime> {
+            let records = self.journal.others.iter();
+            let records = records.filter(|(key, _)| self.others.contains(key) == is_found);
+            records.filter_map(|(_, record)| record.segment).collect()
+        };
+        let (found, others) = (starts(true), starts(false));
+        let is_needed = |start: &MissionTime| {
+            let segment = self.ground.calibrator.ephemeris().segment(*start);
+            !others.contains(start)
+                && segment.is_some_and(|segment| self.journal.uses([segment.start, segment.end()]))
+        };
+        found.into_iter().filter(is_needed).collect()
+    }
+
+    /// Writes the archive without the packets: twice, so that the checkpoint before the newest does not bring them back.
+    fn write(self, config: &GroundConfig) -> Result<(), GroundError> {
+        let Self { mut ground, journal, .. } = self;
+        let is_empty = journal.is_empty() && ground.collector.held().packets().next().is_none();
+        ground.accumulator.set_spans(&journal.spans_s());
+        if let Some(archive) = &mut ground.archive {
+            archive.journal = journal;
         }
-        if self.collector.begin_anew_if_empty() {
-            self.begin_anew(config)?;
+        if is_empty {
+            // As if nothing had ever been received.
+            ground.collector = Collector::new(ground.collector.held().bytes_max());
+            ground.calibrator = config.calibrator(&ground.outcome.ledger)?;
+            ground.accumulator = config.accumulator(&ground.outcome.ledger);
         }
-        Ok(())
+        ground.checkpoint()?;
+        ground.checkpoint()
     }
 }
 
 const OTHER_CONTENT: &str = "its content differs from that of the packet in the state";
 const OTHER_POSITIONS: &str = "the positions that are known now are others than those that it was placed by";
 
-/// Whether a packet holds visibilities that all lie in a stretch of mission time.
-fn lies_in(packet: &WaitingPacket, [from, to]: [MissionTime; 2]) -> bool {
+/// Whether a packet holds visibilities that all lie in a span of mission time.
+fn lies_in(packet: &HeldPacket, [from, to]: [MissionTime; 2]) -> bool {
     packet.span().is_some_and(|[first, last]| from <= first && last <= to)
 }

@@ -1,14 +1,14 @@
-//! Why a state cannot be kept or gone on with.
+//! Errors of the ground and its archive.
 
 use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// Why a state cannot be kept or gone on with.
+/// Errors of the ground and its archive.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum StateError {
-    /// A state that is to be put together with itself.
+pub enum GroundError {
+    /// An archive that is to be merged with itself.
     #[error("{}: named twice; expected each state once", path.display())]
     NamedTwice {
         /// The folder.
@@ -19,18 +19,18 @@ pub enum StateError {
     Io {
         /// File or folder.
         path: PathBuf,
-        /// What was tried.
+        /// What was attempted.
         action: &'static str,
         /// What the system said.
         source: std::io::Error,
     },
-    /// Another process has the folder.
-    #[error("{}: another process is keeping its state there; expected one at a time", path.display())]
+    /// Another process uses the folder.
+    #[error("{}: in use by another process; expected one at a time", path.display())]
     Locked {
         /// The folder.
         path: PathBuf,
     },
-    /// A checkpoint that does not hold.
+    /// A damaged checkpoint.
     #[error("{}: found {found}; expected {expected}", path.display())]
     Damaged {
         /// The file.
@@ -40,7 +40,7 @@ pub enum StateError {
         /// What was expected.
         expected: &'static str,
     },
-    /// No checkpoint holds, though there are some.
+    /// There are checkpoints, and none can be used.
     #[error(
         "{}: none of its {checkpoints} checkpoints holds, the newest because of: {newest}; move the folder away to \
          begin anew from the files",
@@ -51,10 +51,10 @@ pub enum StateError {
         path: PathBuf,
         /// How many there are.
         checkpoints: usize,
-        /// What is wrong with the newest.
-        newest: Box<StateError>,
+        /// Why the newest cannot be used.
+        newest: Box<GroundError>,
     },
-    /// The state was summed with other settings.
+    /// The archive was made with other settings.
     #[error(
         "{}: the state was summed with {key} = {found}; expected {expected}, as this session is to sum: give the \
          settings that the state was made with, or another folder",
@@ -65,12 +65,12 @@ pub enum StateError {
         path: PathBuf,
         /// Key.
         key: String,
-        /// Its value in the state.
+        /// Its value in the archive.
         found: String,
         /// Its value now.
         expected: String,
     },
-    /// Sums that do not hold what the journal says.
+    /// Sums that disagree with the journal.
     #[error(
         "the packet of visibilities with count {count}: {found} of its visibilities could be taken out of the sums; \
          expected {expected}, as the journal says: nothing has been changed"
@@ -78,12 +78,12 @@ pub enum StateError {
     NotInSums {
         /// Packet count.
         count: u64,
-        /// Visibilities that the sums would give.
+        /// Visibilities that could be removed.
         found: u64,
         /// Visibilities that the journal has.
         expected: u32,
     },
-    /// A new state where there is one.
+    /// A new archive where there is one.
     #[error("{}: holds a state already; expected a new folder", path.display())]
     Occupied {
         /// The folder.
@@ -100,9 +100,9 @@ pub enum StateError {
     Accumulation(#[from] crate::accumulation::AccumulationError),
 }
 
-impl StateError {
-    /// A folder that is no state's.
-    pub(super) fn without_checkpoint(path: &std::path::Path) -> Self {
+impl GroundError {
+    /// A folder without an archive.
+    pub(in crate::ground) fn without_checkpoint(path: &std::path::Path) -> Self {
         Self::Damaged {
             path: path.to_owned(),
             found: "no checkpoint".into(),
@@ -110,8 +110,8 @@ impl StateError {
         }
     }
 
-    /// Names what was tried when the operating system refused.
-    pub(super) fn io(
+    /// Adds path and attempt to an error of the operating system.
+    pub(in crate::ground) fn io(
         path: &std::path::Path,
         action: &'static str,
     ) -> impl FnOnce(std::io::Error) -> Self + use<> {

@@ -1,0 +1,161 @@
+//! The packets of one kind received over all files and sessions.
+
+use std::ops::Range;
+
+use crate::downlink::wire::CucTime;
+use crate::units::IntervalSet;
+
+/// The received set of one kind: packets by count and creation time, in any order of arrival. Memory grows with the
+/// number of distinct times and of gaps.
+///
+/// Counts of 46 bits never wrap. They restart with the spacecraft, which the packets' times reveal: two packets with
+/// the same count and different times are two packets, of two eras.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ReceivedSet {
+    /// Intervals of counts with the same time: `(time, first)..(time, last + 1)`.
+    packets: IntervalSet<(CucTime, u64)>,
+}
+
+/// The counts received between two restarts of the spacecraft's count.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Era {
+    /// Time of its first packet received.
+    pub from: CucTime,
+    /// Missing counts: between packets received, and from 0 to the first.
+    pub missing: Vec<Range<u64>>,
+    /// One beyond the last count received. Packets sent after it, before the next era, are unknown.
+    pub end: u64,
+}
+
+impl ReceivedSet {
+    /// Adds a packet. Returns whether it is new.
+    pub fn insert(&mut self, count: u64, time: CucTime) -> bool {
+        if self.contains(count, time) {
+            return false;
+        }
+        self.packets.insert((time, count)..(time, count + 1));
+        true
+    }
+
+    /// Removes a packet.
+    pub fn remove(&mut self, count: u64, time: CucTime) {
+        self.packets.remove((time, count)..(time, count + 1));
+    }
+
+    /// Whether a packet is in the set.
+    #[must_use]
+    pub fn contains(&self, count: u64, time: CucTime) -> bool {
+        self.packets.contains((time, count))
+    }
+
+    /// Number of packets.
+    #[must_use]
+    pub fn len(&self) -> u64 {
+        self.packets.iter().map(|Range { start, end }| end.1 - start.1).sum()
+    }
+
+    /// Whether the set is empty.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.packets.is_empty()
+    }
+
+    /// The eras, by time: where counts decrease with time, a new one begins.
+    #[must_use]
+    pub fn eras(&self) -> Vec<Era> {
+        let mut eras: Vec<Era> = Vec::new();
+        for Range { start: (time, start), end: (_, end) } in self.packets.iter() {
+            if eras.last().is_none_or(|era| start < era.end) {
+                eras.push(Era { from: time, ..Era::default() });
+            }
+            let Some(era) = eras.last_mut() else { continue };
+            if era.end < start {
+                era.missing.push(era.end..start);
+            }
+            era.end = end;
+        }
+        eras
+    }
+
+    /// Number of restarts among the packets received.
+    #[must_use]
+    pub fn restarts(&self) -> u64 {
+        let mut end = 0;
+        let decreases = |of: Range<(CucTime, u64)>| of.start.1 < std::mem::replace(&mut end, of.end.1);
+        self.packets.iter().map(decreases).filter(|decreases| *decreases).count() as u64
+    }
+
+    /// Drops the packets with the earliest times until at most `intervals_max` intervals are left.
+    pub(crate) fn remove_oldest(&mut self, intervals_max: usize) {
+        self.packets.drop_lowest(intervals_max);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn at(s: u64) -> CucTime {
+        CucTime(s << 24)
+    }
+
+    fn missing(received: &ReceivedSet) -> Vec<Vec<u64>> {
+        received.eras().into_iter().map(|era| era.missing.into_iter().flatten().collect()).collect()
+    }
+
+    proptest! {
+        #[test]
+        fn it_is_a_set_whatever_the_order(
+            packets in proptest::collection::vec((0..60_u64, 0..2_u64), 1..150),
+            out in 0..60_u64,
+        ) {
+            // Two packets made at each instant, as those of a pass are; and once more after a restart.
+            let made = |(count, era): (u64, u64)| at(count / 2 + 40 * era);
+            let (mut received, mut expected) = (ReceivedSet::default(), BTreeSet::new());
+            for &(count, era) in &packets {
+                prop_assert_eq!(received.insert(count, made((count, era))), expected.insert((era, count)));
+            }
+            prop_assert_eq!(received.len(), expected.len() as u64);
+            let mut sorted = ReceivedSet::default();
+            for &(era, count) in &expected {
+                sorted.insert(count, made((count, era)));
+            }
+            prop_assert_eq!(&sorted, &received);
+            let of_era = |era: u64| expected.iter().filter(|(of, _)| *of == era).map(|(_, count)| *count).collect();
+            let eras: [Vec<u64>; 2] = [of_era(0), of_era(1)];
+            let is_restart = matches!((eras[0].last(), eras[1].first()), (Some(last), Some(first)) if first <= last);
+            prop_assert_eq!(received.restarts(), u64::from(is_restart));
+            prop_assert_eq!(received.eras().len(), 1 + usize::from(is_restart));
+            let absent: Vec<Vec<u64>> = match is_restart {
+                true => eras.iter().map(|era| (0..era[era.len() - 1]).filter(|c| !era.contains(c)).collect()).collect(),
+                // One era as far as anyone knows.
+                false => {
+                    let all = eras.concat();
+                    vec![(0..all[all.len() - 1]).filter(|count| !all.contains(count)).collect()]
+                }
+            };
+            prop_assert_eq!(missing(&received), absent);
+            received.remove(out, made((out, 0)));
+            expected.remove(&(0, out));
+            prop_assert_eq!(received.len(), expected.len() as u64);
+            prop_assert!(received.insert(out, made((out, 0))));
+        }
+    }
+
+    #[test]
+    fn a_count_made_at_another_time_is_another_packet() {
+        let mut received = ReceivedSet::default();
+        // What was sent after a restart comes first, then what was sent before it.
+        assert!(received.insert(0, at(8)) && received.insert(2, at(9)));
+        assert!(received.insert(0, at(1)) && received.insert(2, at(2)) && received.insert(7, at(3)));
+        assert!(!received.insert(2, at(2)) && !received.insert(2, at(9)));
+        assert_eq!(missing(&received), [vec![1, 3, 4, 5, 6], vec![1]]);
+        let [before, after] = received.eras().try_into().unwrap();
+        assert_eq!([(before.from, before.end), (after.from, after.end)], [(at(1), 8), (at(8), 3)]);
+        assert_eq!(received.restarts(), 1);
+    }
+}

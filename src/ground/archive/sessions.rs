@@ -1,0 +1,66 @@
+//! Opening an archive, and merging several.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use super::folder::{StateFolder, checkpoints};
+use super::store::{Archive, Opened};
+use crate::ground::{Ground, GroundConfig, GroundError};
+use crate::runtime::Outlet;
+
+impl Ground {
+    /// A ground that resumes from the newest checkpoint in `folder`, or starts a new archive there.
+    ///
+    /// A checkpoint is written whenever `checkpoint_every` visibilities have been received, and at the end.
+    ///
+    /// # Errors
+    /// A folder that cannot be used or is in use; an archive that was made with other settings, or without a usable
+    /// checkpoint; calibration that cannot be read.
+    pub fn open(folder: &Path, config: &GroundConfig, checkpoint_every: u64) -> Result<Self, GroundError> {
+        Opened::new(folder, config, true)?.resume(config, checkpoint_every)
+    }
+
+    /// Merges archives into a new one, in the folder `into`; those of `parts` stay as they are.
+    ///
+    /// # Errors
+    /// A folder that holds an archive already; an archive that is named twice; archives of different instruments or
+    /// settings, or that hold the same visibilities.
+    pub fn merge(into: &Path, parts: &[PathBuf], config: &GroundConfig) -> Result<Self, GroundError> {
+        let mut whole: Option<Opened> = None;
+        let mut seen = BTreeSet::new();
+        for path in parts {
+            let real = path.canonicalize().map_err(GroundError::io(path, "find"))?;
+            if !seen.insert(real) {
+                return Err(GroundError::NamedTwice { path: path.clone() });
+            }
+            if checkpoints(path)?.is_empty() {
+                return Err(GroundError::without_checkpoint(path));
+            }
+            let part = Opened::new(path, config, false)?;
+            match &mut whole {
+                None => whole = Some(part),
+                Some(whole) => whole.merge(part)?,
+            }
+        }
+        let mut whole = whole.ok_or_else(|| GroundError::without_checkpoint(into))?;
+        whole.folder = StateFolder::open(into)?;
+        if !checkpoints(into)?.is_empty() {
+            return Err(GroundError::Occupied { path: into.to_owned() });
+        }
+        let mut ground = whole.resume(config, u64::MAX)?;
+        ground.advance(&mut Outlet::collect())?;
+        ground.checkpoint()?;
+        Ok(ground)
+    }
+
+    /// Packets of visibilities in the archive.
+    #[must_use]
+    pub fn packets(&self) -> usize {
+        self.archive.as_ref().map_or(0, |archive| archive.journal.packets())
+    }
+
+    /// Checkpoints that could not be used, in words.
+    pub fn notes(&self) -> impl Iterator<Item = &str> {
+        self.archive.iter().flat_map(Archive::notes)
+    }
+}

@@ -1,0 +1,191 @@
+//! The archive of a running ground, and what its checkpoints hold.
+
+use std::path::Path;
+
+use super::checkpoint::{self, ArchiveHeadView};
+use super::draft::RecordDraft;
+use super::folder::StateFolder;
+use super::journal::{Journal, OtherRecord};
+use super::settings::{compare, settings_of};
+use crate::accumulation::Accumulator;
+use crate::array::Ephemeris;
+use crate::calibration::{AutoTable, Calibrator};
+use crate::downlink::{DownlinkError, Kind};
+use crate::frames::{EphemerisSegment, VisibilityReason};
+use crate::ground::{
+    Collector, CollectorState, DeliveredPacket, Ground, GroundConfig, GroundError, GroundOutcome,
+};
+use crate::runtime::{Ledger, LedgerReport};
+
+/// Keeps a journal of what a ground applies, and writes checkpoints of the ground into a folder.
+pub(in crate::ground) struct Archive {
+    pub(super) folder: StateFolder,
+    /// Settings that shape the sums.
+    settings: Vec<(String, String)>,
+    pub(super) journal: Journal,
+    /// Checkpoints that could not be used, in words.
+    notes: Vec<String>,
+    /// What applying the current packet posts.
+    posts: Ledger<VisibilityReason>,
+    /// Visibilities from one checkpoint to the next.
+    interval: u64,
+    since_checkpoint: u64,
+}
+
+impl Archive {
+    /// Records a delivery that became `draft`; returns what it has posted to the ledger.
+    pub(in crate::ground) fn record(
+        &mut self,
+        packets: &[DeliveredPacket],
+        draft: RecordDraft,
+        ephemeris: &Ephemeris,
+    ) -> LedgerReport<VisibilityReason> {
+        let posts = self.take_posts();
+        let (Some(first), Some(last)) = (packets.first(), packets.last()) else { return posts };
+        if first.header.kind == Kind::Visibilities {
+            self.since_checkpoint += u64::from(draft.entry.visibilities);
+            self.journal.record_visibilities(first, draft, &posts);
+            return posts;
+        }
+        let is_used = |segment: &EphemerisSegment| ephemeris.segment(segment.start) == Some(segment);
+        let segment = draft.segment.filter(is_used).map(|segment| segment.start);
+        let payload = [first.header.count, last.header.count];
+        for DeliveredPacket { header, check, reading } in packets {
+            let (bytes, report) = (header.bytes as u32, draft.report);
+            let record = OtherRecord { check: *check, bytes, reading: *reading, payload, segment, report };
+            self.journal.others.insert((header.kind, (header.time, header.count)), record);
+        }
+        posts
+    }
+
+    /// Checkpoints that could not be used, in words.
+    pub(super) fn notes(&self) -> impl Iterator<Item = &str> {
+        self.notes.iter().map(String::as_str)
+    }
+
+    /// Whether a checkpoint is due.
+    pub(in crate::ground) fn is_due(&self) -> bool {
+        self.since_checkpoint >= self.interval
+    }
+
+    /// What was posted since this was called last.
+    pub(in crate::ground) fn take_posts(&self) -> LedgerReport<VisibilityReason> {
+        self.posts.take()
+    }
+
+    /// Writes a checkpoint.
+    pub(in crate::ground) fn checkpoint(
+        &mut self,
+        collector: &Collector,
+        calibrator: &Calibrator,
+        accumulator: &mut Accumulator,
+    ) -> Result<(), GroundError> {
+        self.since_checkpoint = 0;
+        let no_autos = AutoTable::default();
+        let head = ArchiveHeadView {
+            settings: &self.settings,
+            collector: collector.view(),
+            ephemeris: calibrator.ephemeris().segments().collect(),
+            autos: calibrator.autos().unwrap_or(&no_autos),
+            accumulator: accumulator.state(),
+            journal: &self.journal,
+        };
+        self.folder.save(|out, path| {
+            checkpoint::write(out, path, &head, |out| {
+                accumulator.write_engines(out).map_err(GroundError::from)
+            })
+        })
+    }
+}
+
+/// All that a checkpoint holds: data, and the journal.
+pub(super) struct ArchiveContents {
+    pub(super) collector: CollectorState,
+    pub(super) ephemeris: Vec<EphemerisSegment>,
+    pub(super) autos: AutoTable,
+    pub(super) accumulator: Accumulator,
+    pub(super) journal: Journal,
+}
+
+impl ArchiveContents {
+    /// Of a ground that has received nothing.
+    pub(super) fn empty(config: &GroundConfig, posts: &Ledger<VisibilityReason>) -> Self {
+        Self {
+            collector: CollectorState::new(config.wait_bytes),
+            ephemeris: Vec::new(),
+            autos: AutoTable::default(),
+            accumulator: config.accumulator(posts),
+            journal: Journal::default(),
+        }
+    }
+
+    /// Adds what another ground has received: records, sums, and data that only it has.
+    ///
+    /// # Errors
+    /// Another instrument; a packet of visibilities that is in both journals.
+    pub(super) fn merge(&mut self, other: Self) -> Result<(), GroundError> {
+        self.journal.merge(other.journal).map_err(|count| {
+            let apid = Kind::Visibilities.apid();
+            DownlinkError::TakenTwice { apid, count }
+        })?;
+        self.collector.merge(other.collector, |header| self.journal.contains(header))?;
+        // Of segments that start at the same time the first is used.
+        self.ephemeris.extend(other.ephemeris);
+        self.autos.merge(other.autos);
+        Ok(self.accumulator.merge(other.accumulator)?)
+    }
+}
+
+/// A folder that is open, and what its newest usable checkpoint holds.
+pub(super) struct Opened {
+    pub(super) folder: StateFolder,
+    contents: Option<ArchiveContents>,
+    notes: Vec<String>,
+    settings: Vec<(String, String)>,
+    posts: Ledger<VisibilityReason>,
+}
+
+impl Opened {
+    /// Opens a folder. Checkpoints that cannot be used get another name if `sets_aside`.
+    pub(super) fn new(folder: &Path, config: &GroundConfig, sets_aside: bool) -> Result<Self, GroundError> {
+        let mut folder = StateFolder::open(folder)?;
+        let settings = settings_of(config)?;
+        let posts = Ledger::new();
+        let (contents, notes) = folder.load(sets_aside, |path| {
+            checkpoint::read(path, |head, engines| {
+                compare(path, &head.settings, &settings)?;
+                let accumulator = config.accumulator(&posts).resume(head.accumulator, engines)?;
+                let (collector, ephemeris, autos) = (head.collector, head.ephemeris, head.autos);
+                Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal: head.journal })
+            })
+        })?;
+        Ok(Self { folder, contents, notes, settings, posts })
+    }
+
+    /// Merges the contents of another folder into these.
+    pub(super) fn merge(&mut self, other: Self) -> Result<(), GroundError> {
+        self.notes.extend(other.notes);
+        match (&mut self.contents, other.contents) {
+            (Some(ours), Some(theirs)) => return ours.merge(theirs),
+            (None, theirs) => self.contents = theirs,
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// A ground that resumes from these contents.
+    pub(super) fn resume(self, config: &GroundConfig, interval: u64) -> Result<Ground, GroundError> {
+        let Self { folder, contents, notes, settings, posts } = self;
+        let contents = contents.unwrap_or_else(|| ArchiveContents::empty(config, &posts));
+        let ArchiveContents { collector, ephemeris, autos, mut accumulator, journal } = contents;
+        let outcome = GroundOutcome::default();
+        outcome.ledger.post_report(&journal.ledger());
+        accumulator.set_spans(&journal.spans_s());
+        let instrument = collector.instrument().cloned();
+        let calibrator = config.calibrator(&posts)?.resume(instrument, ephemeris, autos, journal.blocks());
+        let collector = Collector::resume(collector, journal.delivered(), journal.reception());
+        let (interval, since_checkpoint) = (interval.max(1), 0);
+        let archive = Archive { folder, settings, journal, notes, posts, interval, since_checkpoint };
+        Ok(Ground { collector, calibrator, accumulator, outcome, archive: Some(archive) })
+    }
+}

@@ -1,0 +1,204 @@
+//! Views of the journal: counters, the ledger, received packets and blocks, spans. Each is a fold over its records.
+
+use std::collections::BTreeMap;
+
+use super::journal::{Journal, JournalEntry, Sent, Used, VisibilityRecord};
+use crate::calibration::{BlockKey, ReceivedBlocks};
+use crate::downlink::{Kind, ReceptionCounters};
+use crate::frames::VisibilityReason;
+use crate::runtime::LedgerReport;
+use crate::units::{ChannelId, MissionTime};
+
+impl Journal {
+    /// Records of packets with visibilities.
+    fn with_visibilities(&self) -> impl Iterator<Item = &VisibilityRecord> {
+        self.visibilities.values().filter(|record| record.entry.visibilities > 0)
+    }
+
+    /// Number of packets with visibilities.
+    pub(super) fn packets(&self) -> usize {
+        self.with_visibilities().count()
+    }
+
+    /// Packets with visibilities, each with the share of what was offered to the sums that they have taken.
+    pub(super) fn shares(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
+        self.with_visibilities().map(|record| {
+            let offered = (record.offered > 0).then_some(record.offered);
+            let share = offered.map(|offered| f64::from(record.accumulated) / f64::from(offered));
+            (&record.entry, share)
+        })
+    }
+
+    /// Packets that were delivered.
+    pub(super) fn delivered(&self) -> impl Iterator<Item = (Kind, Sent)> {
+        let visibilities = self.visibilities.keys().map(|sent| (Kind::Visibilities, *sent));
+        visibilities.chain(self.others.keys().copied())
+    }
+
+    /// Counters of the packets that were delivered.
+    pub(super) fn reception(&self) -> ReceptionCounters {
+        let mut counters = ReceptionCounters::default();
+        for record in self.visibilities.values() {
+            counters.add_packet(Kind::Visibilities, record.bytes, &record.reading);
+        }
+        for ((kind, _), record) in &self.others {
+            counters.add_packet(*kind, record.bytes, &record.reading);
+        }
+        counters
+    }
+
+    /// Blocks that were received, and the spacecraft's reports.
+    pub(super) fn blocks(&self) -> ReceivedBlocks {
+        let mut blocks = ReceivedBlocks::default();
+        for record in self.with_visibilities() {
+            let JournalEntry { channel, pair, start, visibilities, .. } = record.entry;
+            blocks.insert(BlockKey { channel, pair, first: start });
+            if !record.is_duplicate {
+                blocks.count(record.window, u64::from(visibilities));
+            }
+        }
+        self.others.values().filter_map(|record| record.report).for_each(|report| blocks.report(report));
+        blocks
+    }
+
+    /// What applying all packets has posted to the ledger.
+    pub(super) fn ledger(&self) -> LedgerReport<VisibilityReason> {
+        let mut ledger = LedgerReport::default();
+        for record in self.visibilities.values() {
+            ledger.accumulated = ledger.accumulated.saturating_add(u64::from(record.accumulated));
+            if record.is_duplicate {
+                ledger.sampled = ledger.sampled.saturating_add(u64::from(record.entry.visibilities));
+            }
+            for &(reason, count) in &record.left_out {
+                let sum = ledger.left_out.entry(reason).or_default();
+                *sum = sum.saturating_add(u64::from(count));
+            }
+        }
+        ledger
+    }
+
+    /// First and last mission time, s, of what was offered to the engine of each channel of the sums.
+    pub(super) fn spans_s(&self) -> BTreeMap<ChannelId, [f64; 2]> {
+        let mut spans: BTreeMap<ChannelId, [f64; 2]> = BTreeMap::new();
+        for record in self.visibilities.values() {
+            let Some(Used { channel, span_s: [first, last] }) = record.used else { continue };
+            let span = spans.entry(channel).or_insert([first, last]);
+            *span = [span[0].min(first), span[1].max(last)];
+        }
+        spans
+    }
+
+    /// Whether the sums hold visibilities of pairs whose positions lie in a span of time.
+    pub(super) fn uses(&self, [from, to]: [MissionTime; 2]) -> bool {
+        self.visibilities.values().any(|VisibilityRecord { entry, accumulated, .. }| {
+            *accumulated > 0 && entry.pair.i != entry.pair.j && entry.start <= to && entry.end >= from
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use num_complex::Complex32;
+
+    use super::*;
+    use crate::accumulation::MapConfig;
+    use crate::calibration::CalibrationConfig;
+    use crate::downlink::receive::PacketReading;
+    use crate::downlink::{
+        CucTime, DownlinkConfig, FORMAT_VERSION, PacketHeader, PacketSegment, Transmission,
+    };
+    use crate::frames::{
+        AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, PlacedFrame,
+        PlacedVisibilities, VisibilityBlock,
+    };
+    use crate::ground::archive::RecordDraft;
+    use crate::ground::{DeliveredPacket, Ground, GroundConfig};
+    use crate::runtime::{Outlet, Stage};
+    use crate::units::Pair;
+
+    fn block(pair: Pair, start: i64) -> GroundFrame {
+        GroundFrame::Visibilities(VisibilityBlock {
+            pair,
+            start: MissionTime(start),
+            offset_ticks: vec![0, 10],
+            duration_ticks: vec![10; 2],
+            value_k_sr: vec![Complex32::new(3.0, 0.0); 2],
+            weight: vec![1.0; 2],
+            flags: vec![Flags::GOOD; 2],
+            ..VisibilityBlock::default()
+        })
+    }
+
+    /// An instrument; auto-correlations; a pair without positions, sent twice in different packets; reports.
+    fn transmission() -> Vec<u8> {
+        let instrument = Instrument {
+            name: "test".to_owned(),
+            epoch_tai_s: 2e9,
+            moon_radius_m: 1_737_100.0,
+            satellites: 8,
+            channels: vec![Channel { frequency_hz: 3e6, width_hz: 8e3 }],
+            response: AntennaResponse::Isotropic,
+            seed: 7,
+            configuration_hash: 1,
+            spectrometer: None,
+        };
+        let report = |time: i64, sampled: u64| {
+            GroundFrame::Housekeeping(Housekeeping { time: MissionTime(time), sampled, dropped: 1 })
+        };
+        let frames = [
+            GroundFrame::Instrument(instrument),
+            block(Pair { i: 1, j: 1 }, 100),
+            block(Pair { i: 0, j: 1 }, 200),
+            report(500, 9),
+            block(Pair { i: 0, j: 1 }, 200),
+            block(Pair { i: 0, j: 2 }, 900),
+            report(1000, 12),
+        ];
+        let mut transmission = Transmission::new(&DownlinkConfig::default()).unwrap();
+        let mut bytes = Vec::new();
+        frames.iter().for_each(|frame| transmission.send(frame, &mut bytes).unwrap());
+        bytes
+    }
+
+    #[test]
+    fn what_a_ground_counts_is_what_is_folded() {
+        let folder = tempfile::tempdir().unwrap();
+        let (calibration, map) = (CalibrationConfig::default(), MapConfig::default());
+        let config = GroundConfig { calibration, map, wait_bytes: 0 };
+        let mut ground = Ground::open(folder.path(), &config, u64::MAX).unwrap();
+        ground.step(transmission(), &mut Outlet::collect()).unwrap();
+        {
+            let journal = &ground.archive.as_ref().unwrap().journal;
+            assert_eq!(journal.reception(), ground.collector.counters());
+            assert_eq!(journal.ledger(), ground.outcome.ledger.report());
+            assert_eq!(&journal.blocks(), ground.calibrator.blocks());
+            assert_eq!((journal.blocks().visibilities(), journal.ledger().sampled), (6, 2));
+            assert_eq!(journal.delivered().count(), 7);
+        }
+        ground.finish(&mut Outlet::collect()).unwrap();
+        let said = (ground.outcome.ledger.close().unwrap(), ground.collector.counters());
+        drop(ground);
+        // A session without data counts the same.
+        let mut again = Ground::open(folder.path(), &config, u64::MAX).unwrap();
+        again.finish(&mut Outlet::collect()).unwrap();
+        assert_eq!((again.outcome.ledger.close().unwrap(), again.collector.counters()), said);
+    }
+
+    #[test]
+    fn spans_are_of_the_channels_of_the_sums() {
+        let mut journal = Journal::default();
+        for (count, times_s) in [(0, [3.0, 4.0]), (1, [1.0, 2.0])] {
+            let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(count));
+            let header = PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 };
+            let mut draft = RecordDraft::of(Some(&block(Pair { i: 0, j: 1 }, 200)));
+            // The second of two sub-bands of channel 2.
+            draft.entry.channel = ChannelId(5);
+            let channel = ChannelId(2);
+            draft.offer(&PlacedFrame::Visibilities(PlacedVisibilities { channel, ..Default::default() }));
+            draft.used_s = Some(times_s);
+            let packet = DeliveredPacket { header, check: 1, reading: PacketReading::default() };
+            journal.record_visibilities(&packet, draft, &LedgerReport::default());
+        }
+        assert_eq!(journal.spans_s(), BTreeMap::from([(ChannelId(2), [1.0, 4.0])]));
+    }
+}

@@ -1,0 +1,44 @@
+//! Configuration of the ground.
+
+use std::path::Path;
+
+use crate::accumulation::{Accumulator, MapConfig};
+use crate::calibration::{CalibrationConfig, CalibrationError, Calibrator};
+use crate::frames::VisibilityReason;
+use crate::runtime::Ledger;
+
+/// Default capacity of the hold buffer, bytes: a week of thirty channels.
+pub const WAIT_BYTES: u64 = 1 << 28;
+
+/// Segments of positions that are kept: more than two years of windows.
+const SEGMENTS_MAX: usize = 8192;
+
+/// Configuration of the ground, from bytes to sums.
+#[derive(Clone, Debug)]
+pub struct GroundConfig {
+    /// Calibration.
+    pub calibration: CalibrationConfig,
+    /// Sums.
+    pub map: MapConfig,
+    /// Bytes of visibilities that may wait for their positions. An archive keeps the value that it was made with.
+    pub wait_bytes: u64,
+}
+
+impl GroundConfig {
+    /// A calibrator without data, posting to `ledger`.
+    pub(super) fn calibrator(
+        &self,
+        ledger: &Ledger<VisibilityReason>,
+    ) -> Result<Calibrator, CalibrationError> {
+        let calibration = self.calibration.build(Path::new(""))?;
+        Ok(Calibrator::new(calibration, ledger.clone())
+            .with_van_vleck(self.calibration.van_vleck()?)
+            .with_autos()
+            .with_segments(SEGMENTS_MAX))
+    }
+
+    /// An accumulator without data, posting to `ledger`.
+    pub(super) fn accumulator(&self, ledger: &Ledger<VisibilityReason>) -> Accumulator {
+        Accumulator::new(self.map.clone(), ledger.clone())
+    }
+}

@@ -1,0 +1,133 @@
+//! The ground as one stage: bytes of a downlink to sums.
+
+use std::sync::{Mutex, PoisonError};
+
+use super::archive::{Archive, RecordDraft};
+use super::{Collector, Delivery, GroundConfig, GroundError, GroundOutcome};
+use crate::accumulation::{Accumulator, Snapshot};
+use crate::calibration::Calibrator;
+use crate::frames::{GroundFrame, Instrument, PlacedFrame};
+use crate::runtime::{Outlet, Stage, Units};
+
+/// Takes the bytes of a downlink and emits sums.
+///
+/// Collects packets, each once; places and calibrates their visibilities; adds them to the sums. With an [`Archive`] it
+/// resumes from earlier sessions and writes checkpoints.
+pub struct Ground {
+    pub(super) collector: Collector,
+    pub(super) calibrator: Calibrator,
+    pub(super) accumulator: Accumulator,
+    pub(super) outcome: GroundOutcome,
+    pub(super) archive: Option<Archive>,
+}
+
+impl Ground {
+    /// A ground that keeps nothing for later sessions.
+    ///
+    /// # Errors
+    /// Calibration that cannot be read.
+    pub fn new(config: &GroundConfig) -> Result<Self, GroundError> {
+        let outcome = GroundOutcome::default();
+        Ok(Self {
+            collector: Collector::new(config.wait_bytes),
+            calibrator: config.calibrator(&outcome.ledger)?,
+            accumulator: config.accumulator(&outcome.ledger),
+            outcome,
+            archive: None,
+        })
+    }
+
+    /// The instrument, once it is known.
+    #[must_use]
+    pub fn instrument(&self) -> Option<&Instrument> {
+        self.collector.instrument()
+    }
+
+    /// What it leaves behind besides its sums.
+    #[must_use]
+    pub fn outcome(&self) -> GroundOutcome {
+        self.outcome.clone()
+    }
+
+    /// Applies deliveries until more bytes are needed; writes checkpoints that are due.
+    pub(super) fn advance(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
+        loop {
+            let ephemeris = self.calibrator.ephemeris();
+            let Some(delivery) = self.collector.next_delivery(&|span| ephemeris.covers(span))? else {
+                return Ok(());
+            };
+            self.apply(delivery, out)?;
+            if self.archive.as_ref().is_some_and(Archive::is_due) {
+                self.checkpoint()?;
+            }
+        }
+    }
+
+    /// Takes a delivery through calibration into the sums, and into the journal if there is an archive.
+    fn apply(&mut self, delivery: Delivery, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
+        let Delivery { packets, frame } = delivery;
+        let Some(archive) = &mut self.archive else {
+            if let Some(placed) = placed(&mut self.calibrator, frame)? {
+                self.accumulator.accept(placed, out)?;
+            }
+            return Ok(());
+        };
+        let mut draft = RecordDraft::of(frame.as_ref());
+        if let Some(placed) = placed(&mut self.calibrator, frame)? {
+            draft.offer(&placed);
+            draft.used_s = self.accumulator.accept(placed, out)?;
+        }
+        let posted = archive.record(&packets, draft, self.calibrator.ephemeris());
+        self.outcome.ledger.post_report(&posted);
+        Ok(())
+    }
+
+    /// Writes a checkpoint, if there is an archive.
+    pub(super) fn checkpoint(&mut self) -> Result<(), GroundError> {
+        let Some(archive) = &mut self.archive else { return Ok(()) };
+        archive.checkpoint(&self.collector, &self.calibrator, &mut self.accumulator)
+    }
+}
+
+fn placed(
+    calibrator: &mut Calibrator,
+    frame: Option<GroundFrame>,
+) -> Result<Option<PlacedFrame>, GroundError> {
+    Ok(frame.map(|frame| calibrator.accept(frame)).transpose()?.flatten())
+}
+
+impl Stage for Ground {
+    type In = Vec<u8>;
+    type Out = Snapshot;
+    type Error = GroundError;
+
+    fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
+        self.collector.push(&bytes);
+        self.advance(out)
+    }
+
+    fn finish(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
+        self.collector.finish();
+        self.advance(out)?;
+        // The checkpoint keeps held packets as they are; the final maps use them without their positions.
+        self.checkpoint()?;
+        while let Some(delivery) = self.collector.flush_next() {
+            self.apply(delivery, out)?;
+        }
+        self.calibrator.close();
+        if let Some(archive) = &self.archive {
+            self.outcome.ledger.post_report(&archive.take_posts());
+        }
+        fill(&self.outcome.reception, self.collector.counters());
+        fill(&self.outcome.autos, self.calibrator.auto_powers());
+        Ok(self.accumulator.finish(out)?)
+    }
+
+    fn units(&self) -> Units {
+        Units::of(self.collector.bytes(), "bytes")
+    }
+}
+
+fn fill<T>(place: &Mutex<T>, value: T) {
+    *place.lock().unwrap_or_else(PoisonError::into_inner) = value;
+}
