@@ -1,6 +1,6 @@
 //! What a run leaves behind: maps, pictures, figures.
 //!
-//! Uses [`crate::solve`] and [`crate::sky`].
+//! Uses [`crate::solve`], [`crate::sky`] and, for coverage, [`crate::ground`].
 
 mod autos;
 mod channel;
