@@ -11,7 +11,7 @@ use crate::runtime::{Outlet, Stage, Units};
 
 /// Takes the bytes of a downlink and emits sums.
 ///
-/// Collects packets, each once; places and calibrates their visibilities; adds them to the sums. With an [`Archive`] it
+/// Collects packets, each once; places and calibrates their visibilities; adds them to the sums. With an [archive](super::archive) it
 /// resumes from earlier sessions and writes checkpoints.
 pub struct Ground {
     pub(super) collector: Collector,

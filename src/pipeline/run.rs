@@ -20,20 +20,20 @@ use crate::products::{ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::solve::SolveWatch;
 
-/// What can be watched of a graph while it runs.
+/// Handles to watch a running graph.
 #[derive(Clone, Debug)]
 pub struct Watched {
     /// Counters and times of its stages.
     pub metrics: Arc<Metrics>,
-    /// The solution that is being worked on.
+    /// The solution in progress.
     pub solving: SolveWatch,
     /// The senders, if the ground listens.
     pub listening: Option<Listening>,
 }
 
-/// Where a ground takes its downlink from.
+/// A source of downlink bytes.
 pub trait GroundSource: Source<Out = Vec<u8>, Error = DownlinkError> {
-    /// What can be seen of its senders, if it listens.
+    /// Its senders, if it listens.
     fn listening(&self) -> Option<Listening> {
         None
     }
@@ -53,12 +53,12 @@ impl GroundSource for SocketSource {
     }
 }
 
-/// Where a spacecraft's downlink goes.
+/// Destination of a simulated downlink.
 #[derive(Debug, Default)]
 pub struct Destination {
     /// A file.
     pub file: Option<PathBuf>,
-    /// A ground that listens.
+    /// A listening ground.
     pub socket: Option<SocketSink>,
 }
 
@@ -68,13 +68,13 @@ impl<P: AsRef<Path>> From<&P> for Destination {
     }
 }
 
-/// Whom to tell about a graph that is about to run.
+/// Receives the handles of a graph that is about to run.
 pub type Watcher<'a> = &'a mut dyn FnMut(Watched);
 
-/// Name of the stage that takes the downlink in.
+/// Name of the stage that reads the downlink.
 pub const READ: &str = "read";
 
-/// Name of the downlink file that `run` leaves among its products, by its format.
+/// Name of the downlink file that `run` leaves among its products.
 #[must_use]
 pub fn downlink_file(format: Format) -> &'static str {
     match format {
@@ -182,7 +182,7 @@ pub fn replay<S: GroundSource + 'static>(
     conclude(RunScope::Ground, config, out, Ended { report, outcome, listening, samples: None })
 }
 
-/// The link's faults, if any are asked for; the truth about them goes beside the downlink file.
+/// Adds the link's faults, if any are configured; their truth file goes beside the downlink file.
 fn add_link(
     graph: &mut Graph,
     bytes: Link<Vec<u8>>,
@@ -195,7 +195,7 @@ fn add_link(
     })
 }
 
-/// Before anything is computed, so that a bad place is known at once.
+/// Creates the folder before anything is computed, so that an error shows at once.
 fn make_folder(out: &Path) -> Result<(), PipelineError> {
     let made = std::fs::create_dir_all(out);
     made.map_err(|source| ProductsError::Write { path: out.to_owned(), source }.into())
@@ -248,7 +248,7 @@ fn conclude(
     Ok(summary)
 }
 
-/// Gives this process as many worker threads as the configuration says; once, before anything runs.
+/// Starts as many worker threads as configured; once, before anything runs.
 ///
 /// # Errors
 /// Threads that cannot be started, or a number other than the one that the process already has.

@@ -3,8 +3,8 @@
 //! [`Publisher`] is the sink that writes every [`crate::solve::Solution`]; [`write_autos`] writes the
 //! auto-correlations. [`pictures`] draws.
 //!
-//! May use [`crate::solve`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give equal bytes, and
-//! every map carries its provenance: configuration hashes, seed, program version and data span.
+//! May use [`crate::solve`], [`crate::ground`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
+//! equal bytes, and every map carries its provenance: configuration hashes, seed, program version and data span.
 
 mod autos;
 mod channel;

@@ -27,7 +27,7 @@ const FIXED_BYTES: u64 = 24;
 const PIECE_BYTES: u64 = 1 << 20;
 
 /// Most memory that a decoded head may take for each of its bytes on disk: of its parts, a record of a packet of
-/// positions needs most, 136 bytes for at least 14.
+/// positions needs most, 120 bytes for at least 14.
 const MEMORY_A_BYTE: usize = 16;
 
 /// A checkpoint without its engines: data, and the journal.

@@ -32,8 +32,8 @@
 //! that a damaged one does not bring the packets back.
 //!
 //! # Size
-//! The journal takes some 90 bytes a packet of visibilities in a checkpoint and 300 in memory: of 26 million, in packets
-//! of 215 as windows give them, 11 MB and 36 MB a channel, of 550 MB of downlink. Held packets take up to `wait_bytes` in
+//! The journal takes some 95 bytes a packet of visibilities in a checkpoint and 300 in memory: of 26 million, in packets
+//! of 215 as windows give them, 12 MB and 36 MB a channel, of 550 MB of downlink. Held packets take up to `wait_bytes` in
 //! either. The received set grows with the number of creation times; positions of 8192 windows, more than two years,
 //! take 72 MB.
 //!

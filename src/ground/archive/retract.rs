@@ -199,7 +199,7 @@ impl Retraction {
         let needed = self.segments_needed();
         for (record, keys) in payloads.into_values() {
             let [first, last] = record.payload;
-            let is_whole = keys.len() as u64 == last - first + 1;
+            let is_whole = last.checked_sub(first).is_some_and(|more| more == keys.len() as u64 - 1);
             if !is_whole || record.segment.is_some_and(|start| needed.contains(&start)) {
                 self.report.kept += keys.len() as u64;
                 continue;
