@@ -45,7 +45,7 @@ fn plan(file: &str, overrides: &[&str]) -> Plan {
         "spacecraft.every_nth_integration=3",
         "spacecraft.every_nth_window=200",
         // Longer baselines see the limb alone of this sky, and sums over pixels do not know the limb that well;
-        // harmonic_forward.rs has them, with an exact limb.
+        // tests/physics/forward.rs has them, with an exact limb.
         "spacecraft.baseline_wavelengths_max=9.0",
         // Beyond what is in the map, which must not matter.
         "sky.l_max=96",

@@ -97,7 +97,7 @@ const DOCUMENTED: [(usize, [Row; 4]); 2] = [
 ];
 
 /// Models of the real and of the nominal circle, both of which hold against sums over directions
-/// (harmonic_forward.rs), differ by what is documented.
+/// (forward.rs), differ by what is documented.
 #[test]
 fn departures_cost_what_the_documentation_says() {
     let tenth = 0.1_f64.to_radians();

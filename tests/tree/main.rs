@@ -1,0 +1,216 @@
+//! The tree is the data's path: reads `src/` as text and fails where an import goes against it.
+//!
+//! Three rules, each with its own message on how to mend what offends:
+//! a folder imports only folders before it in [`ORDER`], and the ground nothing of the spacecraft; no circle of imports
+//! runs through more than two files; no type name that is public or visible in the crate stands twice.
+//!
+//! An import is a `use` or a path in the code. It is followed through `pub use` to the file that defines the item, so
+//! that a re-export neither hides an import nor makes one. Code under `#[cfg(test)]` is free.
+#![allow(clippy::unwrap_used, clippy::panic)] // A test fails by panicking.
+
+mod rules;
+mod source;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use source::{File, ModulePath, parse};
+
+/// Folders (and files) directly below `src/`, each after all that it may use.
+const ORDER: [&str; 19] = [
+    "units",
+    "files",
+    "frames",
+    "runtime",
+    "sky",
+    "array",
+    "response",
+    "daughters",
+    "mother",
+    "downlink",
+    "calibration",
+    "accumulation",
+    "ground",
+    "solve",
+    "products",
+    "pipeline",
+    "bench",
+    "cli",
+    "main",
+];
+const SPACECRAFT: [&str; 2] = ["daughters", "mother"];
+const GROUND: [&str; 6] = ["downlink", "calibration", "accumulation", "ground", "solve", "products"];
+
+#[test]
+fn the_tree_is_the_path_of_the_data() {
+    let mut sources = Vec::new();
+    read_folder(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/src")), "", &mut sources);
+    let tree = Tree::new(&sources);
+    // Without these the rules would hold of nothing.
+    assert!(tree.files.len() > 150, "only {} files", tree.files.len());
+    assert!(tree.imports().values().map(BTreeSet::len).sum::<usize>() > 500, "hardly any import was found");
+    let types: usize = tree.files.values().map(|file| file.types.len()).sum();
+    assert!(types > 300, "only {types} types");
+    let offences = tree.offences();
+    assert!(offences.is_empty(), "{} offences\n{}", offences.len(), offences.join("\n"));
+}
+
+fn read_folder(folder: &Path, below: &str, sources: &mut Vec<(String, String)>) {
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let name = format!("{below}{}", path.file_name().unwrap().to_str().unwrap());
+        if path.is_dir() {
+            read_folder(&path, &format!("{name}/"), sources);
+        } else if name.ends_with(".rs") {
+            sources.push((name, std::fs::read_to_string(&path).unwrap()));
+        }
+    }
+}
+
+struct Tree {
+    files: BTreeMap<ModulePath, File>,
+}
+
+impl Tree {
+    /// Of files by their paths below `src/`, and their text.
+    fn new(sources: &[(String, String)]) -> Self {
+        let parsed: Vec<_> = sources.iter().map(|(path, text)| parse(path, text)).collect();
+        let of_tests: BTreeSet<ModulePath> = parsed.iter().flat_map(|(_, _, tests)| tests.clone()).collect();
+        let is_test = |module: &[String]| (0..=module.len()).any(|n| of_tests.contains(&module[..n]));
+        let kept = parsed.into_iter().filter(|(module, ..)| !is_test(module));
+        Self { files: kept.map(|(module, file, _)| (module, file)).collect() }
+    }
+
+    fn offences(&self) -> Vec<String> {
+        [self.against_order(), self.circles(), self.types_twice()].concat()
+    }
+
+    fn against_order(&self) -> Vec<String> {
+        let mut found = BTreeSet::new();
+        let place = |folder: &String| ORDER.iter().position(|name| name == folder);
+        for (module, file) in self.files.iter().filter(|(module, _)| !module.is_empty()) {
+            let Some(here) = place(&module[0]) else {
+                found.insert(format!(
+                    "src/{}: `{}` has no place in the data's path; give it one in tests/tree/main.rs",
+                    file.path, module[0]
+                ));
+                continue;
+            };
+            let re_exported = file.exports.values();
+            for (base, path) in file.references.iter().chain(re_exported) {
+                let Some(target) = self.resolve(base, path).filter(|target| !target.is_empty()) else {
+                    continue;
+                };
+                let (from, to) = (&module[0], &target[0]);
+                if place(to).is_some_and(|there| there > here) {
+                    found.insert(format!(
+                        "src/{} imports `{}`, but `{to}` comes after `{from}` in the data's path.\n    \
+                         Move what both need to `{from}` or before it, or let the caller pass it in.",
+                        file.path,
+                        path.join("::")
+                    ));
+                } else if GROUND.contains(&from.as_str()) && SPACECRAFT.contains(&to.as_str()) {
+                    found.insert(format!(
+                        "src/{} imports `{}`, but the ground knows the spacecraft by bytes alone.\n    \
+                         Move what both need before `daughters` (to `frames`, `array` or `response`).",
+                        file.path,
+                        path.join("::")
+                    ));
+                }
+            }
+        }
+        found.into_iter().collect()
+    }
+
+    fn circles(&self) -> Vec<String> {
+        let imports = self.imports();
+        let reach: BTreeMap<_, _> = imports.keys().map(|from| (*from, reachable(from, &imports))).collect();
+        let circles: BTreeSet<Vec<&ModulePath>> = reach
+            .iter()
+            .map(|(from, to)| to.iter().filter(|to| reach[*to].contains(from)).copied().collect())
+            .filter(|circle: &Vec<_>| circle.len() > 2)
+            .collect();
+        let describe = |circle: &Vec<&ModulePath>| {
+            let mut text = format!(
+                "{} files import each other in a circle.\n    \
+                 Cut it where one needs least of another: move that item to the other file or to a third below both.",
+                circle.len()
+            );
+            for file in circle {
+                let to = imports[*file].iter().filter(|to| circle.contains(to));
+                let to: Vec<_> = to.map(|to| format!("src/{}", self.files[*to].path)).collect();
+                text += &format!("\n    src/{} imports {}", self.files[*file].path, to.join(", "));
+            }
+            text
+        };
+        circles.iter().map(describe).collect()
+    }
+
+    fn types_twice(&self) -> Vec<String> {
+        let mut places: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+        for file in self.files.values() {
+            for name in &file.types {
+                places.entry(name).or_default().push(&file.path);
+            }
+        }
+        let twice = places.into_iter().filter(|(_, places)| places.len() > 1);
+        let describe = |(name, places): (&str, Vec<&str>)| {
+            format!(
+                "`{name}` is defined in src/{}.\n    Rename all but one after what sets it apart, or make it private.",
+                places.join(" and src/")
+            )
+        };
+        twice.map(describe).collect()
+    }
+
+    /// Which files each file imports; what it merely re-exports is not among them.
+    fn imports(&self) -> BTreeMap<&ModulePath, BTreeSet<&ModulePath>> {
+        let of = |module, file: &File| {
+            let targets = file.references.iter().filter_map(|(base, path)| self.resolve(base, path));
+            targets.filter(|target| *target != module).collect()
+        };
+        self.files.iter().map(|(module, file)| (module, of(module, file))).collect()
+    }
+
+    /// The file that defines what `path` names in the module `base`; none if that is another crate or a local name.
+    fn resolve(&self, base: &[String], path: &[String]) -> Option<&ModulePath> {
+        self.follow(self.absolute(base, path)?, &mut BTreeSet::new())
+    }
+
+    fn absolute(&self, base: &[String], path: &[String]) -> Option<ModulePath> {
+        let supers = path.iter().take_while(|part| *part == "super").count();
+        let child = || [base, &path[..1]].concat();
+        match path.first()?.as_str() {
+            "crate" => Some(path[1..].to_vec()),
+            "self" => Some([base, &path[1..]].concat()),
+            "super" => Some([base.get(..base.len().checked_sub(supers)?)?, &path[supers..]].concat()),
+            _ if self.files.contains_key(&child()) => Some([base, path].concat()),
+            _ => None,
+        }
+    }
+
+    fn follow(&self, path: ModulePath, seen: &mut BTreeSet<ModulePath>) -> Option<&ModulePath> {
+        let length = (0..=path.len()).rev().find(|n| self.files.contains_key(&path[..*n]))?;
+        let (module, file) = self.files.get_key_value(&path[..length])?;
+        let Some((base, source)) = path.get(length).and_then(|name| file.exports.get(name)) else {
+            return Some(module);
+        };
+        if !seen.insert(path.clone()) {
+            return None;
+        }
+        let mut source = self.absolute(base, source)?;
+        source.extend_from_slice(&path[length + 1..]);
+        self.follow(source, seen)
+    }
+}
+
+fn reachable<'a>(
+    from: &'a ModulePath,
+    imports: &BTreeMap<&'a ModulePath, BTreeSet<&'a ModulePath>>,
+) -> BTreeSet<&'a ModulePath> {
+    let (mut found, mut open) = (BTreeSet::new(), vec![from]);
+    while let Some(file) = open.pop() {
+        open.extend(imports[file].iter().filter(|to| found.insert(**to)));
+    }
+    found
+}
