@@ -51,7 +51,7 @@ fn states(array: &Array, window: ObservingWindow, wavelength_m: f64, u_max: f64,
     }
 }
 
-/// Wall-clock and processor time; the second is what a busy machine leaves comparable.
+/// Wall-clock and processor time; the latter is comparable on a busy machine too.
 struct Clock(Instant, f64);
 
 impl Clock {

@@ -25,7 +25,7 @@ const VERSION: u16 = 1;
 /// Beginnings of the magics of earlier formats, one for each engine.
 const EARLIER: [&[u8]; 2] = [b"LNRPIX", b"LNRHRM"];
 
-/// What the sums are over. Numbers in checkpoints: never to be renumbered.
+/// Basis of an engine in a checkpoint; the numbers are never to be changed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BasisKind {
     /// Over pixels.
@@ -49,7 +49,7 @@ const HEAD_BYTES_MAX: usize = 4096;
 const CODEC: Configuration<LittleEndian, Fixint, Limit<HEAD_BYTES_MAX>> =
     bincode::config::standard().with_little_endian().with_fixed_int_encoding().with_limit::<HEAD_BYTES_MAX>();
 
-/// Numbers of variants on disk: never to be renumbered.
+/// Antenna responses by their number in checkpoints: append only.
 pub(super) const RESPONSES: [AntennaResponse; 2] =
     [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal];
 

@@ -1,7 +1,7 @@
-//! The engine: all of it that does not depend on what the sky is expanded in.
+//! The engine without its basis.
 //!
 //! An [`ExactEngine`] checks and counts visibilities, collects them in batches, and hands each batch to its [`SkyBasis`],
-//! which turns it into integers and adds them to the exact sums.
+//! which rounds it to integers and adds them to the exact sums.
 
 use std::fmt;
 use std::io::{Read, Write};
@@ -16,9 +16,9 @@ use super::{AccumulationError, Added, NormalEngine, NormalSums, Refusal, SumCoun
 use crate::frames::PlacedVisibilities;
 use crate::units::vector::Vec3;
 
-/// What the sky is expanded in: how a visibility enters the sums, and what the sums mean.
+/// A basis of the sky: how visibilities enter the sums, and how the sums become equations.
 pub trait SkyBasis: Sized + Send + Sync {
-    /// What distinguishes one engine from another.
+    /// Everything on which the sums depend besides the data; only engines of equal setup can be merged.
     type Setup: Copy + fmt::Debug + PartialEq + Send + Sync;
     /// Where a visibility belongs in the sums.
     type Place: Copy + Send + Sync;
@@ -29,7 +29,7 @@ pub trait SkyBasis: Sized + Send + Sync {
     /// A setup as it stands in a checkpoint.
     type Head: bincode::Encode + bincode::Decode<()>;
 
-    /// Number of the basis in checkpoints.
+    /// The basis in checkpoints.
     const KIND: BasisKind;
     /// Visibilities that are summed together.
     const BATCH: usize;
@@ -62,12 +62,11 @@ pub trait SkyBasis: Sized + Send + Sync {
 
     /// The sums as numbers.
     fn equations(&self, exact: &Self::Exact, counts: SumCounts) -> Self::Equations {
-        self.into_equations(exact.clone(), counts)
+        self.finish(exact.clone(), counts)
     }
 
     /// The sums as numbers; the integers are given up.
-    #[expect(clippy::wrong_self_convention)] // It is the sums that are converted.
-    fn into_equations(&self, exact: Self::Exact, counts: SumCounts) -> Self::Equations;
+    fn finish(&self, exact: Self::Exact, counts: SumCounts) -> Self::Equations;
 
     /// The setup for a checkpoint.
     fn head(setup: &Self::Setup) -> Self::Head;
@@ -195,7 +194,8 @@ impl<B: SkyBasis> ExactEngine<B> {
             return Err(AccumulationError::Frequency { expected_hz, found_hz });
         }
         let found: Vec<_> = (0..placed.len()).into_par_iter().map(|k| self.accept(placed, k)).collect();
-        let one = |accepted: &Accepted<B::Place>| Totals::one(self.scale, accepted.weight);
+        let scale = self.scale;
+        let one = |accepted: &Accepted<B::Place>| Totals::one(scale, accepted.weight);
         if direction == Direction::Out {
             let mut accepted = found.iter().flatten();
             let left = accepted.try_fold(self.totals, |totals, removed| totals.and(one(removed), direction));
@@ -207,7 +207,6 @@ impl<B: SkyBasis> ExactEngine<B> {
         }
         let mut added = Added::default();
         for found in found {
-            let one = |accepted: &Accepted<B::Place>| Totals::one(self.scale, accepted.weight);
             match found.and_then(|accepted| Ok((self.with(one(&accepted), direction)?, accepted))) {
                 Ok((totals, accepted)) => {
                     added.visibilities += 1;
@@ -226,7 +225,8 @@ impl<B: SkyBasis> ExactEngine<B> {
     /// The totals with others, if the integers have room for both: no element exceeds what the weights allow.
     fn with(&self, others: Totals, direction: Direction) -> Result<Totals, Refusal> {
         let totals = self.totals.and(others, direction).ok_or(Refusal::Full)?;
-        if totals.scales() > B::SCALES_MAX { Err(Refusal::Full) } else { Ok(totals) }
+        let is_full = direction == Direction::In && totals.scales() > B::SCALES_MAX;
+        if is_full { Err(Refusal::Full) } else { Ok(totals) }
     }
 
     fn combine(&mut self, mut other: Self, direction: Direction) -> Result<(), AccumulationError> {
@@ -282,7 +282,7 @@ impl<B: SkyBasis> NormalEngine for ExactEngine<B> {
     fn into_sums(mut self) -> B::Equations {
         self.flush();
         let counts = self.counts();
-        self.basis.into_equations(self.exact, counts)
+        self.basis.finish(self.exact, counts)
     }
 
     fn checkpoint(&mut self, out: &mut dyn Write) -> Result<(), AccumulationError> {

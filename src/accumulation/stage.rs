@@ -41,7 +41,7 @@ pub enum SnapshotSums {
 }
 
 impl SnapshotSums {
-    /// What is in the sums.
+    /// Number and weight of the visibilities in the sums.
     #[must_use]
     pub fn counts(&self) -> SumCounts {
         match self {
@@ -264,7 +264,7 @@ impl Accumulator {
         Ok(())
     }
 
-    /// The sums that `placed` belongs to, created with the first data; `None` if its positions tell no orbit.
+    /// The sums that `placed` belongs to, created with the first data; `None` if its positions determine no orbit.
     fn sums(&mut self, placed: &PlacedVisibilities) -> Result<Option<&mut ChannelSums>, AccumulationError> {
         let channel = placed.channel;
         let index = usize::from(channel.0);
@@ -338,7 +338,7 @@ impl Accumulator {
     }
 }
 
-/// An engine for the channel of `placed`, which is its first data; `None` if its positions tell no orbit.
+/// An engine for the channel of `placed`, which is its first data; `None` if its positions determine no orbit.
 fn engine(
     config: &MapConfig,
     instrument: &Instrument,

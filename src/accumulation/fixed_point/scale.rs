@@ -18,7 +18,7 @@ const SIGNAL_TO_NOISE_MAX: f64 = 16_384.0;
 /// Weights are counted in this part of the scale.
 const WEIGHT_STEPS: f64 = 18_446_744_073_709_551_616.0; // 2^64
 
-/// The greatest weight of a thermal visibility at a frequency in a channel of a width, (K sr)^-2, with room above it.
+/// Greatest weight of thermal visibilities in a channel, (K sr)^-2, with head room.
 ///
 /// `2 dnu dt / T_sys^2` of 25 s under the mean sky of Cane (1979, MNRAS 189, 465), times 1024. It depends on nothing
 /// in the data, so that engines of one channel always agree.

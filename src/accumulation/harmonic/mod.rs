@@ -135,7 +135,7 @@ impl SkyBasis for HarmonicBasis {
         self.sums(exact.values(&self.grids, self.quanta), counts)
     }
 
-    fn into_equations(&self, exact: ExactTori, counts: SumCounts) -> HarmonicSums {
+    fn finish(&self, exact: ExactTori, counts: SumCounts) -> HarmonicSums {
         self.sums(exact.into_values(&self.grids, self.quanta), counts)
     }
 

@@ -7,7 +7,7 @@ use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::response::harmonic::{GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry, degrees};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// What distinguishes one harmonic engine from another.
+/// Setup of a harmonic engine; only engines of equal setup can be merged.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HarmonicSetup {
     /// Greatest degree of the map.

@@ -239,7 +239,7 @@ fn parts(kernel: &[f32; LANES]) -> [u16; LANES] {
 }
 
 /// For each alpha the most that terms add to a sum, in quanta times the greatest power of two that values are multiples
-/// of: their values times their kernels, and half of what they are rounded to.
+/// of: their values times their kernels, and half of the step to which they are rounded.
 ///
 /// 32 bits hold it: 2^21 times 2^8 and an eighth, and 2^22 for each term of a group.
 #[inline(always)]

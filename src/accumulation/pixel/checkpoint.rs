@@ -8,7 +8,7 @@ use crate::accumulation::checkpoint::{FrameReader, FrameWriter, RESPONSES, numbe
 use crate::response::pixel::PixelMethod;
 use crate::sky::healpix::{is_valid_nside, pixel_count};
 
-/// Greatest nside that is believed.
+/// Greatest nside that is accepted.
 const NSIDE_MAX: u32 = 64;
 
 /// A setup of the pixel engine in a checkpoint.
@@ -23,7 +23,7 @@ pub struct PixelHead {
     weight_max: f64,
 }
 
-/// Numbers of variants on disk: never to be renumbered.
+/// Methods by their number in checkpoints: append only.
 const METHODS: [PixelMethod; 3] = [PixelMethod::Centre, PixelMethod::Average, PixelMethod::AverageExact];
 
 impl PixelHead {

@@ -42,7 +42,7 @@ const RIGHT_STEPS: f64 = 1024.0;
 /// The engine that sums over the pixels of a HEALPix map.
 pub type PixelEngine = ExactEngine<PixelBasis>;
 
-/// What distinguishes one pixel engine from another.
+/// Setup of a pixel engine; only engines of equal setup can be merged.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PixelSetup {
     /// HEALPix nside of the map.
@@ -231,7 +231,7 @@ impl SkyBasis for PixelBasis {
         exact.combine(other, direction);
     }
 
-    fn into_equations(&self, exact: ExactPixels, counts: SumCounts) -> PixelSums {
+    fn finish(&self, exact: ExactPixels, counts: SumCounts) -> PixelSums {
         let (unit, right_unit) = self.units();
         let values = |sums: Vec<i128>| sums.into_iter().map(|sum| sum as f64 * right_unit).collect();
         PixelSums {

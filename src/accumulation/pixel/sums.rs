@@ -14,7 +14,7 @@ pub struct PixelSums {
     pub right: Vec<f64>,
     /// BtN^-1n, K^-1.
     pub noise: Vec<f64>,
-    /// What is in them.
+    /// Number and weight of the visibilities in them.
     pub counts: SumCounts,
 }
 
