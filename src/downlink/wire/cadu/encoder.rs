@@ -2,7 +2,7 @@
 
 use super::framer::{Framer, PACKET_HEADER_BYTES};
 use super::reed_solomon::ReedSolomon;
-use super::{HOUSEKEEPING, IDLE, SCIENCE, SYNC_MARKER, SYNC_MARKER_BYTES, randomize};
+use super::{HOUSEKEEPING, IDLE, SCIENCE, SYNC_MARKER, randomize};
 use crate::downlink::wire::Kind;
 
 /// Packs packets into frames and encodes these as CADUs.
@@ -29,12 +29,6 @@ impl CaduEncoder {
             idle: framer(IDLE),
             in_pass: false,
         }
-    }
-
-    /// Octets of a CADU.
-    #[must_use]
-    pub fn cadu_bytes(&self) -> usize {
-        SYNC_MARKER_BYTES + self.code.block_bytes()
     }
 
     /// Appends the CADUs that complete packets fill. Ignores an incomplete packet at the end.
