@@ -180,8 +180,8 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
     })
 }
 
-/// Time that the chain of sample fidelity takes on this machine, s: before the first sample, and per second of mission
-/// time. Runs it for two and for six seconds of the first window.
+/// What the chain of samples takes on this machine, s: before the first sample, and for each second of mission time. Runs
+/// it for two and for six seconds of the first window.
 ///
 /// # Errors
 /// As [`bench`].
