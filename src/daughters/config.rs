@@ -1,70 +1,70 @@
-//! Configuration of sampling, of the daughters' instrumental errors and of their links.
+//! Configuration of sampling, of the daughters' faults and of their links to the mother.
 
 use serde::{Deserialize, Serialize};
 
 use crate::units::{Checks, InvalidValue};
 
-/// Number of bits that means "not quantised": samples stay floats.
+/// Bits that stand for samples that are not quantised.
 pub const FLOAT_BITS: u32 = 32;
 
-/// The `[daughters]` section; only sample fidelity uses it.
+/// The `[daughters]` section; used by sample fidelity alone.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DaughtersConfig {
-    /// Bits per real or imaginary part: 1, 2, 4, 8, or 32 for floats.
+    /// Bits of the real and of the imaginary part: 1, 2, 4, 8, or 32 for floats.
     pub bits: u32,
-    /// Time constant of the level control, s.
+    /// Time constant of the automatic level control, s.
     pub level_time_constant_s: f64,
-    /// Samples per block.
+    /// Samples in a block.
     pub block_samples: usize,
-    /// Maximum rate of one daughter's link to the mother, bit/s; 0 for no limit.
+    /// Greatest rate of the link from one daughter to the mother, bit/s; 0 for no limit.
     pub link_bits_per_s_max: f64,
-    /// Size of one daughter's transmit buffer, bytes.
+    /// Buffer of one daughter before its link, bytes.
     pub link_buffer_bytes: u64,
-    /// Which blocks a full buffer drops.
+    /// What is dropped when the buffer is full.
     pub link_drop: DropPolicy,
-    /// Instrumental errors and artificial signals; none by default.
+    /// Faults and artificial signals; none by default.
     pub disturbances: Disturbances,
 }
 
-/// Which blocks a full buffer drops.
+/// What a full buffer drops.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum DropPolicy {
-    /// The arriving block.
+    /// The newest block.
     #[default]
     Newest,
-    /// The blocks queued longest.
+    /// The oldest blocks.
     Oldest,
 }
 
-/// Instrumental errors and artificial signals. A list has one value per daughter; an empty list means no error.
+/// Faults and artificial signals. Lists have one value a daughter, or are empty for no such fault.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Disturbances {
-    /// Relative error of the amplitude gain: gain minus one.
+    /// Amplitude gain less one.
     pub gain_error: Vec<f64>,
-    /// Drift of the gain error since the epoch, 1/s.
+    /// Its drift, 1/s since the epoch.
     pub gain_drift_per_s: Vec<f64>,
-    /// Phase error, rad.
+    /// Phase, rad.
     pub phase_rad: Vec<f64>,
-    /// Drift of the phase error since the epoch, rad/s.
+    /// Its drift, rad/s since the epoch.
     pub phase_drift_rad_per_s: Vec<f64>,
-    /// Clock offset, s; a positive offset samples too late.
+    /// Clock offset, s; positive if samples are late.
     pub clock_offset_s: Vec<f64>,
-    /// Drift of the clock offset since the epoch, s/s.
+    /// Its drift, s/s since the epoch.
     pub clock_drift: Vec<f64>,
-    /// Power of the Earth's narrow-band interference at the limb, K sr; 0 for none.
+    /// Power of narrow-band leakage from the Earth at the limb, K sr; 0 for none.
     pub interference_k_sr: f64,
-    /// Frequency of the interference relative to the channel's centre, Hz.
+    /// Its frequency, Hz from the channel's centre.
     pub interference_offset_hz: f64,
-    /// Depth behind the limb over which the interference falls by a factor e, m.
+    /// Depth behind the limb over which its power falls by a factor e, m.
     pub interference_depth_m: f64,
-    /// Power of the calibration tone, K sr; equal and in phase at all daughters; 0 for none.
+    /// Power of the calibration tone, K sr, equal and in phase at all daughters; 0 for none.
     pub calibration_k_sr: f64,
-    /// Frequency of the tone relative to the channel's centre, Hz.
+    /// Its frequency, Hz from the channel's centre.
     pub calibration_offset_hz: f64,
-    /// Phase of the tone at the start of a window, rad.
+    /// Its phase at the start of a window, rad.
     pub calibration_phase_rad: f64,
 }
 
@@ -83,7 +83,8 @@ impl Default for DaughtersConfig {
 }
 
 impl DaughtersConfig {
-    /// All problems of the section for an array of `satellites` and channels of the given width; empty if it is valid.
+    /// Everything that is wrong with the section for an array of `satellites` and channels of a width; empty if it is
+    /// good.
     #[must_use]
     pub fn problems(&self, satellites: usize, channel_width_hz: f64) -> Vec<InvalidValue> {
         let mut checks = Checks::of("daughters");
@@ -109,12 +110,7 @@ impl DaughtersConfig {
             ("disturbances.clock_drift", &d.clock_drift),
         ] {
             let count = list.len();
-            checks.number(
-                key,
-                count as f64,
-                count == 0 || count == satellites,
-                "no value, or one per daughter",
-            );
+            checks.number(key, count as f64, count == 0 || count == satellites, "no value or one a daughter");
             for &value in list {
                 checks.number(key, value, true, "finite numbers");
             }
@@ -140,7 +136,7 @@ impl DaughtersConfig {
         checks.finish()
     }
 
-    /// Data rate of the samples of all daughters, bit/s: daughters x channels x width x 2 x bits.
+    /// Rate that the samples of all daughters need, bit/s: daughters x channels x width x 2 x bits.
     #[must_use]
     pub fn rate_bits_per_s(&self, satellites: usize, channels: usize, width_hz: f64) -> f64 {
         (satellites * channels) as f64 * width_hz * 2.0 * f64::from(self.bits)

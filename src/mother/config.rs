@@ -12,7 +12,7 @@ use crate::response::model::ModelChoice;
 use crate::units::constants::YEAR_S;
 use crate::units::{Checks, InvalidValue, PerChannel};
 
-/// Maximum number of channels, which is the mission's.
+/// Most channels: the mission's own number.
 pub const CHANNELS_MAX: usize = 30;
 
 /// Lowest and highest channel frequency, Hz: the mission's band.
@@ -21,15 +21,15 @@ pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 /// Size of one visibility in the store and on the link, bytes.
 pub const VISIBILITY_BYTES: u64 = 21;
 
-/// Narrowest channel in sample fidelity, Hz: one chunk of 2^14 samples lasts half a minute, in which the array moves by
-/// some degrees; the work for a chunk grows with the third power of its duration.
+/// Narrowest channel of samples, Hz. The 2^14 samples that are synthesised together then span half a minute, in which the
+/// array moves by some degrees; the cost of narrower channels grows with the third power of that time.
 const SAMPLES_WIDTH_HZ_MIN: f64 = 500.0;
 
-/// The `[spacecraft]` section: the space segment.
+/// The `[spacecraft]` section.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SpacecraftConfig {
-    /// What is simulated: integrated visibilities, or the samples behind them.
+    /// What is simulated: integrated visibilities, or samples that are correlated.
     pub fidelity: Fidelity,
     /// Centre frequencies, Hz.
     pub channels_hz: Vec<f64>,
@@ -37,25 +37,25 @@ pub struct SpacecraftConfig {
     pub channel_width_hz: f64,
     /// Length of the mission, s.
     pub duration_s: f64,
-    /// Observe only every n-th window.
+    /// Observe only in every n-th window.
     pub every_nth_window: u64,
-    /// Maximum observing time per window, from its start, s; 0 for the whole window.
+    /// Observe only for this time from the start of each window, s; 0 for all of it.
     pub window_s_max: f64,
-    /// Send down only every n-th integration of a window.
+    /// Send only every n-th integration of a window.
     pub every_nth_integration: PerChannel<u64>,
     /// Longest integration, s.
     pub integration_s_max: f64,
-    /// Maximum motion of a baseline during an integration, wavelengths.
+    /// Longest motion of a baseline in one integration, wavelengths.
     pub motion_wavelengths_max: f64,
     /// Longest baseline that is correlated, wavelengths; 0 for no limit.
     pub baseline_wavelengths_max: PerChannel<f64>,
-    /// Model that predicts visibilities.
+    /// Visibility model.
     pub model: ModelChoice,
-    /// Whether visibilities are averages over their integrations (motion along the orbit; harmonic model only) or
-    /// instantaneous values at their middle.
+    /// Whether visibilities are averages over their integrations (motion along the orbit; harmonic model only), or
+    /// values at their middle.
     pub smear_integrations: bool,
-    /// Whether visibilities are averages over the channel's width, as in sample fidelity: the integrand times
-    /// `sinc(pi n . r_ij dnu / c)`. The ground's rows of B are for the channel's centre.
+    /// Whether visibilities are averages over the width of their channel, as those of samples are: the integrand times
+    /// `sinc(pi n . r_ij dnu / c)`. The ground's rows of B are for the centre of the channel.
     pub smear_bandwidth: bool,
     /// Whether thermal noise is added. Weights describe the noise in either case.
     pub thermal_noise: bool,
@@ -63,20 +63,19 @@ pub struct SpacecraftConfig {
     pub receiver_noise_k_sr: f64,
     /// Antenna response of the daughters.
     pub antenna: Antenna,
-    /// Number of sub-bands into which each channel of samples is divided before correlation: a power of two, 1 for none.
+    /// Sub-bands into which each channel of samples is divided before correlation: a power of two, 1 for none.
     pub sub_bands: usize,
-    /// Ecliptic longitude and latitude, deg, of the delay centre towards which samples are delayed before correlation;
-    /// empty for no delays.
+    /// Delay centre of samples: ecliptic longitude and latitude, deg; empty for no delays.
     pub delay_centre_deg: Vec<f64>,
-    /// Integration time of the auto-correlations, s, rounded to whole blocks; 0 for none.
+    /// Integration time of auto-correlations, s, in whole blocks of samples; 0 for no auto-correlations.
     pub auto_integration_s: f64,
-    /// Whether auto-correlations are sent with fidelity "visibilities" too; sample fidelity always sends them.
+    /// Whether auto-correlations are simulated with fidelity "visibilities", too; with samples they always are.
     pub auto_powers: bool,
-    /// Number of blocks that the mother receives beyond a missing one before it gives it up.
+    /// Blocks that the correlator reads ahead while one is missing.
     pub wait_blocks: u64,
     /// Capacity of the onboard store, bytes.
     pub store_bytes_max: u64,
-    /// Which visibilities a full store drops.
+    /// What a full store drops.
     pub store_drop: StoreDrop,
     /// Mission epoch: TAI seconds since 1958-01-01.
     pub epoch_tai_s: f64,
@@ -84,7 +83,7 @@ pub struct SpacecraftConfig {
     pub ninth: NinthConfig,
 }
 
-/// Level of detail of the simulation; the downlink has the same form.
+/// Level of detail of the simulated spacecraft; the form of the downlink does not depend on it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Fidelity {
@@ -95,17 +94,17 @@ pub enum Fidelity {
     Samples,
 }
 
-/// Which visibilities a full store drops.
+/// What a full store drops.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum StoreDrop {
-    /// The latest ones, of all channels and pairs alike.
+    /// The newest data, of all channels and pairs alike.
     #[default]
     Newest,
-    /// The earliest ones, likewise.
+    /// The oldest data, of all channels and pairs alike.
     Oldest,
-    /// The ones that add least to the map per byte: blocks with the lowest weight per visibility, relative to the weight of
-    /// a second of their channel. Those are the long baselines, whose integrations are short.
+    /// The data that adds least to the map for each byte: blocks with the least weight of a visibility, relative to the
+    /// weight of a second of their channel. These are the long baselines, whose integrations are short.
     LowestValue,
 }
 
@@ -152,7 +151,7 @@ impl Default for SpacecraftConfig {
             sub_bands: 1,
             delay_centre_deg: Vec::new(),
             auto_integration_s: 1.0,
-            // One per second over years would outnumber the visibilities several times.
+            // One each second over years would be several times as many as the visibilities.
             auto_powers: false,
             wait_blocks: 16,
             store_bytes_max: 4 << 30,
@@ -164,7 +163,7 @@ impl Default for SpacecraftConfig {
     }
 }
 
-/// Integrations that are shorter than a dump of the correlator.
+/// Integrations that are shorter than the shortest sum of the correlator.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[error(
     "spacecraft.motion_wavelengths_max and spacecraft.integration_s_max give integrations of {shortest_s:.3e} s, shorter \
@@ -174,25 +173,25 @@ impl Default for SpacecraftConfig {
 pub struct IntegrationTooShort {
     /// The shortest integration, s.
     pub shortest_s: f64,
-    /// Length of a dump, s.
+    /// The shortest sum, s.
     pub dump_s: f64,
 }
 
 impl SpacecraftConfig {
-    /// The channels for the instrument description.
+    /// The channels, as the instrument description has them.
     #[must_use]
     pub fn channels(&self) -> Vec<Channel> {
         let width_hz = self.channel_width_hz;
         self.channels_hz.iter().map(|&frequency_hz| Channel { frequency_hz, width_hz }).collect()
     }
 
-    /// Integration time of the auto-correlations, s; 0 if there are none.
+    /// Integration time of auto-correlations, s; 0 if there are none.
     #[must_use]
     pub fn autos_s(&self) -> f64 {
         if self.auto_powers || self.fidelity == Fidelity::Samples { self.auto_integration_s } else { 0.0 }
     }
 
-    /// One schedule per channel.
+    /// One schedule a channel.
     #[must_use]
     pub fn schedules(&self) -> Vec<Schedule> {
         let schedule = |(channel, &frequency_hz): (usize, &f64)| Schedule {
@@ -205,7 +204,7 @@ impl SpacecraftConfig {
         self.channels_hz.iter().enumerate().map(schedule).collect()
     }
 
-    /// Sample fidelity only: integrations of this array that are shorter than a dump of the correlator.
+    /// Integrations of samples in an array that are shorter than one sum of the correlator.
     #[must_use]
     pub fn dump_problem(&self, array: &Array) -> Option<IntegrationTooShort> {
         let schedules = self.schedules();
@@ -216,7 +215,7 @@ impl SpacecraftConfig {
         short.then_some(IntegrationTooShort { shortest_s, dump_s })
     }
 
-    /// The delay centre and the sub-bands of sample fidelity.
+    /// Delays and sub-bands of samples.
     #[must_use]
     pub fn division(&self) -> Division {
         let delay_centre = match self.delay_centre_deg[..] {
@@ -230,7 +229,7 @@ impl SpacecraftConfig {
         Division { sub_bands: self.sub_bands.max(1), delay_centre }
     }
 
-    /// Checks the channels, and the settings with a value per channel.
+    /// Checks channels, and lists by channel.
     fn check_channels(&self, checks: &mut Checks) {
         let channels = self.channels_hz.len();
         let count = format!("({channels} channels)");
@@ -278,7 +277,7 @@ impl SpacecraftConfig {
         }
     }
 
-    /// Checks the fidelity, and the model, delays and sub-bands that it allows.
+    /// Checks what is simulated and how, with delays and sub-bands.
     fn check_fidelity(&self, checks: &mut Checks) {
         let samples = self.fidelity == Fidelity::Samples;
         let direct = self.model != ModelChoice::Harmonic && !self.smear_integrations && !self.smear_bandwidth;
@@ -315,7 +314,7 @@ impl SpacecraftConfig {
         checks.require("thermal_noise", false, noisy, "true with fidelity = \"samples\": samples are noise");
     }
 
-    /// The rule for adaptive integration times.
+    /// The rule of the adaptive integration.
     #[must_use]
     pub fn rule(&self) -> IntegrationRule {
         IntegrationRule {
@@ -324,7 +323,7 @@ impl SpacecraftConfig {
         }
     }
 
-    /// All problems of the section; empty if it is valid.
+    /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("spacecraft");
@@ -345,7 +344,7 @@ impl SpacecraftConfig {
             "seconds, above 0 and at most 1e9",
         );
         let window = self.window_s_max;
-        checks.number("window_s_max", window, window >= 0.0, "seconds, or 0 for whole windows");
+        checks.number("window_s_max", window, window >= 0.0, "seconds, or 0 for all of a window");
         let width = self.channel_width_hz;
         checks.number("channel_width_hz", width, width > 0.0 && width <= 1e6, "above 0 Hz and at most 1 MHz");
         let moving = self.fidelity == Fidelity::Visibilities || width >= SAMPLES_WIDTH_HZ_MIN;
@@ -379,7 +378,7 @@ impl SpacecraftConfig {
             checks.number("baseline_wavelengths_max", limit, limit >= 0.0, "wavelengths, or 0 for no limit");
         }
         let epoch = self.epoch_tai_s;
-        // The time code holds four octets of whole seconds.
+        // Four octets of whole seconds are what the time code holds.
         checks.number("epoch_tai_s", epoch, (0.0..=3.0e9).contains(&epoch), "0 to 3e9 s");
     }
 }

@@ -4,15 +4,15 @@ use serde::{Deserialize, Serialize};
 
 use crate::units::{Checks, InvalidValue};
 
-/// The `[products]` section: what is written beside the final maps.
+/// The `[products]` section: products besides the final maps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ProductsConfig {
     /// Whether pictures are drawn.
     pub pictures: bool,
-    /// Whether every snapshot is also written as a FITS map.
+    /// Whether every snapshot is written as a FITS map, too.
     pub snapshot_maps: bool,
-    /// FWHM of the smoothed copy of the final map, which has four times its nside, degrees; 0 for none.
+    /// FWHM to which the final map, with split pixels, is smoothed, degrees; 0 for none.
     pub smooth_fwhm_deg: f64,
 }
 
@@ -23,7 +23,7 @@ impl Default for ProductsConfig {
 }
 
 impl ProductsConfig {
-    /// All problems of the section; empty if it is valid.
+    /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("products");
