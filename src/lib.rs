@@ -56,6 +56,8 @@ pub mod files;
 
 pub mod frames;
 
+pub mod runtime;
+
 pub mod sky;
 
 pub mod array;
@@ -77,8 +79,6 @@ pub mod ground;
 pub mod solve;
 
 pub mod products;
-
-pub mod runtime;
 
 pub mod pipeline;
 

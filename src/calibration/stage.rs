@@ -119,7 +119,7 @@ impl Calibrator {
     /// # Errors
     /// As [`Calibrator::accept`].
     pub fn calibrated(&mut self, block: VisibilityBlock) -> Result<PlacedVisibilities, CalibrationError> {
-        let ledger = std::mem::replace(&mut self.ledger, Ledger::new());
+        let ledger = std::mem::take(&mut self.ledger);
         let placed = self.place(block);
         self.ledger = ledger;
         Ok(placed?.unwrap_or_default())
@@ -130,7 +130,7 @@ impl Calibrator {
     /// # Errors
     /// As [`Calibrator::accept`].
     pub fn remove_autos(&mut self, block: VisibilityBlock) -> Result<u64, CalibrationError> {
-        let ledger = std::mem::replace(&mut self.ledger, Ledger::new());
+        let ledger = std::mem::take(&mut self.ledger);
         let placed = self.calibrate_autos(block);
         self.ledger = ledger;
         let (placed, autos) = (placed?, self.autos.as_mut());

@@ -68,7 +68,7 @@ impl JournalEntry {
 
 /// A packet of visibilities, and what became of them.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
-pub(super) struct VisibilityRecord {
+pub(super) struct JournalRecord {
     pub(super) entry: JournalEntry,
     /// Start of the window of the visibilities.
     pub(super) window: MissionTime,
@@ -117,7 +117,7 @@ pub(super) struct OtherRecord {
 /// Records of all packets that were applied, in the order of sending.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Journal {
-    pub(super) visibilities: BTreeMap<Sent, VisibilityRecord>,
+    pub(super) visibilities: BTreeMap<Sent, JournalRecord>,
     pub(super) others: BTreeMap<(Kind, Sent), OtherRecord>,
 }
 
@@ -154,7 +154,7 @@ impl Journal {
         let DeliveredPacket { header, check, reading } = *packet;
         let entry = JournalEntry { count: header.count, made: header.time, ..draft.entry };
         let left_out = posts.left_out.iter().map(|(&reason, &count)| (reason, count as u32)).collect();
-        let record = VisibilityRecord {
+        let record = JournalRecord {
             entry,
             window: draft.window,
             check,
@@ -199,7 +199,7 @@ impl Encode for Journal {
 
 impl<Context> Decode<Context> for Journal {
     fn decode<D: Decoder<Context = Context>>(decoder: &mut D) -> Result<Self, DecodeError> {
-        let records = Vec::<VisibilityRecord>::decode(decoder)?;
+        let records = Vec::<JournalRecord>::decode(decoder)?;
         let visibilities = records.into_iter().map(|record| (record.entry.sent(), record)).collect();
         Ok(Self { visibilities, others: Decode::decode(decoder)? })
     }

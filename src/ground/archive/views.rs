@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::journal::{Journal, JournalEntry, Sent, Used, VisibilityRecord};
+use super::journal::{Journal, JournalEntry, JournalRecord, Sent, Used};
 use crate::calibration::{BlockKey, ReceivedBlocks};
 use crate::downlink::{Kind, ReceptionCounters};
 use crate::frames::VisibilityReason;
@@ -11,7 +11,7 @@ use crate::units::{ChannelId, MissionTime};
 
 impl Journal {
     /// Records of packets with visibilities.
-    fn with_visibilities(&self) -> impl Iterator<Item = &VisibilityRecord> {
+    fn with_visibilities(&self) -> impl Iterator<Item = &JournalRecord> {
         self.visibilities.values().filter(|record| record.entry.visibilities > 0)
     }
 
@@ -90,7 +90,7 @@ impl Journal {
 
     /// Whether the sums hold visibilities of pairs whose positions lie in a span of time.
     pub(super) fn uses(&self, [from, to]: [MissionTime; 2]) -> bool {
-        self.visibilities.values().any(|VisibilityRecord { entry, accumulated, .. }| {
+        self.visibilities.values().any(|JournalRecord { entry, accumulated, .. }| {
             *accumulated > 0 && entry.pair.i != entry.pair.j && entry.start <= to && entry.end >= from
         })
     }
