@@ -151,7 +151,25 @@ impl MapConfig {
     /// The settings that determine the sums, by key; the others determine only what is solved from them.
     #[must_use]
     pub fn of_sums(&self) -> Vec<(&'static str, String)> {
-        let Self { nside, engine, rows, baseline_bp_max, companion_seed, limits, weight_max, .. } = self;
+        // Every field is named: whoever adds a key decides here whether a state depends on it.
+        let Self {
+            nside,
+            engine,
+            rows,
+            baseline_bp_max,
+            companion_seed,
+            limits,
+            weight_max,
+            epsilon: _,
+            prior_k: _,
+            prior_files: _,
+            prior_fwhm_deg: _,
+            snapshot_every_s: _,
+            residual_max: _,
+            iterations_max: _,
+            trace_probes: _,
+            l_max: _, // As `degree`.
+        } = self;
         let mut settings = vec![
             ("map.nside", nside.to_string()),
             ("map.engine", format!("{engine:?}")),

@@ -51,7 +51,7 @@ pub trait SkyBasis: Sized + Send + Sync {
     /// Where a visibility of satellites at these positions belongs.
     ///
     /// # Errors
-    /// PairPositions that the basis does not cover.
+    /// Positions that the basis does not cover.
     fn place(&self, r_i_m: Vec3, r_j_m: Vec3) -> Result<Self::Place, Refusal>;
 
     /// Adds a batch to the sums, or removes it.

@@ -10,7 +10,7 @@ use crate::units::{Checks, InvalidValue};
 /// Most sub-bands of a channel.
 const SUB_BANDS_MAX: usize = 64;
 
-/// Bits of samples that are corrected, in words.
+/// Accepted values, for messages.
 const QUANTISER_BITS: &str = "0 for none, 1, 2 or 4";
 
 /// Choice of the calibration hook.
@@ -96,9 +96,13 @@ impl CalibrationConfig {
         if let Some(problem) = self.problems().into_iter().next() {
             return Err(problem.into());
         }
-        let calibration: Box<dyn Calibration> = match &self.gains_file {
-            Some(file) => Box::new(AntennaGains::read(&folder.join(file))?),
-            None => Box::new(Identity),
+        let calibration: Box<dyn Calibration> = match self.hook {
+            CalibrationHook::Identity => Box::new(Identity),
+            CalibrationHook::AntennaGains => {
+                // `problems` has required the file.
+                let file = self.gains_file.as_deref().unwrap_or(Path::new(""));
+                Box::new(AntennaGains::read(&folder.join(file))?)
+            }
         };
         Ok(match self.sub_bands {
             1 => calibration,

@@ -59,7 +59,7 @@ impl VanVleck {
         let mut total = 0.0;
         for k in 0..STEPS {
             let from = h * k as f64;
-            // Gauss's rule of three points: nothing is asked at the very end, where cos is 0.
+            // Gauss's rule of three points: the integrand is never evaluated at the end, where cos is 0.
             let at = |x: f64| slope(from + h * (0.5 + 0.5 * x));
             let root = 0.6_f64.sqrt();
             total += h * (5.0 * at(-root) + 8.0 * at(0.0) + 5.0 * at(root)) / 18.0;
@@ -97,7 +97,7 @@ impl VanVleck {
     /// the integration.
     pub fn apply(&self, block: &mut VisibilityBlock, width_hz: f64) {
         if block.pair.i == block.pair.j {
-            // A power knows no correlation: it is scaled as all powers are.
+            // Powers have no correlation coefficient; they are scaled by the power ratio.
             for (value, weight) in block.value_k_sr.iter_mut().zip(&mut block.weight) {
                 *value /= self.power_ratio as f32;
                 *weight *= self.power_ratio.powi(2) as f32;

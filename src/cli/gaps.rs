@@ -73,7 +73,7 @@ fn table(gaps: &Gaps, most: usize) -> String {
     for RestartReport { kind, apid, last } in &gaps.restarts {
         let _ = writeln!(
             text,
-            "{apid:#05x}: the spacecraft began to count anew after packet {last} of {kind}; losses there are unknown"
+            "{apid:#05x}: the spacecraft restarted its packet counts after packet {last} of {kind}; losses there are unknown"
         );
     }
     if gaps.gaps.is_empty() {

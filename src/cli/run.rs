@@ -16,7 +16,7 @@ use crate::pipeline::{INTEGRATE, Plan, run, use_threads};
 /// and pictures of map, input and error; and the downlink file and summary.json. Ctrl-C ends it early, with maps of the
 /// data so far.
 ///
-/// Example: lunarray run pipelines/reference.toml --set map.nside=16 --out out/coarse
+/// Example: lunarray run pipelines/quicklook.toml --set map.nside=8 --out out/coarse
 #[derive(Debug, Args)]
 pub(super) struct RunArgs {
     #[command(flatten)]

@@ -17,7 +17,7 @@ use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, use_threads};
 /// `lunarray replay` needs. An incomplete file has the extension .partial. Ctrl-C ends the simulation after the current
 /// window and leaves a valid file.
 ///
-/// Example: lunarray simulate pipelines/reference.toml --out sky.ccsds
+/// Example: lunarray simulate pipelines/quicklook.toml --out sky.ccsds
 #[derive(Debug, Args)]
 pub(super) struct SimulateArgs {
     #[command(flatten)]

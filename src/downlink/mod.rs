@@ -1,6 +1,6 @@
-//! The bytes between the spacecraft and the ground, in four rooms:
+//! The bytes between the spacecraft and the ground, in four modules:
 //!
-//! | room | holds | may use |
+//! | module | holds | may use |
 //! |---|---|---|
 //! | [`wire`] | the format: payloads, packets, coded frames, and their encoders | `frames`, `units` |
 //! | [`receive`] | bytes back to packets and ground frames, with counts of what is missing or damaged | `wire` |

@@ -62,7 +62,7 @@ impl CollectorState {
         Ok(())
     }
 
-    /// Whether a collector can have left it; a forged checkpoint may hold anything.
+    /// Whether the state is reachable by a collector; a forged checkpoint may hold anything.
     #[must_use]
     pub fn is_sound(&self) -> bool {
         self.held.is_sound()

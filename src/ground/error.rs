@@ -43,7 +43,7 @@ pub enum GroundError {
     /// There are checkpoints, and none can be used.
     #[error(
         "{}: none of its {checkpoints} checkpoints holds, the newest because of: {newest}; move the folder away to \
-         begin anew from the files",
+         start again from the files",
         path.display()
     )]
     NoneHolds {
@@ -72,7 +72,7 @@ pub enum GroundError {
     },
     /// Sums that disagree with the journal.
     #[error(
-        "the packet of visibilities with count {count}: {found} of its visibilities could be taken out of the sums; \
+        "the packet of visibilities with count {count}: {found} of its visibilities could be removed from the sums; \
          expected {expected}, as the journal says: nothing has been changed"
     )]
     NotInSums {

@@ -49,7 +49,7 @@ impl HeldPacket {
         Packet { offset: 0, header: *header, payload, check: *check, late: false }
     }
 
-    /// First and last instant of the visibilities in it; `None` if it does not tell.
+    /// First and last instant of the visibilities in it; `None` if its span is unknown.
     #[must_use]
     pub fn span(&self) -> Option<[MissionTime; 2]> {
         visibilities_span(&self.payload).filter(|_| self.header.kind == Kind::Visibilities)
@@ -98,7 +98,7 @@ impl HoldBuffer {
         *bytes = bytes.saturating_add(cost).saturating_sub(replaced.map_or(0, |packet| packet.cost()));
     }
 
-    /// Whether inserting packets can have made it; a forged checkpoint may hold anything.
+    /// Whether the state is reachable by inserting packets; a forged checkpoint may hold anything.
     pub(super) fn is_sound(&self) -> bool {
         let is_packet =
             |packet: &HeldPacket| packet.header.count <= COUNT_MAX && packet.header.bytes <= PACKET_BYTES_MAX;
@@ -141,7 +141,7 @@ impl HoldBuffer {
         found
     }
 
-    /// Releases a packet of visibilities once the ephemeris covers its span, or if it does not tell its span.
+    /// Releases a packet of visibilities once the ephemeris covers its span, or if its span is unknown.
     pub fn release(
         &mut self,
         header: &PacketHeader,

@@ -106,7 +106,7 @@ pub fn run(
     let map = &plan.config.map;
     let truth = match map.engine {
         EngineKind::Harmonic => Truth::band_limited(&skies, map.nside, map.degree())?,
-        _ => Truth::new(&skies, map.nside)?,
+        EngineKind::Pixel => Truth::new(&skies, map.nside)?,
     };
     drop(skies);
     let solving = SolveWatch::new(cancel.clone());

@@ -97,7 +97,7 @@ pub(super) struct Queue<T> {
     sender: Sender<Stamped<T>>,
     halt: Arc<Halt>,
     counters: Arc<Counters>,
-    /// Birth of what is pushed; `None` in a source, where items are born as they are pushed.
+    /// Source timestamp of pushed items; `None` in a source, which stamps them as it pushes.
     born: Option<Instant>,
     waited: Duration,
     closed: bool,
@@ -136,7 +136,7 @@ impl<T> Queue<T> {
 }
 
 impl<T> Drop for Queue<T> {
-    /// A panic on the way out must not look like a clean end to the next stage.
+    /// A panic while unwinding must not look like a clean end to the next stage.
     fn drop(&mut self) {
         if std::thread::panicking() {
             self.halt.set();

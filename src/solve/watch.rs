@@ -19,7 +19,7 @@ pub struct Solving {
     pub target: f64,
 }
 
-/// Shared between a solver, whoever shows its progress, and whoever may interrupt it.
+/// Shared between a solver, the progress display and the interrupt handler.
 #[derive(Clone, Debug, Default)]
 pub struct SolveWatch {
     cancel: Cancel,

@@ -31,7 +31,7 @@ fn a_damaged_checkpoint_is_told_and_the_one_before_used() {
             let said = String::from_utf8(output.stderr).unwrap();
             assert!(output.status.success(), "{engine}, byte {at}: {said}");
             let name = path.file_name().unwrap().to_str().unwrap();
-            let told = said.contains(name) && said.contains("going on from the one before");
+            let told = said.contains(name) && said.contains("resuming from the previous checkpoint");
             assert!(told, "{engine}, byte {at}: {said}");
             assert!(place.bytes("state") == good, "{engine}, byte {at}");
         }
@@ -66,7 +66,10 @@ fn looking_at_a_damaged_state_says_so_and_changes_nothing() {
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(output.status.success(), "{said}");
         let name = newest.file_name().unwrap().to_str().unwrap();
-        assert!(said.contains(name) && said.contains("going on from the one before"), "{args:?}: {said}");
+        assert!(
+            said.contains(name) && said.contains("resuming from the previous checkpoint"),
+            "{args:?}: {said}"
+        );
         assert_eq!(std::fs::read(&newest).unwrap(), b"nothing", "{args:?}");
         if args[0] == "merge" {
             let said = String::from_utf8(output.stdout).unwrap();

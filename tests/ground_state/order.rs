@@ -154,7 +154,7 @@ fn passes_of_both_sides_of_a_restart_may_come_in_any_order() {
         assert!(place.maps("plain") == place.maps("order 0"), "{order:?}");
         let (contents, gaps) = (succeed(&["inspect", &file]), succeed(&["gaps", &place.path(&name)]));
         for text in [&plain, &contents, &gaps] {
-            assert!(text.contains("began to count anew"), "{text}");
+            assert!(text.contains("restarted its packet counts"), "{text}");
         }
         let inspected = json(&["inspect", &file]);
         assert_eq!(inspected["reception"]["visibilities"]["duplicates"], 0, "{order:?}");

@@ -14,7 +14,7 @@
 //!
 //! Summing a visibility costs some thousand multiply-adds, whatever the map's size, and the size of the sums does not
 //! grow with the data. With M the power of four not below `weight_max`, weights are rounded to `2^-30 M` and data to
-//! `2^-19 sqrt(M)`, those above 2^21 of these to 21 bits (see the module `exact`); there is room for a total weight of
+//! `2^-24 sqrt(M)`, those above 2^21 of these to 21 bits (see the module `exact`); there is room for a total weight of
 //! `2^32 M`.
 
 mod blocks;

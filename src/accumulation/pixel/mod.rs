@@ -68,7 +68,7 @@ pub struct PixelBasis {
     rows: RowMaker,
 }
 
-/// PairPositions of a visibility's satellites.
+/// Positions of the two satellites of a visibility.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PairPositions {
     r_i_m: Vec3,

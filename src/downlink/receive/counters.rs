@@ -244,7 +244,7 @@ impl ReceptionCounters {
         let times: Vec<String> = kinds.map(|kind| format!("{kind} {}", self.kind(kind).restarts)).collect();
         (!times.is_empty()).then(|| {
             format!(
-                "the spacecraft began to count anew (times: {}): losses just before a restart cannot be known",
+                "the spacecraft restarted its packet counts (times: {}): losses just before a restart cannot be known",
                 times.join(", ")
             )
         })

@@ -42,7 +42,7 @@ pub(super) struct ArchiveHead {
     pub(super) journal: Journal,
 }
 
-/// A [`ArchiveHead`] to be written: field by field the same, without copies of what is large.
+/// An [`ArchiveHead`] borrowed for writing: the same fields, without copies of the large ones.
 #[derive(Encode)]
 pub(super) struct ArchiveHeadView<'a> {
     pub(super) settings: &'a Vec<(String, String)>,
@@ -82,7 +82,7 @@ pub(super) fn write(
     let damaged = |found: String| GroundError::Damaged {
         path: path.to_owned(),
         found,
-        expected: "a state that can be written",
+        expected: "a serialisable state",
     };
     let config = bincode::config::standard();
     let mut size = SizeWriter::default();
@@ -122,7 +122,7 @@ pub(super) fn read<T>(
 
 /// Reads a checkpoint from anything; messages call it `path`.
 ///
-/// The checksum is compared before anything is believed.
+/// The checksum is verified before anything is decoded.
 pub(super) fn read_from<T>(
     from: &mut (impl Read + Seek),
     path: &Path,
@@ -141,7 +141,7 @@ pub(super) fn read_from<T>(
     }
     let length = length.first_chunk().map_or(0, |length| u64::from_le_bytes(*length));
     if length > bytes - FIXED_BYTES {
-        return Err(damaged(format!("a head of {length} bytes"), "one that the file has room for"));
+        return Err(damaged(format!("a head of {length} bytes"), "a head that fits in the file"));
     }
     let mut head = vec![0; length as usize];
     from.read_exact(&mut head).map_err(failed())?;
@@ -160,8 +160,8 @@ pub(super) fn read_from<T>(
     }
 }
 
-/// A head, and the bytes of it. Lengths that a forger claims are held against a limit, before memory is reserved, that
-/// follows from the bytes that are there: the least of some that the decoder knows, at most four times as much.
+/// A head and its length in bytes. Claimed lengths are limited by the bytes present before memory is reserved: the
+/// decoder's limit is the smallest of its fixed ones that covers them, at most four times as much.
 fn decode(bytes: &[u8]) -> Result<(ArchiveHead, usize), DecodeError> {
     let most = bytes.len().saturating_mul(MEMORY_A_BYTE);
     match usize::BITS - most.leading_zeros() {

@@ -99,7 +99,7 @@ impl StateFolder {
 
 /// A note on a checkpoint that cannot be used when an older one is.
 pub(super) fn note(error: &GroundError, used: &Path) -> String {
-    format!("{error}; going on from the one before, {}", used.display())
+    format!("{error}; resuming from the previous checkpoint, {}", used.display())
 }
 
 /// The checkpoints in a folder, oldest first.

@@ -10,7 +10,8 @@ use super::packet_order::{PacketStreams, SendingOrder, Stream};
 use crate::downlink::{CucTime, Era, Kind, ReceivedSet};
 use crate::units::MissionTime;
 
-/// Packets of the same channel and pair on either side of one that tell what the map would take of it.
+/// Packets of the same channel and pair, before and after a missing one, from which its accumulated fraction is
+/// estimated.
 const NEAR: u64 = 4;
 
 /// What has been received, as input to [`find_gaps`].
@@ -129,7 +130,7 @@ pub struct Gaps {
 /// Finds what is missing between the packets received.
 ///
 /// Every pass sends channel after channel and pair after pair, each in as many packets as it takes. The order and the
-/// usual number of packets are learnt from what was received. A gap is filled in that order, starting from the packet
+/// usual number of packets are inferred from what was received. A gap is filled in that order, starting from the packet
 /// before it, with packets like those that the same channel and pair sent about that time. Missing positions are worth
 /// the visibilities that wait between the positions on either side. What was sent after the last packet received is not
 /// known to be missing.

@@ -10,7 +10,7 @@
 //! Every packet is applied once. The description of the instrument comes first; until it arrives, everything is held.
 //! Positions and the spacecraft's reports are applied at once. Visibilities are applied as soon as positions are known
 //! over their whole span; gaps hold nothing back. Beyond `wait_bytes` of held visibilities, those that were sent first
-//! are applied and flagged for want of positions, for good.
+//! are applied, and permanently flagged as without positions.
 //!
 //! Unless that happens, sums and journal are a function of the set of packets received, bit for bit, not of their order.
 //! Snapshots are not part of an archive. Blocks that the spacecraft sent twice, in different packets, are an exception:

@@ -69,7 +69,7 @@ impl PacketStreams {
     }
 }
 
-/// The order of packets in an era, learnt from those received.
+/// The order of packets in an era, inferred from those received.
 pub(super) struct SendingOrder {
     /// By count.
     entries: Vec<JournalEntry>,
@@ -188,7 +188,7 @@ impl SendingOrder {
     }
 }
 
-/// Whether a packet goes on with the channel and pair of the one before it, in the same pass.
+/// Whether a packet continues the channel and pair of the one before it, in the same pass.
 fn same_pass(before: &JournalEntry, entry: &JournalEntry) -> bool {
     // A pass is over when another channel or pair has been in between: then time has gone back, or far ahead.
     let length_s = (before.end.seconds() - before.start.seconds()).max(1.0);

@@ -52,7 +52,7 @@ pub struct Retracted {
 type RecordKey = (Kind, Sent);
 
 /// A retraction under way. Records are removed and their visibilities subtracted; the views of the journal are folded
-/// again by whoever opens the checkpoint.
+/// again when the checkpoint is next opened.
 struct Retraction {
     ground: Ground,
     journal: Journal,
@@ -216,8 +216,7 @@ impl Retraction {
         }
     }
 
-    /// Starts of the positions that no packets but those found have brought, and by which visibilities that stay were
-    /// placed.
+    /// Starts of the positions that came only from the packets found, and by which visibilities that stay were placed.
     fn segments_needed(&self) -> BTreeSet<MissionTime> {
         let starts = |is_found: bool| -> BTreeSet<MissionTime> {
             let records = self.journal.others.iter();

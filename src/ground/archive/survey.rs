@@ -173,7 +173,7 @@ impl CoverageSurvey {
         find_gaps(&self.received)
     }
 
-    /// The parts of a span of time, s, for which positions are known, but for their edges: there were observations. If
+    /// The parts of a span of time, s, in which the array observed: those covered by positions, without their edges. If
     /// there are none, all of it, at least a second.
     #[must_use]
     pub fn observed_s(&self, [a, b]: [f64; 2]) -> Vec<[f64; 2]> {
@@ -205,7 +205,7 @@ mod tests {
             });
         }
         // The second window, of which the first and third came but for their edges; the third, by its last stream and its
-        // own beginning; a part of one; and the fourth, of which nobody knows where it was.
+        // own beginning; a part of one; and the fourth, whose time is unknown.
         assert_eq!(survey.observed_s([2399.0, 18_001.0]), [[9000.0, 11_400.0]]);
         assert_eq!(survey.observed_s([20_400.0, 18_000.0]), [[18_000.0, 20_400.0]]);
         assert_eq!(survey.observed_s([18_100.0, 18_900.0]), [[18_100.0, 18_900.0]]);

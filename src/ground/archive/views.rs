@@ -20,7 +20,7 @@ impl Journal {
         self.with_visibilities().count()
     }
 
-    /// Packets with visibilities, each with the share of what was offered to the sums that they have taken.
+    /// Packets with visibilities, each with the fraction of its offered visibilities that was accumulated.
     pub(super) fn shares(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
         self.with_visibilities().map(|record| {
             let offered = (record.offered > 0).then_some(record.offered);

@@ -20,20 +20,6 @@
 //!
 //! which is greatest, `cos((i - i0)/2)`, where both differences vanish. The remaining error is a rotation by `i - i0`
 //! about the line of nodes. [`GeometryLimits`] bounds it and the altitude; pairs beyond the limits are refused.
-//!
-//! Pairs within the limits are approximated. Rms error over rms visibility, for a diffuse sky with a monopole
-//! (tests/harmonic_departures.rs):
-//!
-//! | u = b / wavelength | 0.1 deg, l <= 64 | l <= 191 | 5 km, l <= 64 | l <= 191 |
-//! |---|---|---|---|---|
-//! | 3 | 0.4 % | 0.4 % | 9 % | 10 % |
-//! | 10 | 0.8 % | 0.9 % | 13 % | 14 % |
-//! | 30 | 1.1 % | 3.1 % | 34 % | 39 % |
-//! | 120 | 0.9 % | 2.1 % | 57 % | 68 % |
-//!
-//! A tilt of 0.1 deg costs a few per cent. 5 km of altitude cost more: they move the Moon's limb by 0.23 deg, and long
-//! baselines see a sky without small scales at the limb only. The default limit of 150 m keeps errors below 2 % at all
-//! of these u.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -59,6 +45,20 @@ pub struct PairOrientation {
 }
 
 /// Greatest departures from the orbit that an engine accepts.
+///
+/// Pairs within the limits are approximated. Rms error over rms visibility, for a diffuse sky with a monopole
+/// (`tests/physics/departures.rs`):
+///
+/// | u = b / wavelength | 0.1 deg, l <= 64 | l <= 191 | 5 km, l <= 64 | l <= 191 |
+/// |---|---|---|---|---|
+/// | 3 | 0.4 % | 0.4 % | 9 % | 10 % |
+/// | 10 | 0.8 % | 0.9 % | 13 % | 14 % |
+/// | 30 | 1.1 % | 3.1 % | 34 % | 39 % |
+/// | 120 | 0.9 % | 2.1 % | 57 % | 68 % |
+///
+/// A tilt of 0.1 deg costs a few per cent. 5 km of altitude cost more: they move the Moon's limb by 0.23 deg, and long
+/// baselines see a sky without small scales at the limb only. The default limit of 150 m keeps errors below 2 % at all
+/// of these u.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GeometryLimits {

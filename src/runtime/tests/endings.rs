@@ -276,7 +276,7 @@ fn a_failure_wakes_a_chain_that_waits_for_its_source() {
     graph.sink("waiting", nothing, Into::new(|_: u64| Ok(())));
     let numbers = graph.source("count", 1, Count::to(u64::MAX));
     graph.sink("fail", numbers, Into::new(|n: u64| if n == 9 { Err(TestError(n)) } else { Ok(()) }));
-    let error = graph.run(&Cancel::new(), Duration::from_millis(300)).unwrap_err();
+    let error = graph.run(&Cancel::new(), Duration::from_secs(2)).unwrap_err();
     let RuntimeError::Failed { stage, laggards, .. } = &error else { panic!("{error:?}") };
     assert_eq!(stage, "fail");
     // Not `waiting`: it was woken although its source said nothing.
