@@ -233,7 +233,7 @@ fn a_run_without_a_map_fails_and_says_why() {
     // Weights above the limit: nothing is accumulated, and the ledger says so.
     let refused =
         fail(&[&none[..], &["--set", "map.weight_max=1e-30", "--set", "map.snapshot_every_s=0"]].concat());
-    assert!(refused.contains("no pair's visibility could be used"), "{refused}");
+    assert!(refused.contains("no visibility of a pair could be used"), "{refused}");
     assert!(refused.contains("weight above map.weight_max"), "{refused}");
 }
 
