@@ -73,7 +73,7 @@ fn looking_at_a_damaged_state_says_so_and_changes_nothing() {
         assert_eq!(std::fs::read(&newest).unwrap(), b"nothing", "{args:?}");
         if args[0] == "merge" {
             let said = String::from_utf8(output.stdout).unwrap();
-            assert!(said.starts_with("1 state with"), "{said}");
+            assert!(said.starts_with("Merged 1 state with"), "{said}");
         }
     }
     let twice = fail(&["merge", &state, &state, "--map", &place.pipeline, "--out", &place.path("twice")]);

@@ -163,7 +163,7 @@ fn places_that_cannot_be_are_told() {
     let ground =
         place.ground("remote", &["--listen", "tcp://0.0.0.0:0", "--allow-remote", "--idle-s", "0.2"]);
     let (status, said) = ground.end_without_summary();
-    assert!(!status.success() && said.contains("no pair's visibility could be used"), "{said}");
+    assert!(!status.success() && said.contains("no visibility of a pair could be used"), "{said}");
 }
 
 #[test]
