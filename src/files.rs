@@ -1,23 +1,40 @@
-//! Atomic files: complete under their name, or absent. Everything that writes files uses them.
+//! Atomic files: complete under their name, or absent, and written by one process at a time. Everything that writes files
+//! uses them.
 
-use std::fs::{self, File};
+use std::ffi::OsString;
+use std::fs::{self, File, Metadata, TryLockError};
+use std::hash::{BuildHasher, RandomState};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Bytes that are buffered before a write.
 const WRITE_BYTES: usize = 1 << 20;
+
+/// What unfinished files end with.
+const PARTIAL: &str = ".partial";
+
+/// Unfinished files of one name that are tried before the folder counts as unusable.
+const NAMES_TRIED: usize = 100;
+
+/// How often, and how many times, a writer looks again whether another that began at the same time has gone.
+const RIVAL_POLL: Duration = Duration::from_millis(20);
+const RIVAL_LOOKS: usize = 50;
 
 /// What happens to a file that is dropped before it is finished.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum IfUnfinished {
     /// It is removed.
     Remove,
-    /// It remains as `NAME.partial`.
+    /// It remains as `NAME.partial`, unless it is empty.
     Keep,
 }
 
-/// A file that is called `NAME.partial` until [`AtomicFile::finish`] has put all of it on disk. Then it takes its name
-/// and replaces an older file.
+/// A file that has another name until [`AtomicFile::finish`] has put all of it on disk. Then it takes its own name and
+/// replaces an older file.
+///
+/// The other name is new and cannot be foreseen, `.NAME.PROCESS-NUMBER.partial`, and the file is locked: a second writer
+/// of the same name is refused, and unfinished files that nobody writes any more are removed.
 #[derive(Debug)]
 pub struct AtomicFile {
     path: PathBuf,
@@ -33,7 +50,7 @@ impl AtomicFile {
     /// Creates the file, and its folder if necessary.
     ///
     /// # Errors
-    /// The system's error.
+    /// The system's error; [`io::ErrorKind::ResourceBusy`] if another process, or this one, is writing the file.
     pub fn create(path: &Path, unfinished: IfUnfinished) -> io::Result<Self> {
         if let Some(folder) = folder_of(path) {
             fs::create_dir_all(folder)?;
@@ -42,11 +59,28 @@ impl AtomicFile {
             let reason = "something is there that is not a regular file; expected a file or a new name";
             return Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
         }
-        let mut name = path.as_os_str().to_owned();
-        name.push(".partial");
-        let partial_path = PathBuf::from(name);
-        let file = Some(File::create(&partial_path)?);
-        Ok(Self { path: path.to_owned(), partial_path, file, unfinished, pending: Vec::new(), written: 0 })
+        let (partial_path, file) = create_partial(path)?;
+        let partial = Self {
+            path: path.to_owned(),
+            partial_path,
+            file: Some(file),
+            unfinished,
+            pending: Vec::new(),
+            written: 0,
+        };
+        // From here on an error removes what was created, as nothing is in it.
+        for _ in 0..RIVAL_LOOKS {
+            let Some(rival) = partial.rival() else { return Ok(partial) };
+            // Of two that began at the same time, the one with the lesser name stays.
+            if rival < partial.partial_path {
+                return Err(busy(&rival));
+            }
+            std::thread::sleep(RIVAL_POLL);
+        }
+        match partial.rival() {
+            None => Ok(partial),
+            Some(rival) => Err(busy(&rival)),
+        }
     }
 
     /// Bytes written so far.
@@ -70,6 +104,93 @@ impl AtomicFile {
         File::open(folder_of(&self.path).unwrap_or(Path::new(".")))?.sync_all()?;
         Ok(self.written)
     }
+
+    /// The first of the other unfinished files of this name that another writer holds; those that nobody holds are
+    /// removed.
+    fn rival(&self) -> Option<PathBuf> {
+        let name = self.path.file_name().map(|name| name.as_encoded_bytes());
+        let is_other = |path: &PathBuf| *path != self.partial_path && finished_name(path) == name;
+        let unfinished = unfinished_files(&self.path.with_file_name("")).into_iter().filter(is_other);
+        // A failed writer leaves the last one.
+        unfinished.chain([self.kept_path()]).filter_map(|path| remove_stale(&path)).min()
+    }
+
+    fn kept_path(&self) -> PathBuf {
+        let mut kept = self.path.clone().into_os_string();
+        kept.push(PARTIAL);
+        kept.into()
+    }
+}
+
+/// A new, locked file for the content of `path`, in its folder.
+fn create_partial(path: &Path) -> io::Result<(PathBuf, File)> {
+    let name = path.file_name().ok_or(io::ErrorKind::InvalidFilename)?;
+    for _ in 0..NAMES_TRIED {
+        let mut unique = OsString::from(".");
+        unique.push(name);
+        // Seeded by the system.
+        let number = RandomState::new().hash_one(());
+        unique.push(format!(".{}-{number:016x}{PARTIAL}", std::process::id()));
+        let unique = path.with_file_name(unique);
+        // O_CREAT | O_EXCL: fails if anything is there, and never follows a symbolic link.
+        let file = match File::options().write(true).create_new(true).open(&unique) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => continue,
+            other => other?,
+        };
+        match file.try_lock() {
+            // Another writer may have taken it for one that nobody holds, and removed it.
+            Ok(()) if is_at(&file, &unique) => return Ok((unique, file)),
+            Ok(()) | Err(TryLockError::WouldBlock) => {}
+            Err(TryLockError::Error(error)) => {
+                let _ = fs::remove_file(&unique);
+                return Err(error);
+            }
+        }
+    }
+    Err(io::ErrorKind::ResourceBusy.into())
+}
+
+fn busy(rival: &Path) -> io::Error {
+    let reason = format!("another process is writing it, as {}; expected one writer", rival.display());
+    io::Error::new(io::ErrorKind::ResourceBusy, reason)
+}
+
+/// Removes an unfinished file that nobody holds; returns its path if somebody does. Anything but a regular file stays.
+fn remove_stale(path: &Path) -> Option<PathBuf> {
+    if !fs::symlink_metadata(path).is_ok_and(|found| found.is_file()) {
+        return None;
+    }
+    let file = File::options().read(true).write(true).open(path).ok()?;
+    match file.try_lock() {
+        Ok(()) if is_at(&file, path) => {
+            // If it cannot be removed, it does no harm.
+            let _ = fs::remove_file(path);
+            None
+        }
+        Err(TryLockError::WouldBlock) => Some(path.to_owned()),
+        Ok(()) | Err(TryLockError::Error(_)) => None,
+    }
+}
+
+/// Paths of the files in a folder that have names of unfinished files; none if it cannot be read. An empty path is the
+/// working directory.
+fn unfinished_files(folder: &Path) -> Vec<PathBuf> {
+    let here = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    let names = fs::read_dir(here).into_iter().flatten().flatten().map(|entry| entry.file_name());
+    let unfinished = names.filter(|name| finished_name(Path::new(name)).is_some());
+    unfinished.map(|name| folder.join(name)).collect()
+}
+
+/// Name of the file that an unfinished file `.NAME.PROCESS-NUMBER.partial` was to become.
+fn finished_name(path: &Path) -> Option<&[u8]> {
+    let name = path.file_name()?.as_encoded_bytes();
+    let name = name.strip_prefix(b".")?.strip_suffix(PARTIAL.as_bytes())?;
+    let (name, number) = name.split_at_checked(name.len().checked_sub(17)?)?;
+    let (name, process) = name.split_at(name.iter().rposition(|byte| *byte == b'.')?);
+    let is_unique = number[0] == b'-'
+        && number[1..].iter().all(u8::is_ascii_hexdigit)
+        && process[1..].iter().all(u8::is_ascii_digit);
+    is_unique.then_some(name)
 }
 
 impl Write for AtomicFile {
@@ -97,11 +218,13 @@ impl Drop for AtomicFile {
             return;
         }
         // The error that stopped the writing matters; a leftover file does not.
-        match self.unfinished {
-            IfUnfinished::Remove => drop(fs::remove_file(&self.partial_path)),
-            // Everything written so far, not only full buffers.
-            IfUnfinished::Keep => drop(self.flush()),
+        if self.unfinished == IfUnfinished::Remove || self.bytes() == 0 {
+            let _ = fs::remove_file(&self.partial_path);
+            return;
         }
+        // Everything written so far, not only full buffers.
+        let _ = self.flush();
+        let _ = fs::rename(&self.partial_path, self.kept_path());
     }
 }
 
@@ -115,6 +238,87 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     file.finish().map(|_| ())
 }
 
+/// A folder that one process uses at a time: holds a lock on a file in it.
+///
+/// The system unlocks it however the process ends.
+#[derive(Debug)]
+pub struct FolderLock {
+    folder: PathBuf,
+    lock_path: PathBuf,
+    lock: File,
+    /// The folder as it was when it was locked.
+    locked: Metadata,
+    removes_lock: bool,
+}
+
+impl FolderLock {
+    /// Creates the folder if needed, and locks it by a file `name` in it. Removes unfinished files that nobody holds.
+    /// If `removes_lock`, the file goes when the lock is dropped.
+    ///
+    /// # Errors
+    /// The system's error; [`io::ErrorKind::ResourceBusy`] if another process, or this one, has locked the folder.
+    pub fn acquire(folder: &Path, name: &str, removes_lock: bool) -> io::Result<Self> {
+        fs::create_dir_all(folder)?;
+        let lock_path = folder.join(name);
+        let lock = loop {
+            let lock = File::options().create(true).append(true).open(&lock_path)?;
+            match lock.try_lock() {
+                // The one who had locked it may have removed it.
+                Ok(()) if is_at(&lock, &lock_path) => break lock,
+                Ok(()) => {}
+                Err(TryLockError::WouldBlock) => {
+                    let reason = "in use by another process; expected one at a time";
+                    return Err(io::Error::new(io::ErrorKind::ResourceBusy, reason));
+                }
+                Err(TryLockError::Error(error)) => return Err(error),
+            }
+        };
+        let locked = fs::metadata(folder)?;
+        for path in unfinished_files(folder) {
+            remove_stale(&path);
+        }
+        Ok(Self { folder: folder.to_owned(), lock_path, lock, locked, removes_lock })
+    }
+
+    /// What has become of the folder, if it is no longer the one that was locked: moved, replaced, or without its lock.
+    #[must_use]
+    pub fn lost(&self) -> Option<&'static str> {
+        match fs::metadata(&self.folder) {
+            Err(_) => Some("is gone: it was moved or removed"),
+            Ok(found) if !is_same(&found, &self.locked) => Some("is another one: it was moved and replaced"),
+            Ok(_) if !is_at(&self.lock, &self.lock_path) => Some("has lost its lock: the file was removed"),
+            Ok(_) => None,
+        }
+    }
+}
+
+impl Drop for FolderLock {
+    fn drop(&mut self) {
+        if self.removes_lock && self.lost().is_none() {
+            let _ = fs::remove_file(&self.lock_path);
+        }
+    }
+}
+
+/// Whether `path` leads to an open file.
+pub fn is_at(file: &File, path: &Path) -> bool {
+    let found = file.metadata().and_then(|here| Ok((here, fs::metadata(path)?)));
+    found.is_ok_and(|(here, there)| is_same(&here, &there))
+}
+
+/// Whether both are of one file or folder.
+#[cfg(unix)]
+fn is_same(here: &Metadata, there: &Metadata) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    (here.dev(), here.ino()) == (there.dev(), there.ino())
+}
+
+/// Whether both are of one file or folder; unknown on this system.
+#[cfg(not(unix))]
+fn is_same(_: &Metadata, _: &Metadata) -> bool {
+    true
+}
+
 fn folder_of(path: &Path) -> Option<&Path> {
     path.parent().filter(|folder| !folder.as_os_str().is_empty())
 }
@@ -122,6 +326,14 @@ fn folder_of(path: &Path) -> Option<&Path> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn names(folder: &Path) -> Vec<String> {
+        let entries = fs::read_dir(folder).unwrap();
+        let mut names: Vec<String> =
+            entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
 
     #[test]
     fn a_file_is_there_once_it_is_finished() {
@@ -150,5 +362,121 @@ mod tests {
             let left = fs::read(path.with_extension("partial")).ok();
             assert_eq!(left.map(|bytes| bytes.len()), remains.then_some(WRITE_BYTES + 8));
         }
+        // An empty file is nothing to keep.
+        drop(AtomicFile::create(&folder.path().join("empty"), IfUnfinished::Keep).unwrap());
+        assert_eq!(names(folder.path()), ["Keep.partial"]);
+    }
+
+    #[test]
+    fn a_second_writer_is_refused_and_leaves_the_first_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("file");
+        let mut first = AtomicFile::create(&path, IfUnfinished::Keep).unwrap();
+        first.write_all(b"first").unwrap();
+        for _ in 0..3 {
+            let refused = AtomicFile::create(&path, IfUnfinished::Keep).unwrap_err();
+            assert_eq!(refused.kind(), io::ErrorKind::ResourceBusy);
+            assert!(refused.to_string().contains("another process is writing it"), "{refused}");
+        }
+        assert_eq!(names(folder.path()).len(), 1);
+        // Of another name, in the same folder.
+        write_atomically(&folder.path().join("file2"), b"second").unwrap();
+        first.finish().unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"first");
+        write_atomically(&path, b"then").unwrap();
+        assert_eq!(names(folder.path()), ["file", "file2"]);
+    }
+
+    #[test]
+    fn of_writers_that_begin_together_one_writes() {
+        let folder = tempfile::tempdir().unwrap();
+        for round in 0..10 {
+            let path = folder.path().join(format!("file-{round}"));
+            let barrier = std::sync::Barrier::new(6);
+            let written: Vec<bool> = std::thread::scope(|scope| {
+                let writers: Vec<_> = (0..6)
+                    .map(|writer: u8| {
+                        let (path, barrier) = (&path, &barrier);
+                        scope.spawn(move || {
+                            barrier.wait();
+                            let file = AtomicFile::create(path, IfUnfinished::Remove);
+                            // Nobody gives up his place before all have asked.
+                            barrier.wait();
+                            let written = file.and_then(|mut file| {
+                                file.write_all(&[writer; 9])?;
+                                file.finish()
+                            });
+                            written.is_ok()
+                        })
+                    })
+                    .collect();
+                writers.into_iter().map(|writer| writer.join().unwrap()).collect()
+            });
+            assert_eq!(written.iter().filter(|written| **written).count(), 1, "{written:?}");
+        }
+        assert_eq!(names(folder.path()).len(), 10);
+    }
+
+    #[test]
+    fn leftovers_that_nobody_holds_are_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("file");
+        let leftovers = [".file.77-0123456789abcdef.partial", "file.partial"];
+        let others =
+            [".other.77-0123456789abcdef.partial", ".file.partial", "other.partial", ".file.x-1.partial"];
+        for name in leftovers.iter().chain(&others) {
+            fs::write(folder.path().join(name), "left").unwrap();
+        }
+        write_atomically(&path, b"new").unwrap();
+        let mut expected: Vec<&str> = others.iter().copied().chain(["file"]).collect();
+        expected.sort_unstable();
+        assert_eq!(names(folder.path()), expected);
+        // Whoever locks the folder removes all of its unfinished files.
+        drop(FolderLock::acquire(folder.path(), ".lock", true).unwrap());
+        expected.retain(|name| *name != others[0]);
+        assert_eq!(names(folder.path()), expected);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn planted_links_are_not_followed() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, victim) = (folder.path().join("file"), folder.path().join("victim"));
+        fs::write(&victim, "precious").unwrap();
+        for name in ["file.partial", ".file.1-0123456789abcdef.partial"] {
+            std::os::unix::fs::symlink(&victim, folder.path().join(name)).unwrap();
+        }
+        let mut file = AtomicFile::create(&path, IfUnfinished::Keep).unwrap();
+        file.write_all(b"mine").unwrap();
+        drop(file);
+        // It took the link's place.
+        assert_eq!(fs::read(folder.path().join("file.partial")).unwrap(), b"mine");
+        write_atomically(&path, b"whole").unwrap();
+        assert_eq!(fs::read(&victim).unwrap(), b"precious");
+        assert_eq!(fs::read(&path).unwrap(), b"whole");
+    }
+
+    #[test]
+    fn a_folder_has_one_user_who_notices_its_loss() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("folder");
+        let lock = FolderLock::acquire(&folder, ".lock", true).unwrap();
+        let refused = FolderLock::acquire(&folder, ".lock", true).unwrap_err();
+        assert_eq!(refused.kind(), io::ErrorKind::ResourceBusy);
+        assert_eq!(lock.lost(), None);
+        fs::remove_file(folder.join(".lock")).unwrap();
+        assert!(lock.lost().unwrap().contains("lost its lock"));
+        // The next one is not disturbed when the first lets go.
+        let next = FolderLock::acquire(&folder, ".lock", true).unwrap();
+        drop(lock);
+        assert_eq!(next.lost(), None);
+        fs::rename(&folder, place.path().join("elsewhere")).unwrap();
+        assert!(next.lost().unwrap().contains("moved or removed"));
+        fs::create_dir(&folder).unwrap();
+        assert!(next.lost().unwrap().contains("replaced"));
+        drop(next);
+        let last = FolderLock::acquire(&folder, ".lock", true).unwrap();
+        drop(last);
+        assert!(names(&folder).is_empty());
     }
 }

@@ -50,6 +50,9 @@
 //! Units are SI throughout and stand in names; temperatures are in K, visibilities in K sr.
 //! "The paper" is Deng et al., arXiv:2511.18494.
 
+// They panic when nobody reads any more; `cli/output.rs` has what does not.
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod units;
 
 pub mod files;

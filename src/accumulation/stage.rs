@@ -10,7 +10,7 @@ use super::{
     PixelSums, SumCounts, automatic_weight_max,
 };
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
-use crate::runtime::{Ledger, Outlet, Stage, Units};
+use crate::runtime::{Cancel, Ledger, Outlet, Stage, Units};
 use crate::units::ChannelId;
 use crate::units::vector::{norm, sub};
 
@@ -123,13 +123,28 @@ pub struct Accumulator {
     channels: Vec<Option<ChannelSums>>,
     next_snapshot_s: Option<f64>,
     accumulated: u64,
+    cancel: Cancel,
 }
 
 impl Accumulator {
     /// A stage that reports to `ledger`.
     #[must_use]
     pub fn new(config: MapConfig, ledger: Ledger<VisibilityReason>) -> Self {
-        Self { config, ledger, instrument: None, channels: Vec::new(), next_snapshot_s: None, accumulated: 0 }
+        Self {
+            config,
+            ledger,
+            instrument: None,
+            channels: Vec::new(),
+            next_snapshot_s: None,
+            accumulated: 0,
+            cancel: Cancel::new(),
+        }
+    }
+
+    /// Once `cancel` is triggered, only final sums are emitted.
+    #[must_use]
+    pub fn cancelled_by(self, cancel: &Cancel) -> Self {
+        Self { cancel: cancel.clone(), ..self }
     }
 
     /// Its state besides the engines and spans.
@@ -306,9 +321,12 @@ impl Accumulator {
     fn emit(&mut self, out: &mut Outlet<Snapshot>) {
         let Some(instrument) = &self.instrument else { return };
         for (index, slot) in self.channels.iter_mut().enumerate() {
+            if self.cancel.is_cancelled() {
+                return;
+            }
             let Some(channel) = slot.as_mut().filter(|channel| !channel.engine.is_empty()) else { continue };
             channel.snapshots += 1;
-            out.push(Snapshot {
+            let snapshot = Snapshot {
                 instrument: Arc::clone(instrument),
                 channel: ChannelId(index as u16),
                 number: channel.snapshots,
@@ -316,7 +334,8 @@ impl Accumulator {
                 span_s: channel.span_s,
                 nside: self.config.nside,
                 sums: channel.engine.sums(),
-            });
+            };
+            out.push_unless(snapshot, &self.cancel);
         }
     }
 
@@ -411,6 +430,9 @@ impl Stage for Accumulator {
     fn finish(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
         let Some(instrument) = self.instrument.take() else { return Ok(()) };
         for (index, slot) in self.channels.drain(..).enumerate() {
+            if out.is_closed() {
+                return Ok(());
+            }
             let Some(ChannelSums { engine, span_s, snapshots, .. }) =
                 slot.filter(|sums| !sums.engine.is_empty())
             else {

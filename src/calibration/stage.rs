@@ -165,6 +165,19 @@ impl Calibrator {
         }
     }
 
+    /// Counts visibilities that were received and that the next session will add.
+    pub fn leave_for_later(&mut self, block: &VisibilityBlock) {
+        let count = block.len() as u64;
+        let Some(key) = BlockKey::of(block) else { return };
+        if self.blocks.insert(key) {
+            self.blocks.count(block.start, count);
+            self.ledger.left_out(VisibilityReason::NextSession, count);
+        } else {
+            self.ledger.sampled(count);
+            self.ledger.left_out(VisibilityReason::Duplicate, count);
+        }
+    }
+
     /// Posts to the ledger what was sampled, and what was lost before it was received.
     pub fn close(&self) {
         self.blocks.close(&self.ledger);

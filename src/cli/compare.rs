@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
+use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::products::{draw_comparison, draw_relative_error};
 use crate::sky::fits::{ReadOptions, read_whole_map_file};
 use crate::sky::{Comparison, Frame, SkyMap, compare};
@@ -53,7 +53,7 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     if let (Some(map_hz), Some(truth_hz)) = (map_hz, truth_hz)
         && (map_hz - truth_hz).abs() > 1e-6 * truth_hz
     {
-        eprintln!("note: the map is at {map_hz} Hz, the truth at {truth_hz} Hz (FREQ)");
+        print_notes([format!("the map is at {map_hz} Hz, the truth at {truth_hz} Hz (FREQ)")]);
     }
     if let Some(l_max) = args.band_limit {
         truth = truth.band_limited(map.nside(), l_max)?;

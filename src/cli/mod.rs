@@ -1,4 +1,4 @@
-//! The command line: one file per command, plus what commands share (`arguments`, `output`, `progress`).
+//! The command line: one file per command, plus what commands share (`arguments`, `interrupt`, `output`, `progress`).
 //!
 //! A command parses its arguments, calls [`crate::pipeline`] (or another library function) and prints the result for
 //! people or, with `--json`, for programs. It holds no physics and no state of its own. May use every other folder.
@@ -11,6 +11,7 @@ mod corrupt;
 mod gaps;
 mod geometry;
 mod inspect;
+mod interrupt;
 mod merge;
 mod output;
 mod predict;
@@ -25,7 +26,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use output::{Completion, print_error};
+use output::{Completion, is_broken_pipe, print_error};
 
 /// Simulate a lunar-orbit radio interferometer, and map the sky from its downlink.
 ///
@@ -34,6 +35,9 @@ use output::{Completion, print_error};
 /// receives their downlink, and makes maps of the whole sky.
 ///
 /// Start with `lunarray run`: it needs no input file and writes maps to out/quicklook/.
+///
+/// Exit codes: 0 done; 1 failed; 2 wrong usage; 130 ended by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP, with what was
+/// received saved if there is a state. 0 also for `replay --listen` and `--follow` that SIGTERM ends.
 #[derive(Debug, Parser)]
 #[command(name = "lunarray", version, propagate_version = true, max_term_width = 100)]
 struct Cli {
@@ -61,8 +65,9 @@ enum Command {
 
 /// Runs the command on the process's command line and returns the exit code.
 ///
-/// 0: done. 1: failed, with the reason on standard error. 2: wrong usage. 130: interrupted by Ctrl-C, with valid
-/// products of the data so far.
+/// 0: done, also if the reader of standard output has gone. 1: failed, with the reason on standard error. 2: wrong usage.
+/// 128 and the number of the signal: ended early, by Ctrl-C with 130, by SIGTERM with 143, by SIGHUP with 129; a second
+/// signal ends the process at once with the same code. For a ground that listens or follows, SIGTERM is the regular end: 0.
 #[must_use]
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
@@ -83,16 +88,11 @@ pub fn main() -> ExitCode {
     };
     match result {
         Ok(Completion::Done) => ExitCode::SUCCESS,
-        Ok(Completion::Interrupted) => ExitCode::from(130),
+        Ok(Completion::Interrupted(code)) => ExitCode::from(code),
         Err(error) if is_broken_pipe(error.as_ref()) => ExitCode::SUCCESS,
         Err(error) => {
             print_error(error.as_ref());
             ExitCode::FAILURE
         }
     }
-}
-
-/// Whether the reader of our output has closed it, as `head` does: not a failure.
-fn is_broken_pipe(error: &(dyn std::error::Error + 'static)) -> bool {
-    error.downcast_ref::<std::io::Error>().is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
 }

@@ -14,15 +14,29 @@ pub(super) type CommandResult = Result<Completion, CommandError>;
 pub(super) enum Completion {
     /// It did all of its work.
     Done,
-    /// Ctrl-C ended it early; what it leaves is valid.
-    Interrupted,
+    /// A signal ended it early; what it leaves is valid. The code to exit with.
+    Interrupted(u8),
 }
 
 impl Completion {
-    /// `Interrupted` if the run was cancelled.
-    pub(super) fn of(cancelled: bool) -> Self {
-        if cancelled { Self::Interrupted } else { Self::Done }
+    /// Ends a command after it has `printed` its result. That nobody reads it is not a failure.
+    pub(super) fn after(self, printed: Result<(), CommandError>) -> CommandResult {
+        match printed {
+            Err(error) if !is_broken_pipe(error.as_ref()) => Err(error),
+            _ => Ok(self),
+        }
     }
+}
+
+/// Whether the reader of our output has closed it, as `head` does: not a failure.
+pub(super) fn is_broken_pipe(error: &(dyn std::error::Error + 'static)) -> bool {
+    error.downcast_ref::<std::io::Error>().is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
+}
+
+/// Prints a line to standard error. If that is not possible, there is nobody to tell.
+pub(super) fn say(line: impl std::fmt::Display) {
+    // In one piece, so that lines of several threads stay apart.
+    let _ = std::io::stderr().lock().write_all(format!("{line}\n").as_bytes());
 }
 
 /// Prints one JSON object on a line of its own.
@@ -47,7 +61,7 @@ pub(super) fn print_text(text: &str) -> Result<(), CommandError> {
 /// Prints notes to standard error.
 pub(super) fn print_notes<T: std::fmt::Display>(notes: impl IntoIterator<Item = T>) {
     for note in notes {
-        eprintln!("note: {note}");
+        say(format_args!("note: {note}"));
     }
 }
 
@@ -59,12 +73,12 @@ pub(super) fn print_config_notes(config: &Config) {
 /// Prints an error and its causes; causes that the message already quotes are left out.
 pub(super) fn print_error(error: &(dyn std::error::Error + 'static)) {
     let mut said = error.to_string();
-    eprintln!("error: {said}");
+    say(format_args!("error: {said}"));
     let mut cause = error.source();
     while let Some(error) = cause {
         let text = error.to_string();
         if !said.contains(&text) {
-            eprintln!("  because: {text}");
+            say(format_args!("  because: {text}"));
         }
         said = text;
         cause = error.source();

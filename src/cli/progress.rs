@@ -1,36 +1,26 @@
-//! Progress of long runs: a bar on a terminal, plain lines otherwise; and Ctrl-C.
+//! Progress of long runs: a bar on a terminal, plain lines otherwise.
 
 use std::io::IsTerminal;
-use std::sync::mpsc::{Sender, channel};
+use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::output::CommandError;
+use super::output::say;
 use crate::downlink::transport::socket::ListenStatus;
 use crate::pipeline::Watched;
 use crate::runtime::Cancel;
 use crate::solve::Solving;
 
-/// Refresh interval on a terminal.
+/// Refresh interval on a terminal, and of looking for an interrupt.
 const POLL: Duration = Duration::from_millis(200);
 /// Interval between lines without a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(10);
 
-/// A token that the first Ctrl-C (or SIGTERM) cancels; a second one ends the process immediately.
-pub(super) fn cancel_on_interrupt() -> Result<Cancel, CommandError> {
-    let cancel = Cancel::new();
-    let token = cancel.clone();
-    ctrlc::set_handler(move || {
-        if token.is_cancelled() {
-            std::process::exit(130);
-        }
-        eprintln!("\ninterrupted: finishing with the data so far (interrupt again to stop immediately)");
-        token.cancel();
-    })?;
-    Ok(cancel)
-}
+/// What is said when a run is interrupted.
+const INTERRUPTED: &str =
+    "\ninterrupted: finishing with the data so far (interrupt again to stop immediately)";
 
 /// Shows the progress of a running graph until dropped.
 pub(super) struct Progress {
@@ -39,14 +29,28 @@ pub(super) struct Progress {
 }
 
 impl Progress {
-    /// Starts to show the progress of `stage` through `total` items; 0 if the total is unknown.
-    pub(super) fn watch(watched: Watched, stage: &'static str, total: u64) -> Self {
+    /// Starts to show the progress of `stage` through `total` items, 0 if the total is unknown; and says when the run is
+    /// cancelled.
+    pub(super) fn watch(watched: Watched, stage: &'static str, total: u64, cancel: &Cancel) -> Self {
         let (stop, stopped) = channel();
+        let cancel = cancel.clone();
         let thread = std::thread::spawn(move || {
             let mut shown = ProgressView::new(total);
-            let wait = if shown.bar.is_some() { POLL } else { LINE_EVERY };
-            while stopped.recv_timeout(wait).is_err_and(|e| e == std::sync::mpsc::RecvTimeoutError::Timeout) {
-                shown.show(&watched, stage);
+            let every = if shown.bar.is_some() { POLL } else { LINE_EVERY };
+            let (mut last, mut is_told) = (Instant::now(), false);
+            loop {
+                let is_over = !matches!(stopped.recv_timeout(POLL), Err(RecvTimeoutError::Timeout));
+                if !is_told && cancel.is_cancelled() {
+                    say(INTERRUPTED);
+                    is_told = true;
+                }
+                if is_over {
+                    break;
+                }
+                if last.elapsed() >= every {
+                    shown.show(&watched, stage);
+                    last = Instant::now();
+                }
             }
             if let Some(bar) = shown.bar {
                 bar.finish_and_clear();
@@ -145,7 +149,7 @@ impl ProgressView {
                 let elapsed_s = self.since.elapsed().as_secs();
                 let of =
                     if self.total > 0 { format!(" {done}/{} windows,", self.total) } else { String::new() };
-                eprintln!("{elapsed_s:>5} s:{of} {message}");
+                say(format_args!("{elapsed_s:>5} s:{of} {message}"));
             }
         }
     }

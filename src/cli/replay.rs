@@ -6,15 +6,15 @@ use clap::{ArgGroup, Args};
 use crossbeam_channel::{Receiver, bounded};
 
 use super::arguments::not_negative_s;
-use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
-use super::progress::{Progress, cancel_on_interrupt};
+use super::interrupt::Interrupt;
+use super::output::{CommandError, CommandResult, print_json_line, print_notes, print_text, say};
+use super::progress::Progress;
 use crate::downlink::transport::socket::{SocketError, SocketSource, TcpUrl, Until};
 use crate::downlink::{FileSource, Pace, Paced, Steps};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::{
     Config, ConfigSource, GroundSource, PipelineError, READ, RunSummary, replay, use_threads,
 };
-use crate::runtime::Cancel;
 
 /// Capacity of the hold buffer when listening without a state, bytes.
 const WAIT_BYTES_LIVE: u64 = 1 << 20;
@@ -51,11 +51,11 @@ pub(super) struct ReplayArgs {
     /// Default 256 MiB, or 1 MiB when listening without a state; an existing state keeps its own.
     #[arg(long, value_name = "BYTES")]
     wait_bytes: Option<u64>,
-    /// Follow the last FILE as it grows, until Ctrl-C, which leaves maps of the data so far.
+    /// Follow the last FILE as it grows, until Ctrl-C or SIGTERM, which leaves maps of the data so far.
     #[arg(long, requires = "files")]
     follow: bool,
-    /// Receive the downlink from senders that connect to this address, instead of files, until Ctrl-C. Port 0 chooses
-    /// a free port; standard error prints `listening on tcp://HOST:PORT`.
+    /// Receive the downlink from senders that connect to this address, instead of files, until Ctrl-C or SIGTERM (exit
+    /// code 0). Port 0 chooses a free port; standard error prints `listening on tcp://HOST:PORT`.
     #[arg(long, value_name = "tcp://HOST:PORT", conflicts_with_all = ["files", "pace"])]
     listen: Option<TcpUrl>,
     /// Allow an address that other machines can reach. Anyone who connects can add data to the maps.
@@ -129,66 +129,82 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
         None => Ground::new(&settings)?,
     };
     print_notes(ground.notes());
+    let interrupt = Interrupt::default();
+    let session = Session { args, config: &config, interrupt: &interrupt };
     let summary = match &args.listen {
-        Some(url) => from_senders(args, url, &config, ground)?,
-        None => from_files(args, &config, ground)?,
+        Some(url) => session.from_senders(url, ground)?,
+        None => session.from_files(ground)?,
     };
-    if args.json {
-        print_json_line(&summary)?;
-    } else {
-        print_text(&format!("{summary}\nProducts are in {}", args.out.display()))?;
-    }
-    Ok(Completion::of(summary.cancelled))
-}
-
-fn from_senders(
-    args: &ReplayArgs,
-    url: &TcpUrl,
-    config: &Config,
-    ground: Ground,
-) -> Result<RunSummary, CommandError> {
-    let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
-    let until = Until { idle_s: args.idle_s, connections: args.connections };
-    let source = SocketSource::bind(&addresses, &config.downlink.listen, until)
-        .map_err(|error| match error {
-            SocketError::Listen { source, .. } => SocketError::Listen { url: url.clone(), source },
-            other => other,
-        })?
-        .knowing(ground.instrument().cloned())
-        .telling(Box::new(|note| eprintln!("note: {note}")));
-    let cancel = cancel_on_interrupt()?;
-    eprintln!("listening on {}", source.url());
-    Ok(watched(source, args, config, ground, &cancel)?)
-}
-
-fn from_files(args: &ReplayArgs, config: &Config, ground: Ground) -> Result<RunSummary, CommandError> {
-    let files = match args.follow {
-        true => FileSource::follow(&args.files, args.idle_s)?,
-        false => FileSource::open(&args.files)?,
-    };
-    let cancel = cancel_on_interrupt()?;
-    let pace = match (args.step, args.speed) {
-        (Some(StepLength(every_s)), _) => {
-            let tell = Box::new(|note: &str| eprintln!("{note}"));
-            Pace::Steps(Steps { every_s, go: lines_of_input(), tell })
+    let completion = match args.follow || args.listen.is_some() {
+        true => {
+            let is_saved = args.state.is_some() || summary.report.cut.is_empty();
+            interrupt.completion_of_service(summary.cancelled, is_saved)
         }
-        (None, Speed(Some(times))) => Pace::Speed(times),
-        (None, Speed(None)) => return Ok(watched(files, args, config, ground, &cancel)?),
+        false => interrupt.completion(summary.cancelled),
     };
-    Ok(watched(Paced::new(files, pace), args, config, ground, &cancel)?)
+    completion.after(if args.json {
+        print_json_line(&summary)
+    } else {
+        print_text(&format!("{summary}\nProducts are in {}", args.out.display()))
+    })
 }
 
-fn watched<S: GroundSource + 'static>(
-    source: S,
-    args: &ReplayArgs,
-    config: &Config,
-    ground: Ground,
-    cancel: &Cancel,
-) -> Result<RunSummary, PipelineError> {
-    let mut progress = None;
-    replay(source, config, ground, &args.out, cancel, &mut |watched| {
-        progress = Some(Progress::watch(watched, READ, 0));
-    })
+/// What a replay is to do, and what may end it.
+struct Session<'a> {
+    args: &'a ReplayArgs,
+    config: &'a Config,
+    interrupt: &'a Interrupt,
+}
+
+impl Session<'_> {
+    fn from_senders(&self, url: &TcpUrl, ground: Ground) -> Result<RunSummary, CommandError> {
+        let Self { args, config, .. } = self;
+        let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
+        let until = Until { idle_s: args.idle_s, connections: args.connections };
+        let source = SocketSource::bind(&addresses, &config.downlink.listen, until)
+            .map_err(|error| match error {
+                SocketError::Listen { source, .. } => SocketError::Listen { url: url.clone(), source },
+                other => other,
+            })?
+            .knowing(ground.instrument().cloned())
+            .telling(Box::new(|note| print_notes([note])));
+        let address = source.url();
+        Ok(self.watched(source, ground, &|| say(format_args!("listening on {address}")))?)
+    }
+
+    fn from_files(&self, ground: Ground) -> Result<RunSummary, CommandError> {
+        let args = self.args;
+        let files = match args.follow {
+            true => FileSource::follow(&args.files, args.idle_s)?,
+            false => FileSource::open(&args.files)?,
+        };
+        let pace = match (args.step, args.speed) {
+            (Some(StepLength(every_s)), _) => {
+                let tell = Box::new(|note: &str| say(note));
+                Pace::Steps(Steps { every_s, go: lines_of_input(), tell })
+            }
+            (None, Speed(Some(times))) => Pace::Speed(times),
+            (None, Speed(None)) => return Ok(self.watched(files, ground, &|| {})?),
+        };
+        Ok(self.watched(Paced::new(files, pace), ground, &|| {})?)
+    }
+
+    /// Runs the ground; `begun` is called once signals end it in order.
+    fn watched<S: GroundSource + 'static>(
+        &self,
+        source: S,
+        ground: Ground,
+        begun: &dyn Fn(),
+    ) -> Result<RunSummary, PipelineError> {
+        let Self { args, config, interrupt } = self;
+        let cancel = interrupt.cancel();
+        let mut progress = None;
+        replay(source, config, ground, &args.out, cancel, &mut |watched| {
+            interrupt.arm_or_note();
+            begun();
+            progress = Some(Progress::watch(watched, READ, 0, cancel));
+        })
+    }
 }
 
 /// A channel with one message for each line of standard input, until its end.

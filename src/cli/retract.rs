@@ -51,9 +51,9 @@ pub(super) fn execute(args: &RetractArgs) -> CommandResult {
     let config = config.ground(WAIT_BYTES);
     let (found, notes) = Ground::retract(&args.state, &args.files, span, &config)?;
     print_notes(notes.iter().map(String::as_str));
-    for refused in &found.named {
-        eprintln!("note: packet {} of {} was not removed: {}", refused.count, refused.kind, refused.reason);
-    }
+    print_notes(found.named.iter().map(|refused| {
+        format!("packet {} of {} was not removed: {}", refused.count, refused.kind, refused.reason)
+    }));
     if args.json {
         print_json_line(&found)?;
         return Ok(Completion::Done);

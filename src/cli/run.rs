@@ -5,8 +5,9 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::arguments::PipelineArgs;
-use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
-use super::progress::{Progress, cancel_on_interrupt};
+use super::interrupt::Interrupt;
+use super::output::{CommandResult, print_config_notes, print_json_line, print_text};
+use super::progress::Progress;
 use crate::pipeline::{INTEGRATE, Plan, run, use_threads};
 
 /// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
@@ -14,7 +15,7 @@ use crate::pipeline::{INTEGRATE, Plan, run, use_threads};
 /// Without a pipeline file it runs the embedded quicklook: three channels over one precession period of the orbit, in
 /// about a minute. Writes, for each channel, snapshots as data arrive, the final map and a noise-only map (HEALPix FITS),
 /// and pictures of map, input and error; and the downlink file and summary.json. Ctrl-C ends it early, with maps of the
-/// data so far.
+/// data so far: runtime.grace_s limits the time for them.
 ///
 /// Example: lunarray run pipelines/quicklook.toml --set map.nside=8 --out out/coarse
 #[derive(Debug, Args)]
@@ -35,17 +36,17 @@ pub(super) fn execute(args: &RunArgs) -> CommandResult {
     let plan = Plan::new(config)?;
     use_threads(&plan.config.runtime)?;
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
-    let cancel = cancel_on_interrupt()?;
+    let interrupt = Interrupt::default();
     let mut progress = None;
     let windows = plan.windows_watched();
-    let summary = run(&plan, &out, &cancel, &mut |metrics| {
-        progress = Some(Progress::watch(metrics, INTEGRATE, windows));
+    let summary = run(&plan, &out, interrupt.cancel(), &mut |metrics| {
+        interrupt.arm_or_note();
+        progress = Some(Progress::watch(metrics, INTEGRATE, windows, interrupt.cancel()));
     })?;
     drop(progress);
-    if args.json {
-        print_json_line(&summary)?;
+    interrupt.completion(summary.cancelled).after(if args.json {
+        print_json_line(&summary)
     } else {
-        print_text(&format!("{summary}\nProducts are in {}", out.display()))?;
-    }
-    Ok(Completion::of(summary.cancelled))
+        print_text(&format!("{summary}\nProducts are in {}", out.display()))
+    })
 }

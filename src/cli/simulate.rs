@@ -6,16 +6,17 @@ use std::sync::atomic::Ordering;
 use clap::Args;
 
 use super::arguments::{PipelineArgs, not_negative_s};
-use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
-use super::progress::{Progress, cancel_on_interrupt};
+use super::interrupt::Interrupt;
+use super::output::{CommandResult, print_config_notes, print_json_line, print_text};
+use super::progress::Progress;
 use crate::downlink::transport::socket::{SendOptions, SocketSink, TcpUrl};
 use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, use_threads};
 
 /// Simulate the space segment, and write its downlink to a file or send it to a listening ground segment.
 ///
 /// The downlink holds CCSDS space packets with the instrument description, the ephemeris and the visibilities: all that
-/// `lunarray replay` needs. An incomplete file has the extension .partial. Ctrl-C ends the simulation after the current
-/// window and leaves a valid file.
+/// `lunarray replay` needs. A file that a failure leaves incomplete has the extension .partial. Ctrl-C ends the simulation
+/// after the current window, or without it after runtime.grace_s, and leaves a valid file; none before the first window.
 ///
 /// Example: lunarray simulate pipelines/quicklook.toml --out sky.ccsds
 #[derive(Debug, Args)]
@@ -52,29 +53,37 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     print_config_notes(&config);
     let plan = Plan::new(config)?;
     use_threads(&plan.config.runtime)?;
-    let cancel = cancel_on_interrupt()?;
+    let interrupt = Interrupt::default();
+    let cancel = interrupt.cancel();
     let options = SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s };
-    let socket = args.send.as_ref().map(|url| SocketSink::new(url, options, &cancel)).transpose()?;
+    let socket = args.send.as_ref().map(|url| SocketSink::new(url, options, cancel)).transpose()?;
     let confirmed = socket.as_ref().map(SocketSink::confirmed);
     let mut progress = None;
     let windows = plan.windows_watched();
     let to = Destination { file: args.out.clone(), socket };
-    let report = simulate(&plan, to, &cancel, &mut |metrics| {
-        progress = Some(Progress::watch(metrics, INTEGRATE, windows));
+    let report = simulate(&plan, to, cancel, &mut |metrics| {
+        interrupt.arm_or_note();
+        progress = Some(Progress::watch(metrics, INTEGRATE, windows, cancel));
     })?;
     drop(progress);
-    let mut places: Vec<String> =
-        args.out.iter().map(|out| format!("Wrote the downlink to {}", out.display())).collect();
+    let is_written = report.stage("record").is_some_and(|record| record.units > 0);
+    let mut places: Vec<String> = args
+        .out
+        .iter()
+        .map(|out| match is_written {
+            true => format!("Wrote the downlink to {}", out.display()),
+            false => format!("There is nothing to write to {}", out.display()),
+        })
+        .collect();
     if let (Some(url), Some(confirmed)) = (&args.send, confirmed) {
         places.push(match confirmed.load(Ordering::Relaxed) {
             0 => format!("Sent the downlink to {url}, which confirmed no bytes"),
             bytes => format!("{url} confirmed all {bytes} bytes"),
         });
     }
-    if args.json {
-        print_json_line(&report)?;
+    interrupt.completion(report.cancelled).after(if args.json {
+        print_json_line(&report)
     } else {
-        print_text(&format!("{report}\n{}", places.join("\n")))?;
-    }
-    Ok(Completion::of(report.cancelled))
+        print_text(&format!("{report}\n{}", places.join("\n")))
+    })
 }

@@ -57,6 +57,8 @@ pub enum VisibilityReason {
     StoreFull,
     /// It was sent and did not arrive.
     NotReceived,
+    /// It arrived after the session was interrupted, which keeps it for the next one.
+    NextSession,
 }
 
 impl Reason for VisibilityReason {
@@ -90,6 +92,7 @@ impl Reason for VisibilityReason {
             Self::SumsFull => "refused by the engine: sums full at this map.weight_max",
             Self::StoreFull => "full",
             Self::NotReceived => "not received",
+            Self::NextSession => "left for the next session",
         }
     }
 
@@ -151,6 +154,6 @@ mod tests {
         assert_eq!(texts.len(), all.len());
         // Some of the places, so that none moves unseen.
         assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
-        assert_eq!((all.len(), all.last()), (24, Some(&VisibilityReason::NotReceived)));
+        assert_eq!((all.len(), all.last()), (25, Some(&VisibilityReason::NextSession)));
     }
 }

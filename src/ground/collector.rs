@@ -108,6 +108,8 @@ pub struct Collector {
     candidates: VecDeque<PacketHeader>,
     /// Whether positions have arrived since held visibilities were last considered.
     has_new_positions: bool,
+    /// Whether visibilities are held, as far as there is room, although their positions are known.
+    sets_aside: bool,
 }
 
 impl Collector {
@@ -122,6 +124,7 @@ impl Collector {
             link: Decoder::new(),
             candidates: VecDeque::new(),
             has_new_positions: false,
+            sets_aside: false,
         }
     }
 
@@ -147,6 +150,11 @@ impl Collector {
     #[must_use]
     pub fn view(&self) -> CollectorView<'_> {
         CollectorView { held: &self.held, decoder: self.decoder.state() }
+    }
+
+    /// From now on holds visibilities for the next session, as far as there is room.
+    pub fn set_aside(&mut self) {
+        self.sets_aside = true;
     }
 
     /// Appends the next bytes of the stream.
@@ -283,6 +291,8 @@ impl Collector {
         loop {
             while let Some(header) = self.candidates.pop_front() {
                 let found = match header.kind {
+                    // The next session considers all of them.
+                    Kind::Visibilities if self.sets_aside => None,
                     Kind::Visibilities => self.held.release(&header, placed).map(|packet| vec![packet]),
                     _ => self.held.take_payload(&header),
                 };
@@ -358,6 +368,7 @@ impl Collector {
         }
         // As nearly all are: never copied into the hold buffer.
         if header.kind == Kind::Visibilities
+            && !(self.sets_aside && self.held.has_room(&header))
             && self.decoder.instrument().is_some()
             && visibilities_span(packet.payload).is_none_or(placed)
         {

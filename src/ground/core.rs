@@ -1,13 +1,14 @@
 //! The ground as one stage: bytes of a downlink to sums.
 
 use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
 
 use super::archive::{Archive, RecordDraft};
 use super::{Collector, Delivery, GroundConfig, GroundError, GroundOutcome};
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::Calibrator;
 use crate::frames::{GroundFrame, Instrument, PlacedFrame};
-use crate::runtime::{Outlet, Stage, Units};
+use crate::runtime::{Cancel, Outlet, Stage, Units};
 
 /// Takes the bytes of a downlink and emits sums.
 ///
@@ -19,6 +20,10 @@ pub struct Ground {
     pub(super) accumulator: Accumulator,
     pub(super) outcome: GroundOutcome,
     pub(super) archive: Option<Archive>,
+    /// Ends the work early; see [`Ground::cancelled_by`].
+    pub(super) cancel: Cancel,
+    /// How long it goes on adding then, if there is no archive.
+    pub(super) linger: Duration,
 }
 
 impl Ground {
@@ -34,7 +39,18 @@ impl Ground {
             accumulator: config.accumulator(&outcome.ledger),
             outcome,
             archive: None,
+            cancel: Cancel::new(),
+            linger: Duration::ZERO,
         })
+    }
+
+    /// Once `cancel` is triggered, visibilities that arrive are no longer added to the sums, which takes time. With an
+    /// archive they are held for the next session, as far as the hold buffer has room. Without one they are added for
+    /// `linger` yet, and the rest counts as not received. Checkpoint and final sums follow as ever.
+    #[must_use]
+    pub fn cancelled_by(mut self, cancel: &Cancel, linger: Duration) -> Self {
+        self.accumulator = self.accumulator.cancelled_by(cancel);
+        Self { cancel: cancel.clone(), linger, ..self }
     }
 
     /// The instrument, once it is known.
@@ -52,6 +68,11 @@ impl Ground {
     /// Applies deliveries until more bytes are needed; writes checkpoints that are due.
     pub(super) fn advance(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         loop {
+            match self.archive {
+                Some(_) if self.cancel.is_cancelled() => self.collector.set_aside(),
+                None if self.cancel.elapsed().is_some_and(|elapsed| elapsed >= self.linger) => return Ok(()),
+                _ => {}
+            }
             let ephemeris = self.calibrator.ephemeris();
             let Some(delivery) = self.collector.next_delivery(&|span| ephemeris.covers(span))? else {
                 return Ok(());
@@ -112,7 +133,14 @@ impl Stage for Ground {
         // The checkpoint keeps held packets as they are; the final maps use them without their positions.
         self.checkpoint()?;
         while let Some(delivery) = self.collector.flush_next() {
-            self.apply(delivery, out)?;
+            match &delivery.frame {
+                Some(GroundFrame::Visibilities(block))
+                    if self.archive.is_some() && self.cancel.is_cancelled() =>
+                {
+                    self.calibrator.leave_for_later(block);
+                }
+                _ => self.apply(delivery, out)?,
+            }
         }
         self.calibrator.close();
         if let Some(archive) = &self.archive {

@@ -30,6 +30,18 @@ pub enum GroundError {
         /// The folder.
         path: PathBuf,
     },
+    /// The folder of a running archive is no longer the one that was locked.
+    #[error(
+        "{}: the folder of the state {what} while it was in use; expected it to stay: nothing was saved there. Its last \
+         checkpoint is where the folder went; replay what came after it",
+        path.display()
+    )]
+    FolderLost {
+        /// The folder.
+        path: PathBuf,
+        /// What has become of it.
+        what: &'static str,
+    },
     /// A damaged checkpoint.
     #[error("{}: found {found}; expected {expected}", path.display())]
     Damaged {

@@ -56,8 +56,12 @@ impl HeldPacket {
     }
 
     fn cost(&self) -> u64 {
-        (self.header.bytes as u64).saturating_add(OVERHEAD_BYTES)
+        cost(&self.header)
     }
+}
+
+fn cost(header: &PacketHeader) -> u64 {
+    (header.bytes as u64).saturating_add(OVERHEAD_BYTES)
 }
 
 /// Holds visibilities until their positions are known, and segments until their payload is complete, in bounded memory.
@@ -148,6 +152,12 @@ impl HoldBuffer {
         placed: &dyn Fn([MissionTime; 2]) -> bool,
     ) -> Option<HeldPacket> {
         if self.get(header)?.span().is_none_or(placed) { self.remove(header) } else { None }
+    }
+
+    /// Whether one more packet of visibilities stays within its capacity.
+    #[must_use]
+    pub fn has_room(&self, header: &PacketHeader) -> bool {
+        self.bytes.saturating_add(cost(header)) <= self.bytes_max
     }
 
     /// Whether it holds more visibilities than its capacity.

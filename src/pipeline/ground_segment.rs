@@ -11,6 +11,9 @@ use crate::runtime::{Graph, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::solve::{SolveWatch, Solver, SolverSetup, StoppingRule};
 
+/// Name of the stage that keeps the state.
+pub(super) const GROUND: &str = "ground";
+
 impl Config {
     /// Configuration of the ground, with a hold buffer of `wait_bytes`.
     #[must_use]
@@ -66,7 +69,7 @@ pub(super) fn add(
     let channels = Arc::clone(&outcome.channels);
     let publisher = Publisher::new(config.products.clone(), out, truth, provenance, channels)?;
     // Sums are large: one waits while another is solved.
-    let sums = graph.stage("ground", 1, bytes, ground);
+    let sums = graph.stage(GROUND, 1, bytes, ground);
     let maps = graph.stage("solve", 1, sums, Solver::new(setup));
     graph.sink("publish", maps, publisher);
     Ok(outcome)

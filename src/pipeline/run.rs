@@ -15,6 +15,7 @@ use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
+use crate::files::FolderLock;
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::products::{ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
@@ -74,6 +75,9 @@ pub type Watcher<'a> = &'a mut dyn FnMut(Watched);
 /// Name of the stage that reads the downlink.
 pub const READ: &str = "read";
 
+/// Name of the stage that writes the downlink file.
+const RECORD: &str = "record";
+
 /// Name of the downlink file that `run` leaves among its products.
 #[must_use]
 pub fn downlink_file(format: Format) -> &'static str {
@@ -93,24 +97,25 @@ pub fn run(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    make_folder(out)?;
+    let _lock = lock_folder(out)?;
+    let file = out.join(downlink_file(plan.config.downlink.format));
+    let recorder = Recorder::create(&file)?;
     let skies = space_segment::skies(plan)?;
     let mut graph = Graph::new();
     let counts = SampleCounts::default();
     let bytes = space_segment::add(&mut graph, plan, &skies, &counts)?;
-    let file = out.join(downlink_file(plan.config.downlink.format));
     let bytes = add_link(&mut graph, bytes, &plan.config, &file)?;
-    let recorder = Recorder::create(&file)?;
     let capacity = plan.config.runtime.queue_capacity;
-    let bytes = graph.stage("record", capacity, bytes, recorder);
+    let bytes = graph.stage(RECORD, capacity, bytes, recorder);
     let map = &plan.config.map;
     let truth = match map.engine {
         EngineKind::Harmonic => Truth::band_limited(&skies, map.nside, map.degree())?,
         EngineKind::Pixel => Truth::new(&skies, map.nside)?,
     };
     drop(skies);
-    let solving = SolveWatch::new(cancel.clone());
-    let ground = Ground::new(&plan.config.ground(WAIT_BYTES))?;
+    let grace = Grace::of(&plan.config.runtime);
+    let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
+    let ground = Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add);
     let mapping = Mapping { out, truth, watch: solving.clone() };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: None };
@@ -133,6 +138,7 @@ pub fn simulate(
     if plan.config.downlink.link.is_on() && file.is_none() {
         return Err(DownlinkError::from(SocketError::TruthNowhere).into());
     }
+    let recorder = file.as_deref().map(Recorder::create).transpose()?;
     let skies = space_segment::skies(plan)?;
     let mut graph = Graph::new();
     let counts = SampleCounts::default();
@@ -141,13 +147,12 @@ pub fn simulate(
     if let Some(file) = &file {
         bytes = add_link(&mut graph, bytes, &plan.config, file)?;
     }
-    let recorder = file.as_deref().map(Recorder::create).transpose()?;
     match (recorder, socket) {
         (Some(recorder), Some(socket)) => {
-            let bytes = graph.stage("record", plan.config.runtime.queue_capacity, bytes, recorder);
+            let bytes = graph.stage(RECORD, plan.config.runtime.queue_capacity, bytes, recorder);
             graph.sink("send", bytes, socket);
         }
-        (Some(recorder), None) => graph.sink("record", bytes, recorder),
+        (Some(recorder), None) => graph.sink(RECORD, bytes, recorder),
         (None, Some(socket)) => graph.sink("send", bytes, socket),
         // The graph says that its end is open.
         (None, None) => drop(bytes),
@@ -170,11 +175,13 @@ pub fn replay<S: GroundSource + 'static>(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    make_folder(out)?;
+    let _lock = lock_folder(out)?;
     let mut graph = Graph::new();
     let listening = source.listening();
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
-    let solving = SolveWatch::new(cancel.clone());
+    let grace = Grace::of(&config.runtime);
+    let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
+    let ground = ground.cancelled_by(cancel, grace.to_add);
     let mapping = Mapping { out, truth: Truth::unknown(), watch: solving.clone() };
     let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone() };
@@ -195,10 +202,25 @@ fn add_link(
     })
 }
 
-/// Creates the folder before anything is computed, so that an error shows at once.
-fn make_folder(out: &Path) -> Result<(), PipelineError> {
-    let made = std::fs::create_dir_all(out);
-    made.map_err(|source| ProductsError::Write { path: out.to_owned(), source }.into())
+/// Creates and locks the folder before anything is computed, so that an error shows at once.
+fn lock_folder(out: &Path) -> Result<FolderLock, PipelineError> {
+    let locked = FolderLock::acquire(out, ".lock", true);
+    locked.map_err(|source| ProductsError::Write { path: out.to_owned(), source }.into())
+}
+
+/// How the time after cancellation is divided.
+struct Grace {
+    /// For the sums, if they are not saved.
+    to_add: Duration,
+    /// Until iterations end; making maps of what they have found takes the rest.
+    to_iterate: Duration,
+}
+
+impl Grace {
+    fn of(config: &RuntimeConfig) -> Self {
+        let whole = Duration::from_secs_f64(config.grace_s);
+        Self { to_add: whole / 4, to_iterate: whole * 3 / 5 }
+    }
 }
 
 fn start(
@@ -210,6 +232,8 @@ fn start(
     if config.stall_s > 0.0 {
         graph.fail_after_stall(Duration::from_secs_f64(config.stall_s));
     }
+    // What these save is to be whole, however long it takes.
+    graph.cut_after(Duration::from_secs_f64(config.grace_s), &[RECORD, ground_segment::GROUND]);
     watch(watched);
     Ok(graph.run(cancel, Duration::from_secs_f64(config.shutdown_s))?)
 }

@@ -100,7 +100,9 @@ impl RunSummary {
             .map_err(|source| ProductsError::Write { path: path.clone(), source })?;
         let ours: BTreeSet<&str> =
             self.channels.iter().flat_map(|channel| &channel.files).map(String::as_str).collect();
-        for file in files_of(&before).iter().filter(|file| !ours.contains(file.as_str())) {
+        // A run that was cut short has not made all of its maps; those of the run before stay.
+        let is_whole = self.report.cut.is_empty();
+        for file in files_of(&before).iter().filter(|file| is_whole && !ours.contains(file.as_str())) {
             let file = folder.join(file);
             // A file may be gone already, and a folder may hold other files.
             let _ = std::fs::remove_file(&file);
@@ -146,7 +148,13 @@ impl fmt::Display for RunSummary {
         for channel in &self.channels {
             writeln!(f, "{channel}")?;
         }
-        if self.cancelled {
+        if !self.report.cut.is_empty() {
+            write!(
+                f,
+                "Ended early, and products are missing: runtime.grace_s left no time for {}.",
+                self.report.cut.join(" and ")
+            )?;
+        } else if self.cancelled {
             write!(f, "Ended early: all products hold the data so far.")?;
         }
         Ok(())

@@ -2,15 +2,20 @@
 
 use std::convert::Infallible;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Sender, bounded};
 
 /// Asks a run to end early: sources stop, all stages drain their queues, every `finish` runs.
 ///
-/// Clones share one state; safe to trigger from a signal handler's thread.
+/// Clones share one state; safe to trigger from a signal handler.
 #[derive(Clone, Debug, Default)]
-pub struct Cancel(Arc<AtomicBool>);
+pub struct Cancel {
+    flag: Arc<AtomicBool>,
+    /// When somebody first saw the flag: a signal handler must not read a clock.
+    seen: Arc<OnceLock<Instant>>,
+}
 
 impl Cancel {
     /// A token that has not been triggered.
@@ -21,23 +26,36 @@ impl Cancel {
 
     /// Triggers it; it cannot be reset.
     pub fn cancel(&self) {
-        self.0.store(true, Ordering::Release);
+        self.flag.store(true, Ordering::Release);
+    }
+
+    /// The flag itself; setting it cancels. For signal handlers.
+    #[must_use]
+    pub fn flag(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.flag)
     }
 
     /// Whether it was triggered.
     #[must_use]
     pub fn is_cancelled(&self) -> bool {
-        self.0.load(Ordering::Acquire)
+        self.flag.load(Ordering::Acquire)
+    }
+
+    /// Time since it was first seen to be triggered; `None` if it was not. A running graph looks often.
+    #[must_use]
+    pub fn elapsed(&self) -> Option<Duration> {
+        self.is_cancelled().then(|| self.seen.get_or_init(Instant::now).elapsed())
     }
 }
 
-/// Set by the first failure; wakes every thread that waits on a channel.
+/// Set by the first failure, or when a cancelled run is cut short; wakes every thread that waits on a channel.
 ///
 /// The flag is set before the failing thread drops its channels. So a thread that finds a channel closed reads from the
 /// flag whether the other end finished or failed.
 #[derive(Debug)]
 pub(super) struct Halt {
-    set: AtomicBool,
+    failed: AtomicBool,
+    cut: AtomicBool,
     stop: Receiver<Infallible>,
     /// Dropped to disconnect `stop`, which wakes all threads that select on it.
     hold: Mutex<Option<Sender<Infallible>>>,
@@ -46,16 +64,33 @@ pub(super) struct Halt {
 impl Halt {
     pub(super) fn new() -> Self {
         let (hold, stop) = bounded(0);
-        Self { set: AtomicBool::new(false), stop, hold: Mutex::new(Some(hold)) }
+        let (failed, cut) = (AtomicBool::new(false), AtomicBool::new(false));
+        Self { failed, cut, stop, hold: Mutex::new(Some(hold)) }
     }
 
-    pub(super) fn set(&self) {
-        self.set.store(true, Ordering::SeqCst);
+    /// Ends a run that failed: stages stop without `finish`.
+    pub(super) fn fail(&self) {
+        self.failed.store(true, Ordering::SeqCst);
+        self.wake();
+    }
+
+    /// Ends a cancelled run whose time is up: stages take what is in their queue and run `finish`; outputs are discarded.
+    pub(super) fn cut(&self) {
+        self.cut.store(true, Ordering::SeqCst);
+        self.wake();
+    }
+
+    fn wake(&self) {
         drop(self.hold.lock().unwrap_or_else(PoisonError::into_inner).take());
     }
 
+    pub(super) fn has_failed(&self) -> bool {
+        self.failed.load(Ordering::SeqCst)
+    }
+
+    /// Whether outputs are discarded, for either reason.
     pub(super) fn is_set(&self) -> bool {
-        self.set.load(Ordering::SeqCst)
+        self.has_failed() || self.cut.load(Ordering::SeqCst)
     }
 
     /// Never yields; disconnects when the run halts. For `select!`.

@@ -14,6 +14,9 @@ pub struct RuntimeConfig {
     pub threads: usize,
     /// Time that stages have to end after a failure, s.
     pub shutdown_s: f64,
+    /// Time for maps of the data so far after Ctrl-C, s; solutions that take longer are cut off. What was received is saved
+    /// first, and is not part of it.
+    pub grace_s: f64,
     /// Longest time without progress before the run fails, s; must exceed the longest step, for example that of a
     /// solution. 0 for no limit.
     pub stall_s: f64,
@@ -21,7 +24,7 @@ pub struct RuntimeConfig {
 
 impl Default for RuntimeConfig {
     fn default() -> Self {
-        Self { queue_capacity: 64, threads: 0, shutdown_s: 10.0, stall_s: 0.0 }
+        Self { queue_capacity: 64, threads: 0, shutdown_s: 10.0, grace_s: 2.5, stall_s: 0.0 }
     }
 }
 
@@ -45,6 +48,8 @@ impl RuntimeConfig {
         );
         let seconds = self.shutdown_s;
         checks.number("shutdown_s", seconds, (0.0..=3600.0).contains(&seconds), "0 s to 3600 s");
+        let grace = self.grace_s;
+        checks.number("grace_s", grace, (0.0..=1e6).contains(&grace), "0 s to 1e6 s");
         let stall = self.stall_s;
         checks.number(
             "stall_s",

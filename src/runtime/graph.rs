@@ -79,6 +79,8 @@ pub struct Graph {
     halt: Arc<Halt>,
     /// Longest time without progress before the run fails; `None` for no limit.
     stall: Option<Duration>,
+    /// How long a cancelled run waits for stages that are not kept; `None` for no limit.
+    grace: Option<Duration>,
     /// First mistake in the calls that built the graph.
     mistake: Option<RuntimeError>,
 }
@@ -98,6 +100,7 @@ impl Graph {
             metrics: Arc::default(),
             halt: Arc::new(Halt::new()),
             stall: None,
+            grace: None,
             mistake: None,
         }
     }
@@ -147,6 +150,18 @@ impl Graph {
         self.stall = Some(stall);
     }
 
+    /// Limits how long a cancelled run waits for its stages, but for those named in `kept`.
+    ///
+    /// When `grace` is over and the sources have handed over what they had, stages that wait take what is in their queue,
+    /// run `finish`, and end; their outputs are discarded. A stage that is in a long step then is left behind, as after a
+    /// failure: it keeps running, so the process should end. Kept stages, those that save data, may take longer.
+    pub fn cut_after(&mut self, grace: Duration, kept: &[&str]) {
+        self.grace = Some(grace);
+        for node in &mut self.nodes {
+            node.kept = kept.contains(&node.counters.name.as_str());
+        }
+    }
+
     /// Counters that may be read while the graph runs.
     #[must_use]
     pub fn metrics(&self) -> Arc<Metrics> {
@@ -155,7 +170,8 @@ impl Graph {
 
     /// Runs every stage on its own thread until all have ended.
     ///
-    /// After `cancel` the sources stop and the other stages drain, without a deadline. After a failure the stages have
+    /// After `cancel` the sources stop and the other stages drain, without a deadline unless [`Graph::cut_after`] has set
+    /// one. After a failure the stages have
     /// `deadline` to end; the error names those that do not, which keep running. A thread cannot be ended from outside, so
     /// the process should be.
     ///
@@ -168,7 +184,8 @@ impl Graph {
         if let Some(open) = self.nodes.iter().find(|node| !node.taken) {
             return Err(RuntimeError::OpenEnd { stage: open.counters.name.clone() });
         }
-        supervisor::run(self.nodes, &self.halt, cancel, Limits { deadline, stall: self.stall })
+        let limits = Limits { grace: self.grace, deadline, stall: self.stall };
+        supervisor::run(self.nodes, &self.halt, cancel, limits)
     }
 
     fn counters(&mut self, name: &str, queue: Option<usize>, unit: &'static str) -> Arc<Counters> {
@@ -200,7 +217,7 @@ impl Graph {
     }
 
     fn add(&mut self, counters: Arc<Counters>, worker: Box<dyn Worker>, taken: bool) {
-        self.nodes.push(StageNode { counters, worker, taken });
+        self.nodes.push(StageNode { counters, worker, taken, kept: false });
     }
 
     fn note(&mut self, mistake: RuntimeError) {

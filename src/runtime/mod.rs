@@ -7,7 +7,7 @@
 //!
 //! A run ends in one of two ways:
 //! - The source is done, or [`Cancel`] stops it. Every stage drains its queue, every `finish` runs, and the run returns a
-//!   [`Report`].
+//!   [`Report`]. A cancelled run may have a time limit, [`Graph::cut_after`].
 //! - A stage fails or panics. The supervisor keeps the first error with the name and position of the stage, and wakes all
 //!   other stages, which stop without `finish`. The error names the stages that do not end by the deadline.
 //!

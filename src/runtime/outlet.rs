@@ -5,8 +5,11 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Sender, TrySendError, select};
 
-use super::cancel::Halt;
+use super::cancel::{Cancel, Halt};
 use super::metrics::Counters;
+
+/// How often a sender that may give up looks for room.
+const ROOM_POLL: Duration = Duration::from_millis(10);
 
 /// An item, and the instant at which the source emitted the item that it was made from.
 pub(super) struct Stamped<T> {
@@ -44,11 +47,19 @@ impl<T> Outlet<T> {
         }
     }
 
-    /// Whether pushed items are discarded, as the run has failed.
+    /// As [`Outlet::push`], but gives up waiting for room when `cancel` is triggered; for items that no one needs then.
+    pub fn push_unless(&mut self, item: T, cancel: &Cancel) {
+        match &mut self.0 {
+            Target::Queue(queue) => queue.push_unless(item, cancel),
+            Target::List(list) => list.push(item),
+        }
+    }
+
+    /// Whether pushed items are discarded, as the run has failed or was cut short.
     #[must_use]
     pub fn is_closed(&self) -> bool {
         match &self.0 {
-            Target::Queue(queue) => queue.closed,
+            Target::Queue(queue) => queue.closed || queue.halt.is_set(),
             Target::List(_) => false,
         }
     }
@@ -108,8 +119,22 @@ impl<T> Queue<T> {
         Self { sender, halt, counters, born: None, waited: Duration::ZERO, closed: false }
     }
 
+    fn push_unless(&mut self, item: T, cancel: &Cancel) {
+        let since = Instant::now();
+        self.counters.set_working(false);
+        while self.sender.is_full() && !cancel.is_cancelled() && !self.halt.is_set() {
+            std::thread::sleep(ROOM_POLL);
+        }
+        self.counters.set_working(true);
+        self.waited += since.elapsed();
+        // This is the only sender, so there is room still.
+        if !cancel.is_cancelled() {
+            self.push(item);
+        }
+    }
+
     fn push(&mut self, item: T) {
-        if self.closed {
+        if self.closed || self.halt.is_set() {
             return;
         }
         let born = self.born.unwrap_or_else(Instant::now);
@@ -139,7 +164,7 @@ impl<T> Drop for Queue<T> {
     /// A panic while unwinding must not look like a clean end to the next stage.
     fn drop(&mut self) {
         if std::thread::panicking() {
-            self.halt.set();
+            self.halt.fail();
         }
     }
 }

@@ -71,6 +71,9 @@ pub struct Report {
     pub elapsed_s: f64,
     /// Whether a source was cancelled before its end.
     pub cancelled: bool,
+    /// Stages that had not ended when the time after cancellation was over; what they still had to do is missing.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub cut: Vec<String>,
 }
 
 impl Report {
@@ -110,8 +113,14 @@ impl fmt::Display for Report {
             }
             writeln!(f, "{}", line.trim_end())?;
         }
-        let cut = if self.cancelled { ", cancelled" } else { "" };
-        write!(f, "elapsed {}{cut}", duration(self.elapsed_s))
+        write!(f, "elapsed {}", duration(self.elapsed_s))?;
+        if self.cancelled {
+            f.write_str(", cancelled")?;
+        }
+        if !self.cut.is_empty() {
+            write!(f, ", cut short: {}", self.cut.join(", "))?;
+        }
+        Ok(())
     }
 }
 

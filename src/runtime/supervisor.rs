@@ -23,7 +23,7 @@ struct Verdict {
 impl Verdict {
     fn fail(&self, error: RuntimeError) {
         self.first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
-        self.halt.set();
+        self.halt.fail();
     }
 
     fn take(&self) -> Option<RuntimeError> {
@@ -38,16 +38,36 @@ struct WorkerEnd {
     timings: Timings,
 }
 
+/// How often a run looks whether it was cancelled.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// How long stages may take to end when a cancelled run is cut short, before it leaves them behind.
+const LEAVE: Duration = Duration::from_millis(300);
+
 /// A thread that was started, and its timings when it has ended.
 struct Member {
     counters: Arc<Counters>,
+    /// Whether a cancelled run waits for it however long it takes.
+    kept: bool,
     handle: Option<JoinHandle<()>>,
     timings: Option<Timings>,
+}
+
+impl Member {
+    fn is_running(&self) -> bool {
+        self.handle.is_some()
+    }
+
+    fn is_source(&self) -> bool {
+        self.counters.queue_capacity.is_none()
+    }
 }
 
 /// How long a run waits for its stages.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Limits {
+    /// For stages that are not kept to end after cancellation; `None` for no limit.
+    pub(super) grace: Option<Duration>,
     /// For all stages to end after a failure.
     pub(super) deadline: Duration,
     /// For any progress; `None` for no limit.
@@ -86,9 +106,8 @@ pub(super) fn run(
     let (say, heard) = bounded(nodes.len().max(1));
     let mut members = start(nodes, &verdict, cancel, &say);
     drop(say);
-    let cancelled = join(&mut members, &heard, &verdict, limits);
-    let laggards =
-        Laggards { stages: names(members.iter().filter(|member| member.handle.is_some())), waited: deadline };
+    let (cancelled, cut) = join(&mut members, &heard, &verdict, cancel, limits);
+    let laggards = Laggards { stages: names(members.iter().filter(|m| m.is_running())), waited: deadline };
     if let Some(error) = verdict.take() {
         return Err(with_laggards(error, laggards));
     }
@@ -96,7 +115,7 @@ pub(super) fn run(
         .iter()
         .filter_map(|member| Some(StageReport::new(&member.counters, member.timings.as_ref()?)))
         .collect();
-    Ok(Report { stages, elapsed_s: since.elapsed().as_secs_f64(), cancelled })
+    Ok(Report { stages, elapsed_s: since.elapsed().as_secs_f64(), cancelled, cut })
 }
 
 fn names<'a>(members: impl Iterator<Item = &'a Member>) -> Vec<String> {
@@ -111,7 +130,7 @@ fn start(
     say: &Sender<WorkerEnd>,
 ) -> Vec<Member> {
     let mut members = Vec::with_capacity(nodes.len());
-    for (index, StageNode { counters, worker, .. }) in nodes.into_iter().enumerate() {
+    for (index, StageNode { counters, worker, kept, .. }) in nodes.into_iter().enumerate() {
         let watch = Watch::new(Arc::clone(&counters), cancel.clone(), Arc::clone(&verdict.halt));
         let (verdict_there, say) = (Arc::clone(verdict), say.clone());
         let body = move || {
@@ -120,7 +139,7 @@ fn start(
             let _ = say.send(WorkerEnd { index, ending, timings });
         };
         match thread::Builder::new().name(counters.name.clone()).spawn(body) {
-            Ok(handle) => members.push(Member { counters, handle: Some(handle), timings: None }),
+            Ok(handle) => members.push(Member { counters, kept, handle: Some(handle), timings: None }),
             Err(source) => {
                 let stage = counters.name.clone();
                 verdict.fail(RuntimeError::Thread { stage, laggards: Laggards::default(), source });
@@ -166,17 +185,35 @@ fn panic_message(payload: &(dyn Any + Send)) -> String {
     text.unwrap_or("a payload that is not text").to_owned()
 }
 
-/// Waits for all members, after a failure no longer than `deadline`; removes the handles of members that ended. Returns
-/// whether cancellation stopped a source early.
-fn join(members: &mut [Member], heard: &Receiver<WorkerEnd>, verdict: &Verdict, limits: Limits) -> bool {
+/// Whether a run whose grace is over may be cut short. Sources first hand over all that they have, unless nobody works
+/// on it: then they wait for something else, like a pipe.
+fn may_cut(members: &[Member]) -> bool {
+    let handing_over = members.iter().any(|member| member.is_source() && member.is_running());
+    !handing_over || !members.iter().any(|member| member.kept && member.counters.is_working())
+}
+
+/// Waits for all members: after a failure no longer than `deadline`, after cancellation and its grace for kept ones only.
+/// Removes the handles of members that ended. Returns whether cancellation stopped a source early, and the names of the
+/// stages that it cut short.
+fn join(
+    members: &mut [Member],
+    heard: &Receiver<WorkerEnd>,
+    verdict: &Verdict,
+    cancel: &Cancel,
+    limits: Limits,
+) -> (bool, Vec<String>) {
     let mut cancelled = false;
+    let mut cut = Vec::new();
+    let mut clock = limits.grace.map_or_else(never, |_| tick(LOOK));
+    let mut leave = never();
+    let mut leaving = false;
     let mut remaining = members.len();
     let mut stop = verdict.halt.stop().clone();
     let mut give_up = never();
     let patience = limits.stall.unwrap_or_default();
     let mut watch = StallWatch { patience, seen: Vec::new(), since: Instant::now() };
     let mut look = limits.stall.map_or_else(never, |stall| tick(stall / 8));
-    while remaining > 0 {
+    while remaining > 0 && !(leaving && members.iter().all(|member| !member.kept || !member.is_running())) {
         select! {
             recv(heard) -> ended => {
                 let Ok(WorkerEnd { index, ending, timings }) = ended else { break };
@@ -199,10 +236,22 @@ fn join(members: &mut [Member], heard: &Receiver<WorkerEnd>, verdict: &Verdict, 
                     verdict.fail(RuntimeError::Stalled { stages, waited: patience, laggards: Laggards::default() });
                 }
             }
+            recv(clock) -> _ => {
+                let (elapsed, grace) = (cancel.elapsed(), limits.grace.unwrap_or_default());
+                let is_over = elapsed.is_some_and(|elapsed| elapsed >= grace);
+                if is_over && !verdict.halt.has_failed() && may_cut(members) {
+                    cut = names(members.iter().filter(|member| member.is_running() && !member.kept));
+                    cancelled = true;
+                    verdict.halt.cut();
+                    (clock, look, leave) = (never(), never(), after(LEAVE));
+                    stop = never();
+                }
+            }
+            recv(leave) -> _ => leaving = true,
             recv(give_up) -> _ => break,
         }
     }
-    cancelled
+    (cancelled, cut)
 }
 
 fn with_laggards(mut error: RuntimeError, found: Laggards) -> RuntimeError {

@@ -35,6 +35,8 @@ pub(super) struct StageNode {
     pub(super) worker: Box<dyn Worker>,
     /// Whether its output is connected; true for a sink.
     pub(super) taken: bool,
+    /// Whether a cancelled run waits for it however long it takes.
+    pub(super) kept: bool,
 }
 
 /// The four timings of a stage.
@@ -127,13 +129,15 @@ impl<T> Inlet<T> {
         watch.counters.set_working(false);
         let received = match self.receiver.try_recv() {
             Ok(stamped) => Some(stamped),
-            Err(TryRecvError::Empty) => self.wait(&watch.halt),
+            Err(TryRecvError::Empty) if watch.halt.is_set() => None,
+            // The wait may end although an item has just arrived.
+            Err(TryRecvError::Empty) => self.wait(&watch.halt).or_else(|| self.receiver.try_recv().ok()),
             Err(TryRecvError::Disconnected) => None,
         };
         watch.received();
         watch.counters.set_working(true);
         // After the wait: a closed channel means an end only if nothing failed.
-        if watch.halt.is_set() {
+        if watch.halt.has_failed() {
             return Input::Halt;
         }
         let Some(stamped) = received else {
@@ -163,7 +167,7 @@ impl<S: Source> Worker for SourceWorker<S> {
         let Self { source, out } = self;
         watch.counters.set_working(true);
         let ending = loop {
-            if watch.halt.is_set() {
+            if watch.halt.has_failed() {
                 return Ok(Ending::Halted);
             }
             if watch.cancel.is_cancelled() {

@@ -28,10 +28,21 @@ impl Cholesky {
     /// [`NotPositive`] with the first row of the tile that has no factor.
     pub fn new(mut matrix: SymmetricTiles) -> Result<Self, NotPositive> {
         for step in 0..matrix.along() {
-            factor_column(&mut matrix, step)?;
-            subtract_column(&mut matrix, step);
+            Self::advance(&mut matrix, step)?;
         }
-        Ok(Self(matrix))
+        Ok(Self::of(matrix))
+    }
+
+    /// One step of the factorisation, of `matrix.along()`, in their order.
+    pub(super) fn advance(matrix: &mut SymmetricTiles, step: usize) -> Result<(), NotPositive> {
+        factor_column(matrix, step)?;
+        subtract_column(matrix, step);
+        Ok(())
+    }
+
+    /// The factor, after all steps.
+    pub(super) fn of(matrix: SymmetricTiles) -> Self {
+        Self(matrix)
     }
 
     /// Order of the matrix.

@@ -9,6 +9,9 @@ use crate::units::ChannelId;
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum SolveError {
+    /// The run was cancelled, and there is no time for the solution.
+    #[error("the run was cancelled before the map was made")]
+    Interrupted,
     /// Nothing to solve.
     #[error("there is no data for a map")]
     NoData,

@@ -4,7 +4,8 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use super::harmonic::{HarmonicRequest, solve_harmonics};
-use super::{Diagnostics, SolveError, SolveWatch, StoppingRule, solve_pixels};
+use super::tikhonov::solve_pixels_while;
+use super::{Diagnostics, SolveError, SolveWatch, StoppingRule};
 use crate::accumulation::{Snapshot, SnapshotSums};
 use crate::frames::Instrument;
 use crate::runtime::{Outlet, Stage, Units};
@@ -87,19 +88,29 @@ impl Stage for Solver {
         let epsilon = self.setup.epsilon.get(index).ok_or(SolveError::NoEpsilon(channel))?;
         let prior = self.prior(index, pixel_count(nside));
         let visibilities = sums.counts().visibilities;
+        let frequency_hz = instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
+        let name = format!("{:.3} MHz", frequency_hz / 1e6);
+        // Maps on the way are not worth the time that the final ones need.
+        let watch = self.setup.watch.named(&name).wanted(is_final);
+        if !watch.goes_on() {
+            return Ok(());
+        }
         let (map_k, noise_k, diagnostics) = match sums {
             SnapshotSums::Pixel(sums) => {
-                let solved = solve_pixels(sums, epsilon, prior.as_deref())?;
+                let solved = match solve_pixels_while(sums, epsilon, prior.as_deref(), &|| watch.goes_on()) {
+                    Err(SolveError::Interrupted) => return Ok(()),
+                    solved => solved?,
+                };
                 (solved.map_k, solved.noise_k, solved.diagnostics)
             }
             SnapshotSums::Harmonic(sums) => {
                 let probes = if is_final { self.setup.trace_probes } else { 0 };
                 let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes };
-                let frequency_hz = instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
-                let name = format!("{:.3} MHz", frequency_hz / 1e6);
                 let start = self.last.remove(&channel);
-                let watch = self.setup.watch.named(&name);
                 let solved = solve_harmonics(&sums, request, prior.as_deref(), start.as_ref(), watch)?;
+                if !watch.goes_on() && !is_final {
+                    return Ok(());
+                }
                 if !is_final {
                     self.last.insert(channel, solved.unknowns);
                 }

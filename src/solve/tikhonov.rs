@@ -74,10 +74,23 @@ pub fn solve_pixels(
     epsilon: f64,
     prior_k: Option<&[f64]>,
 ) -> Result<PixelSolution, SolveError> {
+    solve_pixels_while(sums, epsilon, prior_k, &|| true)
+}
+
+/// As [`solve_pixels`], as long as `goes_on` says so.
+///
+/// # Errors
+/// Also [`SolveError::Interrupted`].
+pub(super) fn solve_pixels_while(
+    sums: PixelSums,
+    epsilon: f64,
+    prior_k: Option<&[f64]>,
+    goes_on: &dyn Fn() -> bool,
+) -> Result<PixelSolution, SolveError> {
     check_request(&sums, epsilon)?;
     let pixels = sums.unknowns();
     let LargestEigenvalue { value: w_max, iterations, .. } =
-        largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| true);
+        largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| goes_on());
     let mut map_k = sums.right.clone();
     if let Some(prior_k) = prior_k {
         if prior_k.len() != pixels {
@@ -87,8 +100,14 @@ pub fn solve_pixels(
     }
     let PixelSums { mut normal, noise: mut noise_k, .. } = sums;
     normal.add_to_diagonal(epsilon * w_max);
-    let factor =
-        Cholesky::new(normal).map_err(|NotPositive(pixel)| SolveError::NotPositive { pixel, epsilon })?;
+    for step in 0..normal.along() {
+        if !goes_on() {
+            return Err(SolveError::Interrupted);
+        }
+        Cholesky::advance(&mut normal, step)
+            .map_err(|NotPositive(pixel)| SolveError::NotPositive { pixel, epsilon })?;
+    }
+    let factor = Cholesky::of(normal);
     rayon::join(|| factor.solve(&mut map_k), || factor.solve(&mut noise_k));
     if let Some(prior_k) = prior_k {
         add(&mut map_k, prior_k);

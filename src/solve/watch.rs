@@ -1,6 +1,7 @@
 //! Progress of a long solution, and how it is interrupted.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use crate::runtime::Cancel;
 
@@ -23,6 +24,8 @@ pub struct Solving {
 #[derive(Clone, Debug, Default)]
 pub struct SolveWatch {
     cancel: Cancel,
+    /// Time for iterations after cancellation; `None` for no limit.
+    time: Option<Duration>,
     state: Arc<Mutex<WatchState>>,
 }
 
@@ -38,6 +41,8 @@ struct WatchState {
 pub struct NamedWatch<'a> {
     watch: &'a SolveWatch,
     name: &'a str,
+    /// Whether the solution is wanted although the run was cancelled.
+    wanted: bool,
 }
 
 /// Iterations that a solution may take if the run was interrupted before it began: enough for the well-measured part of
@@ -48,7 +53,18 @@ impl SolveWatch {
     /// A watch whose solutions end early when `cancel` is triggered.
     #[must_use]
     pub fn new(cancel: Cancel) -> Self {
-        Self { cancel, state: Arc::default() }
+        Self { cancel, ..Self::default() }
+    }
+
+    /// Ends all iterations `time` after cancellation.
+    #[must_use]
+    pub fn within(self, time: Duration) -> Self {
+        Self { time: Some(time), ..self }
+    }
+
+    /// Whether the time after cancellation is over.
+    fn is_over(&self) -> bool {
+        self.cancel.elapsed().zip(self.time).is_some_and(|(elapsed, time)| elapsed >= time)
     }
 
     /// The solution in progress, if any.
@@ -60,7 +76,7 @@ impl SolveWatch {
     /// The watch for a solution of this name.
     #[must_use]
     pub fn named<'a>(&'a self, name: &'a str) -> NamedWatch<'a> {
-        NamedWatch { watch: self, name }
+        NamedWatch { watch: self, name, wanted: true }
     }
 
     fn state(&self) -> MutexGuard<'_, WatchState> {
@@ -69,20 +85,32 @@ impl SolveWatch {
 }
 
 impl<'a> NamedWatch<'a> {
+    /// Whether the solution is wanted although the run was cancelled; it is unless this says otherwise.
+    #[must_use]
+    pub fn wanted(self, wanted: bool) -> Self {
+        Self { wanted, ..self }
+    }
+
+    /// Whether it is worth while to go on.
+    pub(super) fn goes_on(self) -> bool {
+        if self.wanted { !self.watch.is_over() } else { !self.watch.cancel.is_cancelled() }
+    }
+
     /// Starts a task that ends at the residual `target`.
     pub(super) fn start(self, what: &str, target: f64) -> SolveTask<'a> {
-        let Self { watch, name } = self;
+        let Self { watch, name, .. } = self;
         let mut state = watch.state();
         state.started += 1;
         let number = state.started;
         let what = format!("{name}: {what}");
         state.now = Some(Solving { number, what, iteration: 0, residual: 1.0, target });
-        SolveTask { watch, was_cancelled: watch.cancel.is_cancelled() }
+        SolveTask { named: self, watch, was_cancelled: watch.cancel.is_cancelled() }
     }
 }
 
 /// A task in progress.
 pub(super) struct SolveTask<'a> {
+    named: NamedWatch<'a>,
     watch: &'a SolveWatch,
     was_cancelled: bool,
 }
@@ -95,7 +123,7 @@ impl SolveTask<'_> {
             solving.residual = residual;
         }
         if self.was_cancelled {
-            iteration < ITERATIONS_WHEN_CANCELLED
+            iteration < ITERATIONS_WHEN_CANCELLED && self.named.goes_on()
         } else {
             !self.watch.cancel.is_cancelled()
         }

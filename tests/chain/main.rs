@@ -7,6 +7,8 @@ mod common;
 mod bench;
 mod coded;
 mod command_line;
+mod ending;
 mod harmonic;
+mod outputs;
 mod paper;
 mod run;

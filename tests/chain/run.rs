@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use common::process::{wait_until, written};
 use common::workplace::{Workplace, fail, files, succeed};
 use serde_json::Value;
 
@@ -196,12 +197,10 @@ fn an_interrupt_leaves_maps_of_the_data_so_far() {
         .spawn()
         .unwrap();
     // Wait until the downlink has more than the queues hold, so that some of it is in the sums, however busy the machine.
-    let (since, partial) = (Instant::now(), Path::new(&out).join("downlink.ccsds.partial"));
-    while std::fs::metadata(&partial).map_or(0, |found| found.len()) < 4 << 20 {
-        assert!(since.elapsed() < Duration::from_secs(300), "no four megabytes in five minutes");
+    wait_until("four megabytes", || {
         assert!(child.try_wait().unwrap().is_none(), "it has ended by itself");
-        std::thread::sleep(Duration::from_millis(50));
-    }
+        written(Path::new(&out), "downlink.ccsds") >= 4 << 20
+    });
     let id = child.id().to_string();
     assert!(std::process::Command::new("kill").args(["-INT", &id]).status().unwrap().success());
     let since = Instant::now();

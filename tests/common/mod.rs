@@ -2,6 +2,7 @@
 #![allow(dead_code)] // Each test file uses its part.
 
 pub mod downlink;
+pub mod process;
 pub mod workplace;
 
 use std::path::PathBuf;

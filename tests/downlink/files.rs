@@ -72,11 +72,12 @@ fn a_file_has_its_name_only_when_it_is_whole() {
     for frame in frames() {
         writer.write(&frame).unwrap();
     }
-    assert!(partial.exists());
+    // It has a name that nobody else chooses.
+    assert_eq!((partial.exists(), fs::read_dir(folder.path()).unwrap().count()), (false, 2));
     assert_eq!(fs::read(&path).unwrap(), b"an older file");
     let bytes = writer.bytes();
     assert_eq!(writer.finish().unwrap(), bytes);
-    assert!(!partial.exists());
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
     assert_eq!(fs::metadata(&path).unwrap().len(), bytes);
 }
 

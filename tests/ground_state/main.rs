@@ -5,6 +5,7 @@
 mod common;
 
 mod damage;
+mod ending;
 mod forged;
 mod gaps;
 mod kill;

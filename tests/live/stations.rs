@@ -121,6 +121,27 @@ fn interrupted_it_leaves_maps_of_what_was_sent() {
 }
 
 #[test]
+fn sigterm_ends_it_with_a_checkpoint_of_all_that_it_has_confirmed() {
+    let place = Place::new();
+    let file = place.downlink("packets");
+    let bytes = std::fs::read(&file).unwrap();
+    place.replay("whole.out", &file, &["--state", &place.path("whole")]);
+    // Nobody reads what it says.
+    let mut ground = place.ground("cut.out", &["--state", &place.path("cut")]);
+    drop(ground.child.stdout.take());
+    assert_eq!(ground.send(&bytes), format!("taken {} bytes\n", bytes.len()));
+    // At once: most of it is not in the sums yet.
+    let killed = Process::new("kill").args(["-TERM", &ground.child.id().to_string()]).status().unwrap();
+    assert!(killed.success());
+    let (status, said) = ground.end_without_summary();
+    assert_eq!(status.code(), Some(0), "{said}");
+    // Without the file: the state has everything.
+    let (out, state) = (place.path("resumed.out"), place.path("cut"));
+    succeed(&["replay", "--map", place.pipeline(), "--out", &out, "--state", &state]);
+    assert!(place.checkpoint("cut") == place.checkpoint("whole"));
+}
+
+#[test]
 fn listening_ends_when_nobody_sends() {
     let place = Place::new();
     let file = place.downlink("cadu");

@@ -9,6 +9,7 @@ use std::time::Duration;
 use crate::downlink::error::{DownlinkError, io_error};
 use crate::downlink::receive::{Event, EventReader, Intake};
 use crate::downlink::wire::Format;
+use crate::files::is_at;
 use crate::runtime::{Flow, Outlet, Source, Units};
 
 /// Bytes read from a file at a time.
@@ -147,8 +148,7 @@ impl OpenFile {
         let Ok(there) = std::fs::metadata(path) else {
             return Err(DownlinkError::Replaced { path: path.clone(), read: self.bytes });
         };
-        let here = self.file.metadata().map_err(io_error(path, "examine the file"))?;
-        if there.is_file() && (there.len() < self.bytes || !is_same(&here, &there)) {
+        if there.is_file() && (there.len() < self.bytes || !is_at(&self.file, path)) {
             return Err(DownlinkError::Replaced { path: path.clone(), read: self.bytes });
         }
         Ok(())
@@ -158,19 +158,6 @@ impl OpenFile {
 /// Whether the file can be opened again with the same content; a pipe cannot.
 fn is_regular(file: &File) -> bool {
     file.metadata().is_ok_and(|found| found.is_file())
-}
-
-/// Whether an open file is the one that its path leads to.
-#[cfg(unix)]
-fn is_same(here: &std::fs::Metadata, there: &std::fs::Metadata) -> bool {
-    use std::os::unix::fs::MetadataExt;
-    (here.dev(), here.ino()) == (there.dev(), there.ino())
-}
-
-/// Whether an open file is the one that its path leads to; unknown on this system.
-#[cfg(not(unix))]
-fn is_same(_: &std::fs::Metadata, _: &std::fs::Metadata) -> bool {
-    true
 }
 
 /// The format of a file, by its first packet. Reads all of a foreign file, in bounded memory.

@@ -11,22 +11,29 @@ use crate::runtime::{Outlet, Sink, Stage, Units};
 #[derive(Debug)]
 pub struct Recorder {
     path: PathBuf,
-    /// `None` once finished.
+    /// `None` before the first bytes, and once finished: there are no empty files.
     file: Option<AtomicFile>,
     bytes: u64,
 }
 
 impl Recorder {
-    /// Creates the file.
+    /// A recorder to a file, which is created with the first bytes.
     ///
     /// # Errors
-    /// The file cannot be created.
+    /// The file cannot be created, or is being written by another process.
     pub fn create(path: &Path) -> Result<Self, DownlinkError> {
-        let file = AtomicFile::create(path, IfUnfinished::Keep).map_err(io_error(path, "create the file"))?;
-        Ok(Self { path: path.to_owned(), file: Some(file), bytes: 0 })
+        // What can go wrong is told before anything is computed.
+        drop(create(path)?);
+        Ok(Self { path: path.to_owned(), file: None, bytes: 0 })
     }
 
     fn record(&mut self, bytes: &[u8]) -> Result<(), DownlinkError> {
+        if bytes.is_empty() {
+            return Ok(());
+        }
+        if self.bytes == 0 {
+            self.file = Some(create(&self.path)?);
+        }
         self.bytes += bytes.len() as u64;
         match &mut self.file {
             Some(file) => file.write_all(bytes).map_err(io_error(&self.path, "write")),
@@ -40,6 +47,10 @@ impl Recorder {
             None => Ok(()),
         }
     }
+}
+
+fn create(path: &Path) -> Result<AtomicFile, DownlinkError> {
+    AtomicFile::create(path, IfUnfinished::Keep).map_err(io_error(path, "create the file"))
 }
 
 impl Stage for Recorder {

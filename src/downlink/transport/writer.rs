@@ -11,8 +11,8 @@ use crate::frames::GroundFrame;
 
 /// Writes ground frames to a file of packets, or of coded frames of packets.
 ///
-/// The file is called `NAME.partial` until [`DownlinkWriter::finish`] has put all of it on disk; then it takes its
-/// name and replaces an older file. After an interruption the partial file can be read as far as it goes.
+/// The file takes its name, and replaces an older file, when [`DownlinkWriter::finish`] has put all of it on disk. One that
+/// is dropped before becomes `NAME.partial`, which can be read as far as it goes.
 #[derive(Debug)]
 pub struct DownlinkWriter {
     path: PathBuf,

@@ -1,9 +1,10 @@
 //! The folder of an archive: numbered checkpoints, of which the newest two are kept.
 
-use std::fs::{self, File, TryLockError};
+use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use crate::files::{AtomicFile, IfUnfinished};
+use crate::files::{AtomicFile, FolderLock, IfUnfinished};
 use crate::ground::GroundError;
 
 const PREFIX: &str = "checkpoint-";
@@ -15,23 +16,17 @@ pub(super) struct StateFolder {
     path: PathBuf,
     /// Number of the newest checkpoint.
     newest: u64,
-    /// Locked while it is open; the system unlocks it however the process ends.
-    _lock: File,
+    lock: FolderLock,
 }
 
 impl StateFolder {
     /// Creates the folder if needed, and locks it.
     pub(super) fn open(path: &Path) -> Result<Self, GroundError> {
-        fs::create_dir_all(path).map_err(GroundError::io(path, "make the folder"))?;
-        let lock_path = path.join("lock");
-        let lock = File::options().create(true).append(true).open(&lock_path);
-        let lock = lock.map_err(GroundError::io(&lock_path, "open the lock"))?;
-        match lock.try_lock() {
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) => return Err(GroundError::Locked { path: path.to_owned() }),
-            Err(TryLockError::Error(source)) => return Err(GroundError::io(&lock_path, "lock")(source)),
-        }
-        let mut folder = Self { path: path.to_owned(), newest: 0, _lock: lock };
+        let lock = FolderLock::acquire(path, "lock", false).map_err(|error| match error.kind() {
+            ErrorKind::ResourceBusy => GroundError::Locked { path: path.to_owned() },
+            _ => GroundError::io(path, "lock the folder")(error),
+        })?;
+        let mut folder = Self { path: path.to_owned(), newest: 0, lock };
         folder.newest = numbers(&folder.path)?.last().copied().unwrap_or(0);
         Ok(folder)
     }
@@ -79,10 +74,12 @@ impl StateFolder {
         &mut self,
         write: impl FnOnce(&mut AtomicFile, &Path) -> Result<(), GroundError>,
     ) -> Result<(), GroundError> {
+        self.check_place()?;
         let path = self.name(self.newest + 1);
         let file = AtomicFile::create(&path, IfUnfinished::Remove);
         let mut file = file.map_err(GroundError::io(&path, "create the file"))?;
         write(&mut file, &path)?;
+        self.check_place()?;
         file.finish().map_err(GroundError::io(&path, "finish the file"))?;
         self.newest += 1;
         for number in numbers(&self.path)?.into_iter().filter(|number| number + 1 < self.newest) {
@@ -90,6 +87,14 @@ impl StateFolder {
             fs::remove_file(&old).map_err(GroundError::io(&old, "remove the file"))?;
         }
         Ok(())
+    }
+
+    /// Checks that the path still leads to the folder that was locked: another process may use what is there now.
+    fn check_place(&self) -> Result<(), GroundError> {
+        match self.lock.lost() {
+            None => Ok(()),
+            Some(what) => Err(GroundError::FolderLost { path: self.path.clone(), what }),
+        }
     }
 
     fn name(&self, number: u64) -> PathBuf {

@@ -1,6 +1,7 @@
 //! The archive of a running ground, and what its checkpoints hold.
 
 use std::path::Path;
+use std::time::Duration;
 
 use super::checkpoint::{self, ArchiveHeadView};
 use super::draft::RecordDraft;
@@ -15,7 +16,7 @@ use crate::frames::{EphemerisSegment, VisibilityReason};
 use crate::ground::{
     Collector, CollectorState, DeliveredPacket, Ground, GroundConfig, GroundError, GroundOutcome,
 };
-use crate::runtime::{Ledger, LedgerReport};
+use crate::runtime::{Cancel, Ledger, LedgerReport};
 
 /// Keeps a journal of what a ground applies, and writes checkpoints of the ground into a folder.
 pub(in crate::ground) struct Archive {
@@ -186,6 +187,7 @@ impl Opened {
         let collector = Collector::resume(collector, journal.delivered(), journal.reception());
         let (interval, since_checkpoint) = (interval.max(1), 0);
         let archive = Archive { folder, settings, journal, notes, posts, interval, since_checkpoint };
-        Ok(Ground { collector, calibrator, accumulator, outcome, archive: Some(archive) })
+        let (cancel, linger) = (Cancel::new(), Duration::ZERO);
+        Ok(Ground { collector, calibrator, accumulator, outcome, archive: Some(archive), cancel, linger })
     }
 }

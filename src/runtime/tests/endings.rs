@@ -27,6 +27,93 @@ fn pass(n: u64, out: &mut Outlet<u64>) {
     out.push(n);
 }
 
+/// Numbers that a kept stage saves, and a stage that takes one of them and does not come back until `release`.
+fn cut_run(grace: Duration, release: mpsc::Receiver<()>) -> (crate::runtime::Report, Vec<u64>, bool) {
+    let cancel = Cancel::new();
+    let saved = std::sync::Arc::new(std::sync::Mutex::new((Vec::new(), false)));
+    let (steps, ends, token) = (std::sync::Arc::clone(&saved), std::sync::Arc::clone(&saved), cancel.clone());
+    let mut graph = Graph::new();
+    let numbers = graph.source("count", 1, Count::to(u64::MAX));
+    let save = move |n: u64, out: &mut Outlet<u64>| {
+        steps.lock().unwrap().0.push(n);
+        out.push(n);
+        if n == 20 {
+            token.cancel();
+        }
+        Ok(())
+    };
+    let finish = move |_: &mut Outlet<u64>| {
+        ends.lock().unwrap().1 = true;
+        Ok(())
+    };
+    let passed = graph.stage("save", 2, numbers, Each::with_finish(save, finish));
+    let mut stuck = false;
+    let long = graph.stage(
+        "long",
+        1,
+        passed,
+        Each::new(move |n, out: &mut Outlet<u64>| {
+            if n == 19 && !std::mem::replace(&mut stuck, true) {
+                let _ = release.recv();
+            }
+            pass(n, out);
+            Ok(())
+        }),
+    );
+    let (sink, _) = Keep::new();
+    graph.sink("keep", long, sink);
+    graph.cut_after(grace, &["save"]);
+    let report = graph.run(&cancel, PATIENCE).unwrap();
+    let (numbers, finished) = std::mem::take(&mut *saved.lock().unwrap());
+    (report, numbers, finished)
+}
+
+#[test]
+fn a_cancelled_run_leaves_a_long_step_behind_but_not_what_is_kept() {
+    let (release, held) = mpsc::channel();
+    let (report, numbers, finished) = cut_run(Duration::from_millis(100), held);
+    assert!(report.cancelled && finished);
+    // Everything that the source gave was saved.
+    assert_eq!(numbers, (0..report.stage("count").unwrap().items_out).collect::<Vec<_>>());
+    assert!(report.cut.contains(&"long".to_owned()) && !report.cut.contains(&"save".to_owned()), "{report}");
+    assert!(report.to_string().contains("cut short: long"), "{report}");
+    drop(release);
+}
+
+#[test]
+fn a_cancelled_run_that_ends_in_time_is_whole() {
+    let (release, held) = mpsc::channel();
+    drop(release);
+    let (report, _, finished) = cut_run(PATIENCE, held);
+    assert!(report.cancelled && finished && report.cut.is_empty());
+    assert_eq!(report.stage("keep").unwrap().items_in, report.stage("count").unwrap().items_out);
+}
+
+#[test]
+fn a_source_that_waits_for_something_else_does_not_hold_a_cancelled_run() {
+    /// Says nothing until it is released.
+    struct Silent(mpsc::Receiver<()>);
+    impl Source for Silent {
+        type Out = u64;
+        type Error = TestError;
+        fn next(&mut self, _: &mut Outlet<u64>) -> Result<Flow, TestError> {
+            let _ = self.0.recv();
+            Ok(Flow::Continue)
+        }
+    }
+    let (release, held) = mpsc::channel();
+    let (cancel, mut graph) = (Cancel::new(), Graph::new());
+    let numbers = graph.source("silent", 1, Silent(held));
+    let (sink, kept) = Keep::new();
+    graph.sink("keep", numbers, sink);
+    graph.cut_after(Duration::ZERO, &["keep"]);
+    cancel.cancel();
+    // It may see the flag before it waits.
+    let report = graph.run(&cancel, PATIENCE).unwrap();
+    assert!(report.cancelled && kept.lock().unwrap().finished);
+    drop(release);
+}
+
 #[test]
 fn an_error_in_the_middle_carries_stage_place_and_cause() {
     let (error, finished) = fail_with(Each::new(|n, out: &mut Outlet<u64>| {

@@ -1,0 +1,245 @@
+//! Commands that are told to end: by whom, when and how often.
+#![cfg(unix)]
+
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::os::unix::process::ExitStatusExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use super::common::process::{end, hidden, output, signal, start, wait_until, written};
+use super::common::workplace::{SMALL, Workplace, succeed};
+
+/// Far more than the slowest machine needs from a signal to the end, far less than what is interrupted would take.
+const SOON: Duration = Duration::from_secs(60);
+
+/// Numbers of the signals.
+const SIGHUP: i32 = 1;
+const SIGINT: i32 = 2;
+
+/// A run of many windows, and time after Ctrl-C as in earlier versions.
+const LONG: [&str; 4] = ["--set", "spacecraft.every_nth_window=1", "--set", "sky.nside=64"];
+
+fn long_run(place: &Workplace, more: &[&str]) -> Vec<String> {
+    let out = place.path("out");
+    let fixed = ["run", &place.pipeline, "--out", &out, "--json"];
+    [&fixed[..], &LONG, more].concat().into_iter().map(str::to_owned).collect()
+}
+
+/// Waits until a megabyte of the downlink of a run is written.
+fn wait_for_data(place: &Workplace, child: &mut Child) {
+    let out = PathBuf::from(place.path("out"));
+    wait_until("data", || {
+        assert!(child.try_wait().unwrap().is_none(), "it has ended by itself");
+        written(&out, "downlink.ccsds") >= 1 << 20
+    });
+}
+
+/// A named pipe.
+fn pipe(place: &Workplace) -> String {
+    let path = place.path("pipe");
+    assert!(Command::new("mkfifo").arg(&path).status().unwrap().success());
+    path
+}
+
+#[test]
+fn an_interrupt_ends_a_run_whose_standard_error_nobody_reads() {
+    let place = Workplace::new(SMALL);
+    for name in ["INT", "TERM", "HUP"] {
+        let args = long_run(&place, &[]);
+        let mut child = start(&args.iter().map(String::as_str).collect::<Vec<_>>());
+        drop(child.stderr.take());
+        drop(child.stdout.take());
+        wait_for_data(&place, &mut child);
+        signal(&child, name);
+        let (status, took) = end(&mut child);
+        let code =
+            128 + ["HUP", "INT"].iter().position(|other| *other == name).map_or(15, |at| at as i32 + 1);
+        assert_eq!(status.code(), Some(code), "{name}: {status:?}");
+        assert!(took < SOON, "{name}: {took:?}");
+        succeed(&["inspect", &place.path("out/downlink.ccsds")]);
+        assert!(Path::new(&place.path("out/summary.json")).exists());
+        assert_eq!(hidden(Path::new(&place.path("out"))), [] as [PathBuf; 0]);
+        std::fs::remove_dir_all(place.path("out")).unwrap();
+    }
+}
+
+#[test]
+fn a_signal_that_was_ignored_at_the_start_stays_ignored() {
+    let place = Workplace::new(SMALL);
+    let mut child = Command::new("sh")
+        .args(["-c", "trap '' HUP; exec \"$0\" \"$@\""])
+        .arg(assert_cmd::cargo::cargo_bin("lunarray"))
+        .args(long_run(&place, &[]))
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    wait_for_data(&place, &mut child);
+    signal(&child, "HUP");
+    let out = PathBuf::from(place.path("out"));
+    // It goes on: there is more, long after the signal.
+    let before = written(&out, "downlink.ccsds");
+    wait_until("more data", || {
+        assert!(child.try_wait().unwrap().is_none(), "SIGHUP ended it");
+        written(&out, "downlink.ccsds") > before + (4 << 20)
+    });
+    signal(&child, "TERM");
+    assert_eq!(end(&mut child).0.code(), Some(143));
+}
+
+#[test]
+fn while_it_sets_up_a_signal_ends_it_at_once() {
+    let place = Workplace::new(SMALL);
+    // Patterns of baselines of 10,000 wavelengths take minutes, and nothing can be saved.
+    let out = place.path("out");
+    let mut child = start(
+        &[
+            &["run", &place.pipeline, "--out", &out][..],
+            &["--set", "spacecraft.channels_hz=[30e6]", "--set", "spacecraft.baseline_wavelengths_max=0"],
+            &["--set", "spacecraft.model=\"harmonic\"", "--set", "sky.nside=512", "--set", "sky.l_max=1024"],
+        ]
+        .concat(),
+    );
+    wait_until("its folder", || Path::new(&out).join(".lock").exists());
+    std::thread::sleep(Duration::from_millis(300));
+    assert!(child.try_wait().unwrap().is_none());
+    signal(&child, "INT");
+    let (status, took) = end(&mut child);
+    assert_eq!(status.signal(), Some(SIGINT), "{status:?}");
+    assert!(took < SOON, "{took:?}");
+    // No file but the lock, which nobody holds.
+    assert_eq!(hidden(Path::new(&out)), [Path::new(&out).join(".lock")]);
+    assert_eq!(std::fs::read_dir(&out).unwrap().count(), 1);
+    assert_eq!(SIGHUP, 1);
+}
+
+#[test]
+fn before_the_first_window_there_is_no_downlink() {
+    let place = Workplace::new(SMALL);
+    let (folder, pipeline) = (place.path("new"), &place.pipeline);
+    let file = format!("{folder}/sky.ccsds");
+    let mut child = start(
+        &[
+            &["simulate", pipeline, "--out", &file][..],
+            // The first window takes much longer than the grace.
+            &[
+                "--set",
+                "sky.nside=1024",
+                "--set",
+                "spacecraft.model=\"direct\"",
+                "--set",
+                "sky.generated.small_scales=false",
+            ],
+            &["--set", "spacecraft.every_nth_integration=1", "--set", "spacecraft.channels_hz=[3e6]"],
+        ]
+        .concat(),
+    );
+    // The line of progress after ten seconds says that it runs.
+    let mut said = BufReader::new(child.stderr.take().unwrap()).lines();
+    let line = said.next().unwrap().unwrap();
+    assert!(line.contains(" s:"), "{line}");
+    signal(&child, "INT");
+    let (status, took) = end(&mut child);
+    assert_eq!(status.code(), Some(130), "{status:?}");
+    assert!(took < SOON, "{took:?}");
+    let mut printed = String::new();
+    child.stdout.take().unwrap().read_to_string(&mut printed).unwrap();
+    assert!(printed.contains("There is nothing to write"), "{printed}");
+    assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 0);
+}
+
+#[test]
+fn the_second_signal_ends_it_at_once() {
+    let place = Workplace::new(SMALL);
+    let (pipe, file) = (pipe(&place), place.simulate("small.ccsds", &[]));
+    let mut child = start(
+        &[
+            &["replay", &pipe, "--map", &place.pipeline, "--out", &place.path("out")][..],
+            &["--set", "runtime.grace_s=100000"],
+        ]
+        .concat(),
+    );
+    let mut feed = File::options().write(true).open(&pipe).unwrap();
+    feed.write_all(&std::fs::read(&file).unwrap()[..10_000]).unwrap();
+    wait_until("its folder", || Path::new(&place.path("out/.lock")).exists());
+    // Signals are handled soon after; before, one ends it, too.
+    std::thread::sleep(Duration::from_secs(1));
+    signal(&child, "INT");
+    let mut said = BufReader::new(child.stderr.take().unwrap()).lines();
+    assert!(said.any(|line| line.unwrap().contains("interrupt again to stop immediately")));
+    assert!(child.try_wait().unwrap().is_none(), "the first signal ended it, with time left");
+    signal(&child, "TERM");
+    let (status, took) = end(&mut child);
+    assert_eq!(status.code(), Some(143), "{status:?}");
+    assert!(took < SOON, "{took:?}");
+    drop(feed);
+}
+
+#[test]
+fn a_pipe_that_says_nothing_does_not_hold_it() {
+    let place = Workplace::new(SMALL);
+    let (pipe, file) = (pipe(&place), place.simulate("small.ccsds", &[]));
+    let session = |from: &str, state: &str| -> Vec<String> {
+        let (out, state) = (place.path(&format!("{state}.out")), place.path(state));
+        let args = ["replay", from, "--map", &place.pipeline, "--out", &out, "--state", &state, "--json"];
+        args.map(str::to_owned).to_vec()
+    };
+    let run = |args: &[String]| start(&args.iter().map(String::as_str).collect::<Vec<_>>());
+    let newest = |state: &str| {
+        let entries = std::fs::read_dir(place.path(state)).unwrap().map(|entry| entry.unwrap().path());
+        let checkpoint = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "lunarray");
+        std::fs::read(entries.filter(checkpoint).max().unwrap()).unwrap()
+    };
+    assert!(output(run(&session(&file, "whole"))).status.success());
+    let mut child = run(&session(&pipe, "cut"));
+    let mut feed = File::options().write(true).open(&pipe).unwrap();
+    // More than is read at a time, and not all: the rest never comes.
+    let bytes = std::fs::read(&file).unwrap();
+    feed.write_all(&bytes[..bytes.len() / 2]).unwrap();
+    wait_until("its folder", || Path::new(&place.path("cut.out/.lock")).exists());
+    std::thread::sleep(Duration::from_secs(2));
+    signal(&child, "INT");
+    let (status, took) = end(&mut child);
+    let mut said = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut said).unwrap();
+    assert_eq!(status.code(), Some(130), "{said}");
+    assert!(took < SOON, "{took:?}");
+    drop(feed);
+    let _ = newest("cut");
+    assert!(output(run(&session(&file, "cut"))).status.success());
+    assert!(newest("cut") == newest("whole"));
+}
+
+#[test]
+fn nobody_reads_and_nothing_panics() {
+    let place = Workplace::new(SMALL);
+    let file = place.simulate("small.ccsds", &[]);
+    let out = place.path("out");
+    for args in [
+        &["check", &place.pipeline][..],
+        &["inspect", &file],
+        &["inspect", &file, "--json"],
+        &["geometry"],
+        &["--help"],
+        &["replay", &file, "--map", &place.pipeline, "--out", &out],
+        &["check", "no such file"],
+        &["no such command"],
+    ] {
+        for closes in ["stdout", "stderr", "both"] {
+            let mut child = start(args);
+            // Whatever is printed later finds no reader.
+            let stdout = child.stdout.take().filter(|_| closes == "stderr");
+            let stderr = child.stderr.take().filter(|_| closes == "stdout");
+            let mut said = String::new();
+            stderr.map(|mut stderr| stderr.read_to_string(&mut said));
+            stdout.map(|mut stdout| stdout.read_to_end(&mut Vec::new()));
+            let (status, _) = end(&mut child);
+            let code =
+                if args[0].starts_with("no such") { 2 } else { i32::from(args[1..] == ["no such file"]) };
+            assert_eq!(status.code(), Some(code), "{args:?}, {closes}: {said}");
+            assert!(!said.contains("panicked"), "{args:?}: {said}");
+        }
+    }
+}
