@@ -16,7 +16,8 @@ use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, use_threads};
 ///
 /// The downlink holds CCSDS space packets with the instrument description, the ephemeris and the visibilities: all that
 /// `lunarray replay` needs. A file that a failure leaves incomplete has the extension .partial. Ctrl-C ends the simulation
-/// after the current window, or without it after runtime.grace_s, and leaves a valid file; none before the first window.
+/// after the windows in progress, or without them if they take long (runtime.grace_s), and leaves a valid file; none
+/// before the first window.
 ///
 /// Example: lunarray simulate pipelines/quicklook.toml --out sky.ccsds
 #[derive(Debug, Args)]

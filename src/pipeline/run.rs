@@ -219,7 +219,7 @@ struct Grace {
 impl Grace {
     fn of(config: &RuntimeConfig) -> Self {
         let whole = Duration::from_secs_f64(config.grace_s);
-        Self { to_add: whole / 4, to_iterate: whole * 3 / 5 }
+        Self { to_add: whole / 4, to_iterate: whole * 7 / 10 }
     }
 }
 

@@ -48,40 +48,61 @@ impl Cancel {
     }
 }
 
-/// Set by the first failure, or when a cancelled run is cut short; wakes every thread that waits on a channel.
+/// A flag that wakes every thread that waits on a channel.
+#[derive(Debug)]
+pub(super) struct Wake {
+    set: AtomicBool,
+    stop: Receiver<Infallible>,
+    /// Dropped to disconnect `stop`, which wakes all threads that select on it.
+    hold: Mutex<Option<Sender<Infallible>>>,
+}
+
+impl Wake {
+    pub(super) fn new() -> Self {
+        let (hold, stop) = bounded(0);
+        Self { set: AtomicBool::new(false), stop, hold: Mutex::new(Some(hold)) }
+    }
+
+    pub(super) fn set(&self) {
+        self.set.store(true, Ordering::SeqCst);
+        drop(self.hold.lock().unwrap_or_else(PoisonError::into_inner).take());
+    }
+
+    pub(super) fn is_set(&self) -> bool {
+        self.set.load(Ordering::SeqCst)
+    }
+
+    /// Never yields; disconnects when it is set. For `select!`.
+    pub(super) fn stop(&self) -> &Receiver<Infallible> {
+        &self.stop
+    }
+}
+
+/// Set by the first failure, or when a cancelled run is cut short.
 ///
 /// The flag is set before the failing thread drops its channels. So a thread that finds a channel closed reads from the
 /// flag whether the other end finished or failed.
 #[derive(Debug)]
 pub(super) struct Halt {
     failed: AtomicBool,
-    cut: AtomicBool,
-    stop: Receiver<Infallible>,
-    /// Dropped to disconnect `stop`, which wakes all threads that select on it.
-    hold: Mutex<Option<Sender<Infallible>>>,
+    /// For either reason.
+    wake: Wake,
 }
 
 impl Halt {
     pub(super) fn new() -> Self {
-        let (hold, stop) = bounded(0);
-        let (failed, cut) = (AtomicBool::new(false), AtomicBool::new(false));
-        Self { failed, cut, stop, hold: Mutex::new(Some(hold)) }
+        Self { failed: AtomicBool::new(false), wake: Wake::new() }
     }
 
     /// Ends a run that failed: stages stop without `finish`.
     pub(super) fn fail(&self) {
         self.failed.store(true, Ordering::SeqCst);
-        self.wake();
+        self.wake.set();
     }
 
     /// Ends a cancelled run whose time is up: stages take what is in their queue and run `finish`; outputs are discarded.
     pub(super) fn cut(&self) {
-        self.cut.store(true, Ordering::SeqCst);
-        self.wake();
-    }
-
-    fn wake(&self) {
-        drop(self.hold.lock().unwrap_or_else(PoisonError::into_inner).take());
+        self.wake.set();
     }
 
     pub(super) fn has_failed(&self) -> bool {
@@ -90,11 +111,11 @@ impl Halt {
 
     /// Whether outputs are discarded, for either reason.
     pub(super) fn is_set(&self) -> bool {
-        self.has_failed() || self.cut.load(Ordering::SeqCst)
+        self.wake.is_set()
     }
 
     /// Never yields; disconnects when the run halts. For `select!`.
     pub(super) fn stop(&self) -> &Receiver<Infallible> {
-        &self.stop
+        self.wake.stop()
     }
 }

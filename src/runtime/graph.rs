@@ -152,9 +152,11 @@ impl Graph {
 
     /// Limits how long a cancelled run waits for its stages, but for those named in `kept`.
     ///
-    /// When `grace` is over and the sources have handed over what they had, stages that wait take what is in their queue,
-    /// run `finish`, and end; their outputs are discarded. A stage that is in a long step then is left behind, as after a
-    /// failure: it keeps running, so the process should end. Kept stages, those that save data, may take longer.
+    /// Kept stages are those that save data. After three tenths of `grace` a stage before the first of them that is in a
+    /// long step is left behind: what follows it takes what is in the queues, and runs `finish`. When all of `grace` is
+    /// over, everything else ends, and its outputs are discarded; stages in a long step are left behind, too. They keep
+    /// running, as after a failure, so the process should end. Sources that hand over what they have, and kept stages, may
+    /// take longer.
     pub fn cut_after(&mut self, grace: Duration, kept: &[&str]) {
         self.grace = Some(grace);
         for node in &mut self.nodes {

@@ -35,6 +35,8 @@ pub(super) struct Counters {
     steps: AtomicU64,
     /// Whether the stage is in a step, and not waiting for room.
     working: AtomicBool,
+    /// Whether the stage is in its `finish`.
+    finishing: AtomicBool,
     ended: AtomicBool,
 }
 
@@ -50,6 +52,7 @@ impl Counters {
             queue_depth_max: AtomicUsize::new(0),
             steps: AtomicU64::new(0),
             working: AtomicBool::new(false),
+            finishing: AtomicBool::new(false),
             ended: AtomicBool::new(false),
         }
     }
@@ -82,6 +85,14 @@ impl Counters {
 
     pub(super) fn is_working(&self) -> bool {
         self.working.load(Ordering::Relaxed) && !self.ended.load(Ordering::Relaxed)
+    }
+
+    pub(super) fn set_finishing(&self) {
+        self.finishing.store(true, Ordering::Relaxed);
+    }
+
+    pub(super) fn is_finishing(&self) -> bool {
+        self.finishing.load(Ordering::Relaxed)
     }
 
     /// Changes whenever the stage has done something.

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Sender, after, bounded, never, select, tick};
 
-use super::cancel::{Cancel, Halt};
+use super::cancel::{Cancel, Halt, Wake};
 use super::error::{Laggards, RuntimeError};
 use super::metrics::Counters;
 use super::report::{Report, StageReport};
@@ -44,11 +44,18 @@ const LOOK: Duration = Duration::from_millis(50);
 /// How long stages may take to end when a cancelled run is cut short, before it leaves them behind.
 const LEAVE: Duration = Duration::from_millis(300);
 
+/// Share of the grace that stages before the kept ones have to end: the rest is for what follows.
+const INPUT_SHARE: f64 = 0.3;
+
 /// A thread that was started, and its timings when it has ended.
 struct Member {
     counters: Arc<Counters>,
     /// Whether a cancelled run waits for it however long it takes.
     kept: bool,
+    /// Ends its input.
+    last_input: Arc<Wake>,
+    /// Whether the run does not wait for it any more.
+    left: bool,
     handle: Option<JoinHandle<()>>,
     timings: Option<Timings>,
 }
@@ -58,8 +65,9 @@ impl Member {
         self.handle.is_some()
     }
 
-    fn is_source(&self) -> bool {
-        self.counters.queue_capacity.is_none()
+    /// Whether, being a source, it is handing over what it has.
+    fn hands_over(&self) -> bool {
+        self.is_running() && (self.counters.is_finishing() || !self.counters.is_working())
     }
 }
 
@@ -131,7 +139,13 @@ fn start(
 ) -> Vec<Member> {
     let mut members = Vec::with_capacity(nodes.len());
     for (index, StageNode { counters, worker, kept, .. }) in nodes.into_iter().enumerate() {
-        let watch = Watch::new(Arc::clone(&counters), cancel.clone(), Arc::clone(&verdict.halt));
+        let last_input = Arc::new(Wake::new());
+        let watch = Watch::new(
+            Arc::clone(&counters),
+            cancel.clone(),
+            Arc::clone(&verdict.halt),
+            Arc::clone(&last_input),
+        );
         let (verdict_there, say) = (Arc::clone(verdict), say.clone());
         let body = move || {
             let (ending, timings) = live(worker, watch, &verdict_there);
@@ -139,7 +153,10 @@ fn start(
             let _ = say.send(WorkerEnd { index, ending, timings });
         };
         match thread::Builder::new().name(counters.name.clone()).spawn(body) {
-            Ok(handle) => members.push(Member { counters, kept, handle: Some(handle), timings: None }),
+            Ok(handle) => {
+                let handle = Some(handle);
+                members.push(Member { counters, kept, last_input, left: false, handle, timings: None });
+            }
             Err(source) => {
                 let stage = counters.name.clone();
                 verdict.fail(RuntimeError::Thread { stage, laggards: Laggards::default(), source });
@@ -185,11 +202,65 @@ fn panic_message(payload: &(dyn Any + Send)) -> String {
     text.unwrap_or("a payload that is not text").to_owned()
 }
 
-/// Whether a run whose grace is over may be cut short. Sources first hand over all that they have, unless nobody works
-/// on it: then they wait for something else, like a pipe.
-fn may_cut(members: &[Member]) -> bool {
-    let handing_over = members.iter().any(|member| member.is_source() && member.is_running());
-    !handing_over || !members.iter().any(|member| member.kept && member.counters.is_working())
+/// Ends a cancelled run in time.
+struct Cutter {
+    grace: Duration,
+    /// When what has not ended is left behind.
+    leave: Option<Instant>,
+    has_cut_input: bool,
+    /// Whether everything was cut.
+    is_over: bool,
+    /// Stages that lose something.
+    cut: Vec<String>,
+}
+
+impl Cutter {
+    fn new(grace: Duration) -> Self {
+        Self { grace, leave: None, has_cut_input: false, is_over: false, cut: Vec::new() }
+    }
+
+    /// Cuts what is due. Called every [`LOOK`].
+    fn look(&mut self, members: &mut [Member], cancel: &Cancel, halt: &Halt) {
+        let Some(elapsed) = cancel.elapsed().filter(|_| !halt.has_failed()) else { return };
+        // What a source hands over to a stage that saves it is waited for.
+        let may_cut = match &*members {
+            [source, saves, ..] if saves.kept => !source.hands_over(),
+            _ => true,
+        };
+        if !self.has_cut_input && may_cut && elapsed >= self.grace.mul_f64(INPUT_SHARE) {
+            self.cut_input(members);
+        }
+        if !self.is_over && may_cut && elapsed >= self.grace {
+            for member in members.iter_mut().filter(|member| member.is_running() && !member.kept) {
+                member.left = true;
+                if !self.cut.contains(&member.counters.name) {
+                    self.cut.push(member.counters.name.clone());
+                }
+            }
+            halt.cut();
+            (self.is_over, self.leave) = (true, Some(Instant::now() + LEAVE));
+        }
+    }
+
+    /// Ends the input of the stage behind the last one before the kept ones that is in a step; all that follows drains.
+    fn cut_input(&mut self, members: &mut [Member]) {
+        let Some(kept) = members.iter().position(|member| member.kept) else { return };
+        if members[..=kept].iter().all(|member| !member.is_running()) {
+            return;
+        }
+        let is_busy = |member: &Member| member.is_running() && member.counters.is_working();
+        let Some(busy) = members[..kept].iter().rposition(is_busy) else { return };
+        self.cut.push(members[busy].counters.name.clone());
+        members[..=busy].iter_mut().for_each(|member| member.left = true);
+        members[busy + 1].last_input.set();
+        (self.has_cut_input, self.leave) = (true, Some(Instant::now() + LEAVE));
+    }
+
+    /// Whether nobody is left to wait for.
+    fn is_done(&self, members: &[Member]) -> bool {
+        let is_left = self.leave.is_some_and(|leave| Instant::now() >= leave);
+        members.iter().all(|member| !member.is_running() || (is_left && member.left))
+    }
 }
 
 /// Waits for all members: after a failure no longer than `deadline`, after cancellation and its grace for kept ones only.
@@ -203,22 +274,18 @@ fn join(
     limits: Limits,
 ) -> (bool, Vec<String>) {
     let mut cancelled = false;
-    let mut cut = Vec::new();
-    let mut clock = limits.grace.map_or_else(never, |_| tick(LOOK));
-    let mut leave = never();
-    let mut leaving = false;
-    let mut remaining = members.len();
+    let mut cutter = Cutter::new(limits.grace.unwrap_or_default());
+    let clock = limits.grace.map_or_else(never, |_| tick(LOOK));
     let mut stop = verdict.halt.stop().clone();
     let mut give_up = never();
     let patience = limits.stall.unwrap_or_default();
     let mut watch = StallWatch { patience, seen: Vec::new(), since: Instant::now() };
     let mut look = limits.stall.map_or_else(never, |stall| tick(stall / 8));
-    while remaining > 0 && !(leaving && members.iter().all(|member| !member.kept || !member.is_running())) {
+    while !cutter.is_done(members) {
         select! {
             recv(heard) -> ended => {
                 let Ok(WorkerEnd { index, ending, timings }) = ended else { break };
                 cancelled |= ending == Ending::Cancelled;
-                remaining -= 1;
                 let Some(member) = members.get_mut(index) else { continue };
                 member.timings = Some(timings);
                 if let Some(handle) = member.handle.take() {
@@ -229,29 +296,21 @@ fn join(
             recv(stop) -> _ => {
                 stop = never();
                 look = never();
-                give_up = after(limits.deadline);
+                // Not if the run was cut short.
+                if verdict.halt.has_failed() {
+                    give_up = after(limits.deadline);
+                }
             }
             recv(look) -> _ => {
                 if let Some(stages) = watch.look(members) {
                     verdict.fail(RuntimeError::Stalled { stages, waited: patience, laggards: Laggards::default() });
                 }
             }
-            recv(clock) -> _ => {
-                let (elapsed, grace) = (cancel.elapsed(), limits.grace.unwrap_or_default());
-                let is_over = elapsed.is_some_and(|elapsed| elapsed >= grace);
-                if is_over && !verdict.halt.has_failed() && may_cut(members) {
-                    cut = names(members.iter().filter(|member| member.is_running() && !member.kept));
-                    cancelled = true;
-                    verdict.halt.cut();
-                    (clock, look, leave) = (never(), never(), after(LEAVE));
-                    stop = never();
-                }
-            }
-            recv(leave) -> _ => leaving = true,
+            recv(clock) -> _ => cutter.look(members, cancel, &verdict.halt),
             recv(give_up) -> _ => break,
         }
     }
-    (cancelled, cut)
+    (cancelled || cutter.has_cut_input || cutter.is_over, cutter.cut)
 }
 
 fn with_laggards(mut error: RuntimeError, found: Laggards) -> RuntimeError {

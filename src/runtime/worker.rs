@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, TryRecvError, select};
 
-use super::cancel::{Cancel, Halt};
+use super::cancel::{Cancel, Halt, Wake};
 use super::error::{BoxError, Moment};
 use super::metrics::{Counters, Units};
 use super::outlet::{Outlet, Stamped};
@@ -53,20 +53,32 @@ pub(super) struct Watch {
     pub(super) timings: Timings,
     cancel: Cancel,
     halt: Arc<Halt>,
+    /// Set when the stage before this one is not waited for any more.
+    last_input: Arc<Wake>,
     finishing: bool,
     /// End of the last timed interval.
     mark: Instant,
 }
 
 impl Watch {
-    pub(super) fn new(counters: Arc<Counters>, cancel: Cancel, halt: Arc<Halt>) -> Self {
+    pub(super) fn new(
+        counters: Arc<Counters>,
+        cancel: Cancel,
+        halt: Arc<Halt>,
+        last_input: Arc<Wake>,
+    ) -> Self {
         let timings = Timings {
             waiting_in: Timing::new(),
             working: Timing::new(),
             waiting_out: Timing::new(),
             since_source: Timing::new(),
         };
-        Self { counters, timings, cancel, halt, finishing: false, mark: Instant::now() }
+        Self { counters, timings, cancel, halt, last_input, finishing: false, mark: Instant::now() }
+    }
+
+    fn begin_finish(&mut self) {
+        self.finishing = true;
+        self.counters.set_finishing();
     }
 
     /// Position of the worker, for an error.
@@ -129,9 +141,8 @@ impl<T> Inlet<T> {
         watch.counters.set_working(false);
         let received = match self.receiver.try_recv() {
             Ok(stamped) => Some(stamped),
-            Err(TryRecvError::Empty) if watch.halt.is_set() => None,
             // The wait may end although an item has just arrived.
-            Err(TryRecvError::Empty) => self.wait(&watch.halt).or_else(|| self.receiver.try_recv().ok()),
+            Err(TryRecvError::Empty) => self.wait(watch).or_else(|| self.receiver.try_recv().ok()),
             Err(TryRecvError::Disconnected) => None,
         };
         watch.received();
@@ -148,10 +159,11 @@ impl<T> Inlet<T> {
         Input::Item(stamped)
     }
 
-    fn wait(&self, halt: &Halt) -> Option<Stamped<T>> {
+    fn wait(&self, watch: &Watch) -> Option<Stamped<T>> {
         select! {
             recv(self.receiver) -> stamped => stamped.ok(),
-            recv(halt.stop()) -> _ => None,
+            recv(watch.halt.stop()) -> _ => None,
+            recv(watch.last_input.stop()) -> _ => None,
         }
     }
 }
@@ -179,7 +191,7 @@ impl<S: Source> Worker for SourceWorker<S> {
                 break Ending::Finished;
             }
         };
-        watch.finishing = true;
+        watch.begin_finish();
         source.finish(out)?;
         watch.worked_into(out, None, source.units());
         Ok(if out.is_closed() { Ending::Halted } else { ending })
@@ -207,7 +219,7 @@ impl<S: Stage> Worker for StageWorker<S> {
                 Input::Halt => return Ok(Ending::Halted),
             }
         }
-        watch.finishing = true;
+        watch.begin_finish();
         stage.finish(out)?;
         watch.worked_into(out, None, stage.units());
         Ok(if out.is_closed() { Ending::Halted } else { Ending::Finished })
@@ -233,7 +245,7 @@ impl<S: Sink> Worker for SinkWorker<S> {
                 Input::Halt => return Ok(Ending::Halted),
             }
         }
-        watch.finishing = true;
+        watch.begin_finish();
         sink.finish()?;
         watch.worked(Duration::ZERO, None, sink.units());
         Ok(Ending::Finished)
