@@ -120,7 +120,8 @@ pub fn run(
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
     let watched = Watched { metrics: graph.metrics(), solving, listening: None };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
-    let ended = Ended { report, outcome, listening: None, samples: counts.close(plan)? };
+    let samples = close_samples(&counts, plan, &report)?;
+    let ended = Ended { report, outcome, listening: None, samples };
     conclude(RunScope::Whole, &plan.config, out, ended)
 }
 
@@ -159,7 +160,7 @@ pub fn simulate(
     }
     let watched = Watched { metrics: graph.metrics(), solving: SolveWatch::default(), listening: None };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
-    counts.close(plan)?;
+    close_samples(&counts, plan, &report)?;
     Ok(report)
 }
 
@@ -187,6 +188,15 @@ pub fn replay<S: GroundSource + 'static>(
     let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone() };
     let report = start(graph, &config.runtime, cancel, (watched, watch))?;
     conclude(RunScope::Ground, config, out, Ended { report, outcome, listening, samples: None })
+}
+
+/// Closes the ledger of samples; not of a run that was cut short, whose stages may still be counting.
+fn close_samples(
+    counts: &SampleCounts,
+    plan: &Plan,
+    report: &Report,
+) -> Result<Option<SampleSummary>, PipelineError> {
+    if report.cut.is_empty() { counts.close(plan) } else { Ok(None) }
 }
 
 /// Adds the link's faults, if any are configured; their truth file goes beside the downlink file.
