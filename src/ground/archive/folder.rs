@@ -75,6 +75,15 @@ impl StateFolder {
         write: impl FnOnce(&mut AtomicFile, &Path) -> Result<(), GroundError>,
     ) -> Result<(), GroundError> {
         self.check_place()?;
+        let saved = self.save_here(write);
+        // What fails because the folder has gone is to be told as that.
+        saved.or_else(|error| self.check_place().and(Err(error)))
+    }
+
+    fn save_here(
+        &mut self,
+        write: impl FnOnce(&mut AtomicFile, &Path) -> Result<(), GroundError>,
+    ) -> Result<(), GroundError> {
         let path = self.name(self.newest + 1);
         let file = AtomicFile::create(&path, IfUnfinished::Remove);
         let mut file = file.map_err(GroundError::io(&path, "create the file"))?;
