@@ -219,7 +219,7 @@ fn nobody_reads_and_nothing_panics() {
         &["check", &place.pipeline][..],
         &["inspect", &file],
         &["inspect", &file, "--json"],
-        &["geometry"],
+        &["geometry", "--at", "2h"],
         &["--help"],
         &["replay", &file, "--map", &place.pipeline, "--out", &out],
         &["check", "no such file"],
