@@ -132,12 +132,12 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     let interrupt = Interrupt::default();
     let session = Session { args, config: &config, interrupt: &interrupt };
     let summary = match &args.listen {
-        Some(url) => session.from_senders(url, ground)?,
-        None => session.from_files(ground)?,
+        Some(url) => session.hear_senders(url, ground)?,
+        None => session.read_files(ground)?,
     };
     let completion = match args.follow || args.listen.is_some() {
         true => {
-            let is_saved = args.state.is_some() || summary.report.cut.is_empty();
+            let is_saved = args.state.is_some() || !summary.lacks_maps();
             interrupt.completion_of_service(summary.cancelled, is_saved)
         }
         false => interrupt.completion(summary.cancelled),
@@ -157,7 +157,7 @@ struct Session<'a> {
 }
 
 impl Session<'_> {
-    fn from_senders(&self, url: &TcpUrl, ground: Ground) -> Result<RunSummary, CommandError> {
+    fn hear_senders(&self, url: &TcpUrl, ground: Ground) -> Result<RunSummary, CommandError> {
         let Self { args, config, .. } = self;
         let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
         let until = Until { idle_s: args.idle_s, connections: args.connections };
@@ -172,7 +172,7 @@ impl Session<'_> {
         Ok(self.watched(source, ground, &|| say(format_args!("listening on {address}")))?)
     }
 
-    fn from_files(&self, ground: Ground) -> Result<RunSummary, CommandError> {
+    fn read_files(&self, ground: Ground) -> Result<RunSummary, CommandError> {
         let args = self.args;
         let files = match args.follow {
             true => FileSource::follow(&args.files, args.idle_s)?,

@@ -14,6 +14,9 @@ use crate::solve::{SolveWatch, Solver, SolverSetup, StoppingRule};
 /// Name of the stage that keeps the state.
 pub(super) const GROUND: &str = "ground";
 
+/// Name of the stage that makes maps.
+pub(super) const SOLVE: &str = "solve";
+
 impl Config {
     /// Configuration of the ground, with a hold buffer of `wait_bytes`.
     #[must_use]
@@ -70,7 +73,7 @@ pub(super) fn add(
     let publisher = Publisher::new(config.products.clone(), out, truth, provenance, channels)?;
     // Sums are large: one waits while another is solved.
     let sums = graph.stage(GROUND, 1, bytes, ground);
-    let maps = graph.stage("solve", 1, sums, Solver::new(setup));
+    let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));
     graph.sink("publish", maps, publisher);
     Ok(outcome)
 }

@@ -7,13 +7,14 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::config::Config;
+use super::ground_segment::SOLVE;
 use super::sample_summary::SampleSummary;
 use crate::downlink::ReceptionCounters;
 use crate::downlink::transport::socket::ListenReport;
 use crate::files::write_atomically;
 use crate::frames::VisibilityReason;
 use crate::products::{ChannelSummary, ProductsError};
-use crate::runtime::{LedgerReport, Report};
+use crate::runtime::{LedgerReport, Report, StageReport};
 
 /// Which part of the chain ran.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -86,6 +87,13 @@ impl RunSummary {
         }
     }
 
+    /// Whether maps are missing because the time after cancellation did not suffice.
+    #[must_use]
+    pub fn lacks_maps(&self) -> bool {
+        let is_skipped = |solve: &StageReport| solve.items_out < solve.items_in;
+        self.cancelled && (!self.report.cut.is_empty() || self.report.stage(SOLVE).is_some_and(is_skipped))
+    }
+
     /// Writes `summary.json` into `folder`. Removes maps and pictures that the summary of an earlier run there names and
     /// that this run did not write, so that all files belong to this run.
     ///
@@ -101,7 +109,7 @@ impl RunSummary {
         let ours: BTreeSet<&str> =
             self.channels.iter().flat_map(|channel| &channel.files).map(String::as_str).collect();
         // A run that was cut short has not made all of its maps; those of the run before stay.
-        let is_whole = self.report.cut.is_empty();
+        let is_whole = !self.lacks_maps();
         for file in files_of(&before).iter().filter(|file| is_whole && !ours.contains(file.as_str())) {
             let file = folder.join(file);
             // A file may be gone already, and a folder may hold other files.
@@ -148,12 +156,8 @@ impl fmt::Display for RunSummary {
         for channel in &self.channels {
             writeln!(f, "{channel}")?;
         }
-        if !self.report.cut.is_empty() {
-            write!(
-                f,
-                "Ended early, and products are missing: runtime.grace_s left no time for {}.",
-                self.report.cut.join(" and ")
-            )?;
+        if self.lacks_maps() {
+            write!(f, "Ended early, and maps are missing: runtime.grace_s left no time for them.")?;
         } else if self.cancelled {
             write!(f, "Ended early: all products hold the data so far.")?;
         }
