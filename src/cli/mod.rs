@@ -11,6 +11,7 @@ mod corrupt;
 mod gaps;
 mod geometry;
 mod inspect;
+mod lines;
 mod merge;
 mod output;
 mod predict;

@@ -1,12 +1,16 @@
 //! `lunarray replay`: run the ground segment on downlink files or live senders.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use clap::{ArgGroup, Args};
 use crossbeam_channel::{Receiver, bounded};
 
 use super::arguments::not_negative_s;
-use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
+use super::lines::next_line;
+use super::output::{
+    CommandError, CommandResult, Completion, print_incompleteness, print_json_line, print_notes, print_text,
+};
 use super::progress::{Progress, cancel_on_interrupt};
 use crate::downlink::transport::socket::{SocketError, SocketSource, TcpUrl, Until};
 use crate::downlink::{FileSource, Pace, Paced, Steps};
@@ -138,6 +142,7 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     } else {
         print_text(&format!("{summary}\nProducts are in {}", args.out.display()))?;
     }
+    print_incompleteness(&summary);
     Ok(Completion::of(summary.cancelled))
 }
 
@@ -148,6 +153,7 @@ fn from_senders(
     ground: Ground,
 ) -> Result<RunSummary, CommandError> {
     let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
+    let settings = config.ground(0);
     let until = Until { idle_s: args.idle_s, connections: args.connections };
     let source = SocketSource::bind(&addresses, &config.downlink.listen, until)
         .map_err(|error| match error {
@@ -155,6 +161,7 @@ fn from_senders(
             other => other,
         })?
         .knowing(ground.instrument().cloned())
+        .accepting(Arc::new(move |instrument| settings.fits(instrument).is_ok()))
         .telling(Box::new(|note| eprintln!("note: {note}")));
     let cancel = cancel_on_interrupt()?;
     eprintln!("listening on {}", source.url());
@@ -196,8 +203,9 @@ fn lines_of_input() -> Receiver<()> {
     let (say, go) = bounded(0);
     // The thread ends with the input or the process; nothing else can interrupt its read.
     std::thread::spawn(move || {
-        for line in std::io::stdin().lines() {
-            if line.is_err() || say.send(()).is_err() {
+        let mut input = std::io::stdin().lock();
+        while let Ok(Some(_)) = next_line(&mut input, 1) {
+            if say.send(()).is_err() {
                 return;
             }
         }

@@ -5,9 +5,12 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::arguments::PipelineArgs;
-use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
+use super::output::{
+    CommandResult, Completion, print_config_notes, print_incompleteness, print_json_line, print_notes,
+    print_text,
+};
 use super::progress::{Progress, cancel_on_interrupt};
-use crate::pipeline::{INTEGRATE, Plan, run, use_threads};
+use crate::pipeline::{INTEGRATE, Plan, run, sky_notes, use_threads};
 
 /// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
 ///
@@ -33,6 +36,7 @@ pub(super) fn execute(args: &RunArgs) -> CommandResult {
     let config = args.pipeline.source().load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
+    print_notes(sky_notes(&plan)?);
     use_threads(&plan.config.runtime)?;
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
     let cancel = cancel_on_interrupt()?;
@@ -47,5 +51,6 @@ pub(super) fn execute(args: &RunArgs) -> CommandResult {
     } else {
         print_text(&format!("{summary}\nProducts are in {}", out.display()))?;
     }
+    print_incompleteness(&summary);
     Ok(Completion::of(summary.cancelled))
 }

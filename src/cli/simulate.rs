@@ -6,10 +6,12 @@ use std::sync::atomic::Ordering;
 use clap::Args;
 
 use super::arguments::{PipelineArgs, not_negative_s};
-use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
+use super::output::{
+    CommandResult, Completion, print_config_notes, print_json_line, print_notes, print_text,
+};
 use super::progress::{Progress, cancel_on_interrupt};
 use crate::downlink::transport::socket::{SendOptions, SocketSink, TcpUrl};
-use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, use_threads};
+use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, sky_notes, use_threads};
 
 /// Simulate the space segment, and write its downlink to a file or send it to a listening ground segment.
 ///
@@ -51,6 +53,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let config = args.pipeline.source().load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
+    print_notes(sky_notes(&plan)?);
     use_threads(&plan.config.runtime)?;
     let cancel = cancel_on_interrupt()?;
     let options = SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s };

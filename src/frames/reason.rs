@@ -57,6 +57,10 @@ pub enum VisibilityReason {
     StoreFull,
     /// It was sent and did not arrive.
     NotReceived,
+    /// Its packet is missing, and no report says how many visibilities it held: at least one.
+    NotReceivedAtLeast,
+    /// It was received, but its value, weight or duration cannot be used.
+    BadValue,
 }
 
 impl Reason for VisibilityReason {
@@ -90,13 +94,15 @@ impl Reason for VisibilityReason {
             Self::SumsFull => "refused by the engine: sums full at this map.weight_max",
             Self::StoreFull => "full",
             Self::NotReceived => "not received",
+            Self::NotReceivedAtLeast => "not received (at least)",
+            Self::BadValue => "value or weight that cannot be used, as it was sent",
         }
     }
 
     fn lost_in(self) -> Option<&'static str> {
         match self {
             Self::StoreFull => Some("store"),
-            Self::NotReceived => Some("downlink"),
+            Self::NotReceived | Self::NotReceivedAtLeast => Some("downlink"),
             _ => None,
         }
     }
@@ -151,6 +157,6 @@ mod tests {
         assert_eq!(texts.len(), all.len());
         // Some of the places, so that none moves unseen.
         assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
-        assert_eq!((all.len(), all.last()), (24, Some(&VisibilityReason::NotReceived)));
+        assert_eq!((all.len(), all.last()), (26, Some(&VisibilityReason::BadValue)));
     }
 }
