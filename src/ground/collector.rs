@@ -8,7 +8,8 @@ use bincode::{Decode, Encode};
 use super::hold_buffer::{HeldPacket, HoldBuffer, Sent};
 use crate::downlink::error::{DownlinkError, require_packets};
 use crate::downlink::receive::{
-    ByteFeed, Decoder, DecoderState, Event, Insertion, Intake, PacketReading, ReceivedSet, ReceptionCounters,
+    ByteFeed, Decoder, DecoderState, Event, Intake, PacketInsertion, PacketReading, ReceivedSet,
+    ReceptionCounters,
 };
 use crate::downlink::wire::payload::visibilities_span;
 use crate::downlink::wire::{Kind, PacketHeader, PacketSegment};
@@ -373,12 +374,12 @@ impl Collector {
         }
         let received = &mut self.received[header.kind.index()];
         match received.insert_within(header.count, header.time, self.intervals_max) {
-            Insertion::New => {}
-            Insertion::Known => {
+            PacketInsertion::New => {}
+            PacketInsertion::Known => {
                 self.link.accept(&Event::Duplicate { offset, header });
                 return Ok(Handled::Event);
             }
-            Insertion::Full => {
+            PacketInsertion::Full => {
                 self.beyond = [self.beyond[0] + 1, self.beyond[1] + header.bytes as u64];
                 return Ok(Handled::Event);
             }

@@ -18,7 +18,7 @@ pub struct ReceivedSet {
 
 /// What became of a packet that was to be added to a [`ReceivedSet`] of bounded size.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Insertion {
+pub enum PacketInsertion {
     /// It is new and was added.
     New,
     /// It was in the set.
@@ -49,17 +49,17 @@ impl ReceivedSet {
     }
 
     /// Adds a packet, unless the set would then have more than `intervals_max` intervals; returns what became of it.
-    pub fn insert_within(&mut self, count: u64, time: CucTime, intervals_max: usize) -> Insertion {
+    pub fn insert_within(&mut self, count: u64, time: CucTime, intervals_max: usize) -> PacketInsertion {
         if self.contains(count, time) {
-            return Insertion::Known;
+            return PacketInsertion::Known;
         }
         let extends = |count: Option<u64>| count.is_some_and(|count| self.contains(count, time));
         let has_room = self.packets.intervals() < intervals_max;
         if !has_room && !extends(count.checked_sub(1)) && !extends(count.checked_add(1)) {
-            return Insertion::Full;
+            return PacketInsertion::Full;
         }
         self.packets.insert((time, count)..(time, count + 1));
-        Insertion::New
+        PacketInsertion::New
     }
 
     /// Removes a packet.
@@ -194,16 +194,16 @@ mod tests {
     fn a_full_set_takes_only_what_extends_it() {
         let mut received = ReceivedSet::default();
         for count in [10, 20, 30] {
-            assert_eq!(received.insert_within(count, at(count), 3), Insertion::New);
+            assert_eq!(received.insert_within(count, at(count), 3), PacketInsertion::New);
         }
         let full = received.clone();
         for (count, s) in [(40, 40), (11, 20), (10, 11)] {
-            assert_eq!(received.insert_within(count, at(s), 3), Insertion::Full, "{count}");
+            assert_eq!(received.insert_within(count, at(s), 3), PacketInsertion::Full, "{count}");
         }
         assert_eq!(received, full);
-        assert_eq!(received.insert_within(20, at(20), 3), Insertion::Known);
+        assert_eq!(received.insert_within(20, at(20), 3), PacketInsertion::Known);
         for (count, s) in [(11, 10), (9, 10), (21, 20), (31, 30)] {
-            assert_eq!(received.insert_within(count, at(s), 3), Insertion::New, "{count}");
+            assert_eq!(received.insert_within(count, at(s), 3), PacketInsertion::New, "{count}");
         }
         assert_eq!(received.len(), 7);
     }
