@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use lunarray::accumulation::{EngineKind, MapConfig};
 use lunarray::array::{Array, ArrayConfig, Ephemeris, segments_for};
-use lunarray::calibration::{CalibrationConfig, Calibrator};
+use lunarray::calibration::{CalibrationConfig, Calibrator, MissingPackets};
 use lunarray::downlink::receive::cadu::CaduReceiver;
 use lunarray::downlink::wire::cadu::{CaduEncoder, ReedSolomon, randomize};
 use lunarray::downlink::{DownlinkConfig, DownlinkReader, FileSource, PacketReceiver, Packetizer};
@@ -292,7 +292,7 @@ impl Stage for Door {
     }
 
     fn finish(&mut self, _: &mut Outlet<PlacedFrame>) -> Result<(), GroundError> {
-        self.calibrator.close();
+        black_box(self.calibrator.close(MissingPackets::default()));
         Ok(())
     }
 }

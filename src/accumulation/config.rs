@@ -40,6 +40,9 @@ pub struct MapConfig {
     pub nside: usize,
     /// Basis of the normal equations: `pixel` or `harmonic`.
     pub engine: EngineKind,
+    /// Most channels of an instrument. Each takes memory for a map as soon as it has data, so a forged description of
+    /// many channels is refused.
+    pub channels_max: usize,
     /// How the pixel engine computes rows of B.
     pub rows: PixelMethod,
     /// Highest degree of a map from the harmonic engine; 0 for 2.5 nside.
@@ -76,6 +79,7 @@ impl Default for MapConfig {
         Self {
             nside: 16,
             engine: EngineKind::Pixel,
+            channels_max: 64,
             rows: PixelMethod::Average,
             l_max: 0,
             baseline_bp_max: 2.0,
@@ -104,6 +108,8 @@ impl MapConfig {
         let good = is_valid_nside(self.nside) && self.nside <= most;
         let expected = format!("a power of two from 1 to {most} for this engine");
         checks.require("nside", self.nside, good, expected);
+        let channels = self.channels_max;
+        checks.require("channels_max", channels, (1..=4096).contains(&channels), "1 to 4096");
         let longest = self.baseline_bp_max;
         checks.number("baseline_bp_max", longest, longest > 0.0, "a positive number, in units of b_p");
         for &epsilon in self.epsilon.values() {
@@ -160,6 +166,7 @@ impl MapConfig {
             companion_seed,
             limits,
             weight_max,
+            channels_max: _,
             epsilon: _,
             prior_k: _,
             prior_files: _,
@@ -201,6 +208,9 @@ impl MapConfig {
     pub fn misfits(&self, channels: usize) -> Vec<InvalidValue> {
         let files = self.prior_files.len();
         let mut checks = Checks::of("map");
+        let expected =
+            format!("at least the {channels} channels of the instrument, each of which needs memory");
+        checks.require("channels_max", self.channels_max, channels <= self.channels_max, expected);
         for (key, fits, found) in [
             ("epsilon", self.epsilon.fits(channels), self.epsilon.values().len()),
             ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),

@@ -19,7 +19,7 @@ mod sub_bands;
 mod van_vleck;
 
 pub use autos::{AUTOS_MAX, AutoTable};
-pub use blocks::{BlockKey, ReceivedBlocks};
+pub use blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
 pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 pub use gains::AntennaGains;

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use num_complex::Complex64;
 
 use super::autos::{AUTOS_MAX, AutoTable};
-use super::blocks::{BlockKey, ReceivedBlocks};
+use super::blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
 use super::{Calibration, CalibrationError, VanVleck};
 use crate::array::Ephemeris;
 use crate::frames::{
@@ -18,8 +18,9 @@ use crate::units::{MissionTime, Pair};
 /// Places visibilities by the ephemeris packets alone and passes them through the calibration hook. What cannot be used
 /// is flagged in the ledger with its reason.
 ///
-/// At the end the ledger is closed against the spacecraft's own counts: sampled less dropped less received is
-/// what the link lost. Visibilities after the last housekeeping packet count as sampled when received.
+/// At the end the ledger is closed against the spacecraft's own counts: sampled less dropped less received is what the
+/// link lost. Visibilities after the latest report count as sampled when received; of what else was sampled then only
+/// missing packets are known, and the ledger is not known to be complete.
 pub struct Calibrator {
     van_vleck: Option<VanVleck>,
     /// Auto-correlations, if they are kept.
@@ -178,9 +179,16 @@ impl Calibrator {
         }
     }
 
-    /// Posts to the ledger what was sampled, and what was lost before it was received.
-    pub fn close(&self) {
-        self.blocks.close(&self.ledger);
+    /// Counts visibilities that the decoder left out of a block whose window starts at `window`, because their values
+    /// cannot be used.
+    pub fn count_bad(&mut self, window: MissionTime, visibilities: u64) {
+        self.blocks.count_bad(window, visibilities);
+    }
+
+    /// Posts to the ledger what was sampled, and what was lost before it was received; returns whether that is known to
+    /// be all.
+    pub fn close(&self, missing: MissingPackets) -> Completeness {
+        self.blocks.close(&self.ledger, missing)
     }
 
     fn accept_visibilities(
@@ -305,7 +313,7 @@ impl Stage for Calibrator {
     }
 
     fn finish(&mut self, _: &mut Outlet<PlacedFrame>) -> Result<(), CalibrationError> {
-        self.close();
+        self.close(MissingPackets::default());
         Ok(())
     }
 

@@ -12,6 +12,7 @@ mod gaps;
 mod geometry;
 mod inspect;
 mod interrupt;
+mod lines;
 mod merge;
 mod output;
 mod predict;

@@ -2,7 +2,8 @@
 
 use std::io::Write;
 
-use crate::pipeline::Config;
+use crate::pipeline::{Config, RunSummary};
+use crate::units::printable;
 
 /// Why a command failed; the message says where and what was expected.
 pub(super) type CommandError = Box<dyn std::error::Error + Send + Sync>;
@@ -42,26 +43,41 @@ pub(super) fn say(line: impl std::fmt::Display) {
 /// Prints one JSON object on a line of its own.
 pub(super) fn print_json_line(value: &impl serde::Serialize) -> Result<(), CommandError> {
     let mut out = std::io::stdout().lock();
-    serde_json::to_writer(&mut out, value).map_err(|error| match error.io_error_kind() {
-        Some(kind) => Box::new(std::io::Error::from(kind)) as CommandError,
-        None => Box::new(error),
-    })?;
+    out.write_all(json_text(value)?.as_bytes())?;
     out.write_all(b"\n")?;
     Ok(())
+}
+
+/// A JSON object whose strings hold no character that a terminal would obey. JSON itself allows some of them.
+fn json_text(value: &impl serde::Serialize) -> Result<String, serde_json::Error> {
+    let text = serde_json::to_string(value)?;
+    let escaped = |c: char| match printable(c.encode_utf8(&mut [0; 4])) {
+        std::borrow::Cow::Borrowed(_) => c.to_string(),
+        std::borrow::Cow::Owned(_) => format!("\\u{:04x}", u32::from(c)),
+    };
+    match printable(&text) {
+        std::borrow::Cow::Borrowed(_) => Ok(text),
+        std::borrow::Cow::Owned(_) => Ok(text.chars().map(escaped).collect()),
+    }
 }
 
 /// Prints text for people.
 pub(super) fn print_text(text: &str) -> Result<(), CommandError> {
     let mut out = std::io::stdout().lock();
-    out.write_all(text.as_bytes())?;
+    out.write_all(printable_text(text).as_bytes())?;
     out.write_all(b"\n")?;
     Ok(())
+}
+
+/// Text for a terminal, with its line breaks: names and replies of others in it are shown, not obeyed.
+pub(super) fn printable_text(text: &str) -> String {
+    text.split('\n').map(printable).collect::<Vec<_>>().join("\n")
 }
 
 /// Prints notes to standard error.
 pub(super) fn print_notes<T: std::fmt::Display>(notes: impl IntoIterator<Item = T>) {
     for note in notes {
-        say(format_args!("note: {note}"));
+        say(format_args!("note: {}", printable_text(&note.to_string())));
     }
 }
 
@@ -70,17 +86,39 @@ pub(super) fn print_config_notes(config: &Config) {
     print_notes(config.notes());
 }
 
+/// Says on standard error that more may be missing than the ledger tells, unless it is known to be complete.
+pub(super) fn print_incompleteness(summary: &RunSummary) {
+    if !summary.completeness.complete {
+        print_notes([format!("the ledger is {}", summary.completeness)]);
+    }
+}
+
 /// Prints an error and its causes; causes that the message already quotes are left out.
 pub(super) fn print_error(error: &(dyn std::error::Error + 'static)) {
     let mut said = error.to_string();
-    say(format_args!("error: {said}"));
+    say(format_args!("error: {}", printable_text(&said)));
     let mut cause = error.source();
     while let Some(error) = cause {
         let text = error.to_string();
         if !said.contains(&text) {
-            say(format_args!("  because: {text}"));
+            say(format_args!("  because: {}", printable_text(&text)));
         }
         said = text;
         cause = error.source();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_control_character_reaches_the_terminal() {
+        let name = "a\u{1b}[2J\u{9b}31m\u{202e}b";
+        assert_eq!(printable_text(&format!("{name}\nnext")), "a\\u{1b}[2J\\u{9b}31m\\u{202e}b\nnext");
+        let text = json_text(&[name, "plain \u{e9}"]).unwrap();
+        assert!(text.is_ascii() || !text.contains(|c: char| c.is_control() || c == '\u{202e}'), "{text}");
+        // What it says is the same.
+        assert_eq!(serde_json::from_str::<Vec<String>>(&text).unwrap(), [name, "plain \u{e9}"]);
     }
 }

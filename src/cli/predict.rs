@@ -1,12 +1,12 @@
 //! `lunarray predict`: predict single visibilities.
 
-use std::io::BufRead;
 use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
 
 use super::arguments::{ArrayArgs, time_s};
+use super::lines::next_line;
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
 use crate::array::Array;
 use crate::mother::BAND_HZ;
@@ -93,16 +93,16 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
         answer(VisibilityQuery { t_s, pair, freq_hz })?;
         return Ok(Completion::Done);
     }
-    let mut lines = std::io::stdin().lock().lines();
-    let header = lines.next().transpose()?.unwrap_or_default();
+    let mut input = std::io::stdin().lock();
+    let header = next_line(&mut input, 1)?.unwrap_or_default();
     if header.split(',').map(str::trim).ne(["t_s", "i", "j", "freq_hz"]) {
         return Err(format!("standard input, line 1: found `{header}`, expected `t_s,i,j,freq_hz`").into());
     }
-    for (number, line) in lines.enumerate() {
-        let line = line?;
+    for number in 2.. {
+        let Some(line) = next_line(&mut input, number)? else { break };
         if !line.trim().is_empty() {
             let query = parse(&line).and_then(|query| check(&array, query).map(|()| query));
-            answer(query.map_err(|error| format!("standard input, line {}: {error}", number + 2))?)?;
+            answer(query.map_err(|error| format!("standard input, line {number}: {error}"))?)?;
         }
     }
     Ok(Completion::Done)

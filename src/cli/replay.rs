@@ -1,13 +1,17 @@
 //! `lunarray replay`: run the ground segment on downlink files or live senders.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use clap::{ArgGroup, Args};
 use crossbeam_channel::{Receiver, bounded};
 
 use super::arguments::not_negative_s;
 use super::interrupt::Interrupt;
-use super::output::{CommandError, CommandResult, print_json_line, print_notes, print_text, say};
+use super::lines::next_line;
+use super::output::{
+    CommandError, CommandResult, print_incompleteness, print_json_line, print_notes, print_text, say,
+};
 use super::progress::Progress;
 use crate::downlink::transport::socket::{SocketError, SocketSource, TcpUrl, Until};
 use crate::downlink::{FileSource, Pace, Paced, Steps};
@@ -142,11 +146,13 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
         }
         false => interrupt.completion(summary.cancelled),
     };
-    completion.after(if args.json {
+    let printed = if args.json {
         print_json_line(&summary)
     } else {
         print_text(&format!("{summary}\nProducts are in {}", args.out.display()))
-    })
+    };
+    print_incompleteness(&summary);
+    completion.after(printed)
 }
 
 /// What a replay is to do, and what may end it.
@@ -160,6 +166,7 @@ impl Session<'_> {
     fn hear_senders(&self, url: &TcpUrl, ground: Ground) -> Result<RunSummary, CommandError> {
         let Self { args, config, .. } = self;
         let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
+        let settings = config.ground(0);
         let until = Until { idle_s: args.idle_s, connections: args.connections };
         let source = SocketSource::bind(&addresses, &config.downlink.listen, until)
             .map_err(|error| match error {
@@ -167,6 +174,7 @@ impl Session<'_> {
                 other => other,
             })?
             .knowing(ground.instrument().cloned())
+            .accepting(Arc::new(move |instrument| settings.fits(instrument).is_ok()))
             .telling(Box::new(|note| print_notes([note])));
         let address = source.url();
         Ok(self.watched(source, ground, &|| say(format_args!("listening on {address}")))?)
@@ -212,8 +220,9 @@ fn lines_of_input() -> Receiver<()> {
     let (say, go) = bounded(0);
     // The thread ends with the input or the process; nothing else can interrupt its read.
     std::thread::spawn(move || {
-        for line in std::io::stdin().lines() {
-            if line.is_err() || say.send(()).is_err() {
+        let mut input = std::io::stdin().lock();
+        while let Ok(Some(_)) = next_line(&mut input, 1) {
+            if say.send(()).is_err() {
                 return;
             }
         }

@@ -6,9 +6,11 @@ use clap::Args;
 
 use super::arguments::PipelineArgs;
 use super::interrupt::Interrupt;
-use super::output::{CommandResult, print_config_notes, print_json_line, print_text};
+use super::output::{
+    CommandResult, print_config_notes, print_incompleteness, print_json_line, print_notes, print_text,
+};
 use super::progress::Progress;
-use crate::pipeline::{INTEGRATE, Plan, run, use_threads};
+use crate::pipeline::{INTEGRATE, Plan, run, sky_notes, use_threads};
 
 /// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
 ///
@@ -34,6 +36,7 @@ pub(super) fn execute(args: &RunArgs) -> CommandResult {
     let config = args.pipeline.source().load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
+    print_notes(sky_notes(&plan)?);
     use_threads(&plan.config.runtime)?;
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
     let interrupt = Interrupt::default();
@@ -44,9 +47,11 @@ pub(super) fn execute(args: &RunArgs) -> CommandResult {
         progress = Some(Progress::watch(metrics, INTEGRATE, windows, interrupt.cancel()));
     })?;
     drop(progress);
-    interrupt.completion(summary.cancelled).after(if args.json {
+    let printed = if args.json {
         print_json_line(&summary)
     } else {
         print_text(&format!("{summary}\nProducts are in {}", out.display()))
-    })
+    };
+    print_incompleteness(&summary);
+    interrupt.completion(summary.cancelled).after(printed)
 }

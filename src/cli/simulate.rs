@@ -7,10 +7,10 @@ use clap::Args;
 
 use super::arguments::{PipelineArgs, not_negative_s};
 use super::interrupt::Interrupt;
-use super::output::{CommandResult, print_config_notes, print_json_line, print_text};
+use super::output::{CommandResult, print_config_notes, print_json_line, print_notes, print_text};
 use super::progress::Progress;
 use crate::downlink::transport::socket::{SendOptions, SocketSink, TcpUrl};
-use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, use_threads};
+use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, sky_notes, use_threads};
 
 /// Simulate the space segment, and write its downlink to a file or send it to a listening ground segment.
 ///
@@ -53,6 +53,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let config = args.pipeline.source().load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
+    print_notes(sky_notes(&plan)?);
     use_threads(&plan.config.runtime)?;
     let interrupt = Interrupt::default();
     let cancel = interrupt.cancel();

@@ -47,6 +47,11 @@
 //! | visibilities | channel u16, i u8, j u8, start_ticks i64, count u32 | count each: offset_ticks u32, duration_ticks u32, value (re, im) f32 x 2, weight f32, flags u8 |
 //! | housekeeping | time_ticks i64, sampled u64, dropped u64 | |
 //!
+//! A pass begins, after the instrument description, and ends with a report of the spacecraft's counts (housekeeping). Both
+//! say the same, so that a pass that is cut short still tells how much it held. The reports of the last pass hold until
+//! 2^32 s, the end of the range of times: a ledger is complete only with one of them. Files made before this have a
+//! report only at the end of each pass, and none that is the last.
+//!
 //! Each packet of visibilities can be decoded alone. Other payloads are segmented if they exceed a packet.
 //!
 //! The header has a checksum of its own: so a damaged packet can be told from noise, and its loss has a kind, a time

@@ -57,6 +57,10 @@ pub enum VisibilityReason {
     StoreFull,
     /// It was sent and did not arrive.
     NotReceived,
+    /// Its packet is missing, and no report says how many visibilities it held: at least one.
+    NotReceivedAtLeast,
+    /// It was received, but its value, weight or duration cannot be used.
+    BadValue,
     /// It arrived after the session was interrupted, which keeps it for the next one.
     NextSession,
 }
@@ -92,6 +96,8 @@ impl Reason for VisibilityReason {
             Self::SumsFull => "refused by the engine: sums full at this map.weight_max",
             Self::StoreFull => "full",
             Self::NotReceived => "not received",
+            Self::NotReceivedAtLeast => "not received (at least)",
+            Self::BadValue => "value or weight that cannot be used, as it was sent",
             Self::NextSession => "left for the next session",
         }
     }
@@ -99,7 +105,7 @@ impl Reason for VisibilityReason {
     fn lost_in(self) -> Option<&'static str> {
         match self {
             Self::StoreFull => Some("store"),
-            Self::NotReceived => Some("downlink"),
+            Self::NotReceived | Self::NotReceivedAtLeast => Some("downlink"),
             _ => None,
         }
     }
@@ -154,6 +160,6 @@ mod tests {
         assert_eq!(texts.len(), all.len());
         // Some of the places, so that none moves unseen.
         assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
-        assert_eq!((all.len(), all.last()), (25, Some(&VisibilityReason::NextSession)));
+        assert_eq!((all.len(), all.last()), (27, Some(&VisibilityReason::NextSession)));
     }
 }

@@ -8,7 +8,8 @@ use bincode::{Decode, Encode};
 use super::hold_buffer::{HeldPacket, HoldBuffer, Sent};
 use crate::downlink::error::{DownlinkError, require_packets};
 use crate::downlink::receive::{
-    ByteFeed, Decoder, DecoderState, Event, Intake, PacketReading, ReceivedSet, ReceptionCounters,
+    ByteFeed, Decoder, DecoderState, Event, Intake, PacketInsertion, PacketReading, ReceivedSet,
+    ReceptionCounters,
 };
 use crate::downlink::wire::payload::visibilities_span;
 use crate::downlink::wire::{Kind, PacketHeader, PacketSegment};
@@ -80,6 +81,11 @@ pub struct DeliveredPacket {
     pub reading: PacketReading,
 }
 
+/// Most intervals of the received set of a kind: packets of consecutive counts made at one time are one. A pass has a few,
+/// so a mission of 30 channels over 1.3 years has some tens of thousands, and 300,000 if a tenth of its packets are
+/// lost. Some 100 MB a kind, whatever a forger sends.
+const INTERVALS_MAX: usize = 1 << 20;
+
 /// Packets that have been decoded, and what they say.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Delivery {
@@ -110,6 +116,10 @@ pub struct Collector {
     has_new_positions: bool,
     /// Whether visibilities are held, as far as there is room, although their positions are known.
     sets_aside: bool,
+    /// Most intervals of the received set of a kind.
+    intervals_max: usize,
+    /// New packets for which the received set has no room, and their bytes.
+    beyond: [u64; 2],
 }
 
 impl Collector {
@@ -125,7 +135,15 @@ impl Collector {
             candidates: VecDeque::new(),
             has_new_positions: false,
             sets_aside: false,
+            intervals_max: INTERVALS_MAX,
+            beyond: [0; 2],
         }
+    }
+
+    /// Refuses new packets that would need more than `intervals_max` intervals in the received set of their kind.
+    #[must_use]
+    pub fn with_intervals(self, intervals_max: usize) -> Self {
+        Self { intervals_max, ..self }
     }
 
     /// Resumes at the beginning of a stream, with packets that were delivered in earlier sessions and their counters.
@@ -257,7 +275,9 @@ impl Collector {
         let mut counters = self.decoder.counters().clone();
         let link = self.link.counters();
         counters.frames = self.intake.frames();
-        counters.bytes += link.bytes;
+        let [packets_beyond, bytes_beyond] = self.beyond;
+        counters.bytes += link.bytes + bytes_beyond;
+        (counters.packets_beyond, counters.bytes_beyond) = (packets_beyond, bytes_beyond);
         counters.bytes_garbage = link.bytes_garbage;
         counters.garbage_stretches = link.garbage_stretches;
         counters.bytes_truncated = link.bytes_truncated;
@@ -362,9 +382,17 @@ impl Collector {
         if describes && header.segment == PacketSegment::Whole && self.decoder.contradicts(packet.payload) {
             return Err(DownlinkError::OtherInstrument { offset });
         }
-        if !self.received[header.kind.index()].insert(header.count, header.time) {
-            self.link.accept(&Event::Duplicate { offset, header });
-            return Ok(Handled::Event);
+        let received = &mut self.received[header.kind.index()];
+        match received.insert_within(header.count, header.time, self.intervals_max) {
+            PacketInsertion::New => {}
+            PacketInsertion::Known => {
+                self.link.accept(&Event::Duplicate { offset, header });
+                return Ok(Handled::Event);
+            }
+            PacketInsertion::Full => {
+                self.beyond = [self.beyond[0] + 1, self.beyond[1] + header.bytes as u64];
+                return Ok(Handled::Event);
+            }
         }
         // As nearly all are: never copied into the hold buffer.
         if header.kind == Kind::Visibilities

@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
-use crate::accumulation::{Accumulator, MapConfig};
+use super::GroundError;
+use crate::accumulation::{AccumulationError, Accumulator, MapConfig};
 use crate::calibration::{CalibrationConfig, CalibrationError, Calibrator};
-use crate::frames::VisibilityReason;
+use crate::frames::{Instrument, VisibilityReason};
 use crate::runtime::Ledger;
 
 /// Default capacity of the hold buffer, bytes: a week of thirty channels.
@@ -25,6 +26,16 @@ pub struct GroundConfig {
 }
 
 impl GroundConfig {
+    /// Whether maps can be made of an instrument, as far as its description says.
+    ///
+    /// # Errors
+    /// Calibration that was not made for it; settings of the map that do not fit it, or too many channels.
+    pub fn fits(&self, instrument: &Instrument) -> Result<(), GroundError> {
+        let described = self.calibration.build(Path::new(""))?.describe(instrument)?;
+        let misfit = self.map.misfits(described.channels.len()).into_iter().next();
+        misfit.map_or(Ok(()), |misfit| Err(AccumulationError::from(misfit).into()))
+    }
+
     /// A calibrator without data, posting to `ledger`.
     pub(super) fn calibrator(
         &self,

@@ -6,7 +6,8 @@ use std::time::Duration;
 use super::archive::{Archive, RecordDraft};
 use super::{Collector, Delivery, GroundConfig, GroundError, GroundOutcome};
 use crate::accumulation::{Accumulator, Snapshot};
-use crate::calibration::Calibrator;
+use crate::calibration::{Calibrator, MissingPackets};
+use crate::downlink::{CucTime, Kind};
 use crate::frames::{GroundFrame, Instrument, PlacedFrame};
 use crate::runtime::{Cancel, Outlet, Stage, Units};
 
@@ -87,6 +88,10 @@ impl Ground {
     /// Takes a delivery through calibration into the sums, and into the journal if there is an archive.
     fn apply(&mut self, delivery: Delivery, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         let Delivery { packets, frame } = delivery;
+        if let Some(GroundFrame::Visibilities(block)) = &frame {
+            let bad = packets.iter().map(|packet| u64::from(packet.reading.visibilities_bad_value)).sum();
+            self.calibrator.count_bad(block.start, bad);
+        }
         let Some(archive) = &mut self.archive else {
             if let Some(placed) = placed(&mut self.calibrator, frame)? {
                 self.accumulator.accept(placed, out)?;
@@ -101,6 +106,21 @@ impl Ground {
         let posted = archive.record(&packets, draft, self.calibrator.ephemeris());
         self.outcome.ledger.post_report(&posted);
         Ok(())
+    }
+
+    /// Packets of visibilities that are known to be missing.
+    fn missing_packets(&self) -> MissingPackets {
+        let latest = self.calibrator.blocks().latest_report().0;
+        let reported = self.instrument().zip(latest).map(|(instrument, latest)| {
+            // Beyond the range of the time code nothing is made.
+            CucTime::new(instrument.epoch_tai_s, latest.time).unwrap_or(CucTime(u64::MAX))
+        });
+        let mut missing = MissingPackets::default();
+        for (_, received) in self.collector.received().filter(|(kind, _)| *kind == Kind::Visibilities) {
+            let [all, since] = received.missing_since(reported.unwrap_or_default());
+            missing = MissingPackets { all, unreported: if reported.is_some() { since } else { all } };
+        }
+        missing
     }
 
     /// Writes a checkpoint, if there is an archive.
@@ -142,7 +162,7 @@ impl Stage for Ground {
                 _ => self.apply(delivery, out)?,
             }
         }
-        self.calibrator.close();
+        fill(&self.outcome.completeness, self.calibrator.close(self.missing_packets()));
         if let Some(archive) = &self.archive {
             self.outcome.ledger.post_report(&archive.take_posts());
         }

@@ -2,6 +2,7 @@
 
 use std::sync::{Arc, Mutex};
 
+use crate::calibration::Completeness;
 use crate::downlink::ReceptionCounters;
 use crate::frames::{AutoPower, VisibilityReason};
 use crate::runtime::Ledger;
@@ -11,6 +12,8 @@ use crate::runtime::Ledger;
 pub struct GroundOutcome {
     /// What became of every visibility.
     pub ledger: Ledger<VisibilityReason>,
+    /// Whether the ledger is known to be complete.
+    pub completeness: Arc<Mutex<Completeness>>,
     /// What was received, and what was wrong with it.
     pub reception: Arc<Mutex<ReceptionCounters>>,
     /// Auto-correlations, by channel, daughter and time.

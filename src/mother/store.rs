@@ -52,8 +52,10 @@ enum End {
 /// in a pass stays for the next one, and is sent after the positions that it needs. At the end of the mission a last
 /// pass empties the store.
 ///
-/// When the store is full, visibilities are dropped as [`StoreDrop`] says and counted in the housekeeping frame that
-/// closes the pass. Nothing else is ever dropped.
+/// A pass begins, after the instrument's description, and ends with a report of the counts, which are the same: if the
+/// end of the pass is lost, the ground still learns how much it held. The reports of the last pass hold for all time.
+///
+/// When the store is full, visibilities are dropped as [`StoreDrop`] says and counted in the reports of the pass. Nothing else is ever dropped.
 #[derive(Debug)]
 pub struct Store {
     capacity_bytes: u64,
@@ -188,13 +190,23 @@ impl Store {
         Some(taken)
     }
 
-    /// Sends the windows before window `until`, up to `bytes` bytes.
-    fn send(&mut self, until: u64, bytes: Option<u64>, out: &mut Outlet<GroundFrame>) {
+    /// Sends the windows before window `until`, up to `bytes` bytes. The report goes before the first frame that is no
+    /// description of the instrument, without which no packet can be read.
+    fn send(
+        &mut self,
+        until: u64,
+        bytes: Option<u64>,
+        mut report: Option<Housekeeping>,
+        out: &mut Outlet<GroundFrame>,
+    ) {
         let mut left = bytes.unwrap_or(u64::MAX);
         while let Some(window) = self.descriptions.keys().next().copied().filter(|window| *window < until) {
             let descriptions = self.descriptions.remove(&window).unwrap_or_default();
             for frame in &descriptions {
                 left = left.saturating_sub(description_bytes(frame));
+                if !matches!(frame, GroundFrame::Instrument(_)) {
+                    push_report(&mut report, out);
+                }
                 out.push(frame.clone());
             }
             while let Some((&number, _)) =
@@ -207,6 +219,7 @@ impl Store {
                 }
                 let Some(block) = self.remove(number, left / VISIBILITY_BYTES, End::Front) else { break };
                 left -= VISIBILITY_BYTES * block.len() as u64;
+                push_report(&mut report, out);
                 out.push(GroundFrame::Visibilities(block));
             }
             if left < VISIBILITY_BYTES {
@@ -215,16 +228,26 @@ impl Store {
         }
     }
 
-    /// Ends the current pass, if there is one, at `time_s`; `None` sends everything.
+    /// Ends the current pass, if there is one, at `time_s`; `None` for the last pass, which sends everything.
     fn end_pass(&mut self, time_s: Option<f64>, out: &mut Outlet<GroundFrame>) {
-        let Some(report) = self.closing.take() else { return };
+        let Some(closing) = self.closing.take() else { return };
         let bytes = self.link.as_ref().zip(time_s).map(|(link, time_s)| {
-            let sight_s = earth_in_sight_s(&link.array, report.time.seconds(), time_s);
+            let sight_s = earth_in_sight_s(&link.array, closing.time.seconds(), time_s);
             (sight_s * link.bytes_per_s) as u64
         });
-        self.send(self.window, bytes, out);
-        let dropped = report.dropped + self.dropped;
-        out.push(GroundFrame::Housekeeping(Housekeeping { dropped, ..report }));
+        // Nothing is dropped while a pass is sent.
+        let dropped = closing.dropped + self.dropped;
+        let is_last = time_s.is_none() && self.held.values().all(|held| held.window < self.window);
+        let time = if is_last { Housekeeping::FOREVER } else { closing.time };
+        let report = Housekeeping { time, dropped, ..closing };
+        self.send(self.window, bytes, Some(report), out);
+        out.push(GroundFrame::Housekeeping(report));
+    }
+}
+
+fn push_report(report: &mut Option<Housekeeping>, out: &mut Outlet<GroundFrame>) {
+    if let Some(report) = report.take() {
+        out.push(GroundFrame::Housekeeping(report));
     }
 }
 
@@ -255,9 +278,6 @@ impl Stage for Store {
                 self.end_pass(Some(report.time.seconds()), out);
                 self.closing = Some(report);
                 self.window += 1;
-                if self.link.is_none() {
-                    self.end_pass(None, out);
-                }
             }
             other => self.descriptions.entry(self.window).or_default().push(other),
         }
@@ -267,7 +287,7 @@ impl Stage for Store {
     /// An interrupted window is sent as far as it was observed.
     fn finish(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), Infallible> {
         self.end_pass(None, out);
-        self.send(u64::MAX, None, out);
+        self.send(u64::MAX, None, None, out);
         Ok(())
     }
 
@@ -317,8 +337,31 @@ mod tests {
         }
         store.finish(&mut out).unwrap();
         let frames = out.into_vec();
-        let closes = |frame: &GroundFrame| matches!(frame, GroundFrame::Housekeeping(_));
-        frames.split_inclusive(closes).map(<[_]>::to_vec).collect()
+        let passes: Vec<Vec<GroundFrame>> = frames.split_inclusive(ends_pass()).map(<[_]>::to_vec).collect();
+        for (k, pass) in passes.iter().enumerate() {
+            let reports: Vec<&GroundFrame> = pass.iter().filter(|frame| is_report(frame)).collect();
+            // One before everything but descriptions of the instrument, one at the end, and both say the same.
+            assert!(is_report(&pass[0]) && reports.len() == 2 && reports[0] == reports[1], "{reports:?}");
+            let GroundFrame::Housekeeping(report) = reports[0] else { panic!("no report") };
+            assert_eq!(report.is_last(), k + 1 == windows.len());
+        }
+        passes
+    }
+
+    fn is_report(frame: &GroundFrame) -> bool {
+        matches!(frame, GroundFrame::Housekeeping(_))
+    }
+
+    /// Whether a frame is the report that ends a pass: not the first of the pass.
+    fn ends_pass() -> impl FnMut(&GroundFrame) -> bool {
+        let mut in_pass = false;
+        move |frame| match is_report(frame) {
+            true => std::mem::take(&mut in_pass),
+            false => {
+                in_pass = true;
+                false
+            }
+        }
     }
 
     fn sent(pass: &[GroundFrame]) -> usize {

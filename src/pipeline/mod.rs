@@ -29,5 +29,5 @@ pub use run::{
 };
 pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
 pub use sampling::sample_stages;
-pub use space_segment::INTEGRATE;
+pub use space_segment::{INTEGRATE, sky_notes};
 pub use summary::{RunScope, RunSummary};

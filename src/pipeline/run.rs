@@ -275,6 +275,7 @@ fn conclude(
     write_autos(&mut autos, out, config.products.pictures)?;
     let mut summary = RunSummary::new(segment, config, report, ledger, reception, channels);
     (summary.listening, summary.samples) = (listening, samples);
+    summary.completeness = ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let path = summary.write(out)?;
     if summary.channels.is_empty() && !summary.cancelled {
         return Err(PipelineError::NoMap { summary: path, ledger: Box::new(summary.ledger) });

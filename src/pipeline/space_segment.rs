@@ -15,7 +15,7 @@ use crate::mother::{
 };
 use crate::response::model::DirectSum;
 use crate::runtime::{Graph, Link};
-use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::fits::{read_sky, read_unit};
 use crate::sky::generated::generate;
 use crate::sky::{Frame, SkyMap};
 
@@ -25,13 +25,13 @@ pub const INTEGRATE: &str = "integrate";
 /// The simulated sky of every channel, in its own pixels and frame.
 ///
 /// # Errors
-/// A map that cannot be read or that has pixels without a value.
+/// A map that cannot be read, or that has pixels that are no temperature of a sky.
 pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
     let config = &plan.config.sky;
     let sky = |(channel, &frequency_hz): (usize, &f64)| match config.file.as_ref() {
         Some(files) => {
             let path = files.get(channel).unwrap_or_default();
-            Ok(read_whole_map(&path, &ReadOptions::default())?)
+            Ok(read_sky(&path, plan.config.spacecraft.receiver_noise_k_sr > 0.0)?)
         }
         None => {
             let values = generate(&config.generated, frequency_hz, config.nside, plan.config.seed)?;
@@ -39,6 +39,20 @@ pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
         }
     };
     plan.config.spacecraft.channels_hz.iter().enumerate().map(sky).collect()
+}
+
+/// What is assumed about the map files of the sky: those without a unit are in K.
+///
+/// # Errors
+/// A map whose header cannot be read.
+pub fn sky_notes(plan: &Plan) -> Result<Vec<String>, PipelineError> {
+    let mut notes = Vec::new();
+    for path in plan.config.sky.file.iter().flat_map(|files| files.values()) {
+        if read_unit(path)?.trim().is_empty() {
+            notes.push(format!("{}: the map states no unit (TUNIT); it is taken as K", path.display()));
+        }
+    }
+    Ok(notes)
 }
 
 /// Adds the space segment to `graph`; its output are the bytes of the downlink. With sample fidelity its stages count in

@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::config::Config;
 use super::ground_segment::SOLVE;
 use super::sample_summary::SampleSummary;
+use crate::calibration::Completeness;
 use crate::downlink::ReceptionCounters;
 use crate::downlink::transport::socket::ListenReport;
 use crate::files::write_atomically;
@@ -47,6 +48,8 @@ pub struct RunSummary {
     pub channels: Vec<ChannelSummary>,
     /// The ledger of visibilities.
     pub ledger: LedgerReport<VisibilityReason>,
+    /// Whether the ledger is known to be complete.
+    pub completeness: Completeness,
     /// Statistics of samples; absent without sample fidelity.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples: Option<SampleSummary>,
@@ -80,6 +83,7 @@ impl RunSummary {
             ground_hash: format!("{:016x}", config.ground_hash()),
             channels,
             ledger,
+            completeness: Completeness::default(),
             samples: None,
             reception,
             listening: None,
@@ -144,7 +148,7 @@ fn files_of(summary: &[u8]) -> Vec<String> {
 impl fmt::Display for RunSummary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "Stages\n{}\n", self.report)?;
-        writeln!(f, "Ledger of visibilities\n{}\n", self.ledger)?;
+        writeln!(f, "Ledger of visibilities\n{}\n{}\n", self.ledger, self.completeness)?;
         if let Some(samples) = &self.samples {
             writeln!(f, "Samples\n{samples}\n")?;
         }

@@ -49,6 +49,32 @@ pub enum MapError {
         /// Its value.
         value: f64,
     },
+    /// Pixels that are no temperature of a sky.
+    #[error(
+        "{count} of {total} pixels are no temperature of a sky, the first is RING pixel {first} with {value:e} K; expected \
+         0 K to {most:e} K everywhere"
+    )]
+    NoTemperature {
+        /// Number of such pixels.
+        count: usize,
+        /// Number of pixels of the map.
+        total: usize,
+        /// RING number of the first such pixel.
+        first: usize,
+        /// Its value, K.
+        value: f64,
+        /// Greatest temperature, K.
+        most: f64,
+    },
+    /// A sky without power, and receivers without noise.
+    #[error(
+        "every pixel is 0 K, the first with {value:e} K: without noise visibilities have no weight; expected a sky with \
+         some power, or spacecraft.receiver_noise_k_sr above 0"
+    )]
+    Dark {
+        /// Value of the first pixel, K.
+        value: f64,
+    },
     /// Invalid width of a Gaussian beam.
     #[error("a beam of FWHM {fwhm_rad} rad is not allowed; expected a finite width of at least 0")]
     Width {

@@ -13,6 +13,10 @@ use crate::units::vector::Vec3;
 /// Pixels of one task; fixed, so that results do not depend on the number of threads.
 const PIXELS_PER_TASK: usize = 4096;
 
+/// Greatest temperature of a sky, K: far above that of any source below 100 MHz, solar bursts (1e15 K) included. The
+/// square of a visibility and its inverse stay within single precision.
+pub const TEMPERATURE_K_MAX: f64 = 1e16;
+
 /// A HEALPix map in RING order, in K unless stated otherwise.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SkyMap {
@@ -153,6 +157,22 @@ impl SkyMap {
         Ok(Self { nside, frame: self.frame, values })
     }
 
+    /// Checks that every pixel is a temperature of a sky: 0 K to [`TEMPERATURE_K_MAX`].
+    ///
+    /// # Errors
+    /// [`MapError::NoTemperature`] with the number and the first of the others.
+    pub fn check_temperatures(&self) -> Result<(), MapError> {
+        let bad = |&(_, value): &(usize, &f64)| !(0.0..=TEMPERATURE_K_MAX).contains(value);
+        let mut pixels = self.values.iter().enumerate().filter(bad);
+        match pixels.next() {
+            None => Ok(()),
+            Some((first, &value)) => {
+                let (count, total, most) = (1 + pixels.count(), self.values.len(), TEMPERATURE_K_MAX);
+                Err(MapError::NoTemperature { count, total, first, value, most })
+            }
+        }
+    }
+
     /// Checks that every pixel has a usable value.
     ///
     /// # Errors
@@ -233,6 +253,19 @@ mod tests {
         map.values_mut()[101] = f64::INFINITY;
         let expected = MapError::BadPixels { count: 3, total: 192, first: 7, value: HEALPIX_UNSEEN };
         assert_eq!(map.check_whole(), Err(expected));
+    }
+
+    #[test]
+    fn what_is_no_temperature_is_named() {
+        let mut map = ramp(4);
+        assert_eq!(map.check_temperatures(), Ok(()));
+        for value in [-1e-3, 1e307, f64::NAN, f64::INFINITY] {
+            map.values_mut()[9] = value;
+            map.values_mut()[150] = -1.0;
+            let text = map.check_temperatures().unwrap_err().to_string();
+            assert!(text.contains("2 of 192 pixels") && text.contains("pixel 9 with"), "{text}");
+            assert!(text.contains(&format!("{value:e} K")), "{text}");
+        }
     }
 
     #[test]

@@ -11,6 +11,7 @@ mod interval_set;
 mod per_channel;
 mod random;
 mod reason;
+mod text;
 mod time;
 pub mod vector;
 
@@ -20,4 +21,5 @@ pub use interval_set::IntervalSet;
 pub use per_channel::PerChannel;
 pub use random::{StreamKind, random_stream};
 pub use reason::Reason;
+pub use text::printable;
 pub use time::{MissionTime, TICKS_PER_SECOND};

@@ -1,6 +1,6 @@
 //! A small mission and its downlink.
 
-use lunarray::downlink::{DownlinkConfig, Transmission};
+use lunarray::downlink::{DownlinkConfig, Kind, PacketHeader, Transmission};
 use lunarray::frames::{
     AntennaResponse, Channel, EphemerisSegment, Flags, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
 };
@@ -73,4 +73,18 @@ pub fn packets_of(mut bytes: &[u8]) -> Vec<Vec<u8>> {
     }
     assert!(bytes.is_empty());
     packets
+}
+
+/// Whether each packet is the last of its pass: a report that something else than a description came before.
+pub fn pass_ends(packets: &[Vec<u8>]) -> Vec<bool> {
+    let mut in_pass = false;
+    let mut ends = |packet: &Vec<u8>| match PacketHeader::parse(packet).unwrap().kind {
+        Kind::Housekeeping => std::mem::take(&mut in_pass),
+        Kind::Ephemeris | Kind::Visibilities => {
+            in_pass = true;
+            false
+        }
+        Kind::Instrument | Kind::Calibration => false,
+    };
+    packets.iter().map(&mut ends).collect()
 }

@@ -8,20 +8,21 @@ use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 
 use lunarray::accumulation::{Accumulator, MapConfig};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows, segments_for};
-use lunarray::calibration::{CalibrationConfig, Calibrator};
+use lunarray::calibration::{CalibrationConfig, Calibrator, Completeness, MissingPackets};
 use lunarray::downlink::link::{LinkConfig, LinkSimulator, LinkTruth, PacketRange};
 use lunarray::downlink::wire::cadu::INTERLEAVES;
 use lunarray::downlink::{
-    Decoder, DownlinkConfig, Event, Format, Intake, Kind, ReceptionCounters, Transmission,
+    CucTime, Decoder, DownlinkConfig, Event, FORMAT_VERSION, Format, HEADER_BYTES, Intake, Kind,
+    PacketHeader, PacketSegment, ReceptionCounters, Transmission,
 };
 use lunarray::frames::{
     AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, PlacedFrame,
     VisibilityBlock, VisibilityReason,
 };
-use lunarray::ground::{Collector, Delivery, Reception};
+use lunarray::ground::{Collector, Delivery, Ground, GroundConfig, Reception};
 use lunarray::mother::{PacedLink, SpacecraftConfig, Store, StoreDrop};
 use lunarray::runtime::{Ledger, LedgerReport, Outlet, Stage};
-use lunarray::units::{ChannelId, all_pairs};
+use lunarray::units::{ChannelId, MissionTime, all_pairs};
 use num_complex::Complex32;
 use proptest::prelude::*;
 
@@ -147,6 +148,7 @@ fn visibilities_by_packet(sound: &[u8]) -> BTreeMap<u64, Vec<u64>> {
 struct Received {
     ledger: LedgerReport<VisibilityReason>,
     reception: ReceptionCounters,
+    completeness: Completeness,
     /// Numbers of the accumulated visibilities, in order.
     summed: Vec<u64>,
 }
@@ -167,7 +169,7 @@ fn receive(arrived: &[u8]) -> Received {
     for frame in frames.into_vec() {
         calibrator.step(frame, &mut placed).unwrap();
     }
-    calibrator.finish(&mut placed).unwrap();
+    let completeness = calibrator.close(MissingPackets::default());
     // All baselines and weights: what is placed is summed.
     let map = MapConfig { nside: 1, baseline_bp_max: 1e6, weight_max: 1e3, ..MapConfig::default() };
     let mut accumulator = Accumulator::new(map, ledger.clone());
@@ -181,7 +183,7 @@ fn receive(arrived: &[u8]) -> Received {
     accumulator.finish(&mut maps).unwrap();
     let ledger = ledger.close().unwrap();
     let reception = account.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    Received { ledger, reception, summed }
+    Received { ledger, reception, completeness, summed }
 }
 
 fn counts_of(ranges: &[PacketRange], kind: Kind) -> BTreeSet<u64> {
@@ -223,9 +225,12 @@ fn hold_to_the_truth(sent: &Sent) {
         assert_eq!(summed, good);
     }
     // Losses by the ground's count, as far as the last housekeeping received reports them.
+    // Two in each pass, and the last pass may have both.
     let reports_lost = counts_of(&truth.packets_lost, Kind::Housekeeping);
-    let last_report_came = !reports_lost.contains(&(WINDOWS as u64 - 1));
-    if last_report_came && reception.instrument.packets > 0 {
+    let last_reports = [2 * WINDOWS as u64 - 2, 2 * WINDOWS as u64 - 1];
+    let last_report_came = !last_reports.iter().all(|report| reports_lost.contains(report));
+    assert_eq!(received.completeness.complete, last_report_came && reception.instrument.packets > 0);
+    if received.completeness.complete {
         assert_eq!(ledger.sampled, SAMPLED);
         assert_eq!(ledger.count(VisibilityReason::StoreFull), truth.visibilities_dropped);
         assert_eq!(ledger.count(VisibilityReason::NotReceived), truth.visibilities_lost);
@@ -367,4 +372,165 @@ fn a_slow_link_and_a_small_store_lose_what_the_policy_says() {
     }
     // As many bytes hold more integration time where the least worthy are dropped.
     assert!(integrations_s[2] > integrations_s[0].max(integrations_s[1]), "{integrations_s:?}");
+}
+
+/// What a whole ground makes of what arrived: its ledger, and whether it claims to be complete.
+fn ground_of(arrived: &[u8]) -> (LedgerReport<VisibilityReason>, Completeness) {
+    let map = MapConfig { nside: 1, baseline_bp_max: 1e6, weight_max: 1e3, ..MapConfig::default() };
+    let config = GroundConfig { calibration: CalibrationConfig::default(), map, wait_bytes: 1 << 24 };
+    let mut ground = Ground::new(&config).unwrap();
+    let outcome = ground.outcome();
+    let mut maps = Outlet::collect();
+    for part in arrived.chunks(7_000) {
+        ground.step(part.to_vec(), &mut maps).unwrap();
+    }
+    ground.finish(&mut maps).unwrap();
+    let completeness = outcome.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    (outcome.ledger.close().unwrap(), completeness)
+}
+
+/// Passes and frames that do not arrive, of each of which a ground may notice nothing.
+fn lossy_links() -> Vec<LinkConfig> {
+    let none = LinkConfig::default();
+    vec![
+        LinkConfig { pass_cut: 1.0, ..none.clone() },
+        LinkConfig { pass_cut: 0.4, ..none.clone() },
+        LinkConfig { pass_loss: 0.4, ..none.clone() },
+        LinkConfig { frame_loss: 0.3, ..none.clone() },
+        LinkConfig { frame_loss: 0.9, ..none.clone() },
+        LinkConfig { pass_cut: 0.5, pass_loss: 0.2, pass_swap: 0.3, frame_loss: 0.05, ..none.clone() },
+        LinkConfig { burst_every_bits: 1e5, burst_bits: 10_000.0, ..none },
+    ]
+}
+
+#[test]
+fn a_ledger_never_claims_to_be_complete_while_something_is_missing() {
+    let spacecraft = SpacecraftConfig::default();
+    let [mut complete, mut incomplete, mut lost] = [0; 3];
+    for (coded, link, seed) in [false, true].into_iter().flat_map(|coded| {
+        let links = lossy_links().into_iter();
+        links.flat_map(move |link| (0..6).map(move |seed| (coded, link.clone(), seed)))
+    }) {
+        let format = if coded { Format::Cadu } else { Format::Packets };
+        let downlink = DownlinkConfig { format, packet_bytes_max: 400, link, ..DownlinkConfig::default() };
+        let sent = send(&Case { seed, downlink, spacecraft: spacecraft.clone() });
+        let (ledger, completeness) = ground_of(&sent.arrived);
+        let told = ledger.count(VisibilityReason::NotReceived);
+        let at_least = ledger.count(VisibilityReason::NotReceivedAtLeast);
+        let truth = &sent.truth;
+        let what = format!("{format:?} {:?} {seed}: {ledger:?} {completeness:?} {truth:?}", truth.link);
+        assert!(told + at_least <= truth.visibilities_lost && ledger.sampled <= SAMPLED, "{what}");
+        if completeness.complete {
+            assert_eq!((ledger.sampled, told, at_least), (SAMPLED, truth.visibilities_lost, 0), "{what}");
+        }
+        // Known gaps are told in either case.
+        let sets = visibility_gaps(&sent.arrived);
+        assert!(told + at_least >= sets || ledger.sampled == 0, "{sets} {what}");
+        complete += i32::from(completeness.complete);
+        incomplete += i32::from(!completeness.complete);
+        lost += i32::from(truth.visibilities_lost > 0);
+    }
+    // Both are common, and nearly all links lose something.
+    assert!(complete > 15 && incomplete > 15 && lost > 60, "{complete} {incomplete} {lost}");
+}
+
+/// Packets of visibilities that are missing between those that arrived.
+fn visibility_gaps(arrived: &[u8]) -> u64 {
+    let mut collector = Collector::new(1 << 24);
+    collector.push(arrived);
+    collector.finish();
+    while collector.next_delivery(&|_| true).unwrap().is_some() {}
+    collector.counters().visibilities.missing
+}
+
+#[test]
+fn a_mission_of_which_every_pass_is_cut_short_still_tells_what_is_missing() {
+    let link = LinkConfig { pass_cut: 1.0, ..LinkConfig::default() };
+    let downlink = DownlinkConfig { packet_bytes_max: 400, link, ..DownlinkConfig::default() };
+    let spacecraft = SpacecraftConfig::default();
+    let mut exact = 0;
+    for seed in 0..10 {
+        let case = Case { seed, downlink: downlink.clone(), spacecraft: spacecraft.clone() };
+        let sent = send(&case);
+        // No pass has its closing report, but most have the one that begins them.
+        let (ledger, completeness) = ground_of(&sent.arrived);
+        if completeness.complete {
+            exact += 1;
+            assert_eq!(ledger.sampled, SAMPLED);
+            assert_eq!(ledger.count(VisibilityReason::NotReceived), sent.truth.visibilities_lost);
+            assert!(sent.truth.visibilities_lost > 0);
+        }
+    }
+    assert!(exact >= 5, "{exact}");
+}
+
+#[test]
+fn forged_packet_times_fill_a_bounded_set_and_are_then_refused() {
+    /// A sound packet of visibilities with no payload.
+    fn forged(count: u64, s: u64) -> Vec<u8> {
+        let (kind, segment, version) = (Kind::Visibilities, PacketSegment::Whole, FORMAT_VERSION);
+        let header =
+            PacketHeader { kind, segment, count, time: CucTime(s << 24), version, bytes: HEADER_BYTES + 4 };
+        let mut packet = header.to_bytes().to_vec();
+        let check = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc32Iscsi, &packet) as u32;
+        packet.extend(check.to_be_bytes());
+        packet
+    }
+    const ROOM: usize = 100;
+    let mut collector = Collector::new(1 << 20).with_intervals(ROOM);
+    let mut push = |packets: Vec<u8>| {
+        collector.push(&packets);
+        while collector.next_delivery(&|_| true).unwrap().is_some() {}
+        let counters = collector.counters();
+        let [beyond, duplicates] = [counters.packets_beyond, counters.visibilities.duplicates];
+        (
+            collector.received().map(|(_, set)| set.len()).sum::<u64>(),
+            beyond,
+            duplicates,
+            counters.bytes_beyond,
+        )
+    };
+    let bytes = (HEADER_BYTES + 4) as u64;
+    let all: Vec<u8> = (0..3 * ROOM as u64).flat_map(|k| forged(2 * k, k)).collect();
+    assert_eq!(push(all.clone()), (100, 200, 0, 200 * bytes));
+    // What was received before is known; what goes on from it is taken.
+    assert_eq!(push(all), (100, 400, 100, 400 * bytes));
+    assert_eq!(push(forged(7, 3)), (101, 400, 100, 400 * bytes));
+}
+
+#[test]
+fn a_forged_report_neither_poisons_the_ledger_nor_the_state() {
+    let spacecraft = SpacecraftConfig::default();
+    let downlink = DownlinkConfig { packet_bytes_max: 400, ..DownlinkConfig::default() };
+    let sent = send(&Case { seed: 1, downlink: downlink.clone(), spacecraft });
+    let (sound, _) = ground_of(&sent.arrived);
+    // As the spacecraft would send it, from a transmission of its own; counts that the payload allows and does not.
+    let report = |time: MissionTime, sampled: u64| {
+        let mut bytes = Vec::new();
+        let mut transmission = Transmission::new(&downlink).unwrap();
+        for frame in FRAMES.iter().take(2) {
+            transmission.send(frame, &mut bytes).unwrap();
+        }
+        let before = bytes.len();
+        let frame = GroundFrame::Housekeeping(Housekeeping { time, sampled, dropped: 0 });
+        transmission.send(&frame, &mut bytes).unwrap();
+        bytes.split_off(before)
+    };
+    let huge = report(MissionTime(5), 1 << 48);
+    // 2^64 - 1 sampled and dropped: refused as a payload.
+    let mut impossible = report(MissionTime(5), 0);
+    let end = impossible.len() - 4;
+    impossible[end - 16..end].fill(0xFF);
+    let check = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc32Iscsi, &impossible[..end]) as u32;
+    impossible[end..].copy_from_slice(&check.to_be_bytes());
+    for (forged, contradictory) in [(huge, 1), (impossible, 0)] {
+        for bytes in [[&forged[..], &sent.arrived].concat(), [&sent.arrived[..], &forged].concat()] {
+            let (ledger, completeness) = ground_of(&bytes);
+            assert_eq!(ledger, sound);
+            assert_eq!((completeness.complete, completeness.reports_contradictory), (true, contradictory));
+        }
+        // With nothing else the ledger closes, and claims nothing.
+        let (_, completeness) = ground_of(&forged);
+        assert!(!completeness.complete);
+    }
 }

@@ -16,7 +16,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use common::downlink::{mission, packets_of, transmit};
+use common::downlink::{mission, packets_of, pass_ends, transmit};
 use common::workplace::{SMALL, Workplace, fail, succeed};
 use lunarray::downlink::transport::socket::{ListenConfig, SocketSource, Until};
 use lunarray::downlink::{
@@ -182,7 +182,7 @@ fn assert_closed(reception: &Value) {
     let of = |key: &str| reception[key].as_u64().unwrap();
     let kinds = ["instrument", "ephemeris", "visibilities", "calibration", "housekeeping"];
     let packets: u64 = kinds.iter().map(|kind| reception[kind]["bytes"].as_u64().unwrap()).sum();
-    let others = ["bytes_garbage", "bytes_truncated", "bytes_damaged", "bytes_duplicate"];
+    let others = ["bytes_garbage", "bytes_truncated", "bytes_damaged", "bytes_duplicate", "bytes_beyond"];
     let others: u64 = others.iter().map(|key| of(key)).sum();
     assert_eq!(of("bytes"), packets + others, "{reception}");
 }

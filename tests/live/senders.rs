@@ -123,24 +123,177 @@ fn bad_senders_are_closed_and_counted_and_a_good_one_loses_nothing() {
 }
 
 #[test]
-fn connections_beyond_the_limit_are_refused() {
+fn beyond_the_limit_a_connection_that_delivers_stays() {
+    let place = Place::new();
+    let file = place.downlink("packets");
+    place.replay("read", &file, &[]);
+    let packets = packets_of(&std::fs::read(&file).unwrap());
+    let set = ["--set", "downlink.listen.connections_max=1", "--connections", "1"];
+    let ground = place.ground("heard", &set);
+    let over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let (ground, over, packets) = (&ground, &over, &packets);
+        let good = scope.spawn(move || {
+            let mut stream = ground.connect();
+            // Delivers as long as the other tries: in small pieces, of which there are enough for a minute.
+            let (mut left, piece) = (&packets[..], packets.len().div_ceil(600));
+            while !over.load(Ordering::Relaxed) && left.len() > piece {
+                let (now, rest) = left.split_at(piece);
+                stream.write_all(&now.concat()).unwrap();
+                left = rest;
+                std::thread::sleep(Duration::from_millis(100));
+            }
+            finish(stream, &left.concat())
+        });
+        // Whether the system hands over the second connection after the first is certain, when is not.
+        ground.wait_for("listening on");
+        std::thread::sleep(Duration::from_millis(300));
+        let mut answer = String::new();
+        ground.connect().read_to_string(&mut answer).unwrap();
+        over.store(true, Ordering::Relaxed);
+        assert!(answer.starts_with("busy: ") && answer.contains("connections_max"), "{answer}");
+        assert!(good.join().unwrap().starts_with("taken "));
+    });
+    let summary = ground.succeed();
+    assert_eq!([&summary["listening"]["connections"], &summary["listening"]["refused"]], [1, 1]);
+    assert!(place.maps("heard") == place.maps("read"));
+}
+
+/// Keeps 24 peers at a ground that has places for a few: each connects, may send one packet, stays until it is closed,
+/// and connects again. Meanwhile a good sender sends a downlink; returns the ground's summary.
+fn besieged(place: &Place, name: &str, from: &[&str], replayed: &[Vec<u8>]) -> Value {
+    let set = ["--set", "downlink.listen.connections_max=4", "--set", "downlink.listen.bytes_per_s_max=0"];
+    let ground = place.ground(name, &set);
+    let over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let (ground, over) = (&ground, &over);
+        for peer in 0..24 {
+            let packet = replayed.get(peer % replayed.len().max(1)).cloned().unwrap_or_default();
+            let address = from[peer % from.len()].to_owned();
+            scope.spawn(move || {
+                while !over.load(Ordering::Relaxed) {
+                    let Some(mut stream) = connect_from(&address, &ground.url) else { continue };
+                    let _ = stream.write_all(&packet);
+                    stream.set_read_timeout(Some(Duration::from_millis(200))).unwrap();
+                    let mut answer = [0; 256];
+                    // Until the ground closes it.
+                    while !over.load(Ordering::Relaxed)
+                        && matches!(stream.read(&mut answer), Err(error) if is_time_out(&error))
+                    {
+                    }
+                }
+            });
+        }
+        // They hold all places.
+        ground.wait_for("gave way");
+        let said = succeed(&["simulate", place.pipeline(), "--send", &ground.url, "--connect-s", "600"]);
+        over.store(true, Ordering::Relaxed);
+        assert!(said.contains("confirmed all"), "{said}");
+    });
+    let killed = Process::new("kill").args(["-INT", &ground.child.id().to_string()]).status().unwrap();
+    assert!(killed.success());
+    let (_, summary, _) = ground.end();
+    summary
+}
+
+fn is_time_out(error: &std::io::Error) -> bool {
+    matches!(error.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut)
+}
+
+/// A connection from a loopback address.
+fn connect_from(address: &str, url: &str) -> Option<TcpStream> {
+    let (from, to) = (format!("{address}:0").parse().unwrap(), url.strip_prefix("tcp://").unwrap());
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().unwrap();
+    let connected = runtime.block_on(async {
+        let socket = tokio::net::TcpSocket::new_v4()?;
+        socket.bind(from)?;
+        socket.connect(to.parse().unwrap()).await?.into_std()
+    });
+    // The system may be short of ports for a moment.
+    let stream = connected.ok()?;
+    stream.set_nonblocking(false).unwrap();
+    Some(stream)
+}
+
+#[test]
+fn silent_peers_do_not_keep_a_good_sender_out() {
+    let place = Place::new();
+    let file = place.downlink("packets");
+    place.replay("read", &file, &[]);
+    // From one address, which the good sender has too; and from others.
+    for (name, from) in [("one", &["127.0.0.1"][..]), ("others", &["127.0.0.2", "127.0.0.3"])] {
+        let summary = besieged(&place, name, from, &[]);
+        assert!(place.maps(name) == place.maps("read"), "{name}");
+        assert!(summary["listening"]["ended"]["gave-way"].as_u64() > Some(3), "{}", summary["listening"]);
+    }
+}
+
+#[test]
+fn peers_that_replay_a_packet_each_do_not_keep_a_good_sender_out() {
+    let place = Place::new();
+    let file = place.downlink("packets");
+    place.replay("read", &file, &[]);
+    let packets = packets_of(&std::fs::read(&file).unwrap());
+    let summary = besieged(&place, "heard", &["127.0.0.1"], &packets[packets.len() - 24..]);
+    assert!(place.maps("heard") == place.maps("read"));
+    assert!(summary["listening"]["ended"]["gave-way"].as_u64() > Some(3), "{}", summary["listening"]);
+}
+
+#[test]
+fn the_first_description_shuts_nobody_out() {
     let place = Place::new();
     let file = place.downlink("packets");
     place.replay("read", &file, &[]);
     let good = std::fs::read(&file).unwrap();
-    let (begin, rest) = good.split_at(good.len() / 3);
-    let set = ["--set", "downlink.listen.connections_max=1", "--connections", "1"];
-    let ground = place.ground("heard", &set);
-    let mut stream = ground.connect();
-    stream.write_all(begin).unwrap();
-    // Whether the system hands over the second connection after the first is certain, when is not.
-    let mut answer = String::new();
-    ground.connect().read_to_string(&mut answer).unwrap();
-    assert!(answer.contains("connections_max"), "{answer}");
-    finish(stream, rest);
+    let other = transmit(&mission(1, 10), &DownlinkConfig::default());
+    let others = packets_of(&other);
+    let is_data = |packet: &&Vec<u8>| PacketHeader::parse(packet).unwrap().kind == Kind::Visibilities;
+    let without_data: Vec<u8> = others.iter().filter(|packet| !is_data(packet)).flatten().copied().collect();
+    let ground = place.ground("heard", &["--state", &place.path("state"), "--connections", "3"]);
+    for bytes in [&others[0], &without_data] {
+        let answer = ground.send(bytes);
+        assert!(answer.contains("confirmed its instrument"), "{answer}");
+    }
+    assert_eq!(ground.send(&good), format!("taken {} bytes\n", good.len()));
     let summary = ground.succeed();
-    assert_eq!([&summary["listening"]["connections"], &summary["listening"]["refused"]], [1, 1]);
+    assert_eq!(summary["listening"]["ended"]["unconfirmed"], 2);
     assert!(place.maps("heard") == place.maps("read"));
+}
+
+#[test]
+fn an_instrument_of_too_many_channels_takes_no_memory() {
+    let place = Place::new();
+    let file = place.downlink("packets");
+    place.replay("read", &file, &[]);
+    let good = std::fs::read(&file).unwrap();
+    // 400 channels with one visibility each.
+    let mut frames = mission(1, 1);
+    let lunarray::frames::GroundFrame::Instrument(instrument) = &mut frames[0] else {
+        panic!("no description")
+    };
+    instrument.channels = vec![instrument.channels[0]; 400];
+    let lunarray::frames::GroundFrame::Visibilities(block) = frames[2].clone() else { panic!("no data") };
+    frames.truncate(2);
+    frames.extend((0..400).map(|channel| {
+        let channel = lunarray::units::ChannelId(channel);
+        lunarray::frames::GroundFrame::Visibilities(lunarray::frames::VisibilityBlock {
+            channel,
+            ..block.clone()
+        })
+    }));
+    let forged = transmit(&frames, &DownlinkConfig::default());
+    let ground = place.ground("heard", &["--connections", "2"]);
+    let answer = ground.send(&forged);
+    assert!(answer.contains("does not fit the ground's configuration"), "{answer}");
+    ground.send(&good);
+    let summary = ground.succeed();
+    assert_eq!(summary["listening"]["ended"]["unfit-instrument"], 1);
+    assert!(place.maps("heard") == place.maps("read"));
+    // From a file it is an error that names the key.
+    let file = place.path("forged");
+    std::fs::write(&file, forged).unwrap();
+    let said = complaint(&["replay", &file, "--out", &place.path("out")]);
+    assert!(said.contains("map.channels_max = 64") && said.contains("400 channels"), "{said}");
 }
 
 #[test]

@@ -49,12 +49,11 @@ fn two_stations_that_send_the_same_leave_the_state_of_one() {
     let halves: Vec<Vec<u8>> = [0, 1]
         .map(|half| {
             let (mut pass, mut bytes) = (0, Vec::new());
-            for packet in &packets {
+            for (packet, ends) in packets.iter().zip(pass_ends(&packets)) {
                 if pass % 2 == half {
                     bytes.extend_from_slice(packet);
                 }
-                let header = PacketHeader::parse(packet).unwrap();
-                pass += i32::from(header.kind == Kind::Housekeeping);
+                pass += i32::from(ends);
             }
             bytes
         })
@@ -196,9 +195,10 @@ fn a_receiver_that_leaves_is_told_with_what_was_sent() {
         let (mut stream, _) = listener.accept().unwrap();
         stream.read_exact(&mut [0; 1000]).unwrap();
     });
-    let said = complaint(&["simulate", place.pipeline(), "--send", &url]);
+    let said = complaint(&["simulate", place.pipeline(), "--send", &url, "--connect-s", "1"]);
     receiver.join().unwrap();
     assert!(said.contains("bytes had been sent") && said.contains(&url), "{said}");
+    assert!(said.contains("more attempts in") && said.contains("--connect-s"), "{said}");
 }
 
 #[test]
@@ -218,4 +218,48 @@ fn a_sender_waits_for_the_ground_to_start_and_keeps_to_its_rate() {
         assert!(since.elapsed().as_secs_f64() >= 1.5);
         ground.succeed();
     });
+}
+
+#[test]
+fn a_sender_tries_a_busy_receiver_again_from_the_beginning() {
+    let place = Place::new();
+    let file = place.downlink("packets");
+    let sent = std::fs::read(&file).unwrap();
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("tcp://{}", listener.local_addr().unwrap());
+    let receiver = std::thread::spawn(move || {
+        // Busy at once, busy after a part, and busy after everything.
+        for bytes in [0, 10_000, usize::MAX] {
+            let (mut stream, _) = listener.accept().unwrap();
+            let mut taken = Vec::new();
+            Read::by_ref(&mut stream).take(bytes as u64).read_to_end(&mut taken).unwrap();
+            stream.write_all(b"busy: others\n").unwrap();
+            stream.shutdown(Shutdown::Write).unwrap();
+            let _ = stream.read_to_end(&mut Vec::new());
+        }
+        let (mut stream, _) = listener.accept().unwrap();
+        let mut taken = Vec::new();
+        stream.read_to_end(&mut taken).unwrap();
+        stream.write_all(format!("taken {} bytes\n", taken.len()).as_bytes()).unwrap();
+        taken
+    });
+    let said = succeed(&["simulate", place.pipeline(), "--send", &url, "--connect-s", "600"]);
+    assert!(said.contains(&format!("confirmed all {} bytes", sent.len())), "{said}");
+    assert!(receiver.join().unwrap() == sent, "not the whole downlink, once");
+}
+
+#[test]
+fn a_receivers_answer_does_not_command_the_terminal() {
+    let place = Place::new();
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("tcp://{}", listener.local_addr().unwrap());
+    let receiver = std::thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        stream.read_to_end(&mut Vec::new()).unwrap();
+        stream.write_all("closed \u{1b}]0;owned\u{7}\u{9b}2J\rtaken\n".as_bytes()).unwrap();
+    });
+    let said = complaint(&["simulate", place.pipeline(), "--send", &url]);
+    receiver.join().unwrap();
+    assert!(said.contains("\\u{1b}]0;owned"), "{said}");
+    assert!(said.chars().all(|c| c == '\n' || !c.is_control()), "{said:?}");
 }

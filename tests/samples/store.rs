@@ -45,9 +45,13 @@ fn a_window_is_cut_at_one_time_in_all_channels_and_pairs() {
         }
         let report = Housekeeping { time: MissionTime(7), sampled: sampled as u64, dropped: 0 };
         store.step(GroundFrame::Housekeeping(report), &mut out).unwrap();
+        // A pass begins with the first frame of the next window, or at the end.
+        store.finish(&mut out).unwrap();
         let mut frames = out.into_vec();
         let Some(GroundFrame::Housekeeping(report)) = frames.pop() else { panic!("no report") };
         assert_eq!(report.dropped, sampled as u64 - room);
+        assert!(report.is_last());
+        assert_eq!(frames.remove(0), GroundFrame::Housekeeping(report));
         let mut held = 0;
         let mut sent = 0;
         for frame in &frames {

@@ -5,7 +5,7 @@ use std::io::Cursor;
 
 use lunarray::sky::fits::{
     Card, CardValue, Column, FitsError, FitsProblem, MapFile, Ordering, Precision, ReadOptions, WriteOptions,
-    read_map, read_map_file, read_map_from, read_whole_map, write_columns, write_map,
+    read_map, read_map_file, read_map_from, read_sky, read_unit, read_whole_map, write_columns, write_map,
 };
 use lunarray::sky::{Frame, MapError, SkyMap};
 use lunarray::units::constants::HEALPIX_UNSEEN;
@@ -251,8 +251,46 @@ fn temperatures_come_in_kelvin_whatever_their_unit() {
             assert_eq!(*found, factor * value, "{unit}");
         }
     }
+    assert!(fs::read(&path).is_ok() && read_unit(&path).unwrap() == "MK");
+    fs::write(&path, forged(&bytes, "TUNIT1  =                   17")).unwrap();
+    let refused = read_whole_map(&path, &ReadOptions::default()).unwrap_err().to_string();
+    assert!(refused.contains("TUNIT1 is 17"), "{refused}");
     for unit in ["MJy/sr", "Jy/beam", "counts", "mJy"] {
         let refused = read(unit).unwrap_err().to_string();
         assert!(refused.contains(&format!("`{unit}`")) && refused.contains("expected K"), "{refused}");
+    }
+}
+
+#[test]
+fn pixels_of_another_scheme_are_refused() {
+    let bytes = bytes_of(&map(2), &WriteOptions::default());
+    for (value, good) in [("'HEALPIX'", true), ("'healpix '", true), ("'WCS'", false), ("T", false)] {
+        let parsed = parse(&forged(&bytes, &format!("PIXTYPE = {value}")));
+        match parsed {
+            Ok(_) => assert!(good, "{value}"),
+            Err(problem) => {
+                let text = problem.to_string();
+                assert!(!good && text.contains("PIXTYPE") && text.contains("'HEALPIX'"), "{text}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_sky_that_is_none_is_refused_with_file_pixel_and_value() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("sky.fits");
+    let read = |value: f64, may_be_dark: bool| {
+        let mut values = vec![0.0; 48];
+        values[7] = value;
+        let map = SkyMap::new(Frame::Ecliptic, values).unwrap();
+        let options = WriteOptions { precision: Precision::Double, ..WriteOptions::default() };
+        write_map(&path, &map, &options).unwrap();
+        read_sky(&path, may_be_dark).map_err(|error| error.to_string())
+    };
+    assert!(read(1e7, false).is_ok() && read(0.0, true).is_ok());
+    for (value, words) in [(-1.0, "pixel 7 with -1e0 K"), (1e307, "pixel 7 with 1e307 K"), (0.0, "0 K")] {
+        let refused = read(value, false).unwrap_err();
+        assert!(refused.contains("sky.fits") && refused.contains(words), "{refused}");
     }
 }

@@ -41,6 +41,8 @@ pub(super) struct SentPass {
     pub(super) packets: Vec<SentPacket>,
     /// The spacecraft's own counts at the end of the pass.
     pub(super) report: Option<Housekeeping>,
+    /// Whether it holds positions or visibilities: the next report ends it, and does not begin it.
+    has_data: bool,
 }
 
 impl SentPass {
@@ -51,6 +53,7 @@ impl SentPass {
         let payload = header.bytes - HEADER_BYTES - TRAILER_BYTES;
         let visibilities =
             if header.kind == Kind::Visibilities { visibilities_in(payload) as u64 } else { 0 };
+        self.has_data |= matches!(header.kind, Kind::Ephemeris | Kind::Visibilities);
         if header.kind == Kind::Housekeeping {
             let payload = head.get(HEADER_BYTES..HEADER_BYTES + payload);
             self.report = payload.and_then(|payload| decode_housekeeping(payload).ok()).or(self.report);
@@ -100,7 +103,7 @@ impl Splitter {
             let Some((bytes, ends)) = taken else { break };
             rest = &rest[bytes..];
             self.offset += bytes as u64;
-            if ends && self.open.values().all(|open| open.bytes == 0) {
+            if ends && self.pass.has_data && self.open.values().all(|open| open.bytes == 0) {
                 done(std::mem::take(&mut self.pass));
             }
         }

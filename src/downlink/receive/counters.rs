@@ -122,7 +122,7 @@ impl FaultCounts {
 
 /// Counters of a reception.
 ///
-/// `bytes = bytes_garbage + bytes_truncated + bytes_damaged + bytes_duplicate +` those of the kinds' packets.
+/// `bytes = bytes_garbage + bytes_truncated + bytes_damaged + bytes_duplicate + bytes_beyond +` those of the kinds' packets.
 /// Visibilities in sound packets are `decoded + bad_value + refused + before_instrument + foreign`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct ReceptionCounters {
@@ -140,6 +140,10 @@ pub struct ReceptionCounters {
     pub bytes_damaged: u64,
     /// Bytes of duplicate packets.
     pub bytes_duplicate: u64,
+    /// Bytes of new packets for which the received set had no room.
+    pub bytes_beyond: u64,
+    /// New packets for which the received set had no room: refused.
+    pub packets_beyond: u64,
     /// Instrument descriptions.
     pub instrument: KindCounts,
     /// Satellite positions.
@@ -274,6 +278,13 @@ impl std::fmt::Display for ReceptionCounters {
         }
         if let Some(restarts) = self.restarts_text() {
             writeln!(f, "{restarts}")?;
+        }
+        if self.packets_beyond > 0 {
+            writeln!(
+                f,
+                "{} new packets refused: the set of received packets is full, as only a forger fills it",
+                self.packets_beyond
+            )?;
         }
         if self.payloads_before_instrument > 0 {
             let (payloads, visibilities) =

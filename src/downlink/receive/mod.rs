@@ -28,5 +28,5 @@ pub use decoder::{Decoder, DecoderState};
 pub use event_reader::{ByteFeed, EventReader};
 pub use intake::Intake;
 pub use listing::{LISTED_MAX, Listing};
-pub use received_set::{Era, ReceivedSet};
+pub use received_set::{Era, PacketInsertion, ReceivedSet};
 pub use receiver::{Event, Packet, PacketReceiver};

@@ -16,6 +16,17 @@ pub struct ReceivedSet {
     packets: IntervalSet<(CucTime, u64)>,
 }
 
+/// What became of a packet that was to be added to a [`ReceivedSet`] of bounded size.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PacketInsertion {
+    /// It is new and was added.
+    New,
+    /// It was in the set.
+    Known,
+    /// It is new, and there is no room for it.
+    Full,
+}
+
 /// The counts received between two restarts of the spacecraft's count.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Era {
@@ -35,6 +46,20 @@ impl ReceivedSet {
         }
         self.packets.insert((time, count)..(time, count + 1));
         true
+    }
+
+    /// Adds a packet, unless the set would then have more than `intervals_max` intervals; returns what became of it.
+    pub fn insert_within(&mut self, count: u64, time: CucTime, intervals_max: usize) -> PacketInsertion {
+        if self.contains(count, time) {
+            return PacketInsertion::Known;
+        }
+        let extends = |count: Option<u64>| count.is_some_and(|count| self.contains(count, time));
+        let has_room = self.packets.intervals() < intervals_max;
+        if !has_room && !extends(count.checked_sub(1)) && !extends(count.checked_add(1)) {
+            return PacketInsertion::Full;
+        }
+        self.packets.insert((time, count)..(time, count + 1));
+        PacketInsertion::New
     }
 
     /// Removes a packet.
@@ -75,6 +100,25 @@ impl ReceivedSet {
             era.end = end;
         }
         eras
+    }
+
+    /// Number of missing counts, between packets received and from 0 to the first: all of them, and those that follow a
+    /// packet made after `time`.
+    #[must_use]
+    pub fn missing_since(&self, time: CucTime) -> [u64; 2] {
+        let (mut all, mut since) = (0_u64, 0_u64);
+        let mut before = None;
+        for Range { start: (made, first), end: (_, end) } in self.packets.iter() {
+            // A lower count made later begins an era, at 0.
+            let (due, is_since) = match before {
+                Some((was_made, due)) if due <= first => (due, was_made > time),
+                _ => (0, before.is_some_and(|(was_made, _)| was_made > time)),
+            };
+            all = all.saturating_add(first - due);
+            since = since.saturating_add(if is_since { first - due } else { 0 });
+            before = Some((made, end));
+        }
+        [all, since]
     }
 
     /// Number of restarts among the packets received.
@@ -144,6 +188,38 @@ mod tests {
             prop_assert_eq!(received.len(), expected.len() as u64);
             prop_assert!(received.insert(out, made((out, 0))));
         }
+    }
+
+    #[test]
+    fn a_full_set_takes_only_what_extends_it() {
+        let mut received = ReceivedSet::default();
+        for count in [10, 20, 30] {
+            assert_eq!(received.insert_within(count, at(count), 3), PacketInsertion::New);
+        }
+        let full = received.clone();
+        for (count, s) in [(40, 40), (11, 20), (10, 11)] {
+            assert_eq!(received.insert_within(count, at(s), 3), PacketInsertion::Full, "{count}");
+        }
+        assert_eq!(received, full);
+        assert_eq!(received.insert_within(20, at(20), 3), PacketInsertion::Known);
+        for (count, s) in [(11, 10), (9, 10), (21, 20), (31, 30)] {
+            assert_eq!(received.insert_within(count, at(s), 3), PacketInsertion::New, "{count}");
+        }
+        assert_eq!(received.len(), 7);
+    }
+
+    #[test]
+    fn missing_counts_are_known_by_the_time_before_them() {
+        let mut received = ReceivedSet::default();
+        for (count, s) in [(2, 1), (5, 2), (6, 3), (9, 4), (1, 5), (3, 5)] {
+            received.insert(count, at(s));
+        }
+        // 0, 1, 3, 4, 7, 8; after the restart 0 and 2.
+        assert_eq!(received.missing_since(at(0)), [8, 6]);
+        assert_eq!(received.missing_since(at(2)), [8, 4]);
+        assert_eq!(received.missing_since(at(4)), [8, 1]);
+        assert_eq!(received.missing_since(at(5)), [8, 0]);
+        assert_eq!(ReceivedSet::default().missing_since(at(0)), [0, 0]);
     }
 
     #[test]

@@ -65,6 +65,8 @@ pub struct Paced<S> {
     mark: CucTime,
     /// Whether a pass has ended since the last step.
     pass_over: bool,
+    /// Whether positions or visibilities came since the last report of the spacecraft's counts.
+    in_pass: bool,
     steps: u64,
     ended: bool,
 }
@@ -85,6 +87,7 @@ impl<S> Paced<S> {
             newest: CucTime::default(),
             mark: CucTime::default(),
             pass_over: false,
+            in_pass: false,
             steps: 0,
             ended: false,
         }
@@ -125,7 +128,13 @@ impl<S> Paced<S> {
     fn note(&mut self, header: &PacketHeader) {
         self.start.get_or_insert_with(|| (Instant::now(), header.time));
         self.newest = self.newest.max(header.time);
-        self.pass_over = header.kind == Kind::Housekeeping;
+        // A report ends a pass if something else came since the last one; else it begins the next.
+        self.pass_over = header.kind == Kind::Housekeeping && self.in_pass;
+        match header.kind {
+            Kind::Housekeeping => self.in_pass = false,
+            Kind::Ephemeris | Kind::Visibilities => self.in_pass = true,
+            Kind::Instrument | Kind::Calibration => {}
+        }
         if let Pace::Steps(Steps { every_s: Some(every_s), .. }) = self.pace {
             let step = ((every_s * f64::from(1 << 24)) as u64).max(1);
             let begun = self.newest.0.saturating_sub(self.mark.0);

@@ -29,6 +29,8 @@ pub struct Packetizer {
     /// The segments sent since the last frame of another kind.
     ephemeris: Vec<EphemerisSegment>,
     ephemeris_is_open: bool,
+    /// Whether positions or visibilities were sent since the last report of the spacecraft's counts.
+    in_pass: bool,
     bytes_since_repeat: u64,
     /// Latest time of anything sampled so far.
     now: Option<MissionTime>,
@@ -51,6 +53,7 @@ impl Packetizer {
             instrument: None,
             ephemeris: Vec::new(),
             ephemeris_is_open: false,
+            in_pass: false,
             bytes_since_repeat: 0,
             now: None,
             counts: [0; Kind::ALL.len()],
@@ -64,11 +67,11 @@ impl Packetizer {
     /// [`DownlinkError::NoInstrument`] before the instrument description; [`DownlinkError::Frame`] for a frame that the
     /// ground would refuse; [`DownlinkError::Time`] for a time outside 1958-2094.
     pub fn encode(&mut self, frame: &GroundFrame, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
-        let (start, counts, now) = (out.len(), self.counts, self.now);
+        let (start, counts, now, in_pass) = (out.len(), self.counts, self.now, self.in_pass);
         let result = self.repeat(out).and_then(|()| self.send(frame, out));
         if result.is_err() {
             out.truncate(start);
-            (self.counts, self.now) = (counts, now);
+            (self.counts, self.now, self.in_pass) = (counts, now, in_pass);
         }
         self.bytes_since_repeat += (out.len() - start) as u64;
         result
@@ -89,6 +92,13 @@ impl Packetizer {
         sent
     }
 
+    /// Whether positions or visibilities were sent since the last report of the spacecraft's counts: the next report
+    /// ends the pass.
+    #[must_use]
+    pub fn is_in_pass(&self) -> bool {
+        self.in_pass
+    }
+
     fn send(&mut self, frame: &GroundFrame, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         match frame {
             GroundFrame::Instrument(instrument) => {
@@ -97,18 +107,27 @@ impl Packetizer {
             }
             GroundFrame::Ephemeris(segment) => {
                 self.send_ephemeris(segment, out)?;
+                self.in_pass = true;
                 self.remember(segment);
                 Ok(())
             }
             GroundFrame::Visibilities(block) => {
                 self.ephemeris_is_open = false;
-                self.send_visibilities(block, out)
+                self.send_visibilities(block, out)?;
+                self.in_pass = true;
+                Ok(())
             }
             GroundFrame::Housekeeping(counts) => {
                 self.ephemeris_is_open = false;
                 self.payload.clear();
                 encode_housekeeping(counts, &mut self.payload)?;
-                let now = self.advance(counts.time);
+                let ends_pass = std::mem::take(&mut self.in_pass);
+                let now = match (ends_pass && !counts.is_last(), self.now) {
+                    (true, _) => self.advance(counts.time),
+                    // The counts are known ahead of what follows, so they do not advance the clock.
+                    (false, Some(now)) => now,
+                    (false, None) => MissionTime::default().min(counts.time),
+                };
                 self.send_payload(Kind::Housekeeping, now, out)
             }
         }

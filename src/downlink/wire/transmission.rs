@@ -23,17 +23,21 @@ impl Transmission {
         Ok(Self { packetizer: Packetizer::new(config)?, encoder: config.encoder(), packets: Vec::new() })
     }
 
-    /// Appends the bytes that a frame adds to the downlink. Housekeeping ends a pass.
+    /// Appends the bytes that a frame adds to the downlink. Housekeeping ends a pass, or begins it: then nothing else
+    /// of the pass was sent.
     ///
     /// # Errors
     /// Those of [`Packetizer::encode`].
     pub fn send(&mut self, frame: &GroundFrame, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         let Some(encoder) = &mut self.encoder else { return self.packetizer.encode(frame, out) };
         self.packets.clear();
+        let was_in_pass = self.packetizer.is_in_pass();
         self.packetizer.encode(frame, &mut self.packets)?;
         encoder.encode(&self.packets, out);
-        if matches!(frame, GroundFrame::Housekeeping(_)) {
-            encoder.flush(out);
+        match (matches!(frame, GroundFrame::Housekeeping(_)), was_in_pass) {
+            (true, true) => encoder.flush(out),
+            (true, false) => encoder.flush_housekeeping(out),
+            (false, _) => {}
         }
         Ok(())
     }

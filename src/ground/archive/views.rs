@@ -57,6 +57,9 @@ impl Journal {
                 blocks.count(record.window, u64::from(visibilities));
             }
         }
+        for record in self.visibilities.values() {
+            blocks.count_bad(record.window, u64::from(record.reading.visibilities_bad_value));
+        }
         self.others.values().filter_map(|record| record.report).for_each(|report| blocks.report(report));
         blocks
     }

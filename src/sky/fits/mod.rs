@@ -16,6 +16,7 @@ pub use card::{Card, CardValue};
 pub use error::{FitsError, FitsProblem};
 pub use header::Header;
 pub use read::{
-    MapFile, ReadOptions, read_map, read_map_file, read_map_from, read_whole_map, read_whole_map_file,
+    MapFile, ReadOptions, read_map, read_map_file, read_map_from, read_sky, read_unit, read_whole_map,
+    read_whole_map_file,
 };
 pub use write::{Column, Ordering, Precision, WriteOptions, write_columns, write_map};

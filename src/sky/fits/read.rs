@@ -4,11 +4,12 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
+use super::card::CardValue;
 use super::error::{FitsError, FitsProblem};
 use super::header::{BLOCK_BYTES, Header};
 use super::table::{CellType, ColumnLayout, TableLayout};
 use crate::sky::healpix::{is_valid_nside, nested_to_ring, nside_of, pixel_count};
-use crate::sky::{Frame, SkyMap, is_unseen};
+use crate::sky::{Frame, MapError, SkyMap, is_unseen};
 use crate::units::constants::HEALPIX_UNSEEN;
 
 /// Size of a read, about, bytes.
@@ -77,6 +78,36 @@ pub fn read_whole_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile
     Ok(MapFile { map, name, unit, frame_assumed, header })
 }
 
+/// Reads the map of a sky, in K: temperatures in every pixel, and some of them above 0 unless `may_be_dark`.
+///
+/// # Errors
+/// As [`read_whole_map`]; [`crate::sky::MapError::NoTemperature`], [`crate::sky::MapError::Dark`].
+pub fn read_sky(path: &Path, may_be_dark: bool) -> Result<SkyMap, FitsError> {
+    let map = read_whole_map(path, &ReadOptions::default())?;
+    let refuse = |problem: MapError| FitsError::new(path, problem.into());
+    map.check_temperatures().map_err(refuse)?;
+    match map.values().iter().all(|&value| value == 0.0) {
+        true if !may_be_dark => Err(refuse(MapError::Dark { value: 0.0 })),
+        _ => Ok(map),
+    }
+}
+
+/// The unit (TUNIT) of the first map in a file, empty if it states none; reads only headers.
+///
+/// # Errors
+/// [`FitsError`] with the file and its problem.
+pub fn read_unit(path: &Path) -> Result<String, FitsError> {
+    let read = || {
+        let file = File::open(path).map_err(FitsProblem::io("open"))?;
+        let length = file.metadata().map_err(FitsProblem::io("examine"))?.len();
+        let mut reader = BufReader::new(file);
+        check_start(&mut reader, length)?;
+        let (header, _) = find_table(&mut reader, length)?;
+        unit(&header, 1 + usize::from(is_explicit(&header)?))
+    };
+    read().map_err(|problem| FitsError::new(path, problem))
+}
+
 /// A unit of temperature in K, whether thermodynamic or Rayleigh-Jeans: at these frequencies they are the same. `None`
 /// for a unit of another quantity; a map without a unit is in K.
 fn kelvin(unit: &str) -> Option<f64> {
@@ -84,7 +115,7 @@ fn kelvin(unit: &str) -> Option<f64> {
     let name = unit.split_once('_').map_or(unit, |(name, _)| name);
     match name {
         "" | "K" | "Kelvin" | "kelvin" | "KELVIN" | "Kelvins" => Some(1.0),
-        "mK" => Some(1e-3),
+        "mK" | "milliK" => Some(1e-3),
         "uK" | "muK" | "microK" => Some(1e-6),
         "kK" => Some(1e3),
         "MK" => Some(1e6),
@@ -116,6 +147,7 @@ pub fn read_map_from(
 ) -> Result<MapFile, FitsProblem> {
     check_start(reader, length)?;
     let (header, start) = find_table(reader, length)?;
+    check_pixels(&header)?;
     let table = TableLayout::new(&header, start, length)?;
     reader.seek(SeekFrom::Start(start)).map_err(FitsProblem::io("seek"))?;
 
@@ -131,8 +163,7 @@ pub fn read_map_from(
         Some(index) => read_explicit(reader, &table, index, column, nside)?,
     };
     let values = if nested { to_ring(nside, &values) } else { values };
-    let number = options.column + 1 + usize::from(explicit);
-    let unit = header.text(&format!("TUNIT{number}")).unwrap_or("").to_owned();
+    let unit = unit(&header, options.column + 1 + usize::from(explicit))?;
     let map = SkyMap::new(frame, values)?;
     Ok(MapFile { map, name: column.name.clone(), unit, frame_assumed, header })
 }
@@ -171,6 +202,25 @@ fn find_table(reader: &mut (impl Read + Seek), length: u64) -> Result<(Header, u
         at = needed.next_multiple_of(BLOCK_BYTES as u64);
     }
     Err(FitsProblem::NoTable { units })
+}
+
+/// The unit of a column, counted from 1; empty without one.
+fn unit(header: &Header, column: usize) -> Result<String, FitsProblem> {
+    let key = format!("TUNIT{column}");
+    match header.get(&key) {
+        None => Ok(String::new()),
+        Some(CardValue::Text(text)) => Ok(text.trim().to_owned()),
+        Some(other) => Err(FitsProblem::keyword(&key, other, "a unit such as 'K'")),
+    }
+}
+
+/// Requires HEALPix pixels of the whole sphere, as far as the header says.
+fn check_pixels(header: &Header) -> Result<(), FitsProblem> {
+    match header.get("PIXTYPE") {
+        None => Ok(()),
+        Some(CardValue::Text(text)) if text.trim().eq_ignore_ascii_case("HEALPIX") => Ok(()),
+        Some(other) => Err(FitsProblem::keyword("PIXTYPE", other, "'HEALPIX'")),
+    }
 }
 
 /// Whether the table gives pixel numbers, from INDXSCHM or else OBJECT.

@@ -116,8 +116,8 @@ pub struct EphemerisSummary {
 /// The spacecraft's own counts: the latest report.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct HousekeepingSummary {
-    /// Time of the report, s since the mission epoch.
-    pub time_s: f64,
+    /// Time up to which the counts hold, s since the mission epoch; `None` for all time: the last report of a mission.
+    pub time_s: Option<f64>,
     /// Visibilities sampled since the mission epoch.
     pub sampled: u64,
     /// Visibilities dropped on board since the mission epoch.

@@ -244,7 +244,7 @@ impl Inspector {
             baselines: self.rows.iter().map(pair).collect(),
             ephemeris: self.covered.summary(self.segments, self.nodes),
             housekeeping: self.housekeeping.map(|counts| HousekeepingSummary {
-                time_s: counts.time.seconds(),
+                time_s: (!counts.is_last()).then(|| counts.time.seconds()),
                 sampled: counts.sampled,
                 dropped: counts.dropped,
             }),

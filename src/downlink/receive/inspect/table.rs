@@ -5,6 +5,7 @@ use std::fmt;
 
 use super::{Contents, VisibilityCounts};
 use crate::downlink::receive::{Listing, ReceptionCounters};
+use crate::units::printable;
 
 /// Channels side by side.
 const CHANNELS_A_ROW: usize = 6;
@@ -43,7 +44,9 @@ impl Contents {
                 writeln!(
                     f,
                     "\ninstrument    {}: {} satellites, response {}",
-                    i.name, i.satellites, i.response
+                    printable(&i.name),
+                    i.satellites,
+                    i.response
                 )?;
                 writeln!(f, "              epoch {} TAI, Moon {} m", i.epoch_tai, i.moon_radius_m)?;
                 writeln!(f, "              seed {}, configuration {}", i.seed, i.configuration_hash)?;
@@ -66,8 +69,9 @@ impl Contents {
         writeln!(f, "visibilities  {count}, integrating {integration} together; {flagged} flagged")?;
         if let Some(counts) = &self.housekeeping {
             let (sampled, dropped) = (counts.sampled, counts.dropped);
-            let until = format!("until {:.0} s", counts.time_s);
-            writeln!(f, "on board      {sampled} sampled, {dropped} dropped {until}")?;
+            let end = || "the end of the mission".to_owned();
+            let until = counts.time_s.map_or_else(end, |time_s| format!("{time_s:.0} s"));
+            writeln!(f, "on board      {sampled} sampled, {dropped} dropped until {until}")?;
         }
         let ephemeris = &self.ephemeris;
         let (segments, intervals) = (ephemeris.segments, ephemeris.covered.count);

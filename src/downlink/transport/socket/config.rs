@@ -9,7 +9,7 @@ use crate::units::{Checks, InvalidValue};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ListenConfig {
-    /// Maximum number of open connections; further ones are refused.
+    /// Maximum number of open connections. For a further one the least useful gives way; if all deliver, it is refused.
     pub connections_max: usize,
     /// Maximum time from connecting to the first sound packet or frame, s; 0 for no limit.
     pub first_packet_s_max: f64,

@@ -7,12 +7,13 @@ use std::time::Duration;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
+use tokio::sync::Notify;
 use tokio::task::spawn_blocking;
 use tokio::time::{Instant, sleep_until, timeout};
 
-use super::listener::{First, ListenContext, PacketBatch, first};
+use super::listener::{BUSY, CLOSED, First, ListenContext, PacketBatch, first};
 use super::report::{ConnectionEnd, SenderReport};
-use super::sender_intake::SenderIntake;
+use super::sender_intake::{SenderIntake, Signs};
 use crate::downlink::receive::ReceptionCounters;
 
 /// Bytes read at a time; fewer at rates so low that a read would take longer than a tenth of a second.
@@ -33,25 +34,44 @@ struct ConnectionState {
     packets: Vec<u8>,
 }
 
+/// A connection's place.
+struct SeatTaken<'a> {
+    shared: &'a Arc<ListenContext>,
+    number: u64,
+    /// Tells the connection to give way.
+    leave: Arc<Notify>,
+}
+
+impl Drop for SeatTaken<'_> {
+    fn drop(&mut self) {
+        self.shared.seats.release(self.number);
+    }
+}
+
 /// Receives everything that a sender sends.
 pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<ListenContext>) {
     let status = &shared.listening.status;
     status.open.fetch_add(1, Ordering::Relaxed);
     shared.listening.write().connections += 1;
+    let (number, leave) = shared.seats.take(peer.ip(), Instant::now());
+    let seat = SeatTaken { shared: &shared, number, leave };
     let mut bytes = 0;
-    let (state, mut ended) = exchange(&mut stream, &shared, &mut bytes).await;
+    let (state, mut ended) = exchange(&mut stream, &seat, &mut bytes).await;
     let (mut packets, mut refused, mut format) = (0, 0, None);
     let mut counters = ReceptionCounters::default();
     let finished = state.map(|mut state| {
         spawn_blocking(move || {
-            state.intake.finish(&mut state.packets);
-            state
+            let finished = state.intake.finish(&mut state.packets);
+            (state, finished)
         })
     });
     if let Some(finished) = finished
-        && let Ok(mut state) = finished.await
+        && let Ok((mut state, finished)) = finished.await
     {
-        if !hand_on(std::mem::take(&mut state.packets), &shared).await {
+        if let (ConnectionEnd::Whole, Err(refused)) = (ended, finished) {
+            ended = refused;
+        }
+        if !hand_on(std::mem::take(&mut state.packets), &seat).await {
             ended = ConnectionEnd::Stopped;
         }
         (packets, refused) = state.intake.packets();
@@ -61,7 +81,8 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
     }
     let answer = match ended {
         ConnectionEnd::Whole => format!("taken {bytes} bytes\n"),
-        other => format!("closed after {bytes} bytes: {other}\n"),
+        ConnectionEnd::GaveWay => format!("{BUSY}closed after {bytes} bytes: {ended}\n"),
+        other => format!("{CLOSED}after {bytes} bytes: {other}\n"),
     };
     // A sender need not read the answer.
     let _ = timeout(ANSWER, stream.write_all(answer.as_bytes())).await;
@@ -74,9 +95,10 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
 /// Reads until either side ends the connection. Returns no state if the receiver failed.
 async fn exchange(
     stream: &mut TcpStream,
-    shared: &ListenContext,
+    seat: &SeatTaken<'_>,
     bytes: &mut u64,
 ) -> (Option<ConnectionState>, ConnectionEnd) {
+    let shared = seat.shared;
     let rate = shared.config.bytes_per_s_max;
     let read_bytes = match rate > 0.0 {
         true => ((rate / READS_PER_S) as usize).clamp(READ_BYTES_MIN, READ_BYTES),
@@ -88,7 +110,7 @@ async fn exchange(
     let mut silence = Duration::ZERO;
     let mut due = Instant::now();
     loop {
-        let read = match read(stream, shared, &mut state, &mut silence).await {
+        let read = match read(stream, seat, &mut state, &mut silence).await {
             Ok(read) => read,
             Err(ended) => return (Some(state), ended),
         };
@@ -101,12 +123,16 @@ async fn exchange(
         });
         let Ok((back, found)) = found.await else { return (None, ConnectionEnd::Failed) };
         state = back;
-        if matches!(found, Ok(true)) {
+        let Signs { is_alive, is_new } = found.unwrap_or_default();
+        if is_alive {
             silence = Duration::ZERO;
             shared.note_sign();
         }
+        if is_new {
+            shared.seats.note_new(seat.number, Instant::now());
+        }
         let packets = std::mem::take(&mut state.packets);
-        if !hand_on(packets, shared).await {
+        if !hand_on(packets, seat).await {
             return (Some(state), ConnectionEnd::Stopped);
         }
         if let Err(ended) = found.and(within_limits(&state.intake, shared)) {
@@ -122,10 +148,11 @@ async fn exchange(
 /// Reads the next bytes into the chunk, or returns why there are none.
 async fn read(
     stream: &mut TcpStream,
-    shared: &ListenContext,
+    seat: &SeatTaken<'_>,
     state: &mut ConnectionState,
     silence: &mut Duration,
 ) -> Result<usize, ConnectionEnd> {
+    let shared = seat.shared;
     let (limit_s, ended) = match state.intake.is_alive() {
         true => (shared.config.idle_s_max, ConnectionEnd::Idle),
         false => (shared.config.first_packet_s_max, ConnectionEnd::FirstPacket),
@@ -133,10 +160,11 @@ async fn read(
     let limit = if limit_s > 0.0 { Duration::from_secs_f64(limit_s) } else { NEVER };
     let since = Instant::now();
     let reading = timeout(limit.saturating_sub(*silence), stream.read(&mut state.chunk));
-    let read = first(shared.stopped(), reading).await;
+    let read = first(first(shared.stopped(), seat.leave.notified()), reading).await;
     *silence += since.elapsed();
     match read {
-        First::A(()) => Err(ConnectionEnd::Stopped),
+        First::A(First::A(())) => Err(ConnectionEnd::Stopped),
+        First::A(First::B(())) => Err(ConnectionEnd::GaveWay),
         First::B(Err(_)) => Err(ended),
         First::B(Ok(Err(_))) => Err(ConnectionEnd::Broken),
         First::B(Ok(Ok(0))) => Err(ConnectionEnd::Whole),
@@ -144,28 +172,31 @@ async fn read(
     }
 }
 
-fn within_limits(intake: &SenderIntake, shared: &ListenContext) -> Result<bool, ConnectionEnd> {
+fn within_limits(intake: &SenderIntake, shared: &ListenContext) -> Result<(), ConnectionEnd> {
     if intake.held_bytes() as u64 > shared.config.memory_bytes_max {
         return Err(ConnectionEnd::Memory);
     }
     if intake.bytes_in_vain() > shared.config.garbage_bytes_max {
         return Err(ConnectionEnd::Garbage);
     }
-    Ok(true)
+    Ok(())
 }
 
 /// Passes packets to the ground once there is room. Returns whether the ground still accepts any.
-async fn hand_on(bytes: Vec<u8>, shared: &ListenContext) -> bool {
+async fn hand_on(bytes: Vec<u8>, seat: &SeatTaken<'_>) -> bool {
     if bytes.is_empty() {
         return true;
     }
+    let SeatTaken { shared, number, .. } = seat;
     let status = &shared.listening.status;
     let all = ListenContext::room_bytes(&shared.config);
     let needed = u32::try_from(bytes.len().min(all)).unwrap_or(u32::MAX);
     status.waiting.fetch_add(1, Ordering::Relaxed);
+    shared.seats.note_wait(*number, true, Instant::now());
     // Room is granted in the order of request, so that a fast sender does not crowd out a slow one.
     let room = Arc::clone(&shared.room).acquire_many_owned(needed).await;
     status.waiting.fetch_sub(1, Ordering::Relaxed);
+    shared.seats.note_wait(*number, false, Instant::now());
     let Ok(room) = room else { return false };
     let backlog = (all - shared.room.available_permits().min(all)) as u64;
     status.backlog_bytes.store(backlog, Ordering::Relaxed);

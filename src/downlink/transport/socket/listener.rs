@@ -16,6 +16,7 @@ use tokio::time::{Instant, sleep, timeout};
 use super::config::ListenConfig;
 use super::connection::serve;
 use super::report::Listening;
+use super::seats::{Room, Seats};
 use super::sender_intake::Mission;
 
 /// Interval between two checks of the end condition.
@@ -23,6 +24,12 @@ const TICK: Duration = Duration::from_millis(50);
 
 /// Number of notes allowed at once; after that one per second.
 const NOTES_AT_ONCE: f64 = 20.0;
+
+/// Begins an answer after which a sender may try again.
+pub(super) const BUSY: &str = "busy: ";
+
+/// Begins an answer after which it is of no use to try again.
+pub(super) const CLOSED: &str = "closed ";
 
 /// Receives notes about connections.
 pub type Teller = Box<dyn Fn(&str) + Send + Sync>;
@@ -48,6 +55,7 @@ pub(super) struct ListenContext {
     pub(super) until: Until,
     pub(super) mission: Mission,
     pub(super) listening: Listening,
+    pub(super) seats: Seats,
     pub(super) room: Arc<Semaphore>,
     pub(super) batches: Sender<PacketBatch>,
     /// True once reading must stop.
@@ -90,7 +98,8 @@ impl ListenContext {
     fn refuse(&self, stream: &TcpStream, peer: SocketAddr) {
         self.listening.write().refused += 1;
         // A sender need not read the answer.
-        let _ = stream.try_write(b"closed: there are downlink.listen.connections_max others\n");
+        let _ =
+            stream.try_write(format!("{BUSY}there are downlink.listen.connections_max others\n").as_bytes());
         self.notes.say(&format!("{peer}: refused; there are downlink.listen.connections_max others"));
     }
 }
@@ -98,19 +107,32 @@ impl ListenContext {
 /// Listens until the end condition holds, then waits for all connections to end.
 pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
     let mut connections = JoinSet::new();
+    // Accepted, and without a place yet. Others wait in the system's queue, in the order in which they came.
+    let mut newcomer: Option<(TcpStream, SocketAddr)> = None;
     shared.note_sign();
     while !shared.is_over() {
         while connections.try_join_next().is_some() {}
+        if let Some((stream, peer)) = newcomer.take() {
+            if connections.len() < shared.config.connections_max {
+                connections.spawn(serve(stream, peer, Arc::clone(&shared)));
+                continue;
+            }
+            match shared.seats.make_room(peer.ip(), Instant::now()) {
+                Room::None => shared.refuse(&stream, peer),
+                Room::Soon => {
+                    newcomer = Some((stream, peer));
+                    match first(shared.stopped(), timeout(TICK, connections.join_next())).await {
+                        First::A(()) => break,
+                        First::B(_) => {}
+                    }
+                }
+            }
+            continue;
+        }
         match first(shared.stopped(), timeout(TICK, listener.accept())).await {
             First::A(()) => break,
             First::B(Err(_)) => {}
-            First::B(Ok(Ok((stream, peer)))) => {
-                if connections.len() >= shared.config.connections_max {
-                    shared.refuse(&stream, peer);
-                } else {
-                    connections.spawn(serve(stream, peer, Arc::clone(&shared)));
-                }
-            }
+            First::B(Ok(Ok(accepted))) => newcomer = Some(accepted),
             // Too many open files, or the peer is gone already: others may connect.
             First::B(Ok(Err(error))) => {
                 shared.notes.say(&format!("cannot accept a connection: {error}"));
@@ -118,7 +140,7 @@ pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
             }
         }
     }
-    drop(listener);
+    drop((listener, newcomer));
     shared.stop.send_replace(true);
     while connections.join_next().await.is_some() {}
 }

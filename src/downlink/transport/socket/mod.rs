@@ -13,6 +13,10 @@
 //! connection that waits for room does not read, so TCP slows its sender and no other. Segments of one payload stay
 //! together, so that those of two connections never mix.
 //!
+//! When all places are taken, the least useful connection gives way to a newcomer (`seats`). A ground without an
+//! instrument takes that of the first sender whose visibilities have positions; until then it holds each sender's packets
+//! back, so that a mere description shuts nobody out.
+//!
 //! A sender that violates the limits of [`ListenConfig`] is disconnected, counted by reason and reported; the others
 //! continue. Once a sender has closed its side and all its packets are passed on, the ground answers with a line of
 //! text, `taken N bytes`, and closes.
@@ -25,6 +29,7 @@ mod connection;
 mod error;
 mod listener;
 mod report;
+mod seats;
 mod sender_intake;
 mod sink;
 mod source;
@@ -34,6 +39,7 @@ pub use config::ListenConfig;
 pub use error::SocketError;
 pub use listener::{Teller, Until};
 pub use report::{ConnectionEnd, ListenReport, ListenStatus, Listening, SenderReport};
+pub use sender_intake::InstrumentCheck;
 pub use sink::{SendOptions, SocketSink};
 pub use source::SocketSource;
 pub use url::TcpUrl;

@@ -32,6 +32,12 @@ pub enum ConnectionEnd {
     Memory,
     /// A description of another instrument than the ground's.
     OtherInstrument,
+    /// A description of an instrument of which the ground can make no maps.
+    UnfitInstrument,
+    /// The ground knows no instrument, and this one came without visibilities and their positions.
+    Unconfirmed,
+    /// All places were taken, and it was the least useful.
+    GaveWay,
     /// Its receiver failed: a bug in the program.
     Failed,
 }
@@ -47,6 +53,11 @@ impl fmt::Display for ConnectionEnd {
             Self::Garbage => "no sound packet in downlink.listen.garbage_bytes_max",
             Self::Memory => "more incomplete data than downlink.listen.memory_bytes_max",
             Self::OtherInstrument => "packets of another instrument than the ground's",
+            Self::UnfitInstrument => "an instrument that does not fit the ground's configuration",
+            Self::Unconfirmed => {
+                "no visibilities with positions confirmed its instrument, and the ground knows none"
+            }
+            Self::GaveWay => "it gave way to another; all downlink.listen.connections_max were taken",
             Self::Failed => "its receiver failed, which is a bug in the program",
         })
     }
@@ -74,7 +85,7 @@ pub struct ListenReport {
     pub address: String,
     /// Accepted connections.
     pub connections: u64,
-    /// Connections refused because `connections_max` were open.
+    /// Connections refused because `connections_max` were open, all of them useful.
     pub refused: u64,
     /// Bytes read.
     pub bytes: u64,

@@ -4,43 +4,177 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use super::report::ConnectionEnd;
 use crate::downlink::receive::cadu::FrameCounters;
-use crate::downlink::receive::{Decoder, Event, Intake, Packet, ReceptionCounters};
-use crate::downlink::wire::{Format, HEADER_BYTES, Kind, PacketSegment, packet_check};
-use crate::frames::{GroundFrame, Instrument};
+use crate::downlink::receive::{Decoder, Event, Intake, Packet, ReceivedSet, ReceptionCounters};
+use crate::downlink::wire::{Format, HEADER_BYTES, Kind, PacketHeader, PacketSegment, packet_check};
+use crate::frames::{GroundFrame, Instrument, VisibilityBlock};
+use crate::units::MissionTime;
 
 /// Segments of a payload are kept together up to this number of bytes; the ephemeris of a window is a hundredth of it.
 const GROUP_BYTES_MAX: usize = 1 << 20;
 
-/// The ground's instrument: that of its state, or the first that a sender describes. Shared by all connections.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Mission(Arc<Mutex<Option<Instrument>>>);
+/// Bytes of packets held back until visibilities with positions confirm their instrument: several times those after which
+/// description and positions are repeated (1 MiB).
+const UNCONFIRMED_BYTES_MAX: usize = 1 << 22;
 
-impl Mission {
-    pub(super) fn of(instrument: Option<Instrument>) -> Self {
-        Self(Arc::new(Mutex::new(instrument)))
-    }
+/// Segments of positions among which those of a visibility are looked for.
+const POSITIONS_MAX: usize = 1 << 10;
 
-    /// Whether an instrument is the ground's. The first one becomes the ground's.
-    fn agrees(&self, found: &Instrument) -> bool {
-        let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        known.get_or_insert_with(|| found.clone()) == found
+/// Intervals of packets that are remembered of each kind, to tell new packets from replayed ones: a few MB.
+const SEEN_MAX: usize = 1 << 16;
+
+/// Whether the ground can make maps of an instrument.
+pub type InstrumentCheck = Arc<dyn Fn(&Instrument) -> bool + Send + Sync>;
+
+/// What all connections know of the ground: its instrument, that of its state or the first that visibilities with
+/// positions confirm; and the packets that came from any of them.
+#[derive(Clone)]
+pub(super) struct Mission {
+    known: Arc<Mutex<Option<Instrument>>>,
+    fits: InstrumentCheck,
+    seen: Arc<Mutex<[ReceivedSet; Kind::ALL.len()]>>,
+}
+
+impl Default for Mission {
+    fn default() -> Self {
+        Self { known: Arc::default(), fits: Arc::new(|_| true), seen: Arc::default() }
     }
 }
 
+impl Mission {
+    /// Accepts a first instrument only if it fits.
+    pub(super) fn accepting(self, fits: InstrumentCheck) -> Self {
+        Self { fits, ..self }
+    }
+
+    /// Whether an instrument is the ground's. The first one becomes the ground's.
+    pub(super) fn confirm(&self, found: &Instrument) -> bool {
+        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        known.get_or_insert_with(|| found.clone()) == found
+    }
+
+    /// Whether no connection has delivered a packet before.
+    fn is_new(&self, header: &PacketHeader) -> bool {
+        let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
+        let seen = &mut seen[header.kind.index()];
+        let is_new = seen.insert(header.count, header.time);
+        seen.remove_oldest(SEEN_MAX);
+        is_new
+    }
+}
+
+/// What is known of a sender's instrument.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Standing {
+    /// It has not described one, or the ground knows none and nothing has confirmed it.
+    Open,
+    /// It is the ground's.
+    Ours,
+    /// It is refused, from the description on.
+    Refused(ConnectionEnd),
+}
+
+/// Judges a sender by its instrument.
+struct Judge {
+    mission: Mission,
+    standing: Standing,
+    decoder: Decoder,
+    /// Spans of the positions received.
+    positions: Vec<[MissionTime; 2]>,
+}
+
+impl Judge {
+    fn new(mission: Mission) -> Self {
+        Self { mission, standing: Standing::Open, decoder: Decoder::new(), positions: Vec::new() }
+    }
+
+    /// Whether packets may be passed on: all that came before may be, or none of them.
+    fn passes(&mut self) -> bool {
+        if self.standing == Standing::Open {
+            let known = self.mission.known.lock().unwrap_or_else(PoisonError::into_inner);
+            match (&*known, self.decoder.instrument()) {
+                (Some(known), Some(found)) if known != found => {
+                    self.standing = Standing::Refused(ConnectionEnd::OtherInstrument);
+                }
+                (Some(_), Some(_)) => self.standing = Standing::Ours,
+                // It may not say.
+                (Some(_), None) => return true,
+                (None, _) => {}
+            }
+        }
+        self.standing == Standing::Ours
+    }
+
+    fn refused(&self) -> Option<ConnectionEnd> {
+        match self.standing {
+            Standing::Refused(end) => Some(end),
+            _ => None,
+        }
+    }
+
+    /// Takes a sound packet.
+    fn see(&mut self, event: &Event<'_>, kind: Kind) {
+        let describes = kind == Kind::Instrument;
+        if self.refused().is_some() || (self.standing == Standing::Ours && !describes) {
+            return;
+        }
+        let found = self.decoder.accept(event);
+        if self.decoder.counters().instruments_contradictory > 0 {
+            self.standing = Standing::Refused(ConnectionEnd::OtherInstrument);
+            return;
+        }
+        match found {
+            Some(GroundFrame::Instrument(found)) => {
+                self.passes();
+                if self.standing == Standing::Open && !(self.mission.fits)(&found) {
+                    self.standing = Standing::Refused(ConnectionEnd::UnfitInstrument);
+                }
+            }
+            Some(GroundFrame::Ephemeris(segment)) if self.positions.len() < POSITIONS_MAX => {
+                self.positions.push([segment.start, segment.end()]);
+            }
+            Some(GroundFrame::Visibilities(block)) => self.see_block(&block),
+            _ => {}
+        }
+    }
+
+    /// Visibilities with positions confirm the instrument.
+    fn see_block(&mut self, block: &VisibilityBlock) {
+        let Some(&offset) = block.offset_ticks.first() else { return };
+        let first = block.start.plus_ticks(i64::from(offset));
+        let has_positions = self.positions.iter().any(|[from, to]| (*from..=*to).contains(&first));
+        if let Some(found) = self.decoder.instrument().filter(|_| has_positions) {
+            self.standing = match self.mission.confirm(found) {
+                true => Standing::Ours,
+                false => Standing::Refused(ConnectionEnd::OtherInstrument),
+            };
+            self.positions = Vec::new();
+        }
+    }
+}
+
+/// Signs of life in a piece of a stream.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Signs {
+    /// It had a sound packet or frame.
+    pub(super) is_alive: bool,
+    /// It had a sound packet that no connection had delivered before.
+    pub(super) is_new: bool,
+}
+
 /// The receiver of one connection. It counts everything but packets, which the ground counts.
-#[derive(Debug)]
 pub(super) struct SenderIntake {
     intake: Intake,
     stream: Decoder,
-    /// Decodes instrument descriptions only.
-    instruments: Decoder,
-    mission: Mission,
+    judge: Judge,
     /// Packets of a payload that lacks its last segment.
     group: Vec<u8>,
     grouped: u64,
+    /// Whole payloads that may not be passed on yet.
+    held: Vec<u8>,
+    held_packets: u64,
     packets: u64,
     packets_refused: u64,
-    foreign: bool,
+    has_new: bool,
     /// Sound packets and frames at the last sign of life, and the bytes until then.
     signs: u64,
     bytes_at_sign: u64,
@@ -51,36 +185,52 @@ impl SenderIntake {
         Self {
             intake: Intake::unfiltered(),
             stream: Decoder::new(),
-            instruments: Decoder::new(),
-            mission,
+            judge: Judge::new(mission),
             group: Vec::new(),
             grouped: 0,
+            held: Vec::new(),
+            held_packets: 0,
             packets: 0,
             packets_refused: 0,
-            foreign: false,
+            has_new: false,
             signs: 0,
             bytes_at_sign: 0,
         }
     }
 
-    /// Takes the next bytes and appends the packets that they complete to `out`. Returns whether there was a sign of
-    /// life: a sound packet or frame.
+    /// Takes the next bytes and appends the packets that they complete and that may be passed on to `out`.
     ///
     /// # Errors
-    /// [`ConnectionEnd::OtherInstrument`]: from then on no packet is appended.
-    pub(super) fn take(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<bool, ConnectionEnd> {
+    /// The instrument is refused, or not confirmed in time: from then on no packet is appended.
+    pub(super) fn take(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<Signs, ConnectionEnd> {
         self.intake.push(bytes);
         self.hand_out(out);
-        let alive = self.look_for_signs();
-        if self.foreign { Err(ConnectionEnd::OtherInstrument) } else { Ok(alive) }
+        let is_alive = self.look_for_signs();
+        let is_new = std::mem::take(&mut self.has_new);
+        match self.judge.refused() {
+            Some(end) => Err(end),
+            None if self.held.len() > UNCONFIRMED_BYTES_MAX => Err(ConnectionEnd::Unconfirmed),
+            None => Ok(Signs { is_alive, is_new }),
+        }
     }
 
     /// Ends the stream; appends the remaining packets.
-    pub(super) fn finish(&mut self, out: &mut Vec<u8>) {
+    ///
+    /// # Errors
+    /// The instrument is refused, or was not confirmed.
+    pub(super) fn finish(&mut self, out: &mut Vec<u8>) -> Result<(), ConnectionEnd> {
         self.intake.finish();
         self.hand_out(out);
-        self.end_group(out);
+        self.end_group();
+        self.pass_on(out);
         self.look_for_signs();
+        let is_unconfirmed = self.held_packets > 0;
+        self.refuse_held();
+        match self.judge.refused() {
+            Some(end) => Err(end),
+            None if is_unconfirmed => Err(ConnectionEnd::Unconfirmed),
+            None => Ok(()),
+        }
     }
 
     /// Whether a sound packet or frame has arrived since the last check.
@@ -88,7 +238,7 @@ impl SenderIntake {
         // Blocks of equal octets and streams of markers are codewords too, so only valid frames count.
         let ours = |frames: FrameCounters| frames.frames - frames.frames_foreign - frames.frames_malformed;
         let frames = self.intake.frames().map_or(0, ours);
-        let signs = self.packets + self.grouped + self.packets_refused + frames;
+        let signs = self.packets + self.grouped + self.held_packets + self.packets_refused + frames;
         let alive = signs > self.signs;
         if alive {
             (self.signs, self.bytes_at_sign) = (signs, self.intake.bytes());
@@ -117,7 +267,7 @@ impl SenderIntake {
 
     /// Memory held, bytes.
     pub(super) fn held_bytes(&self) -> usize {
-        self.intake.held_bytes() + self.group.capacity()
+        self.intake.held_bytes() + self.group.capacity() + self.held.capacity()
     }
 
     /// Counters of everything but packets.
@@ -131,14 +281,9 @@ impl SenderIntake {
                 self.stream.accept(&event);
                 continue;
             };
-            if packet.header.kind == Kind::Instrument && !self.foreign {
-                let found = self.instruments.accept(&event);
-                let other =
-                    |frame| matches!(frame, GroundFrame::Instrument(found) if !self.mission.agrees(&found));
-                let contradicts = self.instruments.counters().instruments_contradictory > 0;
-                self.foreign = contradicts || found.is_some_and(other);
-            }
-            if self.foreign {
+            self.has_new |= self.judge.mission.is_new(&packet.header);
+            self.judge.see(&event, packet.header.kind);
+            if self.judge.refused().is_some() {
                 self.packets_refused += 1;
                 continue;
             }
@@ -146,19 +291,32 @@ impl SenderIntake {
             self.grouped += 1;
             let ends = matches!(packet.header.segment, PacketSegment::Whole | PacketSegment::Last);
             if ends || self.group.len() > GROUP_BYTES_MAX {
-                out.append(&mut self.group);
-                self.packets += std::mem::take(&mut self.grouped);
+                self.end_group();
+                self.pass_on(out);
             }
         }
-        if self.foreign {
-            self.group.clear();
-            self.packets_refused += std::mem::take(&mut self.grouped);
+        if self.judge.refused().is_some() {
+            self.end_group();
+            self.refuse_held();
         }
     }
 
-    fn end_group(&mut self, out: &mut Vec<u8>) {
-        out.append(&mut self.group);
-        self.packets += std::mem::take(&mut self.grouped);
+    /// Passes whole payloads on if they may be.
+    fn pass_on(&mut self, out: &mut Vec<u8>) {
+        if self.judge.passes() {
+            out.append(&mut self.held);
+            self.packets += std::mem::take(&mut self.held_packets);
+        }
+    }
+
+    fn refuse_held(&mut self) {
+        self.held = Vec::new();
+        self.packets_refused += std::mem::take(&mut self.held_packets);
+    }
+
+    fn end_group(&mut self) {
+        self.held.append(&mut self.group);
+        self.held_packets += std::mem::take(&mut self.grouped);
     }
 }
 
@@ -179,7 +337,6 @@ mod tests {
     use super::*;
     use crate::downlink::{DownlinkConfig, Transmission};
     use crate::frames::{AntennaResponse, Channel, EphemerisSegment, Housekeeping};
-    use crate::units::MissionTime;
 
     fn instrument(name: &str) -> Instrument {
         Instrument {
@@ -195,12 +352,28 @@ mod tests {
         }
     }
 
+    /// A ground whose instrument is known.
+    fn ours() -> Mission {
+        let mission = Mission::default();
+        assert!(mission.confirm(&instrument("ours")));
+        mission
+    }
+
     /// A description, positions in many segments, and housekeeping.
     fn sent(name: &str, format: Format) -> Vec<u8> {
+        transmit(name, format, None)
+    }
+
+    /// The same, with visibilities that begin at `start`.
+    fn with_block(name: &str, start: i64) -> Vec<u8> {
+        transmit(name, Format::Packets, Some(block(start)))
+    }
+
+    fn transmit(name: &str, format: Format, block: Option<GroundFrame>) -> Vec<u8> {
         let config = DownlinkConfig { packet_bytes_max: 512, format, ..DownlinkConfig::default() };
         let (mut transmission, mut bytes) = (Transmission::new(&config).unwrap(), Vec::new());
         let positions_m = (0..8 * 40).map(|k| [f64::from(k), -2e6, 0.5]).collect();
-        for frame in [
+        let frames = [
             GroundFrame::Instrument(instrument(name)),
             GroundFrame::Ephemeris(EphemerisSegment {
                 start: MissionTime(0),
@@ -209,7 +382,8 @@ mod tests {
                 positions_m,
             }),
             GroundFrame::Housekeeping(Housekeeping { time: MissionTime(9), sampled: 0, dropped: 0 }),
-        ] {
+        ];
+        for frame in frames.into_iter().chain(block) {
             transmission.send(&frame, &mut bytes).unwrap();
         }
         transmission.finish(&mut bytes);
@@ -225,7 +399,7 @@ mod tests {
             pieces.push(out);
         }
         let mut out = Vec::new();
-        sender.finish(&mut out);
+        let _ = sender.finish(&mut out);
         pieces.push(out);
         (pieces, foreign)
     }
@@ -235,7 +409,7 @@ mod tests {
         let plain = sent("ours", Format::Packets);
         for format in [Format::Packets, Format::Cadu] {
             for piece in [1, 100, 1 << 16] {
-                let mut sender = SenderIntake::new(Mission::default());
+                let mut sender = SenderIntake::new(ours());
                 let (pieces, foreign) = through(&mut sender, &sent("ours", format), piece);
                 assert!(!foreign && pieces.concat() == plain);
                 // The description, the positions and the counts: for any pieces, no payload is divided.
@@ -249,8 +423,7 @@ mod tests {
     #[test]
     fn another_instrument_is_refused_from_its_description_on() {
         for format in [Format::Packets, Format::Cadu] {
-            let mission = Mission::default();
-            through(&mut SenderIntake::new(mission.clone()), &sent("ours", format), 1000);
+            let mission = ours();
             let mut sender = SenderIntake::new(mission.clone());
             let (pieces, foreign) = through(&mut sender, &sent("theirs", format), 1000);
             assert!(foreign && pieces.concat().is_empty());
@@ -260,6 +433,69 @@ mod tests {
             let both = [sent("ours", format), sent("theirs", format)].concat();
             let (pieces, foreign) = through(&mut sender, &both, 1000);
             assert!(foreign && pieces.concat() == sent("ours", Format::Packets));
+        }
+    }
+
+    /// Visibilities that begin at `start`.
+    fn block(start: i64) -> GroundFrame {
+        GroundFrame::Visibilities(VisibilityBlock {
+            pair: crate::units::Pair { i: 0, j: 1 },
+            start: MissionTime(start),
+            offset_ticks: vec![0],
+            duration_ticks: vec![10],
+            value_k_sr: vec![num_complex::Complex32::ONE],
+            weight: vec![1.0],
+            flags: vec![crate::frames::Flags::GOOD],
+            ..VisibilityBlock::default()
+        })
+    }
+
+    #[test]
+    fn only_visibilities_with_positions_make_an_instrument_the_grounds() {
+        let format = Format::Packets;
+        for (start, confirms) in [(5, true), (-7, false)] {
+            let mission = Mission::default();
+            // Descriptions and positions alone do not, however many.
+            for name in ["forged", "more", "theirs"] {
+                let mut sender = SenderIntake::new(mission.clone());
+                let (pieces, refused) = through(&mut sender, &sent(name, format), 1000);
+                assert!(!refused && pieces.concat().is_empty() && sender.packets().1 > 10);
+            }
+            let bytes = with_block("ours", start);
+            let mut sender = SenderIntake::new(mission.clone());
+            let (pieces, refused) = through(&mut sender, &bytes, 1000);
+            assert!(!refused);
+            match confirms {
+                true => assert!(pieces.concat() == bytes),
+                false => assert!(pieces.concat().is_empty()),
+            }
+            let mut sender = SenderIntake::new(mission);
+            assert_eq!(through(&mut sender, &with_block("theirs", 5), 1000).1, confirms);
+        }
+    }
+
+    #[test]
+    fn what_is_not_confirmed_is_not_kept_for_long() {
+        let mut sender = SenderIntake::new(Mission::default());
+        let bytes = sent("forged", Format::Packets);
+        let mut ends = Vec::new();
+        for _ in 0..=UNCONFIRMED_BYTES_MAX / bytes.len() {
+            ends.extend(sender.take(&bytes, &mut Vec::new()).err());
+        }
+        assert_eq!(ends, [ConnectionEnd::Unconfirmed]);
+        assert!(sender.finish(&mut Vec::new()) == Err(ConnectionEnd::Unconfirmed) && sender.packets().0 == 0);
+    }
+
+    #[test]
+    fn an_instrument_that_does_not_fit_is_refused_and_replayed_packets_are_not_new() {
+        let mission = Mission::default().accepting(Arc::new(|found| found.name != "unfit"));
+        let mut sender = SenderIntake::new(mission.clone());
+        let bytes = with_block("unfit", 5);
+        assert_eq!(sender.take(&bytes, &mut Vec::new()), Err(ConnectionEnd::UnfitInstrument));
+        let bytes = with_block("ours", 900);
+        for is_new in [true, false] {
+            let mut sender = SenderIntake::new(mission.clone());
+            assert_eq!(sender.take(&bytes, &mut Vec::new()), Ok(Signs { is_alive: true, is_new }));
         }
     }
 
@@ -276,7 +512,7 @@ mod tests {
                 bytes[at] ^= octet;
             }
             bytes.truncate(1 + cut.index(bytes.len()));
-            let mut sender = SenderIntake::new(Mission::default());
+            let mut sender = SenderIntake::new(ours());
             let (pieces, _) = through(&mut sender, &bytes, piece);
             let counters = sender.stream();
             let others = counters.bytes_garbage + counters.bytes_damaged + counters.bytes_truncated;

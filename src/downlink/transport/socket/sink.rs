@@ -7,9 +7,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use super::error::SocketError;
+use super::listener::{BUSY, CLOSED};
 use super::url::TcpUrl;
 use crate::downlink::error::DownlinkError;
 use crate::runtime::{Cancel, Sink, Units};
+use crate::units::printable;
 
 /// Longest blocking of a system call between two checks for the end of the run.
 const POLL: Duration = Duration::from_millis(200);
@@ -20,13 +22,20 @@ const GRACE: Duration = Duration::from_secs(10);
 /// Bytes sent between two checks of the rate.
 const PIECE_BYTES: usize = 1 << 16;
 
+/// Bytes kept from the beginning, to be sent again to a receiver that was busy.
+const RESEND_BYTES_MAX: usize = 1 << 24;
+
+/// Pause before the first new attempt; each further one is twice as long, up to the longest.
+const PAUSE: Duration = Duration::from_millis(200);
+const PAUSE_MAX: Duration = Duration::from_secs(5);
+
 /// Maximum length of an answer, bytes.
 const ANSWER_BYTES_MAX: u64 = 1 << 10;
 
 /// Options for sending.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SendOptions {
-    /// Time limit for connecting, s.
+    /// Time limit for connecting, and for finding a receiver that is busy free again, s.
     pub connect_s: f64,
     /// Maximum rate, bytes/s; 0 for as fast as the receiver reads.
     pub bytes_per_s: f64,
@@ -34,6 +43,9 @@ pub struct SendOptions {
 
 /// Sends a byte stream to a listening ground. Connects with the first bytes, and blocks while the receiver does not
 /// read.
+///
+/// A receiver that is busy, or loses the connection, is tried again with the stream from its beginning, as long as that
+/// is kept: what was received before is not applied twice.
 #[derive(Debug)]
 pub struct SocketSink {
     url: TcpUrl,
@@ -44,6 +56,8 @@ pub struct SocketSink {
     /// When the first byte was sent.
     since: Instant,
     bytes: u64,
+    /// The stream from its beginning; `None` once it is longer than what is kept.
+    sent: Option<Vec<u8>>,
     confirmed: Arc<AtomicU64>,
 }
 
@@ -61,6 +75,7 @@ impl SocketSink {
             stream: None,
             since: Instant::now(),
             bytes: 0,
+            sent: Some(Vec::new()),
             confirmed: Arc::default(),
         })
     }
@@ -90,13 +105,104 @@ impl SocketSink {
                 let waited_s = (10.0 * waited_s).round() / 10.0;
                 return Err(SocketError::Connect { url: self.url.clone(), waited_s, source: failed });
             }
-            std::thread::sleep(POLL);
+            self.pause(POLL);
+        }
+    }
+
+    /// Waits, but not once the run has been cancelled.
+    fn pause(&self, length: Duration) {
+        let until = Instant::now() + length;
+        while let Some(left) = until.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()) {
+            if self.cancel.is_cancelled() {
+                return;
+            }
+            std::thread::sleep(left.min(POLL));
+        }
+    }
+
+    /// Sends pieces on a connection, a new one if there is none.
+    fn send_all(&mut self, bytes: &[u8]) -> Result<(), SocketError> {
+        let mut stream = match self.stream.take() {
+            Some(stream) => stream,
+            None => {
+                let stream = self.connect()?;
+                (self.since, self.bytes) = (Instant::now(), 0);
+                stream
+            }
+        };
+        for piece in bytes.chunks(PIECE_BYTES) {
+            self.send(&mut stream, piece)?;
+            self.hold_back();
+        }
+        self.stream = Some(stream);
+        Ok(())
+    }
+
+    /// Ends the stream; returns the receiver's answer.
+    fn end(&mut self) -> Result<String, SocketError> {
+        let Some(mut stream) = self.stream.take() else { return Ok(String::new()) };
+        let answer = self.answer(&mut stream)?;
+        match answer.starts_with(BUSY) {
+            true => Err(self.closed()(answer)),
+            false => Ok(answer),
+        }
+    }
+
+    /// After a failure, does the same again with all that was sent so far, until it succeeds or the time is over.
+    fn retry<T>(
+        &mut self,
+        failure: SocketError,
+        again: impl Fn(&mut Self) -> Result<T, SocketError>,
+    ) -> Result<T, SocketError> {
+        let (since, mut failure, mut pause, mut attempts) = (Instant::now(), failure, PAUSE, 0);
+        while self.may_try_again(&failure) && since.elapsed().as_secs_f64() < self.options.connect_s {
+            self.pause(pause);
+            pause = (2 * pause).min(PAUSE_MAX);
+            attempts += 1;
+            self.stream = None;
+            let Some(sent) = self.sent.take() else { break };
+            let resent = self.send_all(&sent);
+            self.sent = Some(sent);
+            match resent.and_then(|()| again(self)) {
+                Ok(done) => return Ok(done),
+                // The reason why it closed says more than that nobody listens now.
+                Err(SocketError::Connect { .. }) => {}
+                Err(error) => failure = error,
+            }
+        }
+        match failure {
+            SocketError::Closed { url, bytes, reason } if attempts > 0 => {
+                let waited_s = since.elapsed().as_secs_f64();
+                let reason =
+                    format!("{reason}; {attempts} more attempts in {waited_s:.1} s (--connect-s) failed");
+                Err(SocketError::Closed { url, bytes, reason })
+            }
+            other => Err(other),
+        }
+    }
+
+    /// Whether the receiver may take the stream from its beginning: it was busy, or the connection broke.
+    fn may_try_again(&self, failure: &SocketError) -> bool {
+        let SocketError::Closed { reason, .. } = failure else { return false };
+        let is_final = reason.starts_with(CLOSED);
+        self.sent.is_some() && !is_final && !self.cancel.is_cancelled()
+    }
+
+    /// Keeps bytes for another attempt, as long as there is room.
+    fn keep(&mut self, bytes: &[u8]) {
+        if let Some(sent) = &mut self.sent {
+            match sent.len() + bytes.len() <= RESEND_BYTES_MAX {
+                true => sent.extend_from_slice(bytes),
+                false => self.sent = None,
+            }
         }
     }
 
     fn closed<E: ToString>(&self) -> impl Fn(E) -> SocketError + use<E> {
         let (url, bytes) = (self.url.clone(), self.bytes);
-        move |reason| SocketError::Closed { url: url.clone(), bytes, reason: reason.to_string() }
+        // The receiver's words are shown as they are, but for what a terminal would take for a command.
+        let shown = |reason: E| printable(&reason.to_string()).into_owned();
+        move |reason| SocketError::Closed { url: url.clone(), bytes, reason: shown(reason) }
     }
 
     /// Sends a piece; blocks while the receiver does not read.
@@ -149,7 +255,9 @@ impl SocketSink {
 
     /// The receiver's answer after the last byte.
     fn answer(&self, stream: &mut TcpStream) -> Result<String, SocketError> {
-        stream.shutdown(Shutdown::Write).map_err(self.closed())?;
+        if let Err(error) = stream.shutdown(Shutdown::Write) {
+            return Err(self.refused(stream, &error));
+        }
         let since = Instant::now();
         let mut said = Vec::new();
         let mut piece = [0; 256];
@@ -161,7 +269,9 @@ impl SocketSink {
                 }
                 Ok(bytes) => said.extend_from_slice(&piece[..bytes]),
                 Err(error) if may_go_on(&error) => self.require_patience(since)?,
-                Err(error) => return Err(self.closed()(error)),
+                Err(error) if said.is_empty() => return Err(self.closed()(error)),
+                // What it said before the connection broke says more.
+                Err(_) => return Err(self.closed()(String::from_utf8_lossy(&said).trim().to_owned())),
             }
         }
     }
@@ -178,25 +288,23 @@ impl Sink for SocketSink {
     type Error = DownlinkError;
 
     fn take(&mut self, bytes: Vec<u8>) -> Result<(), DownlinkError> {
-        let mut stream = match self.stream.take() {
-            Some(stream) => stream,
-            None => {
-                let stream = self.connect()?;
-                self.since = Instant::now();
-                stream
-            }
-        };
-        for piece in bytes.chunks(PIECE_BYTES) {
-            self.send(&mut stream, piece)?;
-            self.hold_back();
+        let sent = self.send_all(&bytes);
+        self.keep(&bytes);
+        match sent {
+            Ok(()) => Ok(()),
+            // All that is kept includes these bytes.
+            Err(failure) => Ok(self.retry(failure, |_| Ok(()))?),
         }
-        self.stream = Some(stream);
-        Ok(())
     }
 
     fn finish(&mut self) -> Result<(), DownlinkError> {
-        let Some(mut stream) = self.stream.take() else { return Ok(()) };
-        let answer = self.answer(&mut stream)?;
+        if self.stream.is_none() {
+            return Ok(());
+        }
+        let answer = match self.end() {
+            Ok(answer) => answer,
+            Err(failure) => self.retry(failure, Self::end)?,
+        };
         if answer == format!("taken {} bytes", self.bytes) {
             self.confirmed.store(self.bytes, Ordering::Relaxed);
         } else if !answer.is_empty() {

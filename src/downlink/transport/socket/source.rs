@@ -13,7 +13,8 @@ use super::config::ListenConfig;
 use super::error::SocketError;
 use super::listener::{ListenContext, Notes, PacketBatch, Teller, Until, listen};
 use super::report::Listening;
-use super::sender_intake::Mission;
+use super::seats::Seats;
+use super::sender_intake::{InstrumentCheck, Mission};
 use super::url::TcpUrl;
 use crate::downlink::error::DownlinkError;
 use crate::frames::Instrument;
@@ -66,11 +67,20 @@ impl SocketSource {
         })
     }
 
-    /// Accepts packets of this instrument only; with `None`, of the one described first.
+    /// Accepts packets of this instrument only; with `None`, of the first whose visibilities come with positions.
     #[must_use]
-    pub fn knowing(mut self, instrument: Option<Instrument>) -> Self {
-        if let Some((_, mission, _)) = &mut self.waiting {
-            *mission = Mission::of(instrument);
+    pub fn knowing(self, instrument: Option<Instrument>) -> Self {
+        if let (Some((_, mission, _)), Some(instrument)) = (&self.waiting, &instrument) {
+            mission.confirm(instrument);
+        }
+        self
+    }
+
+    /// Accepts an instrument only if `fits` says so.
+    #[must_use]
+    pub fn accepting(mut self, fits: InstrumentCheck) -> Self {
+        if let Some((listener, mission, tell)) = self.waiting.take() {
+            self.waiting = Some((listener, mission.accepting(fits), tell));
         }
         self
     }
@@ -118,6 +128,7 @@ impl SocketSource {
             until: self.until,
             mission,
             listening: self.listening.clone(),
+            seats: Seats::default(),
             room: Arc::clone(&self.room),
             batches,
             stop: Arc::clone(&self.stop),

@@ -51,6 +51,12 @@ impl CaduEncoder {
         }
     }
 
+    /// Appends the partial frame of housekeeping, padded with an idle packet: it does not wait for the end of the pass.
+    pub fn flush_housekeeping(&mut self, out: &mut Vec<u8>) {
+        let code = self.code;
+        self.housekeeping.flush(|frame| code_frame(code, frame, out));
+    }
+
     /// Ends a pass: appends the partial frames, padded with idle packets; science before housekeeping.
     pub fn flush(&mut self, out: &mut Vec<u8>) {
         let code = self.code;

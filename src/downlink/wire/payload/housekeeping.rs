@@ -1,12 +1,16 @@
 //! The spacecraft's own counts.
 //!
-//! Record: `time_ticks` i64, `sampled` u64, `dropped` u64. No arrays.
+//! Record: `time_ticks` i64, `sampled` u64, `dropped` u64. No arrays. The time of the last report of a mission is 2^32 s,
+//! the end of the range: see [`Housekeeping::FOREVER`].
 
 use bincode::{Decode, Encode};
 
 use super::{PayloadFault, put_record, require, require_length, require_time, take_record};
 use crate::frames::Housekeeping;
 use crate::units::MissionTime;
+
+/// Most visibilities that a report may claim: 2^48, a third of a million times those of 30 channels over 1.3 years.
+const SAMPLED_MAX: u64 = 1 << 48;
 
 #[derive(Encode, Decode)]
 struct HousekeepingRecord {
@@ -32,6 +36,32 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<Housekeeping, PayloadFault> {
 
 fn check(counts: &Housekeeping) -> Result<(), PayloadFault> {
     require_time(counts.time)?;
+    let possible = counts.sampled <= SAMPLED_MAX;
+    require(possible, "sampled visibilities", counts.sampled as f64, "at most 2^48")?;
     let good = counts.dropped <= counts.sampled;
     require(good, "dropped visibilities", counts.dropped as f64, "no more than were sampled")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_last_report_is_sent_and_impossible_counts_are_refused() {
+        let last = Housekeeping { time: Housekeeping::FOREVER, sampled: 9, dropped: 2 };
+        let mut bytes = Vec::new();
+        encode(&last, &mut bytes).unwrap();
+        assert_eq!(decode(&bytes), Ok(last));
+        let forged = |time: i64, sampled: u64, dropped: u64| {
+            let mut bytes = Vec::new();
+            put_record("housekeeping", HousekeepingRecord { time_ticks: time, sampled, dropped }, &mut bytes)
+                .unwrap();
+            decode(&bytes)
+        };
+        assert!(forged(0, SAMPLED_MAX, SAMPLED_MAX).is_ok());
+        let refused = [(0, u64::MAX, u64::MAX), (0, SAMPLED_MAX + 1, 0), (0, 1, 2), (last.time.0 + 1, 1, 0)];
+        for (time, sampled, dropped) in refused {
+            assert!(matches!(forged(time, sampled, dropped), Err(PayloadFault::Value { .. })), "{sampled}");
+        }
+    }
 }
