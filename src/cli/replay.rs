@@ -129,10 +129,16 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
         None => Ground::new(&settings)?,
     };
     print_notes(ground.notes());
-    let summary = match &args.listen {
-        Some(url) => from_senders(args, url, &config, ground)?,
-        None => from_files(args, &config, ground)?,
+    let saving = ground.outcome().saving;
+    let ended = match &args.listen {
+        Some(url) => from_senders(args, url, &config, ground),
+        None => from_files(args, &config, ground),
     };
+    let summary = ended.inspect_err(|error| {
+        let told = matches!(error.downcast_ref::<PipelineError>(), Some(PipelineError::Unsaved { .. }));
+        // Another failure must not hide that nothing was saved.
+        print_notes(saving.report().filter(|saving| saving.unsaved.is_some() && !told));
+    })?;
     if args.json {
         print_json_line(&summary)?;
     } else {

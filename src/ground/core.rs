@@ -1,6 +1,7 @@
 //! The ground as one stage: bytes of a downlink to sums.
 
 use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
 
 use super::archive::{Archive, RecordDraft};
 use super::{Collector, Delivery, GroundConfig, GroundError, GroundOutcome};
@@ -8,6 +9,9 @@ use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::Calibrator;
 use crate::frames::{GroundFrame, Instrument, PlacedFrame};
 use crate::runtime::{Outlet, Stage, Units};
+
+/// Waits before the last checkpoint of a session is tried again: what lacks may be there a moment later.
+const LAST_WAITS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(1)];
 
 /// Takes the bytes of a downlink and emits sums.
 ///
@@ -58,7 +62,8 @@ impl Ground {
             };
             self.apply(delivery, out)?;
             if self.archive.as_ref().is_some_and(Archive::is_due) {
-                self.checkpoint()?;
+                // Nothing is lost yet if it fails: the outcome says so, and it is tried again.
+                let _ = self.checkpoint();
             }
         }
     }
@@ -87,6 +92,17 @@ impl Ground {
         let Some(archive) = &mut self.archive else { return Ok(()) };
         archive.checkpoint(&self.collector, &self.calibrator, &mut self.accumulator)
     }
+
+    /// Writes the last checkpoint of a session. Maps are made even if it fails for good; the outcome says so.
+    fn last_checkpoint(&mut self) {
+        for wait in LAST_WAITS {
+            if self.checkpoint().is_ok() {
+                return;
+            }
+            std::thread::sleep(wait);
+        }
+        let _ = self.checkpoint();
+    }
 }
 
 fn placed(
@@ -110,7 +126,7 @@ impl Stage for Ground {
         self.collector.finish();
         self.advance(out)?;
         // The checkpoint keeps held packets as they are; the final maps use them without their positions.
-        self.checkpoint()?;
+        self.last_checkpoint();
         while let Some(delivery) = self.collector.flush_next() {
             self.apply(delivery, out)?;
         }
