@@ -73,9 +73,9 @@ impl GainsFile {
         let text = std::fs::read_to_string(path)
             .map_err(|source| CalibrationError::Read { path: path.to_owned(), source })?;
         let parsed = if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json")) {
-            serde_json::from_str(&text).map_err(|error| echo_lines(error))
+            serde_json::from_str(&text).map_err(echo_lines)
         } else {
-            toml::from_str(&text).map_err(|error| echo_lines(error))
+            toml::from_str(&text).map_err(echo_lines)
         };
         parsed.map_err(|message| CalibrationError::Syntax { path: path.to_owned(), message })
     }
