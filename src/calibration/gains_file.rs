@@ -5,7 +5,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::CalibrationError;
-use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
+use crate::units::{Checks, InvalidValue, MAX_SATELLITES, echo_lines};
 
 /// Interpolation of gains between solutions.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -73,9 +73,9 @@ impl GainsFile {
         let text = std::fs::read_to_string(path)
             .map_err(|source| CalibrationError::Read { path: path.to_owned(), source })?;
         let parsed = if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json")) {
-            serde_json::from_str(&text).map_err(|error| error.to_string())
+            serde_json::from_str(&text).map_err(echo_lines)
         } else {
-            toml::from_str(&text).map_err(|error| error.to_string())
+            toml::from_str(&text).map_err(echo_lines)
         };
         parsed.map_err(|message| CalibrationError::Syntax { path: path.to_owned(), message })
     }

@@ -13,7 +13,7 @@ use crate::mother::BAND_HZ;
 use crate::response::pixel::{PairGeometry, exact};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::healpix::pixel_area_sr;
-use crate::units::Pair;
+use crate::units::{Pair, echo};
 
 /// Predict visibilities of a sky map by a direct sum over its pixels.
 ///
@@ -96,7 +96,8 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
     let mut input = std::io::stdin().lock();
     let header = next_line(&mut input, 1)?.unwrap_or_default();
     if header.split(',').map(str::trim).ne(["t_s", "i", "j", "freq_hz"]) {
-        return Err(format!("standard input, line 1: found `{header}`, expected `t_s,i,j,freq_hz`").into());
+        let found = echo(header);
+        return Err(format!("standard input, line 1: found `{found}`, expected `t_s,i,j,freq_hz`").into());
     }
     for number in 2.. {
         let Some(line) = next_line(&mut input, number)? else { break };
@@ -114,10 +115,10 @@ fn parse(line: &str) -> Result<VisibilityQuery, String> {
         return Err(format!("found {} fields, expected t_s,i,j,freq_hz", fields.len()));
     };
     let number = |name: &str, text: &str| {
-        text.parse::<f64>().map_err(|_| format!("{name} = `{text}`: expected a number"))
+        text.parse::<f64>().map_err(|_| format!("{name} = `{}`: expected a number", echo(text)))
     };
     let satellite = |name: &str, text: &str| {
-        text.parse::<usize>().map_err(|_| format!("{name} = `{text}`: expected a satellite's number"))
+        text.parse::<usize>().map_err(|_| format!("{name} = `{}`: expected a satellite's number", echo(text)))
     };
     let pair = Pair::from_one_based(satellite("i", i)?, satellite("j", j)?).map_err(|e| e.to_string())?;
     Ok(VisibilityQuery { t_s: number("t_s", t_s)?, pair, freq_hz: number("freq_hz", freq_hz)? })
@@ -126,13 +127,13 @@ fn parse(line: &str) -> Result<VisibilityQuery, String> {
 fn check(array: &Array, query: VisibilityQuery) -> Result<(), String> {
     let VisibilityQuery { t_s, pair, freq_hz } = query;
     if !(-1e9..=1e9).contains(&t_s) {
-        return Err(format!("t_s = {t_s}: expected seconds, -1e9 to 1e9"));
+        return Err(format!("t_s = {}: expected seconds, -1e9 to 1e9", echo(t_s)));
     }
     if usize::from(pair.j) >= array.satellites() {
         return Err(format!("pair {pair}: the array has {} satellites", array.satellites()));
     }
     if !(BAND_HZ[0]..=BAND_HZ[1]).contains(&freq_hz) {
-        return Err(format!("freq_hz = {freq_hz}: expected {} to {}", BAND_HZ[0], BAND_HZ[1]));
+        return Err(format!("freq_hz = {}: expected {} to {}", echo(freq_hz), BAND_HZ[0], BAND_HZ[1]));
     }
     Ok(())
 }

@@ -139,6 +139,9 @@ impl ProgressView {
         if let Some(solving) = watched.solving.now() {
             message.push(self.solution(&solving));
         }
+        if let Some(saving) = watched.saving.report().filter(|saving| saving.unsaved.is_some()) {
+            message.insert(0, saving.to_string());
+        }
         let message = message.join(", ");
         match &self.bar {
             Some(bar) => {

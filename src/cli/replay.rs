@@ -133,12 +133,18 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
         None => Ground::new(&settings)?,
     };
     print_notes(ground.notes());
+    let saving = ground.outcome().saving;
     let interrupt = Interrupt::default();
     let session = Session { args, config: &config, interrupt: &interrupt };
-    let summary = match &args.listen {
-        Some(url) => session.hear_senders(url, ground)?,
-        None => session.read_files(ground)?,
+    let ended = match &args.listen {
+        Some(url) => session.hear_senders(url, ground),
+        None => session.read_files(ground),
     };
+    let summary = ended.inspect_err(|error| {
+        let told = matches!(error.downcast_ref::<PipelineError>(), Some(PipelineError::Unsaved { .. }));
+        // Another failure must not hide that nothing was saved.
+        print_notes(saving.report().filter(|saving| saving.unsaved.is_some() && !told));
+    })?;
     let completion = match args.follow || args.listen.is_some() {
         true => {
             let is_saved = args.state.is_some() || !summary.lacks_maps();

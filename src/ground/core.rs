@@ -11,6 +11,9 @@ use crate::downlink::{CucTime, Kind};
 use crate::frames::{GroundFrame, Instrument, PlacedFrame};
 use crate::runtime::{Cancel, Outlet, Stage, Units};
 
+/// Waits before the last checkpoint of a session is tried again: what lacks may be there a moment later.
+const LAST_WAITS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(1)];
+
 /// Takes the bytes of a downlink and emits sums.
 ///
 /// Collects packets, each once; places and calibrates their visibilities; adds them to the sums. With an [archive](super::archive) it
@@ -80,7 +83,8 @@ impl Ground {
             };
             self.apply(delivery, out)?;
             if self.archive.as_ref().is_some_and(Archive::is_due) {
-                self.checkpoint()?;
+                // Nothing is lost yet if it fails: the outcome says so, and it is tried again.
+                let _ = self.checkpoint();
             }
         }
     }
@@ -128,6 +132,17 @@ impl Ground {
         let Some(archive) = &mut self.archive else { return Ok(()) };
         archive.checkpoint(&self.collector, &self.calibrator, &mut self.accumulator)
     }
+
+    /// Writes the last checkpoint of a session. Maps are made even if it fails for good; the outcome says so.
+    fn last_checkpoint(&mut self) {
+        for wait in LAST_WAITS {
+            if self.checkpoint().is_ok() {
+                return;
+            }
+            std::thread::sleep(wait);
+        }
+        let _ = self.checkpoint();
+    }
 }
 
 fn placed(
@@ -151,7 +166,7 @@ impl Stage for Ground {
         self.collector.finish();
         self.advance(out)?;
         // The checkpoint keeps held packets as they are; the final maps use them without their positions.
-        self.checkpoint()?;
+        self.last_checkpoint();
         while let Some(delivery) = self.collector.flush_next() {
             match &delivery.frame {
                 Some(GroundFrame::Visibilities(block))

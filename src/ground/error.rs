@@ -52,6 +52,16 @@ pub enum GroundError {
         /// What was expected.
         expected: &'static str,
     },
+    /// A file with a name that is like a checkpoint's and that none has.
+    #[error(
+        "{}: found a number that no checkpoint has; expected a name such as checkpoint-00000001.lunarray: rename the \
+         file, or move it away",
+        path.display()
+    )]
+    CheckpointName {
+        /// The file.
+        path: PathBuf,
+    },
     /// There are checkpoints, and none can be used.
     #[error(
         "{}: none of its {checkpoints} checkpoints holds, the newest because of: {newest}; move the folder away to \

@@ -20,5 +20,5 @@ pub use collector::{Collector, CollectorState, CollectorView, DeliveredPacket, D
 pub use config::{GroundConfig, WAIT_BYTES};
 pub use error::GroundError;
 pub use hold_buffer::{HeldPacket, HoldBuffer};
-pub use outcome::GroundOutcome;
+pub use outcome::{GroundOutcome, SavingReport, SharedSaving};
 pub use reception::Reception;

@@ -1,6 +1,11 @@
 //! What the ground leaves behind besides its sums.
 
-use std::sync::{Arc, Mutex};
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use serde::Serialize;
+
+use super::GroundError;
 
 use crate::calibration::Completeness;
 use crate::downlink::ReceptionCounters;
@@ -18,4 +23,53 @@ pub struct GroundOutcome {
     pub reception: Arc<Mutex<ReceptionCounters>>,
     /// Auto-correlations, by channel, daughter and time.
     pub autos: Arc<Mutex<Vec<AutoPower>>>,
+    /// How its checkpoints went, at any time.
+    pub saving: SharedSaving,
+}
+
+/// How the checkpoints of a session went.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct SavingReport {
+    /// Checkpoints that were written.
+    pub written: u64,
+    /// Attempts that failed.
+    pub failed: u64,
+    /// Why the last attempt failed; `None` if it did not.
+    pub unsaved: Option<String>,
+}
+
+impl fmt::Display for SavingReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.unsaved {
+            Some(reason) => write!(f, "state not saved, {} attempts failed: {reason}", self.failed),
+            None => write!(f, "state saved; {} attempts failed before", self.failed),
+        }
+    }
+}
+
+/// The report on the checkpoints of a ground at work; clones share it.
+#[derive(Clone, Debug, Default)]
+pub struct SharedSaving(Arc<Mutex<Option<SavingReport>>>);
+
+impl SharedSaving {
+    /// The report so far; `None` without an archive.
+    #[must_use]
+    pub fn report(&self) -> Option<SavingReport> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// There is an archive.
+    pub(super) fn begin(&self) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert_default();
+    }
+
+    /// Counts an attempt; returns whether the one before had failed.
+    pub(super) fn update(&self, failure: Option<&GroundError>) -> bool {
+        let mut report = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let SavingReport { written, failed, unsaved } = report.get_or_insert_default();
+        let failed_before = unsaved.is_some();
+        *if failure.is_some() { failed } else { written } += 1;
+        *unsaved = failure.map(ToString::to_string);
+        failed_before
+    }
 }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 use super::config::{Config, Problems};
+use crate::units::{echo, echo_lines};
 
 /// Name of the default pipeline in messages.
 const QUICKLOOK_NAME: &str = "embedded quicklook";
@@ -24,7 +25,7 @@ pub enum ConfigError {
         source: std::io::Error,
     },
     /// Not TOML, or unknown keys or wrong types.
-    #[error("{origin}: {source}")]
+    #[error("{}: {}", echo(origin), echo_lines(source))]
     Parse {
         /// File, or the embedded default's name.
         origin: String,
@@ -32,10 +33,10 @@ pub enum ConfigError {
         source: Box<toml::de::Error>,
     },
     /// A `--set` that is not `key=value`.
-    #[error("--set {0}: expected key=value, for example --set map.nside=32")]
+    #[error("--set {}: expected key=value, for example --set map.nside=32", echo(.0))]
     Override(String),
     /// A `--set` with a key below one that is not a section.
-    #[error("--set {key}: `{part}` is not a section")]
+    #[error("--set {}: `{}` is not a section", echo(key), echo(part))]
     NotASection {
         /// Whole key.
         key: String,
@@ -43,10 +44,10 @@ pub enum ConfigError {
         part: String,
     },
     /// An unknown key.
-    #[error("{0}: no such key; pipelines/reference.toml holds all of them")]
+    #[error("{}: no such key; pipelines/reference.toml holds all of them", echo(.0))]
     Unknown(String),
     /// Invalid values; all of them.
-    #[error("{origin}: {} problem(s)\n{}", problems.len(), bullets(problems))]
+    #[error("{}: {} problem(s)\n{}", echo(origin), problems.len(), bullets(problems))]
     Values {
         /// File, or the embedded default's name.
         origin: String,
@@ -234,6 +235,30 @@ mod tests {
         assert!(matches!(with(&["seed.more=1"]), Err(ConfigError::NotASection { .. })));
         let unknown = with(&["map.nsides=8"]).unwrap_err().to_string();
         assert!(unknown.contains("nsides"), "{unknown}");
+    }
+
+    #[test]
+    fn messages_stay_short_whatever_the_file_holds() {
+        let long = "7".repeat(10_000_000);
+        let texts = [
+            format!("[map]\nepsilon = \"{long}\""),
+            format!("[map]\nepsilon = {long}"),
+            format!("[map]\nnside = [{long}"),
+            format!("k{long} = 1\nm{long} = 2"),
+            format!("[map]\nepsilon = 1{}", "0".repeat(300)),
+        ];
+        for text in texts {
+            let source = ConfigSource::default();
+            let told =
+                source.parse_text(&text).map(|config| config.problems()).map_err(|error| error.to_string());
+            let told = told.unwrap_or_else(|error| vec![error.into()]);
+            let told: Vec<String> = told.iter().map(ToString::to_string).collect();
+            // Room for the keys of a section.
+            assert!(!told.is_empty() && told.iter().all(|text| text.len() < 4000), "{}", told.concat().len());
+        }
+        let told = with(&["map.epsilon=text"]).unwrap_err().to_string();
+        assert!(told.contains("\"text\"") && !told.contains("untagged"), "{told}");
+        assert!(with(&[&long]).unwrap_err().to_string().len() < 300);
     }
 
     #[test]

@@ -69,6 +69,18 @@ pub enum PipelineError {
         /// The ledger of visibilities.
         ledger: Box<crate::runtime::LedgerReport<VisibilityReason>>,
     },
+    /// The ground's last checkpoint could not be written.
+    #[error(
+        "the state was not saved: {reason}. Maps and {} hold all data; the state holds that of its newest checkpoint: \
+         mend the cause, and replay the same files again",
+        summary.display()
+    )]
+    Unsaved {
+        /// Where the summary is.
+        summary: std::path::PathBuf,
+        /// Why it could not be written.
+        reason: String,
+    },
     /// No observing window.
     #[error(
         "spacecraft.duration_s = {duration_s}: there is no observing window in it. The first begins when the Earth sets for \

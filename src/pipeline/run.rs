@@ -16,7 +16,7 @@ use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
 use crate::files::FolderLock;
-use crate::ground::{Ground, WAIT_BYTES};
+use crate::ground::{Ground, SharedSaving, WAIT_BYTES};
 use crate::products::{ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::solve::SolveWatch;
@@ -30,6 +30,8 @@ pub struct Watched {
     pub solving: SolveWatch,
     /// The senders, if the ground listens.
     pub listening: Option<Listening>,
+    /// The ground's checkpoints.
+    pub saving: SharedSaving,
 }
 
 /// A source of downlink bytes.
@@ -118,7 +120,8 @@ pub fn run(
     let ground = Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add);
     let mapping = Mapping { out, truth, watch: solving.clone() };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
-    let watched = Watched { metrics: graph.metrics(), solving, listening: None };
+    let saving = SharedSaving::default();
+    let watched = Watched { metrics: graph.metrics(), solving, listening: None, saving };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
     let samples = close_samples(&counts, plan, &report)?;
     let ended = Ended { report, outcome, listening: None, samples };
@@ -158,7 +161,8 @@ pub fn simulate(
         // The graph says that its end is open.
         (None, None) => drop(bytes),
     }
-    let watched = Watched { metrics: graph.metrics(), solving: SolveWatch::default(), listening: None };
+    let (solving, saving) = (SolveWatch::default(), SharedSaving::default());
+    let watched = Watched { metrics: graph.metrics(), solving, listening: None, saving };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
     close_samples(&counts, plan, &report)?;
     Ok(report)
@@ -167,7 +171,8 @@ pub fn simulate(
 /// The ground segment alone: `ground`, made with the same configuration, takes downlink files or what senders send.
 ///
 /// # Errors
-/// A file that cannot be read; the first failure of any stage; no visibility for any map.
+/// A file that cannot be read; the first failure of any stage; a last checkpoint that could not be written; no
+/// visibility for any map.
 pub fn replay<S: GroundSource + 'static>(
     source: S,
     config: &Config,
@@ -185,7 +190,8 @@ pub fn replay<S: GroundSource + 'static>(
     let ground = ground.cancelled_by(cancel, grace.to_add);
     let mapping = Mapping { out, truth: Truth::unknown(), watch: solving.clone() };
     let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
-    let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone() };
+    let saving = outcome.ground.saving.clone();
+    let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone(), saving };
     let report = start(graph, &config.runtime, cancel, (watched, watch))?;
     conclude(RunScope::Ground, config, out, Ended { report, outcome, listening, samples: None })
 }
@@ -276,7 +282,11 @@ fn conclude(
     let mut summary = RunSummary::new(segment, config, report, ledger, reception, channels);
     (summary.listening, summary.samples) = (listening, samples);
     summary.completeness = ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    summary.saving = ground.saving.report();
     let path = summary.write(out)?;
+    if let Some(reason) = summary.saving.as_ref().and_then(|saving| saving.unsaved.clone()) {
+        return Err(PipelineError::Unsaved { summary: path, reason });
+    }
     if summary.channels.is_empty() && !summary.cancelled {
         return Err(PipelineError::NoMap { summary: path, ledger: Box::new(summary.ledger) });
     }

@@ -14,6 +14,7 @@ use crate::downlink::ReceptionCounters;
 use crate::downlink::transport::socket::ListenReport;
 use crate::files::write_atomically;
 use crate::frames::VisibilityReason;
+use crate::ground::SavingReport;
 use crate::products::{ChannelSummary, ProductsError};
 use crate::runtime::{LedgerReport, Report, StageReport};
 
@@ -58,6 +59,9 @@ pub struct RunSummary {
     /// The senders, if the ground listened.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub listening: Option<ListenReport>,
+    /// Checkpoints of the ground's state, if it keeps one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub saving: Option<SavingReport>,
     /// Stages: throughput, times, queues.
     pub report: Report,
 }
@@ -87,6 +91,7 @@ impl RunSummary {
             samples: None,
             reception,
             listening: None,
+            saving: None,
             report,
         }
     }
@@ -155,6 +160,9 @@ impl fmt::Display for RunSummary {
         writeln!(f, "Reception\n{}\n", self.reception)?;
         if let Some(listening) = &self.listening {
             writeln!(f, "Senders\n{listening}\n")?;
+        }
+        if let Some(saving) = self.saving.as_ref().filter(|saving| saving.failed > 0) {
+            writeln!(f, "State\n{saving}\n")?;
         }
         writeln!(f, "Maps")?;
         for channel in &self.channels {

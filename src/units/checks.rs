@@ -5,6 +5,8 @@ use std::fmt;
 
 use thiserror::Error;
 
+use super::echo;
+
 /// A configuration value that is not accepted.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error("{key} = {value}: expected {expected}")]
@@ -46,7 +48,7 @@ impl Checks {
             "" => key.to_string(),
             section => format!("{section}.{key}"),
         };
-        self.found.push(InvalidValue { key, value: value.to_string(), expected: expected.into() });
+        self.found.push(InvalidValue { key, value: echo(value), expected: expected.into() });
     }
 
     /// As [`Checks::require`], and requires that the value is finite.
@@ -77,6 +79,7 @@ mod tests {
         checks.require("nside", 3, false, "a power of two");
         checks.require("engine", "pixel", true, "pixel or harmonic");
         checks.number("weight_max", f64::INFINITY, true, "a number");
+        checks.number("weight_max", 1e300, false, "less");
         checks.number("epsilon", 0.5, true, "above 0");
         let mut outside = Checks::of("");
         outside.require("seed", "-1", false, format!("0 to {}", u64::MAX));
@@ -85,6 +88,7 @@ mod tests {
         let expected = [
             "map.nside = 3: expected a power of two",
             "map.weight_max = inf: expected a number",
+            "map.weight_max = 1e300: expected less",
             "seed = -1: expected 0 to 18446744073709551615",
         ];
         assert_eq!(told, expected);

@@ -6,6 +6,7 @@
 pub(crate) mod arithmetic;
 mod checks;
 pub mod constants;
+mod echo;
 mod ids;
 mod interval_set;
 mod per_channel;
@@ -16,6 +17,7 @@ mod time;
 pub mod vector;
 
 pub use checks::{Checks, InvalidValue};
+pub use echo::{echo, echo_lines};
 pub use ids::{ChannelId, MAX_SATELLITES, Pair, PairError, all_pairs};
 pub use interval_set::IntervalSet;
 pub use per_channel::PerChannel;

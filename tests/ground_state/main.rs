@@ -6,10 +6,13 @@ mod common;
 
 mod damage;
 mod ending;
+#[cfg(target_os = "linux")] // How calls of the system are caught differs elsewhere.
+mod faults;
 mod forged;
 mod gaps;
 mod kill;
 mod merge;
+mod model;
 mod order;
 mod retract;
 

@@ -1,7 +1,7 @@
 //! Checkpoints, written and read.
 
 use std::fs::File;
-use std::io::{BufReader, BufWriter, Read, Seek, SeekFrom, Write};
+use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use bincode::enc::write::SizeWriter;
@@ -117,7 +117,16 @@ pub(super) fn read<T>(
     path: &Path,
     rest: impl FnOnce(ArchiveHead, &mut dyn Read) -> Result<T, GroundError>,
 ) -> Result<T, GroundError> {
-    read_from(&mut File::open(path).map_err(GroundError::io(path, "read"))?, path, rest)
+    read_from(&mut open(path)?, path, rest)
+}
+
+/// Requires that the checksum of a checkpoint holds.
+pub(super) fn verify(path: &Path) -> Result<(), GroundError> {
+    checked_length(&mut open(path)?, path).map(|_| ())
+}
+
+fn open(path: &Path) -> Result<File, GroundError> {
+    File::open(path).map_err(GroundError::io(path, "open the checkpoint"))
 }
 
 /// Reads a checkpoint from anything; messages call it `path`.
@@ -194,9 +203,11 @@ fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, Gro
     let mut crc = Digest::new(CrcAlgorithm::Crc64Nvme);
     let mut chunk = vec![0; bytes.min(PIECE_BYTES) as usize];
     loop {
-        match body.read(&mut chunk).map_err(failed())? {
-            0 => break,
-            read => crc.update(&chunk[..read]),
+        match body.read(&mut chunk) {
+            Ok(0) => break,
+            Ok(read) => crc.update(&chunk[..read]),
+            Err(error) if error.kind() == ErrorKind::Interrupted => {}
+            Err(error) => return Err(failed()(error)),
         }
     }
     let mut stored = [0; 8];

@@ -1,21 +1,25 @@
-//! The folder of an archive: numbered checkpoints, of which the newest two are kept.
+//! The folder of an archive: numbered checkpoints, of which the newest two are kept. Room for three lets both stay until
+//! another is whole; room for two is enough.
 
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
+use super::checkpoint;
 use crate::files::{AtomicFile, FolderLock, IfUnfinished};
 use crate::ground::GroundError;
 
 const PREFIX: &str = "checkpoint-";
 const SUFFIX: &str = ".lunarray";
+/// Greatest number of a checkpoint, which no state that counts from 1 reaches.
+const NUMBER_MAX: u64 = u64::MAX / 2;
 
 /// A folder that one process uses at a time.
 #[derive(Debug)]
 pub(super) struct StateFolder {
     path: PathBuf,
-    /// Number of the newest checkpoint.
-    newest: u64,
+    /// Numbers of its checkpoints, oldest first.
+    numbers: Vec<u64>,
     lock: FolderLock,
 }
 
@@ -26,36 +30,32 @@ impl StateFolder {
             ErrorKind::ResourceBusy => GroundError::Locked { path: path.to_owned() },
             _ => GroundError::io(path, "lock the folder")(error),
         })?;
-        let mut folder = Self { path: path.to_owned(), newest: 0, lock };
-        folder.newest = numbers(&folder.path)?.last().copied().unwrap_or(0);
-        Ok(folder)
+        Ok(Self { path: path.to_owned(), numbers: numbers(path)?, lock })
     }
 
-    /// The newest checkpoint that `read` can read, or `None` if there is no checkpoint; and notes on newer ones that it
-    /// cannot, which are renamed if `sets_aside`.
+    /// The newest checkpoint that holds, read by `read`, or `None` if there is no checkpoint; and notes on newer ones that
+    /// are damaged, which are renamed if `sets_aside`.
+    ///
+    /// A checkpoint that the system does not let us read may well hold: that is an error, and changes nothing.
     pub(super) fn load<T>(
         &mut self,
         sets_aside: bool,
         read: impl Fn(&Path) -> Result<T, GroundError>,
     ) -> Result<(Option<T>, Vec<String>), GroundError> {
-        let numbers = numbers(&self.path)?;
         let mut bad: Vec<(PathBuf, GroundError)> = Vec::new();
-        for &number in numbers.iter().rev() {
+        for (index, &number) in self.numbers.iter().enumerate().rev() {
             let path = self.name(number);
             match read(&path) {
                 Ok(found) => {
-                    self.newest = number;
                     for (path, _) in bad.iter().filter(|_| sets_aside) {
                         let mut aside = path.clone().into_os_string();
                         aside.push(".damaged");
                         fs::rename(path, aside).map_err(GroundError::io(path, "rename"))?;
                     }
-                    let used = self.name(number);
-                    return Ok((Some(found), bad.iter().map(|(_, error)| note(error, &used)).collect()));
+                    self.numbers.truncate(index + 1);
+                    return Ok((Some(found), bad.iter().map(|(_, error)| note(error, &path)).collect()));
                 }
-                Err(error @ (GroundError::Damaged { .. } | GroundError::Io { .. })) => {
-                    bad.push((path, error))
-                }
+                Err(error @ GroundError::Damaged { .. }) => bad.push((path, error)),
                 Err(error) => return Err(error),
             }
         }
@@ -69,31 +69,56 @@ impl StateFolder {
         }
     }
 
-    /// Writes a checkpoint, whole or not at all, and removes all but the newest two.
+    /// Writes a checkpoint, whole or not at all, and removes all but the newest two. If there is no room for a third, the
+    /// older of the two gives way, once the newer one has been found to hold.
     pub(super) fn save(
         &mut self,
-        write: impl FnOnce(&mut AtomicFile, &Path) -> Result<(), GroundError>,
+        mut write: impl FnMut(&mut AtomicFile, &Path) -> Result<(), GroundError>,
     ) -> Result<(), GroundError> {
         self.check_place()?;
-        let saved = self.save_here(write);
+        let saved = self.save_here(&mut write);
         // What fails because the folder has gone is to be told as that.
         saved.or_else(|error| self.check_place().and(Err(error)))
     }
 
     fn save_here(
         &mut self,
-        write: impl FnOnce(&mut AtomicFile, &Path) -> Result<(), GroundError>,
+        mut write: impl FnMut(&mut AtomicFile, &Path) -> Result<(), GroundError>,
     ) -> Result<(), GroundError> {
-        let path = self.name(self.newest + 1);
-        let file = AtomicFile::create(&path, IfUnfinished::Remove);
-        let mut file = file.map_err(GroundError::io(&path, "create the file"))?;
-        write(&mut file, &path)?;
+        let number = self.numbers.last().map_or(1, |newest| newest + 1);
+        let path = self.name(number);
+        if number > NUMBER_MAX {
+            return Err(GroundError::CheckpointName { path: self.name(NUMBER_MAX) });
+        }
+        match self.write(&path, &mut write) {
+            Err(error) if is_out_of_room(&error) && self.numbers.len() > 1 => {
+                self.drop_older()?;
+                self.write(&path, &mut write)?;
+            }
+            written => written?,
+        }
+        self.numbers.push(number);
+        self.remove_all_but(2);
+        Ok(())
+    }
+
+    fn write(
+        &self,
+        path: &Path,
+        write: &mut impl FnMut(&mut AtomicFile, &Path) -> Result<(), GroundError>,
+    ) -> Result<(), GroundError> {
+        let file = AtomicFile::create(path, IfUnfinished::Remove);
+        let mut file = file.map_err(GroundError::io(path, "create the file"))?;
+        write(&mut file, path)?;
         self.check_place()?;
-        file.finish().map_err(GroundError::io(&path, "finish the file"))?;
-        self.newest += 1;
-        for number in numbers(&self.path)?.into_iter().filter(|number| number + 1 < self.newest) {
-            let old = self.name(number);
-            fs::remove_file(&old).map_err(GroundError::io(&old, "remove the file"))?;
+        file.finish().map_err(GroundError::io(path, "finish the file")).map(|_| ())
+    }
+
+    /// Removes all checkpoints but the newest. That has to hold: otherwise an error, and nothing is removed.
+    pub(super) fn drop_older(&mut self) -> Result<(), GroundError> {
+        if let Some(&newest) = self.numbers.last() {
+            checkpoint::verify(&self.name(newest))?;
+            self.remove_all_but(1);
         }
         Ok(())
     }
@@ -104,6 +129,17 @@ impl StateFolder {
             None => Ok(()),
             Some(what) => Err(GroundError::FolderLost { path: self.path.clone(), what }),
         }
+    }
+
+    /// Removes all checkpoints but the newest ones. One that stays takes room and does no harm: the next time again.
+    fn remove_all_but(&mut self, most: usize) {
+        let oldest = self.numbers.len().saturating_sub(most);
+        let (path, mut index) = (&self.path, 0);
+        self.numbers.retain(|&number| {
+            index += 1;
+            let removed = || fs::remove_file(name(path, number));
+            index > oldest || removed().is_err_and(|error| error.kind() != ErrorKind::NotFound)
+        });
     }
 
     fn name(&self, number: u64) -> PathBuf {
@@ -122,18 +158,151 @@ pub(super) fn checkpoints(folder: &Path) -> Result<Vec<PathBuf>, GroundError> {
 }
 
 fn name(folder: &Path, number: u64) -> PathBuf {
-    folder.join(format!("{PREFIX}{number:08}{SUFFIX}"))
+    folder.join(file_name(number))
 }
 
-/// Numbers of the checkpoints, in order.
+fn file_name(number: u64) -> String {
+    format!("{PREFIX}{number:08}{SUFFIX}")
+}
+
+/// Numbers of the checkpoints, in order. A name that is like theirs and that none can have may hide one: it is refused.
 fn numbers(folder: &Path) -> Result<Vec<u64>, GroundError> {
     let mut numbers = Vec::new();
     for entry in fs::read_dir(folder).map_err(GroundError::io(folder, "read the folder"))? {
         let name = entry.map_err(GroundError::io(folder, "read the folder"))?.file_name();
-        let name = name.to_string_lossy();
-        let number = name.strip_prefix(PREFIX).and_then(|name| name.strip_suffix(SUFFIX));
-        numbers.extend(number.and_then(|number| number.parse::<u64>().ok()));
+        let text = name.to_string_lossy();
+        let Some(digits) = text.strip_prefix(PREFIX).and_then(|text| text.strip_suffix(SUFFIX)) else {
+            continue;
+        };
+        match digits.parse::<u64>() {
+            Ok(number) if number <= NUMBER_MAX && file_name(number) == text => numbers.push(number),
+            _ => return Err(GroundError::CheckpointName { path: folder.join(&name) }),
+        }
     }
     numbers.sort_unstable();
     Ok(numbers)
+}
+
+/// Whether the disk or a quota is full.
+fn is_out_of_room(error: &GroundError) -> bool {
+    use ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
+    matches!(error, GroundError::Io { source, .. }
+        if matches!(source.kind(), StorageFull | QuotaExceeded | FileTooLarge))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{self, Write};
+
+    use super::*;
+
+    fn full(path: &Path) -> GroundError {
+        GroundError::io(path, "write")(io::Error::from(ErrorKind::StorageFull))
+    }
+
+    /// A checkpoint of no ground, whose checksum holds.
+    fn sealed(text: &str) -> Vec<u8> {
+        let mut bytes = format!("{text:>32}").into_bytes();
+        let crc = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes);
+        bytes.extend(crc.to_le_bytes());
+        bytes
+    }
+
+    fn save(folder: &mut StateFolder, text: &str) -> Result<(), GroundError> {
+        folder.save(|file, path| file.write_all(&sealed(text)).map_err(GroundError::io(path, "write")))
+    }
+
+    /// As [`save`], on a disk with room for this number of checkpoints.
+    fn save_in(folder: &mut StateFolder, room: usize, text: &str) -> Result<(), GroundError> {
+        let place = folder.path.clone();
+        folder.save(|file, path| match checkpoints(&place)?.len() < room {
+            true => file.write_all(&sealed(text)).map_err(GroundError::io(path, "write")),
+            false => Err(full(path)),
+        })
+    }
+
+    fn names(folder: &Path) -> Vec<String> {
+        let entries = fs::read_dir(folder).unwrap();
+        let mut names: Vec<String> =
+            entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.retain(|name| name != "lock");
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn room_for_two_checkpoints_is_enough() {
+        let place = tempfile::tempdir().unwrap();
+        let mut folder = StateFolder::open(place.path()).unwrap();
+        for (number, room) in [(1, 3), (2, 3), (3, 3), (4, 2), (5, 2)] {
+            save_in(&mut folder, room, &number.to_string()).unwrap();
+            assert_eq!(fs::read(folder.name(number)).unwrap(), sealed(&number.to_string()));
+            // Both stay where there is room for a third.
+            let kept = if room == 3 { number.min(2) } else { 2 };
+            assert_eq!(checkpoints(place.path()).unwrap().len() as u64, kept);
+        }
+        // Without room for a second, nothing is lost.
+        assert!(is_out_of_room(&save_in(&mut folder, 1, "6").unwrap_err()));
+        assert_eq!(names(place.path()), ["checkpoint-00000005.lunarray"]);
+        save(&mut folder, "7").unwrap();
+        assert_eq!(names(place.path()), [5, 6].map(file_name));
+    }
+
+    #[test]
+    fn the_older_checkpoint_gives_way_only_to_one_that_holds() {
+        let place = tempfile::tempdir().unwrap();
+        let mut folder = StateFolder::open(place.path()).unwrap();
+        ["1", "2"].iter().for_each(|text| save(&mut folder, text).unwrap());
+        fs::write(folder.name(2), b"damaged, and more than twenty-four bytes").unwrap();
+        assert!(matches!(save_in(&mut folder, 2, "3"), Err(GroundError::Damaged { .. })));
+        assert_eq!(names(place.path()), [1, 2].map(file_name));
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_not_damaged() {
+        let place = tempfile::tempdir().unwrap();
+        let mut folder = StateFolder::open(place.path()).unwrap();
+        for number in 1..3 {
+            save(&mut folder, &number.to_string()).unwrap();
+        }
+        let before = names(place.path());
+        for kind in [ErrorKind::PermissionDenied, ErrorKind::NotFound, ErrorKind::Other] {
+            let refused = |path: &Path| Err(GroundError::io(path, "read")(io::Error::from(kind)));
+            let loaded = folder.load::<()>(true, refused);
+            assert!(matches!(loaded, Err(GroundError::Io { path, .. }) if path.ends_with(&before[1])));
+            assert_eq!(names(place.path()), before);
+        }
+    }
+
+    #[test]
+    fn names_that_no_checkpoint_has_are_refused() {
+        for name in [
+            "checkpoint-18446744073709551615.lunarray",
+            "checkpoint-18446744073709551616.lunarray",
+            "checkpoint-7.lunarray",
+            "checkpoint-+0000007.lunarray",
+            "checkpoint-00000007 (copy).lunarray",
+        ] {
+            let place = tempfile::tempdir().unwrap();
+            fs::write(place.path().join(name), sealed("")).unwrap();
+            let error = StateFolder::open(place.path()).unwrap_err();
+            assert!(
+                matches!(&error, GroundError::CheckpointName { path } if path.ends_with(name)),
+                "{error}"
+            );
+        }
+        // Nothing follows the greatest number.
+        let place = tempfile::tempdir().unwrap();
+        fs::write(place.path().join(file_name(NUMBER_MAX)), sealed("")).unwrap();
+        let mut folder = StateFolder::open(place.path()).unwrap();
+        assert!(matches!(save(&mut folder, ""), Err(GroundError::CheckpointName { .. })));
+        // Other files are nobody's business.
+        let place = tempfile::tempdir().unwrap();
+        for name in
+            ["notes.txt", "checkpoint-00000001.lunarray.damaged", "checkpoint-00000002.lunarray.partial"]
+        {
+            fs::write(place.path().join(name), b"x").unwrap();
+        }
+        assert!(StateFolder::open(place.path()).unwrap().numbers.is_empty());
+    }
 }

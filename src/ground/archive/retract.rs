@@ -100,7 +100,8 @@ impl Ground {
             retraction.retract_others();
         }
         let report = retraction.report.clone();
-        if report.packets > 0 {
+        // Also if all had gone: an earlier retraction may have been ended before the older checkpoint was replaced.
+        if report.packets > 0 || report.absent > 0 {
             retraction.write(config)?;
         }
         Ok((report, notes))
@@ -247,6 +248,10 @@ impl Retraction {
             ground.accumulator = config.accumulator(&ground.outcome.ledger);
         }
         ground.checkpoint()?;
+        if let Some(archive) = &mut ground.archive {
+            // The old contents have to go, whether or not there is room for another copy of the new ones.
+            archive.folder.drop_older()?;
+        }
         ground.checkpoint()
     }
 }

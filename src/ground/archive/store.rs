@@ -1,5 +1,6 @@
 //! The archive of a running ground, and what its checkpoints hold.
 
+use std::io::ErrorKind;
 use std::path::Path;
 use std::time::Duration;
 
@@ -8,15 +9,19 @@ use super::draft::RecordDraft;
 use super::folder::StateFolder;
 use super::journal::{Journal, OtherRecord};
 use super::settings::{compare, settings_of};
-use crate::accumulation::Accumulator;
+use crate::accumulation::{AccumulationError, Accumulator};
 use crate::array::Ephemeris;
 use crate::calibration::{AutoTable, Calibrator};
 use crate::downlink::{DownlinkError, Kind};
 use crate::frames::{EphemerisSegment, VisibilityReason};
 use crate::ground::{
     Collector, CollectorState, DeliveredPacket, Ground, GroundConfig, GroundError, GroundOutcome,
+    SharedSaving,
 };
 use crate::runtime::{Cancel, Ledger, LedgerReport};
+
+/// After a failure a checkpoint is tried again after this part of the interval, then after twice that, and so on.
+const RETRIES: u64 = 8;
 
 /// Keeps a journal of what a ground applies, and writes checkpoints of the ground into a folder.
 pub(in crate::ground) struct Archive {
@@ -30,7 +35,10 @@ pub(in crate::ground) struct Archive {
     posts: Ledger<VisibilityReason>,
     /// Visibilities from one checkpoint to the next.
     interval: u64,
-    since_checkpoint: u64,
+    /// Visibilities from the last attempt to the next: fewer than the interval after one that failed, and more each time.
+    wait: u64,
+    since_attempt: u64,
+    saving: SharedSaving,
 }
 
 impl Archive {
@@ -44,7 +52,7 @@ impl Archive {
         let posts = self.take_posts();
         let (Some(first), Some(last)) = (packets.first(), packets.last()) else { return posts };
         if first.header.kind == Kind::Visibilities {
-            self.since_checkpoint += u64::from(draft.entry.visibilities);
+            self.since_attempt += u64::from(draft.entry.visibilities);
             self.journal.record_visibilities(first, draft, &posts);
             return posts;
         }
@@ -66,7 +74,7 @@ impl Archive {
 
     /// Whether a checkpoint is due.
     pub(in crate::ground) fn is_due(&self) -> bool {
-        self.since_checkpoint >= self.interval
+        self.since_attempt >= self.wait
     }
 
     /// What was posted since this was called last.
@@ -74,14 +82,30 @@ impl Archive {
         self.posts.take()
     }
 
-    /// Writes a checkpoint.
+    /// Writes a checkpoint, and keeps what became of it. After a failure everything is still there to be written again.
     pub(in crate::ground) fn checkpoint(
         &mut self,
         collector: &Collector,
         calibrator: &Calibrator,
         accumulator: &mut Accumulator,
     ) -> Result<(), GroundError> {
-        self.since_checkpoint = 0;
+        let written = self.write(collector, calibrator, accumulator);
+        let failed_before = self.saving.update(written.as_ref().err());
+        self.since_attempt = 0;
+        self.wait = match (&written, failed_before) {
+            (Ok(()), _) => self.interval,
+            (Err(_), false) => (self.interval / RETRIES).max(1),
+            (Err(_), true) => self.wait.saturating_mul(2).min(self.interval),
+        };
+        written
+    }
+
+    fn write(
+        &mut self,
+        collector: &Collector,
+        calibrator: &Calibrator,
+        accumulator: &mut Accumulator,
+    ) -> Result<(), GroundError> {
         let no_autos = AutoTable::default();
         let head = ArchiveHeadView {
             settings: &self.settings,
@@ -92,9 +116,11 @@ impl Archive {
             journal: &self.journal,
         };
         self.folder.save(|out, path| {
-            checkpoint::write(out, path, &head, |out| {
-                accumulator.write_engines(out).map_err(GroundError::from)
-            })
+            let of_file = |error| match error {
+                AccumulationError::Io(source) => GroundError::io(path, "write")(source),
+                other => other.into(),
+            };
+            checkpoint::write(out, path, &head, |out| accumulator.write_engines(out).map_err(of_file))
         })
     }
 }
@@ -155,7 +181,14 @@ impl Opened {
         let (contents, notes) = folder.load(sets_aside, |path| {
             checkpoint::read(path, |head, engines| {
                 compare(path, &head.settings, &settings)?;
-                let accumulator = config.accumulator(&posts).resume(head.accumulator, engines)?;
+                let of_file = |error| match error {
+                    AccumulationError::Io(source) if source.kind() != ErrorKind::UnexpectedEof => {
+                        GroundError::io(path, "read")(source)
+                    }
+                    other => other.into(),
+                };
+                let accumulator = config.accumulator(&posts).resume(head.accumulator, engines);
+                let accumulator = accumulator.map_err(of_file)?;
                 let (collector, ephemeris, autos) = (head.collector, head.ephemeris, head.autos);
                 Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal: head.journal })
             })
@@ -180,13 +213,16 @@ impl Opened {
         let contents = contents.unwrap_or_else(|| ArchiveContents::empty(config, &posts));
         let ArchiveContents { collector, ephemeris, autos, mut accumulator, journal } = contents;
         let outcome = GroundOutcome::default();
+        outcome.saving.begin();
         outcome.ledger.post_report(&journal.ledger());
         accumulator.set_spans(&journal.spans_s());
         let instrument = collector.instrument().cloned();
         let calibrator = config.calibrator(&posts)?.resume(instrument, ephemeris, autos, journal.blocks());
         let collector = Collector::resume(collector, journal.delivered(), journal.reception());
-        let (interval, since_checkpoint) = (interval.max(1), 0);
-        let archive = Archive { folder, settings, journal, notes, posts, interval, since_checkpoint };
+        let (interval, saving) = (interval.max(1), outcome.saving.clone());
+        let (wait, since_attempt) = (interval, 0);
+        let archive =
+            Archive { folder, settings, journal, notes, posts, interval, wait, since_attempt, saving };
         let (cancel, linger) = (Cancel::new(), Duration::ZERO);
         Ok(Ground { collector, calibrator, accumulator, outcome, archive: Some(archive), cancel, linger })
     }

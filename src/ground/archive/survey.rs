@@ -1,6 +1,6 @@
 //! What an archive or a downlink file holds.
 
-use std::io::Cursor;
+use std::io::{Cursor, ErrorKind};
 use std::path::{Path, PathBuf};
 
 use super::checkpoint;
@@ -53,6 +53,20 @@ impl CoverageSurvey {
     }
 
     fn of_folder(path: &Path) -> Result<Self, GroundError> {
+        let mut again = 0;
+        loop {
+            match Self::of_newest(path) {
+                // A ground at work has written newer ones and removed it since the folder was read.
+                Err(GroundError::Io { source, .. }) if source.kind() == ErrorKind::NotFound && again < 10 => {
+                    again += 1;
+                }
+                found => return found,
+            }
+        }
+    }
+
+    /// The newest checkpoint of a folder that holds.
+    fn of_newest(path: &Path) -> Result<Self, GroundError> {
         let files: Vec<PathBuf> = checkpoints(path)?;
         let mut bad = Vec::new();
         for file in files.iter().rev() {
@@ -61,7 +75,8 @@ impl CoverageSurvey {
                     let notes = bad.iter().map(|error| note(error, file)).collect();
                     return Ok(Self { notes, ..found });
                 }
-                Err(error) => bad.push(error),
+                Err(error @ GroundError::Damaged { .. }) => bad.push(error),
+                Err(error) => return Err(error),
             }
         }
         match bad.into_iter().next() {
