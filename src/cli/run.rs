@@ -7,7 +7,7 @@ use clap::Args;
 use super::arguments::PipelineArgs;
 use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
 use super::progress::{Progress, cancel_on_interrupt};
-use crate::pipeline::{INTEGRATE, Plan, run, use_threads};
+use crate::pipeline::{INTEGRATE, Plan, Segment, run, use_threads};
 
 /// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
 ///
@@ -34,6 +34,7 @@ pub(super) fn execute(args: &RunArgs) -> CommandResult {
     print_config_notes(&config);
     let plan = Plan::new(config)?;
     use_threads(&plan.config.runtime)?;
+    plan.cost().require_memory(Segment::Whole, args.pipeline.memory_limit())?;
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
     let cancel = cancel_on_interrupt()?;
     let mut progress = None;

@@ -9,7 +9,7 @@ use super::arguments::{PipelineArgs, not_negative_s};
 use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
 use super::progress::{Progress, cancel_on_interrupt};
 use crate::downlink::transport::socket::{SendOptions, SocketSink, TcpUrl};
-use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, use_threads};
+use crate::pipeline::{Destination, INTEGRATE, Plan, Segment, simulate, use_threads};
 
 /// Simulate the space segment, and write its downlink to a file or send it to a listening ground segment.
 ///
@@ -52,6 +52,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     print_config_notes(&config);
     let plan = Plan::new(config)?;
     use_threads(&plan.config.runtime)?;
+    plan.cost().require_memory(Segment::Space, args.pipeline.memory_limit())?;
     let cancel = cancel_on_interrupt()?;
     let options = SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s };
     let socket = args.send.as_ref().map(|url| SocketSink::new(url, options, &cancel)).transpose()?;

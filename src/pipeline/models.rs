@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use super::error::PipelineError;
-use super::plan::Plan;
+use super::plan::{Expected, Plan};
 use crate::array::Array;
 use crate::mother::{Fidelity, Schedule};
 use crate::response::harmonic::RotationTable;
@@ -21,9 +21,13 @@ impl Plan {
     /// The choice of model for each channel, with skies of these nsides, channel by channel.
     #[must_use]
     pub fn model_plans(&self, nsides: &[usize]) -> Vec<ModelPlan> {
+        self.model_plans_for(&self.visibilities(), nsides)
+    }
+
+    /// As [`Self::model_plans`], for the visibilities of [`Self::visibilities`].
+    pub(super) fn model_plans_for(&self, expected: &[Expected], nsides: &[usize]) -> Vec<ModelPlan> {
         let spacecraft = &self.config.spacecraft;
-        let plan = |((schedule, expected), &sky_nside): ((&Schedule, _), &usize)| {
-            let expected: crate::pipeline::Expected = expected;
+        let plan = |((schedule, expected), &sky_nside): ((&Schedule, &Expected), &usize)| {
             let longest = longest_baseline_wavelengths(&self.array, schedule);
             let (frequencies, stretch) = match spacecraft.smear_bandwidth {
                 true => {
@@ -49,7 +53,7 @@ impl Plan {
             }
             ModelPlan::new(spacecraft.model, load)
         };
-        self.schedules.iter().zip(self.visibilities()).zip(nsides).map(plan).collect()
+        self.schedules.iter().zip(expected).zip(nsides).map(plan).collect()
     }
 }
 

@@ -14,7 +14,7 @@ mod reason;
 mod time;
 pub mod vector;
 
-pub use checks::{Checks, InvalidValue};
+pub use checks::{Checks, InvalidValue, shortened};
 pub use ids::{ChannelId, MAX_SATELLITES, Pair, PairError, all_pairs};
 pub use interval_set::IntervalSet;
 pub use per_channel::PerChannel;

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// One value for all channels, or one for each.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "expected one value, or a list with one for each channel")]
 pub enum PerChannel<T> {
     /// The same for all channels.
     All(T),

@@ -10,3 +10,4 @@ mod command_line;
 mod harmonic;
 mod paper;
 mod run;
+mod start_up;
