@@ -15,9 +15,9 @@ mod placing;
 mod windows;
 
 pub use baseline::scaled_baseline;
-pub use config::{ArrayConfig, ArrayError, BreathingConfig, NodeMotion};
+pub use config::{ArrayConfig, ArrayError, BreathingConfig, NodeMotion, Spacing};
 pub use ephemeris::{Ephemeris, Insertion, segments_for};
-pub use formation::Formation;
+pub use formation::{Formation, Progression};
 pub use integration::{IntegrationRule, integration_time_s};
 pub use orbit::{Array, SatelliteState, hidden_by_moon};
 pub use placing::PlacingCounts;
