@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::kepler::KeplerElements;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
 
@@ -44,6 +45,8 @@ pub struct ArrayConfig {
     /// Arcs by which daughter 2 and those after it trail daughter 1 at their greatest, m, in ascending order; empty for
     /// those that `breathing` describes.
     pub arcs_m: Vec<f64>,
+    /// Orbits of their own, one a satellite, in place of the circle and its formation; empty for the circle.
+    pub kepler: Vec<KeplerElements>,
     /// The formation's breathing.
     pub breathing: BreathingConfig,
 }
@@ -62,6 +65,7 @@ impl Default for ArrayConfig {
             node_longitude_deg: 0.0,
             earth_longitude_deg: 0.0,
             arcs_m: Vec::new(),
+            kepler: Vec::new(),
             breathing: BreathingConfig::default(),
         }
     }
@@ -120,6 +124,16 @@ pub enum ArrayError {
     /// A value of the configuration that is not accepted.
     #[error(transparent)]
     Invalid(#[from] InvalidValue),
+    /// Satellites that are not apart.
+    #[error(
+        "array.kepler: satellites {first} and {second} are at one place at the epoch: expected orbits or anomalies that differ"
+    )]
+    OnePlace {
+        /// One of them, from 1.
+        first: usize,
+        /// The other.
+        second: usize,
+    },
     /// Daughters that meet.
     #[error(
         "array: daughters {} and {} would meet, or change places, as the formation breathes: their arcs behind daughter 1 go \
@@ -193,6 +207,11 @@ impl ArrayConfig {
             |m| m > 0.0 && m <= half_m,
             "m, above 0 and up to half of the orbit",
         );
+        let orbits = self.kepler.len();
+        let fits = orbits == 0 || orbits == self.satellites;
+        checks.require("kepler", format_args!("({orbits} orbits)"), fits, "one for each satellite, or none");
+        let one = orbits == 0 || arcs == 0;
+        checks.require("kepler", format_args!("({orbits} orbits)"), one, "none where array.arcs_m is given");
         for (key, value) in [
             ("orbital_phase_deg", self.orbital_phase_deg),
             ("node_longitude_deg", self.node_longitude_deg),
@@ -200,6 +219,10 @@ impl ArrayConfig {
         ] {
             checks.number(key, value, true, FINITE);
         }
-        checks.finish()
+        let mut found = checks.finish();
+        let of_one =
+            |(index, elements): (usize, &KeplerElements)| elements.problems(index, self.moon_radius_m);
+        found.extend(self.kepler.iter().take(MAX_SATELLITES).enumerate().flat_map(of_one));
+        found
     }
 }

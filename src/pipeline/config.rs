@@ -5,13 +5,14 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::problems::Problems;
-use crate::accumulation::MapConfig;
+use crate::accumulation::{EngineKind, MapConfig};
 use crate::array::{Array, ArrayConfig};
 use crate::calibration::{CalibrationConfig, VanVleck};
 use crate::daughters::DaughtersConfig;
 use crate::downlink::DownlinkConfig;
-use crate::mother::{Fidelity, SpacecraftConfig};
+use crate::mother::{Antenna, Fidelity, SpacecraftConfig};
 use crate::products::ProductsConfig;
+use crate::response::model::ModelChoice;
 use crate::runtime::RuntimeConfig;
 use crate::sky::SkyConfig;
 use crate::units::Checks;
@@ -64,6 +65,7 @@ impl Config {
         let expected = format!("spacecraft.sub_bands, which is {space}");
         checks.require("calibration.sub_bands", ground, space == ground, expected);
         self.check_quantiser(&mut checks);
+        self.check_orbits(&mut checks);
         found.extend(checks.finish());
         let array = self.array.problems();
         let spacecraft = self.spacecraft.problems();
@@ -86,6 +88,28 @@ impl Config {
         found.extend(self.map.misfits(channels));
         found.append(self.ground_problems());
         found
+    }
+
+    /// Requires what satellites that do not share a circle can have.
+    fn check_orbits(&self, checks: &mut Checks) {
+        if self.array.kepler.is_empty() {
+            return;
+        }
+        let Self { spacecraft, map, .. } = self;
+        let visibilities = spacecraft.fidelity == Fidelity::Visibilities;
+        let direct = spacecraft.model != ModelChoice::Harmonic;
+        let isotropic = spacecraft.antenna == Antenna::Isotropic;
+        for (key, value, good, expected) in [
+            ("map.engine", "\"harmonic\"", map.engine == EngineKind::Pixel, "\"pixel\""),
+            ("spacecraft.fidelity", "\"samples\"", visibilities, "\"visibilities\""),
+            ("spacecraft.model", "\"harmonic\"", direct, "\"auto\" or \"direct\""),
+            ("spacecraft.smear_integrations", "true", !spacecraft.smear_integrations, "false"),
+            ("spacecraft.antenna", "\"dipole-normal\"", isotropic, "\"isotropic\""),
+            ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
+        ] {
+            let expected = format!("{expected} with array.kepler: the other needs a common circle");
+            checks.require(key, value, good, expected);
+        }
     }
 
     /// Requires that a van Vleck correction is that of the daughters' quantiser.

@@ -8,6 +8,7 @@ mod bench;
 mod coded;
 mod command_line;
 mod harmonic;
+mod orbits;
 mod paper;
 mod run;
 mod start_up;

@@ -57,7 +57,7 @@ fn epochs_agree() {
                 assert!(norm(sub(state.velocity_m_s, velocity)) < 5e-5, "t = {t_s}, daughter {n}");
             }
             let arc = epoch["arc_m"][n].as_f64().unwrap();
-            assert!((array.formation().arc_m(n, t_s).0 - arc).abs() < 1e-6);
+            assert!((array.formation().unwrap().arc_m(n, t_s).0 - arc).abs() < 1e-6);
         }
         assert!(norm(sub(array.earth_hat(t_s), vector(&epoch["earth_hat"]))) < 1e-12);
         assert_eq!(array.observing(t_s), epoch["observing"].as_bool().unwrap(), "t = {t_s}");
