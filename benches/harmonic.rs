@@ -28,7 +28,7 @@ fn geometry(array: &Array, frequency_hz: f64) -> PatternGeometry {
 
 /// The states of every pair below `u_max` over a window, pair after pair.
 fn states(array: &Array, window: ObservingWindow, wavelength_m: f64, u_max: f64, out: &mut Vec<PairState>) {
-    let (radius, formation) = (array.orbit_radius_m(), array.formation());
+    let (radius, formation) = (array.orbit_radius_m(), array.formation().unwrap());
     let rate = TAU / array.orbital_period_s();
     for pair in all_pairs(array.satellites()) {
         let mut t = window.start.seconds();

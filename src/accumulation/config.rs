@@ -112,12 +112,8 @@ impl MapConfig {
         checks.require("channels_max", channels, (1..=4096).contains(&channels), "1 to 4096");
         let longest = self.baseline_bp_max;
         checks.number("baseline_bp_max", longest, longest > 0.0, "a positive number, in units of b_p");
-        for &epsilon in self.epsilon.values() {
-            checks.number("epsilon", epsilon, epsilon > 0.0 && epsilon <= 1.0, "above 0 and at most 1");
-        }
-        for &prior in self.prior_k.values() {
-            checks.number("prior_k", prior, prior >= 0.0, "K, not negative");
-        }
+        checks.numbers("epsilon", self.epsilon.values(), |e| e > 0.0 && e <= 1.0, "above 0 and at most 1");
+        checks.numbers("prior_k", self.prior_k.values(), |k| k >= 0.0, "K, not negative");
         let fwhm = self.prior_fwhm_deg;
         checks.number("prior_fwhm_deg", fwhm, (0.0..=180.0).contains(&fwhm), "0 to 180");
         if is_harmonic {

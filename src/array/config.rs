@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::kepler::KeplerElements;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
 
@@ -41,6 +42,11 @@ pub struct ArrayConfig {
     pub node_longitude_deg: f64,
     /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch, degrees.
     pub earth_longitude_deg: f64,
+    /// Arcs by which daughter 2 and those after it trail daughter 1 at their greatest, m, in ascending order; empty for
+    /// those that `breathing` describes.
+    pub arcs_m: Vec<f64>,
+    /// Orbits of their own, one a satellite, in place of the circle and its formation; empty for the circle.
+    pub kepler: Vec<KeplerElements>,
     /// The formation's breathing.
     pub breathing: BreathingConfig,
 }
@@ -58,9 +64,22 @@ impl Default for ArrayConfig {
             orbital_phase_deg: 0.0,
             node_longitude_deg: 0.0,
             earth_longitude_deg: 0.0,
+            arcs_m: Vec::new(),
+            kepler: Vec::new(),
             breathing: BreathingConfig::default(),
         }
     }
+}
+
+/// What grows by the same factor from daughter to daughter.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Spacing {
+    /// The distance to the daughter before (the paper, Sect. 2): more daughters lie between the third and the last.
+    #[default]
+    Steps,
+    /// The arc to daughter 1: more daughters lie close to the first two as well.
+    Arcs,
 }
 
 /// Contraction and expansion of the formation along the track (the paper, Sect. 2).
@@ -73,12 +92,15 @@ pub struct BreathingConfig {
     pub first_spacing_m_min: f64,
     /// Ratio R_2 of largest to smallest distance of daughters 1 and 2.
     pub first_ratio: f64,
-    /// Smallest distance of daughters 2 and 3, m; the largest is R times this.
+    /// Smallest distance of daughters 2 and 3, m; the largest is R times this. Used for four daughters or more whose steps
+    /// grow.
     pub second_spacing_m_min: f64,
     /// Ratio R of largest to smallest arc of daughters 3 and later.
     pub ratio: f64,
     /// Longest arc from the first to the last daughter, m.
     pub span_m_max: f64,
+    /// What grows by the same factor from daughter to daughter.
+    pub growing: Spacing,
 }
 
 impl Default for BreathingConfig {
@@ -90,6 +112,7 @@ impl Default for BreathingConfig {
             second_spacing_m_min: 500.0,
             ratio: 3.0,
             span_m_max: 100e3,
+            growing: Spacing::Steps,
         }
     }
 }
@@ -101,6 +124,30 @@ pub enum ArrayError {
     /// A value of the configuration that is not accepted.
     #[error(transparent)]
     Invalid(#[from] InvalidValue),
+    /// Satellites that are not apart.
+    #[error(
+        "array.kepler: satellites {first} and {second} are at one place at the epoch: expected orbits or anomalies that differ"
+    )]
+    OnePlace {
+        /// One of them, from 1.
+        first: usize,
+        /// The other.
+        second: usize,
+    },
+    /// Daughters that meet.
+    #[error(
+        "array: daughters {} and {} would meet, or change places, as the formation breathes: their arcs behind daughter 1 go \
+         from {} m and {} m to {} m and {} m; expected ascending arcs at all times", first, first + 1, wide_m[0],
+        wide_m[1], narrow_m[0], narrow_m[1]
+    )]
+    Meeting {
+        /// The first of the two, from 1.
+        first: usize,
+        /// Their greatest arcs, m.
+        wide_m: [f64; 2],
+        /// Their smallest arcs, m.
+        narrow_m: [f64; 2],
+    },
     /// No geometric progression of spacings fits.
     #[error(
         "array.breathing: no progression of spacings fits {satellites} daughters between {first_m} m \
@@ -149,6 +196,22 @@ impl ArrayConfig {
         checks.number("orbital_period_s", period, period >= 1e3, "at least 1000 s");
         let inclination = self.inclination_deg;
         checks.number("inclination_deg", inclination, (0.0..=180.0).contains(&inclination), "0 to 180");
+        let arcs = self.arcs_m.len();
+        let expected = "an arc for each daughter but the first, or none";
+        let fits = arcs == 0 || arcs + 1 == self.satellites;
+        checks.require("arcs_m", format_args!("({arcs} values)"), fits, expected);
+        let half_m = std::f64::consts::PI * (self.moon_radius_m + self.altitude_m);
+        checks.numbers(
+            "arcs_m",
+            &self.arcs_m,
+            |m| m > 0.0 && m <= half_m,
+            "m, above 0 and up to half of the orbit",
+        );
+        let orbits = self.kepler.len();
+        let fits = orbits == 0 || orbits == self.satellites;
+        checks.require("kepler", format_args!("({orbits} orbits)"), fits, "one for each satellite, or none");
+        let one = orbits == 0 || arcs == 0;
+        checks.require("kepler", format_args!("({orbits} orbits)"), one, "none where array.arcs_m is given");
         for (key, value) in [
             ("orbital_phase_deg", self.orbital_phase_deg),
             ("node_longitude_deg", self.node_longitude_deg),
@@ -156,6 +219,10 @@ impl ArrayConfig {
         ] {
             checks.number(key, value, true, FINITE);
         }
-        checks.finish()
+        let mut found = checks.finish();
+        let of_one =
+            |(index, elements): (usize, &KeplerElements)| elements.problems(index, self.moon_radius_m);
+        found.extend(self.kepler.iter().take(MAX_SATELLITES).enumerate().flat_map(of_one));
+        found
     }
 }

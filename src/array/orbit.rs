@@ -4,22 +4,21 @@ use std::f64::consts::TAU;
 
 use super::config::{ArrayConfig, ArrayError, NodeMotion};
 use super::formation::Formation;
+use super::kepler::KeplerOrbit;
+use super::state::SatelliteState;
 use crate::units::constants::SIDEREAL_MONTH_S;
-use crate::units::vector::{Vec3, add, cross, dot, scale};
+use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
 
-/// Position and velocity of one daughter.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SatelliteState {
-    /// Position, m.
-    pub position_m: Vec3,
-    /// Velocity, m/s, with orbital motion, precession and breathing.
-    pub velocity_m_s: Vec3,
-}
+/// Nearest that two satellites may be at the epoch, m.
+const APART_M: f64 = 1.0;
 
 /// The array in motion: positions at any time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Array {
-    formation: Formation,
+    /// The formation on a circle, if there is one.
+    formation: Option<Formation>,
+    /// Orbits of their own; none for a formation on a circle.
+    kepler: Vec<KeplerOrbit>,
     orbit_radius_m: f64,
     moon_radius_m: f64,
     inclination_rad: f64,
@@ -40,8 +39,11 @@ impl Array {
             return Err(problem.into());
         }
         let rate = TAU / config.precession_period_s;
+        let kepler: Vec<KeplerOrbit> = config.kepler.iter().map(KeplerOrbit::new).collect();
+        require_apart(&kepler)?;
         Ok(Self {
-            formation: Formation::new(config)?,
+            formation: if kepler.is_empty() { Some(Formation::new(config)?) } else { None },
+            kepler,
             orbit_radius_m: config.moon_radius_m + config.altitude_m,
             moon_radius_m: config.moon_radius_m,
             inclination_rad: config.inclination_deg.to_radians(),
@@ -59,7 +61,7 @@ impl Array {
     /// Number of daughters.
     #[must_use]
     pub fn satellites(&self) -> usize {
-        self.formation.satellites()
+        self.formation.as_ref().map_or(self.kepler.len(), Formation::satellites)
     }
 
     /// Radius of the Moon, m.
@@ -68,38 +70,46 @@ impl Array {
         self.moon_radius_m
     }
 
-    /// Radius of the orbit, m.
+    /// Radius of the orbit, or the semi-major axis of satellite 1, m.
     #[must_use]
     pub fn orbit_radius_m(&self) -> f64 {
-        self.orbit_radius_m
+        self.kepler.first().map_or(self.orbit_radius_m, KeplerOrbit::semi_major_axis_m)
     }
 
-    /// Inclination of the orbit to the ecliptic, rad.
+    /// Inclination of the orbit, or of that of satellite 1, to the ecliptic, rad.
     #[must_use]
     pub fn inclination_rad(&self) -> f64 {
-        self.inclination_rad
+        self.kepler.first().map_or(self.inclination_rad, KeplerOrbit::inclination_rad)
     }
 
-    /// Orbital period, s.
+    /// Greatest distance of a satellite from the Moon's centre, m.
+    #[must_use]
+    pub fn farthest_m(&self) -> f64 {
+        let farthest_m = self.kepler.iter().map(KeplerOrbit::apoapsis_m).fold(0.0, f64::max);
+        if self.kepler.is_empty() { self.orbit_radius_m } else { farthest_m }
+    }
+
+    /// Orbital period, or that of satellite 1, s.
     #[must_use]
     pub fn orbital_period_s(&self) -> f64 {
-        self.orbital_period_s
+        self.kepler.first().map_or(self.orbital_period_s, KeplerOrbit::period_s)
     }
 
-    /// The daughters' arcs.
+    /// The daughters' arcs, if they follow each other on a circle.
     #[must_use]
-    pub fn formation(&self) -> &Formation {
-        &self.formation
+    pub fn formation(&self) -> Option<&Formation> {
+        self.formation.as_ref()
     }
 
     /// State of daughter `n` (from 0) at `t_s`.
     ///
-    /// `r = R [cos O cos f - sin O sin f cos i, sin O cos f + cos O sin f cos i, sin f sin i]`
+    /// On the circle, `r = R [cos O cos f - sin O sin f cos i, sin O cos f + cos O sin f cos i, sin f sin i]`
     /// with `f = phi - s_n / R` (the paper, Sect. 2).
     #[must_use]
     pub fn state(&self, n: usize, t_s: f64) -> SatelliteState {
+        let Some(formation) = &self.formation else { return self.kepler[n].state(t_s) };
         let radius = self.orbit_radius_m;
-        let (arc_m, arc_rate_m_s) = self.formation.arc_m(n, t_s);
+        let (arc_m, arc_rate_m_s) = formation.arc_m(n, t_s);
         // As in the paper; after 1.3 years the last bit of the phase is worth 7 um along the track.
         let phase = self.phase_rad + TAU * t_s / self.orbital_period_s - arc_m / radius;
         let phase_rate = TAU / self.orbital_period_s - arc_rate_m_s / radius;
@@ -125,18 +135,28 @@ impl Array {
         }
     }
 
-    /// Position of a satellite that trails daughter 1 by an arc `arc_m` on the same circle, m.
+    /// Position of a satellite that trails daughter 1 by an arc `arc_m` on its osculating circle, m.
     #[must_use]
     pub fn trailing_m(&self, arc_m: f64, t_s: f64) -> Vec3 {
         let ahead_m = self.position_m(0, t_s);
-        let (sin, cos) = ((self.formation.arc_m(0, t_s).0 - arc_m) / self.orbit_radius_m).sin_cos();
+        let own_m = self.formation.as_ref().map_or(0.0, |formation| formation.arc_m(0, t_s).0);
+        let (sin, cos) = ((own_m - arc_m) / self.orbit_radius_m()).sin_cos();
         let along_m = cross(self.orbit_normal_hat(t_s), ahead_m);
         add(scale(cos, ahead_m), scale(sin, along_m))
     }
 
-    /// Normal of the orbital plane.
+    /// Normal of the orbital plane, or of that of satellite 1.
     #[must_use]
     pub fn orbit_normal_hat(&self, t_s: f64) -> Vec3 {
+        self.normal_hat(0, t_s)
+    }
+
+    /// Normal of the plane in which satellite `n` (from 0) moves.
+    #[must_use]
+    pub fn normal_hat(&self, n: usize, t_s: f64) -> Vec3 {
+        if let Some(orbit) = self.kepler.get(n) {
+            return orbit.normal_hat(t_s);
+        }
         let (sin_o, cos_o) = (self.node_rad + self.node_rate_rad_s * t_s).sin_cos();
         let (sin_i, cos_i) = self.inclination_rad.sin_cos();
         [sin_i * sin_o, -sin_i * cos_o, cos_i]
@@ -184,6 +204,18 @@ impl Array {
         let position = self.position_m(n, t_s);
         hiding_depth_m(position, self.earth_hat(t_s), self.moon_radius_m)
     }
+}
+
+/// Requires that no two satellites are at one place at the epoch.
+fn require_apart(orbits: &[KeplerOrbit]) -> Result<(), ArrayError> {
+    let places: Vec<Vec3> = orbits.iter().map(|orbit| orbit.state(0.0).position_m).collect();
+    for (second, place) in places.iter().enumerate() {
+        let near = |other: &Vec3| norm(sub(*place, *other)) < APART_M;
+        if let Some(first) = places[..second].iter().position(near) {
+            return Err(ArrayError::OnePlace { first: first + 1, second: second + 1 });
+        }
+    }
+    Ok(())
 }
 
 /// Whether the Moon hides direction `n_hat` from a satellite at `r_m` (the paper, Eq. 8).

@@ -7,6 +7,9 @@ use crate::units::MissionTime;
 /// Steps an orbit of the search for a limb crossing; a window is a third of an orbit.
 const STEPS_PER_ORBIT: f64 = 64.0;
 
+/// As many for an ellipse, on which the Moon may hide the Earth for a short part of an orbit.
+const STEPS_PER_ELLIPSE: f64 = 1024.0;
+
 /// Observing windows in order of time: the intervals in which the Earth is hidden from daughter 1.
 ///
 /// Only whole windows: one in progress at `from_s` or at `until_s` is skipped.
@@ -27,7 +30,8 @@ impl<'a> ObservingWindows<'a> {
 
     /// The next time after `now_s` at which the Earth sets (`hides`) or rises.
     fn next_edge_s(&self, mut now_s: f64, hides: bool) -> Option<f64> {
-        let step_s = self.array.orbital_period_s() / STEPS_PER_ORBIT;
+        let steps = if self.array.formation().is_some() { STEPS_PER_ORBIT } else { STEPS_PER_ELLIPSE };
+        let step_s = self.array.orbital_period_s() / steps;
         let is_past = |t_s: f64| (self.array.earth_depth_m(t_s) > 0.0) == hides;
         let mut was_before = !is_past(now_s);
         while now_s < self.until_s {

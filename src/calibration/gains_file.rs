@@ -5,7 +5,16 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::CalibrationError;
-use crate::units::{Checks, InvalidValue, MAX_SATELLITES, echo_lines};
+use crate::units::{Checks, InvalidValue, MAX_SATELLITES, shortened};
+
+/// Longest line of a message that is repeated whole, characters.
+const LINE_CHARS: usize = 300;
+
+/// An error of a parser, which may quote lines of any length.
+fn message(error: impl std::fmt::Display) -> String {
+    let text = error.to_string();
+    text.lines().map(|line| shortened(line.trim_end(), LINE_CHARS)).collect::<Vec<_>>().join("\n")
+}
 
 /// Interpolation of gains between solutions.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -73,9 +82,9 @@ impl GainsFile {
         let text = std::fs::read_to_string(path)
             .map_err(|source| CalibrationError::Read { path: path.to_owned(), source })?;
         let parsed = if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json")) {
-            serde_json::from_str(&text).map_err(echo_lines)
+            serde_json::from_str(&text).map_err(message)
         } else {
-            toml::from_str(&text).map_err(echo_lines)
+            toml::from_str(&text).map_err(message)
         };
         parsed.map_err(|message| CalibrationError::Syntax { path: path.to_owned(), message })
     }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use crate::pipeline::ConfigSource;
+use crate::pipeline::{ConfigSource, MemoryLimit};
 use crate::units::constants::DAY_S;
 
 /// A pipeline file, and settings that replace some of its own.
@@ -22,6 +22,10 @@ pub(super) struct PipelineArgs {
     /// Downlink format, in place of the file's: plain space packets, or coded transfer frames (CADUs).
     #[arg(long, value_name = "packets|cadu")]
     format: Option<String>,
+    /// Greatest memory that the estimate may come to, with a unit, such as 8GB or 16GiB; what the machine has available
+    /// if not given.
+    #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
+    memory_max: Option<u64>,
 }
 
 /// An array, for commands that need nothing else of a pipeline.
@@ -60,10 +64,37 @@ impl StateMapArgs {
 
 impl PipelineArgs {
     pub(super) fn source(&self) -> ConfigSource {
-        let Self { pipeline, seed, overrides, format } = self;
+        let Self { pipeline, seed, overrides, format, .. } = self;
         let format = format.iter().map(|format| format!("downlink.format={format:?}"));
         let overrides = overrides.iter().cloned().chain(format).collect();
         ConfigSource { file: pipeline.clone(), overrides, seed: *seed }
+    }
+
+    /// The memory that the run may take.
+    pub(super) fn memory_limit(&self) -> Option<MemoryLimit> {
+        self.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine)
+    }
+}
+
+/// Bytes from a size such as `8GB`, `16GiB` or `500 MB`; a number alone is of bytes.
+fn size_bytes(text: &str) -> Result<u64, String> {
+    const UNITS: [(&str, f64); 9] = [
+        ("KIB", 1024.0),
+        ("MIB", 1_048_576.0),
+        ("GIB", 1_073_741_824.0),
+        ("TIB", 1_099_511_627_776.0),
+        ("KB", 1e3),
+        ("MB", 1e6),
+        ("GB", 1e9),
+        ("TB", 1e12),
+        ("B", 1.0),
+    ];
+    let upper = text.trim().to_ascii_uppercase();
+    let found = UNITS.iter().find_map(|(unit, bytes)| Some((upper.strip_suffix(unit)?, *bytes)));
+    let (number, unit_bytes) = found.unwrap_or((&upper, 1.0));
+    match number.trim().parse::<f64>() {
+        Ok(value) if (1.0..=1e18).contains(&(value * unit_bytes)) => Ok((value * unit_bytes) as u64),
+        _ => Err("expected a size such as 8GB, 16GiB or 500MB".into()),
     }
 }
 
@@ -93,6 +124,25 @@ pub(super) fn not_negative_s(text: &str) -> Result<f64, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn sizes_have_units() {
+        for (text, expected) in [
+            ("8GB", 8_000_000_000),
+            ("16GiB", 17_179_869_184),
+            ("1.5 gb", 1_500_000_000),
+            ("500MB", 500_000_000),
+            ("2TiB", 2_199_023_255_552),
+            ("4096", 4096),
+            ("12B", 12),
+            ("3kB", 3000),
+        ] {
+            assert_eq!(size_bytes(text), Ok(expected), "{text}");
+        }
+        for text in ["", "GB", "-1GB", "0", "NaNGB", "infB", "8 parsecs", "1e30TB", "8GBit"] {
+            assert!(size_bytes(text).is_err(), "{text}");
+        }
+    }
 
     #[test]
     fn times_have_units() {

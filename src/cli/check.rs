@@ -4,12 +4,13 @@ use clap::Args;
 
 use super::arguments::PipelineArgs;
 use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
-use crate::pipeline::{ConfigError, Plan};
+use crate::pipeline::{ConfigError, Plan, Segment};
 
 /// Check a pipeline and estimate its cost, without running it.
 ///
 /// Lists all problems of the file at once. If there are none, prints the number of visibilities by channel, downlink
-/// bytes, memory, operations and an estimated run time.
+/// bytes, memory, operations and an estimated run time. Fails if the memory is more than this machine has available;
+/// --memory-max states another machine's.
 ///
 /// Example: lunarray check pipelines/reference.toml --set map.nside=32
 #[derive(Debug, Args)]
@@ -36,5 +37,6 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     } else {
         print_text(&format!("{}: no problems\n\n{cost}", source.origin()))?;
     }
+    cost.require_memory(Segment::Whole, args.pipeline.memory_limit())?;
     Ok(Completion::Done)
 }

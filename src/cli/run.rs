@@ -10,7 +10,7 @@ use super::output::{
     CommandResult, print_config_notes, print_incompleteness, print_json_line, print_notes, print_text,
 };
 use super::progress::Progress;
-use crate::pipeline::{INTEGRATE, Plan, run, sky_notes, use_threads};
+use crate::pipeline::{INTEGRATE, Plan, Segment, run, sky_notes, use_threads};
 
 /// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
 ///
@@ -38,6 +38,7 @@ pub(super) fn execute(args: &RunArgs) -> CommandResult {
     let plan = Plan::new(config)?;
     print_notes(sky_notes(&plan)?);
     use_threads(&plan.config.runtime)?;
+    plan.cost().require_memory(Segment::Whole, args.pipeline.memory_limit())?;
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
     let interrupt = Interrupt::default();
     let mut progress = None;

@@ -10,7 +10,7 @@ use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_config_notes, print_json_line, print_notes, print_text};
 use super::progress::Progress;
 use crate::downlink::transport::socket::{SendOptions, SocketSink, TcpUrl};
-use crate::pipeline::{Destination, INTEGRATE, Plan, simulate, sky_notes, use_threads};
+use crate::pipeline::{Destination, INTEGRATE, Plan, Segment, simulate, sky_notes, use_threads};
 
 /// Simulate the space segment, and write its downlink to a file or send it to a listening ground segment.
 ///
@@ -55,6 +55,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let plan = Plan::new(config)?;
     print_notes(sky_notes(&plan)?);
     use_threads(&plan.config.runtime)?;
+    plan.cost().require_memory(Segment::Space, args.pipeline.memory_limit())?;
     let interrupt = Interrupt::default();
     let cancel = interrupt.cancel();
     let options = SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s };

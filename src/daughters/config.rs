@@ -111,9 +111,7 @@ impl DaughtersConfig {
         ] {
             let count = list.len();
             checks.number(key, count as f64, count == 0 || count == satellites, "no value or one a daughter");
-            for &value in list {
-                checks.number(key, value, true, "finite numbers");
-            }
+            checks.numbers(key, list, |_| true, "finite numbers");
         }
         for (key, power) in [
             ("disturbances.interference_k_sr", d.interference_k_sr),

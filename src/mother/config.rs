@@ -234,12 +234,15 @@ impl SpacecraftConfig {
         let channels = self.channels_hz.len();
         let count = format!("({channels} channels)");
         let expected = format!("1 to {CHANNELS_MAX} channels");
-        checks.require("channels_hz", count, (1..=CHANNELS_MAX).contains(&channels), expected);
+        let is_listed = (1..=CHANNELS_MAX).contains(&channels);
+        checks.require("channels_hz", count, is_listed, expected);
         let [low_hz, high_hz] = BAND_HZ;
-        for (index, &value) in self.channels_hz.iter().enumerate() {
+        // Each value and pair of values can be a problem: of a list that is too long only its length is.
+        let listed = if is_listed { self.channels_hz.as_slice() } else { &[] };
+        for (index, &value) in listed.iter().enumerate() {
             let key = format!("channels_hz[{index}]");
             let inside = (low_hz..=high_hz).contains(&value);
-            checks.require(&key, value, inside, format!("{low_hz} Hz to {high_hz} Hz"));
+            checks.number(&key, value, inside, format!("{low_hz} Hz to {high_hz} Hz"));
             let half_hz = 0.5 * self.channel_width_hz;
             // Sub-bands are channels of the downlink, which lie within the band; others must only stay above zero.
             let inside = value - half_hz >= low_hz && value + half_hz <= high_hz;
@@ -249,15 +252,15 @@ impl SpacecraftConfig {
                  {high_hz} Hz",
                 self.channel_width_hz
             );
-            checks.require(&key, value, fits, expected);
+            checks.number(&key, value, fits, expected);
         }
-        for (second, &high) in self.channels_hz.iter().enumerate() {
-            for (first, &low) in self.channels_hz[..second].iter().enumerate() {
+        for (second, &high) in listed.iter().enumerate() {
+            for (first, &low) in listed[..second].iter().enumerate() {
                 let distance_hz = (high - low).abs();
                 let apart = distance_hz >= self.channel_width_hz.max(1e3);
                 let expected =
                     format!("at least channel_width_hz, and 1 kHz, from channels_hz[{first}] = {low}");
-                checks.require(format!("channels_hz[{second}]"), high, apart, expected);
+                checks.number(format!("channels_hz[{second}]"), high, apart, expected);
             }
         }
         for (key, values, fits) in [
@@ -301,7 +304,10 @@ impl SpacecraftConfig {
             }
             _ => false,
         };
-        let centre = format!("{:?}", self.delay_centre_deg);
+        let centre = match self.delay_centre_deg.len() {
+            0..=2 => format!("{:?}", self.delay_centre_deg),
+            values => format!("({values} values)"),
+        };
         let expected = "ecliptic longitude and latitude, -90 to 90 degrees, or []";
         checks.require("delay_centre_deg", &centre, good, expected);
         let bands = self.sub_bands;
@@ -371,12 +377,11 @@ impl SpacecraftConfig {
             self.every_nth_window >= 1,
             "at least 1",
         );
-        for &nth in self.every_nth_integration.values() {
-            checks.number("every_nth_integration", nth as f64, nth >= 1, "at least 1");
-        }
-        for &limit in self.baseline_wavelengths_max.values() {
-            checks.number("baseline_wavelengths_max", limit, limit >= 0.0, "wavelengths, or 0 for no limit");
-        }
+        let some = self.every_nth_integration.values().iter().all(|&nth| nth >= 1);
+        checks.require("every_nth_integration", 0, some, "at least 1");
+        let limits = self.baseline_wavelengths_max.values();
+        let expected = "wavelengths, or 0 for no limit";
+        checks.numbers("baseline_wavelengths_max", limits, |limit| limit >= 0.0, expected);
         let epoch = self.epoch_tai_s;
         // Four octets of whole seconds are what the time code holds.
         checks.number("epoch_tai_s", epoch, (0.0..=3.0e9).contains(&epoch), "0 to 3e9 s");

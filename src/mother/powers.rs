@@ -15,12 +15,12 @@ const BEYOND: f64 = 1.0;
 
 /// `Int T A S dn` (K sr) along the arc of orbit that a window covers.
 ///
-/// All daughters follow each other on one circle, so one table serves them all: a daughter that trails another by an
-/// arc has the same power later.
+/// Daughters that follow each other on one circle share a table: one that trails another by an arc has the same power
+/// later. Others have a table each.
 pub(super) struct SkyPowers {
-    /// Time of the table's first value, s.
+    /// Time of the tables' first values, s.
     from_s: f64,
-    table: Vec<f64>,
+    tables: Vec<Vec<f64>>,
 }
 
 impl SkyPowers {
@@ -33,6 +33,8 @@ impl SkyPowers {
         array: &Array,
         windows: &[ObservingWindow],
     ) -> Result<Vec<Self>, ModelError> {
+        let shared = array.formation().is_some();
+        let tables = if shared { 1 } else { array.satellites() };
         // Arcs are longest at the start of a breathing period.
         let lags_s = (0..array.satellites()).map(|n| lag_s(array, n, 0.0));
         let longest_s = lags_s.fold(0.0, f64::max);
@@ -43,27 +45,33 @@ impl SkyPowers {
             (from_s, steps as usize + 1)
         });
         let spans: Vec<(f64, usize)> = spans.collect();
-        let place = |t_s: f64| DaughterPosition {
-            r_m: array.trailing_m(0.0, t_s),
-            normal_hat: array.orbit_normal_hat(t_s),
+        let place = |n: usize, t_s: f64| DaughterPosition {
+            r_m: if shared { array.trailing_m(0.0, t_s) } else { array.position_m(n, t_s) },
+            normal_hat: array.normal_hat(n, t_s),
         };
-        let instants =
-            spans.iter().flat_map(|&(from_s, count)| (0..count).map(move |k| from_s + STEP_S * k as f64));
-        let places: Vec<DaughterPosition> = instants.map(place).collect();
+        let instants = |&(from_s, count): &(f64, usize)| (0..count).map(move |k| from_s + STEP_S * k as f64);
+        let places: Vec<DaughterPosition> = spans
+            .iter()
+            .flat_map(|span| (0..tables).flat_map(move |n| instants(span).map(move |t_s| place(n, t_s))))
+            .collect();
         let mut powers = vec![0.0; places.len()];
         model.predict_powers(&places, &mut powers)?;
         let mut powers = powers.into_iter();
-        let of = |(from_s, count)| Self { from_s, table: powers.by_ref().take(count).collect() };
+        let of = |(from_s, count)| Self {
+            from_s,
+            tables: (0..tables).map(|_| powers.by_ref().take(count).collect()).collect(),
+        };
         Ok(spans.into_iter().map(of).collect())
     }
 
     /// The power of daughter `n` at a time of the window, K sr.
     pub fn at(&self, array: &Array, n: usize, t_s: f64) -> f64 {
         let x = (t_s - lag_s(array, n, t_s) - self.from_s) / STEP_S;
+        let table = if self.tables.len() == 1 { &self.tables[0] } else { &self.tables[n] };
         // Four nodes of the table, whatever the time.
-        let first = (x.floor() - BEYOND).clamp(0.0, self.table.len().saturating_sub(4) as f64) as usize;
+        let first = (x.floor() - BEYOND).clamp(0.0, table.len().saturating_sub(4) as f64) as usize;
         let x = x - first as f64;
-        let nodes = self.table.iter().skip(first).take(4).enumerate();
+        let nodes = table.iter().skip(first).take(4).enumerate();
         nodes
             .map(|(k, power)| {
                 let others = (0..4).filter(|m| *m != k);
@@ -73,8 +81,9 @@ impl SkyPowers {
     }
 }
 
-/// Time that the array takes to move along the arc by which a daughter trails, s.
+/// Time that the array takes to move along the arc by which a daughter trails, s; 0 without a common circle.
 fn lag_s(array: &Array, n: usize, t_s: f64) -> f64 {
+    let Some(formation) = array.formation() else { return 0.0 };
     let speed_m_s = std::f64::consts::TAU * array.orbit_radius_m() / array.orbital_period_s();
-    array.formation().arc_m(n, t_s).0 / speed_m_s
+    formation.arc_m(n, t_s).0 / speed_m_s
 }

@@ -86,14 +86,16 @@ impl Schedule {
 /// Shortest length of a pair's baseline in a window, m. A chord depends only on the daughters' arcs, which are linear in
 /// time between turnarounds, so it is shortest at an end of the window or at a turnaround.
 fn shortest_m(array: &Array, window: ObservingWindow, pair: Pair) -> f64 {
+    // Ellipses give no bound.
+    let Some(formation) = array.formation() else { return 0.0 };
     let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
     let length_m =
         |t_s: f64| norm(sub(array.position_m(pair.i.into(), t_s), array.position_m(pair.j.into(), t_s)));
-    let next = |t_s: &f64| Some(array.formation().next_turnaround_s(*t_s)).filter(|turn_s| *turn_s < end_s);
+    let next = |t_s: &f64| Some(formation.next_turnaround_s(*t_s)).filter(|turn_s| *turn_s < end_s);
     let instants = std::iter::successors(Some(start_s), next).take(TURNAROUNDS_MAX);
     let shortest = instants.chain([end_s]).map(length_m).fold(f64::INFINITY, f64::min);
     // No bound for a formation with more turnarounds than that.
-    if (end_s - start_s) * 2.0 > TURNAROUNDS_MAX as f64 * array.formation().period_s() {
+    if (end_s - start_s) * 2.0 > TURNAROUNDS_MAX as f64 * formation.period_s() {
         return 0.0;
     }
     shortest

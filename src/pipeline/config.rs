@@ -4,13 +4,15 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::accumulation::MapConfig;
+use super::problems::Problems;
+use crate::accumulation::{EngineKind, MapConfig};
 use crate::array::{Array, ArrayConfig};
 use crate::calibration::{CalibrationConfig, VanVleck};
 use crate::daughters::DaughtersConfig;
 use crate::downlink::DownlinkConfig;
-use crate::mother::{Fidelity, SpacecraftConfig};
+use crate::mother::{Antenna, Fidelity, SpacecraftConfig};
 use crate::products::ProductsConfig;
+use crate::response::model::ModelChoice;
 use crate::runtime::RuntimeConfig;
 use crate::sky::SkyConfig;
 use crate::units::Checks;
@@ -46,19 +48,13 @@ pub struct Config {
     pub runtime: RuntimeConfig,
 }
 
-/// Everything that is wrong with a pipeline, from any section.
-pub type Problems = Vec<Box<dyn std::error::Error + Send + Sync>>;
-
-fn boxed<E: std::error::Error + Send + Sync + 'static>(found: Vec<E>) -> Problems {
-    found.into_iter().map(|problem| Box::new(problem) as _).collect()
-}
-
 impl Config {
     /// Everything that is wrong with a whole pipeline; empty if it is good.
     #[must_use]
     pub fn problems(&self) -> Problems {
         let channels = self.spacecraft.channels_hz.len();
-        let mut found = boxed(self.sky.problems(channels));
+        let mut found = Problems::default();
+        found.extend(self.sky.problems(channels));
         let mut checks = Checks::of("");
         let bad = |c: char| c.is_control() || c == '/' || c == '\\';
         let is_folder =
@@ -69,26 +65,51 @@ impl Config {
         let expected = format!("spacecraft.sub_bands, which is {space}");
         checks.require("calibration.sub_bands", ground, space == ground, expected);
         self.check_quantiser(&mut checks);
-        found.extend(boxed(checks.finish()));
+        self.check_orbits(&mut checks);
+        found.extend(checks.finish());
         let array = self.array.problems();
         let spacecraft = self.spacecraft.problems();
         if array.is_empty() {
             match Array::new(&self.array) {
                 Ok(array) if spacecraft.is_empty() => {
-                    found.extend(boxed(self.spacecraft.dump_problem(&array).into_iter().collect()));
+                    if let Some(problem) = self.spacecraft.dump_problem(&array) {
+                        found.push(|| problem);
+                    }
                 }
                 Ok(_) => {}
-                Err(problem) => found.push(Box::new(problem)),
+                Err(problem) => found.push(|| problem),
             }
         }
-        found.extend(boxed(array));
+        found.extend(array);
         let width_hz = self.spacecraft.channel_width_hz;
-        found.extend(boxed(self.daughters.problems(self.array.satellites, width_hz)));
-        found.extend(boxed(spacecraft));
-        found.extend(boxed(self.downlink.problems()));
-        found.extend(boxed(self.map.misfits(channels)));
-        found.extend(self.ground_problems());
+        found.extend(self.daughters.problems(self.array.satellites, width_hz));
+        found.extend(spacecraft);
+        found.extend(self.downlink.problems());
+        found.extend(self.map.misfits(channels));
+        found.append(self.ground_problems());
         found
+    }
+
+    /// Requires what satellites that do not share a circle can have.
+    fn check_orbits(&self, checks: &mut Checks) {
+        if self.array.kepler.is_empty() {
+            return;
+        }
+        let Self { spacecraft, map, .. } = self;
+        let visibilities = spacecraft.fidelity == Fidelity::Visibilities;
+        let direct = spacecraft.model != ModelChoice::Harmonic;
+        let isotropic = spacecraft.antenna == Antenna::Isotropic;
+        for (key, value, good, expected) in [
+            ("map.engine", "\"harmonic\"", map.engine == EngineKind::Pixel, "\"pixel\""),
+            ("spacecraft.fidelity", "\"samples\"", visibilities, "\"visibilities\""),
+            ("spacecraft.model", "\"harmonic\"", direct, "\"auto\" or \"direct\""),
+            ("spacecraft.smear_integrations", "true", !spacecraft.smear_integrations, "false"),
+            ("spacecraft.antenna", "\"dipole-normal\"", isotropic, "\"isotropic\""),
+            ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
+        ] {
+            let expected = format!("{expected} with array.kepler: the other needs a common circle");
+            checks.require(key, value, good, expected);
+        }
     }
 
     /// Requires that a van Vleck correction is that of the daughters' quantiser.
@@ -110,11 +131,12 @@ impl Config {
     /// Everything that is wrong with the ground segment's sections; empty if they are good.
     #[must_use]
     pub fn ground_problems(&self) -> Problems {
-        let mut found = boxed(self.downlink.listen.problems());
-        found.extend(boxed(self.calibration.problems()));
-        found.extend(boxed(self.map.problems()));
-        found.extend(boxed(self.products.problems()));
-        found.extend(boxed(self.runtime.problems()));
+        let mut found = Problems::default();
+        found.extend(self.downlink.listen.problems());
+        found.extend(self.calibration.problems());
+        found.extend(self.map.problems());
+        found.extend(self.products.problems());
+        found.extend(self.runtime.problems());
         found
     }
 

@@ -1,16 +1,25 @@
 //! Where a configuration comes from: a file or the embedded default, and overrides from the command line.
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use super::config::{Config, Problems};
-use crate::units::{echo, echo_lines};
+use super::config::Config;
+use super::config_reader::{Lines, Reading, SHOWN_MAX, parse_table};
+use super::problems::Problems;
+use crate::units::shortened;
 
 /// Name of the default pipeline in messages.
 const QUICKLOOK_NAME: &str = "embedded quicklook";
 /// The default pipeline, which runs when no file is named.
 pub const QUICKLOOK: &str = include_str!("../../pipelines/quicklook.toml");
+
+/// Longest pipeline file, bytes: a hundred times one with every key, and little enough to be held many times over.
+const FILE_BYTES_MAX: u64 = 1 << 20;
+
+/// Most sections of an override's key; the deepest key has three.
+const DEPTH_MAX: usize = 8;
 
 /// Why there is no usable configuration.
 #[derive(Debug, Error)]
@@ -24,40 +33,31 @@ pub enum ConfigError {
         /// The system's error.
         source: std::io::Error,
     },
-    /// Not TOML, or unknown keys or wrong types.
-    #[error("{}: {}", echo(origin), echo_lines(source))]
-    Parse {
-        /// File, or the embedded default's name.
-        origin: String,
-        /// Line, column and what was expected.
-        source: Box<toml::de::Error>,
+    /// The file is too long for a pipeline file.
+    #[error("{}: more than {FILE_BYTES_MAX} bytes; expected a pipeline file, which has some thousand", path.display())]
+    TooLong {
+        /// Path.
+        path: PathBuf,
     },
     /// A `--set` that is not `key=value`.
-    #[error("--set {}: expected key=value, for example --set map.nside=32", echo(.0))]
+    #[error("--set {0}: expected key=value, for example --set map.nside=32")]
     Override(String),
     /// A `--set` with a key below one that is not a section.
-    #[error("--set {}: `{}` is not a section", echo(key), echo(part))]
+    #[error("--set {key}: `{part}` is not a section")]
     NotASection {
         /// Whole key.
         key: String,
         /// Part of the key.
         part: String,
     },
-    /// An unknown key.
-    #[error("{}: no such key; pipelines/reference.toml holds all of them", echo(.0))]
-    Unknown(String),
-    /// Invalid values; all of them.
-    #[error("{}: {} problem(s)\n{}", echo(origin), problems.len(), bullets(problems))]
+    /// Text that is not TOML, unknown keys, wrong types, invalid values: all that could be found.
+    #[error("{origin}: {problems}")]
     Values {
         /// File, or the embedded default's name.
         origin: String,
         /// What is wrong.
-        problems: Vec<Box<dyn std::error::Error + Send + Sync>>,
+        problems: Problems,
     },
-}
-
-fn bullets(problems: &[Box<dyn std::error::Error + Send + Sync>]) -> String {
-    problems.iter().map(|problem| format!("  - {problem}")).collect::<Vec<_>>().join("\n")
 }
 
 /// Where a configuration comes from, and overrides of it.
@@ -81,12 +81,9 @@ impl ConfigSource {
     /// Reads the file, applies the overrides and parses; does not check values.
     ///
     /// # Errors
-    /// An unreadable file, TOML errors with line and column, unknown keys, bad overrides.
+    /// An unreadable file; everything that is not TOML, not a key or not of its type, and every bad override.
     pub fn parse(&self) -> Result<Config, ConfigError> {
-        match &self.file {
-            Some(path) => self.parse_text(&read(path)?),
-            None => self.parse_text(QUICKLOOK),
-        }
+        self.parse_text(&self.text()?)
     }
 
     /// As [`Self::parse`], with this text instead of the file.
@@ -94,35 +91,14 @@ impl ConfigSource {
     /// # Errors
     /// As [`Self::parse`].
     pub fn parse_text(&self, text: &str) -> Result<Config, ConfigError> {
-        let origin = self.origin();
-        let parse_error = |origin: String, table: Option<&toml::Table>, source: toml::de::Error| {
-            let unknown = table.map(unknown_keys).unwrap_or_default();
-            // A single one is reported by the parser, which knows its line.
-            if unknown.len() > 1 {
-                let problems = unknown.into_iter().map(|key| Box::new(ConfigError::Unknown(key)) as _);
-                return ConfigError::Values { origin, problems: problems.collect() };
-            }
-            ConfigError::Parse { origin, source: Box::new(source) }
-        };
-        // Straight from the text first: these errors know their line.
-        let mut config: Config = toml::from_str(text)
-            .map_err(|source| parse_error(origin.clone(), toml::from_str(text).ok().as_ref(), source))?;
-        if !self.overrides.is_empty() {
-            let mut table: toml::Table =
-                toml::from_str(text).map_err(|source| parse_error(origin, None, source))?;
-            for text in &self.overrides {
-                set(&mut table, text)?;
-            }
-            let origin = format!("--set {}", self.overrides.join(" --set "));
-            config = table.clone().try_into().map_err(|source| parse_error(origin, Some(&table), source))?;
+        self.checked(text, self.origin(), |_| Problems::default())
+    }
+
+    fn text(&self) -> Result<String, ConfigError> {
+        match &self.file {
+            Some(path) => read(path),
+            None => Ok(QUICKLOOK.to_owned()),
         }
-        if let Some(seed) = self.seed {
-            config.seed = seed;
-        }
-        if config.name.is_empty() {
-            config.name = self.default_name();
-        }
-        Ok(config)
     }
 
     fn default_name(&self) -> String {
@@ -130,65 +106,76 @@ impl ConfigSource {
         stem.map_or_else(|| "lunarray".into(), |stem| stem.to_string_lossy().into_owned())
     }
 
-    /// [`Self::parse`], then every check of a whole pipeline.
+    /// [`Self::parse`], and every check of a whole pipeline.
     ///
     /// # Errors
-    /// As [`Self::parse`]; [`ConfigError::Values`] with all invalid values.
+    /// As [`Self::parse`]; invalid values; all of them together.
     pub fn load(&self) -> Result<Config, ConfigError> {
-        let config = self.parse()?;
-        refuse(self.origin(), config.problems()).map(|()| config)
+        self.checked(&self.text()?, self.origin(), Config::problems)
     }
 
-    /// [`Self::parse`], then the checks of the sections of the ground segment. Without a file these have their defaults,
+    /// [`Self::parse`], and the checks of the sections of the ground segment. Without a file these have their defaults,
     /// which fit any downlink; those of the quicklook are for its own three channels.
     ///
     /// # Errors
     /// As [`Self::load`].
     pub fn load_ground(&self) -> Result<Config, ConfigError> {
-        let (config, origin) = match &self.file {
-            Some(_) => (self.parse()?, self.origin()),
-            None => (self.parse_text("")?, "default settings".to_owned()),
-        };
-        refuse(origin, config.ground_problems()).map(|()| config)
+        match &self.file {
+            Some(_) => self.checked(&self.text()?, self.origin(), Config::ground_problems),
+            None => self.checked("", "default settings".to_owned(), Config::ground_problems),
+        }
     }
-}
 
-fn refuse(origin: String, problems: Problems) -> Result<(), ConfigError> {
-    if problems.is_empty() { Ok(()) } else { Err(ConfigError::Values { origin, problems }) }
+    /// Reads `text` and the overrides, and requires that there are no problems in reading and none of the values.
+    fn checked(
+        &self,
+        text: &str,
+        origin: String,
+        problems_of: impl Fn(&Config) -> Problems,
+    ) -> Result<Config, ConfigError> {
+        let mut table = match parse_table(text) {
+            Ok(table) => table,
+            Err(problems) => return Err(ConfigError::Values { origin, problems }),
+        };
+        let mut lines = Lines::of(text);
+        let mut bad_overrides = Vec::new();
+        for text in &self.overrides {
+            match set(&mut table, text) {
+                Ok(key) => lines.set(key, text),
+                Err(error) => bad_overrides.push(error),
+            }
+        }
+        let mut reading = Reading::new(table, &lines);
+        if let Some(seed) = self.seed {
+            reading.config.seed = seed;
+        }
+        if reading.config.name.is_empty() {
+            reading.config.name = self.default_name();
+        }
+        let of_values = problems_of(&reading.config);
+        let told = reading.tell(of_values, bad_overrides);
+        match told.is_empty() {
+            true => Ok(reading.config),
+            false => Err(ConfigError::Values { origin, problems: told }),
+        }
+    }
 }
 
 fn read(path: &Path) -> Result<String, ConfigError> {
-    std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })
-}
-
-/// Keys that have no default because they may be absent.
-const OPTIONAL_KEYS: [&str; 2] = ["sky.file", "calibration.gains_file"];
-
-/// All unknown keys of a table, with their sections.
-fn unknown_keys(table: &toml::Table) -> Vec<String> {
-    fn walk(prefix: &str, table: &toml::Table, known: &toml::Table, found: &mut Vec<String>) {
-        for (key, value) in table {
-            let path = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
-            match (known.get(key), value) {
-                (Some(toml::Value::Table(known)), toml::Value::Table(table)) => {
-                    walk(&path, table, known, found);
-                }
-                (Some(_), _) => {}
-                (None, _) if OPTIONAL_KEYS.contains(&path.as_str()) => {}
-                (None, _) => found.push(path),
-            }
-        }
+    let failed = |source| ConfigError::Read { path: path.to_owned(), source };
+    let file = std::fs::File::open(path).map_err(failed)?;
+    let mut text = String::new();
+    let bytes = file.take(FILE_BYTES_MAX + 1).read_to_string(&mut text).map_err(failed)?;
+    if bytes as u64 > FILE_BYTES_MAX {
+        return Err(ConfigError::TooLong { path: path.to_owned() });
     }
-    let mut found = Vec::new();
-    // The default configuration always has a TOML form: the reference file's test relies on it too.
-    let known = toml::Table::try_from(Config::default()).unwrap_or_default();
-    walk("", table, &known, &mut found);
-    found
+    Ok(text)
 }
 
-/// Sets `key=value` in a table; a value that is not TOML is a string.
-fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
-    let (key, value) = text.split_once('=').ok_or_else(|| ConfigError::Override(text.to_owned()))?;
+/// Sets `key=value` in a table; a value that is not TOML is a string. Returns the key.
+fn set<'a>(table: &mut toml::Table, text: &'a str) -> Result<&'a str, ConfigError> {
+    let bad = || ConfigError::Override(shortened(text, SHOWN_MAX));
+    let (key, value) = text.split_once('=').ok_or_else(bad)?;
     let key = key.trim();
     let parsed = toml::from_str::<toml::Table>(&format!("value = {value}"));
     let value = parsed
@@ -196,18 +183,19 @@ fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
         .and_then(|mut table| table.remove("value"))
         .unwrap_or_else(|| toml::Value::String(value.trim().to_owned()));
     let (sections, last) = key.rsplit_once('.').map_or(("", key), |(head, last)| (head, last));
-    if last.is_empty() {
-        return Err(ConfigError::Override(text.to_owned()));
+    if last.is_empty() || sections.split('.').count() > DEPTH_MAX {
+        return Err(bad());
     }
     let mut here = table;
     for part in sections.split('.').filter(|part| !part.is_empty()) {
         let next = here.entry(part).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        here = next
-            .as_table_mut()
-            .ok_or_else(|| ConfigError::NotASection { key: key.to_owned(), part: part.to_owned() })?;
+        here = next.as_table_mut().ok_or_else(|| ConfigError::NotASection {
+            key: shortened(key, SHOWN_MAX),
+            part: shortened(part, SHOWN_MAX),
+        })?;
     }
     here.insert(last.to_owned(), value);
-    Ok(())
+    Ok(key)
 }
 
 #[cfg(test)]
@@ -231,43 +219,99 @@ mod tests {
         let config = config.unwrap();
         assert_eq!((config.map.nside, config.seed, config.array.breathing.ratio), (8, 5, 2.0));
         assert_eq!(config.sky.file.unwrap().get(0), Some(PathBuf::from("some/map.fits")));
-        assert!(matches!(with(&["map.nside"]), Err(ConfigError::Override(_))));
-        assert!(matches!(with(&["seed.more=1"]), Err(ConfigError::NotASection { .. })));
-        let unknown = with(&["map.nsides=8"]).unwrap_err().to_string();
-        assert!(unknown.contains("nsides"), "{unknown}");
+        for (bad, part) in [
+            ("map.nside", "expected key=value"),
+            ("=8", "expected key=value"),
+            ("seed.more=1", "--set seed.more: `seed` is not a section"),
+            ("map.nsides=8", "--set map.nsides=8: map.nsides: no such key; [map] has baseline_bp_max, "),
+            ("a.b.c.d.e.f.g.h.i.j=1", "expected key=value"),
+        ] {
+            let told = with(&["seed=5", bad]).unwrap_err().to_string();
+            assert!(told.contains(part), "{bad}: {told}");
+        }
+    }
+
+    /// The problems of a text with overrides, a line each.
+    fn told(text: &str, overrides: &[&str]) -> Vec<String> {
+        let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
+        let source = ConfigSource { overrides, ..ConfigSource::default() };
+        let error = source.checked(text, "here".to_owned(), Config::problems).unwrap_err().to_string();
+        error.lines().map(str::to_owned).collect()
     }
 
     #[test]
-    fn messages_stay_short_whatever_the_file_holds() {
-        let long = "7".repeat(10_000_000);
-        let texts = [
-            format!("[map]\nepsilon = \"{long}\""),
-            format!("[map]\nepsilon = {long}"),
-            format!("[map]\nnside = [{long}"),
-            format!("k{long} = 1\nm{long} = 2"),
-            format!("[map]\nepsilon = 1{}", "0".repeat(300)),
+    fn unknown_keys_wrong_types_and_bad_values_are_told_together() {
+        let text = "sed = 1\n[map]\nnside = \"big\"\nepsilon = -1.0\nl_maxx = 3\n\n[sat]\na = 1\nb = 2\n[spacecraft]\n\
+                    duration_s = -3\nninth = 9\n[sky]\nfile = 7\nnside = 7\n[products]\npictures = 1";
+        let found = told(text, &["map.weight_max=lots", "runtime.threads", "spacecraft.antenna=\"dish\""]);
+        let expected = [
+            "here: 13 problem(s)",
+            "--set runtime.threads: expected key=value",
+            "line 5: map.l_maxx: no such key; [map] has",
+            "line 3: map.nside: invalid type: string \"big\", expected a whole number, not negative",
+            "--set map.weight_max=lots: map.weight_max: invalid type: string \"lots\", expected a number",
+            "line 17: products.pictures: invalid type: integer `1`, expected a boolean",
+            "line 7: sat: no such key; a pipeline has",
+            "line 1: sed: no such key",
+            "line 14: sky.file: expected one value, or a list with one for each channel",
+            "--set spacecraft.antenna=\"dish\": spacecraft.antenna: unknown variant `dish`, expected `isotropic`",
+            "line 12: spacecraft.ninth: found one value (integer), expected a section",
+            "sky.nside = 7: expected a power of two",
+            "spacecraft.duration_s = -3: expected seconds",
+            "map.epsilon = -1: expected above 0",
         ];
-        for text in texts {
-            let source = ConfigSource::default();
-            let told =
-                source.parse_text(&text).map(|config| config.problems()).map_err(|error| error.to_string());
-            let told = told.unwrap_or_else(|error| vec![error.into()]);
-            let told: Vec<String> = told.iter().map(ToString::to_string).collect();
-            // Room for the keys of a section.
-            assert!(!told.is_empty() && told.iter().all(|text| text.len() < 4000), "{}", told.concat().len());
+        for expected in expected {
+            assert!(found.iter().any(|line| line.contains(expected)), "{expected} is not in {found:#?}");
         }
-        let told = with(&["map.epsilon=text"]).unwrap_err().to_string();
-        assert!(told.contains("\"text\"") && !told.contains("untagged"), "{told}");
-        assert!(with(&[&long]).unwrap_err().to_string().len() < 300);
+        assert_eq!(found.len(), expected.len(), "{found:#?}");
     }
 
     #[test]
-    fn unknown_keys_are_told_all_at_once() {
-        let told = with(&["map.nsides=8", "sky.fil=x", "map.nside=8", "seeds=1"]).unwrap_err().to_string();
-        for key in ["map.nsides", "sky.fil:", "seeds"] {
-            assert!(told.contains(key), "{key} is not in {told}");
+    fn what_may_follow_from_an_unreadable_value_is_not_told() {
+        // As many values as the channels that cannot be read, and a quantiser that the ground would correct.
+        let text = "[spacecraft]\nchannels_hz = [1e6, \"2 MHz\"]\nevery_nth_integration = [1, 1]\nfidelity = \"samples\"\n\
+                    [daughters]\nbits = \"two\"\n[calibration]\nquantiser_bits = 2\n[map]\nepsilon = [1e-4, 1e-4]\n\
+                    [array]\nsatellites = \"four\"\n[daughters.disturbances]\ngain_error = [0.1, 0.1, 0.1, 0.1]\n";
+        let found = told(text, &[]);
+        assert_eq!(found.len(), 4, "{found:#?}");
+        for key in ["array.satellites: ", "daughters.bits: ", "spacecraft.channels_hz: "] {
+            assert!(found.iter().any(|line| line.contains(key)), "{key} is not in {found:#?}");
         }
-        assert!(!told.contains("map.nside:"), "{told}");
+    }
+
+    #[test]
+    fn text_that_is_not_toml_is_told_by_place() {
+        let found = told("seed = 1\n[map\nnside = 3\n", &[]);
+        assert!(found[1].contains("line 2, column 5: "), "{found:?}");
+        let long = format!("seed = 1\nname = {}", "x".repeat(100_000));
+        assert!(told(&long, &[]).iter().all(|line| line.len() < 300));
+    }
+
+    #[test]
+    fn many_problems_are_counted_and_some_shown() {
+        let keys: String = (0..50_000).map(|k| format!("k{k} = 1\n")).collect();
+        let found = told(&keys, &[]);
+        assert_eq!((found.len(), found[0].as_str()), (22, "here: 50000 problem(s)"));
+        assert_eq!(found[21], "  and 49980 more");
+        let list = |value: &str| format!("[{}]", vec![value; 100_000].join(", "));
+        let text = format!(
+            "[spacecraft]\nchannels_hz = {0}\nevery_nth_integration = {1}\nbaseline_wavelengths_max = {0}\ndelay_centre_deg = {0}\n\
+             [map]\nepsilon = {0}\nprior_k = {0}\n[daughters.disturbances]\ngain_error = {0}\n",
+            list("-1.0"),
+            list("0")
+        );
+        let found = told(&text, &[]);
+        assert!(found.len() < 20 && found.iter().all(|line| line.len() < 300), "{found:#?}");
+        assert!(found.iter().any(|line| line.contains("channels_hz = (100000 channels): expected 1 to 30")));
+    }
+
+    #[test]
+    fn a_file_that_is_no_pipeline_is_not_read_whole() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("long.toml");
+        std::fs::write(&path, "# comment\n".repeat(200_000)).unwrap();
+        let source = ConfigSource { file: Some(path), ..ConfigSource::default() };
+        assert!(matches!(source.load(), Err(ConfigError::TooLong { .. })));
     }
 
     #[test]

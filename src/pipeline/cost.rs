@@ -5,12 +5,24 @@ use std::fmt;
 use serde::Serialize;
 
 use super::engine_cost::EngineCost;
+use super::error::PipelineError;
+use super::memory::MemoryLimit;
 use super::plan::Plan;
 use super::rates::{FRINGES_PER_S, SAMPLES_PER_S, cores};
 use crate::frames::ObservingWindow;
 use crate::mother::{Fidelity, VISIBILITY_BYTES};
 use crate::response::model::{ModelKind, ModelPlan};
 use crate::sky::healpix::pixel_count;
+
+/// Visibilities that wait for a batch of the model, at most, and the memory of one with its position, bytes.
+const QUEUED_VISIBILITIES_MAX: f64 = 1e6;
+const QUEUED_VISIBILITY_BYTES: f64 = 200.0;
+
+/// Memory of the program, its queues and its pictures, bytes.
+const BASE_BYTES: f64 = 5e7;
+
+/// Memory of a snapshot's line in the summary and of the names of its files, bytes.
+const SNAPSHOT_RECORD_BYTES: f64 = 500.0;
 
 /// The cost of one channel.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -49,6 +61,8 @@ pub struct Cost {
     pub downlink_bytes: f64,
     /// Memory for sums, snapshots, solving and the simulated sky, bytes.
     pub memory_bytes: f64,
+    /// Of these, what the space segment takes, bytes.
+    pub simulation_memory_bytes: f64,
     /// Rate that the daughters' samples need on their links to the mother, all together, bit/s; with
     /// samples alone.
     pub samples_bits_per_s: Option<f64>,
@@ -63,6 +77,15 @@ pub struct Cost {
     pub sampling_s: Option<f64>,
     /// Estimated time of the whole run, s, at the rates of one machine and with as many cores as this one.
     pub predicted_s: f64,
+}
+
+/// Part of a pipeline that is to run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Segment {
+    /// All of it.
+    Whole,
+    /// Up to the downlink.
+    Space,
 }
 
 impl ChannelCost {
@@ -80,7 +103,7 @@ impl Plan {
     #[must_use]
     pub fn cost(&self) -> Cost {
         let map = &self.config.map;
-        let sky_pixels = self.sky_pixels() as f64;
+        let nsides = self.sky_nsides();
         let fringes_per_s = FRINGES_PER_S * cores();
         let expected = self.visibilities();
         let frequencies = &self.config.spacecraft.channels_hz;
@@ -88,7 +111,7 @@ impl Plan {
         let channels: Vec<ChannelCost> = frequencies
             .iter()
             .zip(&expected)
-            .zip(self.model_plans(&self.sky_nsides()))
+            .zip(self.model_plans_for(&expected, &nsides))
             .zip(&engines)
             .map(|(((&frequency_hz, expected), simulation), engine)| ChannelCost {
                 frequency_hz,
@@ -106,16 +129,12 @@ impl Plan {
             })
             .collect();
         let sent: f64 = expected.iter().map(|e| e.sent).sum();
-        let solutions = self.solutions();
-        // One engine a channel; a snapshot being made, one in the queue, one in the solver, which works in it.
-        let snapshots = if solutions > 1 { 3.0 } else { 0.0 };
-        let greatest = |of: fn(&EngineCost) -> f64| engines.iter().map(of).fold(0.0, f64::max);
-        let memory_bytes = engines.iter().map(|engine| engine.sums_bytes).sum::<f64>()
-            + snapshots * greatest(|engine| engine.sums_bytes)
-            + greatest(|engine| engine.other_bytes)
-            + sky_pixels * 8.0 * (frequencies.len() + 3) as f64
+        let solutions = self.solutions(sent);
+        let simulation_memory_bytes = self.simulation_bytes(sent, &nsides)
             + channels.iter().map(|channel| channel.simulation.bytes).sum::<f64>();
-        let solving_s = solutions as f64 * engines.iter().map(|engine| engine.solution_s).sum::<f64>();
+        let memory_bytes = self.memory_bytes(simulation_memory_bytes, &engines, solutions);
+        let solving_s = solutions as f64 * engines.iter().map(|engine| engine.solution_s).sum::<f64>()
+            + engines.iter().map(|engine| engine.probes_s).sum::<f64>();
         let sampling_s = self.sampling_s();
         let simulating_s: f64 =
             sampling_s.unwrap_or_else(|| channels.iter().map(ChannelCost::simulation_s).sum());
@@ -132,6 +151,7 @@ impl Plan {
                     + self.auto_bytes()
                     + self.ninth_bytes()),
             memory_bytes,
+            simulation_memory_bytes,
             samples_bits_per_s: self.samples_bits_per_s(),
             link_bits_per_s: self.link_bits_per_s(),
             without_effect: self.without_effect(),
@@ -173,14 +193,59 @@ impl Plan {
         self.observing_s() * rate / 8.0 + PACKET_BYTES * packets as f64
     }
 
-    fn solutions(&self) -> u64 {
+    /// Solutions of each channel for `sent` visibilities of all: one for each snapshot step with data in it, and the final
+    /// one.
+    fn solutions(&self, sent: f64) -> u64 {
         let every_s = self.config.map.snapshot_every_s;
-        if every_s > 0.0 { (self.config.spacecraft.duration_s / every_s).ceil() as u64 } else { 1 }
+        if every_s <= 0.0 {
+            return 1;
+        }
+        let steps = (self.config.spacecraft.duration_s / every_s).ceil();
+        let observed = (self.observing_s() / every_s).ceil() + self.windows.len() as f64;
+        steps.min(observed).min(sent.ceil()).max(1.0) as u64
     }
 
-    fn sky_pixels(&self) -> usize {
-        // A file's size is not read here; the published maps have this one.
-        pixel_count(self.config.sky.nside)
+    /// Memory of the space segment besides its models, bytes.
+    fn simulation_bytes(&self, sent: f64, nsides: &[usize]) -> f64 {
+        let pixels: Vec<f64> = nsides.iter().map(|&nside| pixel_count(nside) as f64).collect();
+        // Every sky, and three copies of one that is turned and resampled.
+        let skies = pixels.iter().sum::<f64>() + 3.0 * pixels.iter().copied().fold(0.0, f64::max);
+        8.0 * skies + sent.min(QUEUED_VISIBILITIES_MAX) * QUEUED_VISIBILITY_BYTES
+    }
+
+    /// Memory of all, at the time when it is greatest: while the sums grow, or at the end, when the space segment is gone.
+    fn memory_bytes(&self, simulation_bytes: f64, engines: &[EngineCost], solutions: u64) -> f64 {
+        let greatest = |of: fn(&EngineCost) -> f64| engines.iter().map(of).fold(0.0, f64::max);
+        let sums = engines.iter().map(|engine| engine.sums_bytes).sum::<f64>()
+            + solutions as f64 * engines.len() as f64 * SNAPSHOT_RECORD_BYTES;
+        let copy = greatest(|engine| engine.copy_bytes);
+        // One copy is made, one waits in the queue, and one is in the solver.
+        let solving = |copies: usize| match copies {
+            0 => 0.0,
+            copies => copies.min(3) as f64 * copy + greatest(|engine| engine.other_bytes),
+        };
+        let growing = simulation_bytes + sums + solving(if solutions > 1 { 3 } else { 0 });
+        let last = if engines.iter().any(|engine| engine.copies_last) { engines.len() } else { 0 };
+        growing.max(sums + solving(last)) + BASE_BYTES
+    }
+}
+
+impl Cost {
+    /// Requires that the memory that a segment needs is within the limit.
+    ///
+    /// # Errors
+    /// [`PipelineError::Memory`].
+    pub fn require_memory(&self, segment: Segment, limit: Option<MemoryLimit>) -> Result<(), PipelineError> {
+        let needed_bytes = match segment {
+            Segment::Whole => self.memory_bytes,
+            Segment::Space => self.simulation_memory_bytes,
+        };
+        match limit {
+            Some(limit) if needed_bytes > limit.bytes as f64 => {
+                Err(PipelineError::Memory { needed_bytes, limit })
+            }
+            _ => Ok(()),
+        }
     }
 }
 

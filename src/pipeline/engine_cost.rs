@@ -13,6 +13,16 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 /// Products with BtN^-1B in one harmonic solution: some 15 for W_max, 25 each for the map and the noise map.
 const APPLICATIONS: f64 = 65.0;
 
+/// Products with BtN^-1B for one random probe of the traces, of at most 120: as many as for an accuracy of 1e-4 in a map of
+/// the quicklook.
+const PROBE_APPLICATIONS: f64 = 40.0;
+
+/// Alphas that the weights of one window reach: as many as their kernel, and those that the plane passes on its way.
+const WINDOW_ALPHAS: f64 = 16.0;
+
+/// Vectors of the unknowns that a solution holds: the basis for W_max, and that of a probe.
+const BASIS_VECTORS: [f64; 2] = [60.0, 120.0];
+
 /// Transforms that take as long as all that is done to a line of phases in one product with BtN^-1B: two of them, the
 /// products with the weights, and the way from the matrix products and back (benches/harmonic).
 const TRANSFORMS_PER_LINE: f64 = 4.0;
@@ -22,12 +32,18 @@ const TRANSFORMS_PER_LINE: f64 = 4.0;
 pub(super) struct EngineCost {
     /// Memory of the sums, bytes.
     pub(super) sums_bytes: f64,
+    /// Memory of a copy of the sums as numbers, from which a map is solved, bytes.
+    pub(super) copy_bytes: f64,
+    /// Whether the final map is solved from a copy, too, or in the memory of the sums.
+    pub(super) copies_last: bool,
     /// Memory besides the sums, bytes: tables and workspace.
     pub(super) other_bytes: f64,
     /// Estimated time of a visibility, s.
     pub(super) visibility_s: f64,
     /// Estimated time of a solution, s.
     pub(super) solution_s: f64,
+    /// Estimated time of the random probes of the final solution, s.
+    pub(super) probes_s: f64,
     /// Multiply-adds of a visibility.
     pub(super) visibility_multiply_adds: f64,
     /// Multiply-adds of a solution.
@@ -51,9 +67,13 @@ impl Plan {
         let solution_multiply_adds = pixels.powi(3) / 6.0;
         EngineCost {
             sums_bytes: PixelEngine::memory_bytes(nside) as f64,
+            copy_bytes: PixelEngine::memory_bytes(nside) as f64,
+            copies_last: false,
             other_bytes: 0.0,
             visibility_s: visibility_multiply_adds / (RANK_K_MULTIPLY_ADDS_PER_S * cores()),
             solution_s: solution_multiply_adds / (CHOLESKY_MULTIPLY_ADDS_PER_S * cores()),
+            // Factorised sums have no traces.
+            probes_s: 0.0,
             visibility_multiply_adds,
             solution_multiply_adds,
         }
@@ -69,11 +89,20 @@ impl Plan {
         // A complex transform takes 5 n log2(n) operations, of which two make a multiply-add.
         let transform_multiply_adds = 2.5 * points * points.log2();
         let application_multiply_adds = size.lines as f64 * TRANSFORMS_PER_LINE * transform_multiply_adds;
+        // A window's pairs share a plane, and so the alphas that its weights are spread to; others take no memory.
+        let reached = (WINDOW_ALPHAS * self.windows.len() as f64 / points).min(1.0);
+        let application_s = application_multiply_adds / (TRANSFORM_MULTIPLY_ADDS_PER_S * cores());
+        let vector_bytes = 8.0 * ((l_max + 1) as f64).powi(2);
+        let vectors = BASIS_VECTORS[usize::from(map.trace_probes > 0)];
         EngineCost {
-            sums_bytes: memory.sums as f64,
-            other_bytes: (memory.tables + memory.workspace) as f64,
+            sums_bytes: memory.sums as f64 * reached,
+            copy_bytes: memory.sums as f64 * reached,
+            // Integers are freed node by node, in pieces too small to go back to the system.
+            copies_last: true,
+            other_bytes: (memory.tables + memory.workspace) as f64 + vectors * vector_bytes,
             visibility_s: 1.0 / (HARMONIC_VISIBILITIES_PER_S * cores()),
-            solution_s: APPLICATIONS * application_multiply_adds / (TRANSFORM_MULTIPLY_ADDS_PER_S * cores()),
+            solution_s: APPLICATIONS * application_s,
+            probes_s: map.trace_probes as f64 * PROBE_APPLICATIONS * application_s,
             visibility_multiply_adds: SPREAD_MULTIPLY_ADDS,
             solution_multiply_adds: APPLICATIONS * size.matrix_multiply_adds,
         }

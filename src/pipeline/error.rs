@@ -3,6 +3,7 @@
 use thiserror::Error;
 
 use super::config_source::ConfigError;
+use super::memory::MemoryLimit;
 use crate::array::ArrayError;
 use crate::frames::{SampleReason, VisibilityReason};
 use crate::runtime::{LedgerImbalance, RuntimeError};
@@ -94,6 +95,18 @@ pub enum PipelineError {
         /// Distance between used windows, windows.
         every_nth: u64,
     },
+    /// More memory needed than there is.
+    #[error(
+        "an estimated {} of memory are needed, and {} are available ({}): expected at most that; lower map.nside, \
+         map.l_max or the number of channels, or state another limit, as in --memory-max {}GB",
+        gigabytes(*needed_bytes), gigabytes(limit.bytes as f64), limit.source, (needed_bytes / 1e9).ceil()
+    )]
+    Memory {
+        /// Estimated need, bytes.
+        needed_bytes: f64,
+        /// The limit.
+        limit: MemoryLimit,
+    },
     /// The thread pool cannot be started.
     #[error("cannot start {threads} worker threads: {reason}")]
     Threads {
@@ -102,4 +115,9 @@ pub enum PipelineError {
         /// The system's error.
         reason: String,
     },
+}
+
+/// Bytes as gigabytes.
+fn gigabytes(bytes: f64) -> String {
+    format!("{:.2} GB", bytes / 1e9)
 }

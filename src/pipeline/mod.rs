@@ -3,15 +3,18 @@
 //! The only place where space and ground meet, and where concrete stages are connected. Uses every folder before it.
 
 pub(crate) mod config;
+mod config_reader;
 mod config_source;
 mod cost;
 mod engine_cost;
 pub(crate) mod error;
 mod file_problems;
 mod ground_segment;
+mod memory;
 pub(crate) mod models;
 mod notes;
 pub(crate) mod plan;
+mod problems;
 mod rates;
 mod run;
 mod sample_summary;
@@ -19,11 +22,14 @@ pub(crate) mod sampling;
 pub(crate) mod space_segment;
 mod summary;
 
-pub use config::{Config, Problems};
+pub use config::Config;
+pub use config_reader::ReadProblem;
 pub use config_source::{ConfigError, ConfigSource, QUICKLOOK};
-pub use cost::{ChannelCost, Cost};
+pub use cost::{ChannelCost, Cost, Segment};
 pub use error::PipelineError;
+pub use memory::{MemoryLimit, MemorySource};
 pub use plan::{Expected, Plan};
+pub use problems::{Problem, Problems};
 pub use run::{
     Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, simulate, use_threads,
 };

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use super::error::PipelineError;
-use super::plan::Plan;
+use super::plan::{Expected, Plan};
 use crate::array::Array;
 use crate::mother::{Fidelity, Schedule};
 use crate::response::harmonic::RotationTable;
@@ -21,9 +21,13 @@ impl Plan {
     /// The choice of model for each channel, with skies of these nsides, channel by channel.
     #[must_use]
     pub fn model_plans(&self, nsides: &[usize]) -> Vec<ModelPlan> {
+        self.model_plans_for(&self.visibilities(), nsides)
+    }
+
+    /// As [`Self::model_plans`], for the visibilities of [`Self::visibilities`].
+    pub(super) fn model_plans_for(&self, expected: &[Expected], nsides: &[usize]) -> Vec<ModelPlan> {
         let spacecraft = &self.config.spacecraft;
-        let plan = |((schedule, expected), &sky_nside): ((&Schedule, _), &usize)| {
-            let expected: crate::pipeline::Expected = expected;
+        let plan = |((schedule, expected), &sky_nside): ((&Schedule, &Expected), &usize)| {
             let longest = longest_baseline_wavelengths(&self.array, schedule);
             let (frequencies, stretch) = match spacecraft.smear_bandwidth {
                 true => {
@@ -47,9 +51,13 @@ impl Plan {
                 let direct = ModelPlan::new(ModelChoice::Direct, load);
                 return ModelPlan { why: "samples take direct sums", ..direct };
             }
+            if self.array.formation().is_none() {
+                let direct = ModelPlan::new(ModelChoice::Direct, load);
+                return ModelPlan { why: "harmonics need a common circle", ..direct };
+            }
             ModelPlan::new(spacecraft.model, load)
         };
-        self.schedules.iter().zip(self.visibilities()).zip(nsides).map(plan).collect()
+        self.schedules.iter().zip(expected).zip(nsides).map(plan).collect()
     }
 }
 
@@ -70,7 +78,12 @@ impl Plan {
 /// The longest baseline of a schedule, wavelengths. The limit holds at the start of an integration; until its middle a
 /// baseline moves by less than the rule allows.
 fn longest_baseline_wavelengths(array: &Array, schedule: &Schedule) -> f64 {
-    let formation = array.formation();
+    let Some(formation) = array.formation() else {
+        // No two satellites are further apart than on opposite sides; what counts is in the schedule.
+        let limit = schedule.baseline_wavelengths_max;
+        let most = 2.0 * array.farthest_m() * schedule.frequency_hz / SPEED_OF_LIGHT_M_S;
+        return if limit > 0.0 { most.min(limit + schedule.rule.motion_wavelengths_max) } else { most };
+    };
     // Arcs are greatest at the start of a period.
     let arcs = (0..array.satellites()).map(|n| formation.arc_m(n, 0.0).0);
     let arc_m = arcs.fold(0.0, f64::max);

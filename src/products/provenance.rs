@@ -22,7 +22,7 @@ impl Provenance {
             Card::text("CREATOR", concat!("lunarray ", env!("CARGO_PKG_VERSION")), "program"),
             Card::text(
                 "PIPELINE",
-                &name.chars().take(60).collect::<String>(),
+                &in_ascii(&name.chars().take(60).collect::<String>()),
                 "instrument description's name",
             ),
             Card::text("CONTENT", what, "what the map shows"),
@@ -37,5 +37,28 @@ impl Provenance {
             Card::text("HASHSPAC", &format!("{configuration_hash:016x}"), "configuration, space segment"),
             Card::text("HASHGRND", &format!("{:016x}", self.ground_hash), "configuration, ground segment"),
         ]
+    }
+}
+
+/// A text as a header can hold it: what is not printable ASCII is percent-encoded, byte by byte in UTF-8 (RFC 3986).
+fn in_ascii(text: &str) -> String {
+    text.bytes()
+        .map(|byte| match byte {
+            0x20..=0x7e => char::from(byte).to_string(),
+            _ => format!("%{byte:02X}"),
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_in_any_script_fit_a_header() {
+        assert_eq!(in_ascii("it's 100 % ASCII"), "it's 100 % ASCII");
+        // U+00E4 and U+6708 in UTF-8 (RFC 3629).
+        assert_eq!(in_ascii("m\u{e4}rz \u{6708}"), "m%C3%A4rz %E6%9C%88");
+        assert_eq!(in_ascii("a\x1b[31m\n\x7f"), "a%1B[31m%0A%7F");
     }
 }

@@ -5,7 +5,13 @@ use std::fmt;
 
 use thiserror::Error;
 
-use super::echo;
+use super::shortened;
+
+/// Most characters of a value in a message.
+const SHOWN_MAX: usize = 80;
+
+/// Sizes of numbers that are written without a power of ten.
+const PLAIN: std::ops::Range<f64> = 1e-6..1e16;
 
 /// A configuration value that is not accepted.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
@@ -48,7 +54,11 @@ impl Checks {
             "" => key.to_string(),
             section => format!("{section}.{key}"),
         };
-        self.found.push(InvalidValue { key, value: echo(value), expected: expected.into() });
+        self.found.push(InvalidValue {
+            key,
+            value: shortened(&value.to_string(), SHOWN_MAX),
+            expected: expected.into(),
+        });
     }
 
     /// As [`Checks::require`], and requires that the value is finite.
@@ -59,7 +69,32 @@ impl Checks {
         ok: bool,
         expected: impl Into<Cow<'static, str>>,
     ) {
-        self.require(key, value, ok && value.is_finite(), expected);
+        let ok = ok && value.is_finite();
+        match PLAIN.contains(&value.abs()) || value == 0.0 {
+            true => self.require(key, value, ok, expected),
+            false => self.require(key, format_args!("{value:e}"), ok, expected),
+        }
+    }
+
+    /// Requires that every value of a list is finite and `ok`. A list of any length is one problem: its first bad value,
+    /// and the number of the others.
+    pub fn numbers(
+        &mut self,
+        key: impl fmt::Display,
+        values: &[f64],
+        ok: impl Fn(f64) -> bool,
+        expected: &'static str,
+    ) {
+        let mut bad = values.iter().enumerate().filter(|(_, value)| !(value.is_finite() && ok(**value)));
+        let Some((index, &value)) = bad.next() else { return };
+        let place = if values.len() == 1 { String::new() } else { format!("[{index}]") };
+        match bad.count() {
+            0 => self.number(format_args!("{key}{place}"), value, false, expected),
+            more => {
+                let expected = format!("{expected}, as of {more} more of its values");
+                self.number(format_args!("{key}{place}"), value, false, expected);
+            }
+        }
     }
 
     /// The values that are not accepted, in the order of the checks; empty if all are good.
@@ -79,7 +114,6 @@ mod tests {
         checks.require("nside", 3, false, "a power of two");
         checks.require("engine", "pixel", true, "pixel or harmonic");
         checks.number("weight_max", f64::INFINITY, true, "a number");
-        checks.number("weight_max", 1e300, false, "less");
         checks.number("epsilon", 0.5, true, "above 0");
         let mut outside = Checks::of("");
         outside.require("seed", "-1", false, format!("0 to {}", u64::MAX));
@@ -88,8 +122,30 @@ mod tests {
         let expected = [
             "map.nside = 3: expected a power of two",
             "map.weight_max = inf: expected a number",
-            "map.weight_max = 1e300: expected less",
             "seed = -1: expected 0 to 18446744073709551615",
+        ];
+        assert_eq!(told, expected);
+    }
+
+    #[test]
+    fn long_values_and_lists_are_told_in_short() {
+        let mut checks = Checks::of("map");
+        checks.require("name", "m".repeat(1000), false, "a name");
+        checks.number("large", 1e300, false, "a number");
+        checks.number("small", -1e-300, false, "a number");
+        let list = vec![-1.0; 1_000_000];
+        checks.numbers("epsilon", &list, |x| x > 0.0, "above 0");
+        checks.numbers("one", &[f64::NAN], |_| true, "a number");
+        checks.numbers("pair", &[1.0, 0.0], |x| x > 0.0, "above 0");
+        checks.numbers("good", &[1.0, 2.0], |x| x > 0.0, "above 0");
+        let told: Vec<String> = checks.finish().iter().map(ToString::to_string).collect();
+        let expected = [
+            format!("map.name = {}... (1000 bytes): expected a name", "m".repeat(80)),
+            "map.large = 1e300: expected a number".to_owned(),
+            "map.small = -1e-300: expected a number".to_owned(),
+            "map.epsilon[0] = -1: expected above 0, as of 999999 more of its values".to_owned(),
+            "map.one = NaN: expected a number".to_owned(),
+            "map.pair[1] = 0: expected above 0".to_owned(),
         ];
         assert_eq!(told, expected);
     }

@@ -17,7 +17,7 @@ mod time;
 pub mod vector;
 
 pub use checks::{Checks, InvalidValue};
-pub use echo::{echo, echo_lines};
+pub use echo::{echo, shortened};
 pub use ids::{ChannelId, MAX_SATELLITES, Pair, PairError, all_pairs};
 pub use interval_set::IntervalSet;
 pub use per_channel::PerChannel;

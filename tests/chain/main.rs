@@ -9,6 +9,8 @@ mod coded;
 mod command_line;
 mod ending;
 mod harmonic;
+mod orbits;
 mod outputs;
 mod paper;
 mod run;
+mod start_up;

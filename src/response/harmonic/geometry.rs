@@ -363,7 +363,7 @@ mod tests {
                 assert!((found.inclination_rad - PI / 6.0).abs() < 1e-9, "{p} {t_s}");
                 let node = -TAU * t_s / (1.3 * 365.25 * 86_400.0);
                 assert!(wrap(found.node_rad - node).abs() < 1e-9, "{p} {t_s}");
-                let arcs = [i, j].map(|n| array.formation().arc_m(n, t_s).0 / RADIUS_M);
+                let arcs = [i, j].map(|n| array.formation().unwrap().arc_m(n, t_s).0 / RADIUS_M);
                 let phase = TAU * (t_s / 8_248.68).fract() - 0.5 * (arcs[0] + arcs[1]);
                 assert!(wrap(found.phase_rad - phase).abs() < 1e-9, "{p} {t_s}");
                 let placed = orbit.pair(&found, 30.0).unwrap();

@@ -1,0 +1,168 @@
+//! Memory that a run may take.
+
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Memory that a run may take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MemoryLimit {
+    /// Bytes.
+    pub bytes: u64,
+    /// What sets the limit.
+    pub source: MemorySource,
+}
+
+/// What limits memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum MemorySource {
+    /// Memory that the system has free or can free.
+    System,
+    /// The limit of a control group, as containers and job schedulers set it.
+    ControlGroup,
+    /// The user.
+    User,
+}
+
+impl fmt::Display for MemorySource {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::System => "MemAvailable of /proc/meminfo",
+            Self::ControlGroup => "the limit of this process's control group",
+            Self::User => "the limit that was given",
+        })
+    }
+}
+
+impl MemoryLimit {
+    /// A limit that a user set.
+    #[must_use]
+    pub fn of_user(bytes: u64) -> Self {
+        Self { bytes, source: MemorySource::User }
+    }
+
+    /// What this machine has available for this process; `None` where the system does not say.
+    #[must_use]
+    pub fn of_machine() -> Option<Self> {
+        Self::below(Path::new("/"))
+    }
+
+    /// As [`Self::of_machine`], with the system's files below `root`.
+    fn below(root: &Path) -> Option<Self> {
+        let system = available_bytes(&fs::read_to_string(root.join("proc/meminfo")).ok()?);
+        let system = system.map(|bytes| Self { bytes, source: MemorySource::System });
+        let groups = group_bytes(root).map(|bytes| Self { bytes, source: MemorySource::ControlGroup });
+        system.into_iter().chain(groups).min_by_key(|limit| limit.bytes)
+    }
+}
+
+/// MemAvailable of `/proc/meminfo`, bytes.
+fn available_bytes(meminfo: &str) -> Option<u64> {
+    let line = meminfo.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    let kibibytes: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    kibibytes.checked_mul(1024)
+}
+
+/// The least memory that a control group of this process, or one above it, has left, bytes.
+fn group_bytes(root: &Path) -> Option<u64> {
+    let groups = fs::read_to_string(root.join("proc/self/cgroup")).ok()?;
+    groups.lines().filter_map(|line| group_line_bytes(root, line)).min()
+}
+
+/// Of one line of `/proc/self/cgroup`: `0::PATH` of version 2, or `ID:CONTROLLERS:PATH` of version 1.
+fn group_line_bytes(root: &Path, line: &str) -> Option<u64> {
+    let mut parts = line.splitn(3, ':').skip(1);
+    let (controllers, path) = (parts.next()?, parts.next()?);
+    let (mount, files) = match controllers {
+        "" => (root.join("sys/fs/cgroup"), ["memory.max", "memory.current", "inactive_file"]),
+        _ if controllers.split(',').any(|name| name == "memory") => (
+            root.join("sys/fs/cgroup/memory"),
+            ["memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"],
+        ),
+        _ => return None,
+    };
+    // Within a container the path may be that of the host, and the container's own group the mount itself.
+    let own: PathBuf = mount.join(path.trim_start_matches('/'));
+    let folders = own.ancestors().take_while(|folder| folder.starts_with(&mount));
+    folders.filter_map(|folder| folder_bytes(folder, files)).min()
+}
+
+/// What one group has left of its limit: file pages that nobody uses can be freed, so they do not count.
+fn folder_bytes(folder: &Path, [limit, usage, unused]: [&str; 3]) -> Option<u64> {
+    let number = |name: &str| fs::read_to_string(folder.join(name)).ok()?.trim().parse::<u64>().ok();
+    let stat = fs::read_to_string(folder.join("memory.stat")).unwrap_or_default();
+    let unused = stat.lines().find_map(|line| line.strip_prefix(unused)?.trim().parse::<u64>().ok());
+    let used = number(usage)?.saturating_sub(unused.unwrap_or(0));
+    Some(number(limit)?.saturating_sub(used))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A folder with these files.
+    fn system(files: &[(&str, &str)]) -> tempfile::TempDir {
+        let root = tempfile::tempdir().unwrap();
+        for (name, text) in files {
+            let path = root.path().join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        }
+        root
+    }
+
+    const MEMINFO: (&str, &str) =
+        ("proc/meminfo", "MemTotal:       24000000 kB\nMemAvailable:   20000000 kB\nBuffers:  1 kB\n");
+
+    fn limit(files: &[(&str, &str)]) -> Option<(u64, MemorySource)> {
+        let limit = MemoryLimit::below(system(files).path());
+        limit.map(|limit| (limit.bytes, limit.source))
+    }
+
+    #[test]
+    fn without_groups_the_system_sets_the_limit() {
+        let system = Some((20_480_000_000, MemorySource::System));
+        assert_eq!(limit(&[MEMINFO]), system);
+        // A group without a limit, and one of other controllers.
+        let free = ("sys/fs/cgroup/memory.max", "max\n");
+        assert_eq!(limit(&[MEMINFO, ("proc/self/cgroup", "0::/\n"), free]), system);
+        assert_eq!(limit(&[MEMINFO, ("proc/self/cgroup", "3:cpu,cpuacct:/x\n")]), system);
+        assert_eq!(limit(&[]), None);
+        assert_eq!(limit(&[("proc/meminfo", "MemTotal: 5 kB\n")]), None);
+        assert_eq!(limit(&[("proc/meminfo", "MemAvailable: many\n")]), None);
+    }
+
+    #[test]
+    fn the_tightest_group_sets_the_limit() {
+        let files = [
+            MEMINFO,
+            ("proc/self/cgroup", "0::/jobs/ours\n"),
+            ("sys/fs/cgroup/jobs/memory.max", "4000000000\n"),
+            ("sys/fs/cgroup/jobs/memory.current", "3000000000\n"),
+            ("sys/fs/cgroup/jobs/memory.stat", "anon 1000000000\nfile 2000000000\ninactive_file 500000000\n"),
+            ("sys/fs/cgroup/jobs/ours/memory.max", "max\n"),
+            ("sys/fs/cgroup/jobs/ours/memory.current", "1000\n"),
+        ];
+        assert_eq!(limit(&files), Some((1_500_000_000, MemorySource::ControlGroup)));
+    }
+
+    #[test]
+    fn groups_of_version_1_are_known() {
+        let files = [
+            MEMINFO,
+            ("proc/self/cgroup", "5:cpu:/a\n9:memory:/docker/0123\n0::/\n"),
+            ("sys/fs/cgroup/memory/memory.limit_in_bytes", "2000000000\n"),
+            ("sys/fs/cgroup/memory/memory.usage_in_bytes", "700000000\n"),
+            ("sys/fs/cgroup/memory/memory.stat", "inactive_file 1\ntotal_inactive_file 200000000\n"),
+        ];
+        assert_eq!(limit(&files), Some((1_500_000_000, MemorySource::ControlGroup)));
+    }
+
+    #[test]
+    fn this_machine_says_what_it_has() {
+        if cfg!(target_os = "linux") {
+            assert!(MemoryLimit::of_machine().is_some_and(|limit| limit.bytes > 0));
+        }
+    }
+}
