@@ -15,7 +15,7 @@ use crate::mother::{
 };
 use crate::response::model::DirectSum;
 use crate::runtime::{Graph, Link};
-use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::fits::read_sky_map;
 use crate::sky::generated::generate;
 use crate::sky::{Frame, SkyMap};
 
@@ -25,13 +25,13 @@ pub const INTEGRATE: &str = "integrate";
 /// The simulated sky of every channel, in its own pixels and frame.
 ///
 /// # Errors
-/// A map that cannot be read or that has pixels without a value.
+/// A map that cannot be read, that has pixels without a value, or that is of another frequency.
 pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
     let config = &plan.config.sky;
     let sky = |(channel, &frequency_hz): (usize, &f64)| match config.file.as_ref() {
         Some(files) => {
             let path = files.get(channel).unwrap_or_default();
-            Ok(read_whole_map(&path, &ReadOptions::default())?)
+            Ok(read_sky_map(&path, frequency_hz, config.frequency)?)
         }
         None => {
             let values = generate(&config.generated, frequency_hz, config.nside, plan.config.seed)?;

@@ -24,7 +24,7 @@ mod rotation;
 pub mod spectra;
 
 pub use compare::{Comparison, ErrorSummary, compare};
-pub use config::{GENERATED_NSIDE_MAX, SkyConfig};
+pub use config::{GENERATED_NSIDE_MAX, MapFrequency, SkyConfig};
 pub use error::MapError;
 pub use frame::{Frame, Rotation, rotate};
 pub use map::{SkyMap, is_unseen};

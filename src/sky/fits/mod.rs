@@ -7,6 +7,7 @@
 
 mod card;
 mod error;
+mod frequency;
 mod header;
 mod read;
 mod table;
@@ -14,6 +15,7 @@ mod write;
 
 pub use card::{Card, CardValue};
 pub use error::{FitsError, FitsProblem};
+pub use frequency::read_sky_map;
 pub use header::Header;
 pub use read::{
     MapFile, ReadOptions, read_map, read_map_file, read_map_from, read_whole_map, read_whole_map_file,
