@@ -21,4 +21,4 @@ pub use formation::Formation;
 pub use integration::{IntegrationRule, integration_time_s};
 pub use orbit::{Array, SatelliteState, hidden_by_moon};
 pub use placing::PlacingCounts;
-pub use windows::{ObservingWindows, earth_in_sight_s};
+pub use windows::{EarthShadow, ObservingWindows, earth_in_sight_s};

@@ -57,6 +57,8 @@ pub enum VisibilityReason {
     StoreFull,
     /// It was sent and did not arrive.
     NotReceived,
+    /// Its flags say that the Earth was in sight of one of its daughters.
+    EarthInSight,
 }
 
 impl Reason for VisibilityReason {
@@ -90,6 +92,7 @@ impl Reason for VisibilityReason {
             Self::SumsFull => "refused by the engine: sums full at this map.weight_max",
             Self::StoreFull => "full",
             Self::NotReceived => "not received",
+            Self::EarthInSight => "Earth in sight of a daughter",
         }
     }
 
@@ -151,6 +154,7 @@ mod tests {
         assert_eq!(texts.len(), all.len());
         // Some of the places, so that none moves unseen.
         assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
-        assert_eq!((all.len(), all.last()), (24, Some(&VisibilityReason::NotReceived)));
+        assert_eq!((all.len(), all[23]), (25, VisibilityReason::NotReceived));
+        assert_eq!(all.last(), Some(&VisibilityReason::EarthInSight));
     }
 }

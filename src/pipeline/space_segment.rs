@@ -68,6 +68,7 @@ pub fn add(
         noise,
         smear_integrations: config.spacecraft.smear_integrations,
         auto_integration_s: config.spacecraft.autos_s(),
+        flag_earth: config.spacecraft.flag_earth,
     };
     let integrator =
         Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options);

@@ -150,6 +150,8 @@ impl Spacecraft {
             division: self.division,
             auto_integration_s: self.auto_integration_s,
             block_samples: self.daughters.block_samples,
+            // These windows are cut from a real one's beginning, in which the last daughters still see the Earth.
+            flag_earth: false,
             wait_blocks: 4,
         };
         let counts = Arc::default();

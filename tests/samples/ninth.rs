@@ -203,6 +203,7 @@ const PIPELINE: &str = r#"
     duration_s = 3e4
     window_s_max = 6.0
     baseline_wavelengths_max = 24.0
+    flag_earth = false # the last daughters see the Earth for 64 s of a window
     [spacecraft.ninth]
     on = true
     integration_s = 2.0
