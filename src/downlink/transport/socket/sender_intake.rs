@@ -192,6 +192,7 @@ mod tests {
             seed: 7,
             configuration_hash: 1,
             spectrometer: None,
+            noiseless: false,
         }
     }
 
