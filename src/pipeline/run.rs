@@ -16,7 +16,7 @@ use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
 use crate::ground::{Ground, WAIT_BYTES};
-use crate::products::{ProductsError, Truth, write_autos};
+use crate::products::{MapShape, ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::solve::SolveWatch;
 
@@ -104,10 +104,12 @@ pub fn run(
     let capacity = plan.config.runtime.queue_capacity;
     let bytes = graph.stage("record", capacity, bytes, recorder);
     let map = &plan.config.map;
-    let truth = match map.engine {
-        EngineKind::Harmonic => Truth::band_limited(&skies, map.nside, map.degree())?,
-        EngineKind::Pixel => Truth::new(&skies, map.nside)?,
+    let shape = MapShape {
+        nside: map.nside,
+        l_max: (map.engine == EngineKind::Harmonic).then(|| map.degree()),
+        processing: plan.config.products.processing(),
     };
+    let truth = Truth::new(&skies, shape)?;
     drop(skies);
     let solving = SolveWatch::new(cancel.clone());
     let ground = Ground::new(&plan.config.ground(WAIT_BYTES))?;

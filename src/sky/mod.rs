@@ -23,7 +23,7 @@ mod map;
 mod rotation;
 pub mod spectra;
 
-pub use compare::{Comparison, ErrorSummary, compare};
+pub use compare::{Comparison, ErrorSummary, InputSky, compare, compare_with};
 pub use config::{GENERATED_NSIDE_MAX, MapFrequency, SkyConfig};
 pub use error::MapError;
 pub use frame::{Frame, Rotation, rotate};

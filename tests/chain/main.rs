@@ -9,4 +9,5 @@ mod coded;
 mod command_line;
 mod harmonic;
 mod paper;
+mod products;
 mod run;
