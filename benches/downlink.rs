@@ -42,6 +42,7 @@ fn instrument() -> Instrument {
         seed: 0,
         configuration_hash: 0,
         spectrometer: None,
+        noiseless: false,
     }
 }
 

@@ -65,6 +65,7 @@ fn mission() -> Vec<GroundFrame> {
         seed: 1,
         configuration_hash: 2,
         spectrometer: None,
+        noiseless: false,
     })];
     for pass in 0..2 {
         let start = MissionTime(8_000_000_000 * pass);

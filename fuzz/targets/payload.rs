@@ -34,6 +34,7 @@ fuzz_target!(|data: &[u8]| {
         seed: 1,
         configuration_hash: 2,
         spectrometer: None,
+        noiseless: false,
     });
     let mut packetizer = Packetizer::new(&Default::default()).expect("default");
     packetizer.encode(&instrument, &mut stream).expect("sound");

@@ -68,7 +68,8 @@ pub struct MapConfig {
     pub residual_max: f64,
     /// Iteration limit of a harmonic solution.
     pub iterations_max: usize,
-    /// Random probes for the traces of the covariances of a final harmonic map; 0 for none.
+    /// Random probes for the traces of the covariances of a final map; 0 for no traces. Those of up to 3072 unknowns (nside 16,
+    /// or l_max 54) are exact and need none: any number above 0 will do.
     pub trace_probes: usize,
     /// Departures from the common circle that the harmonic engine accepts.
     pub limits: GeometryLimits,
@@ -122,6 +123,7 @@ impl MapConfig {
             let degree = self.degree() as f64;
             checks.number("l_max", degree, self.degree() <= L_MAX, "at most 383; 0 stands for 2.5 nside");
         }
+        self.check_effects(&mut checks);
         let residual = self.residual_max;
         checks.number("residual_max", residual, residual > 0.0 && residual < 1.0, "above 0 and below 1");
         let iterations = self.iterations_max as f64;
@@ -142,6 +144,27 @@ impl MapConfig {
         let files = self.prior_files.len();
         checks.require("prior_files", format!("({files} files)"), one, "none where map.prior_k is given");
         checks.finish()
+    }
+
+    /// Requires that keys of the other engine are not set.
+    fn check_effects(&self, checks: &mut Checks) {
+        let usual = Self::default();
+        let (other, set) = match self.engine {
+            EngineKind::Pixel => (
+                "harmonic",
+                vec![
+                    ("l_max", self.l_max != usual.l_max),
+                    ("residual_max", self.residual_max != usual.residual_max),
+                    ("iterations_max", self.iterations_max != usual.iterations_max),
+                    ("limits", self.limits != usual.limits),
+                ],
+            ),
+            EngineKind::Harmonic => ("pixel", vec![("rows", self.rows != usual.rows)]),
+        };
+        for (key, is_set) in set {
+            let expected = format!("no such key: it has no effect without map.engine = \"{other}\"");
+            checks.require(key, "(set)", !is_set, expected);
+        }
     }
 
     /// Greatest degree of a map from the harmonic engine.

@@ -186,4 +186,17 @@ pub trait NormalSums: Send {
 
     /// Number and weight of the visibilities in the sums.
     fn counts(&self) -> SumCounts;
+
+    /// How well the eigenvalues of `BtN^-1B` are known.
+    fn accuracy(&self) -> Accuracy;
+}
+
+/// What rounding and the approximations of an engine leave open of an eigenvalue W of `BtN^-1B`: `relative` W + `absolute`
+/// W_max, as measured against rows one by one in f64.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Accuracy {
+    /// Of the eigenvalue itself.
+    pub relative: f64,
+    /// Of the largest one. Much smaller eigenvalues have no meaning.
+    pub absolute: f64,
 }

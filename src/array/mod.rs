@@ -25,4 +25,4 @@ pub use kepler::KeplerElements;
 pub use orbit::{Array, hidden_by_moon};
 pub use placing::PlacingCounts;
 pub use state::SatelliteState;
-pub use windows::{ObservingWindows, earth_in_sight_s};
+pub use windows::{EarthShadow, ObservingWindows, earth_in_sight_s};

@@ -2,7 +2,7 @@
 
 use super::orbit::Array;
 use crate::frames::ObservingWindow;
-use crate::units::MissionTime;
+use crate::units::{MissionTime, Pair};
 
 /// Steps an orbit of the search for a limb crossing; a window is a third of an orbit.
 const STEPS_PER_ORBIT: f64 = 64.0;
@@ -45,6 +45,53 @@ impl<'a> ObservingWindows<'a> {
             now_s = next_s;
         }
         None
+    }
+}
+
+/// When the Earth is hidden from each daughter during an observing window.
+///
+/// A window is daughter 1's. Those that trail her see the Earth set later, the last of the fiducial array by 64 s at most
+/// (100 km of arc at 1.55 km/s), and rise later.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct EarthShadow {
+    /// By daughter: first and last tick.
+    spans: Vec<[MissionTime; 2]>,
+}
+
+impl EarthShadow {
+    /// The spans of all daughters within `window`. A daughter from which the Earth is hidden at neither end nor in the middle
+    /// of it counts as not in the shadow at all.
+    #[must_use]
+    pub fn new(array: &Array, window: ObservingWindow) -> Self {
+        let [start_s, end_s] = [window.start, window.end].map(MissionTime::seconds);
+        let span = |n: usize| {
+            // The window's own edges are hers, to the tick.
+            if n == 0 {
+                return [window.start, window.end];
+            }
+            let is_hidden = |t_s: f64| array.earth_depth_of_m(n, t_s) > 0.0;
+            let inside = [start_s, end_s, 0.5 * (start_s + end_s)].into_iter().find(|t_s| is_hidden(*t_s));
+            let Some(inside_s) = inside else { return [window.end, window.start] };
+            // Whole ticks within the shadow.
+            let from = match is_hidden(start_s) {
+                true => window.start,
+                false => MissionTime::from_seconds(bisect(start_s, inside_s, is_hidden)).plus_ticks(1),
+            };
+            let until = match is_hidden(end_s) {
+                true => window.end,
+                false => MissionTime::from_seconds(bisect(inside_s, end_s, |t| !is_hidden(t))).plus_ticks(-1),
+            };
+            [from, until]
+        };
+        Self { spans: (0..array.satellites()).map(span).collect() }
+    }
+
+    /// Whether the Earth is hidden from both daughters of `pair` from `from` to `until`.
+    #[must_use]
+    pub fn covers(&self, pair: Pair, from: MissionTime, until: MissionTime) -> bool {
+        [pair.i, pair.j].into_iter().all(|n| {
+            self.spans.get(usize::from(n)).is_some_and(|[first, last]| *first <= from && until <= *last)
+        })
     }
 }
 

@@ -150,6 +150,7 @@ mod tests {
             seed: 7,
             configuration_hash: 1,
             spectrometer: None,
+            noiseless: false,
         };
         let power = |daughter, time_s, power_k_sr| AutoPower {
             daughter,

@@ -94,6 +94,7 @@ mod tests {
             seed: 0,
             configuration_hash: 0,
             spectrometer: None,
+            noiseless: false,
         }
     }
 

@@ -42,7 +42,7 @@
 //!
 //! | kind | record | arrays |
 //! |---|---|---|
-//! | instrument | name (u64 length, UTF-8), epoch_tai_s f64, moon_radius_m f64, satellites u8, response u8, seed u64, configuration_hash u64, channels u16 | channels x (frequency_hz, width_hz) f64; with a spectrometer also low_hz, width_hz, channels f64 |
+//! | instrument | name (u64 length, UTF-8), epoch_tai_s f64, moon_radius_m f64, satellites u8, response u8 (plus 128 without thermal noise), seed u64, configuration_hash u64, channels u16 | channels x (frequency_hz, width_hz) f64; with a spectrometer also low_hz, width_hz, channels f64 |
 //! | ephemeris | start_ticks i64, step_ticks u32, satellites u8, nodes u32 | nodes x satellites x 3 positions f64, m |
 //! | visibilities | channel u16, i u8, j u8, start_ticks i64, count u32 | count each: offset_ticks u32, duration_ticks u32, value (re, im) f32 x 2, weight f32, flags u8 |
 //! | housekeeping | time_ticks i64, sampled u64, dropped u64 | |

@@ -17,6 +17,8 @@ impl Flags {
     pub const SATURATED: Self = Self(4);
     /// Calibration rejected it.
     pub const UNCALIBRATED: Self = Self(8);
+    /// The Earth was in sight of one of the two daughters during part of the integration.
+    pub const EARTH: Self = Self(16);
 
     /// Whether no bit is set.
     #[must_use]
@@ -33,6 +35,7 @@ impl Flags {
             Self::INCOMPLETE => Some(VisibilityReason::Incomplete),
             Self::SATURATED => Some(VisibilityReason::Saturated),
             Self::UNCALIBRATED => Some(VisibilityReason::Uncalibrated),
+            Self::EARTH => Some(VisibilityReason::EarthInSight),
             _ => Some(VisibilityReason::UnknownFlag),
         }
     }

@@ -1,5 +1,10 @@
 //! The instrument description: all that the ground knows of the array, except its ephemeris.
 
+use bincode::de::Decoder;
+use bincode::enc::Encoder;
+use bincode::error::{DecodeError, EncodeError};
+use bincode::{Decode, Encode};
+
 use crate::units::{ChannelId, Pair};
 
 /// One frequency channel.
@@ -47,7 +52,7 @@ impl Spectrometer {
 }
 
 /// The instrument description at the start of a downlink.
-#[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Instrument {
     /// Name of the pipeline or mission.
     pub name: String,
@@ -67,9 +72,36 @@ pub struct Instrument {
     pub configuration_hash: u64,
     /// Spectrometer, if any: the satellite after those that are correlated, with the channels after theirs.
     pub spectrometer: Option<Spectrometer>,
+    /// Whether a simulation left thermal noise out.
+    pub noiseless: bool,
 }
 
+/// Added to the code of an antenna response by a simulation without thermal noise.
+const NOISELESS: u8 = 128;
+
 impl Instrument {
+    /// Antenna response and whether there is thermal noise, in one byte of packets and of states: 0 (isotropic) or 1
+    /// (dipole), plus 128 without noise.
+    #[must_use]
+    pub fn response_code(&self) -> u8 {
+        let response = match self.response {
+            AntennaResponse::Isotropic => 0,
+            AntennaResponse::DipoleNormal => 1,
+        };
+        response | if self.noiseless { NOISELESS } else { 0 }
+    }
+
+    /// What [`Instrument::response_code`] stands for; `None` if nothing has that code.
+    #[must_use]
+    pub fn response_of_code(code: u8) -> Option<(AntennaResponse, bool)> {
+        let response = match code & !NOISELESS {
+            0 => AntennaResponse::Isotropic,
+            1 => AntennaResponse::DipoleNormal,
+            _ => return None,
+        };
+        Some((response, code & NOISELESS != 0))
+    }
+
     /// The channel in which `pair` measures; `None` if it has no such channel.
     #[must_use]
     pub fn channel_of(&self, channel: ChannelId, pair: Pair) -> Option<Channel> {
@@ -89,3 +121,34 @@ impl Instrument {
         self.spectrometer.is_some() && (pair.i, pair.j) == (self.satellites, self.satellites)
     }
 }
+
+impl Encode for Instrument {
+    fn encode<E: Encoder>(&self, out: &mut E) -> Result<(), EncodeError> {
+        let Self { name, epoch_tai_s, moon_radius_m, satellites, channels, .. } = self;
+        (name, epoch_tai_s, moon_radius_m, satellites, channels).encode(out)?;
+        (self.response_code(), self.seed, self.configuration_hash, &self.spectrometer).encode(out)
+    }
+}
+
+impl<C> Decode<C> for Instrument {
+    fn decode<D: Decoder<Context = C>>(from: &mut D) -> Result<Self, DecodeError> {
+        let (name, epoch_tai_s, moon_radius_m, satellites, channels) = Decode::decode(from)?;
+        let (code, seed, configuration_hash, spectrometer) = Decode::decode(from)?;
+        let (response, noiseless) =
+            Self::response_of_code(code).ok_or(DecodeError::Other("an unknown antenna response"))?;
+        Ok(Self {
+            name,
+            epoch_tai_s,
+            moon_radius_m,
+            satellites,
+            channels,
+            response,
+            seed,
+            configuration_hash,
+            spectrometer,
+            noiseless,
+        })
+    }
+}
+
+bincode::impl_borrow_decode!(Instrument);

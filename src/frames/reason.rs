@@ -63,6 +63,8 @@ pub enum VisibilityReason {
     BadValue,
     /// It arrived after the session was interrupted, which keeps it for the next one.
     NextSession,
+    /// Its flags say that the Earth was in sight of one of its daughters.
+    EarthInSight,
 }
 
 impl Reason for VisibilityReason {
@@ -99,6 +101,7 @@ impl Reason for VisibilityReason {
             Self::NotReceivedAtLeast => "not received (at least)",
             Self::BadValue => "value or weight that cannot be used, as it was sent",
             Self::NextSession => "left for the next session",
+            Self::EarthInSight => "Earth in sight of a daughter",
         }
     }
 
@@ -160,6 +163,7 @@ mod tests {
         assert_eq!(texts.len(), all.len());
         // Some of the places, so that none moves unseen.
         assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
-        assert_eq!((all.len(), all.last()), (27, Some(&VisibilityReason::NextSession)));
+        assert_eq!((all.len(), all[23]), (28, VisibilityReason::NotReceived));
+        assert_eq!(all.last(), Some(&VisibilityReason::EarthInSight));
     }
 }

@@ -41,6 +41,9 @@ pub struct SpacecraftConfig {
     pub every_nth_window: u64,
     /// Observe only for this time from the start of each window, s; 0 for all of it.
     pub window_s_max: f64,
+    /// Flag a visibility while the Earth is in sight of one of its two daughters. Windows are daughter 1's, and the others
+    /// trail her into the shadow.
+    pub flag_earth: bool,
     /// Send only every n-th integration of a window.
     pub every_nth_integration: PerChannel<u64>,
     /// Longest integration, s.
@@ -138,6 +141,7 @@ impl Default for SpacecraftConfig {
             duration_s: 1.3 * YEAR_S,
             every_nth_window: 1,
             window_s_max: 0.0,
+            flag_earth: true,
             every_nth_integration: PerChannel::All(1),
             integration_s_max: rule.duration_s_max,
             motion_wavelengths_max: rule.motion_wavelengths_max,

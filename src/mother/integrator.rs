@@ -10,11 +10,11 @@ use rayon::prelude::*;
 
 use super::powers::SkyPowers;
 use super::schedule::{Integration, Schedule};
-use crate::array::{Array, segments_for};
+use crate::array::{Array, EarthShadow, segments_for};
 use crate::frames::{Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, VisibilityBlock};
 use crate::response::model::{ModelError, PairPosition, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
-use crate::units::{ChannelId, Pair, StreamKind, TICKS_PER_SECOND, all_pairs, random_stream};
+use crate::units::{ChannelId, MissionTime, Pair, StreamKind, TICKS_PER_SECOND, all_pairs, random_stream};
 
 /// Largest spacing of tabulated positions, s; interpolation is then accurate to micrometres.
 pub(super) const EPHEMERIS_STEP_S: f64 = 60.0;
@@ -48,6 +48,8 @@ pub struct MeasurementOptions {
     pub smear_integrations: bool,
     /// Integration time of the auto-correlations, s; 0 for none.
     pub auto_integration_s: f64,
+    /// Whether visibilities are flagged while the Earth is in sight of one of their daughters.
+    pub flag_earth: bool,
 }
 
 /// A window whose visibilities have not been predicted yet.
@@ -69,6 +71,19 @@ struct WindowChannel<'a> {
     window: ObservingWindow,
     channel: ChannelId,
     powers: &'a SkyPowers,
+    /// Present if the Earth in sight is flagged.
+    shadow: Option<&'a EarthShadow>,
+}
+
+impl WindowChannel<'_> {
+    /// Flags of an integration.
+    fn flags(&self, pair: Pair, from: MissionTime, duration_ticks: u32) -> Flags {
+        let until = from.plus_ticks(duration_ticks.into());
+        match self.shadow {
+            Some(shadow) if !shadow.covers(pair, from, until) => Flags::EARTH,
+            _ => Flags::GOOD,
+        }
+    }
 }
 
 /// Thermal noise of integrated visibilities.
@@ -142,12 +157,13 @@ impl Integrator {
     fn measure_queue(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
         let queued = std::mem::take(&mut self.queued);
         let windows: Vec<ObservingWindow> = queued.iter().map(|queued| queued.window).collect();
+        let shadows = self.shadows(&windows);
         // By channel, then by window.
         let mut blocks: Vec<std::vec::IntoIter<Vec<VisibilityBlock>>> = Vec::new();
         let mut powers: Vec<Vec<SkyPowers>> = Vec::new();
         for channel in 0..self.schedules.len() {
             let sky = SkyPowers::predict(self.models[channel].as_mut(), &self.array, &windows)?;
-            blocks.push(self.channel_blocks(&queued, channel, &sky)?.into_iter());
+            blocks.push(self.channel_blocks(&queued, channel, &sky, &shadows)?.into_iter());
             powers.push(sky);
             if out.is_closed() {
                 return Ok(());
@@ -160,7 +176,8 @@ impl Integrator {
             }
             let visibilities = blocks.iter_mut().flat_map(|windows| windows.next().unwrap_or_default());
             let autos = powers.iter().zip(0..).flat_map(|(powers, channel)| {
-                self.autos(WindowChannel { window, channel: ChannelId(channel), powers: &powers[k] })
+                let (channel, shadow) = (ChannelId(channel), shadows.get(k));
+                self.autos(WindowChannel { window, channel, powers: &powers[k], shadow })
             });
             let mut sampled = 0;
             for block in visibilities.chain(autos) {
@@ -177,19 +194,29 @@ impl Integrator {
         Ok(())
     }
 
+    /// The Earth's shadow in each window; none if it does not matter.
+    fn shadows(&self, windows: &[ObservingWindow]) -> Vec<EarthShadow> {
+        if !self.options.flag_earth {
+            return Vec::new();
+        }
+        windows.iter().map(|window| EarthShadow::new(&self.array, *window)).collect()
+    }
+
     /// The measurements of one channel, window by window and pair by pair.
     fn channel_blocks(
         &mut self,
         queued: &[QueuedWindow],
         channel: usize,
         powers: &[SkyPowers],
+        shadows: &[EarthShadow],
     ) -> Result<Vec<Vec<VisibilityBlock>>, ModelError> {
         let scheduled: Vec<(WindowChannel, &Scheduled)> = queued
             .iter()
             .zip(powers)
-            .flat_map(|(queued, powers)| {
-                let context =
-                    WindowChannel { window: queued.window, channel: ChannelId(channel as u16), powers };
+            .enumerate()
+            .flat_map(|(k, (queued, powers))| {
+                let (window, shadow) = (queued.window, shadows.get(k));
+                let context = WindowChannel { window, channel: ChannelId(channel as u16), powers, shadow };
                 queued.channels[channel].iter().map(move |pair| (context, pair))
             })
             .collect();
@@ -235,10 +262,11 @@ impl Integrator {
     /// Adds noise, weights and time tags to the model's predictions.
     fn measure(
         &self,
-        WindowChannel { window, channel, powers }: WindowChannel,
+        context: WindowChannel,
         scheduled: &Scheduled,
         predictions: &[Complex64],
     ) -> VisibilityBlock {
+        let WindowChannel { window, channel, powers, .. } = context;
         let (pair, noise_model) = (scheduled.pair, self.options.noise);
         let width_hz = self.instrument.channels[usize::from(channel.0)].width_hz;
         let mut noise = noise_model.stream(window, channel, pair);
@@ -259,13 +287,14 @@ impl Integrator {
             block.duration_ticks.push(integration.duration_ticks);
             block.value_k_sr.push(Complex32::new(value.re as f32, value.im as f32));
             block.weight.push((sigma * sigma).recip() as f32);
-            block.flags.push(Flags::GOOD);
+            block.flags.push(context.flags(pair, from, integration.duration_ticks));
         }
         block
     }
 
     /// Auto-correlations over a window, if configured: contiguous integrations, the last one cut at the window's end.
-    fn autos(&self, WindowChannel { window, channel, powers }: WindowChannel) -> Vec<VisibilityBlock> {
+    fn autos(&self, context: WindowChannel) -> Vec<VisibilityBlock> {
+        let WindowChannel { window, channel, powers, .. } = context;
         let step = (self.options.auto_integration_s * TICKS_PER_SECOND as f64) as u32;
         if step == 0 {
             return Vec::new();
@@ -281,7 +310,8 @@ impl Integrator {
             for offset in (0..length).step_by(step as usize) {
                 let duration = step.min(length - offset);
                 let dt_s = f64::from(duration) / TICKS_PER_SECOND as f64;
-                let middle_s = window.start.plus_ticks(offset.into()).seconds() + 0.5 * dt_s;
+                let from = window.start.plus_ticks(offset.into());
+                let middle_s = from.seconds() + 0.5 * dt_s;
                 let expected_k_sr =
                     noise_model.receiver_noise_k_sr + powers.at(&self.array, n.into(), middle_s);
                 let samples = width_hz * dt_s;
@@ -296,7 +326,7 @@ impl Integrator {
                 block.duration_ticks.push(duration);
                 block.value_k_sr.push(Complex32::new(power as f32, 0.0));
                 block.weight.push((samples / (power * power)) as f32);
-                block.flags.push(Flags::GOOD);
+                block.flags.push(context.flags(pair, from, duration));
             }
             block
         };

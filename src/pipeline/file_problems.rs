@@ -11,9 +11,11 @@ impl Plan {
     #[must_use]
     pub fn file_problems(&self) -> Problems {
         let mut found = Problems::default();
-        let may_be_dark = self.config.spacecraft.receiver_noise_k_sr > 0.0;
-        let skies = self.config.sky.file.iter().flat_map(|files| files.values());
-        let skies = skies.map(|path| read_sky(path, may_be_dark));
+        let (sky, spacecraft) = (&self.config.sky, &self.config.spacecraft);
+        let skies = sky.file.iter().flat_map(|files| files.values());
+        let skies = skies.zip(&spacecraft.channels_hz).map(|(path, &frequency_hz)| {
+            read_sky(path, frequency_hz, sky.frequency, spacecraft.receiver_noise_k_sr > 0.0)
+        });
         let priors = self.config.map.prior_files.iter();
         let priors = priors.map(|path| read_whole_map(path, &ReadOptions::default()));
         for problem in skies.chain(priors).filter_map(Result::err) {

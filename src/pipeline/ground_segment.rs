@@ -68,7 +68,7 @@ pub(super) fn add(
         trace_probes: config.map.trace_probes,
         watch,
     };
-    let provenance = Provenance { ground_hash: config.ground_hash() };
+    let provenance = Provenance { ground_hash: config.ground_hash(), map: config.map.clone() };
     let channels = Arc::clone(&outcome.channels);
     let publisher = Publisher::new(config.products.clone(), out, truth, provenance, channels)?;
     // Sums are large: one waits while another is solved.

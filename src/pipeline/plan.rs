@@ -44,6 +44,7 @@ impl Plan {
             seed: config.seed,
             configuration_hash: config.space_hash(),
             spectrometer: spacecraft.ninth.spectrometer(),
+            noiseless: !spacecraft.thermal_noise,
         };
         let schedules = spacecraft.schedules();
         let mut windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.every_nth_window);

@@ -17,7 +17,7 @@ use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, Soc
 use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
 use crate::files::FolderLock;
 use crate::ground::{Ground, SharedSaving, WAIT_BYTES};
-use crate::products::{ProductsError, Truth, write_autos};
+use crate::products::{MapShape, ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::solve::SolveWatch;
 
@@ -110,10 +110,12 @@ pub fn run(
     let capacity = plan.config.runtime.queue_capacity;
     let bytes = graph.stage(RECORD, capacity, bytes, recorder);
     let map = &plan.config.map;
-    let truth = match map.engine {
-        EngineKind::Harmonic => Truth::band_limited(&skies, map.nside, map.degree())?,
-        EngineKind::Pixel => Truth::new(&skies, map.nside)?,
+    let shape = MapShape {
+        nside: map.nside,
+        l_max: (map.engine == EngineKind::Harmonic).then(|| map.degree()),
+        processing: plan.config.products.processing(),
     };
+    let truth = Truth::new(&skies, shape)?;
     drop(skies);
     let grace = Grace::of(&plan.config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);

@@ -43,6 +43,7 @@ pub fn sample_stages(
         instrument,
         division,
         auto_integration_s: config.spacecraft.autos_s(),
+        flag_earth: config.spacecraft.flag_earth,
         block_samples: daughters.block_samples,
         wait_blocks: config.spacecraft.wait_blocks,
     };

@@ -25,13 +25,14 @@ pub const INTEGRATE: &str = "integrate";
 /// The simulated sky of every channel, in its own pixels and frame.
 ///
 /// # Errors
-/// A map that cannot be read, or that has pixels that are no temperature of a sky.
+/// A map that cannot be read, that has pixels that are no temperature of a sky, or that is of another frequency.
 pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
     let config = &plan.config.sky;
     let sky = |(channel, &frequency_hz): (usize, &f64)| match config.file.as_ref() {
         Some(files) => {
             let path = files.get(channel).unwrap_or_default();
-            Ok(read_sky(&path, plan.config.spacecraft.receiver_noise_k_sr > 0.0)?)
+            let may_be_dark = plan.config.spacecraft.receiver_noise_k_sr > 0.0;
+            Ok(read_sky(&path, frequency_hz, config.frequency, may_be_dark)?)
         }
         None => {
             let values = generate(&config.generated, frequency_hz, config.nside, plan.config.seed)?;
@@ -82,6 +83,7 @@ pub fn add(
         noise,
         smear_integrations: config.spacecraft.smear_integrations,
         auto_integration_s: config.spacecraft.autos_s(),
+        flag_earth: config.spacecraft.flag_earth,
     };
     let integrator =
         Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options);

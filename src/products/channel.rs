@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::config::ProductsConfig;
+use super::config::{PostProcessing, ProductsConfig};
 use super::error::ProductsError;
 use super::pictures::{
     Axis, Bars, ColourScale, Curve, MapPanel, Palette, Picture, PictureError, Plot, Sampling, Scaling, Sheet,
@@ -10,8 +10,9 @@ use super::pictures::{
 };
 use super::provenance::Provenance;
 use super::summary::{ChannelSummary, SnapshotSummary};
+use super::truth::ChannelTruth;
 use crate::sky::fits::{WriteOptions, write_map};
-use crate::sky::{Comparison, Frame, SkyMap, compare};
+use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with};
 use crate::solve::Solution;
 use crate::units::constants::DAY_S;
 
@@ -26,7 +27,7 @@ pub(super) struct ChannelFolder {
     /// Name of the channel's folder within `root`.
     name: String,
     frequency_hz: f64,
-    truth: Option<SkyMap>,
+    truth: Option<ChannelTruth>,
     /// Snapshots for the sheet.
     shown: SheetMaps,
     snapshots: Vec<SnapshotSummary>,
@@ -39,7 +40,7 @@ impl ChannelFolder {
     pub(super) fn open(
         root: &Path,
         config: &ProductsConfig,
-        truth: Option<&SkyMap>,
+        truth: Option<&ChannelTruth>,
         solution: &Solution,
     ) -> Result<Self, ProductsError> {
         let channel = usize::from(solution.channel.0);
@@ -67,28 +68,50 @@ impl ChannelFolder {
         solution: &Solution,
         provenance: &Provenance,
     ) -> Result<(), ProductsError> {
-        let map = SkyMap::new(Frame::Ecliptic, solution.map_k.clone())?;
-        let noise = SkyMap::new(Frame::Ecliptic, solution.noise_k.clone())?;
-        // A map of harmonics has no power beyond its own degrees.
-        let l_max = solution.diagnostics.l_max;
-        let comparison =
-            self.truth.as_ref().map(|truth| compare(&map, truth, Some(&noise), l_max)).transpose()?;
-        self.note(solution, comparison.as_ref());
+        let solved = ShownMaps {
+            map: SkyMap::new(Frame::Ecliptic, solution.map_k.clone())?,
+            noise: SkyMap::new(Frame::Ecliptic, solution.noise_k.clone())?,
+            processing: None,
+        };
+        let origin = Origin { provenance, solution };
+        let processed =
+            self.config.processing().map(|processing| solved.processed(processing)).transpose()?;
+        let shown = processed.as_ref().unwrap_or(&solved);
+        let comparison = self.compare(solution, shown)?;
+        self.note(solution, shown, comparison.as_ref());
         if self.config.snapshot_maps && !solution.is_final {
-            self.write_map(&format!("snapshot-{:03}.fits", solution.number), &map, provenance, solution)?;
+            let name = format!("snapshot-{:03}.fits", solution.number);
+            self.write_map(&name, &solved.map, None, origin)?;
         }
         if self.config.pictures {
-            self.shown.offer(&solution.map_k, &caption(solution));
-            self.draw_snapshot(solution)?;
+            self.shown.offer(shown.map.values(), &caption(solution));
+            self.draw_snapshot(solution, shown)?;
         }
         if solution.is_final {
-            self.write_final(solution, &map, &noise, provenance)?;
+            for maps in [Some(&solved), processed.as_ref()].into_iter().flatten() {
+                self.write_final(maps, origin)?;
+            }
             if self.config.pictures {
-                self.draw_final(solution, comparison.as_ref())?;
+                self.draw_final(shown, comparison.as_ref(), origin)?;
             }
             self.summary = Some(self.summarise(solution, comparison));
         }
         Ok(())
+    }
+
+    /// The truth for maps that are shown.
+    fn input(&self, processing: Option<PostProcessing>) -> Option<&InputSky> {
+        let truth = self.truth.as_ref()?;
+        if processing.is_some() { truth.processed.as_ref() } else { Some(&truth.plain) }
+    }
+
+    fn compare(&self, solution: &Solution, shown: &ShownMaps) -> Result<Option<Comparison>, ProductsError> {
+        let Some(input) = self.input(shown.processing) else { return Ok(None) };
+        // A map of harmonics has no power beyond its own degrees; pixels that were split have no more than before.
+        let l_max = solution.diagnostics.l_max.unwrap_or(3 * solution.nside - 1);
+        let comparison = compare_with(&shown.map, input, Some(&shown.noise), Some(l_max))?;
+        let is_noisy = !solution.instrument.noiseless;
+        Ok(Some(if is_noisy { comparison.with_noise_subtracted() } else { comparison }))
     }
 
     /// The summary, if there was a final map.
@@ -96,22 +119,23 @@ impl ChannelFolder {
         self.summary.map(|summary| ChannelSummary { files: self.files, ..summary })
     }
 
-    fn note(&mut self, solution: &Solution, comparison: Option<&Comparison>) {
+    fn note(&mut self, solution: &Solution, shown: &ShownMaps, comparison: Option<&Comparison>) {
+        let input = self.input(shown.processing);
+        let rms_error_over_rms_truth =
+            input.map(|input| rms_error_over_rms_truth(shown.map.values(), input.map.values()));
         self.snapshots.push(SnapshotSummary {
             number: solution.number,
             until_s: solution.span_s[1],
             visibilities: solution.visibilities,
-            rms_error_over_rms_truth: self
-                .truth
-                .as_ref()
-                .map(|truth| rms_error_over_rms_truth(&solution.map_k, truth.values())),
+            rms_error_over_rms_truth,
             rho_mean: comparison.map(|c| mean_rho(&c.rho, 2 * solution.nside)),
         });
     }
 
     fn summarise(&self, solution: &Solution, comparison: Option<Comparison>) -> ChannelSummary {
         let pixels = solution.map_k.len() as f64;
-        let (rho, snr) = comparison.map_or((None, None), |c| (Some(c.rho), c.snr));
+        let (rho, rho_noise_subtracted, snr) =
+            comparison.map_or((None, None, None), |c| (Some(c.rho), c.rho_noise_subtracted, c.snr));
         ChannelSummary {
             frequency_hz: self.frequency_hz,
             seed: solution.instrument.seed,
@@ -123,7 +147,10 @@ impl ChannelFolder {
             noise_rms_k: (solution.noise_k.iter().map(|x| x * x).sum::<f64>() / pixels).sqrt(),
             diagnostics: solution.diagnostics,
             snapshots: self.snapshots.clone(),
+            thermal_noise: !solution.instrument.noiseless,
+            post_processing: self.config.processing(),
             rho,
+            rho_noise_subtracted,
             snr,
             files: Vec::new(),
         }
@@ -141,37 +168,32 @@ impl ChannelFolder {
         &mut self,
         name: &str,
         map: &SkyMap,
-        provenance: &Provenance,
-        solution: &Solution,
+        processing: Option<PostProcessing>,
+        Origin { provenance, solution }: Origin<'_>,
     ) -> Result<(), ProductsError> {
         let what = name.trim_end_matches(".fits");
-        let options = WriteOptions { cards: provenance.cards(solution, what), ..WriteOptions::default() };
+        let cards = provenance.cards(solution, what, processing);
+        let options = WriteOptions { cards, ..WriteOptions::default() };
         let path = self.file(name);
         Ok(write_map(&path, map, &options)?)
     }
 
-    fn write_final(
-        &mut self,
-        solution: &Solution,
-        map: &SkyMap,
-        noise: &SkyMap,
-        provenance: &Provenance,
-    ) -> Result<(), ProductsError> {
-        self.write_map("map.fits", map, provenance, solution)?;
-        self.write_map("noise.fits", noise, provenance, solution)?;
-        if self.config.smooth_fwhm_deg > 0.0 {
-            let smooth = map.refined(4, self.config.smooth_fwhm_deg.to_radians())?;
-            self.write_map("map-smooth.fits", &smooth, provenance, solution)?;
-        }
-        if let Some(truth) = self.truth.clone() {
-            self.write_map("input.fits", &truth, provenance, solution)?;
+    /// Map, noise and input, as solved or post-processed.
+    fn write_final(&mut self, maps: &ShownMaps, origin: Origin<'_>) -> Result<(), ProductsError> {
+        let &ShownMaps { ref map, ref noise, processing } = maps;
+        let ending = if processing.is_some() { "-smooth" } else { "" };
+        self.write_map(&format!("map{ending}.fits"), map, processing, origin)?;
+        self.write_map(&format!("noise{ending}.fits"), noise, processing, origin)?;
+        if let Some(input) = self.input(processing).map(|input| input.map.clone()) {
+            self.write_map(&format!("input{ending}.fits"), &input, processing, origin)?;
         }
         Ok(())
     }
 
     /// The colour scale that map and input share: the range of the input, or of the map if there is no input.
-    fn scale(&self, map_k: &[f64]) -> ColourScale {
-        let reference = self.truth.as_ref().map_or(map_k, SkyMap::values);
+    fn scale(&self, shown: &ShownMaps) -> ColourScale {
+        let input = self.input(shown.processing).map(|input| &input.map);
+        let reference = input.unwrap_or(&shown.map).values();
         ColourScale::robust(reference, Scaling::Log, Palette::default())
     }
 
@@ -179,11 +201,11 @@ impl ChannelFolder {
         MapPanel { values, caption: caption.to_owned(), scale, unit: "K".to_owned() }
     }
 
-    fn draw_snapshot(&mut self, solution: &Solution) -> Result<(), ProductsError> {
-        let map = &solution.map_k;
+    fn draw_snapshot(&mut self, solution: &Solution, shown: &ShownMaps) -> Result<(), ProductsError> {
+        let map = shown.map.values();
         let title = format!("{} MHz, {}", self.frequency_hz / 1e6, caption(solution));
         let subtitle = format!("{} visibilities", solution.visibilities);
-        let panel = self.panel(map, "", self.scale(map));
+        let panel = self.panel(map, "", self.scale(shown));
         let path = self.file(&format!("snapshot-{:03}.png", solution.number));
         // Half the size of the final picture, because there are many.
         let sheet = Sheet { title, subtitle, width_px: 800, view: view(), ..Sheet::default() };
@@ -192,35 +214,43 @@ impl ChannelFolder {
 
     fn draw_final(
         &mut self,
-        solution: &Solution,
+        shown: &ShownMaps,
         comparison: Option<&Comparison>,
+        Origin { provenance, solution }: Origin<'_>,
     ) -> Result<(), ProductsError> {
         let mhz = self.frequency_hz / 1e6;
-        let map = &solution.map_k;
-        let scale = self.scale(map);
-        let subtitle = format!("{} visibilities, nside {}", solution.visibilities, solution.nside);
+        let map = shown.map.values();
+        let scale = self.scale(shown);
+        let how = provenance.caption(solution);
+        let subtitle = format!("{} visibilities, {}; {how}", solution.visibilities, shown.resolution());
         let panel = self.panel(map, &format!("Map at {mhz} MHz"), scale);
         let path = self.file("map.png");
         draw_map(&panel, &subtitle, &view())?.write(&path)?;
-        if let Some(truth) = self.truth.clone() {
-            let panel = self.panel(truth.values(), &format!("Input at {mhz} MHz"), scale);
+        if let Some(input) = self.input(shown.processing).cloned() {
+            let panel = self.panel(input.map.values(), &format!("Input at {mhz} MHz"), scale);
             let path = self.file("input.png");
-            draw_map(&panel, "", &view())?.write(&path)?;
+            draw_map(&panel, &shown.resolution(), &view())?.write(&path)?;
         }
         if let Some(comparison) = comparison {
             let path = self.file("error.png");
             let title = format!("Relative error at {mhz} MHz");
             draw_relative_error(&title, &subtitle, comparison)?.write(&path)?;
             let path = self.file("spectra.png");
-            draw_comparison(&format!("{mhz} MHz"), comparison)?.write(&path)?;
+            let noise = if solution.instrument.noiseless { "without" } else { "with" };
+            let title = format!("{mhz} MHz, {}, {noise} thermal noise", shown.resolution());
+            draw_comparison(&title, comparison)?.write(&path)?;
         }
-        self.draw_sheet(solution, scale)
+        self.draw_sheet(shown, &caption(solution), scale)
     }
 
     /// Draws the sheet of snapshots.
-    fn draw_sheet(&mut self, last: &Solution, scale: ColourScale) -> Result<(), ProductsError> {
-        let caption = caption(last);
-        let shown = self.shown.spread((&last.map_k, &caption));
+    fn draw_sheet(
+        &mut self,
+        last: &ShownMaps,
+        caption: &str,
+        scale: ColourScale,
+    ) -> Result<(), ProductsError> {
+        let shown = self.shown.spread((last.map.values(), caption));
         let panels: Vec<MapPanel<'_>> = shown.map(|(map, caption)| self.panel(map, caption, scale)).collect();
         let sheet = Sheet {
             title: format!("The map at {} MHz sharpens", self.frequency_hz / 1e6),
@@ -233,6 +263,39 @@ impl ChannelFolder {
         let picture = draw_sheet(&panels, &sheet)?;
         let path = self.file("sharpening.png");
         Ok(picture.write(&path)?)
+    }
+}
+
+/// Where a map comes from.
+#[derive(Clone, Copy)]
+struct Origin<'a> {
+    provenance: &'a Provenance,
+    solution: &'a Solution,
+}
+
+/// A map and its noise-only companion, as solved or post-processed.
+struct ShownMaps {
+    map: SkyMap,
+    noise: SkyMap,
+    /// What was done with them.
+    processing: Option<PostProcessing>,
+}
+
+impl ShownMaps {
+    fn processed(&self, processing: PostProcessing) -> Result<Self, ProductsError> {
+        let apply = |map: &SkyMap| processing.apply(map);
+        Ok(Self { map: apply(&self.map)?, noise: apply(&self.noise)?, processing: Some(processing) })
+    }
+
+    /// In words.
+    fn resolution(&self) -> String {
+        let nside = self.map.nside();
+        match self.processing {
+            None => format!("nside {nside}"),
+            Some(PostProcessing { split, fwhm_deg }) => {
+                format!("nside {} split to {nside}, FWHM {fwhm_deg} deg", nside / split)
+            }
+        }
     }
 }
 
@@ -328,13 +391,20 @@ pub fn draw_comparison(title: &str, comparison: &Comparison) -> Result<Picture, 
         points: comparison.l.iter().map(|&l| l as f64).zip(values.iter().copied()).collect(),
         dashed,
     };
+    let correlations = match &comparison.rho_noise_subtracted {
+        None => vec![curve("", &comparison.rho, false)],
+        Some(quiet) => vec![
+            curve("with the map's noise", &comparison.rho, false),
+            curve("its power subtracted", quiet, true),
+        ],
+    };
     let l = Axis { label: "degree l".to_owned(), ..Axis::default() };
     let mut plots = vec![
         Plot {
             title: "Correlation with the input".to_owned(),
             x: l.clone(),
             y: Axis { label: "rho_{l}".to_owned(), limits: Some((0.0, 1.05)), log: false },
-            curves: vec![curve("", &comparison.rho, false)],
+            curves: correlations,
             levels: vec![1.0],
         },
         Plot {

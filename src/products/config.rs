@@ -2,6 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::sky::harmonics::Alm;
+use crate::sky::spectra::{gaussian_beam, multiply_degrees};
+use crate::sky::{MapError, SkyMap};
 use crate::units::{Checks, InvalidValue};
 
 /// The `[products]` section: products besides the final maps.
@@ -12,7 +15,8 @@ pub struct ProductsConfig {
     pub pictures: bool,
     /// Whether every snapshot is written as a FITS map, too.
     pub snapshot_maps: bool,
-    /// FWHM to which the final map, with split pixels, is smoothed, degrees; 0 for none.
+    /// FWHM to which maps, noise and input, with split pixels, are smoothed before they are compared and drawn, degrees; 0
+    /// for none.
     pub smooth_fwhm_deg: f64,
 }
 
@@ -22,7 +26,52 @@ impl Default for ProductsConfig {
     }
 }
 
+/// What is done with maps before they are compared and drawn: pixels are split, and smoothed to a Gaussian beam (the paper,
+/// Sect. 4: nside 64 to 256, FWHM 1 deg).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct PostProcessing {
+    /// Pixels along a side into which one is split.
+    pub split: usize,
+    /// FWHM, degrees.
+    pub fwhm_deg: f64,
+}
+
+impl PostProcessing {
+    /// nside of a map of `nside` afterwards.
+    #[must_use]
+    pub fn nside(self, nside: usize) -> usize {
+        self.split * nside
+    }
+
+    /// FWHM, rad.
+    #[must_use]
+    pub fn fwhm_rad(self) -> f64 {
+        self.fwhm_deg.to_radians()
+    }
+
+    /// The map after it.
+    ///
+    /// # Errors
+    /// As [`SkyMap::refined`].
+    pub fn apply(self, map: &SkyMap) -> Result<SkyMap, MapError> {
+        map.refined(self.split, self.fwhm_rad())
+    }
+
+    /// Smooths coefficients.
+    pub fn smooth(self, alm: &mut Alm) {
+        let beam = gaussian_beam(self.fwhm_rad(), alm.l_max());
+        multiply_degrees(alm, &beam);
+    }
+}
+
 impl ProductsConfig {
+    /// What is done with maps, if anything.
+    #[must_use]
+    pub fn processing(&self) -> Option<PostProcessing> {
+        let fwhm_deg = self.smooth_fwhm_deg;
+        (fwhm_deg > 0.0).then_some(PostProcessing { split: 4, fwhm_deg })
+    }
+
     /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {

@@ -19,10 +19,10 @@ mod truth;
 
 pub use autos::{AutoSummary, summarise, write_autos};
 pub use channel::{draw_comparison, draw_relative_error};
-pub use config::ProductsConfig;
+pub use config::{PostProcessing, ProductsConfig};
 pub use error::ProductsError;
 pub use provenance::Provenance;
 pub use publisher::Publisher;
 pub use summary::{ChannelSummary, SnapshotSummary};
 pub use time_coverage::draw_coverage;
-pub use truth::Truth;
+pub use truth::{MapShape, Truth};

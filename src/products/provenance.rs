@@ -1,24 +1,28 @@
 //! Provenance of the maps.
 
-use crate::frames::Instrument;
+use super::config::PostProcessing;
+use crate::accumulation::{EngineKind, MapConfig};
+use crate::frames::{AntennaResponse, Instrument};
 use crate::sky::fits::Card;
 use crate::solve::Solution;
 
 /// The ground segment's share of the provenance; the rest comes with each solution.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Provenance {
     /// Hash of the ground segment's configuration.
     pub ground_hash: u64,
+    /// Configuration of the maps.
+    pub map: MapConfig,
 }
 
 impl Provenance {
     /// FITS header cards of a map. Runs on the same data give the same cards.
     #[must_use]
-    pub fn cards(&self, solution: &Solution, what: &str) -> Vec<Card> {
+    pub fn cards(&self, solution: &Solution, what: &str, processing: Option<PostProcessing>) -> Vec<Card> {
         let Instrument { name, channels, seed, configuration_hash, epoch_tai_s, .. } =
             solution.instrument.as_ref();
         let frequency_hz = channels.get(usize::from(solution.channel.0)).map_or(0.0, |c| c.frequency_hz);
-        vec![
+        let mut cards = vec![
             Card::text("CREATOR", concat!("lunarray ", env!("CARGO_PKG_VERSION")), "program"),
             Card::text(
                 "PIPELINE",
@@ -36,7 +40,86 @@ impl Provenance {
             Card::text("SEED", &format!("{seed:016x}"), "seed of the space segment, hexadecimal"),
             Card::text("HASHSPAC", &format!("{configuration_hash:016x}"), "configuration, space segment"),
             Card::text("HASHGRND", &format!("{:016x}", self.ground_hash), "configuration, ground segment"),
-        ]
+        ];
+        cards.extend(self.method_cards(solution, frequency_hz));
+        if let Some(PostProcessing { split, fwhm_deg }) = processing {
+            let split = i64::try_from(split).unwrap_or(i64::MAX);
+            cards.push(Card::integer("SPLIT", split, "parts along a side of a pixel of the map as solved"));
+            cards.push(Card::real("FWHM", fwhm_deg, "[deg] Gaussian beam to which it was smoothed then"));
+        }
+        cards
+    }
+
+    /// What the map was made from, and how.
+    fn method_cards(&self, solution: &Solution, frequency_hz: f64) -> Vec<Card> {
+        let map = &self.map;
+        let mut cards = vec![
+            Card::text("NOISE", noise(&solution.instrument), "thermal noise in the visibilities"),
+            Card::text("ANTENNA", antenna(solution.instrument.response), "response of every daughter"),
+            Card::text("ENGINE", engine(map.engine), "unknowns of the solution"),
+        ];
+        match map.engine {
+            EngineKind::Pixel => {
+                let rows = format!("{:?}", map.rows).to_lowercase();
+                cards.push(Card::text("ROWS", &rows, "of B: average over pixels, or centre"));
+            }
+            EngineKind::Harmonic => {
+                let l_max = i64::try_from(map.degree()).unwrap_or(i64::MAX);
+                cards.push(Card::integer("LMAX", l_max, "greatest degree of the solution"));
+            }
+        }
+        let (limit_m, limit) = (map.baseline_m_max(frequency_hz), map.baseline_bp_max);
+        cards.push(Card::real("BASEMAX", limit_m, "[m] longest baseline used"));
+        cards.push(Card::real("BPMAX", limit, "the same in units of b_p = wavelength / pixel"));
+        cards.push(Card::text("PRIOR", &self.prior(usize::from(solution.channel.0)), "prior map"));
+        cards
+    }
+
+    /// The prior of a channel in words.
+    fn prior(&self, channel: usize) -> String {
+        let map = &self.map;
+        match map.prior_files.get(channel).map(|path| path.file_name().unwrap_or(path.as_os_str())) {
+            // A header card holds 68 characters.
+            Some(name) => {
+                let name: String = name.to_string_lossy().chars().filter(char::is_ascii_graphic).collect();
+                let start = name.len().saturating_sub(30);
+                format!("{}, FWHM {} deg", &name[start..], map.prior_fwhm_deg)
+            }
+            None => match map.prior_k.get(channel) {
+                Some(level_k) if level_k != 0.0 => format!("uniform, {level_k:e} K"),
+                _ => "none".to_owned(),
+            },
+        }
+    }
+
+    /// How a map was made, in a line below its picture.
+    pub(super) fn caption(&self, solution: &Solution) -> String {
+        let map = &self.map;
+        let prior = self.prior(usize::from(solution.channel.0));
+        format!(
+            "epsilon {:e}, b < {} b_p, prior: {prior}, thermal noise {}",
+            solution.diagnostics.epsilon,
+            map.baseline_bp_max,
+            noise(&solution.instrument)
+        )
+    }
+}
+
+fn noise(instrument: &Instrument) -> &'static str {
+    if instrument.noiseless { "off" } else { "on" }
+}
+
+fn antenna(response: AntennaResponse) -> &'static str {
+    match response {
+        AntennaResponse::Isotropic => "isotropic",
+        AntennaResponse::DipoleNormal => "dipole-normal",
+    }
+}
+
+fn engine(engine: EngineKind) -> &'static str {
+    match engine {
+        EngineKind::Pixel => "pixel",
+        EngineKind::Harmonic => "harmonic",
     }
 }
 

@@ -4,6 +4,7 @@ use std::fmt;
 
 use serde::Serialize;
 
+use super::config::PostProcessing;
 use crate::solve::Diagnostics;
 
 /// One snapshot.
@@ -46,9 +47,19 @@ pub struct ChannelSummary {
     pub diagnostics: Diagnostics,
     /// The snapshots, including the final map.
     pub snapshots: Vec<SnapshotSummary>,
-    /// rho_l of the final map, l = 0, 1, ..; absent without a truth.
+    /// Whether the visibilities, and so the map, hold thermal noise; with real data they do.
+    pub thermal_noise: bool,
+    /// What was done with map, noise and input before they were compared; absent if nothing was.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub post_processing: Option<PostProcessing>,
+    /// rho_l of the final map as it is, with its thermal noise if it holds any, and the input at its own resolution,
+    /// l = 0, 1, ..; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rho: Option<Vec<f64>>,
+    /// The same with the power of the noise-only companion subtracted from that of the map, which leaves noise out of it up to
+    /// chance; absent without noise or truth. Null where noise is all.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rho_noise_subtracted: Option<Vec<f64>>,
     /// SNR_l of the final map; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub snr: Option<Vec<f64>>,
@@ -67,8 +78,11 @@ impl fmt::Display for ChannelSummary {
             self.mean_k,
             self.noise_rms_k
         )?;
-        if let Some(rho) = &self.rho {
-            write!(f, "\n             rho_l:")?;
+        let noise = if self.thermal_noise { "with the map's thermal noise" } else { "without thermal noise" };
+        let curves = [(noise, &self.rho), ("noise power subtracted", &self.rho_noise_subtracted)];
+        for (what, rho) in curves {
+            let Some(rho) = rho else { continue };
+            write!(f, "\n             rho_l ({what}):")?;
             let l_max = rho.len().saturating_sub(1).min(2 * self.nside);
             let step = (l_max / 8).max(1);
             for l in (step..=l_max).step_by(step) {

@@ -1,11 +1,34 @@
 //! The true sky of a simulation, which the ground segment does not know.
 
-use crate::sky::{MapError, SkyMap};
+use super::config::PostProcessing;
+use crate::sky::{Frame, InputSky, MapError, SkyMap};
 use crate::units::ChannelId;
 
-/// The true sky of every channel at the resolution of the maps; used only for comparison.
+/// The true sky of every channel, to compare maps with.
+///
+/// Spectra are of the sky at its own resolution, pictures and relative errors of the sky in pixels of the maps.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Truth(Vec<SkyMap>);
+pub struct Truth(Vec<ChannelTruth>);
+
+/// The true sky of a channel.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct ChannelTruth {
+    /// In the pixels of the maps.
+    pub(super) plain: InputSky,
+    /// In those of post-processed maps, and smoothed like them, if there are any.
+    pub(super) processed: Option<InputSky>,
+}
+
+/// Maps with which a truth is compared.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MapShape {
+    /// nside.
+    pub nside: usize,
+    /// Greatest degree of maps of harmonics; `None` for maps of pixels.
+    pub l_max: Option<usize>,
+    /// What is done with them.
+    pub processing: Option<PostProcessing>,
+}
 
 impl Truth {
     /// No truth, as with real data.
@@ -14,26 +37,39 @@ impl Truth {
         Self::default()
     }
 
-    /// The truth for pixel maps: `skies`, one per channel, rotated to ecliptic axes and resampled to `nside`.
+    /// The truth for maps of this shape: `skies`, one per channel, turned to ecliptic axes. For maps of pixels they are
+    /// averaged over them; for maps of harmonics they are limited to the same degrees.
     ///
     /// # Errors
-    /// A sky that cannot be rotated or resampled.
-    pub fn new(skies: &[SkyMap], nside: usize) -> Result<Self, MapError> {
-        let at_map_size = |sky: &SkyMap| sky.to_ecliptic().resized(nside);
-        skies.iter().map(at_map_size).collect::<Result<_, _>>().map(Self)
-    }
-
-    /// The truth for harmonic maps: `skies`, one per channel, rotated to ecliptic axes and limited to degrees up to `l_max`.
-    ///
-    /// # Errors
-    /// A sky without a harmonic transform.
-    pub fn band_limited(skies: &[SkyMap], nside: usize, l_max: usize) -> Result<Self, MapError> {
-        skies.iter().map(|sky| sky.band_limited(nside, l_max)).collect::<Result<_, _>>().map(Self)
+    /// A sky that cannot be turned, resampled or smoothed.
+    pub fn new(skies: &[SkyMap], shape: MapShape) -> Result<Self, MapError> {
+        skies.iter().map(|sky| ChannelTruth::new(sky, shape)).collect::<Result<_, _>>().map(Self)
     }
 
     /// The true sky of one channel, if known.
     #[must_use]
-    pub fn channel(&self, channel: ChannelId) -> Option<&SkyMap> {
+    pub(super) fn channel(&self, channel: ChannelId) -> Option<&ChannelTruth> {
         self.0.get(usize::from(channel.0))
+    }
+}
+
+impl ChannelTruth {
+    fn new(sky: &SkyMap, shape: MapShape) -> Result<Self, MapError> {
+        let MapShape { nside, l_max, processing } = shape;
+        let mut plain = InputSky::new(sky, Frame::Ecliptic, nside, 3 * nside - 1)?;
+        if let Some(l_max) = l_max {
+            plain.map = sky.band_limited(nside, l_max)?;
+        }
+        let processed = processing.map(|processing| {
+            let fine = processing.nside(nside);
+            let map = match l_max {
+                Some(l_max) => sky.band_limited(fine, l_max)?,
+                None => sky.to_ecliptic().resized(fine)?,
+            };
+            let mut alm = plain.alm.clone();
+            processing.smooth(&mut alm);
+            Ok::<_, MapError>(InputSky { map: map.smoothed(processing.fwhm_rad())?, alm })
+        });
+        Ok(Self { plain, processed: processed.transpose()? })
     }
 }

@@ -8,12 +8,26 @@ use super::generated::GeneratedSky;
 use super::healpix::is_valid_nside;
 use crate::units::{Checks, InvalidValue, PerChannel};
 
+/// What is done with a map file of another frequency than the channel's.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub enum MapFrequency {
+    /// It is refused.
+    #[default]
+    #[serde(rename = "must-match")]
+    MustMatch,
+    /// It is scaled as a power of frequency: T(nu) = T(FREQ) (nu / FREQ)^index.
+    #[serde(rename = "spectral_index")]
+    SpectralIndex(f64),
+}
+
 /// The `[sky]` section.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SkyConfig {
     /// HEALPix FITS maps in K, one or one a channel; without them the sky is generated.
     pub file: Option<PerChannel<PathBuf>>,
+    /// What is done with a map file whose FREQ is not the channel's.
+    pub frequency: MapFrequency,
     /// nside of the generated sky.
     pub nside: usize,
     /// Highest degree of the harmonic model, at most what the map determines; 0 for what the baselines need.
@@ -24,7 +38,13 @@ pub struct SkyConfig {
 
 impl Default for SkyConfig {
     fn default() -> Self {
-        Self { file: None, nside: 64, l_max: 0, generated: GeneratedSky::default() }
+        Self {
+            file: None,
+            frequency: MapFrequency::default(),
+            nside: 64,
+            l_max: 0,
+            generated: GeneratedSky::default(),
+        }
     }
 }
 
@@ -71,6 +91,13 @@ impl SkyConfig {
             let expected =
                 format!("one a channel, of which there are {channels}: a map holds for one frequency");
             checks.require("file", format!("({files} files)"), files == channels, expected);
+        }
+        if let MapFrequency::SpectralIndex(index) = self.frequency {
+            let (key, good) = ("frequency.spectral_index", (-10.0..=10.0).contains(&index));
+            checks.number(key, index, good, "-10 to 10");
+            let expected =
+                "no such key without sky.file: a generated sky is made for the channel's frequency";
+            checks.require(key, index, self.file.is_some(), expected);
         }
         let mut found = checks.finish();
         found.extend(self.generated.problems());

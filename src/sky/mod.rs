@@ -23,8 +23,8 @@ mod map;
 mod rotation;
 pub mod spectra;
 
-pub use compare::{Comparison, ErrorSummary, compare};
-pub use config::{GENERATED_NSIDE_MAX, SkyConfig};
+pub use compare::{Comparison, ErrorSummary, InputSky, compare, compare_with};
+pub use config::{GENERATED_NSIDE_MAX, MapFrequency, SkyConfig};
 pub use error::MapError;
 pub use frame::{Frame, Rotation, rotate};
 pub use map::{SkyMap, is_unseen};

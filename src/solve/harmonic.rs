@@ -3,8 +3,8 @@
 use super::conjugate_gradients::{Convergence, StoppingRule, System};
 use super::error::SolveError;
 use super::lanczos::{LargestEigenvalue, largest_eigenvalue};
-use super::probing::{Traces, traces};
 use super::tikhonov::{Diagnostics, check_request, subtract_prediction};
+use super::traces::traces;
 use super::vectors::add;
 use super::watch::NamedWatch;
 use crate::accumulation::NormalSums;
@@ -24,7 +24,7 @@ pub struct HarmonicRequest {
     pub nside: usize,
     /// When to stop.
     pub rule: StoppingRule,
-    /// Random probes for the traces of the covariances; 0 for none.
+    /// Random probes for the traces of the covariances where the matrix is too large to be held; 0 for no traces.
     pub probes: usize,
 }
 
@@ -70,27 +70,27 @@ pub fn solve_harmonics(
     }
     let right_hand_sides = [right.as_slice(), sums.noise_right_hand_side()];
     let (solved, convergence) = iterate(sums, regularisation, right_hand_sides, start, request.rule, watch);
-    let traces = (request.probes > 0).then(|| traces(sums, regularisation, request.probes, watch));
     let area_sr = pixel_area_sr(request.nside);
     let map = |x: &[f64]| synthesis(&coefficients(x, l_max), request.nside).map_err(SolveError::from);
     let mut whole = solved[0].clone();
     if let Some(prior) = prior {
         add(&mut whole, &prior);
     }
-    Ok(HarmonicSolution {
-        map_k: map(&whole)?,
-        noise_k: map(&solved[1])?,
-        unknowns: solved,
-        diagnostics: Diagnostics {
-            epsilon: request.epsilon,
-            w_max: w_max * area_sr,
-            w_max_iterations: iterations,
-            l_max: Some(l_max),
-            convergence: Some(convergence[0]),
-            noise_convergence: Some(convergence[1]),
-            traces: traces.map(|traces| Traces { sigma_n_k2: traces.sigma_n_k2 / area_sr, ..traces }),
-        },
-    })
+    let mut diagnostics = Diagnostics {
+        epsilon: request.epsilon,
+        w_max: w_max * area_sr,
+        w_max_iterations: iterations,
+        l_max: Some(l_max),
+        convergence: Some(convergence[0]),
+        noise_convergence: Some(convergence[1]),
+        traces: None,
+        traces_refused: None,
+    };
+    if request.probes > 0 {
+        let found = traces(sums, request.epsilon, w_max, request.probes, watch);
+        diagnostics = diagnostics.with_traces(found, area_sr);
+    }
+    Ok(HarmonicSolution { map_k: map(&whole)?, noise_k: map(&solved[1])?, unknowns: solved, diagnostics })
 }
 
 /// Solves for the map and the noise-only map, from an earlier solution of the same size if there is one.

@@ -14,6 +14,7 @@ mod lanczos;
 mod probing;
 mod stage;
 mod tikhonov;
+mod traces;
 mod vectors;
 mod watch;
 
@@ -23,7 +24,8 @@ pub use diagnostics::{Spectrum, spectrum};
 pub use error::SolveError;
 pub use harmonic::{HarmonicRequest, HarmonicSolution, solve_harmonics};
 pub use lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
-pub use probing::{Estimate, Traces, effective_beam, noise_variance, regularisation, traces};
+pub use probing::{effective_beam, noise_variance, regularisation};
 pub use stage::{Solution, Solver, SolverSetup};
 pub use tikhonov::{Diagnostics, PixelSolution, solve_pixels};
+pub use traces::{Estimate, HELD_MAX, Traces, UnsupportedEpsilon, probed_traces, traces};
 pub use watch::{NamedWatch, SolveWatch, Solving};

@@ -1,8 +1,7 @@
 //! Properties of covariances without their matrices: functions of BtN^-1B from the Krylov spaces of random probes.
 //!
 //! From a vector v, k Lanczos steps give a tridiagonal T with `v.f(A)v = |v|^2 e1.f(T)e1` for all polynomials f up
-//! to degree 2 k - 1, and `f(A)v ~ |v| Q f(T) e1` (Golub & Meurant 2010). Averaged over random v the first is a
-//! trace; its spread is the error bar.
+//! to degree 2 k - 1, and `f(A)v ~ |v| Q f(T) e1` (Golub & Meurant 2010).
 
 use faer::{Mat, Side};
 use rand_distr::{Distribution, StandardNormal};
@@ -22,50 +21,6 @@ const STEPS_MAX: usize = 120;
 const STEPS_BETWEEN: usize = 5;
 /// Relative change that counts as converged: a hundredth of the spread of a few random probes.
 const CONVERGED: f64 = 1e-4;
-
-/// An estimate from random probes.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
-pub struct Estimate {
-    /// Mean.
-    pub value: f64,
-    /// Standard error of the mean; infinite for a single probe.
-    pub error: f64,
-}
-
-impl std::ops::Div<f64> for Estimate {
-    type Output = Self;
-
-    fn div(self, by: f64) -> Self {
-        Self { value: self.value / by, error: self.error / by }
-    }
-}
-
-/// Traces of the thermal covariance and of the imperfection (the paper, Sect. 4).
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
-pub struct Traces {
-    /// `sum W / (W + eps)^2`, K^2.
-    pub sigma_n_k2: Estimate,
-    /// `sum (eps / (W + eps))^2` over the unknowns.
-    pub sigma_s: Estimate,
-    /// Random probes.
-    pub probes: usize,
-}
-
-/// Both traces for R = `regularisation` I, from `probes` random probes.
-#[must_use]
-pub fn traces(sums: &dyn NormalSums, regularisation: f64, probes: usize, watch: NamedWatch<'_>) -> Traces {
-    let eps = regularisation;
-    let (mut thermal, mut imperfect) = (Vec::new(), Vec::new());
-    for probe in 0..probes {
-        let task = watch.start(&format!("trace {} of {probes}", probe + 1), CONVERGED);
-        let start = signs(sums.unknowns(), probe);
-        let space = converged_space(sums, start, &task, &|w: f64| w / ((w + eps) * (w + eps)));
-        let order = sums.unknowns() as f64;
-        thermal.push(order * space.quadrature(|w| w / ((w + eps) * (w + eps))));
-        imperfect.push(order * space.quadrature(|w| (eps / (w + eps)).powi(2)));
-    }
-    Traces { sigma_n_k2: estimate(&thermal), sigma_s: estimate(&imperfect), probes }
-}
 
 /// Variance of the thermal noise of every pixel of an `nside` map, K^2, from `probes` noise maps.
 ///
@@ -178,11 +133,6 @@ impl Space {
         Some((eigenvalues, decomposed.U().to_owned()))
     }
 
-    /// `v.f(A)v` for the unit vector it started from.
-    fn quadrature(&self, f: impl Fn(f64) -> f64) -> f64 {
-        self.eigenvalues.iter().enumerate().map(|(k, w)| f(*w) * self.vectors[(0, k)].powi(2)).sum()
-    }
-
     /// `f(A)v` for the vector of that length that it started from.
     fn function(&self, length: f64, f: impl Fn(f64) -> f64) -> Vec<f64> {
         let mut result = vec![0.0; self.krylov.basis.first().map_or(0, Vec::len)];
@@ -195,19 +145,4 @@ impl Space {
         }
         result
     }
-}
-
-/// A probe of random signs, which gives traces the least spread.
-fn signs(order: usize, probe: usize) -> Vec<f64> {
-    let mut stream = random_stream(2, StreamKind::Probe, [order as u64, probe as u64]);
-    let mut sign = || -> f64 { StandardNormal.sample(&mut stream) };
-    (0..order).map(|_| sign().signum()).collect()
-}
-
-fn estimate(values: &[f64]) -> Estimate {
-    let count = values.len() as f64;
-    let value = values.iter().sum::<f64>() / count;
-    let squares: f64 = values.iter().map(|x| (x - value).powi(2)).sum();
-    let error = if values.len() > 1 { (squares / (count - 1.0) / count).sqrt() } else { f64::INFINITY };
-    Estimate { value, error }
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use super::harmonic::{HarmonicRequest, solve_harmonics};
 use super::tikhonov::solve_pixels_while;
-use super::{Diagnostics, SolveError, SolveWatch, StoppingRule};
+use super::{Diagnostics, SolveError, SolveWatch, StoppingRule, W_MAX_EXACT, largest_eigenvalue, traces};
 use crate::accumulation::{Snapshot, SnapshotSums};
 use crate::frames::Instrument;
 use crate::runtime::{Outlet, Stage, Units};
@@ -47,7 +47,7 @@ pub struct SolverSetup {
     pub prior_maps: Vec<Vec<f64>>,
     /// When the iteration of a harmonic map stops.
     pub rule: StoppingRule,
-    /// Random probes for the traces of a final harmonic map.
+    /// Random probes for the traces of a final map, where its matrix is too large to be held; 0 for no traces.
     pub trace_probes: usize,
     /// Receives progress, and may interrupt.
     pub watch: SolveWatch,
@@ -88,6 +88,7 @@ impl Stage for Solver {
         let epsilon = self.setup.epsilon.get(index).ok_or(SolveError::NoEpsilon(channel))?;
         let prior = self.prior(index, pixel_count(nside));
         let visibilities = sums.counts().visibilities;
+        let probes = if is_final { self.setup.trace_probes } else { 0 };
         let frequency_hz = instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
         let name = format!("{:.3} MHz", frequency_hz / 1e6);
         // Maps on the way are not worth the time that the final ones need.
@@ -97,14 +98,22 @@ impl Stage for Solver {
         }
         let (map_k, noise_k, diagnostics) = match sums {
             SnapshotSums::Pixel(sums) => {
+                // The solution takes the memory of the sums.
+                let found = (probes > 0 && visibilities > 0).then(|| {
+                    let w_max = largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| watch.goes_on()).value;
+                    traces(&sums, epsilon, w_max, probes, watch)
+                });
                 let solved = match solve_pixels_while(sums, epsilon, prior.as_deref(), &|| watch.goes_on()) {
                     Err(SolveError::Interrupted) => return Ok(()),
                     solved => solved?,
                 };
-                (solved.map_k, solved.noise_k, solved.diagnostics)
+                let diagnostics = match found {
+                    Some(found) => solved.diagnostics.with_traces(found, 1.0),
+                    None => solved.diagnostics,
+                };
+                (solved.map_k, solved.noise_k, diagnostics)
             }
             SnapshotSums::Harmonic(sums) => {
-                let probes = if is_final { self.setup.trace_probes } else { 0 };
                 let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes };
                 let start = self.last.remove(&channel);
                 let solved = solve_harmonics(&sums, request, prior.as_deref(), start.as_ref(), watch)?;

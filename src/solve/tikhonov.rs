@@ -6,7 +6,7 @@ use super::cholesky::{Cholesky, NotPositive};
 use super::conjugate_gradients::Convergence;
 use super::error::SolveError;
 use super::lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
-use super::probing::Traces;
+use super::traces::{Traces, UnsupportedEpsilon};
 use super::vectors::{add, subtract};
 use crate::accumulation::{NormalSums, PixelSums};
 
@@ -31,6 +31,22 @@ pub struct Diagnostics {
     /// Traces of the covariances, if requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub traces: Option<Traces>,
+    /// Why there are no traces, if they were requested and cannot be had.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub traces_refused: Option<UnsupportedEpsilon>,
+}
+
+impl Diagnostics {
+    /// With the traces of pixels, whose unknowns have the area `per_area_sr` that those of the sums are without.
+    pub(super) fn with_traces(mut self, found: Result<Traces, UnsupportedEpsilon>, per_area_sr: f64) -> Self {
+        match found {
+            Ok(traces) => {
+                self.traces = Some(Traces { sigma_n_k2: traces.sigma_n_k2 / per_area_sr, ..traces });
+            }
+            Err(refused) => self.traces_refused = Some(refused),
+        }
+        self
+    }
 }
 
 /// A map and its noise-only companion.
@@ -123,6 +139,7 @@ pub(super) fn solve_pixels_while(
             convergence: None,
             noise_convergence: None,
             traces: None,
+            traces_refused: None,
         },
     })
 }

@@ -13,6 +13,7 @@ fidelity = "samples"
 channels_hz = [1.0e6, 20.0e6]
 duration_s = 26e3
 window_s_max = 1.004
+flag_earth = false # the last daughters see the Earth for 64 s of a window
 "#;
 
 const STAGES: [&str; 6] = ["sample", "link", "correlate", "transmit", "receive", "chain"];

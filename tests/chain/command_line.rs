@@ -207,3 +207,17 @@ fn an_unwritable_output_is_named() {
     let complaint = complaint(&["run", "--out", &inside]);
     assert!(complaint.contains(&inside), "{complaint}");
 }
+
+#[test]
+fn a_sky_of_another_frequency_is_a_problem_of_the_file() {
+    let Some(sky) = common::shared("sky/ulsa_3mhz_galactic_nside64.fits") else { return };
+    let file = format!("sky.file={:?}", sky.to_str().unwrap());
+    let one_channel =
+        ["spacecraft.channels_hz=[10e6]", "spacecraft.every_nth_integration=1", "map.epsilon=1e-4"];
+    let mut check = vec!["check", "pipelines/quicklook.toml", "--set", &file];
+    one_channel.iter().for_each(|key| check.extend(["--set", key]));
+    let said = complaint(&check);
+    assert!(said.contains("FREQ is 3000000 Hz") && said.contains("spectral_index"), "{said}");
+    let scaled = [&check[..], &["--set", "sky.frequency={spectral_index=-2.5}"]].concat();
+    lunarray().args(&scaled).assert().success();
+}

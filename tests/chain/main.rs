@@ -12,5 +12,6 @@ mod harmonic;
 mod orbits;
 mod outputs;
 mod paper;
+mod products;
 mod run;
 mod start_up;

@@ -61,9 +61,10 @@ fn the_published_sky_comes_back_as_in_the_paper() {
     // It drops below l = 18, where no baseline is short enough, and with it the poles are dark.
     assert!(rho[4..=12].iter().all(|rho| *rho < 0.95), "{:?}", &rho[..20]);
     assert!(poles(&at_10.join("10.000MHz")) < 0.7);
-    // The run would have failed if its ledger did not close; nothing is refused.
+    // The run would have failed if its ledger did not close; nothing is refused. Daughters that trail by up to 3.6 km see
+    // the Earth for up to 2.3 s into a window, which costs its first integration.
     let flagged: Vec<_> = summary["ledger"]["flagged"].as_object().unwrap().keys().collect();
-    assert_eq!(flagged, ["baseline beyond the map's limit"]);
+    assert_eq!(flagged, ["Earth in sight of a daughter", "baseline beyond the map's limit"]);
 
     // The ground alone makes the same map from the same bytes.
     let again = folder.path().join("again");

@@ -20,6 +20,7 @@ pub fn mission(passes: i64, visibilities: u32) -> Vec<GroundFrame> {
         seed: 7,
         configuration_hash: 1,
         spectrometer: None,
+        noiseless: false,
     })];
     for pass in 0..passes {
         let start = MissionTime(9_000_000_000 * pass);

@@ -27,6 +27,7 @@ fn instrument() -> Instrument {
         seed: 7,
         configuration_hash: u64::MAX,
         spectrometer: None,
+        noiseless: false,
     }
 }
 

@@ -31,6 +31,7 @@ fn frames() -> Vec<GroundFrame> {
         seed: 1,
         configuration_hash: 0xABCD,
         spectrometer: None,
+        noiseless: false,
     })];
     for window in 0..2 {
         let start = MissionTime(8_248_680_000 * window);

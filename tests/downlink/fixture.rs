@@ -25,6 +25,7 @@ fn sent() -> Vec<GroundFrame> {
             seed: 11,
             configuration_hash: 12,
             spectrometer: None,
+            noiseless: false,
         }),
         GroundFrame::Ephemeris(EphemerisSegment {
             start: MissionTime(-1_000_000),

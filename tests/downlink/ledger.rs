@@ -50,6 +50,7 @@ static FRAMES: LazyLock<Vec<GroundFrame>> = LazyLock::new(|| {
         seed: 7,
         configuration_hash: 1,
         spectrometer: None,
+        noiseless: false,
     };
     let mut frames = Vec::new();
     let mut sampled = 0;

@@ -24,6 +24,7 @@ fn instrument() -> Instrument {
         seed: 7,
         configuration_hash: u64::MAX - 1,
         spectrometer: None,
+        noiseless: false,
     }
 }
 

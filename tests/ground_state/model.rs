@@ -65,6 +65,7 @@ impl Mission {
                 response: AntennaResponse::Isotropic,
                 seed: 7,
                 configuration_hash: 1,
+                noiseless: false,
                 spectrometer: None,
             }),
         )];

@@ -13,7 +13,7 @@ use lunarray::sky::generated::{GeneratedSky, generate};
 use lunarray::sky::healpix::pixel_area_sr;
 use lunarray::sky::{Frame, SkyMap, compare};
 use lunarray::solve::{
-    HarmonicRequest, SolveWatch, StoppingRule, effective_beam, noise_variance, regularisation,
+    HarmonicRequest, SolveWatch, StoppingRule, effective_beam, noise_variance, probed_traces, regularisation,
     solve_harmonics, solve_pixels, spectrum, traces,
 };
 use lunarray::units::all_pairs;
@@ -22,7 +22,12 @@ use lunarray::units::vector::{norm, sub};
 
 /// About `count` visibilities of the sky below `baseline_m_max`, over a whole precession; every orbit that is used
 /// gives a few of each pair.
-fn observe(sky: &SkyMap, frequency_hz: f64, baseline_m_max: f64, count: usize) -> Vec<PlacedVisibilities> {
+pub fn observe(
+    sky: &SkyMap,
+    frequency_hz: f64,
+    baseline_m_max: f64,
+    count: usize,
+) -> Vec<PlacedVisibilities> {
     let array = Array::new(&ArrayConfig::default()).unwrap();
     let directions = Directions::from(sky.directions_ecliptic().as_slice());
     let values: Vec<f32> = sky.values().iter().map(|&t| t as f32).collect();
@@ -75,7 +80,7 @@ fn add_all<E: NormalEngine>(mut engine: E, blocks: &[PlacedVisibilities]) -> E::
     engine.into_sums()
 }
 
-fn harmonic_sums(blocks: &[PlacedVisibilities], l_max: usize, baseline_m_max: f64) -> HarmonicSums {
+pub fn harmonic_sums(blocks: &[PlacedVisibilities], l_max: usize, baseline_m_max: f64) -> HarmonicSums {
     let setup = HarmonicSetup {
         l_max,
         frequency_hz: blocks[0].frequency_hz,
@@ -170,7 +175,8 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
     let eps = regularisation(&sums, epsilon);
     assert!((eps / (epsilon * w_max) - 1.0).abs() < 1e-5, "{eps}");
     let watch = SolveWatch::default();
-    let found = traces(&sums, eps, 24, watch.named("test"));
+    let found = probed_traces(&sums, epsilon, w_max, 24, watch.named("test")).unwrap();
+    let held = traces(&sums, epsilon, w_max, 24, watch.named("test")).unwrap();
     let exact_n: f64 = eigenvalues.iter().map(|w| w / (w + eps).powi(2)).sum();
     let exact_s: f64 = eigenvalues.iter().map(|w| (eps / (w + eps)).powi(2)).sum();
     for (found, exact) in [(found.sigma_n_k2, exact_n), (found.sigma_s, exact_s)] {
@@ -178,6 +184,10 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
         assert!((found.value - exact).abs() < 4.0 * found.error, "{found:?} {exact}");
         assert!(found.error < 0.3 * exact, "{found:?} {exact}");
     }
+    // Held, it is the same matrix but for roundings in f64.
+    assert!((held.sigma_n_k2.value / exact_n - 1.0).abs() < 1e-9, "{held:?} {exact_n}");
+    assert!((held.sigma_s.value / exact_s - 1.0).abs() < 1e-9, "{held:?} {exact_s}");
+    assert_eq!((held.probes, found.probes), (0, 24));
     // The solution against the matrix's.
     let right = sums.noise_right_hand_side();
     let request =
@@ -238,8 +248,8 @@ fn traces_agree_with_the_pixel_engine() {
     let exact = spectrum(&pixel_sums(&blocks, nside)).unwrap();
     let sums = harmonic_sums(&blocks, 22, baseline_m_max);
     for epsilon in [0.1, 1e-2] {
-        let eps = regularisation(&sums, epsilon);
-        let found = traces(&sums, eps, 24, SolveWatch::default().named("test"));
+        let w_max = regularisation(&sums, 1.0);
+        let found = traces(&sums, epsilon, w_max, 24, SolveWatch::default().named("test")).unwrap();
         let found = found.sigma_n_k2 / pixel_area_sr(nside);
         let exact = exact.trace_sigma_n(epsilon);
         // Fringes of u < 2.5 end at l = 16; a pixel's window of nside 8 lowers their power there by 9 %, on average

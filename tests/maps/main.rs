@@ -8,3 +8,4 @@ mod closed_loop;
 mod engines;
 mod exact_sums;
 mod tikhonov;
+mod traces;

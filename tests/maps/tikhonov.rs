@@ -30,7 +30,7 @@ fn difference(found: &[f64], expected: &[f64]) -> f64 {
     found.iter().zip(expected).fold(0.0_f64, |max, (x, y)| max.max((x - y).abs())) / scale
 }
 
-fn sums(reference: &Value) -> PixelSums {
+pub fn sums(reference: &Value) -> PixelSums {
     let array = Array::new(&ArrayConfig::default()).unwrap();
     let frequency_hz = number(&reference["nu_hz"]);
     let mut engine = PixelEngine::new(PixelSetup {

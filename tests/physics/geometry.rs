@@ -2,9 +2,11 @@
 
 use crate::common;
 
-use lunarray::array::{Array, ArrayConfig, Formation, IntegrationRule, ObservingWindows, integration_time_s};
+use lunarray::array::{
+    Array, ArrayConfig, EarthShadow, Formation, IntegrationRule, ObservingWindows, integration_time_s,
+};
 use lunarray::units::vector::{norm, sub};
-use lunarray::units::{Pair, all_pairs};
+use lunarray::units::{MissionTime, Pair, all_pairs};
 use serde_json::Value;
 
 fn reference(file: &str) -> Option<Value> {
@@ -98,4 +100,44 @@ fn a_pair_is_a_chord_along_the_track() {
             assert!(along.abs() < 1e-2, "{t_s} {i} {j}: {along}");
         }
     }
+}
+
+/// When each daughter loses the Earth for the first time, s: by bisection of `-n . r = sqrt(r^2 - R^2)` with the orbit and
+/// the arcs of the paper's equations, in Python.
+const EARTH_SETS_S: [f64; 8] = [
+    2792.6427270,
+    2793.0291500,
+    2793.9962511,
+    2795.9538153,
+    2799.9174429,
+    2807.9428438,
+    2824.1921472,
+    2857.0917622,
+];
+
+#[test]
+fn a_pair_observes_where_both_daughters_are_in_the_shadow() {
+    let array = Array::new(&ArrayConfig::default()).unwrap();
+    let window = ObservingWindows::new(&array, 0.0, 1e5).next().unwrap();
+    let shadow = EarthShadow::new(&array, window);
+    for pair in all_pairs(8) {
+        let sets_s = EARTH_SETS_S[usize::from(pair.i)].max(EARTH_SETS_S[usize::from(pair.j)]);
+        let until = window.end;
+        // Their clocks differ by less than a millisecond (as for the windows); a tick is a thousandth of it.
+        let [early, late] = [-1e-3, 1e-3].map(|s| MissionTime::from_seconds(sets_s + s));
+        assert!(!shadow.covers(pair, early, until), "{pair}");
+        assert!(shadow.covers(pair, late, until), "{pair}");
+        // Daughter 1 sees it rise first, and ends the window for all.
+        assert!(!shadow.covers(pair, late, until.plus_ticks(1)), "{pair}");
+    }
+    // A window that is cut short before the last daughters lose the Earth.
+    let end = MissionTime::from_seconds(EARTH_SETS_S[6] + 1.0);
+    let cut = EarthShadow::new(&array, lunarray::frames::ObservingWindow { end, ..window });
+    let late = MissionTime::from_seconds(EARTH_SETS_S[6] + 1e-3);
+    assert!(cut.covers(Pair { i: 0, j: 6 }, late, end));
+    assert!(!cut.covers(Pair { i: 6, j: 7 }, late, end));
+    // One that begins after the last of them did.
+    let start = MissionTime::from_seconds(EARTH_SETS_S[7] + 1e-3);
+    let whole = EarthShadow::new(&array, lunarray::frames::ObservingWindow { start, ..window });
+    assert!(whole.covers(Pair { i: 6, j: 7 }, start, window.end));
 }

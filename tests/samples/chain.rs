@@ -34,6 +34,7 @@ fn mapped(folder: &std::path::Path, name: &str, more: &[&str]) -> (Vec<f64>, Vec
         duration_s = 4.1e7
         every_nth_window = 100
         window_s_max = 30.0
+        flag_earth = false # the last daughters see the Earth for 64 s of a window
         baseline_wavelengths_max = 24.0
         [map]
         nside = 8

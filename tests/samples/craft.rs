@@ -145,10 +145,13 @@ impl Spacecraft {
                 seed: 0,
                 configuration_hash: 0,
                 spectrometer: None,
+                noiseless: false,
             },
             schedules: channels.iter().map(schedule).collect(),
             division: self.division,
             auto_integration_s: self.auto_integration_s,
+            // These windows are cut from a real one's beginning, in which the last daughters still see the Earth.
+            flag_earth: false,
             block_samples: self.daughters.block_samples,
             wait_blocks: 4,
         };

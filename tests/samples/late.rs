@@ -20,6 +20,7 @@ const PIPELINE: &str = r#"
     channels_hz = [1.0e6]
     duration_s = 26e3
     window_s_max = 4.0
+    flag_earth = false # the last daughters see the Earth for 64 s of a window
     auto_integration_s = 0.0
     wait_blocks = 4
 "#;

@@ -21,6 +21,7 @@ const PIPELINE: &str = r#"
     channels_hz = [1.0e6]
     duration_s = 17e3
     window_s_max = 20.48
+    flag_earth = false # the last daughters see the Earth for 64 s of a window
     baseline_wavelengths_max = 24.0
     [map]
     nside = 4

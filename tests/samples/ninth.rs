@@ -62,6 +62,7 @@ fn uniform(seed: Option<u64>, response: AntennaResponse, seconds: f64) -> Vec<Vi
         seed: 0,
         configuration_hash: 0,
         spectrometer: config().spectrometer(),
+        noiseless: false,
     };
     ninth.step(GroundFrame::Instrument(instrument.clone()), &mut out).unwrap();
     let report = Housekeeping { time: end, sampled: 7, dropped: 0 };
@@ -202,6 +203,7 @@ const PIPELINE: &str = r#"
     channels_hz = [1.0e6, 2.0e6]
     duration_s = 3e4
     window_s_max = 6.0
+    flag_earth = false # the last daughters see the Earth for 64 s of a window
     baseline_wavelengths_max = 24.0
     [spacecraft.ninth]
     on = true

@@ -157,6 +157,7 @@ fn downlinked(sky: &Path, fidelity: &str, seed: u64) -> Vec<VisibilityBlock> {
         channels_hz = [1.0e7]
         duration_s = 17e3
         window_s_max = 60.0
+        flag_earth = false # the last daughters see the Earth for 64 s of a window
         model = "direct"
         auto_integration_s = 1.024
         auto_powers = true

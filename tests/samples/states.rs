@@ -18,6 +18,7 @@ fidelity = "samples"
 channels_hz = [1.0e6, 2.0e6]
 duration_s = 3.0e4
 window_s_max = 4.0
+flag_earth = false # the last daughters see the Earth for 64 s of a window
 every_nth_window = 1
 every_nth_integration = 1
 baseline_wavelengths_max = 24.0

@@ -7,7 +7,7 @@ use lunarray::sky::fits::{
     Card, CardValue, Column, FitsError, FitsProblem, MapFile, Ordering, Precision, ReadOptions, WriteOptions,
     read_map, read_map_file, read_map_from, read_sky, read_unit, read_whole_map, write_columns, write_map,
 };
-use lunarray::sky::{Frame, MapError, SkyMap};
+use lunarray::sky::{Frame, MapError, MapFrequency, SkyMap};
 use lunarray::units::constants::HEALPIX_UNSEEN;
 use proptest::prelude::*;
 
@@ -286,11 +286,49 @@ fn a_sky_that_is_none_is_refused_with_file_pixel_and_value() {
         let map = SkyMap::new(Frame::Ecliptic, values).unwrap();
         let options = WriteOptions { precision: Precision::Double, ..WriteOptions::default() };
         write_map(&path, &map, &options).unwrap();
-        read_sky(&path, may_be_dark).map_err(|error| error.to_string())
+        read_sky(&path, 3e6, MapFrequency::MustMatch, may_be_dark).map_err(|error| error.to_string())
     };
     assert!(read(1e7, false).is_ok() && read(0.0, true).is_ok());
     for (value, words) in [(-1.0, "pixel 7 with -1e0 K"), (1e307, "pixel 7 with 1e307 K"), (0.0, "0 K")] {
         let refused = read(value, false).unwrap_err();
         assert!(refused.contains("sky.fits") && refused.contains(words), "{refused}");
+    }
+}
+
+#[test]
+fn a_sky_of_another_frequency_is_refused_or_scaled() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, cards: Vec<Card>| {
+        let path = folder.path().join(name);
+        write_map(&path, &map(4), &WriteOptions { cards, ..WriteOptions::default() }).unwrap();
+        path
+    };
+    let at_3 = write("3.fits", vec![Card::real("FREQ", 3e6, "Hz")]);
+    let unknown = write("unknown.fits", Vec::new());
+    let worded = write("worded.fits", vec![Card::text("FREQ", "3 MHz", "")]);
+    let scaled = MapFrequency::SpectralIndex(-2.5);
+
+    let said = read_sky(&at_3, 10e6, MapFrequency::MustMatch, true).unwrap_err().to_string();
+    for part in ["3.fits", "FREQ is 3000000 Hz", "10000000 Hz", "sky.frequency = { spectral_index"] {
+        assert!(said.contains(part), "{said}");
+    }
+    assert_eq!(read_sky(&at_3, 3e6, MapFrequency::MustMatch, true).unwrap(), map(4));
+    assert_eq!(read_sky(&at_3, 3e6, scaled, true).unwrap(), map(4));
+    // (10 / 3)^-2.5 = 0.3^2 sqrt(0.3).
+    let factor = 0.09 * 0.547_722_557_505;
+    let found = read_sky(&at_3, 10e6, scaled, true).unwrap();
+    for (found, value) in found.values().iter().zip(map(4).values()) {
+        assert!((found / value / factor - 1.0).abs() < 1e-11, "{found} {value}");
+    }
+    // A map that does not say its frequency may be of any, but cannot be scaled.
+    assert_eq!(read_sky(&unknown, 10e6, MapFrequency::MustMatch, true).unwrap(), map(4));
+    let said = read_sky(&unknown, 10e6, scaled, true).unwrap_err().to_string();
+    assert!(said.contains("FREQ is missing"), "{said}");
+    for rule in [MapFrequency::MustMatch, scaled] {
+        let said = read_sky(&worded, 10e6, rule, true).unwrap_err().to_string();
+        assert!(
+            said.contains("FREQ") && said.contains("3 MHz") && said.contains("a positive number"),
+            "{said}"
+        );
     }
 }

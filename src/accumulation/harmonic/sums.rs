@@ -7,8 +7,12 @@ use super::blocks::OrderBlocks;
 use super::grid::Grids;
 use super::operator::{Operator, RightHandSide};
 use super::tori::Tori;
-use crate::accumulation::{NormalSums, SumCounts};
+use crate::accumulation::{Accuracy, NormalSums, SumCounts};
 use crate::sky::harmonics::Alm;
+
+/// Interpolation between nodes and kernels of the weights, which err by up to 1e-3 of an eigenvalue; and where large terms
+/// cancel, these and products in f32.
+const ACCURACY: Accuracy = Accuracy { relative: 2e-3, absolute: 1e-6 };
 
 /// Normal equations of one channel over the real orthonormal harmonics up to `l_max`.
 ///
@@ -72,6 +76,10 @@ impl NormalSums for HarmonicSums {
 
     fn counts(&self) -> SumCounts {
         self.counts
+    }
+
+    fn accuracy(&self) -> Accuracy {
+        ACCURACY
     }
 }
 

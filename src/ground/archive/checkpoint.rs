@@ -254,6 +254,7 @@ mod tests {
             seed: 7,
             configuration_hash: 1,
             spectrometer: None,
+            noiseless: false,
         };
         let own = VisibilityBlock {
             offset_ticks: vec![0],

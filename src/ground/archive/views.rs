@@ -144,6 +144,7 @@ mod tests {
             seed: 7,
             configuration_hash: 1,
             spectrometer: None,
+            noiseless: false,
         };
         let report = |time: i64, sampled: u64| {
             GroundFrame::Housekeeping(Housekeeping { time: MissionTime(time), sampled, dropped: 1 })

@@ -4,6 +4,7 @@ use num_complex::Complex32;
 
 use super::integrate::COMPLETE_MIN;
 use super::kernel::LANES;
+use crate::array::EarthShadow;
 use crate::frames::{Flags, ObservingWindow, VisibilityBlock};
 use crate::units::{ChannelId, Pair};
 
@@ -29,6 +30,8 @@ pub struct AutoIntegrator {
     first_channel: usize,
     lanes: usize,
     window: ObservingWindow,
+    /// Present if the Earth in sight is flagged.
+    shadow: Option<EarthShadow>,
     duration_ticks: u32,
     from_ticks: u32,
     sums: Vec<[(f64, u64); LANES]>,
@@ -51,6 +54,7 @@ impl AutoIntegrator {
             first_channel,
             lanes,
             window,
+            shadow: None,
             duration_ticks: (duration_s * 1e6) as u32,
             from_ticks: 0,
             sums: vec![[(0.0, 0); LANES]; daughters],
@@ -58,6 +62,12 @@ impl AutoIntegrator {
             samples: 0,
             held: vec![vec![VisibilityBlock::default(); lanes]; daughters],
         }
+    }
+
+    /// Flags auto-correlations for which the Earth is not hidden from their daughter.
+    #[must_use]
+    pub fn with_shadow(self, shadow: Option<EarthShadow>) -> Self {
+        Self { shadow, ..self }
     }
 
     /// Adds a row that ends `until_ticks` after the window's start.
@@ -89,6 +99,8 @@ impl AutoIntegrator {
     }
 
     fn close(&mut self, until_ticks: u32, out: &mut Vec<VisibilityBlock>) {
+        let [from, until] =
+            [self.from_ticks, until_ticks].map(|ticks| self.window.start.plus_ticks(ticks.into()));
         for (daughter, held) in self.held.iter_mut().enumerate() {
             for (lane, block) in held.iter_mut().enumerate() {
                 let (sum, count) = std::mem::take(&mut self.sums[daughter][lane]);
@@ -106,8 +118,12 @@ impl AutoIntegrator {
                 if saturated {
                     flags.0 |= Flags::SATURATED.0;
                 }
+                let pair = Pair { i: daughter as u8, j: daughter as u8 };
+                if self.shadow.as_ref().is_some_and(|shadow| !shadow.covers(pair, from, until)) {
+                    flags.0 |= Flags::EARTH.0;
+                }
                 block.channel = ChannelId((self.first_channel + lane) as u16);
-                block.pair = Pair { i: daughter as u8, j: daughter as u8 };
+                block.pair = pair;
                 block.start = self.window.start;
                 block.offset_ticks.push(self.from_ticks);
                 block.duration_ticks.push(until_ticks - self.from_ticks);

@@ -3,7 +3,7 @@
 use num_complex::Complex32;
 
 use super::kernel::{LANES, ProductSums, product};
-use crate::array::{Array, integration_time_s};
+use crate::array::{Array, EarthShadow, integration_time_s};
 use crate::frames::{Flags, ObservingWindow, VisibilityBlock};
 use crate::mother::Schedule;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
@@ -58,6 +58,8 @@ pub struct GroupIntegrator {
     schedules: Vec<Schedule>,
     rule: DumpRule,
     window: ObservingWindow,
+    /// Present if the Earth in sight is flagged.
+    shadow: Option<EarthShadow>,
     /// Number of dumps in the window.
     dumps: u64,
     now: u64,
@@ -96,8 +98,17 @@ impl GroupIntegrator {
     ) -> Self {
         let pairs = all_pairs(array.satellites()).into_iter().map(PairLanes::new).collect();
         let schedules = schedules[..schedules.len().min(LANES)].to_vec();
-        let mut own =
-            Self { first_channel, schedules, rule, window, dumps, now: 0, pairs, powers_known: false };
+        let mut own = Self {
+            first_channel,
+            schedules,
+            rule,
+            window,
+            shadow: None,
+            dumps,
+            now: 0,
+            pairs,
+            powers_known: false,
+        };
         for at in 0..own.pairs.len() {
             for lane in 0..own.schedules.len() {
                 own.pairs[at].number[lane] = window.index / own.schedules[lane].every_nth_window.max(1);
@@ -105,6 +116,12 @@ impl GroupIntegrator {
             }
         }
         own
+    }
+
+    /// Flags visibilities for which the Earth is not hidden from both daughters.
+    #[must_use]
+    pub fn with_shadow(self, shadow: Option<EarthShadow>) -> Self {
+        Self { shadow, ..self }
     }
 
     /// Declares that `powers` (by daughter and lane, K sr) are accurate enough for weights, and weights the visibilities
@@ -208,6 +225,11 @@ impl GroupIntegrator {
         }
         if own.saturated[lane] {
             flags.0 |= Flags::SATURATED.0;
+        }
+        let [start, end] =
+            [from, self.now].map(|dumps| self.window.start.plus_ticks(rule.ticks(dumps).into()));
+        if self.shadow.as_ref().is_some_and(|shadow| !shadow.covers(own.pair, start, end)) {
+            flags.0 |= Flags::EARTH.0;
         }
         let power = if self.powers_known { power_of(own.pair, powers, lane) } else { 1.0 };
         let mean = |sum: f64| if used > 0.0 { (sum / used) as f32 } else { 0.0 };

@@ -10,7 +10,7 @@ use super::autos::{AutoIntegrator, RowPowers};
 use super::integrate::{COMPLETE_MIN, DumpRule, GroupIntegrator, Presence, WINDOW_S_MAX, dump_samples};
 use super::kernel::{LANES, Packed, SLICE, correlate, no_sums};
 use super::spectra::{Divider, Division, Spectra};
-use crate::array::{Array, segments_for};
+use crate::array::{Array, EarthShadow, segments_for};
 use crate::frames::{
     GroundFrame, Housekeeping, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame, VisibilityBlock,
 };
@@ -42,6 +42,8 @@ pub struct CorrelatorSetup {
     pub division: Division,
     /// Integration time of the auto-correlations, s; 0 for none.
     pub auto_integration_s: f64,
+    /// Whether visibilities are flagged while the Earth is in sight of one of their daughters.
+    pub flag_earth: bool,
     /// Samples per block.
     pub block_samples: usize,
     /// Number of blocks that may arrive beyond a missing one before it is given up.
@@ -141,12 +143,15 @@ impl Correlator {
         };
         let aligner = Aligner::new(streams, window);
         let dumps = aligner.samples() / (rule.dump_samples * setup.division.sub_bands) as u64;
+        let shadow = setup.flag_earth.then(|| EarthShadow::new(&setup.array, window));
         let group = |(k, schedules): (usize, &[Schedule])| ChannelGroup {
             first: k * LANES,
-            integrator: GroupIntegrator::new(k * LANES, schedules, *rule, &setup.array, window, dumps),
+            integrator: GroupIntegrator::new(k * LANES, schedules, *rule, &setup.array, window, dumps)
+                .with_shadow(shadow.clone()),
             autos: (setup.auto_integration_s > 0.0).then(|| {
                 let (daughters, integration_s) = (streams.daughters, setup.auto_integration_s);
                 AutoIntegrator::new(k * LANES, schedules.len(), daughters, window, integration_s)
+                    .with_shadow(shadow.clone())
             }),
             packed: Packed::new(streams.daughters),
             powers: vec![[0.0; LANES]; streams.daughters],

@@ -7,6 +7,7 @@
 
 mod card;
 mod error;
+mod frequency;
 mod header;
 mod read;
 mod table;
@@ -14,9 +15,10 @@ mod write;
 
 pub use card::{Card, CardValue};
 pub use error::{FitsError, FitsProblem};
+pub use frequency::read_sky;
 pub use header::Header;
 pub use read::{
-    MapFile, ReadOptions, read_map, read_map_file, read_map_from, read_sky, read_unit, read_whole_map,
+    MapFile, ReadOptions, read_map, read_map_file, read_map_from, read_unit, read_whole_map,
     read_whole_map_file,
 };
 pub use write::{Column, Ordering, Precision, WriteOptions, write_columns, write_map};

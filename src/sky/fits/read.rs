@@ -9,7 +9,7 @@ use super::error::{FitsError, FitsProblem};
 use super::header::{BLOCK_BYTES, Header};
 use super::table::{CellType, ColumnLayout, TableLayout};
 use crate::sky::healpix::{is_valid_nside, nested_to_ring, nside_of, pixel_count};
-use crate::sky::{Frame, MapError, SkyMap, is_unseen};
+use crate::sky::{Frame, SkyMap, is_unseen};
 use crate::units::constants::HEALPIX_UNSEEN;
 
 /// Size of a read, about, bytes.
@@ -76,20 +76,6 @@ pub fn read_whole_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile
         }
     };
     Ok(MapFile { map, name, unit, frame_assumed, header })
-}
-
-/// Reads the map of a sky, in K: temperatures in every pixel, and some of them above 0 unless `may_be_dark`.
-///
-/// # Errors
-/// As [`read_whole_map`]; [`crate::sky::MapError::NoTemperature`], [`crate::sky::MapError::Dark`].
-pub fn read_sky(path: &Path, may_be_dark: bool) -> Result<SkyMap, FitsError> {
-    let map = read_whole_map(path, &ReadOptions::default())?;
-    let refuse = |problem: MapError| FitsError::new(path, problem.into());
-    map.check_temperatures().map_err(refuse)?;
-    match map.values().iter().all(|&value| value == 0.0) {
-        true if !may_be_dark => Err(refuse(MapError::Dark { value: 0.0 })),
-        _ => Ok(map),
-    }
 }
 
 /// The unit (TUNIT) of the first map in a file, empty if it states none; reads only headers.

@@ -349,6 +349,7 @@ mod tests {
             seed: 7,
             configuration_hash: 1,
             spectrometer: None,
+            noiseless: false,
         }
     }
 

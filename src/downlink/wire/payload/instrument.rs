@@ -1,6 +1,7 @@
 //! The instrument description.
 //!
-//! Record: `name` (u64 length, UTF-8), `epoch_tai_s` f64, `moon_radius_m` f64, `satellites` u8, `response` u8,
+//! Record: `name` (u64 length, UTF-8), `epoch_tai_s` f64, `moon_radius_m` f64, `satellites` u8, `response` u8 (plus 128 if
+//! a simulation left thermal noise out),
 //! `seed` u64, `configuration_hash` u64, `channels` u16. Arrays: `frequency_hz` and `width_hz`, f64, one pair a channel.
 //! With a spectrometer, three more f64: its lowest frequency, the width of its channels (Hz), and their number.
 
@@ -8,7 +9,7 @@ use bincode::{Decode, Encode};
 
 use super::arrays::{Arrays, put_f64};
 use super::{PayloadFault, put_record, require, require_length, take_record};
-use crate::frames::{AntennaResponse, Channel, Instrument, Spectrometer};
+use crate::frames::{Channel, Instrument, Spectrometer};
 use crate::units::MAX_SATELLITES;
 
 const NAME_BYTES_MAX: usize = 256;
@@ -40,10 +41,7 @@ pub(crate) fn encode(instrument: &Instrument, out: &mut Vec<u8>) -> Result<(), P
         epoch_tai_s: instrument.epoch_tai_s,
         moon_radius_m: instrument.moon_radius_m,
         satellites: instrument.satellites,
-        response: match instrument.response {
-            AntennaResponse::Isotropic => 0,
-            AntennaResponse::DipoleNormal => 1,
-        },
+        response: instrument.response_code(),
         seed: instrument.seed,
         configuration_hash: instrument.configuration_hash,
         channels: instrument.channels.len() as u16,
@@ -75,23 +73,22 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<Instrument, PayloadFault> {
         }
         _ => None,
     };
+    let code = record.response;
+    let known = Instrument::response_of_code(code);
+    let expected = "0 (isotropic) or 1 (dipole), plus 128 without thermal noise";
+    require(known.is_some(), "antenna response", f64::from(code), expected)?;
+    let (response, noiseless) = known.unwrap_or_default();
     let instrument = Instrument {
         name: record.name,
         epoch_tai_s: record.epoch_tai_s,
         moon_radius_m: record.moon_radius_m,
         satellites: record.satellites,
         channels,
-        response: match record.response {
-            0 => AntennaResponse::Isotropic,
-            1 => AntennaResponse::DipoleNormal,
-            other => {
-                require(false, "antenna response", f64::from(other), "0 (isotropic) or 1 (dipole)")?;
-                AntennaResponse::Isotropic
-            }
-        },
+        response,
         seed: record.seed,
         configuration_hash: record.configuration_hash,
         spectrometer,
+        noiseless,
     };
     check(&instrument)?;
     Ok(instrument)
@@ -138,6 +135,7 @@ fn check_spectrometer(spectrometer: Spectrometer, before: usize) -> Result<(), P
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::frames::AntennaResponse;
 
     #[test]
     fn a_spectrometer_comes_down_and_a_bad_one_is_refused() {
@@ -152,10 +150,15 @@ mod tests {
             seed: 1,
             configuration_hash: 2,
             spectrometer,
+            noiseless: false,
         };
         let mut bytes = Vec::new();
         encode(&instrument, &mut bytes).unwrap();
         assert_eq!(decode(&bytes).unwrap(), instrument);
+        let quiet = Instrument { noiseless: true, ..instrument.clone() };
+        let mut quiet_bytes = Vec::new();
+        encode(&quiet, &mut quiet_bytes).unwrap();
+        assert_eq!(decode(&quiet_bytes).unwrap(), quiet);
         // Without the last numbers it is a description without a spectrometer.
         let plain = Instrument { spectrometer: None, ..instrument.clone() };
         assert_eq!(decode(&bytes[..bytes.len() - SPECTROMETER_BYTES]).unwrap(), plain);

@@ -1,0 +1,64 @@
+//! Maps of the sky at the frequency of a channel.
+
+use std::path::Path;
+
+use super::error::{FitsError, FitsProblem};
+use super::read::{MapFile, ReadOptions, read_whole_map_file};
+use crate::sky::{MapError, MapFrequency, SkyMap};
+
+/// Relative difference up to which two frequencies are the same: a digit lost in a header.
+const SAME: f64 = 1e-6;
+
+/// Reads the map of a sky, in K, for a channel at `frequency_hz`: temperatures in every pixel, and some of them above 0
+/// unless `may_be_dark`.
+///
+/// A map says by FREQ (Hz) for which frequency it holds. One of another frequency is refused, or scaled by a power law, as
+/// `rule` says. One without FREQ is taken as it is, but cannot be scaled.
+///
+/// # Errors
+/// As [`super::read_whole_map`]; [`FitsProblem::Keyword`] or [`FitsProblem::Missing`] for FREQ;
+/// [`MapError::NoTemperature`], [`MapError::Dark`].
+pub fn read_sky(
+    path: &Path,
+    frequency_hz: f64,
+    rule: MapFrequency,
+    may_be_dark: bool,
+) -> Result<SkyMap, FitsError> {
+    let map = read_at(path, frequency_hz, rule)?;
+    let refuse = |problem: MapError| FitsError::new(path, problem.into());
+    map.check_temperatures().map_err(refuse)?;
+    match map.values().iter().all(|&value| value == 0.0) {
+        true if !may_be_dark => Err(refuse(MapError::Dark { value: 0.0 })),
+        _ => Ok(map),
+    }
+}
+
+/// The map at the channel's frequency.
+fn read_at(path: &Path, frequency_hz: f64, rule: MapFrequency) -> Result<SkyMap, FitsError> {
+    let MapFile { mut map, header, .. } = read_whole_map_file(path, &ReadOptions::default())?;
+    let refuse = |problem| FitsError::new(path, problem);
+    let scales = matches!(rule, MapFrequency::SpectralIndex(_));
+    let Some(found) = header.get("FREQ") else {
+        let expected = "the map's frequency, Hz, for sky.frequency = { spectral_index = .. } to scale from";
+        return if scales { Err(refuse(FitsProblem::missing("FREQ", expected))) } else { Ok(map) };
+    };
+    let map_hz = header.real("FREQ").filter(|map_hz| map_hz.is_finite() && *map_hz > 0.0);
+    let Some(map_hz) = map_hz else {
+        return Err(refuse(FitsProblem::keyword("FREQ", found, "a positive number, Hz")));
+    };
+    match rule {
+        _ if (map_hz - frequency_hz).abs() <= SAME * frequency_hz => Ok(map),
+        MapFrequency::MustMatch => {
+            let expected = format!(
+                "{frequency_hz} Hz, the channel's: give a map of that frequency, or have it scaled by \
+                 sky.frequency = {{ spectral_index = -2.5 }}"
+            );
+            Err(refuse(FitsProblem::keyword("FREQ", format!("{map_hz} Hz"), expected)))
+        }
+        MapFrequency::SpectralIndex(index) => {
+            let factor = (frequency_hz / map_hz).powf(index);
+            map.values_mut().iter_mut().for_each(|value| *value *= factor);
+            Ok(map)
+        }
+    }
+}
