@@ -172,11 +172,24 @@ fn remove_stale(path: &Path) -> Option<PathBuf> {
     }
 }
 
+/// The entries of a folder. Interrupted calls are repeated, which the standard library leaves to its callers here.
+///
+/// # Errors
+/// The folder cannot be read.
+pub fn read_folder(folder: &Path) -> io::Result<fs::ReadDir> {
+    loop {
+        match fs::read_dir(folder) {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            read => return read,
+        }
+    }
+}
+
 /// Paths of the files in a folder that have names of unfinished files; none if it cannot be read. An empty path is the
 /// working directory.
 fn unfinished_files(folder: &Path) -> Vec<PathBuf> {
     let here = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
-    let names = fs::read_dir(here).into_iter().flatten().flatten().map(|entry| entry.file_name());
+    let names = read_folder(here).into_iter().flatten().flatten().map(|entry| entry.file_name());
     let unfinished = names.filter(|name| finished_name(Path::new(name)).is_some());
     unfinished.map(|name| folder.join(name)).collect()
 }

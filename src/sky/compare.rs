@@ -232,7 +232,9 @@ mod tests {
         assert_eq!((found.nside, found.frame, found.l.len()), (16, Frame::Ecliptic, 48));
         // The truth keeps its small scales: averages over pixels of nside 16 alias them by their window, 1 - l^2 / 24 nside^2
         // at most 2 % at l = 12, into what little there is.
-        assert!(found.rho.iter().take(12).all(|rho| (rho - 1.0).abs() < 1e-3), "{:?}", &found.rho[..12]);
+        // At even l above 2 the field is zero: what is there is rounding.
+        let mut powers = (0..12).filter(|l| l % 2 == 1 || *l <= 2).map(|l| found.rho[l]);
+        assert!(powers.all(|rho| (rho - 1.0).abs() < 1e-3), "{:?}", &found.rho[..12]);
         assert!(found.snr.is_none());
         let same = compare(&truth, &field(32, Frame::Galactic), None, Some(4)).unwrap();
         assert_eq!((same.nside, same.frame), (32, Frame::Galactic));

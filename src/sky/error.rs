@@ -52,7 +52,7 @@ pub enum MapError {
     /// Pixels that are no temperature of a sky.
     #[error(
         "{count} of {total} pixels are no temperature of a sky, the first is RING pixel {first} with {value:e} K; expected \
-         0 K to {most:e} K everywhere"
+         -{most:e} K to {most:e} K everywhere"
     )]
     NoTemperature {
         /// Number of such pixels.
@@ -68,11 +68,11 @@ pub enum MapError {
     },
     /// A sky without power, and receivers without noise.
     #[error(
-        "every pixel is 0 K, the first with {value:e} K: without noise visibilities have no weight; expected a sky with \
-         some power, or spacecraft.receiver_noise_k_sr above 0"
+        "the mean of the pixels is {value:e} K: without power visibilities have no weight; expected a mean above 0 K, or \
+         spacecraft.receiver_noise_k_sr above 0"
     )]
     Dark {
-        /// Value of the first pixel, K.
+        /// Mean of the pixels, K.
         value: f64,
     },
     /// Invalid width of a Gaussian beam.

@@ -157,12 +157,13 @@ impl SkyMap {
         Ok(Self { nside, frame: self.frame, values })
     }
 
-    /// Checks that every pixel is a temperature of a sky: 0 K to [`TEMPERATURE_K_MAX`].
+    /// Checks that every pixel is a temperature of a sky: at most [`TEMPERATURE_K_MAX`] in size. A sky may have pixels below
+    /// 0, as filtered maps do; the power that a satellite receives counts.
     ///
     /// # Errors
     /// [`MapError::NoTemperature`] with the number and the first of the others.
     pub fn check_temperatures(&self) -> Result<(), MapError> {
-        let bad = |&(_, value): &(usize, &f64)| !(0.0..=TEMPERATURE_K_MAX).contains(value);
+        let bad = |&(_, value): &(usize, &f64)| !(-TEMPERATURE_K_MAX..=TEMPERATURE_K_MAX).contains(value);
         let mut pixels = self.values.iter().enumerate().filter(bad);
         match pixels.next() {
             None => Ok(()),
@@ -259,9 +260,10 @@ mod tests {
     fn what_is_no_temperature_is_named() {
         let mut map = ramp(4);
         assert_eq!(map.check_temperatures(), Ok(()));
-        for value in [-1e-3, 1e307, f64::NAN, f64::INFINITY] {
+        for value in [-1e17, 1e307, f64::NAN, f64::INFINITY] {
             map.values_mut()[9] = value;
-            map.values_mut()[150] = -1.0;
+            map.values_mut()[150] = -1e20;
+            map.values_mut()[151] = -1.0;
             let text = map.check_temperatures().unwrap_err().to_string();
             assert!(text.contains("2 of 192 pixels") && text.contains("pixel 9 with"), "{text}");
             assert!(text.contains(&format!("{value:e} K")), "{text}");

@@ -107,6 +107,8 @@ fn while_it_sets_up_a_signal_ends_it_at_once() {
             &["run", &place.pipeline, "--out", &out][..],
             &["--set", "spacecraft.channels_hz=[30e6]", "--set", "spacecraft.baseline_wavelengths_max=0"],
             &["--set", "spacecraft.model=\"harmonic\"", "--set", "sky.nside=512", "--set", "sky.l_max=1024"],
+            // It does not come so far as to need it.
+            &["--memory-max", "1000GB"],
         ]
         .concat(),
     );

@@ -431,8 +431,8 @@ fn a_ledger_never_claims_to_be_complete_while_something_is_missing() {
         incomplete += i32::from(!completeness.complete);
         lost += i32::from(truth.visibilities_lost > 0);
     }
-    // Both are common, and nearly all links lose something.
-    assert!(complete > 15 && incomplete > 15 && lost > 60, "{complete} {incomplete} {lost}");
+    // Of 84 links nearly all lose something, and either answer is common enough to be tested.
+    assert!(complete >= 8 && incomplete >= 8 && lost > 60, "{complete} {incomplete} {lost}");
 }
 
 /// Packets of visibilities that are missing between those that arrived.

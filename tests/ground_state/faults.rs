@@ -326,7 +326,7 @@ fn a_full_disk_costs_no_maps_and_is_told() {
     let victim = Victim { name: "replay", before, args: &replay, result: &replayed, is_done: "" };
     let expected = victim.undisturbed();
     // At first there is room once the older checkpoint has gone, and a disk that fails once serves the second time.
-    let is_new = |call: &str| call.starts_with("open /checkpoint") && call.contains(".partial");
+    let is_new = |call: &str| call.starts_with("open /.checkpoint") && call.contains(".partial");
     for (kind, failed) in [("ENOSPC", 0), ("EIO", 1)] {
         let place = victim.place();
         let fault = Fault { kind, at: victim.number(kind, "state", is_new), goes_on: false };

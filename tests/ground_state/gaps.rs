@@ -81,7 +81,9 @@ fn gaps_stand_in_the_order_of_what_their_recovery_adds() {
     let file = place.downlink();
     let (worth, all) = (worth(&file), packets(&file));
     // Each pass ends with the spacecraft's own counts.
-    let passes: Vec<&[Vec<u8>]> = all.split_inclusive(|packet| identity(packet).0 == 0x105).collect();
+    let mut passes: Vec<&[Vec<u8>]> = all.split_inclusive(|packet| identity(packet).0 == 0x105).collect();
+    // And begins with them.
+    passes.retain(|packets| packets.iter().any(|packet| identity(packet).0 == VISIBILITIES));
     let counts = |pass: usize, apid: u16| {
         let of_kind = passes[pass].iter().filter(|packet| identity(packet).0 == apid);
         let counts: Vec<u64> = of_kind.map(|packet| identity(packet).1).collect();

@@ -384,6 +384,10 @@ impl Sequence<'_> {
 
     /// Packets from a sender, who describes the instrument first.
     fn listen(&mut self, at: usize) {
+        // A new state learns its instrument only from a sender of visibilities with their positions.
+        if self.states[at].newest() & 1 == 0 {
+            return self.replay(at);
+        }
         let ((given, mut order), every) = (self.some(), self.every());
         let given = given | 1;
         order.insert(0, 0);

@@ -5,6 +5,7 @@
 mod common;
 mod pace;
 mod senders;
+mod soak;
 mod stations;
 
 use std::io::{BufRead, BufReader, Read, Write};

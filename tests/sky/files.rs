@@ -282,14 +282,21 @@ fn a_sky_that_is_none_is_refused_with_file_pixel_and_value() {
     let path = folder.path().join("sky.fits");
     let read = |value: f64, may_be_dark: bool| {
         let mut values = vec![0.0; 48];
-        values[7] = value;
+        (values[7], values[9]) = (value, 0.5 * value);
         let map = SkyMap::new(Frame::Ecliptic, values).unwrap();
         let options = WriteOptions { precision: Precision::Double, ..WriteOptions::default() };
         write_map(&path, &map, &options).unwrap();
         read_sky(&path, 3e6, MapFrequency::MustMatch, may_be_dark).map_err(|error| error.to_string())
     };
     assert!(read(1e7, false).is_ok() && read(0.0, true).is_ok());
-    for (value, words) in [(-1.0, "pixel 7 with -1e0 K"), (1e307, "pixel 7 with 1e307 K"), (0.0, "0 K")] {
+    // -1.5 K in 48 pixels.
+    let refusals = [
+        (-1.0, "the mean of the pixels is -3.125e-2 K"),
+        (-1e17, "pixel 7 with -1e17 K"),
+        (1e307, "pixel 7 with 1e307 K"),
+        (0.0, "the mean of the pixels is 0e0 K"),
+    ];
+    for (value, words) in refusals {
         let refused = read(value, false).unwrap_err();
         assert!(refused.contains("sky.fits") && refused.contains(words), "{refused}");
     }

@@ -35,8 +35,8 @@ impl Transmission {
         self.packetizer.encode(frame, &mut self.packets)?;
         encoder.encode(&self.packets, out);
         match (matches!(frame, GroundFrame::Housekeeping(_)), was_in_pass) {
-            (true, true) => encoder.flush(out),
-            (true, false) => encoder.flush_housekeeping(out),
+            (true, true) => encoder.end_pass(out),
+            (true, false) => encoder.flush(out),
             (false, _) => {}
         }
         Ok(())
@@ -45,7 +45,7 @@ impl Transmission {
     /// Appends what is still buffered.
     pub fn finish(&mut self, out: &mut Vec<u8>) {
         if let Some(encoder) = &mut self.encoder {
-            encoder.flush(out);
+            encoder.end_pass(out);
         }
     }
 }

@@ -6,7 +6,7 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use super::checkpoint;
-use crate::files::{AtomicFile, FolderLock, IfUnfinished};
+use crate::files::{AtomicFile, FolderLock, IfUnfinished, read_folder};
 use crate::ground::GroundError;
 
 const PREFIX: &str = "checkpoint-";
@@ -168,7 +168,7 @@ fn file_name(number: u64) -> String {
 /// Numbers of the checkpoints, in order. A name that is like theirs and that none can have may hide one: it is refused.
 fn numbers(folder: &Path) -> Result<Vec<u64>, GroundError> {
     let mut numbers = Vec::new();
-    for entry in fs::read_dir(folder).map_err(GroundError::io(folder, "read the folder"))? {
+    for entry in read_folder(folder).map_err(GroundError::io(folder, "read the folder"))? {
         let name = entry.map_err(GroundError::io(folder, "read the folder"))?.file_name();
         let text = name.to_string_lossy();
         let Some(digits) = text.strip_prefix(PREFIX).and_then(|text| text.strip_suffix(SUFFIX)) else {

@@ -9,8 +9,8 @@ use crate::sky::{MapError, MapFrequency, SkyMap};
 /// Relative difference up to which two frequencies are the same: a digit lost in a header.
 const SAME: f64 = 1e-6;
 
-/// Reads the map of a sky, in K, for a channel at `frequency_hz`: temperatures in every pixel, and some of them above 0
-/// unless `may_be_dark`.
+/// Reads the map of a sky, in K, for a channel at `frequency_hz`: temperatures in every pixel, of a mean above 0 unless
+/// `may_be_dark`.
 ///
 /// A map says by FREQ (Hz) for which frequency it holds. One of another frequency is refused, or scaled by a power law, as
 /// `rule` says. One without FREQ is taken as it is, but cannot be scaled.
@@ -27,10 +27,11 @@ pub fn read_sky(
     let map = read_at(path, frequency_hz, rule)?;
     let refuse = |problem: MapError| FitsError::new(path, problem.into());
     map.check_temperatures().map_err(refuse)?;
-    match map.values().iter().all(|&value| value == 0.0) {
-        true if !may_be_dark => Err(refuse(MapError::Dark { value: 0.0 })),
-        _ => Ok(map),
+    let mean_k = map.values().iter().sum::<f64>() / map.values().len() as f64;
+    if mean_k <= 0.0 && !may_be_dark {
+        return Err(refuse(MapError::Dark { value: mean_k }));
     }
+    Ok(map)
 }
 
 /// The map at the channel's frequency.

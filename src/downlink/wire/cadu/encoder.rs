@@ -51,17 +51,17 @@ impl CaduEncoder {
         }
     }
 
-    /// Appends the partial frame of housekeeping, padded with an idle packet: it does not wait for the end of the pass.
-    pub fn flush_housekeeping(&mut self, out: &mut Vec<u8>) {
-        let code = self.code;
-        self.housekeeping.flush(|frame| code_frame(code, frame, out));
-    }
-
-    /// Ends a pass: appends the partial frames, padded with idle packets; science before housekeeping.
+    /// Appends the partial frames, padded with idle packets: what a pass begins with does not wait for its end. Science
+    /// before housekeeping, so that the instrument's description comes first.
     pub fn flush(&mut self, out: &mut Vec<u8>) {
         let code = self.code;
         self.science.flush(|frame| code_frame(code, frame, out));
         self.housekeeping.flush(|frame| code_frame(code, frame, out));
+    }
+
+    /// Ends a pass: as [`CaduEncoder::flush`], and the next pass begins with idle frames.
+    pub fn end_pass(&mut self, out: &mut Vec<u8>) {
+        self.flush(out);
         self.in_pass = false;
     }
 }
