@@ -1,5 +1,5 @@
 //! Rates of the harmonic engine on the paper's array.
-#![allow(clippy::expect_used)] // Settings are the bench's own.
+#![allow(clippy::expect_used, clippy::unwrap_used)] // Settings are the bench's own.
 
 use std::f64::consts::TAU;
 use std::time::Instant;

@@ -13,8 +13,7 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 /// Products with BtN^-1B in one harmonic solution: some 15 for W_max, 25 each for the map and the noise map.
 const APPLICATIONS: f64 = 65.0;
 
-/// Products with BtN^-1B for one random probe of the traces, of at most 120: as many as for an accuracy of 1e-4 in a map of
-/// the quicklook.
+/// Products with BtN^-1B for one random probe of the traces, of at most 300: a guess for epsilon = 1e-4, not measured.
 const PROBE_APPLICATIONS: f64 = 40.0;
 
 /// Alphas that the weights of one window reach: as many as their kernel, and those that the plane passes on its way.

@@ -88,6 +88,9 @@ fn run(args: &[String], below: &Path, fault: Fault) -> (Output, Vec<String>) {
     (output, calls.lines().map(str::to_owned).collect())
 }
 
+/// Files with their contents.
+type Contents = Vec<(PathBuf, Vec<u8>)>;
+
 /// A command that is to survive.
 struct Victim<'a> {
     name: &'static str,
@@ -96,7 +99,7 @@ struct Victim<'a> {
     /// Its arguments, in a copy of that folder.
     args: &'a dyn Fn(&Path) -> Vec<String>,
     /// What counts of that which it leaves.
-    result: &'a dyn Fn(&Path) -> Vec<(PathBuf, Vec<u8>)>,
+    result: &'a dyn Fn(&Path) -> Contents,
     /// What it may say when it is repeated after a failure that came when all was done.
     is_done: &'static str,
 }

@@ -1,5 +1,5 @@
 //! A ground that remembers: every packet once, whatever comes twice, late, or is ended by force.
-#![allow(clippy::unwrap_used)] // Also in the helpers.
+#![allow(clippy::unwrap_used, clippy::panic)] // Also in the helpers.
 
 #[path = "../common/mod.rs"]
 mod common;

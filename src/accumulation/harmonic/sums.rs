@@ -11,7 +11,7 @@ use crate::accumulation::{Accuracy, NormalSums, SumCounts};
 use crate::sky::harmonics::Alm;
 
 /// Interpolation between nodes and kernels of the weights, which err by up to 1e-3 of an eigenvalue; and where large terms
-/// cancel, these and products in f32.
+/// cancel, these and products in f32: an estimate, which no measurement at small eigenvalues supports yet.
 const ACCURACY: Accuracy = Accuracy { relative: 2e-3, absolute: 1e-6 };
 
 /// Normal equations of one channel over the real orthonormal harmonics up to `l_max`.
