@@ -157,7 +157,7 @@ impl SkyMap {
         Ok(Self { nside, frame: self.frame, values })
     }
 
-    /// Checks that every pixel is a temperature of a sky: at most [`TEMPERATURE_K_MAX`] in size. A sky may have pixels below
+    /// Checks that every pixel is a temperature of a sky: at most 1e16 K in size. A sky may have pixels below
     /// 0, as filtered maps do; the power that a satellite receives counts.
     ///
     /// # Errors
