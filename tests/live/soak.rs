@@ -1,6 +1,6 @@
 //! A long life: three stations that lose packets and connections, and a ground that is killed again and again.
 //!
-//! By hand, a year and more of passes: LUNARRAY_SOAK_WINDOWS is the thinning of the windows (default 60; 5 gives 900
+//! By hand, a year and more of passes: LUNARRAY_SOAK_WINDOWS is the thinning of the windows (default 60; 5 gives some 1000
 //! passes), LUNARRAY_SOAK_DISK names a folder of a small file system, which is then filled and emptied on the way.
 
 use std::path::Path;
