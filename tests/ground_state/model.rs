@@ -178,9 +178,8 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        // Nothing of this has to outlast a loss of power.
-        let memory = Path::new("/dev/shm");
-        let folder = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
+        // In memory where possible: nothing of this has to outlast a loss of power.
+        let folder = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir());
         let (mission, folder) = (Mission::new(), folder.unwrap());
         Self { mission, folder, fresh: HashMap::new(), steps: HashMap::new() }
     }
@@ -348,11 +347,20 @@ impl Sequence<'_> {
         assert_eq!((before & !after, after & !(before | given)), (0, 0), "{before:b} {given:b} {after:b}");
     }
 
-    fn drive(&mut self, mut source: impl Source<Out = Vec<u8>, Error = DownlinkError>, ground: &mut Ground) {
+    /// Calls `given` with the number of bytes that the source has given so far, from none on.
+    fn drive(
+        &mut self,
+        mut source: impl Source<Out = Vec<u8>, Error = DownlinkError>,
+        ground: &mut Ground,
+        mut given: impl FnMut(usize),
+    ) {
         let mut out = Outlet::collect();
+        let mut bytes_given = 0;
         loop {
+            given(bytes_given);
             let flow = source.next(&mut out).unwrap();
             for bytes in out.take() {
+                bytes_given += bytes.len();
                 ground.step(bytes, &mut Outlet::collect()).unwrap();
             }
             if flow == Flow::Done {
@@ -372,12 +380,16 @@ impl Sequence<'_> {
         std::fs::write(&file, first).unwrap();
         let mut ground = self.bench.open(&self.states[at].folder, every);
         let source = FileSource::follow(std::slice::from_ref(&file), 0.3).unwrap();
-        std::thread::scope(|scope| {
-            scope.spawn(|| {
-                std::fs::File::options().append(true).open(&file).unwrap().write_all(rest).unwrap()
-            });
-            self.drive(source, &mut ground);
+        // It grows once all that it was has been read: a writer of its own could be later than the source waits.
+        let mut rest = Some(rest);
+        self.drive(source, &mut ground, |given| {
+            if given == first.len()
+                && let Some(rest) = rest.take()
+            {
+                std::fs::File::options().append(true).open(&file).unwrap().write_all(rest).unwrap();
+            }
         });
+        assert!(rest.is_none());
         drop(ground);
         self.expect(at, self.states[at].newest() | given);
     }
@@ -406,7 +418,7 @@ impl Sequence<'_> {
                 stream.shutdown(std::net::Shutdown::Write).unwrap();
                 let _ = stream.read_to_end(&mut Vec::new());
             });
-            self.drive(source, &mut ground);
+            self.drive(source, &mut ground, |_| ());
         });
         drop(ground);
         self.expect(at, self.states[at].newest() | given);
