@@ -192,7 +192,7 @@ pub trait NormalSums: Send {
 }
 
 /// What rounding and the approximations of an engine leave open of an eigenvalue W of `BtN^-1B`: `relative` W + `absolute`
-/// W_max. Of the harmonic engine the relative part has been compared with rows one by one in f64; the rest are estimates.
+/// W_max. Those of the harmonic engine have been compared with rows one by one in f64; those of the other are estimates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Accuracy {
     /// Of the eigenvalue itself.

@@ -77,7 +77,7 @@ impl PipelineArgs {
 }
 
 /// Bytes from a size such as `8GB`, `16GiB` or `500 MB`; a number alone is of bytes.
-fn size_bytes(text: &str) -> Result<u64, String> {
+pub(super) fn size_bytes(text: &str) -> Result<u64, String> {
     const UNITS: [(&str, f64); 9] = [
         ("KIB", 1024.0),
         ("MIB", 1_048_576.0),

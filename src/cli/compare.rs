@@ -1,30 +1,30 @@
-//! `lunarray compare`: compare a map with the truth.
+//! `lunarray compare`: compare a map with the truth, or runs with one another.
 
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
-use crate::products::{draw_comparison, draw_relative_error};
+use crate::products::{RunFigures, draw_comparison, draw_relative_error, draw_runs, runs_csv};
 use crate::sky::fits::{ReadOptions, read_whole_map_file};
 use crate::sky::{Comparison, Frame, SkyMap, compare};
 
-/// Compare a map with the truth, degree by degree.
+/// Compare a map with the truth, degree by degree; or runs with one another.
 ///
-/// Both are HEALPix FITS maps in K; they are converted to ecliptic axes and to the coarser of the two resolutions.
+/// Of two maps, both are HEALPix FITS maps in K; they are converted to ecliptic axes and to the coarser of the two resolutions.
 /// rho_l = C_l^X / sqrt(C_l^in C_l^re) is the correlation of map and truth at degree l, whatever the scale of the map;
 /// with a noise-only map, SNR_l = C_l^X / sqrt(C_l^in C_l^ns). Draws these curves, and the relative error
 /// (map - truth) / truth over the sky.
 ///
-/// Example: lunarray compare map.fits input.fits --noise noise.fits
+/// Of output folders of runs, prints their figures as a table (CSV) and draws their curves over one another.
+///
+/// Examples: lunarray compare map.fits input.fits --noise noise.fits;
+/// lunarray compare out/first out/second out/third --plot curves.png
 #[derive(Debug, Args)]
 pub(super) struct CompareArgs {
-    /// Map (FITS).
-    #[arg(value_name = "MAP.fits")]
-    map: PathBuf,
-    /// Truth (FITS).
-    #[arg(value_name = "TRUTH.fits")]
-    truth: PathBuf,
+    /// A map and the truth (FITS); or two or more output folders of runs.
+    #[arg(value_name = "MAP.fits TRUTH.fits|RUN", num_args = 2.., required = true)]
+    paths: Vec<PathBuf>,
     /// Noise-only map (FITS), for SNR_l.
     #[arg(long, value_name = "NOISE.fits")]
     noise: Option<PathBuf>,
@@ -35,8 +35,8 @@ pub(super) struct CompareArgs {
     /// Maximum degree; 3 nside - 1 if not given.
     #[arg(long)]
     l_max: Option<usize>,
-    /// Picture of the curves (PNG); MAP-spectra.png if not given, none with --json. The picture of the relative error
-    /// goes beside it, with -error before the extension.
+    /// Picture of the curves (PNG); MAP-spectra.png, or compare.png of runs, if not given; none with --json. The picture
+    /// of the relative error goes beside it, with -error before the extension.
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
     /// Draw no pictures.
@@ -48,8 +48,12 @@ pub(super) struct CompareArgs {
 }
 
 pub(super) fn execute(args: &CompareArgs) -> CommandResult {
-    let (map, map_hz) = read(&args.map)?;
-    let (mut truth, truth_hz) = read(&args.truth)?;
+    let [map_path, truth_path] = &args.paths[..] else { return compare_runs(args) };
+    if map_path.is_dir() {
+        return compare_runs(args);
+    }
+    let (map, map_hz) = read(map_path)?;
+    let (mut truth, truth_hz) = read(truth_path)?;
     if let (Some(map_hz), Some(truth_hz)) = (map_hz, truth_hz)
         && (map_hz - truth_hz).abs() > 1e-6 * truth_hz
     {
@@ -67,7 +71,7 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     }
     // With --json, pictures are drawn only on request.
     let wanted = !args.no_plot && (args.plot.is_some() || !args.json);
-    let pictures = if wanted { draw(args, &comparison)? } else { Vec::new() };
+    let pictures = if wanted { draw(args, [map_path, truth_path], &comparison)? } else { Vec::new() };
     if args.json {
         return Ok(Completion::Done);
     }
@@ -86,10 +90,44 @@ fn read(path: impl AsRef<Path>) -> Result<(SkyMap, Option<f64>), CommandError> {
     Ok((file.map, frequency_hz))
 }
 
-fn draw(args: &CompareArgs, comparison: &Comparison) -> Result<Vec<PathBuf>, CommandError> {
+/// Runs side by side.
+fn compare_runs(args: &CompareArgs) -> CommandResult {
+    let of_maps = [("--noise", args.noise.is_some()), ("--band-limit", args.band_limit.is_some())];
+    if let Some((option, _)) =
+        of_maps.into_iter().chain([("--l-max", args.l_max.is_some())]).find(|(_, on)| *on)
+    {
+        return Err(format!("{option} is for two maps; expected none with output folders of runs").into());
+    }
+    let runs: Vec<RunFigures> = args
+        .paths
+        .iter()
+        .map(|folder| Ok(RunFigures { label: folder.display().to_string(), ..RunFigures::read(folder)? }))
+        .collect::<Result<_, CommandError>>()?;
+    let all: Vec<&RunFigures> = runs.iter().collect();
+    if args.json {
+        print_json_line(&runs)?;
+    } else {
+        print_text(runs_csv(&all).trim_end())?;
+    }
+    if args.no_plot || (args.json && args.plot.is_none()) {
+        return Ok(Completion::Done);
+    }
+    let plot = args.plot.clone().unwrap_or_else(|| "compare.png".into());
+    draw_runs("", &all)?.write(&plot)?;
+    if !args.json {
+        print_text(&format!("{}", plot.display()))?;
+    }
+    Ok(Completion::Done)
+}
+
+fn draw(
+    args: &CompareArgs,
+    [map, truth]: [&Path; 2],
+    comparison: &Comparison,
+) -> Result<Vec<PathBuf>, CommandError> {
     let name = |path: &Path| path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
-    let title = format!("{} against {}", name(&args.map), name(&args.truth));
-    let plot = args.plot.clone().unwrap_or_else(|| beside(&args.map, "-spectra"));
+    let title = format!("{} against {}", name(map), name(truth));
+    let plot = args.plot.clone().unwrap_or_else(|| beside(map, "-spectra"));
     let error = beside(&plot, "-error");
     draw_comparison(&title, comparison)?.write(&plot)?;
     draw_relative_error(&title, "", comparison)?.write(&error)?;

@@ -22,6 +22,7 @@ mod retract;
 mod run;
 mod simulate;
 mod sky;
+mod study;
 
 use std::process::ExitCode;
 
@@ -62,6 +63,7 @@ enum Command {
     Check(check::CheckArgs),
     Bench(bench::BenchArgs),
     Sky(sky::SkyArgs),
+    Study(study::StudyArgs),
 }
 
 /// Runs the command on the process's command line and returns the exit code.
@@ -86,6 +88,7 @@ pub fn main() -> ExitCode {
         Command::Check(args) => check::execute(&args),
         Command::Bench(args) => bench::execute(&args),
         Command::Sky(args) => sky::execute(&args),
+        Command::Study(args) => study::execute(&args),
     };
     match result {
         Ok(Completion::Done) => ExitCode::SUCCESS,

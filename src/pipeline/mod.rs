@@ -20,6 +20,7 @@ mod run;
 mod sample_summary;
 pub(crate) mod sampling;
 pub(crate) mod space_segment;
+mod study;
 mod summary;
 
 pub use config::Config;
@@ -36,4 +37,7 @@ pub use run::{
 pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
 pub use sampling::sample_stages;
 pub use space_segment::{INTEGRATE, sky_notes};
+pub use study::{
+    CaseSummary, Study, StudyCase, StudyError, StudyPhase, StudySummary, StudyWatcher, run_study,
+};
 pub use summary::{RunScope, RunSummary};

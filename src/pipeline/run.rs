@@ -19,6 +19,7 @@ use crate::files::FolderLock;
 use crate::ground::{Ground, SharedSaving, WAIT_BYTES};
 use crate::products::{MapShape, ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
+use crate::sky::SkyMap;
 use crate::solve::SolveWatch;
 
 /// Handles to watch a running graph.
@@ -109,13 +110,7 @@ pub fn run(
     let bytes = add_link(&mut graph, bytes, &plan.config, &file)?;
     let capacity = plan.config.runtime.queue_capacity;
     let bytes = graph.stage(RECORD, capacity, bytes, recorder);
-    let map = &plan.config.map;
-    let shape = MapShape {
-        nside: map.nside,
-        l_max: (map.engine == EngineKind::Harmonic).then(|| map.degree()),
-        processing: plan.config.products.processing(),
-    };
-    let truth = Truth::new(&skies, shape)?;
+    let truth = Truth::new(&skies, plan.config.map_shape())?;
     drop(skies);
     let grace = Grace::of(&plan.config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
@@ -140,16 +135,27 @@ pub fn simulate(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<Report, PipelineError> {
-    let Destination { file, socket } = to.into();
-    if plan.config.downlink.link.is_on() && file.is_none() {
+    let to = to.into();
+    if plan.config.downlink.link.is_on() && to.file.is_none() {
         return Err(DownlinkError::from(SocketError::TruthNowhere).into());
     }
-    let recorder = file.as_deref().map(Recorder::create).transpose()?;
+    let recorder = to.file.as_deref().map(Recorder::create).transpose()?;
     let skies = space_segment::skies(plan)?;
+    simulate_sky(plan, &skies, (to, recorder), cancel, watch)
+}
+
+/// As [`simulate`], of these skies, one a channel; the recorder is that of the file.
+pub(super) fn simulate_sky(
+    plan: &Plan,
+    skies: &[SkyMap],
+    (to, recorder): (Destination, Option<Recorder>),
+    cancel: &Cancel,
+    watch: Watcher<'_>,
+) -> Result<Report, PipelineError> {
+    let Destination { file, socket } = to;
     let mut graph = Graph::new();
     let counts = SampleCounts::default();
-    let mut bytes = space_segment::add(&mut graph, plan, &skies, &counts)?;
-    drop(skies);
+    let mut bytes = space_segment::add(&mut graph, plan, skies, &counts)?;
     if let Some(file) = &file {
         bytes = add_link(&mut graph, bytes, &plan.config, file)?;
     }
@@ -183,6 +189,19 @@ pub fn replay<S: GroundSource + 'static>(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
+    replay_knowing(Truth::unknown(), source, config, ground, out, cancel, watch)
+}
+
+/// As [`replay`], of a simulation whose skies are known.
+pub(super) fn replay_knowing<S: GroundSource + 'static>(
+    truth: Truth,
+    source: S,
+    config: &Config,
+    ground: Ground,
+    out: &Path,
+    cancel: &Cancel,
+    watch: Watcher<'_>,
+) -> Result<RunSummary, PipelineError> {
     let _lock = lock_folder(out)?;
     let mut graph = Graph::new();
     let listening = source.listening();
@@ -190,12 +209,21 @@ pub fn replay<S: GroundSource + 'static>(
     let grace = Grace::of(&config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
     let ground = ground.cancelled_by(cancel, grace.to_add);
-    let mapping = Mapping { out, truth: Truth::unknown(), watch: solving.clone() };
+    let mapping = Mapping { out, truth, watch: solving.clone() };
     let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
     let saving = outcome.ground.saving.clone();
     let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone(), saving };
     let report = start(graph, &config.runtime, cancel, (watched, watch))?;
     conclude(RunScope::Ground, config, out, Ended { report, outcome, listening, samples: None })
+}
+
+impl Config {
+    /// The maps that a truth is compared with.
+    pub(super) fn map_shape(&self) -> MapShape {
+        let Self { map, products, .. } = self;
+        let l_max = (map.engine == EngineKind::Harmonic).then(|| map.degree());
+        MapShape { nside: map.nside, l_max, processing: products.processing() }
+    }
 }
 
 /// Closes the ledger of samples; not of a run that was cut short, whose stages may still be counting.

@@ -9,7 +9,7 @@ use super::pictures::{
     View, draw_map, draw_plots, draw_sheet,
 };
 use super::provenance::Provenance;
-use super::summary::{ChannelSummary, SnapshotSummary};
+use super::summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 use super::truth::ChannelTruth;
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with};
@@ -134,6 +134,12 @@ impl ChannelFolder {
 
     fn summarise(&self, solution: &Solution, comparison: Option<Comparison>) -> ChannelSummary {
         let pixels = solution.map_k.len() as f64;
+        let power = comparison.as_ref().map(|c| PowerSpectra {
+            map_k2: c.cl_map.clone(),
+            input_k2: c.cl_truth.clone(),
+            cross_k2: c.cl_cross.clone(),
+            noise_k2: c.cl_noise.clone(),
+        });
         let (rho, rho_noise_subtracted, snr) =
             comparison.map_or((None, None, None), |c| (Some(c.rho), c.rho_noise_subtracted, c.snr));
         ChannelSummary {
@@ -152,6 +158,7 @@ impl ChannelFolder {
             rho,
             rho_noise_subtracted,
             snr,
+            power,
             files: Vec::new(),
         }
     }

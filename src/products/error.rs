@@ -19,6 +19,22 @@ pub enum ProductsError {
         /// The system's reason.
         source: std::io::Error,
     },
+    /// The summary of a run that cannot be read.
+    #[error("cannot read {}: {source}; expected the folder of a finished run", path.display())]
+    Read {
+        /// Path.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A file that is not the summary of a run of this version.
+    #[error("{}: {reason}; expected a summary.json that `lunarray run`, `replay` or `study` wrote", path.display())]
+    NotASummary {
+        /// Path.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
     /// Data that cannot be encoded.
     #[error("cannot encode {}: {reason}", path.display())]
     Encode {

@@ -13,6 +13,7 @@ mod error;
 pub mod pictures;
 mod provenance;
 mod publisher;
+mod runs;
 mod summary;
 mod time_coverage;
 mod truth;
@@ -23,6 +24,10 @@ pub use config::{PostProcessing, ProductsConfig};
 pub use error::ProductsError;
 pub use provenance::Provenance;
 pub use publisher::Publisher;
-pub use summary::{ChannelSummary, SnapshotSummary};
+pub use runs::{
+    ChannelFigures, Crossing, DiagnosticFigures, EstimateFigures, PowerFigures, RunFigures, TraceFigures,
+    crossings, draw_runs, runs_csv, spectra_csv,
+};
+pub use summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 pub use time_coverage::draw_coverage;
 pub use truth::{MapShape, Truth};

@@ -24,6 +24,19 @@ pub struct SnapshotSummary {
     pub rho_mean: Option<f64>,
 }
 
+/// Angular power spectra of what is compared, from l = 0.
+#[derive(Clone, Debug, Serialize)]
+pub struct PowerSpectra {
+    /// C_l of the map, K^2.
+    pub map_k2: Vec<f64>,
+    /// C_l of the input at its own resolution, K^2.
+    pub input_k2: Vec<f64>,
+    /// C_l of map times input, K^2.
+    pub cross_k2: Vec<f64>,
+    /// C_l of the noise-only map, K^2.
+    pub noise_k2: Option<Vec<f64>>,
+}
+
 /// One channel: its maps and their quality.
 #[derive(Clone, Debug, Serialize)]
 pub struct ChannelSummary {
@@ -63,6 +76,9 @@ pub struct ChannelSummary {
     /// SNR_l of the final map; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub snr: Option<Vec<f64>>,
+    /// Angular power of the final map, its input and its noise; absent without a truth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub power: Option<PowerSpectra>,
     /// Files written, relative to the output folder.
     pub files: Vec<String>,
 }

@@ -4,8 +4,8 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use super::harmonic::{HarmonicRequest, solve_harmonics};
-use super::tikhonov::solve_pixels_while;
-use super::{Diagnostics, SolveError, SolveWatch, StoppingRule, W_MAX_EXACT, largest_eigenvalue, traces};
+use super::tikhonov::solve_pixels_watched;
+use super::{Diagnostics, SolveError, SolveWatch, StoppingRule};
 use crate::accumulation::{Snapshot, SnapshotSums};
 use crate::frames::Instrument;
 use crate::runtime::{Outlet, Stage, Units};
@@ -98,20 +98,11 @@ impl Stage for Solver {
         }
         let (map_k, noise_k, diagnostics) = match sums {
             SnapshotSums::Pixel(sums) => {
-                // The solution takes the memory of the sums.
-                let found = (probes > 0 && visibilities > 0).then(|| {
-                    let w_max = largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| watch.goes_on()).value;
-                    traces(&sums, epsilon, w_max, probes, watch)
-                });
-                let solved = match solve_pixels_while(sums, epsilon, prior.as_deref(), &|| watch.goes_on()) {
+                let solved = match solve_pixels_watched(sums, epsilon, prior.as_deref(), probes, watch) {
                     Err(SolveError::Interrupted) => return Ok(()),
                     solved => solved?,
                 };
-                let diagnostics = match found {
-                    Some(found) => solved.diagnostics.with_traces(found, 1.0),
-                    None => solved.diagnostics,
-                };
-                (solved.map_k, solved.noise_k, diagnostics)
+                (solved.map_k, solved.noise_k, solved.diagnostics)
             }
             SnapshotSums::Harmonic(sums) => {
                 let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes };

@@ -6,8 +6,9 @@ use super::cholesky::{Cholesky, NotPositive};
 use super::conjugate_gradients::Convergence;
 use super::error::SolveError;
 use super::lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
-use super::traces::{Traces, UnsupportedEpsilon};
+use super::traces::{Traces, UnsupportedEpsilon, traces};
 use super::vectors::{add, subtract};
+use super::watch::{NamedWatch, SolveWatch};
 use crate::accumulation::{NormalSums, PixelSums};
 
 /// Diagnostics of a solution. Eigenvalues and traces are those of pixels, also for a map of harmonics.
@@ -28,7 +29,7 @@ pub struct Diagnostics {
     /// How the iteration for the noise-only map ended.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub noise_convergence: Option<Convergence>,
-    /// Traces of the covariances, if requested.
+    /// Traces of the covariances, if requested and not interrupted.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub traces: Option<Traces>,
     /// Why there are no traces, if they were requested and cannot be had.
@@ -38,10 +39,15 @@ pub struct Diagnostics {
 
 impl Diagnostics {
     /// With the traces of pixels, whose unknowns have the area `per_area_sr` that those of the sums are without.
-    pub(super) fn with_traces(mut self, found: Result<Traces, UnsupportedEpsilon>, per_area_sr: f64) -> Self {
+    pub(super) fn with_traces(
+        mut self,
+        found: Result<Option<Traces>, UnsupportedEpsilon>,
+        per_area_sr: f64,
+    ) -> Self {
         match found {
             Ok(traces) => {
-                self.traces = Some(Traces { sigma_n_k2: traces.sigma_n_k2 / per_area_sr, ..traces });
+                self.traces =
+                    traces.map(|traces| Traces { sigma_n_k2: traces.sigma_n_k2 / per_area_sr, ..traces });
             }
             Err(refused) => self.traces_refused = Some(refused),
         }
@@ -90,23 +96,26 @@ pub fn solve_pixels(
     epsilon: f64,
     prior_k: Option<&[f64]>,
 ) -> Result<PixelSolution, SolveError> {
-    solve_pixels_while(sums, epsilon, prior_k, &|| true)
+    solve_pixels_watched(sums, epsilon, prior_k, 0, SolveWatch::default().named("map"))
 }
 
-/// As [`solve_pixels`], as long as `goes_on` says so.
+/// As [`solve_pixels`], with traces from `probes` probes unless that is 0, as long as `watch` says so.
 ///
 /// # Errors
 /// Also [`SolveError::Interrupted`].
-pub(super) fn solve_pixels_while(
+pub(super) fn solve_pixels_watched(
     sums: PixelSums,
     epsilon: f64,
     prior_k: Option<&[f64]>,
-    goes_on: &dyn Fn() -> bool,
+    probes: usize,
+    watch: NamedWatch<'_>,
 ) -> Result<PixelSolution, SolveError> {
     check_request(&sums, epsilon)?;
     let pixels = sums.unknowns();
     let LargestEigenvalue { value: w_max, iterations, .. } =
-        largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| goes_on());
+        largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| watch.goes_on());
+    // The solution takes the memory of the sums.
+    let traces = (probes > 0).then(|| traces(&sums, epsilon, w_max, probes, watch));
     let mut map_k = sums.right.clone();
     if let Some(prior_k) = prior_k {
         if prior_k.len() != pixels {
@@ -117,7 +126,7 @@ pub(super) fn solve_pixels_while(
     let PixelSums { mut normal, noise: mut noise_k, .. } = sums;
     normal.add_to_diagonal(epsilon * w_max);
     for step in 0..normal.along() {
-        if !goes_on() {
+        if !watch.goes_on() {
             return Err(SolveError::Interrupted);
         }
         Cholesky::advance(&mut normal, step)
@@ -128,18 +137,19 @@ pub(super) fn solve_pixels_while(
     if let Some(prior_k) = prior_k {
         add(&mut map_k, prior_k);
     }
-    Ok(PixelSolution {
-        map_k,
-        noise_k,
-        diagnostics: Diagnostics {
-            epsilon,
-            w_max,
-            w_max_iterations: iterations,
-            l_max: None,
-            convergence: None,
-            noise_convergence: None,
-            traces: None,
-            traces_refused: None,
-        },
-    })
+    let diagnostics = Diagnostics {
+        epsilon,
+        w_max,
+        w_max_iterations: iterations,
+        l_max: None,
+        convergence: None,
+        noise_convergence: None,
+        traces: None,
+        traces_refused: None,
+    };
+    let diagnostics = match traces {
+        Some(found) => diagnostics.with_traces(found, 1.0),
+        None => diagnostics,
+    };
+    Ok(PixelSolution { map_k, noise_k, diagnostics })
 }

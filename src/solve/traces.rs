@@ -73,7 +73,8 @@ pub struct UnsupportedEpsilon {
 
 /// Both traces for R = `epsilon` `w_max` I.
 ///
-/// Of matrices of up to [`HELD_MAX`] unknowns from their eigenvalues, else from `probes` random probes.
+/// Of matrices of up to [`HELD_MAX`] unknowns from their eigenvalues, else from `probes` random probes. `None` if they were
+/// interrupted.
 ///
 /// # Errors
 /// An epsilon that the accuracy of the sums does not support.
@@ -83,12 +84,16 @@ pub fn traces(
     w_max: f64,
     probes: usize,
     watch: NamedWatch<'_>,
-) -> Result<Traces, UnsupportedEpsilon> {
-    let Some(eigenvalues) = held_eigenvalues(sums, watch) else {
+) -> Result<Option<Traces>, UnsupportedEpsilon> {
+    if sums.unknowns() > HELD_MAX {
+        return probed_traces(sums, epsilon, w_max, probes, watch);
+    }
+    let Some(matrix) = held_matrix(sums, watch) else { return Ok(None) };
+    let Some(eigenvalues) = eigenvalues_of(matrix) else {
         return probed_traces(sums, epsilon, w_max, probes, watch);
     };
     let functions = Functions::new(sums, epsilon, w_max);
-    functions.accept(functions.traces(&[Bounds::exact(functions, &eigenvalues)]), epsilon, w_max)
+    functions.accept(functions.traces(&[Bounds::exact(functions, &eigenvalues)]), epsilon, w_max).map(Some)
 }
 
 /// As [`traces`], from random probes in any case.
@@ -101,23 +106,23 @@ pub fn probed_traces(
     w_max: f64,
     probes: usize,
     watch: NamedWatch<'_>,
-) -> Result<Traces, UnsupportedEpsilon> {
+) -> Result<Option<Traces>, UnsupportedEpsilon> {
     let functions = Functions::new(sums, epsilon, w_max);
     let unsupported = UnsupportedEpsilon { epsilon, accuracy: sums.accuracy().absolute };
     // The functions have a pole at -eps, and bounds need a node below the spectrum.
     if functions.delta > OPEN_MAX * functions.eps {
         return Err(unsupported);
     }
-    let found = probe(sums, functions, probes, watch).ok_or(unsupported)?;
-    functions.accept(found, epsilon, w_max)
+    match probe(sums, functions, probes, watch) {
+        Probed::Interrupted => Ok(None),
+        Probed::NoBounds => Err(unsupported),
+        Probed::Bounds(bounds) => functions.accept(functions.traces(&bounds), epsilon, w_max).map(Some),
+    }
 }
 
-/// The eigenvalues of a matrix that is small enough to be held.
-fn held_eigenvalues(sums: &dyn NormalSums, watch: NamedWatch<'_>) -> Option<Vec<f64>> {
+/// A matrix that is small enough to be held; `None` if it was interrupted.
+fn held_matrix(sums: &dyn NormalSums, watch: NamedWatch<'_>) -> Option<Mat<f64>> {
     let order = sums.unknowns();
-    if order > HELD_MAX {
-        return None;
-    }
     let task = watch.start("eigenvalues", 0.0);
     let mut matrix = Mat::<f64>::zeros(order, order);
     let (mut unit, mut column) = (vec![0.0; order], vec![0.0; order]);
@@ -133,7 +138,7 @@ fn held_eigenvalues(sums: &dyn NormalSums, watch: NamedWatch<'_>) -> Option<Vec<
             return None;
         }
     }
-    eigenvalues_of(matrix)
+    Some(matrix)
 }
 
 /// Eigenvalues of a symmetric matrix.
@@ -246,13 +251,16 @@ impl Bounds {
     }
 }
 
-/// The traces from random probes; `None` if the bounds make no sense, as rounding has the last word.
-fn probe(
-    sums: &dyn NormalSums,
-    functions: Functions,
-    probes: usize,
-    watch: NamedWatch<'_>,
-) -> Option<(Traces, [f64; 2])> {
+/// What random probes gave.
+enum Probed {
+    /// Bounds of each, if there are any.
+    Bounds(Vec<Bounds>),
+    /// Bounds that make no sense, as rounding has the last word.
+    NoBounds,
+    Interrupted,
+}
+
+fn probe(sums: &dyn NormalSums, functions: Functions, probes: usize, watch: NamedWatch<'_>) -> Probed {
     let mut all = Vec::new();
     for probe in 0..probes {
         let task = watch.start(&format!("trace {} of {probes}", probe + 1), CLOSED);
@@ -266,13 +274,19 @@ fn probe(
             } else {
                 f64::INFINITY
             };
-            if !is_open || distance < CLOSED || !task.report(step, distance.min(1.0)) {
+            if !is_open || distance < CLOSED {
                 break;
             }
+            if !task.report(step, distance.min(1.0)) {
+                return Probed::Interrupted;
+            }
         }
-        all.push(bounds?);
+        match bounds {
+            Some(bounds) => all.push(bounds),
+            None => return Probed::NoBounds,
+        }
     }
-    (!all.is_empty()).then(|| functions.traces(&all))
+    Probed::Bounds(all)
 }
 
 /// Nodes and weights of a quadrature.

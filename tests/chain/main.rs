@@ -15,3 +15,4 @@ mod paper;
 mod products;
 mod run;
 mod start_up;
+mod study;

@@ -175,8 +175,8 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
     let eps = regularisation(&sums, epsilon);
     assert!((eps / (epsilon * w_max) - 1.0).abs() < 1e-5, "{eps}");
     let watch = SolveWatch::default();
-    let found = probed_traces(&sums, epsilon, w_max, 24, watch.named("test")).unwrap();
-    let held = traces(&sums, epsilon, w_max, 24, watch.named("test")).unwrap();
+    let found = probed_traces(&sums, epsilon, w_max, 24, watch.named("test")).unwrap().unwrap();
+    let held = traces(&sums, epsilon, w_max, 24, watch.named("test")).unwrap().unwrap();
     let exact_n: f64 = eigenvalues.iter().map(|w| w / (w + eps).powi(2)).sum();
     let exact_s: f64 = eigenvalues.iter().map(|w| (eps / (w + eps)).powi(2)).sum();
     for (found, exact) in [(found.sigma_n_k2, exact_n), (found.sigma_s, exact_s)] {
@@ -252,7 +252,7 @@ fn traces_agree_with_the_pixel_engine() {
     let sums = harmonic_sums(&blocks, 22, baseline_m_max);
     for epsilon in [0.1, 1e-2] {
         let w_max = regularisation(&sums, 1.0);
-        let found = traces(&sums, epsilon, w_max, 24, SolveWatch::default().named("test")).unwrap();
+        let found = traces(&sums, epsilon, w_max, 24, SolveWatch::default().named("test")).unwrap().unwrap();
         let found = found.sigma_n_k2 / pixel_area_sr(nside);
         let exact = exact.trace_sigma_n(epsilon);
         // Fringes of u < 2.5 end at l = 16; a pixel's window of nside 8 lowers their power there by 9 %, on average

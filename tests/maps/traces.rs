@@ -5,9 +5,11 @@ use crate::engines::{harmonic_sums, observe};
 
 use std::io::Write;
 use std::process::{Command, Stdio};
+use std::time::Duration;
 
 use faer::{Mat, Side};
 use lunarray::accumulation::{Accuracy, NormalSums};
+use lunarray::runtime::Cancel;
 use lunarray::sky::{Frame, SkyMap};
 use lunarray::solve::{
     SolveWatch, Traces, UnsupportedEpsilon, W_MAX_EXACT, largest_eigenvalue, probed_traces, traces,
@@ -49,14 +51,14 @@ fn traces_of_pixels_are_those_of_the_reference_at_every_epsilon() {
     let sums = crate::tikhonov::sums(&reference);
     let watch = SolveWatch::default();
     for epsilon in epsilons() {
-        let found = traces(&sums, epsilon, w_max(&sums), 1, watch.named("test")).unwrap();
+        let found = traces(&sums, epsilon, w_max(&sums), 1, watch.named("test")).unwrap().unwrap();
         assert_eq!(found.probes, 0);
         check(&found, &eigenvalues, epsilon);
         // Exact: nothing but the accuracy of the sums is open, 1e-11 of W_max, which at 1e-9 is some percent.
         assert!(found.sigma_n_k2.error < 0.1 * found.sigma_n_k2.value, "{found:?}");
         // Bounds of 192 steps at most, the last of which leaves none open; and six standard errors, as six probes know them
         // badly.
-        let probed = probed_traces(&sums, epsilon, w_max(&sums), 6, watch.named("test")).unwrap();
+        let probed = probed_traces(&sums, epsilon, w_max(&sums), 6, watch.named("test")).unwrap().unwrap();
         for (probed, exact) in [(probed.sigma_n_k2, found.sigma_n_k2), (probed.sigma_s, found.sigma_s)] {
             let apart = (probed.value - exact.value).abs();
             assert!(apart < 6.0 * probed.error, "{epsilon:e}: {probed:?} {exact:?}");
@@ -64,14 +66,37 @@ fn traces_of_pixels_are_those_of_the_reference_at_every_epsilon() {
     }
 }
 
-/// Traces over harmonics against those of rows in f64, one by one, with nothing in common.
+/// They are left out, not refused for their accuracy.
 #[test]
-fn traces_of_harmonics_are_right_or_refused_at_every_epsilon() {
-    let Some(python) = common::python() else { return };
-    // Fringes end at l = 2 pi 2.5 = 16 or so: the harmonics beyond are hardly measured, and eigenvalues fall to nothing.
-    let (frequency_hz, baseline_m_max, l_max) = (3e6, 250.0, 20);
+fn interrupted_traces_are_none() {
     let sky = SkyMap::new(Frame::Ecliptic, vec![1e6; 12 * 8 * 8]).unwrap();
-    let blocks = observe(&sky, frequency_hz, baseline_m_max, 3_000);
+    let sums = harmonic_sums(&observe(&sky, 3e6, 250.0, 100), 20, 250.0);
+    let w_max = w_max(&sums);
+    let cancel = Cancel::new();
+    let watch = SolveWatch::new(cancel.clone()).within(Duration::ZERO);
+    assert!(traces(&sums, 0.1, w_max, 2, watch.named("test")).unwrap().is_some());
+    cancel.cancel();
+    assert_eq!(traces(&sums, 0.1, w_max, 2, watch.named("test")), Ok(None));
+    assert_eq!(probed_traces(&sums, 0.1, w_max, 2, watch.named("test")), Ok(None));
+}
+
+/// Fringes end at l = 2 pi 2.5 = 16 or so: the harmonics beyond are hardly measured, and eigenvalues fall to nothing.
+#[test]
+fn traces_of_harmonics_hardly_measured_are_right_or_refused_at_every_epsilon() {
+    compare_with_rows(3e6, 250.0, 20, 3_000);
+}
+
+/// At 10 MHz up to b_p of nside 8. Up to 470 m, which takes minutes, eigenvalues are apart by 1.0e-6 of W_max.
+#[test]
+fn traces_of_harmonics_at_10_mhz_are_right_or_refused_at_every_epsilon() {
+    compare_with_rows(10e6, 234.0, 20, 3_458);
+}
+
+/// Traces over harmonics against those of rows in f64, one by one, with nothing in common.
+fn compare_with_rows(frequency_hz: f64, baseline_m_max: f64, l_max: usize, count: usize) {
+    let Some(python) = common::python() else { return };
+    let sky = SkyMap::new(Frame::Ecliptic, vec![1e6; 12 * 8 * 8]).unwrap();
+    let blocks = observe(&sky, frequency_hz, baseline_m_max, count);
     let visibilities: Vec<Value> = blocks
         .iter()
         .map(|block| json!([block.pair.i, block.pair.j, block.time_s[0], block.weight[0]]))
@@ -108,6 +133,7 @@ fn traces_of_harmonics_are_right_or_refused_at_every_epsilon() {
         ((own - exact).abs() - relative * exact).max(0.0)
     });
     let apart = apart.fold(0.0, f64::max);
+    println!("{} visibilities, apart by {apart:e}; least eigenvalue {:e}", blocks.len(), exact[0] / greatest);
     assert!(apart <= absolute, "{apart:e}");
 
     let watch = SolveWatch::default();
@@ -117,14 +143,14 @@ fn traces_of_harmonics_are_right_or_refused_at_every_epsilon() {
             probed_traces(&sums, epsilon, w_max, 6, watch.named("test")),
         ];
         for found in all {
-            match found {
+            match found.map(Option::unwrap) {
                 Ok(found) if found.probes == 0 => check(&found, &exact, epsilon),
                 Ok(found) => {
                     let expected = expected(&exact, epsilon);
                     for (found, expected) in [found.sigma_n_k2, found.sigma_s].into_iter().zip(expected) {
                         // Six standard errors, as six probes know them badly.
                         assert!(
-                            (found.value - expected).abs() < 4.0 * found.error,
+                            (found.value - expected).abs() < 6.0 * found.error,
                             "{epsilon:e}: {found:?} {expected}"
                         );
                     }

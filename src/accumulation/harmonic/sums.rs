@@ -11,8 +11,9 @@ use crate::accumulation::{Accuracy, NormalSums, SumCounts};
 use crate::sky::harmonics::Alm;
 
 /// Interpolation between nodes and kernels of the weights, which err by up to 1e-3 of an eigenvalue; and where large terms
-/// cancel, these and products in f32: an estimate, which no measurement at small eigenvalues supports yet.
-const ACCURACY: Accuracy = Accuracy { relative: 2e-3, absolute: 1e-6 };
+/// cancel, these and products in f32: up to 1.0e-6 of W_max beyond the relative part, of 2,151 visibilities at 10 MHz up to
+/// 470 m, l_max 20, against rows in f64 of other code (`tests/maps/traces.rs`).
+const ACCURACY: Accuracy = Accuracy { relative: 2e-3, absolute: 2e-6 };
 
 /// Normal equations of one channel over the real orthonormal harmonics up to `l_max`.
 ///

@@ -1,0 +1,120 @@
+//! `lunarray study`: run a pipeline at every combination of some settings.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::arguments::size_bytes;
+use super::interrupt::Interrupt;
+use super::output::{CommandResult, print_json_line, print_notes, print_text, say};
+use super::progress::Progress;
+use crate::pipeline::{
+    INTEGRATE, MemoryLimit, READ, Segment, Study, StudyPhase, StudySummary, run_study, use_threads,
+};
+
+/// Run a pipeline at every combination of some settings, and show the results side by side.
+///
+/// A study names a pipeline file and axes: a key with values, or named cases of several settings. Cases that differ only
+/// in the ground segment share one simulation, and those that differ only in epsilon or prior share their sums. Leaves the
+/// products of every case, tables (study.csv, spectra.csv, study.json) and overlaid curves (study.png): rho_l, SNR_l, C_l,
+/// and, with map.trace_probes, the traces of thermal noise and imperfection against epsilon, with their crossing. Cases
+/// that are finished are not made again: to resume after an interruption, repeat the command.
+///
+/// Example: lunarray study pipelines/paper/fig15-traces.toml --out out/fig15
+#[derive(Debug, Args)]
+pub(super) struct StudyArgs {
+    /// Study file (TOML).
+    #[arg(value_name = "STUDY.toml")]
+    study: PathBuf,
+    /// Output folder; out/NAME if not given.
+    #[arg(short, long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Replace one setting in all cases, for example --set map.nside=16; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+    /// Keep the downlinks and states that cases share, so that cases can be added without simulating again.
+    #[arg(long)]
+    keep: bool,
+    /// Greatest memory that the estimate of a case may come to, with a unit, such as 8GB or 16GiB; what the machine has
+    /// available if not given.
+    #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
+    memory_max: Option<u64>,
+    /// Print the results as one JSON object instead of a table.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn execute(args: &StudyArgs) -> CommandResult {
+    let study = Study::read(&args.study, &args.overrides)?;
+    let limit = args.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine);
+    for case in &study.cases {
+        case.plan.cost().require_memory(Segment::Whole, limit)?;
+    }
+    if let Some(first) = study.cases.first() {
+        use_threads(&first.plan.config.runtime)?;
+    }
+    let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&study.name));
+    let interrupt = Interrupt::default();
+    let mut progress: Option<Progress> = None;
+    let summary = run_study(&study, &out, args.keep, interrupt.cancel(), &mut |number, phase, watched| {
+        interrupt.arm_or_note();
+        // The last one ends before the next begins.
+        drop(progress.take());
+        let case = &study.cases[number];
+        let what = if phase == StudyPhase::Simulate { "simulating for" } else { "mapping" };
+        say(format_args!("case {} of {}: {what} {}", number + 1, study.cases.len(), case.label()));
+        let (stage, total) = match phase {
+            StudyPhase::Simulate => (INTEGRATE, case.plan.windows_watched()),
+            StudyPhase::Map => (READ, 0),
+        };
+        progress = Some(Progress::watch(watched, stage, total, interrupt.cancel()));
+    })?;
+    drop(progress);
+    if summary.cancelled {
+        let done = summary.cases.len();
+        print_notes([format!(
+            "{done} of {} cases are finished; repeat the command to go on",
+            study.cases.len()
+        )]);
+    }
+    interrupt.completion(summary.cancelled).after(if args.json {
+        print_json_line(&summary)
+    } else {
+        print_text(&format!("{}\nTables, curves and products are in {}", table(&summary), out.display()))
+    })
+}
+
+fn table(summary: &StudySummary) -> String {
+    let widest =
+        summary.cases.iter().map(|case| case.figures.label.chars().count()).max().unwrap_or(4).max(4);
+    let mut lines = vec![format!(
+        "{:<widest$}  {:>10}  {:>12}  {:>9}  {:>10}  {:>10}  {:>10}",
+        "case", "MHz", "visibilities", "epsilon", "noise, K", "Tr Sigma_n", "Tr Sigma_s"
+    )];
+    for case in &summary.cases {
+        for channel in &case.figures.channels {
+            let traces = channel.diagnostics.traces.as_ref();
+            let [n, s] = [traces.map(|t| t.sigma_n_k2.value), traces.map(|t| t.sigma_s.value)]
+                .map(|value| value.map_or_else(|| "-".to_owned(), |value| format!("{value:.3e}")));
+            lines.push(format!(
+                "{:<widest$}  {:>10.3}  {:>12}  {:>9.1e}  {:>10.3e}  {n:>10}  {s:>10}",
+                case.figures.label,
+                channel.frequency_hz / 1e6,
+                channel.visibilities,
+                channel.diagnostics.epsilon,
+                channel.noise_rms_k
+            ));
+        }
+    }
+    for crossing in &summary.crossings {
+        let of =
+            |epsilon: Option<f64>| epsilon.map_or_else(|| "not within".to_owned(), |e| format!("{e:.2e}"));
+        lines.push(format!(
+            "traces at {:.3} MHz cross at epsilon {} (Tr Sigma_n = T² Tr Sigma_s, T the mean of the input; {} with T)",
+            crossing.frequency_hz / 1e6,
+            of(crossing.epsilon),
+            of(crossing.epsilon_first_power)
+        ));
+    }
+    lines.join("\n")
+}

@@ -1,0 +1,484 @@
+//! Studies: one simulation, many solutions.
+//!
+//! A study runs a pipeline at every combination of some settings. Cases that differ only in the ground segment share the
+//! downlink of one simulation; those that differ only in the solution (epsilon, prior) share the sums of one state.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use super::config::Config;
+use super::config_source::ConfigSource;
+use super::error::PipelineError;
+use super::plan::Plan;
+use super::run::{Destination, Watched, downlink_file, replay_knowing, simulate_sky};
+use super::space_segment;
+use crate::downlink::{FileSource, Recorder};
+use crate::files::{FolderLock, write_atomically};
+use crate::ground::{Ground, WAIT_BYTES};
+use crate::products::{
+    Crossing, MapShape, ProductsError, RunFigures, Truth, crossings, draw_runs, runs_csv, spectra_csv,
+};
+use crate::runtime::Cancel;
+use crate::sky::SkyMap;
+
+/// Most cases of a study.
+const CASES_MAX: usize = 1000;
+/// Longest study file, bytes.
+const FILE_BYTES_MAX: u64 = 1 << 20;
+/// Most characters of the name of a case's folder, besides its beginning.
+const FOLDER_CHARACTERS_MAX: usize = 100;
+/// Visibilities between checkpoints of a case's state: a minute's work or more.
+const CHECKPOINT_EVERY: u64 = 20_000_000;
+
+/// Why a study cannot be made.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum StudyError {
+    /// The file cannot be read.
+    #[error("cannot read the study {}: {source}", path.display())]
+    Read {
+        /// Path.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The file is no study.
+    #[error("{}: {found}; expected {expected}", path.display())]
+    File {
+        /// Path.
+        path: PathBuf,
+        /// What was found.
+        found: String,
+        /// What was expected.
+        expected: &'static str,
+    },
+    /// A case whose settings are not a pipeline.
+    #[error("case {label}: {source}")]
+    Case {
+        /// Its label.
+        label: String,
+        /// What is wrong.
+        source: Box<PipelineError>,
+    },
+}
+
+/// A study file.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct StudyFile {
+    name: Option<String>,
+    /// Beside the study; the embedded quicklook if absent.
+    pipeline: Option<PathBuf>,
+    /// Overrides of all cases.
+    #[serde(default)]
+    set: Vec<String>,
+    #[serde(default)]
+    axis: Vec<AxisFile>,
+}
+
+/// An axis: a key and its values, or named cases of several settings each.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct AxisFile {
+    key: Option<String>,
+    values: Option<Vec<toml::Value>>,
+    cases: Option<Vec<CaseFile>>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct CaseFile {
+    label: String,
+    set: Vec<String>,
+}
+
+/// A study: its cases, with their configurations.
+#[derive(Clone, Debug)]
+pub struct Study {
+    /// Name; results go to `out/NAME` by default.
+    pub name: String,
+    /// Its cases, in order.
+    pub cases: Vec<StudyCase>,
+}
+
+/// A case of a study.
+#[derive(Clone, Debug)]
+pub struct StudyCase {
+    /// What tells it from the others: a part for each axis.
+    pub labels: Vec<String>,
+    /// Its overrides of the pipeline.
+    pub overrides: Vec<String>,
+    /// Its plan.
+    pub plan: Plan,
+}
+
+impl StudyCase {
+    /// Its parts in one.
+    #[must_use]
+    pub fn label(&self) -> String {
+        self.labels.join(", ")
+    }
+
+    /// Name of the folder of its products: its label without blanks and signs.
+    #[must_use]
+    pub fn folder(&self) -> String {
+        let label = self.label();
+        let parts = label.split(|c: char| !(c.is_ascii_alphanumeric() || ['.', '_'].contains(&c)));
+        let name = parts.filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-");
+        format!("case-{}", name.chars().take(FOLDER_CHARACTERS_MAX).collect::<String>())
+    }
+}
+
+impl Study {
+    /// Reads a study, with more overrides of all its cases, and checks the configuration of every case.
+    ///
+    /// # Errors
+    /// A file that cannot be read or is no study; a case whose settings are wrong.
+    pub fn read(path: &Path, more: &[String]) -> Result<Self, StudyError> {
+        let text = read_text(path)?;
+        let wrong = |found: String, expected| StudyError::File { path: path.to_owned(), found, expected };
+        let file: StudyFile = toml::from_str(&text).map_err(|error| {
+            wrong(error.to_string(), "name, pipeline, set and [[axis]] with key and values, or with cases")
+        })?;
+        let mut combinations = vec![(Vec::new(), Vec::new())];
+        for (number, axis) in file.axis.iter().enumerate() {
+            let steps = steps(axis).ok_or_else(|| {
+                wrong(
+                    format!("axis {}", number + 1),
+                    "key with values, or cases with label and set; at least one",
+                )
+            })?;
+            if combinations.len().saturating_mul(steps.len()) > CASES_MAX {
+                return Err(wrong(format!("more than {CASES_MAX} combinations"), "at most 1000 cases"));
+            }
+            combinations = combinations
+                .iter()
+                .flat_map(|(labels, sets)| {
+                    steps.iter().map(move |(label, set)| {
+                        let labels: Vec<String> = [labels.as_slice(), std::slice::from_ref(label)].concat();
+                        let sets: Vec<String> = [sets.as_slice(), set.as_slice()].concat();
+                        (labels, sets)
+                    })
+                })
+                .collect();
+        }
+        let stem =
+            path.file_stem().map_or_else(|| "study".into(), |stem| stem.to_string_lossy().into_owned());
+        let beside = |pipeline: &PathBuf| path.parent().unwrap_or(Path::new("")).join(pipeline);
+        let pipeline = file.pipeline.as_ref().map(beside);
+        let cases = combinations.into_iter().map(|(labels, sets)| {
+            let overrides = [file.set.as_slice(), &sets, more].concat();
+            let source = ConfigSource { file: pipeline.clone(), overrides: overrides.clone(), seed: None };
+            let plan = source.load().map_err(PipelineError::from).and_then(Plan::new);
+            let plan = plan
+                .map_err(|source| StudyError::Case { label: labels.join(", "), source: Box::new(source) })?;
+            Ok(StudyCase { labels, overrides, plan })
+        });
+        let cases = cases.collect::<Result<Vec<StudyCase>, StudyError>>()?;
+        let mut folders = BTreeSet::new();
+        if let Some(twice) = cases.iter().find(|case| !folders.insert(case.folder())) {
+            let found = format!("two cases with products in {}", twice.folder());
+            return Err(wrong(found, "labels that differ in letters or digits"));
+        }
+        Ok(Self { name: file.name.unwrap_or(stem), cases })
+    }
+}
+
+fn read_text(path: &Path) -> Result<String, StudyError> {
+    let failed = |source| StudyError::Read { path: path.to_owned(), source };
+    let bytes = fs::metadata(path).map_err(failed)?.len();
+    if bytes > FILE_BYTES_MAX {
+        let found = format!("{bytes} bytes");
+        return Err(StudyError::File {
+            path: path.to_owned(),
+            found,
+            expected: "a study, at most a megabyte",
+        });
+    }
+    fs::read_to_string(path).map_err(failed)
+}
+
+/// Label and overrides of each step of an axis; `None` for one without steps.
+fn steps(axis: &AxisFile) -> Option<Vec<(String, Vec<String>)>> {
+    let steps: Vec<_> = match (&axis.key, &axis.values, &axis.cases) {
+        (Some(key), Some(values), None) => {
+            let name = key.rsplit('.').next().unwrap_or(key);
+            let step = |value: &toml::Value| (format!("{name} = {value}"), vec![format!("{key}={value}")]);
+            values.iter().map(step).collect()
+        }
+        (None, None, Some(cases)) => {
+            cases.iter().map(|case| (case.label.clone(), case.set.clone())).collect()
+        }
+        _ => return None,
+    };
+    (!steps.is_empty()).then_some(steps)
+}
+
+/// What a study is doing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StudyPhase {
+    /// Simulating the downlink that some cases share.
+    Simulate,
+    /// Mapping a case.
+    Map,
+}
+
+/// Follows a study: the number of the case, from 0, what is done for it, and the handles of its graph.
+pub type StudyWatcher<'a> = &'a mut dyn FnMut(usize, StudyPhase, Watched);
+
+/// Results of a study.
+#[derive(Clone, Debug, Serialize)]
+pub struct StudySummary {
+    /// Its name.
+    pub name: String,
+    /// Whether it was ended early: repeat the command to go on.
+    pub cancelled: bool,
+    /// Its finished cases.
+    pub cases: Vec<CaseSummary>,
+    /// Where the traces cross, for cases that differ in map.epsilon alone.
+    pub crossings: Vec<Crossing>,
+}
+
+/// A finished case.
+#[derive(Clone, Debug, Serialize)]
+pub struct CaseSummary {
+    /// Folder of its products.
+    pub folder: String,
+    /// Its overrides of the pipeline.
+    pub overrides: Vec<String>,
+    /// Its figures.
+    pub figures: RunFigures,
+}
+
+/// What decides whether a case has to be made again.
+#[derive(PartialEq, Serialize, Deserialize)]
+struct CaseMarker {
+    space_hash: u64,
+    ground_hash: u64,
+    /// All settings but those of the runtime, which change no result.
+    config: serde_json::Value,
+}
+
+impl CaseMarker {
+    fn of(config: &Config) -> Self {
+        let mut value = serde_json::to_value(config).unwrap_or_default();
+        if let Some(sections) = value.as_object_mut() {
+            sections.remove("runtime");
+        }
+        Self { space_hash: config.space_hash(), ground_hash: config.ground_hash(), config: value }
+    }
+}
+
+/// Name of the file in a case's folder that says that it is finished.
+const MARKER: &str = "case.json";
+
+/// Where a study stands.
+struct Making<'a> {
+    study: &'a Study,
+    out: &'a Path,
+    cancel: &'a Cancel,
+    watch: StudyWatcher<'a>,
+}
+
+/// Makes the cases of a study that are not in `out` yet, and tables and curves of all.
+///
+/// Leaves in `out`: a folder of products for each case, `study.json`, `study.csv`, `spectra.csv` and `study.png`. The shared
+/// downlinks and states are removed once they are used up, unless `keep`.
+///
+/// # Errors
+/// As [`super::run()`]; tables and pictures that cannot be written.
+pub fn run_study(
+    study: &Study,
+    out: &Path,
+    keep: bool,
+    cancel: &Cancel,
+    watch: StudyWatcher<'_>,
+) -> Result<StudySummary, PipelineError> {
+    let failed = |path: &Path| {
+        let path = path.to_owned();
+        move |source| PipelineError::from(ProductsError::Write { path, source })
+    };
+    fs::create_dir_all(out).map_err(failed(out))?;
+    let _lock = FolderLock::acquire(out, ".lock", true).map_err(failed(out))?;
+    let mut making = Making { study, out, cancel, watch };
+    let pending = |k: &usize| !is_done(&study.cases[*k], out);
+    let mut pending: Vec<usize> = (0..study.cases.len()).filter(pending).collect();
+    let mut is_cut = false;
+    // The first case that is left, and all that share its downlink.
+    while let (Some(&first), false) = (pending.first(), is_cut) {
+        let key = downlink_key(&study.cases[first].plan.config);
+        let (group, rest): (Vec<usize>, Vec<usize>) =
+            pending.iter().partition(|&&k| downlink_key(&study.cases[k].plan.config) == key);
+        let file = out.join(format!("downlink-{key:016x}.{}", extension(&study.cases[first].plan.config)));
+        is_cut = !making.make(&group, &file, keep)?;
+        if !is_cut && !keep {
+            fs::remove_file(&file).map_err(failed(&file))?;
+        }
+        pending = rest;
+    }
+    let summary = summarise(study, out, is_cut)?;
+    write_results(&summary, out)?;
+    Ok(summary)
+}
+
+fn extension(config: &Config) -> &'static str {
+    let name = downlink_file(config.downlink.format);
+    name.rsplit('.').next().unwrap_or("ccsds")
+}
+
+fn is_done(case: &StudyCase, out: &Path) -> bool {
+    let marker = fs::read(out.join(case.folder()).join(MARKER)).ok();
+    let found = marker.and_then(|bytes| serde_json::from_slice::<CaseMarker>(&bytes).ok());
+    found.is_some_and(|found| found == CaseMarker::of(&case.plan.config))
+}
+
+/// A number that cases of equal downlinks share.
+fn downlink_key(config: &Config) -> u64 {
+    let text = serde_json::to_vec(&(config.space_hash(), &config.downlink)).unwrap_or_default();
+    crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
+}
+
+/// A number that cases of equal sums of one downlink share.
+fn sums_key(config: &Config) -> u64 {
+    let mut map = config.map.clone();
+    let usual = crate::accumulation::MapConfig::default();
+    (map.epsilon, map.prior_k, map.prior_files) = (usual.epsilon, usual.prior_k, usual.prior_files);
+    (map.prior_fwhm_deg, map.residual_max) = (usual.prior_fwhm_deg, usual.residual_max);
+    (map.iterations_max, map.trace_probes) = (usual.iterations_max, usual.trace_probes);
+    let text = serde_json::to_vec(&(map, &config.calibration)).unwrap_or_default();
+    crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
+}
+
+/// The truth for the last shape of maps, as neighbouring cases have the same.
+struct LastTruth {
+    shape: MapShape,
+    truth: Truth,
+}
+
+impl Making<'_> {
+    /// Makes the cases of one downlink; whether all of them were made.
+    fn make(&mut self, group: &[usize], file: &Path, keep: bool) -> Result<bool, PipelineError> {
+        let cases = &self.study.cases;
+        let plan = &cases[group[0]].plan;
+        let skies = space_segment::skies(plan)?;
+        if !file.exists() {
+            let recorder = Some(Recorder::create(file)?);
+            let watch = &mut self.watch;
+            let report = simulate_sky(
+                plan,
+                &skies,
+                (Destination::from(&file), recorder),
+                self.cancel,
+                &mut |watched| {
+                    watch(group[0], StudyPhase::Simulate, watched);
+                },
+            )?;
+            if report.cancelled {
+                // What was simulated is less than the mission.
+                let _ = fs::remove_file(file);
+                return Ok(false);
+            }
+        }
+        let mut left = group.to_vec();
+        let mut last = None;
+        while let Some(&first) = left.first() {
+            let key = sums_key(&cases[first].plan.config);
+            let (same, rest): (Vec<usize>, Vec<usize>) =
+                left.iter().partition(|&&k| sums_key(&cases[k].plan.config) == key);
+            let state = self.out.join(format!("state-{key:016x}"));
+            for (number, &k) in same.iter().enumerate() {
+                // The state has taken the file in once its first case is made.
+                let files = if number == 0 { &[file.to_owned()][..] } else { &[] };
+                if !self.map(k, files, (same.len() > 1).then_some(state.as_path()), &skies, &mut last)? {
+                    return Ok(false);
+                }
+            }
+            if !keep && state.exists() {
+                fs::remove_dir_all(&state)
+                    .map_err(|source| ProductsError::Write { path: state.clone(), source })?;
+            }
+            left = rest;
+        }
+        Ok(true)
+    }
+
+    /// Maps a case; whether it was finished.
+    fn map(
+        &mut self,
+        number: usize,
+        files: &[PathBuf],
+        state: Option<&Path>,
+        skies: &[SkyMap],
+        last: &mut Option<LastTruth>,
+    ) -> Result<bool, PipelineError> {
+        let config = &self.study.cases[number].plan.config;
+        let folder = self.out.join(self.study.cases[number].folder());
+        let shape = config.map_shape();
+        let truth = match last.take() {
+            Some(known) if known.shape == shape => known.truth,
+            _ => Truth::new(skies, shape)?,
+        };
+        *last = Some(LastTruth { shape, truth: truth.clone() });
+        let settings = config.ground(WAIT_BYTES);
+        let ground = match state {
+            Some(state) => Ground::open(state, &settings, CHECKPOINT_EVERY)?,
+            None => Ground::new(&settings)?,
+        };
+        let source = FileSource::open(files)?;
+        let watch = &mut self.watch;
+        let summary = replay_knowing(truth, source, config, ground, &folder, self.cancel, &mut |watched| {
+            watch(number, StudyPhase::Map, watched);
+        })?;
+        if summary.cancelled {
+            return Ok(false);
+        }
+        let path = folder.join(MARKER);
+        let text = serde_json::to_vec_pretty(&CaseMarker::of(config)).unwrap_or_default();
+        write_atomically(&path, &text).map_err(|source| ProductsError::Write { path, source })?;
+        Ok(true)
+    }
+}
+
+fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary, PipelineError> {
+    let mut cases = Vec::new();
+    let mut groups: Vec<(Vec<u8>, Vec<usize>)> = Vec::new();
+    for case in study.cases.iter().filter(|case| is_done(case, out)) {
+        let mut figures = RunFigures::read(&out.join(case.folder()))?;
+        figures.label = case.label();
+        let mut config = case.plan.config.clone();
+        config.map.epsilon = crate::accumulation::MapConfig::default().epsilon;
+        let key = serde_json::to_vec(&config).unwrap_or_default();
+        match groups.iter_mut().find(|(found, _)| *found == key) {
+            Some((_, members)) => members.push(cases.len()),
+            None => groups.push((key, vec![cases.len()])),
+        }
+        cases.push(CaseSummary { folder: case.folder(), overrides: case.overrides.clone(), figures });
+    }
+    let groups: Vec<Vec<&RunFigures>> = groups
+        .into_iter()
+        .map(|(_, members)| members.into_iter().map(|k| &cases[k].figures).collect())
+        .collect();
+    let crossings = crossings(&groups);
+    Ok(StudySummary { name: study.name.clone(), cancelled, cases, crossings })
+}
+
+fn write_results(summary: &StudySummary, out: &Path) -> Result<(), PipelineError> {
+    let runs: Vec<&RunFigures> = summary.cases.iter().map(|case| &case.figures).collect();
+    let json = serde_json::to_vec_pretty(summary)
+        .map_err(|error| ProductsError::Encode { path: out.join("study.json"), reason: error.to_string() })?;
+    for (name, bytes) in [
+        ("study.json", json),
+        ("study.csv", runs_csv(&runs).into_bytes()),
+        ("spectra.csv", spectra_csv(&runs).into_bytes()),
+    ] {
+        let path = out.join(name);
+        write_atomically(&path, &bytes).map_err(|source| ProductsError::Write { path, source })?;
+    }
+    let picture = draw_runs(&summary.name, &runs).map_err(ProductsError::from)?;
+    picture.write(&out.join("study.png")).map_err(ProductsError::from)?;
+    Ok(())
+}

@@ -1,0 +1,411 @@
+//! Several runs side by side: what their summaries say, as tables and overlaid curves.
+
+use std::fmt::Write;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::error::ProductsError;
+use super::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
+
+/// Most runs that are drawn over one another: more cannot be told apart.
+const DRAWN_MAX: usize = 14;
+
+/// What a run's `summary.json` says of its maps.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RunFigures {
+    /// What tells it from the others: its name, unless a study labels it.
+    #[serde(rename = "name")]
+    pub label: String,
+    /// Whether it was ended early.
+    pub cancelled: bool,
+    /// Its channels.
+    pub channels: Vec<ChannelFigures>,
+}
+
+/// Figures of one channel's final map. Spectra run from l = 0; what is not known is `None`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ChannelFigures {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// nside of the map.
+    pub nside: usize,
+    /// Visibilities in it.
+    pub visibilities: u64,
+    /// Its mean, K.
+    pub mean_k: f64,
+    /// RMS of the noise-only map, K.
+    pub noise_rms_k: f64,
+    /// Whether the visibilities hold thermal noise.
+    pub thermal_noise: bool,
+    /// Regularisation and traces.
+    pub diagnostics: DiagnosticFigures,
+    /// rho_l.
+    pub rho: Option<Vec<Option<f64>>>,
+    /// rho_l, the power of the noise subtracted.
+    pub rho_noise_subtracted: Option<Vec<Option<f64>>>,
+    /// SNR_l.
+    pub snr: Option<Vec<Option<f64>>>,
+    /// Angular power.
+    pub power: Option<PowerFigures>,
+}
+
+/// Regularisation of a solution, and its traces.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct DiagnosticFigures {
+    /// epsilon of R = epsilon W_max I.
+    pub epsilon: f64,
+    /// W_max, K^-2.
+    pub w_max: f64,
+    /// Traces, if they were asked for.
+    pub traces: Option<TraceFigures>,
+}
+
+/// Traces of the covariances (the paper, Sect. 4).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TraceFigures {
+    /// Tr Sigma_n, K^2.
+    pub sigma_n_k2: EstimateFigures,
+    /// Tr Sigma_s.
+    pub sigma_s: EstimateFigures,
+}
+
+/// A value with its error; `None` if nothing bounds it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EstimateFigures {
+    /// Value.
+    pub value: f64,
+    /// Error.
+    pub error: Option<f64>,
+}
+
+/// Angular power, K^2.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PowerFigures {
+    /// C_l of the map.
+    pub map_k2: Vec<Option<f64>>,
+    /// C_l of the input.
+    pub input_k2: Vec<Option<f64>>,
+    /// C_l of map times input.
+    pub cross_k2: Vec<Option<f64>>,
+    /// C_l of the noise-only map.
+    pub noise_k2: Option<Vec<Option<f64>>>,
+}
+
+impl RunFigures {
+    /// Reads the `summary.json` in the folder of a run.
+    ///
+    /// # Errors
+    /// A file that cannot be read, or is no summary of a run.
+    pub fn read(folder: &Path) -> Result<Self, ProductsError> {
+        let path = folder.join("summary.json");
+        let bytes =
+            std::fs::read(&path).map_err(|source| ProductsError::Read { path: path.clone(), source })?;
+        serde_json::from_slice(&bytes)
+            .map_err(|error| ProductsError::NotASummary { path, reason: error.to_string() })
+    }
+}
+
+impl ChannelFigures {
+    /// Mean of the input, K: `C_0 = 4 pi mean^2`.
+    #[must_use]
+    pub fn input_mean_k(&self) -> Option<f64> {
+        let power = self.power.as_ref()?.input_k2.first().copied().flatten()?;
+        Some((power / (4.0 * std::f64::consts::PI)).sqrt())
+    }
+
+    /// Mean of rho_l over `from <= l <= to`, if all of these are known.
+    fn rho_mean(&self, from: usize, to: usize) -> Option<f64> {
+        let rho: Option<Vec<f64>> = self.rho.as_ref()?.get(from..=to)?.iter().copied().collect();
+        rho.map(|rho| rho.iter().sum::<f64>() / rho.len() as f64)
+    }
+}
+
+/// Where thermal noise and imperfection are alike, as epsilon changes and nothing else (the paper, Fig. 15).
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Crossing {
+    /// Label of the first of the runs.
+    pub of: String,
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// epsilon at which Tr Sigma_n = T^2 Tr Sigma_s with T the mean of the input, both K^2.
+    pub epsilon: Option<f64>,
+    /// epsilon at which the number of K^2 in Tr Sigma_n is the number of K in T Tr Sigma_s.
+    pub epsilon_first_power: Option<f64>,
+}
+
+/// Crossings of the traces in groups of runs that differ in epsilon alone.
+#[must_use]
+pub fn crossings(groups: &[Vec<&RunFigures>]) -> Vec<Crossing> {
+    let mut found = Vec::new();
+    for group in groups.iter().filter(|group| group.len() > 1) {
+        for (k, first) in group[0].channels.iter().enumerate() {
+            let mut points: Vec<[f64; 4]> = group
+                .iter()
+                .filter_map(|run| {
+                    let channel = run.channels.get(k)?;
+                    let traces = channel.diagnostics.traces.as_ref()?;
+                    let (n, s) = (traces.sigma_n_k2.value, traces.sigma_s.value);
+                    Some([channel.diagnostics.epsilon, n, s, channel.input_mean_k()?])
+                })
+                .collect();
+            points.sort_by(|a, b| a[0].total_cmp(&b[0]));
+            if points.len() < 2 {
+                continue;
+            }
+            found.push(Crossing {
+                of: group[0].label.clone(),
+                frequency_hz: first.frequency_hz,
+                epsilon: crossing(&points, 2),
+                epsilon_first_power: crossing(&points, 1),
+            });
+        }
+    }
+    found
+}
+
+/// Where `n = mean^power s`, on straight lines between logarithms.
+fn crossing(points: &[[f64; 4]], power: i32) -> Option<f64> {
+    let excess = |[epsilon, n, s, mean]: &[f64; 4]| (epsilon.ln(), (n / (s * mean.powi(power))).ln());
+    points.windows(2).find_map(|two| {
+        let ((x0, y0), (x1, y1)) = (excess(&two[0]), excess(&two[1]));
+        (y0 >= 0.0 && y1 < 0.0).then(|| (x0 + (x1 - x0) * y0 / (y0 - y1)).exp())
+    })
+}
+
+/// Text of one field of a table with commas.
+fn field(text: &str) -> String {
+    if text.contains([',', '"', '\n']) {
+        format!("\"{}\"", text.replace('"', "\"\""))
+    } else {
+        text.to_owned()
+    }
+}
+
+fn number(value: Option<f64>) -> String {
+    value.map_or_else(String::new, |value| format!("{value:e}"))
+}
+
+/// Runs as a table (CSV), a line a channel.
+#[must_use]
+pub fn runs_csv(runs: &[&RunFigures]) -> String {
+    let mut text =
+        "run,frequency_hz,nside,visibilities,epsilon,w_max,mean_k,input_mean_k,noise_rms_k,tr_sigma_n_k2,\
+                    tr_sigma_n_error_k2,tr_sigma_s,tr_sigma_s_error,rho_mean_20_120\n"
+            .to_owned();
+    for (run, channel) in runs.iter().flat_map(|run| run.channels.iter().map(move |channel| (run, channel))) {
+        let DiagnosticFigures { epsilon, w_max, traces } = &channel.diagnostics;
+        let [n, s] =
+            [|t: &TraceFigures| t.sigma_n_k2, |t: &TraceFigures| t.sigma_s].map(|of| traces.as_ref().map(of));
+        let start = [
+            field(&run.label),
+            format!("{}", channel.frequency_hz),
+            channel.nside.to_string(),
+            channel.visibilities.to_string(),
+        ];
+        let numbers = [
+            Some(*epsilon),
+            Some(*w_max),
+            Some(channel.mean_k),
+            channel.input_mean_k(),
+            Some(channel.noise_rms_k),
+            n.map(|n| n.value),
+            n.and_then(|n| n.error),
+            s.map(|s| s.value),
+            s.and_then(|s| s.error),
+            channel.rho_mean(20, 120.min(2 * channel.nside)),
+        ];
+        let fields: Vec<String> = start.into_iter().chain(numbers.map(number)).collect();
+        text.push_str(&fields.join(","));
+        text.push('\n');
+    }
+    text
+}
+
+/// Spectra of runs as a table (CSV), a line a degree.
+#[must_use]
+pub fn spectra_csv(runs: &[&RunFigures]) -> String {
+    let mut text =
+        "run,frequency_hz,l,rho,rho_noise_subtracted,snr,map_k2,input_k2,cross_k2,noise_k2\n".to_owned();
+    for (run, channel) in runs.iter().flat_map(|run| run.channels.iter().map(move |channel| (run, channel))) {
+        let power = channel.power.as_ref();
+        let columns = [
+            channel.rho.as_ref(),
+            channel.rho_noise_subtracted.as_ref(),
+            channel.snr.as_ref(),
+            power.map(|power| &power.map_k2),
+            power.map(|power| &power.input_k2),
+            power.map(|power| &power.cross_k2),
+            power.and_then(|power| power.noise_k2.as_ref()),
+        ];
+        let degrees = columns.iter().flatten().map(|column| column.len()).max().unwrap_or(0);
+        for l in 0..degrees {
+            let values =
+                columns.map(|column| number(column.and_then(|column| column.get(l).copied().flatten())));
+            // Writing to a string does not fail.
+            let _ = writeln!(text, "{},{},{l},{}", field(&run.label), channel.frequency_hz, values.join(","));
+        }
+    }
+    text
+}
+
+/// Curves of runs over one another: rho_l, SNR_l, C_l of the maps, and the traces against epsilon where there are some.
+///
+/// # Errors
+/// None in practice: only a page that is too large, which four plots are not.
+pub fn draw_runs(title: &str, runs: &[&RunFigures]) -> Result<Picture, PictureError> {
+    let channels: Vec<(String, &ChannelFigures)> = runs
+        .iter()
+        .flat_map(|run| {
+            run.channels.iter().map(|channel| {
+                let several = run.channels.len() > 1;
+                let frequency = format!("{:.3} MHz", channel.frequency_hz / 1e6);
+                let label = if several { format!("{}, {frequency}", run.label) } else { run.label.clone() };
+                (label, channel)
+            })
+        })
+        .collect();
+    let of_degrees = |get: &dyn Fn(&ChannelFigures) -> Option<&Vec<Option<f64>>>| -> Vec<Curve> {
+        channels
+            .iter()
+            .take(DRAWN_MAX)
+            .enumerate()
+            .filter_map(|(number, (label, channel))| {
+                // What is not known interrupts the curve.
+                let points = get(channel)?
+                    .iter()
+                    .enumerate()
+                    .map(|(l, y)| (l as f64, y.unwrap_or(f64::NAN)))
+                    .collect();
+                Some(Curve { label: label.clone(), points, dashed: number >= 7 })
+            })
+            .collect()
+    };
+    let l = Axis { label: "degree l".to_owned(), ..Axis::default() };
+    let mut plots = Vec::new();
+    let mut plot = |title: &str, y: Axis, curves: Vec<Curve>, levels: Vec<f64>| {
+        if !curves.is_empty() {
+            plots.push(Plot { title: title.to_owned(), x: l.clone(), y, curves, levels });
+        }
+    };
+    let rho = Axis { label: "rho_{l}".to_owned(), limits: Some((0.0, 1.05)), log: false };
+    plot("Correlation with the input", rho, of_degrees(&|c| c.rho.as_ref()), vec![1.0]);
+    let snr = Axis { label: "SNR_{l}".to_owned(), log: true, limits: None };
+    plot("Signal to noise", snr, of_degrees(&|c| c.snr.as_ref()), vec![1.0]);
+    let mut powers = of_degrees(&|c| c.power.as_ref().map(|power| &power.map_k2));
+    if let Some((_, first)) = channels.first()
+        && let Some(power) = &first.power
+        && powers.len() < DRAWN_MAX
+    {
+        let points =
+            power.input_k2.iter().enumerate().map(|(l, y)| (l as f64, y.unwrap_or(f64::NAN))).collect();
+        powers.push(Curve { label: "input".to_owned(), points, dashed: true });
+    }
+    let power = Axis { label: "C_{l} (K²)".to_owned(), log: true, limits: None };
+    plot("Angular power of the maps", power, powers, Vec::new());
+    plots.extend(trace_plot(&channels));
+    if plots.is_empty() {
+        plots.push(Plot { title: "No input to compare with, and no traces".to_owned(), ..Plot::default() });
+    }
+    let columns = plots.len().min(2);
+    draw_plots(title, &plots, columns)
+}
+
+/// The traces against epsilon, if there are at least two.
+fn trace_plot(channels: &[(String, &ChannelFigures)]) -> Option<Plot> {
+    let mut curves: Vec<Curve> = Vec::new();
+    let mut frequencies: Vec<f64> = channels.iter().map(|(_, channel)| channel.frequency_hz).collect();
+    frequencies.dedup();
+    for &frequency_hz in frequencies.iter().take(3) {
+        let mut points: Vec<(f64, f64, f64)> = channels
+            .iter()
+            .filter(|(_, channel)| channel.frequency_hz == frequency_hz)
+            .filter_map(|(_, channel)| {
+                let traces = channel.diagnostics.traces.as_ref()?;
+                let square = channel.input_mean_k()?.powi(2);
+                Some((channel.diagnostics.epsilon, traces.sigma_n_k2.value, square * traces.sigma_s.value))
+            })
+            .collect();
+        points.sort_by(|a, b| a.0.total_cmp(&b.0));
+        if points.len() < 2 {
+            continue;
+        }
+        let at = format!("{:.3} MHz", frequency_hz / 1e6);
+        let noise = points.iter().map(|point| (point.0, point.1)).collect();
+        let imperfection = points.iter().map(|point| (point.0, point.2)).collect();
+        curves.push(Curve { label: format!("Tr Sigma_{{n}}, {at}"), points: noise, dashed: false });
+        let label = format!("mean(T)² Tr Sigma_{{s}}, {at}");
+        curves.push(Curve { label, points: imperfection, dashed: true });
+    }
+    (!curves.is_empty()).then(|| Plot {
+        title: "Thermal noise and imperfection".to_owned(),
+        x: Axis { label: "epsilon".to_owned(), log: true, limits: None },
+        y: Axis { label: "trace (K²)".to_owned(), log: true, limits: None },
+        curves,
+        levels: Vec::new(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn run(label: &str, epsilon: f64, n: f64, s: f64) -> RunFigures {
+        let estimate = |value| EstimateFigures { value, error: None };
+        let traces = TraceFigures { sigma_n_k2: estimate(n), sigma_s: estimate(s) };
+        // A mean of 10 K.
+        let c0 = 4.0 * std::f64::consts::PI * 100.0;
+        let power = PowerFigures {
+            map_k2: vec![Some(c0), None],
+            input_k2: vec![Some(c0), Some(2.0)],
+            cross_k2: vec![Some(c0), Some(1.0)],
+            noise_k2: None,
+        };
+        let channel = ChannelFigures {
+            frequency_hz: 1e7,
+            nside: 8,
+            visibilities: 5,
+            mean_k: 9.5,
+            noise_rms_k: 0.5,
+            thermal_noise: true,
+            diagnostics: DiagnosticFigures { epsilon, w_max: 2.0, traces: Some(traces) },
+            rho: Some(vec![Some(1.0), None]),
+            rho_noise_subtracted: None,
+            snr: None,
+            power: Some(power),
+        };
+        RunFigures { label: label.to_owned(), cancelled: false, channels: vec![channel] }
+    }
+
+    #[test]
+    fn traces_cross_between_the_epsilons_where_they_change_places() {
+        // n = 1 / epsilon and s = epsilon: with 100 K^2 at epsilon = 0.1, with 10 K at epsilon = 1 / sqrt 10.
+        let runs: Vec<RunFigures> =
+            [1e-3, 1e-2, 1e-1, 1.0].map(|epsilon| run("a", epsilon, 1.0 / epsilon, epsilon)).into();
+        let found = crossings(&[runs.iter().rev().collect()]);
+        let [crossing] = &found[..] else { panic!("{found:?}") };
+        // Power laws are straight lines between logarithms.
+        assert!((crossing.epsilon.unwrap() / 0.1 - 1.0).abs() < 1e-9, "{crossing:?}");
+        let first_power = crossing.epsilon_first_power.unwrap();
+        assert!((first_power / 0.1_f64.sqrt() - 1.0).abs() < 1e-9, "{crossing:?}");
+        assert_eq!(crossings(&[vec![&runs[0]]]), []);
+        // Without a change of places there is none.
+        let none = crossings(&[runs[..2].iter().collect()]);
+        assert_eq!((none[0].epsilon, none[0].epsilon_first_power), (None, None));
+    }
+
+    #[test]
+    fn tables_quote_labels_and_leave_unknown_fields_empty() {
+        let runs = [run("b < b_p, \"all\"", 1e-4, 3.0, 0.5)];
+        let all: Vec<&RunFigures> = runs.iter().collect();
+        let table = runs_csv(&all);
+        let lines: Vec<&str> = table.lines().collect();
+        assert_eq!(lines.len(), 2);
+        assert!(
+            lines[1].starts_with("\"b < b_p, \"\"all\"\"\",10000000,8,5,1e-4,2e0,9.5e0,1e1,5e-1,3e0,,5e-1,,")
+        );
+        let spectra = spectra_csv(&all);
+        assert_eq!(spectra.lines().nth(2).unwrap(), "\"b < b_p, \"\"all\"\"\",10000000,1,,,,,2e0,1e0,");
+        assert!(draw_runs("runs", &all).is_ok());
+    }
+}
