@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use crate::pipeline::{ConfigSource, MemoryLimit};
+use super::output::print_notes;
+use crate::pipeline::{Config, ConfigError, ConfigSource, MemoryLimit};
 use crate::units::constants::DAY_S;
 
 /// A pipeline file, and settings that replace some of its own.
@@ -68,6 +69,14 @@ impl PipelineArgs {
         let format = format.iter().map(|format| format!("downlink.format={format:?}"));
         let overrides = overrides.iter().cloned().chain(format).collect();
         ConfigSource { file: pipeline.clone(), overrides, seed: *seed }
+    }
+
+    /// The configuration; what follows from it without being said is noted on standard error.
+    pub(super) fn load(&self) -> Result<Config, ConfigError> {
+        let mut notes = Vec::new();
+        let config = self.source().load_noting(&mut notes)?;
+        print_notes(notes);
+        Ok(config)
     }
 
     /// The memory that the run may take.

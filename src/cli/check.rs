@@ -24,7 +24,7 @@ pub(super) struct CheckArgs {
 
 pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let source = args.pipeline.source();
-    let config = source.load()?;
+    let config = args.pipeline.load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
     let problems = plan.file_problems();

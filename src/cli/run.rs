@@ -33,7 +33,7 @@ pub(super) struct RunArgs {
 }
 
 pub(super) fn execute(args: &RunArgs) -> CommandResult {
-    let config = args.pipeline.source().load()?;
+    let config = args.pipeline.load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
     print_notes(sky_notes(&plan)?);

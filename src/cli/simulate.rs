@@ -50,7 +50,7 @@ fn rate(text: &str) -> Result<f64, String> {
 }
 
 pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
-    let config = args.pipeline.source().load()?;
+    let config = args.pipeline.load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
     print_notes(sky_notes(&plan)?);

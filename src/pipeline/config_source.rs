@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
+use super::channel_lists;
 use super::config::Config;
 use super::config_reader::{Lines, Reading, SHOWN_MAX, parse_table};
 use super::problems::Problems;
@@ -111,7 +112,16 @@ impl ConfigSource {
     /// # Errors
     /// As [`Self::parse`]; invalid values; all of them together.
     pub fn load(&self) -> Result<Config, ConfigError> {
-        self.checked(&self.text()?, self.origin(), Config::problems)
+        self.load_noting(&mut Vec::new())
+    }
+
+    /// As [`Self::load`]; adds to `notes` what was not said in so many words: where an override changes the channels, lists
+    /// with a value for each take those of the nearest channel that the file has.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_noting(&self, notes: &mut Vec<String>) -> Result<Config, ConfigError> {
+        self.checked_noting(&self.text()?, self.origin(), Config::problems, notes)
     }
 
     /// [`Self::parse`], and the checks of the sections of the ground segment. Without a file these have their defaults,
@@ -133,17 +143,35 @@ impl ConfigSource {
         origin: String,
         problems_of: impl Fn(&Config) -> Problems,
     ) -> Result<Config, ConfigError> {
+        self.checked_noting(text, origin, problems_of, &mut Vec::new())
+    }
+
+    fn checked_noting(
+        &self,
+        text: &str,
+        origin: String,
+        problems_of: impl Fn(&Config) -> Problems,
+        notes: &mut Vec<String>,
+    ) -> Result<Config, ConfigError> {
         let mut table = match parse_table(text) {
             Ok(table) => table,
             Err(problems) => return Err(ConfigError::Values { origin, problems }),
         };
         let mut lines = Lines::of(text);
         let mut bad_overrides = Vec::new();
+        let channels_hz = channel_lists::channels_hz(&table);
+        let mut keys = Vec::new();
         for text in &self.overrides {
             match set(&mut table, text) {
-                Ok(key) => lines.set(key, text),
+                Ok(key) => {
+                    lines.set(key, text);
+                    keys.push(key);
+                }
                 Err(error) => bad_overrides.push(error),
             }
+        }
+        if let Some(before) = channels_hz {
+            notes.extend(channel_lists::follow(&mut table, &before, |key| keys.contains(&key)));
         }
         let mut reading = Reading::new(table, &lines);
         if let Some(seed) = self.seed {
@@ -280,6 +308,31 @@ mod tests {
     }
 
     #[test]
+    fn values_follow_the_nearest_channel() {
+        let load = |overrides: &[&str]| {
+            let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
+            let mut notes = Vec::new();
+            let config = ConfigSource { overrides, ..ConfigSource::default() }.load_noting(&mut notes);
+            config.map(|config| (config, notes))
+        };
+        // The quicklook has 1, 3 and 10 MHz with epsilon 1e-4, 1e-6 and 1e-4 and every 8th, 4th and single integration.
+        let (config, notes) = load(&["spacecraft.channels_hz=[5e6, 29e6]"]).unwrap();
+        assert_eq!(config.map.epsilon.values(), [1e-6, 1e-4]);
+        assert_eq!(config.spacecraft.every_nth_integration.values(), [4, 1]);
+        assert_eq!(notes.len(), 2, "{notes:?}");
+        assert!(
+            notes.iter().any(|note| note.starts_with("map.epsilon = [1e-6, 0.0001]: as for")),
+            "{notes:?}"
+        );
+        // What is set is as it was set, also if it is wrong.
+        let (config, notes) = load(&["map.epsilon=0.1", "spacecraft.channels_hz=[5e6]"]).unwrap();
+        assert_eq!((config.map.epsilon.get(0), notes.len()), (Some(0.1), 1));
+        let (_, notes) = load(&["map.epsilon=0.1"]).unwrap();
+        assert!(notes.is_empty());
+        assert!(load(&["spacecraft.channels_hz=[5e6]", "map.epsilon=[0.1, 0.1]"]).is_err());
+    }
+
+    #[test]
     fn text_that_is_not_toml_is_told_by_place() {
         let found = told("seed = 1\n[map\nnside = 3\n", &[]);
         assert!(found[1].contains("line 2, column 5: "), "{found:?}");
@@ -318,7 +371,8 @@ mod tests {
     fn a_ground_without_a_file_takes_any_number_of_channels() {
         let config = ConfigSource::default().load_ground().unwrap();
         assert_eq!((config.map, config.name.as_str()), (MapConfig::default(), "lunarray"));
-        let told = with(&["spacecraft.channels_hz=[3e6]"]).unwrap().problems();
+        let told =
+            with(&["spacecraft.channels_hz=[3e6]", "map.epsilon=[1e-4, 1e-6, 1e-4]"]).unwrap().problems();
         let told: Vec<String> = told.iter().map(ToString::to_string).collect();
         assert!(told.iter().any(|text| text.contains("map.epsilon = (3 values)")), "{told:?}");
     }

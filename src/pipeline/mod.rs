@@ -2,6 +2,7 @@
 //!
 //! The only place where space and ground meet, and where concrete stages are connected. Uses every folder before it.
 
+mod channel_lists;
 pub(crate) mod config;
 mod config_reader;
 mod config_source;

@@ -15,7 +15,7 @@ use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
-use crate::files::FolderLock;
+use crate::files::{FolderLock, write_atomically};
 use crate::ground::{Ground, SharedSaving, WAIT_BYTES};
 use crate::products::{MapShape, ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
@@ -81,6 +81,9 @@ pub const READ: &str = "read";
 /// Name of the stage that writes the downlink file.
 const RECORD: &str = "record";
 
+/// Name of the file of settings that `run` leaves among its products.
+const SETTINGS: &str = "pipeline.toml";
+
 /// Name of the downlink file that `run` leaves among its products.
 #[must_use]
 pub fn downlink_file(format: Format) -> &'static str {
@@ -101,6 +104,7 @@ pub fn run(
     watch: Watcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
     let _lock = lock_folder(out)?;
+    write_settings(&plan.config, out)?;
     let file = out.join(downlink_file(plan.config.downlink.format));
     let recorder = Recorder::create(&file)?;
     let skies = space_segment::skies(plan)?;
@@ -246,6 +250,19 @@ fn add_link(
         Some(link) => graph.stage("link", config.runtime.queue_capacity, bytes, link),
         None => bytes,
     })
+}
+
+/// Leaves all settings of a run beside its products, as a pipeline file that repeats it.
+fn write_settings(config: &Config, out: &Path) -> Result<(), PipelineError> {
+    let path = out.join(SETTINGS);
+    let settings = toml::to_string_pretty(config)
+        .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
+    let version = env!("CARGO_PKG_VERSION");
+    let text = format!(
+        "# All settings of this run, by lunarray {version}: `lunarray run {SETTINGS}` repeats it. Paths of files are as they were \
+         given.\n\n{settings}"
+    );
+    Ok(write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?)
 }
 
 /// Creates and locks the folder before anything is computed, so that an error shows at once.

@@ -77,6 +77,20 @@ fn capacities_and_threads_do_not_change_a_byte() {
 }
 
 #[test]
+fn the_settings_that_a_run_leaves_repeat_it() {
+    let place = Workplace::new(SMALL);
+    let first =
+        run(&place, "first", &["--set", "map.epsilon=[1e-3, 1e-5]", "--seed", "3", "--format", "cadu"]);
+    let settings = place.path("first/pipeline.toml");
+    succeed(&["check", &settings]);
+    let second = place.path("second");
+    succeed(&["run", &settings, "--out", &second]);
+    assert_same(&first, &files(Path::new(&second)));
+    let text = |folder: &str| std::fs::read_to_string(place.path(folder) + "/pipeline.toml").unwrap();
+    assert_eq!(text("first"), text("second"));
+}
+
+#[test]
 fn the_seed_changes_the_noise() {
     let place = Workplace::new(SMALL);
     let one = run(&place, "one", &["--set", "products.pictures=false"]);

@@ -1,6 +1,7 @@
 //! The command in a folder of its own.
 
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
@@ -90,7 +91,8 @@ pub fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
             let path = entry.unwrap().path();
             if path.is_dir() {
                 folders.push(path);
-            } else if path.file_name().unwrap() != "summary.json" {
+            } else if !["summary.json", "pipeline.toml"].map(OsStr::new).contains(&path.file_name().unwrap())
+            {
                 found.insert(path.strip_prefix(folder).unwrap().to_owned(), std::fs::read(path).unwrap());
             }
         }

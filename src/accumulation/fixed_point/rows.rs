@@ -147,10 +147,26 @@ impl IntegerRow {
     ) -> Result<(), E> {
         out(&self.bound.to_le_bytes())?;
         let Some(sums) = self.folded(layout) else { return Ok(()) };
-        let bytes: Vec<u8> = if self.bound < NARROW {
-            sums.flat_map(|sum| (sum as i32).to_le_bytes()).collect()
+        // In place and by `for_each`: a gigabyte of these is what an interrupted run waits for.
+        let count = layout.points() * layout.parts;
+        let bytes = if self.bound < NARROW {
+            let mut bytes = vec![0; 4 * count];
+            let mut places = bytes.as_chunks_mut::<4>().0.iter_mut();
+            sums.for_each(|sum| {
+                if let Some(place) = places.next() {
+                    *place = (sum as i32).to_le_bytes();
+                }
+            });
+            bytes
         } else {
-            sums.flat_map(i64::to_le_bytes).collect()
+            let mut bytes = vec![0; 8 * count];
+            let mut places = bytes.as_chunks_mut::<8>().0.iter_mut();
+            sums.for_each(|sum| {
+                if let Some(place) = places.next() {
+                    *place = sum.to_le_bytes();
+                }
+            });
+            bytes
         };
         out(&bytes)
     }
