@@ -17,6 +17,9 @@ use crate::products::{MapViewer, PublishedMap};
 use crate::runtime::{Metrics, StageProgress};
 use crate::solve::Solving;
 
+/// Most senders in a status; it goes out twice a second.
+const SENDERS_SHOWN: usize = 20;
+
 /// Numbers of connections and requests.
 #[derive(Debug, Default)]
 pub(super) struct VisitorCounts {
@@ -154,13 +157,16 @@ impl Console {
         let now = Instant::now();
         let mut memory = self.memory();
         let rates = memory.pulse.look(&progress, now);
-        let listening =
-            watched.and_then(|watched| watched.listening.as_ref()).map(|listening| ListenerStatus {
+        let listening = watched.and_then(|watched| watched.listening.as_ref()).map(|listening| {
+            let mut report = listening.report();
+            report.senders.listed.truncate(SENDERS_SHOWN);
+            ListenerStatus {
                 open: listening.status.open(),
                 bytes: listening.status.bytes(),
                 backlog_bytes: listening.status.backlog_bytes(),
-                report: listening.report(),
-            });
+                report,
+            }
+        });
         let solving = watched.and_then(|watched| watched.solving.now());
         let saving = ground.and_then(|ground| ground.saving.report());
         let read = |ground: &crate::ground::GroundOutcome| {

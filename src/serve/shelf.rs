@@ -120,6 +120,7 @@ struct ChannelShelf {
     diagnostics: Diagnostics,
     maps: Vec<Snapshot>,
     noise: Arc<HeldMap>,
+    noise_rms_k: f64,
     input: Option<Arc<HeldMap>>,
     figures: Vec<SnapshotSummary>,
     spectra: Option<SpectraOfMap>,
@@ -226,9 +227,10 @@ impl Shelf {
             is_noiseless: solution.instrument.noiseless,
             is_final: solution.is_final,
             span_s: solution.span_s,
-            diagnostics: solution.diagnostics.clone(),
+            diagnostics: solution.diagnostics,
             maps,
             noise,
+            noise_rms_k: rms(&solution.noise_k),
             input,
             figures: all_figures,
             spectra: comparison.map(SpectraOfMap::from),
@@ -256,7 +258,7 @@ impl Shelf {
     /// What the status says.
     pub(super) fn status(&self) -> Vec<ChannelStatus> {
         let status = |(channel, shelf): (&ChannelId, &ChannelShelf)| ChannelStatus {
-            channel: channel.0.into(),
+            channel: channel.0,
             frequency_hz: shelf.frequency_hz,
             nside: shelf.nside,
             is_noiseless: shelf.is_noiseless,
@@ -265,8 +267,8 @@ impl Shelf {
             held: shelf.maps.iter().map(|snapshot| snapshot.number).collect(),
             has_input: shelf.input.is_some(),
             figures: shelf.figures.last().cloned(),
-            noise_rms_k: rms(&shelf.noise.pixels),
-            diagnostics: shelf.diagnostics.clone(),
+            noise_rms_k: shelf.noise_rms_k,
+            diagnostics: shelf.diagnostics,
         };
         self.channels().iter().map(status).collect()
     }
@@ -303,10 +305,8 @@ fn spectrum_of(map: &HeldMap, nside: usize) -> Result<SpectraOfMap, MapError> {
     Ok(SpectraOfMap { cl_map: auto_cl(&alm), ..SpectraOfMap::default() })
 }
 
-fn rms(pixels: &Bytes) -> f64 {
-    let (numbers, _) = pixels.as_chunks::<4>();
-    let squares = numbers.iter().map(|&bytes| f64::from(f32::from_le_bytes(bytes)).powi(2));
-    (squares.sum::<f64>() / numbers.len().max(1) as f64).sqrt()
+fn rms(values: &[f64]) -> f64 {
+    (values.iter().map(|value| value * value).sum::<f64>() / values.len().max(1) as f64).sqrt()
 }
 
 /// Removes every second entry of a list that is too long, but never the first and the last.

@@ -136,7 +136,7 @@ pub(super) struct ListenerStatus {
 pub(super) struct VisitorStatus {
     pub(super) open: u64,
     pub(super) refused: u64,
-    /// Those that did not read, or asked for too long.
+    /// Closed by the server: silent, slow, or not HTTP.
     pub(super) cut: u64,
     pub(super) requests: u64,
 }

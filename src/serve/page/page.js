@@ -2,7 +2,7 @@
 import { Sky, isSeen } from "/sky.js";
 
 const $ = (id) => document.getElementById(id);
-const MAPS_HELD = 48;
+const HELD_BYTES = 96e6, SAMPLE = 65536;
 const BLINK_MS = 700, PLAY_MS = 450;
 const state = {
   status: null, channel: 0, number: null, follows: true, figures: new Map(), curve: "growth",
@@ -56,7 +56,8 @@ async function fetchMap(name) {
   for (let k = 0; k < values.length; k++) values[k] = bytes.getFloat32(4 * k, true);
   // A noise map stands for the last snapshot only.
   if (name !== "noise") state.maps.set(key, values);
-  while (state.maps.size > MAPS_HELD) state.maps.delete(state.maps.keys().next().value);
+  const bytesHeld = () => [...state.maps.values()].reduce((sum, map) => sum + map.byteLength, 0);
+  while (state.maps.size > 2 && bytesHeld() > HELD_BYTES) state.maps.delete(state.maps.keys().next().value);
   return values;
 }
 
@@ -97,7 +98,10 @@ async function limits(a, b) {
   // As the program's pictures: from 0.5 % to 99.5 %, or symmetric; of the input, if there is one to compare with.
   let values = a;
   if (state.blink && !isDifference) values = (channelNow()?.has_input && await fetchMap("input")) || a;
-  let used = Array.from(values, (v, k) => (b ? v - b[k] : v)).filter(isSeen);
+  // A large map's quantiles are those of every so many pixels.
+  let used = [];
+  for (let k = 0, step = Math.ceil(values.length / SAMPLE); k < values.length; k += step) used.push(b ? values[k] - b[k] : values[k]);
+  used = used.filter(isSeen);
   if (isDifference || isNoise) {
     const sizes = Float64Array.from(used, Math.abs).sort();
     look.high = quantile(sizes, 0.99) || 1; look.low = -look.high;
