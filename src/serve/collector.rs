@@ -287,7 +287,11 @@ impl Scrape {
             About("http_refused", "Connections refused as too many were open", None),
             visitors.refused,
         )?;
-        counter(out, About("http_cut", "Connections closed by the server: silent, slow or not HTTP", None), visitors.cut)?;
+        counter(
+            out,
+            About("http_cut", "Connections closed by the server: silent, slow or not HTTP", None),
+            visitors.cut,
+        )?;
         counter(out, About("http_requests", "Requests answered", None), visitors.requests)
     }
 }
