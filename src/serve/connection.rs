@@ -75,11 +75,11 @@ pub(super) async fn accept(
                 .max_buf_size(BUFFER_BYTES)
                 .serve_connection(TokioIo::new(PatientStream::new(stream)), TowerToHyperService::new(router))
                 .await;
-            console.visitors.open.fetch_sub(1, Ordering::Relaxed);
             // A reader that goes away is none of these.
             if served.is_err_and(|error| error.is_parse() || error.is_timeout() || is_stalled(&error)) {
                 console.visitors.cut.fetch_add(1, Ordering::Relaxed);
             }
+            console.visitors.open.fetch_sub(1, Ordering::Relaxed);
         });
     }
 }

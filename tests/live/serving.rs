@@ -456,6 +456,8 @@ fn those_who_do_not_read_or_write_are_cut() {
     wait_until("places again", || served.get("/healthz").status == 200);
     assert!(served.metric("lunarray_http_refused_total") > 0.0);
     drop(silent);
+    // All but the one that asks.
+    wait_until("the silent to be gone", || served.metric("lunarray_http_connections") <= 1.0);
     let cut = served.metric("lunarray_http_cut_total");
     assert!(cut > 0.0, "silent ones were cut");
     // Asks for much more than the system's buffers hold, and reads nothing.
@@ -497,4 +499,20 @@ fn a_place_that_cannot_be_had_is_refused_before_anything_runs() {
     assert!(refused(&["--serve", "http://localhost"]).contains("expected PORT or HOST:PORT"));
     assert!(refused(&["--serve-after"]).contains("--serve"));
     assert!(!std::path::Path::new(&out).exists());
+}
+
+#[test]
+fn a_simulation_shows_its_stages_and_no_ground() {
+    let place = Place::new();
+    let out = place.path("small.ccsds");
+    let served = Served::start(&["simulate", place.pipeline(), "--out", &out, "--serve-after"]);
+    served.wait_for_phase("ended");
+    let status = served.json("/api/status");
+    assert_eq!(status["segment"], "space");
+    assert!(status["ledger"].is_null() && status["reception"].is_null(), "{status}");
+    let stages = status["stages"].as_array().unwrap();
+    let record = stages.iter().find(|stage| stage["name"] == "record").unwrap();
+    assert_eq!(record["units"], std::fs::metadata(&out).unwrap().len());
+    assert_eq!(served.get("/api/maps/0/latest.f32").status, 404);
+    assert!(served.end().success());
 }
