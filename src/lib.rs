@@ -85,6 +85,9 @@ pub mod products;
 
 pub mod pipeline;
 
+#[cfg(feature = "serve")]
+pub mod serve;
+
 pub mod bench;
 
 pub mod cli;

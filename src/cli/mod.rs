@@ -1,4 +1,4 @@
-//! The command line: one file per command, plus what commands share (`arguments`, `interrupt`, `output`, `progress`).
+//! The command line: one file per command, plus what commands share (`arguments`, `interrupt`, `output`, `progress`, `serving`).
 //!
 //! A command parses its arguments, calls [`crate::pipeline`] (or another library function) and prints the result for
 //! people or, with `--json`, for programs. It holds no physics and no state of its own. May use every other folder.
@@ -20,6 +20,11 @@ mod progress;
 mod replay;
 mod retract;
 mod run;
+#[cfg(not(feature = "serve"))]
+#[path = "not_serving.rs"]
+mod serving;
+#[cfg(feature = "serve")]
+mod serving;
 mod simulate;
 mod sky;
 mod study;

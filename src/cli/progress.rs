@@ -139,7 +139,12 @@ impl ProgressView {
         if let Some(solving) = watched.solving.now() {
             message.push(self.solution(&solving));
         }
-        if let Some(saving) = watched.saving.report().filter(|saving| saving.unsaved.is_some()) {
+        if let Some(saving) = watched
+            .ground
+            .as_ref()
+            .and_then(|ground| ground.saving.report())
+            .filter(|saving| saving.unsaved.is_some())
+        {
             message.insert(0, saving.to_string());
         }
         let message = message.join(", ");

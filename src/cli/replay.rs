@@ -13,6 +13,7 @@ use super::output::{
     CommandError, CommandResult, print_incompleteness, print_json_line, print_notes, print_text, say,
 };
 use super::progress::Progress;
+use super::serving::{Page, ServeArgs};
 use crate::downlink::transport::socket::{SocketError, SocketSource, TcpUrl, Until};
 use crate::downlink::{FileSource, Pace, Paced, Steps};
 use crate::ground::{Ground, WAIT_BYTES};
@@ -88,6 +89,8 @@ pub(super) struct ReplayArgs {
     /// Print the summary as one JSON object instead of tables.
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    serve: ServeArgs,
 }
 
 /// Speed relative to real time; `None` for as fast as possible.
@@ -135,11 +138,13 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     print_notes(ground.notes());
     let saving = ground.outcome().saving;
     let interrupt = Interrupt::default();
-    let session = Session { args, config: &config, interrupt: &interrupt };
+    let page = args.serve.start(&config, "ground", args.state.as_deref())?;
+    let session = Session { args, config: &config, interrupt: &interrupt, page: &page };
     let ended = match &args.listen {
         Some(url) => session.hear_senders(url, ground),
         None => session.read_files(ground),
     };
+    let ended = page.conclude(ended, |summary| summary.cancelled);
     let summary = ended.inspect_err(|error| {
         let told = matches!(error.downcast_ref::<PipelineError>(), Some(PipelineError::Unsaved { .. }));
         // Another failure must not hide that nothing was saved.
@@ -158,6 +163,7 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
         print_text(&format!("{summary}\nProducts are in {}", args.out.display()))
     };
     print_incompleteness(&summary);
+    page.stay(&interrupt);
     completion.after(printed)
 }
 
@@ -166,6 +172,7 @@ struct Session<'a> {
     args: &'a ReplayArgs,
     config: &'a Config,
     interrupt: &'a Interrupt,
+    page: &'a Page,
 }
 
 impl Session<'_> {
@@ -210,12 +217,13 @@ impl Session<'_> {
         ground: Ground,
         begun: &dyn Fn(),
     ) -> Result<RunSummary, PipelineError> {
-        let Self { args, config, interrupt } = self;
+        let Self { args, config, interrupt, page } = self;
         let cancel = interrupt.cancel();
         let mut progress = None;
         replay(source, config, ground, &args.out, cancel, &mut |watched| {
             interrupt.arm_or_note();
             begun();
+            page.watch(&watched);
             progress = Some(Progress::watch(watched, READ, 0, cancel));
         })
     }

@@ -10,6 +10,7 @@ use super::output::{
     CommandResult, print_config_notes, print_incompleteness, print_json_line, print_notes, print_text,
 };
 use super::progress::Progress;
+use super::serving::ServeArgs;
 use crate::pipeline::{INTEGRATE, Plan, Segment, run, sky_notes, use_threads};
 
 /// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
@@ -30,6 +31,8 @@ pub(super) struct RunArgs {
     /// Print the summary as one JSON object instead of tables.
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    serve: ServeArgs,
 }
 
 pub(super) fn execute(args: &RunArgs) -> CommandResult {
@@ -41,18 +44,22 @@ pub(super) fn execute(args: &RunArgs) -> CommandResult {
     plan.cost().require_memory(Segment::Whole, args.pipeline.memory_limit())?;
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
     let interrupt = Interrupt::default();
+    let page = args.serve.start(&plan.config, "whole", None)?;
     let mut progress = None;
     let windows = plan.windows_watched();
-    let summary = run(&plan, &out, interrupt.cancel(), &mut |metrics| {
+    let ended = run(&plan, &out, interrupt.cancel(), &mut |watched| {
         interrupt.arm_or_note();
-        progress = Some(Progress::watch(metrics, INTEGRATE, windows, interrupt.cancel()));
-    })?;
+        page.watch(&watched);
+        progress = Some(Progress::watch(watched, INTEGRATE, windows, interrupt.cancel()));
+    });
     drop(progress);
+    let summary = page.conclude(ended, |summary| summary.cancelled)?;
     let printed = if args.json {
         print_json_line(&summary)
     } else {
         print_text(&format!("{summary}\nProducts are in {}", out.display()))
     };
     print_incompleteness(&summary);
+    page.stay(&interrupt);
     interrupt.completion(summary.cancelled).after(printed)
 }

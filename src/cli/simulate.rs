@@ -9,6 +9,7 @@ use super::arguments::{PipelineArgs, not_negative_s};
 use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_config_notes, print_json_line, print_notes, print_text};
 use super::progress::Progress;
+use super::serving::ServeArgs;
 use crate::downlink::transport::socket::{SendOptions, SocketSink, TcpUrl};
 use crate::pipeline::{Destination, INTEGRATE, Plan, Segment, simulate, sky_notes, use_threads};
 
@@ -40,6 +41,8 @@ pub(super) struct SimulateArgs {
     /// Print stages and throughput as one JSON object instead of a table.
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    serve: ServeArgs,
 }
 
 fn rate(text: &str) -> Result<f64, String> {
@@ -57,6 +60,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     use_threads(&plan.config.runtime)?;
     plan.cost().require_memory(Segment::Space, args.pipeline.memory_limit())?;
     let interrupt = Interrupt::default();
+    let page = args.serve.start(&plan.config, "space", None)?;
     let cancel = interrupt.cancel();
     let options = SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s };
     let socket = args.send.as_ref().map(|url| SocketSink::new(url, options, cancel)).transpose()?;
@@ -64,11 +68,13 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let mut progress = None;
     let windows = plan.windows_watched();
     let to = Destination { file: args.out.clone(), socket };
-    let report = simulate(&plan, to, cancel, &mut |metrics| {
+    let ended = simulate(&plan, to, cancel, &mut |watched| {
         interrupt.arm_or_note();
-        progress = Some(Progress::watch(metrics, INTEGRATE, windows, cancel));
-    })?;
+        page.watch(&watched);
+        progress = Some(Progress::watch(watched, INTEGRATE, windows, cancel));
+    });
     drop(progress);
+    let report = page.conclude(ended, |report| report.cancelled)?;
     let is_written = report.stage("record").is_some_and(|record| record.units > 0);
     let mut places: Vec<String> = args
         .out
@@ -84,9 +90,11 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
             bytes => format!("{url} confirmed all {bytes} bytes"),
         });
     }
-    interrupt.completion(report.cancelled).after(if args.json {
+    let printed = if args.json {
         print_json_line(&report)
     } else {
         print_text(&format!("{report}\n{}", places.join("\n")))
-    })
+    };
+    page.stay(&interrupt);
+    interrupt.completion(report.cancelled).after(printed)
 }

@@ -14,6 +14,9 @@ use crate::runtime::{Cancel, Outlet, Stage, Units};
 /// Waits before the last checkpoint of a session is tried again: what lacks may be there a moment later.
 const LAST_WAITS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(1)];
 
+/// Steps after which the counters of the reception are shown again; counting gaps takes a while.
+const STEPS_SHOWN: u64 = 32;
+
 /// Takes the bytes of a downlink and emits sums.
 ///
 /// Collects packets, each once; places and calibrates their visibilities; adds them to the sums. With an [archive](super::archive) it
@@ -28,6 +31,8 @@ pub struct Ground {
     pub(super) cancel: Cancel,
     /// How long it goes on adding then, if there is no archive.
     pub(super) linger: Duration,
+    /// Steps so far.
+    pub(super) steps: u64,
 }
 
 impl Ground {
@@ -45,6 +50,7 @@ impl Ground {
             archive: None,
             cancel: Cancel::new(),
             linger: Duration::ZERO,
+            steps: 0,
         })
     }
 
@@ -159,7 +165,12 @@ impl Stage for Ground {
 
     fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         self.collector.push(&bytes);
-        self.advance(out)
+        self.advance(out)?;
+        self.steps += 1;
+        if self.steps.is_power_of_two() || self.steps.is_multiple_of(STEPS_SHOWN) {
+            fill(&self.outcome.reception, self.collector.counters());
+        }
+        Ok(())
     }
 
     fn finish(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {

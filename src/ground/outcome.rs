@@ -19,7 +19,7 @@ pub struct GroundOutcome {
     pub ledger: Ledger<VisibilityReason>,
     /// Whether the ledger is known to be complete.
     pub completeness: Arc<Mutex<Completeness>>,
-    /// What was received, and what was wrong with it.
+    /// What was received, and what was wrong with it; while the stage works, as of a few steps ago.
     pub reception: Arc<Mutex<ReceptionCounters>>,
     /// Auto-correlations, by channel, daughter and time.
     pub autos: Arc<Mutex<Vec<AutoPower>>>,

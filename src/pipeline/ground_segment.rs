@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use super::config::Config;
 use super::error::PipelineError;
 use crate::ground::{Ground, GroundConfig, GroundOutcome};
-use crate::products::{ChannelSummary, Provenance, Publisher, Truth};
+use crate::products::{ChannelSummary, MapWatch, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::solve::{SolveWatch, Solver, SolverSetup, StoppingRule};
@@ -42,6 +42,8 @@ pub(super) struct Mapping<'a> {
     pub(super) truth: Truth,
     /// Follows solutions.
     pub(super) watch: SolveWatch,
+    /// Sees maps.
+    pub(super) viewers: MapWatch,
 }
 
 /// Adds the ground segment to `graph`. It takes the bytes of a downlink and nothing else from space.
@@ -55,7 +57,7 @@ pub(super) fn add(
     ground: Ground,
     mapping: Mapping<'_>,
 ) -> Result<SegmentOutcome, PipelineError> {
-    let Mapping { out, truth, watch } = mapping;
+    let Mapping { out, truth, watch, viewers } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let setup = SolverSetup {
         epsilon: config.map.epsilon.clone(),
@@ -70,7 +72,8 @@ pub(super) fn add(
     };
     let provenance = Provenance { ground_hash: config.ground_hash(), map: config.map.clone() };
     let channels = Arc::clone(&outcome.channels);
-    let publisher = Publisher::new(config.products.clone(), out, truth, provenance, channels)?;
+    let publisher =
+        Publisher::new(config.products.clone(), out, truth, provenance, channels)?.shown_to(viewers);
     // Sums are large: one waits while another is solved.
     let sums = graph.stage(GROUND, 1, bytes, ground);
     let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));

@@ -16,8 +16,8 @@ use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
 use crate::files::{FolderLock, write_atomically};
-use crate::ground::{Ground, SharedSaving, WAIT_BYTES};
-use crate::products::{MapShape, ProductsError, Truth, write_autos};
+use crate::ground::{Ground, GroundOutcome, WAIT_BYTES};
+use crate::products::{MapShape, MapWatch, ProductsError, Truth, write_autos};
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
 use crate::solve::SolveWatch;
@@ -31,8 +31,10 @@ pub struct Watched {
     pub solving: SolveWatch,
     /// The senders, if the ground listens.
     pub listening: Option<Listening>,
-    /// The ground's checkpoints.
-    pub saving: SharedSaving,
+    /// Ledger, reception and checkpoints of the ground, if there is one.
+    pub ground: Option<GroundOutcome>,
+    /// The maps, for those who want to see them.
+    pub maps: MapWatch,
 }
 
 /// A source of downlink bytes.
@@ -119,10 +121,11 @@ pub fn run(
     let grace = Grace::of(&plan.config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
     let ground = Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add);
-    let mapping = Mapping { out, truth, watch: solving.clone() };
+    let maps = MapWatch::default();
+    let mapping = Mapping { out, truth, watch: solving.clone(), viewers: maps.clone() };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
-    let saving = SharedSaving::default();
-    let watched = Watched { metrics: graph.metrics(), solving, listening: None, saving };
+    let ground = Some(outcome.ground.clone());
+    let watched = Watched { metrics: graph.metrics(), solving, listening: None, ground, maps };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
     let samples = close_samples(&counts, plan, &report)?;
     let ended = Ended { report, outcome, listening: None, samples };
@@ -173,8 +176,8 @@ pub(super) fn simulate_sky(
         // The graph says that its end is open.
         (None, None) => drop(bytes),
     }
-    let (solving, saving) = (SolveWatch::default(), SharedSaving::default());
-    let watched = Watched { metrics: graph.metrics(), solving, listening: None, saving };
+    let (solving, maps) = (SolveWatch::default(), MapWatch::default());
+    let watched = Watched { metrics: graph.metrics(), solving, listening: None, ground: None, maps };
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
     close_samples(&counts, plan, &report)?;
     Ok(report)
@@ -213,10 +216,11 @@ pub(super) fn replay_knowing<S: GroundSource + 'static>(
     let grace = Grace::of(&config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
     let ground = ground.cancelled_by(cancel, grace.to_add);
-    let mapping = Mapping { out, truth, watch: solving.clone() };
+    let maps = MapWatch::default();
+    let mapping = Mapping { out, truth, watch: solving.clone(), viewers: maps.clone() };
     let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
-    let saving = outcome.ground.saving.clone();
-    let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone(), saving };
+    let ground = Some(outcome.ground.clone());
+    let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone(), ground, maps };
     let report = start(graph, &config.runtime, cancel, (watched, watch))?;
     conclude(RunScope::Ground, config, out, Ended { report, outcome, listening, samples: None })
 }

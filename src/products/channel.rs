@@ -11,6 +11,7 @@ use super::pictures::{
 use super::provenance::Provenance;
 use super::summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 use super::truth::ChannelTruth;
+use super::viewer::{MapWatch, PublishedMap};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with};
 use crate::solve::Solution;
@@ -67,6 +68,7 @@ impl ChannelFolder {
         &mut self,
         solution: &Solution,
         provenance: &Provenance,
+        viewers: &MapWatch,
     ) -> Result<(), ProductsError> {
         let solved = ShownMaps {
             map: SkyMap::new(Frame::Ecliptic, solution.map_k.clone())?,
@@ -80,7 +82,7 @@ impl ChannelFolder {
         let comparison = self.compare(solution, shown)?;
         self.note(solution, shown, comparison.as_ref());
         if self.config.snapshot_maps && !solution.is_final {
-            let name = format!("snapshot-{:03}.fits", solution.number);
+            let name = format!("{}.fits", map_name(solution));
             self.write_map(&name, &solved.map, None, origin)?;
         }
         if self.config.pictures {
@@ -94,9 +96,23 @@ impl ChannelFolder {
             if self.config.pictures {
                 self.draw_final(shown, comparison.as_ref(), origin)?;
             }
+        }
+        self.show(comparison.as_ref(), origin, viewers);
+        if solution.is_final {
             self.summary = Some(self.summarise(solution, comparison));
         }
         Ok(())
+    }
+
+    /// Shows the map to those who look on, as its file has it.
+    fn show(&self, comparison: Option<&Comparison>, origin: Origin<'_>, viewers: &MapWatch) {
+        let Origin { provenance, solution } = origin;
+        let Some(figures) = self.snapshots.last() else { return };
+        viewers.offer(|viewer| {
+            let cards = provenance.cards(solution, &map_name(solution), None);
+            let input = self.input(None).map(|input| &input.map);
+            viewer.view(PublishedMap { solution, figures, cards: &cards, comparison, input });
+        });
     }
 
     /// The truth for maps that are shown.
@@ -346,6 +362,11 @@ impl SheetMaps {
             kept.map_or(last, |(map, caption)| (map.as_slice(), caption.as_str()))
         })
     }
+}
+
+/// Name of a map's file without its extension.
+fn map_name(solution: &Solution) -> String {
+    if solution.is_final { "map".to_owned() } else { format!("snapshot-{:03}", solution.number) }
 }
 
 fn caption(solution: &Solution) -> String {

@@ -1,7 +1,7 @@
 //! The products of a run: maps, pictures, tables and summaries in an output folder.
 //!
 //! [`Publisher`] is the sink that writes every [`crate::solve::Solution`]; [`write_autos`] writes the
-//! auto-correlations. [`pictures`] draws.
+//! auto-correlations. [`pictures`] draws. A [`MapViewer`] sees maps as they are published.
 //!
 //! May use [`crate::solve`], [`crate::ground`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
 //! equal bytes, and every map carries its provenance: configuration hashes, seed, program version and data span.
@@ -17,6 +17,7 @@ mod runs;
 mod summary;
 mod time_coverage;
 mod truth;
+mod viewer;
 
 pub use autos::{AutoSummary, summarise, write_autos};
 pub use channel::{draw_comparison, draw_relative_error};
@@ -31,3 +32,4 @@ pub use runs::{
 pub use summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 pub use time_coverage::draw_coverage;
 pub use truth::{MapShape, Truth};
+pub use viewer::{MapViewer, MapWatch, PublishedMap};

@@ -10,6 +10,7 @@ use super::error::ProductsError;
 use super::provenance::Provenance;
 use super::summary::ChannelSummary;
 use super::truth::Truth;
+use super::viewer::MapWatch;
 use crate::runtime::{Sink, Units};
 use crate::solve::Solution;
 use crate::units::ChannelId;
@@ -23,6 +24,7 @@ pub struct Publisher {
     channels: BTreeMap<ChannelId, ChannelFolder>,
     summaries: Arc<Mutex<Vec<ChannelSummary>>>,
     published: u64,
+    viewers: MapWatch,
 }
 
 impl Publisher {
@@ -40,8 +42,23 @@ impl Publisher {
     ) -> Result<Self, ProductsError> {
         std::fs::create_dir_all(folder)
             .map_err(|source| ProductsError::Write { path: folder.to_owned(), source })?;
-        let folder = folder.to_owned();
-        Ok(Self { config, folder, truth, provenance, channels: BTreeMap::new(), summaries, published: 0 })
+        let (folder, viewers) = (folder.to_owned(), MapWatch::default());
+        Ok(Self {
+            config,
+            folder,
+            truth,
+            provenance,
+            channels: BTreeMap::new(),
+            summaries,
+            published: 0,
+            viewers,
+        })
+    }
+
+    /// Shows every map to `viewers`, once its files are written.
+    #[must_use]
+    pub fn shown_to(self, viewers: MapWatch) -> Self {
+        Self { viewers, ..self }
     }
 }
 
@@ -57,7 +74,7 @@ impl Sink for Publisher {
             self.channels.insert(channel, opened);
         }
         if let Some(folder) = self.channels.get_mut(&channel) {
-            folder.publish(&solution, &self.provenance)?;
+            folder.publish(&solution, &self.provenance, &self.viewers)?;
             self.published += 1;
         }
         Ok(())

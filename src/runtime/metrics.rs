@@ -3,6 +3,8 @@
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
+use super::live_timing::{DurationCounts, LiveTiming};
+
 /// Amount that a stage has processed, in a unit of its choice (visibilities, bytes), for its throughput.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Units {
@@ -33,6 +35,10 @@ pub(super) struct Counters {
     queue_depth_max: AtomicUsize,
     /// Steps that have ended.
     steps: AtomicU64,
+    /// Work of each step.
+    pub(super) working_time: LiveTiming,
+    /// From the source's push to the end of the step.
+    pub(super) since_source: LiveTiming,
     /// Whether the stage is in a step, and not waiting for room.
     working: AtomicBool,
     /// Whether the stage is in its `finish`.
@@ -51,6 +57,8 @@ impl Counters {
             units: AtomicU64::new(0),
             queue_depth_max: AtomicUsize::new(0),
             steps: AtomicU64::new(0),
+            working_time: LiveTiming::default(),
+            since_source: LiveTiming::default(),
             working: AtomicBool::new(false),
             finishing: AtomicBool::new(false),
             ended: AtomicBool::new(false),
@@ -129,13 +137,16 @@ impl Counters {
             units: self.units(),
             queue_depth_max: self.queue_depth_max(),
             queue_capacity: self.queue_capacity,
+            working: self.working_time.read(),
+            since_source: self.since_source.read(),
+            is_working: self.is_working(),
             ended: self.ended.load(Ordering::Relaxed),
         }
     }
 }
 
 /// Counters of one stage.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct StageProgress {
     /// Name of the stage.
     pub name: String,
@@ -149,6 +160,12 @@ pub struct StageProgress {
     pub queue_depth_max: usize,
     /// Capacity of that queue; `None` for a source.
     pub queue_capacity: Option<usize>,
+    /// Working: one entry for each step.
+    pub working: DurationCounts,
+    /// From the source's push of an item to the end of the step on what was made from it.
+    pub since_source: DurationCounts,
+    /// Whether the stage is in a step, and not waiting for room.
+    pub is_working: bool,
     /// Whether the stage has ended.
     pub ended: bool,
 }

@@ -102,9 +102,13 @@ impl Watch {
     /// A step is over, of which `waited` was spent waiting for room.
     fn worked(&mut self, waited: Duration, born: Option<Instant>, units: Units) {
         let now = Instant::now();
-        self.timings.working.record((now - self.mark).saturating_sub(waited));
+        let working = (now - self.mark).saturating_sub(waited);
+        self.timings.working.record(working);
+        self.counters.working_time.record(working);
         if let Some(born) = born {
-            self.timings.since_source.record(now.saturating_duration_since(born));
+            let since_source = now.saturating_duration_since(born);
+            self.timings.since_source.record(since_source);
+            self.counters.since_source.record(since_source);
         }
         self.counters.set_units(units);
         self.counters.count_step();

@@ -5,6 +5,7 @@
 mod common;
 mod pace;
 mod senders;
+mod serving;
 mod soak;
 mod stations;
 

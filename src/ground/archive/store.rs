@@ -223,7 +223,16 @@ impl Opened {
         let (wait, since_attempt) = (interval, 0);
         let archive =
             Archive { folder, settings, journal, notes, posts, interval, wait, since_attempt, saving };
-        let (cancel, linger) = (Cancel::new(), Duration::ZERO);
-        Ok(Ground { collector, calibrator, accumulator, outcome, archive: Some(archive), cancel, linger })
+        let (cancel, linger, steps) = (Cancel::new(), Duration::ZERO, 0);
+        Ok(Ground {
+            collector,
+            calibrator,
+            accumulator,
+            outcome,
+            archive: Some(archive),
+            cancel,
+            linger,
+            steps,
+        })
     }
 }

@@ -63,8 +63,11 @@ impl Picture {
         &self.rgb
     }
 
-    /// The picture encoded as PNG.
-    fn to_png(&self) -> Result<Vec<u8>, png::EncodingError> {
+    /// The picture as a PNG file in memory.
+    ///
+    /// # Errors
+    /// What the encoder says.
+    pub fn to_png(&self) -> Result<Vec<u8>, png::EncodingError> {
         let mut bytes = Vec::new();
         let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
         encoder.set_color(png::ColorType::Rgb);

@@ -21,4 +21,4 @@ pub use read::{
     MapFile, ReadOptions, read_map, read_map_file, read_map_from, read_unit, read_whole_map,
     read_whole_map_file,
 };
-pub use write::{Column, Ordering, Precision, WriteOptions, write_columns, write_map};
+pub use write::{Column, Ordering, Precision, WriteOptions, map_bytes, write_columns, write_map};

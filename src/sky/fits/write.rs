@@ -91,6 +91,22 @@ pub fn write_columns(
     write().map_err(|problem| FitsError::new(path, problem))
 }
 
+/// The file that [`write_map`] would write, in memory.
+///
+/// # Errors
+/// As [`write_columns`], but none of the operating system.
+pub fn map_bytes(map: &SkyMap, options: &WriteOptions) -> Result<Vec<u8>, FitsError> {
+    let column = Column { name: "TEMPERATURE", unit: "K", values: map.values() };
+    let write = || {
+        let columns = [column];
+        let table = Table::new(&columns, options)?;
+        let mut bytes = table.header(map.frame())?;
+        table.write_rows(&mut bytes)?;
+        Ok(bytes)
+    };
+    write().map_err(|problem| FitsError::new(Path::new("memory"), problem))
+}
+
 struct Table<'a> {
     columns: &'a [Column<'a>],
     options: &'a WriteOptions,

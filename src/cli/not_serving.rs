@@ -1,0 +1,41 @@
+//! In place of `serving` in a program that was built without the feature `serve`.
+
+use std::path::Path;
+
+use clap::Args;
+
+use super::interrupt::Interrupt;
+use super::output::CommandError;
+use crate::pipeline::{Config, Watched};
+
+/// No arguments.
+#[derive(Debug, Args)]
+pub(super) struct ServeArgs {}
+
+impl ServeArgs {
+    pub(super) fn start(
+        &self,
+        _config: &Config,
+        _segment: &str,
+        _state: Option<&Path>,
+    ) -> Result<Page, CommandError> {
+        Ok(Page)
+    }
+}
+
+/// No page.
+pub(super) struct Page;
+
+impl Page {
+    pub(super) fn watch(&self, _watched: &Watched) {}
+
+    pub(super) fn conclude<T, E: Into<CommandError>>(
+        &self,
+        result: Result<T, E>,
+        _cancelled: impl FnOnce(&T) -> bool,
+    ) -> Result<T, CommandError> {
+        result.map_err(Into::into)
+    }
+
+    pub(super) fn stay(self, _interrupt: &Interrupt) {}
+}

@@ -1,0 +1,85 @@
+//! `--serve`: the page of a running command.
+
+use std::path::Path;
+use std::time::Duration;
+
+use clap::Args;
+
+use super::interrupt::Interrupt;
+use super::output::{CommandError, say};
+use crate::pipeline::{Config, Watched};
+use crate::serve::{ServeAddress, ServeError, Server, Subject};
+
+/// Interval of looking for a signal.
+const POLL: Duration = Duration::from_millis(100);
+
+/// Whether and where a command shows itself.
+#[derive(Debug, Args)]
+pub(super) struct ServeArgs {
+    /// Show the run in a browser: a port of this machine, or HOST:PORT. Port 0 chooses a free one; standard error prints
+    /// `serving on http://HOST:PORT/`. Visitors can only look.
+    #[arg(long, value_name = "PORT|HOST:PORT")]
+    serve: Option<ServeAddress>,
+    /// Allow an address that other machines can reach. Anyone who connects can read all that is shown.
+    #[arg(long, requires = "serve")]
+    serve_remote: bool,
+    /// Go on serving after the end of the run, until Ctrl-C or SIGTERM.
+    #[arg(long, requires = "serve")]
+    serve_after: bool,
+}
+
+impl ServeArgs {
+    /// Starts the server, if one is wanted, to tell of the `segment` of a chain with this configuration.
+    pub(super) fn start(
+        &self,
+        config: &Config,
+        segment: &'static str,
+        state: Option<&Path>,
+    ) -> Result<Page, ServeError> {
+        let Some(address) = &self.serve else { return Ok(Page { server: None, stays: false }) };
+        let server = Server::start(address, self.serve_remote, Subject::new(config, segment, state))?;
+        say(format_args!("serving on {}", server.url()));
+        Ok(Page { server: Some(server), stays: self.serve_after })
+    }
+}
+
+/// The page of a command, if one is wanted; it ends when dropped.
+pub(super) struct Page {
+    server: Option<Server>,
+    /// Whether it stays after the end of the run.
+    stays: bool,
+}
+
+impl Page {
+    /// The run begins.
+    pub(super) fn watch(&self, watched: &Watched) {
+        if let Some(server) = &self.server {
+            server.watch(watched);
+        }
+    }
+
+    /// Tells how a run ended that yielded a result; `cancelled` reads from it whether it was ended early.
+    pub(super) fn conclude<T, E: Into<CommandError>>(
+        &self,
+        result: Result<T, E>,
+        cancelled: impl FnOnce(&T) -> bool,
+    ) -> Result<T, CommandError> {
+        let result = result.map_err(Into::into);
+        if let Some(server) = &self.server {
+            let error = result.as_ref().err().map(ToString::to_string);
+            server.conclude(error, result.as_ref().is_ok_and(cancelled));
+        }
+        result
+    }
+
+    /// After a run that was not ended early: goes on serving until a signal, if that is wanted.
+    pub(super) fn stay(self, interrupt: &Interrupt) {
+        let Some(server) = self.server.filter(|_| self.stays && !interrupt.cancel().is_cancelled()) else {
+            return;
+        };
+        say(format_args!("the run is over; serving on {} until Ctrl-C", server.url()));
+        while !interrupt.cancel().is_cancelled() {
+            std::thread::sleep(POLL);
+        }
+    }
+}

@@ -1,0 +1,297 @@
+//! The same figures for Prometheus, in the text format that it scrapes.
+
+use std::fmt;
+use std::sync::Arc;
+
+use prometheus_client::collector::Collector;
+use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric, text};
+use prometheus_client::metrics::MetricType;
+use prometheus_client::metrics::counter::ConstCounter;
+use prometheus_client::metrics::gauge::ConstGauge;
+use prometheus_client::registry::{Registry, Unit};
+
+use super::console::Console;
+use super::status::{Phase, Status};
+use crate::downlink::Kind;
+use crate::runtime::{DurationCounts, StageProgress};
+use crate::units::Reason;
+
+/// Content type of the text.
+pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+
+/// All metrics as text.
+///
+/// # Errors
+/// None in practice: writing to a string does not fail.
+pub(super) fn scrape(console: &Arc<Console>) -> Result<String, fmt::Error> {
+    let mut registry = Registry::with_prefix("lunarray");
+    registry.register_collector(Box::new(Scrape { status: console.status(), progress: console.progress() }));
+    let mut out = String::new();
+    text::encode(&mut out, &registry)?;
+    Ok(out)
+}
+
+#[derive(Debug)]
+struct Scrape {
+    status: Status,
+    progress: Vec<StageProgress>,
+}
+
+/// Labels of a sample, and its value.
+type Sample<const N: usize, V> = ([(&'static str, String); N], V);
+
+/// Name and help of a metric, and its unit if it has one.
+struct About(&'static str, &'static str, Option<Unit>);
+
+fn items() -> Option<Unit> {
+    Some(Unit::Other("items".into()))
+}
+
+fn gauges<const N: usize>(
+    out: &mut DescriptorEncoder<'_>,
+    About(name, help, unit): About,
+    samples: impl IntoIterator<Item = Sample<N, f64>>,
+) -> fmt::Result {
+    let mut metric = out.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?;
+    for (labels, value) in samples {
+        ConstGauge::new(value).encode(metric.encode_family(&labels)?)?;
+    }
+    Ok(())
+}
+
+fn counters<const N: usize>(
+    out: &mut DescriptorEncoder<'_>,
+    About(name, help, unit): About,
+    samples: impl IntoIterator<Item = Sample<N, u64>>,
+) -> fmt::Result {
+    let mut metric = out.encode_descriptor(name, help, unit.as_ref(), MetricType::Counter)?;
+    for (labels, value) in samples {
+        ConstCounter::new(value).encode(metric.encode_family(&labels)?)?;
+    }
+    Ok(())
+}
+
+fn gauge(out: &mut DescriptorEncoder<'_>, about: About, value: f64) -> fmt::Result {
+    let About(name, help, unit) = about;
+    let value = ConstGauge::new(value);
+    value.encode(out.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?)
+}
+
+fn counter(out: &mut DescriptorEncoder<'_>, about: About, value: u64) -> fmt::Result {
+    let About(name, help, unit) = about;
+    let value = ConstCounter::new(value);
+    value.encode(out.encode_descriptor(name, help, unit.as_ref(), MetricType::Counter)?)
+}
+
+impl Collector for Scrape {
+    fn encode(&self, mut out: DescriptorEncoder<'_>) -> fmt::Result {
+        self.run(&mut out)?;
+        self.stages(&mut out)?;
+        self.ground(&mut out)?;
+        self.senders(&mut out)?;
+        self.maps(&mut out)?;
+        self.visitors(&mut out)
+    }
+}
+
+impl Scrape {
+    fn run(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let Status { version, name, segment, phase, elapsed_s, .. } = &self.status;
+        let build = [
+            ("version", (*version).to_owned()),
+            ("pipeline", name.clone()),
+            ("segment", (*segment).to_owned()),
+        ];
+        gauges(
+            out,
+            About("build_info", "Version, name of the pipeline, part of the chain", None),
+            [(build, 1.0)],
+        )?;
+        let uptime = About("uptime", "Time since the server started", Some(Unit::Seconds));
+        gauge(out, uptime, *elapsed_s)?;
+        let phases = Phase::ALL.map(|p| ([("phase", p.name().to_owned())], f64::from(u8::from(p == *phase))));
+        gauges(out, About("run_phase", "1 for the phase in which the run is", None), phases)
+    }
+
+    fn stages(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let stages = &self.status.stages;
+        let label = |name: &str| [("stage", name.to_owned())];
+        let queued = stages.iter().filter_map(|s| Some((label(&s.name), s.queue?)));
+        let depth = queued.clone().map(|(label, queue)| (label, queue.depth as f64));
+        gauges(out, About("stage_queue", "Items that wait before a stage", items()), depth)?;
+        let capacity = queued.map(|(label, queue)| (label, queue.capacity as f64));
+        gauges(out, About("stage_queue_capacity", "Items that can wait before a stage", items()), capacity)?;
+        let busy = stages.iter().map(|s| (label(&s.name), s.busy));
+        let about =
+            About("stage_busy", "Share of the last seconds in which a stage worked", Some(Unit::Ratios));
+        gauges(out, about, busy)?;
+        let received = stages.iter().map(|s| (label(&s.name), s.items_in));
+        counters(out, About("stage_received", "Items that a stage has taken", items()), received)?;
+        let sent = stages.iter().map(|s| (label(&s.name), s.items_out));
+        counters(out, About("stage_sent", "Items that a stage has passed on", items()), sent)?;
+        let units = stages.iter().filter(|s| !s.unit.is_empty());
+        let units = units.map(|s| ([("stage", s.name.clone()), ("unit", s.unit.to_owned())], s.units));
+        counters(out, About("stage_units", "What a stage has processed, in its own unit", None), units)?;
+        let ended = stages.iter().map(|s| (label(&s.name), f64::from(u8::from(s.ended))));
+        gauges(out, About("stage_ended", "1 for a stage that has ended", None), ended)?;
+        let step = About("stage_step", "Work of a stage on one item", Some(Unit::Seconds));
+        self.histogram(out, step, |stage| &stage.working)?;
+        let about = About(
+            "stage_latency",
+            "From the source's push to the end of a stage's step",
+            Some(Unit::Seconds),
+        );
+        self.histogram(out, about, |stage| &stage.since_source)
+    }
+
+    fn histogram(
+        &self,
+        out: &mut DescriptorEncoder<'_>,
+        About(name, help, unit): About,
+        of: impl Fn(&StageProgress) -> &DurationCounts,
+    ) -> fmt::Result {
+        let mut metric = out.encode_descriptor(name, help, unit.as_ref(), MetricType::Histogram)?;
+        for stage in self.progress.iter().filter(|stage| of(stage).count() > 0) {
+            let durations = of(stage);
+            let mut classes: Vec<(f64, u64)> = durations.classes().collect();
+            // Longer ones are in the last class, too.
+            if let Some(last) = classes.last_mut() {
+                last.0 = f64::MAX;
+            }
+            let labels = [("stage", stage.name.clone())];
+            let mut encoder = metric.encode_family(&labels)?;
+            encoder.encode_histogram::<[(&str, String); 1]>(
+                durations.total_s,
+                durations.count(),
+                &classes,
+                None,
+            )?;
+        }
+        Ok(())
+    }
+
+    fn ground(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let visibilities = || Some(Unit::Other("visibilities".into()));
+        if let Some(ledger) = &self.status.ledger {
+            // Not counters: what is retracted leaves them.
+            let entry = |entry: &str, count: u64| ([("entry", entry.to_owned())], count as f64);
+            let [sampled, accumulated] = [ledger.report.sampled, ledger.report.accumulated];
+            let entries = [entry("sampled", sampled), entry("accumulated", accumulated)];
+            gauges(out, About("ledger", "Visibilities by what became of them", visibilities()), entries)?;
+            let left_out = ledger.report.left_out.iter().map(|(reason, &count)| {
+                let stage = reason.lost_in().unwrap_or("");
+                ([("reason", reason.text().to_owned()), ("lost_in", stage.to_owned())], count as f64)
+            });
+            let about = About("ledger_left_out", "Visibilities flagged, or lost in a stage", visibilities());
+            gauges(out, about, left_out)?;
+            let about = "Visibilities without an entry; zero at the end of a run";
+            let about = About("ledger_unaccounted", about, visibilities());
+            gauge(out, about, ledger.unaccounted as f64)?;
+        }
+        if let Some(reception) = &self.status.reception {
+            let packets = || Some(Unit::Other("packets".into()));
+            let kinds = |of: &dyn Fn(Kind) -> u64| {
+                Kind::ALL.map(|kind| ([("kind", kind.to_string())], of(kind) as f64))
+            };
+            let sound = kinds(&|kind| reception.kind(kind).packets);
+            gauges(out, About("reception", "Sound packets received, each once", packets()), sound)?;
+            let missing = kinds(&|kind| reception.kind(kind).missing);
+            gauges(
+                out,
+                About("reception_missing", "Packets missing between those received", packets()),
+                missing,
+            )?;
+            let damaged = kinds(&|kind| reception.kind(kind).damaged);
+            gauges(out, About("reception_damaged", "Packets with a bad checksum", packets()), damaged)?;
+            let again = kinds(&|kind| reception.kind(kind).duplicates);
+            gauges(out, About("reception_duplicate", "Packets received before", packets()), again)?;
+        }
+        if let Some(saving) = &self.status.saving {
+            let written = About("checkpoints_written", "Checkpoints written in this session", None);
+            counter(out, written, saving.written)?;
+            counter(
+                out,
+                About("checkpoints_failed", "Checkpoints that could not be written", None),
+                saving.failed,
+            )?;
+            let unsaved = f64::from(u8::from(saving.unsaved.is_some()));
+            gauge(
+                out,
+                About("state_unsaved", "1 if the last checkpoint could not be written", None),
+                unsaved,
+            )?;
+        }
+        Ok(())
+    }
+
+    fn senders(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let Some(listening) = &self.status.listening else { return Ok(()) };
+        let report = &listening.report;
+        gauge(out, About("senders_open", "Senders that are connected", None), listening.open as f64)?;
+        counter(
+            out,
+            About("senders_accepted", "Connections accepted from senders", None),
+            report.connections,
+        )?;
+        counter(out, About("senders_refused", "Connections of senders refused", None), report.refused)?;
+        counter(out, About("senders_read", "Read from senders", Some(Unit::Bytes)), listening.bytes)?;
+        let about = "Read from senders and not taken by the ground yet";
+        gauge(out, About("senders_backlog", about, Some(Unit::Bytes)), listening.backlog_bytes as f64)?;
+        let ended = report.ended.iter().filter_map(|(end, &count)| {
+            let name = serde_json::to_value(end).ok()?.as_str()?.to_owned();
+            Some(([("end", name)], count))
+        });
+        counters(out, About("senders_ended", "Connections of senders by how they ended", None), ended)
+    }
+
+    fn maps(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let channels = &self.status.channels;
+        let label = |frequency_hz: f64| [("frequency_mhz", format!("{:.3}", frequency_hz / 1e6))];
+        let known = || channels.iter().filter_map(|c| Some((label(c.frequency_hz), c.figures.as_ref()?)));
+        let numbers = known().map(|(label, figures)| (label, f64::from(figures.number)));
+        gauges(out, About("map_snapshot", "Number of the last map of a channel", None), numbers)?;
+        let counts = known().map(|(label, figures)| (label, figures.visibilities as f64));
+        let unit = Some(Unit::Other("visibilities".into()));
+        gauges(out, About("map", "Visibilities in the last map of a channel", unit), counts)?;
+        let times = known().map(|(label, figures)| (label, figures.until_s));
+        let about =
+            About("map_until", "Mission time of the last data in a channel's map", Some(Unit::Seconds));
+        gauges(out, about, times)?;
+        let noise = channels.iter().map(|channel| (label(channel.frequency_hz), channel.noise_rms_k));
+        let unit = Some(Unit::Other("kelvin".into()));
+        gauges(out, About("map_noise_rms", "RMS of the noise-only map of a channel", unit), noise)?;
+        let solving = self.status.solving.as_ref();
+        let is_solving = f64::from(u8::from(solving.is_some()));
+        gauge(out, About("solver_active", "1 while a map is being solved by iteration", None), is_solving)?;
+        if let Some(solving) = solving {
+            gauge(
+                out,
+                About("solver_iteration", "Iterations of the solution in progress", None),
+                solving.iteration as f64,
+            )?;
+            gauge(out, About("solver_residual", "Its residual", Some(Unit::Ratios)), solving.residual)?;
+            gauge(
+                out,
+                About("solver_target", "The residual at which it ends", Some(Unit::Ratios)),
+                solving.target,
+            )?;
+        }
+        Ok(())
+    }
+
+    fn visitors(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let visitors = self.status.visitors;
+        gauge(out, About("http_connections", "Open connections to this server", None), visitors.open as f64)?;
+        counter(
+            out,
+            About("http_refused", "Connections refused as too many were open", None),
+            visitors.refused,
+        )?;
+        counter(
+            out,
+            About("http_cut", "Connections closed by the server: silent, slow or not HTTP", None),
+            visitors.cut,
+        )?;
+        counter(out, About("http_requests", "Requests answered", None), visitors.requests)
+    }
+}

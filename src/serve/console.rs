@@ -1,0 +1,268 @@
+//! What all connections read: the run, its maps and its log.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::Instant;
+
+use axum::body::Bytes;
+
+use super::event_log::EventLog;
+use super::pulse::Pulse;
+use super::shelf::Shelf;
+use super::status::{ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, stages_of};
+use crate::ground::SavingReport;
+use crate::pipeline::Watched;
+use crate::products::{MapViewer, PublishedMap};
+use crate::runtime::{Metrics, StageProgress};
+use crate::solve::Solving;
+
+/// Most senders in a status; it goes out twice a second.
+const SENDERS_SHOWN: usize = 20;
+
+/// Numbers of connections and requests.
+#[derive(Debug, Default)]
+pub(super) struct VisitorCounts {
+    pub(super) open: AtomicU64,
+    pub(super) refused: AtomicU64,
+    pub(super) cut: AtomicU64,
+    pub(super) requests: AtomicU64,
+}
+
+impl VisitorCounts {
+    fn status(&self) -> VisitorStatus {
+        VisitorStatus {
+            open: self.open.load(Ordering::Relaxed),
+            refused: self.refused.load(Ordering::Relaxed),
+            cut: self.cut.load(Ordering::Relaxed),
+            requests: self.requests.load(Ordering::Relaxed),
+        }
+    }
+}
+
+/// How a run ended.
+#[derive(Clone, Debug)]
+pub(super) struct Ending {
+    pub(super) error: Option<String>,
+    pub(super) cancelled: bool,
+}
+
+/// What changes from one look to the next.
+#[derive(Debug, Default)]
+struct Memory {
+    pulse: Pulse,
+    /// The solution being shown: its number, when it was first seen, and its residual then.
+    solution: Option<(u64, Instant, f64)>,
+    ended: Vec<bool>,
+    senders: u64,
+    saving: SavingReport,
+    status: Option<Status>,
+}
+
+/// The run as its visitors see it.
+#[derive(Debug)]
+pub(super) struct Console {
+    pub(super) name: String,
+    pub(super) segment: &'static str,
+    /// The configuration in JSON.
+    pub(super) config: Bytes,
+    /// Folder of the state, if there is one.
+    pub(super) state: Option<PathBuf>,
+    pub(super) started: Instant,
+    pub(super) shelf: Arc<Shelf>,
+    pub(super) log: Arc<EventLog>,
+    pub(super) visitors: VisitorCounts,
+    pub(super) watched: OnceLock<Watched>,
+    ending: Mutex<Option<Ending>>,
+    memory: Mutex<Memory>,
+}
+
+impl Console {
+    pub(super) fn new(name: String, segment: &'static str, config: Bytes, state: Option<PathBuf>) -> Self {
+        Self {
+            name,
+            segment,
+            config,
+            state,
+            started: Instant::now(),
+            shelf: Arc::default(),
+            log: Arc::default(),
+            visitors: VisitorCounts::default(),
+            watched: OnceLock::new(),
+            ending: Mutex::default(),
+            memory: Mutex::default(),
+        }
+    }
+
+    fn elapsed_s(&self) -> f64 {
+        self.started.elapsed().as_secs_f64()
+    }
+
+    fn note(&self, is_bad: bool, text: impl Into<String>) {
+        self.log.push(self.elapsed_s(), is_bad, text.into());
+    }
+
+    /// The run begins.
+    pub(super) fn begin(&self, watched: &Watched) {
+        let viewer =
+            Onlooker { shelf: Arc::clone(&self.shelf), log: Arc::clone(&self.log), started: self.started };
+        watched.maps.join(Box::new(viewer));
+        if self.watched.set(watched.clone()).is_ok() {
+            self.note(false, "the run begins");
+        }
+    }
+
+    /// The run has ended.
+    pub(super) fn end(&self, ending: Ending) {
+        match &ending {
+            Ending { error: Some(error), .. } => self.note(true, format!("the run failed: {error}")),
+            Ending { cancelled: true, .. } => self.note(true, "the run was ended early"),
+            Ending { .. } => self.note(false, "the run is complete"),
+        }
+        *self.ending.lock().unwrap_or_else(PoisonError::into_inner) = Some(ending);
+    }
+
+    pub(super) fn phase(&self) -> Phase {
+        let ending = self.ending.lock().unwrap_or_else(PoisonError::into_inner);
+        match (&*ending, self.watched.get()) {
+            (Some(Ending { error: Some(_), .. }), _) => Phase::Failed,
+            (Some(_), _) => Phase::Ended,
+            (None, Some(_)) => Phase::Running,
+            (None, None) => Phase::Starting,
+        }
+    }
+
+    fn memory(&self) -> MutexGuard<'_, Memory> {
+        self.memory.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The newest status, at most one look old.
+    pub(super) fn status(&self) -> Status {
+        let known = self.memory().status.clone();
+        known.unwrap_or_else(|| self.look())
+    }
+
+    /// The stages' counters; empty before the run.
+    pub(super) fn progress(&self) -> Vec<StageProgress> {
+        self.watched.get().map(|watched| Metrics::snapshot(&watched.metrics)).unwrap_or_default()
+    }
+
+    /// Looks at the run, notes what has changed, and keeps the status.
+    pub(super) fn look(&self) -> Status {
+        let phase = self.phase();
+        let progress = self.progress();
+        let ending = self.ending.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let watched = self.watched.get();
+        let ground = watched.and_then(|watched| watched.ground.as_ref());
+        let now = Instant::now();
+        let mut memory = self.memory();
+        let rates = memory.pulse.look(&progress, now);
+        let listening = watched.and_then(|watched| watched.listening.as_ref()).map(|listening| {
+            let mut report = listening.report();
+            report.senders.listed.truncate(SENDERS_SHOWN);
+            ListenerStatus {
+                open: listening.status.open(),
+                bytes: listening.status.bytes(),
+                backlog_bytes: listening.status.backlog_bytes(),
+                report,
+            }
+        });
+        let solving = watched.and_then(|watched| watched.solving.now());
+        let saving = ground.and_then(|ground| ground.saving.report());
+        let read = |ground: &crate::ground::GroundOutcome| {
+            let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            if let Some(listening) = &listening {
+                listening.report.complete(&mut reception);
+            }
+            let completeness = ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            (reception, (phase == Phase::Ended).then_some(completeness))
+        };
+        let (reception, completeness) = ground.map(read).map_or((None, None), |(a, b)| (Some(a), b));
+        let status = Status {
+            version: env!("CARGO_PKG_VERSION"),
+            name: self.name.clone(),
+            segment: self.segment,
+            phase,
+            error: ending.as_ref().and_then(|ending| ending.error.clone()),
+            cancelled: ending.is_some_and(|ending| ending.cancelled),
+            elapsed_s: self.elapsed_s(),
+            stages: stages_of(&progress, &rates),
+            solving: solving.map(|solving| memory.solver(solving, now)),
+            ledger: ground.map(|ground| ground.ledger.report().into()),
+            completeness,
+            reception,
+            listening,
+            saving,
+            channels: self.shelf.status(),
+            has_state: self.state.is_some(),
+            visitors: self.visitors.status(),
+        };
+        for (is_bad, text) in memory.changes(&status) {
+            self.note(is_bad, text);
+        }
+        memory.status = Some(status.clone());
+        status
+    }
+}
+
+impl Memory {
+    /// The state of the solver, with the time left.
+    fn solver(&mut self, solving: Solving, now: Instant) -> SolverStatus {
+        let Solving { number, what, iteration, residual, target } = solving;
+        let (_, since, first) = match self.solution {
+            Some(seen) if seen.0 == number => seen,
+            _ => *self.solution.insert((number, now, residual)),
+        };
+        let (done, whole) = ((first / residual).ln(), (first / target).ln());
+        let elapsed_s = now.duration_since(since).as_secs_f64();
+        let is_known = done > 0.05 * whole && elapsed_s > 1.0;
+        let left_s = is_known.then(|| elapsed_s * (whole / done - 1.0).max(0.0));
+        SolverStatus { what, iteration, residual, target, left_s }
+    }
+
+    /// What has happened since the last look, and whether it needs attention.
+    fn changes(&mut self, status: &Status) -> Vec<(bool, String)> {
+        let mut found = Vec::new();
+        self.ended.resize(status.stages.len(), false);
+        for (was, stage) in self.ended.iter_mut().zip(&status.stages) {
+            if stage.ended && !*was {
+                found.push((false, format!("stage {} has ended", stage.name)));
+            }
+            *was = stage.ended;
+        }
+        if let Some(listening) = &status.listening {
+            let closed = listening.report.connections;
+            if closed > self.senders {
+                found.push((
+                    false,
+                    format!("senders: {closed} connections accepted, {} open", listening.open),
+                ));
+            }
+            self.senders = closed;
+        }
+        if let Some(saving) = &status.saving {
+            if saving.written > self.saving.written {
+                found.push((false, format!("checkpoint {} of this session is written", saving.written)));
+            }
+            if saving.unsaved.is_some() && saving.failed > self.saving.failed {
+                found.push((true, saving.to_string()));
+            }
+            self.saving = saving.clone();
+        }
+        found
+    }
+}
+
+/// Sees maps for the console.
+struct Onlooker {
+    shelf: Arc<Shelf>,
+    log: Arc<EventLog>,
+    started: Instant,
+}
+
+impl MapViewer for Onlooker {
+    fn view(&self, map: PublishedMap<'_>) {
+        let said = self.shelf.put(map);
+        self.log.push(self.started.elapsed().as_secs_f64(), false, said);
+    }
+}

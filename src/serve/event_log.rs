@@ -1,0 +1,69 @@
+//! The log of events that the page shows.
+
+use std::collections::VecDeque;
+use std::sync::{Mutex, PoisonError};
+
+use serde::Serialize;
+
+/// Events kept.
+const EVENTS_MAX: usize = 256;
+
+/// Something that happened.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Event {
+    /// Number, from 1.
+    pub(super) id: u64,
+    /// Time since the server's start, s.
+    elapsed_s: f64,
+    /// Whether it needs attention.
+    is_bad: bool,
+    /// What happened.
+    text: String,
+}
+
+/// The last events.
+#[derive(Debug, Default)]
+pub(super) struct EventLog(Mutex<EventQueue>);
+
+#[derive(Debug, Default)]
+struct EventQueue {
+    last: u64,
+    events: VecDeque<Event>,
+}
+
+impl EventLog {
+    pub(super) fn push(&self, elapsed_s: f64, is_bad: bool, text: String) {
+        let mut queue = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        queue.last += 1;
+        let id = queue.last;
+        if queue.events.len() == EVENTS_MAX {
+            queue.events.pop_front();
+        }
+        queue.events.push_back(Event { id, elapsed_s, is_bad, text });
+    }
+
+    /// Kept events after number `id`.
+    pub(super) fn after(&self, id: u64) -> Vec<Event> {
+        let queue = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        queue.events.iter().filter(|event| event.id > id).cloned().collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_last_events_are_kept() {
+        let log = EventLog::default();
+        for number in 1..=1000 {
+            log.push(0.0, false, number.to_string());
+        }
+        let all = log.after(0);
+        assert_eq!((all.len(), all[0].id, all[EVENTS_MAX - 1].id), (EVENTS_MAX, 745, 1000));
+        assert_eq!(
+            log.after(998).iter().map(|event| event.text.as_str()).collect::<Vec<_>>(),
+            ["999", "1000"]
+        );
+    }
+}

@@ -1,0 +1,35 @@
+//! The page of a running chain, and the same for programs: a small HTTP server that only tells.
+//!
+//! | route | what |
+//! |---|---|
+//! | `/` | the page |
+//! | `/events` | server-sent events: `status` twice a second at most, and `log` |
+//! | `/api/status` | the state of the run, in the terms of `summary.json` |
+//! | `/api/config` | the configuration |
+//! | `/api/figures/CHANNEL` | quality of a channel's maps, and spectra of the last |
+//! | `/api/maps/CHANNEL/N.f32`, `.fits`, `.png` | a map; N is a number, `latest`, `noise` or `input` |
+//! | `/api/gaps` | missing packets, if there is a state |
+//! | `/metrics` | for Prometheus |
+//! | `/healthz`, `/readyz` | for a supervisor |
+//!
+//! It reads what a running graph shows anyway ([`crate::pipeline::Watched`]) and sees maps through one hook of the
+//! publisher. Nothing in the chain waits for it: a browser that is late sees the newest state and misses what was between.
+//! All memory is bounded: maps held, connections, what one request may hold. No request can name a file.
+//!
+//! One thread with an event loop serves all connections, a second one draws pictures. May use every folder before it.
+
+mod address;
+mod collector;
+mod connection;
+mod console;
+mod error;
+mod event_log;
+mod pulse;
+mod routes;
+mod server;
+mod shelf;
+mod status;
+
+pub use address::ServeAddress;
+pub use error::ServeError;
+pub use server::{Server, Subject};

@@ -1,0 +1,480 @@
+// The page: events in, panels out. Everything comes from this server; nothing is sent to it.
+import { Sky, isSeen } from "/sky.js";
+
+const $ = (id) => document.getElementById(id);
+const HELD_BYTES = 96e6, SAMPLE = 65536;
+const BLINK_MS = 700, PLAY_MS = 450;
+const state = {
+  status: null, channel: 0, number: null, follows: true, figures: new Map(), curve: "growth",
+  maps: new Map(), blink: false, blinkOn: false, playing: false, gapsAt: 0, gapsSeen: 0,
+};
+let sky;
+
+const number = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
+const short = (v) => {
+  if (v === null || v === undefined || !Number.isFinite(v)) return "–";
+  const a = Math.abs(v);
+  if (a !== 0 && (a >= 1e5 || a < 1e-2)) return v.toExponential(2).replace("e+", "e");
+  return String(Number(v.toPrecision(a >= 1000 ? 5 : 4)));
+};
+const prefixed = (v) => {
+  for (const [size, name] of [[1e9, " G"], [1e6, " M"], [1e3, " k"]]) if (v >= size) return (v / size).toPrecision(3) + name;
+  return v === 0 ? "0 " : v >= 100 ? v.toFixed(0) + " " : v.toPrecision(3) + " ";
+};
+const duration = (s) => {
+  if (!(s > 0)) return "0";
+  if (s >= 1) return `${s.toPrecision(3)} s`;
+  if (s >= 1e-3) return `${(s * 1e3).toPrecision(3)} ms`;
+  return `${(s * 1e6).toPrecision(3)} µs`;
+};
+const clock = (s) => {
+  const [h, m, r] = [Math.floor(s / 3600), Math.floor(s / 60) % 60, Math.floor(s) % 60];
+  return (h ? `${h}:` : "") + `${String(m).padStart(h ? 2 : 1, "0")}:${String(r).padStart(2, "0")}`;
+};
+const days = (s) => `${(s / 86400).toFixed(1)} d`;
+const make = (tag, attributes = {}, ...children) => {
+  const node = document.createElement(tag);
+  for (const [key, value] of Object.entries(attributes)) key === "class" ? (node.className = value) : node.setAttribute(key, value);
+  node.append(...children);
+  return node;
+};
+const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const stored = (key, value) => {
+  try { if (value !== undefined) localStorage.setItem(`lunarray.${key}`, value); return localStorage.getItem(`lunarray.${key}`); } catch { return null; }
+};
+const channelNow = () => state.status?.channels.find((c) => c.channel === state.channel);
+
+// ---- Maps ----
+async function fetchMap(name) {
+  const key = `${state.channel}/${name}`;
+  const held = state.maps.get(key);
+  if (held) { state.maps.delete(key); state.maps.set(key, held); return held; }
+  const answer = await fetch(`/api/maps/${key}.f32`);
+  if (!answer.ok) return null;
+  const bytes = new DataView(await answer.arrayBuffer());
+  const values = new Float32Array(bytes.byteLength / 4);
+  for (let k = 0; k < values.length; k++) values[k] = bytes.getFloat32(4 * k, true);
+  // A noise map stands for the last snapshot only.
+  if (name !== "noise") state.maps.set(key, values);
+  const bytesHeld = () => [...state.maps.values()].reduce((sum, map) => sum + map.byteLength, 0);
+  while (state.maps.size > 2 && bytesHeld() > HELD_BYTES) state.maps.delete(state.maps.keys().next().value);
+  return values;
+}
+
+let drawing = 0;
+async function showSky() {
+  const turn = ++drawing, channel = channelNow();
+  if (!channel || !sky) return;
+  const held = channel.held, at = Math.max(0, held.indexOf(state.number));
+  const before = held[at - 1];
+  let [first, second] = [String(state.number), null];
+  const show = $("show").value;
+  if (show === "difference") second = before === undefined ? null : String(before);
+  if (show === "input") first = "input";
+  if (show === "error") second = "input";
+  if (show === "noise") first = "noise";
+  if (state.blink && state.blinkOn) [first, second] = [channel.has_input ? "input" : String(before ?? state.number), null];
+  const [a, b] = await Promise.all([fetchMap(first), second === null ? null : fetchMap(second)]);
+  if (turn !== drawing) return;
+  if (!a) return; // Thinned away meanwhile; the next status names what is held.
+  $("waiting").hidden = true;
+  const isDifference = show === "difference" || show === "error";
+  sky.show(a, isDifference ? (b ?? a) : null);
+  sky.isDifference = isDifference;
+  await limits(a, isDifference ? b : null, turn);
+  if (turn === drawing) draw();
+}
+
+const quantile = (sorted, q) => sorted[Math.min(sorted.length - 1, Math.max(0, Math.round(q * (sorted.length - 1))))];
+async function limits(a, b) {
+  const look = sky.look, isDifference = sky.isDifference, isNoise = $("show").value === "noise";
+  look.smooth = $("smooth").checked; look.marks = $("marks").checked;
+  look.palette = isDifference || isNoise ? "difference" : $("palette").value;
+  look.scale = isDifference || isNoise ? "linear" : $("scale").value;
+  if ($("fixed").checked) {
+    const [low, high] = [Number($("from").value), Number($("to").value)];
+    if (low < high && (look.scale !== "log" || low > 0)) { look.low = low; look.high = high; return; }
+  }
+  // As the program's pictures: from 0.5 % to 99.5 %, or symmetric; of the input, if there is one to compare with.
+  let values = a;
+  if (state.blink && !isDifference) values = (channelNow()?.has_input && await fetchMap("input")) || a;
+  // A large map's quantiles are those of every so many pixels.
+  let used = [];
+  for (let k = 0, step = Math.ceil(values.length / SAMPLE); k < values.length; k += step) used.push(b ? values[k] - b[k] : values[k]);
+  used = used.filter(isSeen);
+  if (isDifference || isNoise) {
+    const sizes = Float64Array.from(used, Math.abs).sort();
+    look.high = quantile(sizes, 0.99) || 1; look.low = -look.high;
+  } else {
+    if (look.scale === "log") used = used.filter((v) => v > 0);
+    const sorted = Float64Array.from(used).sort();
+    look.low = quantile(sorted, 0.005) ?? 1; look.high = quantile(sorted, 0.995) ?? 2;
+    if (!(look.high > look.low * (1 + 1e-9))) { look.low = look.low / 1.2 - (look.scale === "log" ? 0 : 1); look.high = look.high * 1.2 + 1e-9; }
+  }
+  $("from").value = look.low.toPrecision(4); $("to").value = look.high.toPrecision(4);
+}
+
+function draw() {
+  if (!sky) return;
+  $("stage").classList.toggle("globe", sky.view.projection === "globe");
+  sky.draw();
+  const { look } = sky, colours = sky.palettes[look.palette], canvas = $("legend"), c = canvas.getContext("2d");
+  canvas.width = 256; canvas.height = 1;
+  const image = c.createImageData(256, 1);
+  for (let k = 0; k < 256; k++) image.data.set([colours[3 * k], colours[3 * k + 1], colours[3 * k + 2], 255], 4 * k);
+  c.putImageData(image, 0, 0);
+  $("low").textContent = `${short(look.low)} K`; $("high").textContent = `${short(look.high)} K, ${look.scale}`;
+}
+
+function chooseNumber(held, place) {
+  state.number = held[place];
+  state.follows = place === held.length - 1;
+  syncSlider();
+  showSky();
+}
+
+function syncSlider() {
+  const channel = channelNow();
+  if (!channel) return;
+  const { held } = channel, slider = $("slider"), place = held.indexOf(state.number);
+  slider.max = String(held.length - 1); slider.value = String(place);
+  const snapshots = state.figures.get(state.channel)?.snapshots ?? [];
+  const figures = snapshots.find((s) => s.number === state.number) ?? (place === held.length - 1 ? channel.figures : null);
+  const isFinal = channel.is_final && place === held.length - 1;
+  $("which").textContent = `${isFinal ? "final map" : `snapshot ${state.number}`}${figures ? `, until day ${(figures.until_s / 86400).toFixed(1)}` : ""}`;
+  const file = `/api/maps/${state.channel}/${state.number}`;
+  $("fits").href = `${file}.fits`; $("png").href = `${file}.png`;
+  $("fits").download = `channel-${state.channel}-${state.number}.fits`;
+}
+
+// ---- Panels ----
+function showChannels(channels) {
+  const tabs = $("channels"), known = [...tabs.children].map((tab) => tab.dataset.channel).join();
+  if (known !== channels.map((c) => String(c.channel)).join()) {
+    tabs.replaceChildren(...channels.map((c, k) => {
+      const tab = make("button", { role: "tab", title: `Channel ${c.channel} (${k + 1})` }, `${(c.frequency_hz / 1e6).toFixed(c.frequency_hz % 1e5 ? 3 : 1)} MHz`);
+      tab.dataset.channel = c.channel;
+      tab.addEventListener("click", () => chooseChannel(c.channel));
+      return tab;
+    }));
+  }
+  for (const tab of tabs.children) tab.setAttribute("aria-selected", String(Number(tab.dataset.channel) === state.channel));
+}
+
+function chooseChannel(channel) {
+  state.channel = channel; state.number = null; state.follows = true;
+  update(state.status);
+}
+
+function showStages(stages) {
+  const list = $("stages");
+  const names = stages.map((s) => s.name).join();
+  if (list.dataset.names !== names) {
+    list.dataset.names = names;
+    list.replaceChildren(...stages.map((stage) => {
+      const item = make("li");
+      if (stage.queue) item.append(make("div", { class: "queue" }, make("div", { class: "tube" }, make("i")), make("span"), make("span", { "aria-hidden": "true" }, "→")));
+      item.append(make("div", { class: "box" }, make("b", {}, stage.name), make("div", { class: "load" }, make("i")), make("span"), make("span"), make("span")));
+      return item;
+    }));
+  }
+  const running = stages.filter((s) => !s.ended);
+  const busiest = running.reduce((most, s) => (s.busy > (most?.busy ?? 0.02) ? s : most), null);
+  $("busiest").textContent = busiest ? `busiest: ${busiest.name}, ${(100 * busiest.busy).toFixed(0)} %` : "";
+  stages.forEach((stage, k) => {
+    const item = list.children[k], box = item.querySelector(".box"), [rate, step, latency] = box.querySelectorAll("span");
+    box.classList.toggle("busiest", stage === busiest); box.classList.toggle("ended", stage.ended);
+    box.querySelector(".load i").style.width = `${100 * stage.busy}%`;
+    const unit = { visibilities: "vis", bytes: "B" }[stage.unit] ?? stage.unit;
+    rate.textContent = stage.unit ? `${prefixed(stage.units_per_s)}${unit}/s` : `${number.format(stage.items_out)} items`;
+    step.textContent = stage.working.count ? `step ${duration(stage.working.p99_s)}` : "no step yet";
+    latency.textContent = stage.since_source.count ? `age ${duration(stage.since_source.p99_s)}` : `${(100 * stage.busy).toFixed(0)} % busy`;
+    box.title = `${stage.name}: ${number.format(stage.units)} ${stage.unit || "items"} so far, ${(100 * stage.busy).toFixed(0)} % busy; p99 of a step ${duration(stage.working.p99_s)}, p99 of an item's age since the source ${duration(stage.since_source.p99_s)}${stage.ended ? "; ended" : ""}`;
+    const queue = item.querySelector(".queue");
+    if (queue) {
+      const { depth, capacity, depth_max } = stage.queue;
+      queue.querySelector("i").style.width = `${100 * depth / capacity}%`;
+      queue.classList.toggle("full", depth >= capacity);
+      queue.querySelector("span").textContent = `${depth} / ${capacity}`;
+      queue.title = `queue before ${stage.name}: ${depth} of ${capacity} items, at most ${depth_max} so far`;
+    }
+  });
+}
+
+function showSolver(solving) {
+  $("solver").hidden = !solving;
+  if (!solving) return;
+  const done = Math.min(1, Math.max(0, Math.log(solving.residual) / Math.log(solving.target)));
+  $("solved").style.width = `${100 * done}%`;
+  const left = solving.left_s === null ? "" : `, about ${clock(solving.left_s)} left`;
+  $("solving").textContent = `${solving.what}: iteration ${solving.iteration}, residual ${solving.residual.toExponential(1)} of ${solving.target.toExponential(0)}${left}`;
+}
+
+function showLedger(ledger, phase) {
+  const panel = document.querySelector(".ledger");
+  panel.hidden = !ledger;
+  if (!ledger) return;
+  const sum = (counts) => counts.reduce((a, b) => a + b, 0);
+  const flagged = Object.entries(ledger.flagged), lost = ledger.lost;
+  const parts = [["accumulated", "accumulated", ledger.accumulated],
+    ...flagged.map(([reason, count]) => ["flagged", `flagged: ${reason}`, count]),
+    ...lost.map(({ stage, reason, count }) => ["lost", `lost in ${stage}: ${reason}`, count])];
+  const isOver = phase === "ended" || phase === "failed";
+  const rest = ledger.unaccounted;
+  if (rest > 0) parts.push(["pending", isOver ? "unaccounted" : "on their way", rest]);
+  const total = Math.max(1, sum(parts.map(([, , count]) => count)));
+  const bar = $("ledgerbar");
+  bar.replaceChildren(...parts.filter(([, , count]) => count > 0).map(([kind, name, count]) => {
+    const part = make("i", { class: kind, title: `${name}: ${number.format(count)}` });
+    part.style.width = `${100 * count / total}%`;
+    return part;
+  }));
+  const verdict = isOver ? (rest === 0 ? ["good", "✔ closed"] : ["bad", "✖ does not close"]) : ["", "open while data flow"];
+  $("verdict").className = `verdict ${verdict[0]}`; $("verdict").textContent = verdict[1];
+  bar.className = `ledgerbar ${isOver ? (rest === 0 ? "closed" : "open") : ""}`;
+  bar.setAttribute("aria-label", parts.map(([, name, count]) => `${name} ${count}`).join(", "));
+  const rows = [["", "sampled", ledger.sampled || !isOver && "told at the end" || 0], ...parts];
+  $("ledgerkeys").replaceChildren(...rows.map(([kind, name, count]) => make("li", {}, make("i", { class: kind }), make("span", {}, name), make("b", {}, typeof count === "string" ? count : number.format(count)))));
+}
+
+function showReception(status) {
+  const { reception, listening, saving } = status;
+  document.querySelector(".reception").hidden = !reception;
+  if (!reception) return;
+  const head = make("tr", {}, ...["packets", "received", "missing", "damaged", "again"].map((name) => make("th", { scope: "col" }, name)));
+  const kinds = ["instrument", "ephemeris", "visibilities", "housekeeping"];
+  const cell = (count, isBad) => make("td", isBad && count > 0 ? { class: "bad" } : {}, number.format(count));
+  $("packets").replaceChildren(head, ...kinds.map((kind) => {
+    const k = reception[kind];
+    return make("tr", {}, make("td", {}, kind), cell(k.packets), cell(k.missing, true), cell(k.damaged, true), cell(k.duplicates));
+  }));
+  const ends = listening ? Object.entries(listening.report.ended).map(([end, count]) => `${end} ${count}`).join(", ") : "";
+  $("senders").textContent = listening ? `${listening.open} senders connected, ${number.format(listening.report.connections)} accepted, ${number.format(listening.report.refused)} refused; ${prefixed(listening.bytes)}B read, ${prefixed(listening.backlog_bytes)}B wait${ends ? `; ended: ${ends}` : ""}` : `${prefixed(reception.bytes)}B received`;
+  $("saving").textContent = saving ? (saving.unsaved ? `▲ state not saved, ${saving.failed} attempts failed: ${saving.unsaved}` : `state saved, ${saving.written} checkpoints`) : "";
+}
+
+function showFigures() {
+  const channel = channelNow();
+  if (!channel) return;
+  const figures = channel.figures, list = [];
+  const add = (name, value) => list.push(make("div", {}, make("dt", {}, name), make("dd", {}, value)));
+  add("visibilities", number.format(figures.visibilities)); add("data span", days(channel.span_s[1] - channel.span_s[0]));
+  add("nside", String(channel.nside)); add("noise rms", `${short(channel.noise_rms_k)} K`);
+  if (figures.rms_error_over_rms_truth !== undefined) add("rms error / rms sky", short(figures.rms_error_over_rms_truth));
+  if (figures.rho_mean !== undefined) add("mean ρ, ℓ ≤ 2 nside", short(figures.rho_mean));
+  add("ε", channel.diagnostics.epsilon.toExponential(0));
+  $("figures").replaceChildren(...list);
+}
+
+// ---- Curves ----
+const COLOURS = ["--cool", "--hot", "--third", "--good"], DASHES = [[], [6, 4], [2, 3], [8, 3, 2, 3]];
+function drawCurve() {
+  const canvas = $("curve"), box = canvas.getBoundingClientRect(), ratio = Math.min(devicePixelRatio || 1, 2);
+  if (!box.width) return;
+  canvas.width = box.width * ratio; canvas.height = box.height * ratio;
+  const c = canvas.getContext("2d");
+  c.scale(ratio, ratio);
+  const data = state.figures.get(state.channel), channel = channelNow();
+  const { snapshots = [], spectra } = data ?? {};
+  const byDegree = (values) => (values ?? []).map((v, l) => [l, v]).slice(1);
+  const when = (key, of = (v) => v) => snapshots.filter((s) => s[key] !== undefined).map((s) => [s.until_s / 86400, of(s[key])]);
+  const plots = {
+    rho: { x: "degree ℓ", low: 0, high: 1.05, lines: [["map", byDegree(spectra?.rho)], ["its noise subtracted", byDegree(spectra?.rho_noise_subtracted)]] },
+    cl: { x: "degree ℓ", y: "K²", log: true, lines: [["map", byDegree(spectra?.cl_map)], ["input", byDegree(spectra?.cl_truth)], ["noise", byDegree(spectra?.cl_noise)]] },
+    snr: { x: "degree ℓ", log: true, lines: [["SNR", byDegree(spectra?.snr)]] },
+    growth: { x: "mission time, days", low: 0, lines: [["rms error / rms sky", when("rms_error_over_rms_truth")], ["mean ρ", when("rho_mean")]] },
+  };
+  const plot = plots[state.curve];
+  if (state.curve === "growth" && plot.lines.every(([, points]) => points.length === 0)) {
+    plot.lines = [["visibilities", when("visibilities")]]; plot.low = 0;
+  }
+  const lines = plot.lines.map(([name, points]) => [name, points.filter(([, v]) => v !== null && Number.isFinite(v) && (!plot.log || v > 0))]).filter(([, points]) => points.length);
+  const all = lines.flatMap(([, points]) => points);
+  c.font = "11px system-ui, sans-serif"; c.fillStyle = css("--quiet");
+  if (!all.length) {
+    c.textAlign = "center";
+    c.fillText(channel ? "needs the true sky, which only a simulation knows" : "curves begin with the first map", box.width / 2, box.height / 2);
+    return;
+  }
+  const t = plot.log ? Math.log10 : (v) => v;
+  const least = (of) => all.reduce((a, p) => Math.min(a, of(p)), Infinity), most = (of) => all.reduce((a, p) => Math.max(a, of(p)), -Infinity);
+  let [x0, x1, y0, y1] = [least((p) => p[0]), most((p) => p[0]), plot.low ?? least((p) => t(p[1])), plot.high ?? most((p) => t(p[1]))];
+  if (x1 === x0) { x0 -= 1; x1 += 1; }
+  if (y1 - y0 < 1e-9) y1 = y0 + 1;
+  if (!plot.high && !plot.log) y1 *= 1.05;
+  const [left, right, top, bottom] = [52, 10, 24, 30], [w, h] = [box.width - left - right, box.height - top - bottom];
+  const px = (x) => left + (x - x0) / (x1 - x0) * w, py = (y) => top + h - (t(y) - y0) / (y1 - y0) * h;
+  c.strokeStyle = css("--line"); c.lineWidth = 1;
+  const nice = (span, wanted) => { const raw = span / wanted, p = 10 ** Math.floor(Math.log10(raw)); return p * ([1, 2, 5, 10].find((m) => m * p >= raw) ?? 10); };
+  const ticks = (from, to, step) => { const found = []; for (let v = Math.ceil(from / step - 1e-9) * step; v <= to + 1e-9 * step; v += step) found.push(Math.abs(v) < 1e-12 * step ? 0 : v); return found; };
+  c.textAlign = "right"; c.textBaseline = "middle";
+  for (const v of ticks(y0, y1, plot.log ? Math.max(1, Math.ceil((y1 - y0) / 5)) : nice(y1 - y0, 4))) {
+    const y = top + h - (v - y0) / (y1 - y0) * h;
+    c.beginPath(); c.moveTo(left, y); c.lineTo(left + w, y); c.stroke();
+    c.fillText(plot.log ? `1e${v}` : short(v), left - 6, y);
+  }
+  c.textAlign = "center"; c.textBaseline = "alphabetic";
+  for (const v of ticks(x0, x1, nice(x1 - x0, 5))) {
+    c.beginPath(); c.moveTo(px(v), top); c.lineTo(px(v), top + h); c.stroke();
+    c.fillText(short(v), px(v), top + h + 14);
+  }
+  c.fillText(plot.x, left + w / 2, top + h + 27);
+  if (plot.y) { c.textAlign = "left"; c.fillText(plot.y, 4, 12); }
+  let at = left + 4;
+  lines.forEach(([name, points], k) => {
+    c.strokeStyle = c.fillStyle = css(COLOURS[k]); c.lineWidth = 2; c.setLineDash(DASHES[k]);
+    c.beginPath(); points.forEach(([x, y], n) => (n ? c.lineTo(px(x), py(y)) : c.moveTo(px(x), py(y)))); c.stroke();
+    c.beginPath(); c.moveTo(at, 12); c.lineTo(at + 22, 12); c.stroke(); c.setLineDash([]);
+    if (points.length < 40) for (const [x, y] of points) { c.beginPath(); c.arc(px(x), py(y), 2.4, 0, 7); c.fill(); }
+    c.fillStyle = css("--text"); c.textAlign = "left"; c.fillText(name, at + 27, 16);
+    at += 45 + c.measureText(name).width;
+  });
+}
+
+async function fetchFigures(channel) {
+  const answer = await fetch(`/api/figures/${channel}`);
+  if (!answer.ok) return;
+  state.figures.set(channel, await answer.json());
+  if (channel === state.channel) { drawCurve(); syncSlider(); }
+}
+
+// ---- Gaps ----
+async function fetchGaps() {
+  const answer = await fetch("/api/gaps");
+  if (!answer.ok) { $("gapsnote").textContent = await answer.text(); return; }
+  const { gaps, restarts } = await answer.json();
+  const rows = gaps.slice(0, 50);
+  const head = make("tr", {}, ...["APID", "from", "to", "lost, h", "adds %"].map((name) => make("th", { scope: "col" }, name)));
+  $("gaps").replaceChildren(head, ...rows.map((gap) => make("tr", {}, make("td", {}, `0x${gap.apid.toString(16)}`), make("td", {}, String(gap.from)), make("td", {}, String(gap.to)), make("td", {}, (gap.integration_s / 3600).toFixed(3)), make("td", {}, (100 * gap.gain).toFixed(4)))));
+  $("gaps").hidden = rows.length === 0;
+  $("gapsnote").textContent = (gaps.length ? `${gaps.length} gaps, most valuable first, as of the last checkpoint` : "No packets are missing between those received, as of the last checkpoint.") + (restarts?.length ? `; ${restarts.length} restarts of the counts` : "");
+  $("copy").onclick = () => navigator.clipboard?.writeText(gaps.map((gap) => `0x${gap.apid.toString(16)} ${gap.from} ${gap.to}`).join("\n"));
+}
+
+// ---- Status ----
+function update(status) {
+  if (!status) return;
+  state.status = status;
+  $("name").textContent = `${status.name ? `· ${status.name} ` : ""}· ${({ whole: "whole chain", ground: "ground", space: "space segment" })[status.segment] ?? status.segment}`;
+  document.title = `${status.name || "lunarray"} – ${status.phase}`;
+  const phase = $("phase");
+  phase.textContent = status.phase === "ended" && status.cancelled ? "ended early" : status.phase; phase.className = `chip ${status.phase}`;
+  phase.title = status.error ?? "";
+  $("elapsed").textContent = clock(status.elapsed_s);
+  showStages(status.stages); showSolver(status.solving); showLedger(status.ledger, status.phase); showReception(status);
+  showChannels(status.channels);
+  $("gapspanel").hidden = !status.has_state;
+  const saved = status.saving?.written ?? 0;
+  if (status.has_state && saved !== state.gapsSeen && Date.now() - state.gapsAt > 5000) {
+    state.gapsAt = Date.now(); state.gapsSeen = saved; fetchGaps();
+  }
+  const sections = document.querySelectorAll(".sky, .quality");
+  for (const section of sections) section.hidden = status.segment === "space";
+  const channel = channelNow() ?? status.channels[0];
+  if (!channel) return;
+  state.channel = channel.channel;
+  for (const option of $("show").options) if (["input", "error"].includes(option.value)) option.hidden = option.disabled = !channel.has_input;
+  const latest = channel.held.at(-1), isNew = !channel.held.includes(state.number);
+  const news = `${channel.channel}/${latest}/${channel.is_final}`;
+  if (state.follows || isNew) {
+    const changed = state.number !== latest;
+    state.number = latest;
+    if (changed) showSky();
+  }
+  if (state.news !== news) { state.news = news; fetchFigures(channel.channel); showFigures(); drawCurve(); }
+  syncSlider();
+}
+
+let restarted = null;
+function listen() {
+  const source = new EventSource("/events");
+  source.addEventListener("open", () => { $("link").textContent = "● live"; restarted = null; });
+  source.addEventListener("error", () => { $("link").textContent = "○ not connected; the page shows the last state"; });
+  source.addEventListener("status", (event) => {
+    const status = JSON.parse(event.data);
+    // Another run has taken the place: nothing that is held is of it.
+    if (state.status && status.elapsed_s < state.status.elapsed_s - 1) {
+      state.maps.clear(); state.figures.clear(); state.number = null; state.news = null; $("log").replaceChildren();
+    }
+    update(status);
+  });
+  source.addEventListener("log", (event) => {
+    const entry = JSON.parse(event.data), log = $("log");
+    if ([...log.children].some((item) => item.dataset.id === String(entry.id))) return;
+    const item = make("li", {}, make("time", {}, clock(entry.elapsed_s)), make("span", entry.is_bad ? { class: "bad" } : {}, entry.text));
+    item.dataset.id = entry.id;
+    log.prepend(item);
+    while (log.children.length > 256) log.lastChild.remove();
+  });
+}
+
+// ---- Controls ----
+function setView(change) {
+  Object.assign(sky.view, change);
+  for (const key of ["projection", "frame"]) { $(key).value = sky.view[key]; stored(key, sky.view[key]); }
+  sky.view.lon = ((sky.view.lon % 360) + 360) % 360; sky.view.lat = Math.max(-90, Math.min(90, sky.view.lat));
+  draw();
+}
+function press(button, on) { button.setAttribute("aria-pressed", String(on)); }
+function play(on) { state.playing = on; press($("play"), on); $("play").textContent = on ? "❚❚" : "▶"; if (on) { const held = channelNow()?.held; if (held && state.number === held.at(-1)) chooseNumber(held, 0); } }
+function blink(on) { state.blink = on; state.blinkOn = false; press($("blink"), on); showSky(); }
+function step(by) { const held = channelNow()?.held; if (held) chooseNumber(held, Math.min(held.length - 1, Math.max(0, held.indexOf(state.number) + by))); }
+function cycle(select) { const options = [...select.options].filter((o) => !o.disabled); select.value = options[(options.findIndex((o) => o.value === select.value) + 1) % options.length].value; select.dispatchEvent(new Event("change")); }
+function theme(name) { document.documentElement.dataset.theme = name; stored("theme", name); draw(); drawCurve(); }
+
+function controls() {
+  setInterval(() => { if (state.playing) { const held = channelNow()?.held ?? [], at = held.indexOf(state.number); if (at < 0 || at >= held.length - 1) play(false); else chooseNumber(held, at + 1); } }, PLAY_MS);
+  setInterval(() => { if (state.blink && !document.hidden) { state.blinkOn = !state.blinkOn; showSky(); } }, BLINK_MS);
+  $("play").addEventListener("click", () => play(!state.playing));
+  $("blink").addEventListener("click", () => blink(!state.blink));
+  $("slider").addEventListener("input", () => { play(false); chooseNumber(channelNow()?.held ?? [], Number($("slider").value)); });
+  for (const id of ["show", "scale", "palette", "smooth", "marks", "from", "to"]) $(id).addEventListener("change", () => { if (["scale", "palette"].includes(id)) stored(id, $(id).value); showSky(); });
+  $("fixed").addEventListener("change", () => { for (const id of ["from", "to"]) $(id).disabled = !$("fixed").checked; showSky(); });
+  for (const id of ["projection", "frame"]) $(id).addEventListener("change", () => setView({ [id]: $(id).value }));
+  for (const tab of $("curves").children) tab.addEventListener("click", () => { state.curve = tab.dataset.curve; for (const other of $("curves").children) other.setAttribute("aria-selected", String(other === tab)); drawCurve(); });
+  $("theme").addEventListener("click", () => theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"));
+  $("help").addEventListener("click", () => $("keys").showModal());
+  const stage = $("stage");
+  let drag = null;
+  stage.addEventListener("pointerdown", (event) => { drag = { x: event.clientX, y: event.clientY, lon: sky.view.lon, lat: sky.view.lat }; stage.setPointerCapture(event.pointerId); });
+  stage.addEventListener("pointerup", () => { drag = null; }); stage.addEventListener("pointercancel", () => { drag = null; });
+  stage.addEventListener("pointermove", (event) => {
+    if (drag) {
+      const per = (sky.view.projection === "globe" ? 90 : 180) * sky.ratio / sky.half()[0];
+      setView({ lon: drag.lon + (event.clientX - drag.x) * per, lat: drag.lat + (event.clientY - drag.y) * per });
+      return;
+    }
+    const at = sky.probe(event.clientX, event.clientY), axes = { galactic: ["l", "b"], ecliptic: ["λ", "β"], equatorial: ["α", "δ"] }[sky.view.frame];
+    $("cursor").textContent = at ? `${isSeen(at.value) ? `${short(at.value)} K` : "not measured"} · ${axes[0]} ${at.lon.toFixed(1)}° ${axes[1]} ${at.lat.toFixed(1)}° · pixel ${at.pixel}` : "";
+  });
+  stage.addEventListener("pointerleave", () => { $("cursor").textContent = ""; });
+  addEventListener("resize", () => { draw(); drawCurve(); });
+  addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
+    if (event.target.matches("input[type=number], select") || (event.target.matches("button, input[type=checkbox]") && event.key === " ")) return;
+    const turns = { ArrowLeft: { lon: sky.view.lon - 10 }, ArrowRight: { lon: sky.view.lon + 10 }, ArrowUp: { lat: sky.view.lat + 10 }, ArrowDown: { lat: sky.view.lat - 10 } };
+    const keys = {
+      ArrowLeft: () => step(-1), ArrowRight: () => step(1), " ": () => play(!state.playing), "0": () => setView({ lon: 0, lat: 0 }),
+      p: () => cycle($("projection")), f: () => cycle($("frame")), s: () => cycle($("scale")), c: () => cycle($("palette")),
+      d: () => { $("show").value = $("show").value === "difference" ? "map" : "difference"; showSky(); },
+      b: () => blink(!state.blink), t: () => $("theme").click(), "?": () => $("keys").showModal(),
+    };
+    if (event.shiftKey && turns[event.key]) setView(turns[event.key]);
+    else if (/^[1-9]$/.test(event.key)) { const channel = state.status?.channels[Number(event.key) - 1]; if (channel) chooseChannel(channel.channel); }
+    else if (keys[event.key]) keys[event.key]();
+    else return;
+    event.preventDefault();
+  });
+}
+
+async function begin() {
+  document.documentElement.dataset.theme = stored("theme") ?? (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark");
+  const constants = await (await fetch("/page.json")).json();
+  sky = new Sky($("gl"), $("over"), constants);
+  for (const id of ["scale", "palette"]) { const value = stored(id); if (value && [...$(id).options].some((o) => o.value === value)) $(id).value = value; }
+  for (const id of ["projection", "frame"]) { const value = stored(id); if (value && [...$(id).options].some((o) => o.value === value)) $(id).value = sky.view[id] = value; }
+  controls();
+  drawCurve();
+  listen();
+}
+begin();
