@@ -70,3 +70,51 @@ fn what_needs_a_circle_is_refused_for_ellipses() {
         assert!(said.contains(&told) && said.contains("needs a common circle"), "{set}: {said}");
     }
 }
+
+#[test]
+fn a_triple_on_ellipses_is_mapped_by_refinement() {
+    // Altitudes that breathe by 20 km, and satellites that follow each other with cross-track offsets and pitch.
+    let pipeline = TRIPLE
+        .replace(
+            "eccentricity = 0.012, inclination_deg = 60.02",
+            "eccentricity = 0.01001, inclination_deg = 60.0005",
+        )
+        .replace("node_longitude_deg = 0.02", "node_longitude_deg = 0.0005");
+    let place = Workplace::new(&pipeline);
+    let out = place.path("out");
+    let harmonic = [
+        "sky.nside=32", // Direct sums count pixels as points: far finer than the map's degrees.
+        "map.engine=harmonic",
+        "map.rows=average",
+        "map.refine.passes_max=20",
+    ];
+    let sets: Vec<&str> = harmonic.iter().flat_map(|set| ["--set", set]).collect();
+    let run = [&["run", &place.pipeline, "--out", &out], sets.as_slice()].concat();
+    let summary = json(&run);
+    let ledger = &summary["ledger"];
+    // Nothing is refused for its geometry; what is left out is beyond the map's baselines.
+    let sampled = ledger["sampled"].as_u64().unwrap();
+    assert!(ledger["accumulated"].as_u64().unwrap() > 1000, "{ledger}");
+    for reason in ["plane", "altitude", "altitudes"] {
+        assert!(!ledger.to_string().contains(reason), "{sampled}: {ledger}");
+    }
+    let channel = &summary["channels"][0];
+    let refinement = &channel["refinement"];
+    assert!(refinement["convergence"]["converged"].as_bool().unwrap(), "{refinement}");
+    assert!(refinement["departures"]["by_refinement"].as_u64().unwrap() > 500, "{refinement}");
+    assert!(refinement["chi_square"]["by_pair"].as_object().unwrap().len() == 3, "{refinement}");
+    let rho: Vec<f64> =
+        channel["rho"].as_array().unwrap().iter().map(|rho| rho.as_f64().unwrap_or(0.0)).collect();
+    assert!(rho[1..=6].iter().all(|rho| *rho > 0.9), "{rho:?}");
+    // The ground alone makes the same map; with a saved state it says why it cannot.
+    let (downlink, ground) = (format!("{out}/downlink.ccsds"), place.path("ground"));
+    let replay =
+        [&["replay", &downlink, "--map", &place.pipeline, "--out", &ground], sets.as_slice()].concat();
+    succeed(&replay);
+    for (path, bytes) in maps(&ground) {
+        assert!(bytes == maps(&out)[&path], "{} differs", path.display());
+    }
+    let state = place.path("state");
+    let said = fail(&[replay.as_slice(), &["--state", &state]].concat());
+    assert!(said.contains("map.refine holds visibilities in memory"), "{said}");
+}
