@@ -118,3 +118,44 @@ fn a_triple_on_ellipses_is_mapped_by_refinement() {
     let said = fail(&[replay.as_slice(), &["--state", &state]].concat());
     assert!(said.contains("map.refine holds visibilities in memory"), "{said}");
 }
+
+/// A day of three satellites under the Moon's oblateness, integrated by other code.
+#[test]
+fn orbits_from_files_are_flown_and_mapped() {
+    let Some(python) = common::python() else { return };
+    let kepler = TRIPLE.find("kepler").unwrap()..TRIPLE.find("[spacecraft]").unwrap();
+    let mut pipeline = TRIPLE.replace("every_nth_window = 100", "duration_s = 86400.0\nevery_nth_window = 3");
+    pipeline.replace_range(kepler, "");
+    let place = Workplace::new(&pipeline);
+    let folder = place.path("orbits");
+    std::fs::create_dir(&folder).unwrap();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/oem_orbits.py");
+    let made = std::process::Command::new(python).arg(script).args([&folder, "1.1"]).output().unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let files = format!("array.oem=[\"{folder}/sat1.oem\", \"{folder}/sat2.oem\", \"{folder}/sat3.oem\"]");
+    let out = place.path("out");
+    let run = [
+        "run",
+        &place.pipeline,
+        "--out",
+        &out,
+        "--set",
+        &files,
+        "--set",
+        "map.engine=harmonic",
+        "--set",
+        "map.rows=average",
+        "--set",
+        "map.refine.passes_max=3",
+    ];
+    let summary = json(&run);
+    let accumulated = summary["ledger"]["accumulated"].as_u64().unwrap();
+    let departures = &summary["channels"][0]["refinement"]["departures"];
+    let held = ["on_the_circle", "by_refinement"].map(|key| departures[key].as_u64().unwrap());
+    assert!(accumulated > 100 && held[0] + held[1] == accumulated, "{departures} {accumulated}");
+    assert!((departures["circle_inclination_deg"].as_f64().unwrap() - 60.0).abs() < 0.2, "{departures}");
+    // A mission that lasts longer than the files is refused.
+    let long = [run.as_slice(), &["--set", "spacecraft.duration_s=1e6"]].concat();
+    let said = fail(&long);
+    assert!(said.contains("spacecraft.duration_s = ") && said.contains("array.oem"), "{said}");
+}

@@ -129,6 +129,15 @@ fn difference(found: &[f64], expected: &[f64]) -> f64 {
     square(&mut found.iter().zip(expected).map(|(a, b)| a - b)) / square(&mut expected.iter().copied())
 }
 
+/// Relative difference of one degree.
+fn degree_change(found: &[f64], expected: &[f64], l: usize) -> f64 {
+    let of = |x: &[f64]| {
+        let alm = lunarray::accumulation::harmonic::coefficients(x, L_MAX);
+        (0..=l).flat_map(|m| [alm.get(l, m).re, alm.get(l, m).im]).collect::<Vec<f64>>()
+    };
+    difference(&of(found), &of(expected))
+}
+
 fn write(path: &Path, values: impl Iterator<Item = f64>) {
     fs::write(path, values.flat_map(f64::to_le_bytes).collect::<Vec<u8>>()).unwrap();
 }
@@ -190,15 +199,14 @@ fn refined_maps_are_the_dense_solution_of_other_code() {
             solve_harmonics(&sums.circle, request(NSIDE), None, None, SolveWatch::default().named("test"))
                 .unwrap();
         let first = difference(&circle.unknowns[0][1..], &dense[1..]);
-        let errors: Vec<f64> = [1, 2, 3, 4, 6, 8, 10, 14]
-            .map(|passes| difference(&refined(&sums, NSIDE, passes).0.unknowns[0], &dense))
-            .to_vec();
-        let shown: Vec<String> = errors.iter().map(|error| format!("{error:.1e}")).collect();
-        eprintln!("circle {first:.2}; passes {}", shown.join(" "));
-        // The rows' error, and what W_max / 1e-4 makes of it in the least measured modes.
-        assert!(errors[5] < 1e-2 && errors[7] < 2e-3, "{errors:?}");
-        assert!(first > 0.02 && errors[7] < 0.1 * first, "{first} {errors:?}");
-        let (_, refinement) = refined(&sums, NSIDE, 14);
+        let found = [1, 2, 4, 8].map(|passes| refined(&sums, NSIDE, passes));
+        let errors = found.each_ref().map(|found| difference(&found.0.unknowns[0], &dense));
+        let shown = errors.map(|error| format!("{error:.1e}")).join(" ");
+        eprintln!("circle {first:.2}; 1, 2, 4, 8 passes {shown}");
+        // Four passes leave some per cent at most, eight a thousandth.
+        assert!(errors[2] < 5e-2 && errors[3] < 2e-3, "{errors:?}");
+        assert!(first > 0.1 && errors[3] < 0.01 * first, "{first} {errors:?}");
+        let refinement = &found[3].1;
         assert_eq!(refinement.chi_square.by_pair.len(), BASELINES_M.len());
         // No noise was added: nothing remains but what the regularisation holds back.
         assert!(refinement.chi_square.all < 1.0, "{:?}", refinement.chi_square);
@@ -232,7 +240,12 @@ fn refinement_leaves_a_map_of_a_circle_as_it_is() {
     assert!(refinement.convergence.converged, "{refinement}");
     let change = difference(&map.map_k, &plain.map_k);
     eprintln!("{refinement}: changed by {change:.1e}");
-    assert!(change < 1e-3, "{change:e}");
+    let by_degree: Vec<String> = (0..=L_MAX)
+        .map(|l| format!("{:.1e}", degree_change(&map.unknowns[0], &plain.unknowns[0], l)))
+        .collect();
+    eprintln!("by degree: {}", by_degree.join(" "));
+    // What the fast sums' own approximations, 1e-3 of an eigenvalue, make of a map: refinement takes them away.
+    assert!(change < 3e-3, "{change:e}");
     let noise = difference(&map.noise_k, &plain.noise_k);
     // Noise is strongest where the sums are least exact.
     assert!(noise < 1e-2, "{noise:e}");
@@ -281,8 +294,7 @@ fn rho(found: &[f64], expected: &[f64], l_max: usize, l: usize) -> f64 {
     sum(&a, &b) / (sum(&a, &a) * sum(&b, &b)).sqrt()
 }
 
-/// The table of `docs/engines.md`: error after each pass, at nside 16 and 10 MHz with the real sky's degrees. Takes long, so only
-/// with `LUNARRAY_LONG`.
+/// The error after each pass at nside 16 and 10 MHz, with the real sky's degrees. Takes long, so only with `LUNARRAY_LONG`.
 #[test]
 fn the_table_of_errors_by_pass_at_nside_16() {
     const NSIDE: usize = 16;
@@ -293,15 +305,15 @@ fn the_table_of_errors_by_pass_at_nside_16() {
     let Some(path) = common::shared("sky/ulsa_10mhz_ecliptic_nside64.fits") else { return };
     let sky = read_map(&path, &ReadOptions::default()).unwrap().values().to_vec();
     let sky = analysis(&sky, L_MAX, &AnalysisOptions::default()).unwrap().alm;
-    let baselines_m = [100.0, 210.0, 330.0, 470.0, 690.0, 930.0];
+    let baselines_m = [100.0, 230.0, 470.0, 930.0];
     let rows = GeneralRows::new(RowsSetup {
         l_max: L_MAX,
         wavelength_m: WAVELENGTH_M,
         moon_radius_m: MOON_RADIUS_M,
         response: AntennaResponse::Isotropic,
     });
-    for (altitude_m, cross) in [(20e3, 0.02), (40e3, 0.05), (20e3, 0.2)] {
-        let at = geometry(altitude_m, cross, 6.0, 24, &baselines_m);
+    for (altitude_m, cross) in [(20e3, 0.02), (20e3, 0.2)] {
+        let at = geometry(altitude_m, cross, 12.0, 16, &baselines_m);
         let plan = rows.plan(&at).unwrap();
         let begun = std::time::Instant::now();
         let values = rows.forward(&plan, std::slice::from_ref(&sky)).remove(0);
@@ -309,7 +321,7 @@ fn the_table_of_errors_by_pass_at_nside_16() {
         let begun = std::time::Instant::now();
         let _ = rows.adjoint(&plan, &[&values]);
         let adjoint_s = begun.elapsed().as_secs_f64();
-        // Each tenth row by itself, in another plan.
+        // Some rows by themselves.
         let few: Vec<PairAt> = at.iter().step_by(101).copied().collect();
         let begun = std::time::Instant::now();
         let direct = rows.forward(&rows.plan_direct(&few).unwrap(), std::slice::from_ref(&sky)).remove(0);
@@ -330,13 +342,13 @@ fn the_table_of_errors_by_pass_at_nside_16() {
         let watch = SolveWatch::default();
         let circle = solve_harmonics(&sums.circle, request(NSIDE), None, None, watch.named("test")).unwrap();
         // As far as it goes.
-        let truth = refined(&sums, NSIDE, 20);
+        let truth = refined(&sums, NSIDE, 12);
         eprintln!("{}", truth.1);
         let exact = &truth.0.unknowns[0];
         let of_circle: Vec<String> =
             [4, 12, 24].map(|l| format!("{:.2}", rho(&circle.unknowns[0], exact, L_MAX, l))).to_vec();
         eprintln!("circle alone: rho_l at 4, 12, 24: {}", of_circle.join(" / "));
-        for passes in [1, 2, 3, 4, 6, 8, 10] {
+        for passes in [1, 2, 4, 8] {
             let map = refined(&sums, NSIDE, passes).0;
             let least =
                 (1..=L_MAX).map(|l| rho(&map.unknowns[0], exact, L_MAX, l)).fold(f64::INFINITY, f64::min);
