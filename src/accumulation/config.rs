@@ -73,6 +73,35 @@ pub struct MapConfig {
     pub trace_probes: usize,
     /// Departures from the common circle that the harmonic engine accepts.
     pub limits: GeometryLimits,
+    /// Refinement of a harmonic map with the positions as they are.
+    pub refine: RefineConfig,
+}
+
+/// Refinement of a harmonic map: conjugate gradients with the rows of B of the true positions, preconditioned by the sums of the
+/// nearest circle. Nothing is refused for its geometry then.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RefineConfig {
+    /// Most products with the true matrix; 0 for no refinement.
+    pub passes_max: usize,
+    /// Residual at which it stops, relative to the right-hand side, in the preconditioner's norm.
+    pub residual_max: f64,
+    /// Most visibilities of a channel that are held in memory for it; further ones are left out and counted.
+    pub visibilities_max: u64,
+}
+
+impl Default for RefineConfig {
+    fn default() -> Self {
+        Self { passes_max: 0, residual_max: 1e-3, visibilities_max: 30_000_000 }
+    }
+}
+
+impl RefineConfig {
+    /// Whether maps are refined.
+    #[must_use]
+    pub fn is_on(&self) -> bool {
+        self.passes_max > 0
+    }
 }
 
 impl Default for MapConfig {
@@ -95,6 +124,7 @@ impl Default for MapConfig {
             iterations_max: 300,
             trace_probes: 0,
             limits: GeometryLimits::default(),
+            refine: RefineConfig::default(),
         }
     }
 }
@@ -131,6 +161,7 @@ impl MapConfig {
         for (key, value) in self.limits.values() {
             checks.number(key, value, value >= 0.0, "not negative");
         }
+        self.check_refinement(&mut checks);
         let weight = self.weight_max;
         checks.number(
             "weight_max",
@@ -146,6 +177,33 @@ impl MapConfig {
         checks.finish()
     }
 
+    /// Checks the refinement, and that nothing is asked for that it cannot do.
+    fn check_refinement(&self, checks: &mut Checks) {
+        let RefineConfig { residual_max, visibilities_max, .. } = self.refine;
+        checks.number(
+            "refine.residual_max",
+            residual_max,
+            residual_max > 0.0 && residual_max < 1.0,
+            "above 0 and below 1",
+        );
+        checks.require("refine.visibilities_max", visibilities_max, visibilities_max > 0, "at least 1");
+        if self.refine.is_on() {
+            let (every, probes) = (self.snapshot_every_s, self.trace_probes);
+            checks.number(
+                "snapshot_every_s",
+                every,
+                every == 0.0,
+                "0 with map.refine: visibilities are held until the end",
+            );
+            checks.require(
+                "trace_probes",
+                probes,
+                probes == 0,
+                "0 with map.refine: traces would be those of the circle",
+            );
+        }
+    }
+
     /// Requires that keys of the other engine are not set.
     fn check_effects(&self, checks: &mut Checks) {
         let usual = Self::default();
@@ -157,6 +215,7 @@ impl MapConfig {
                     ("residual_max", self.residual_max != usual.residual_max),
                     ("iterations_max", self.iterations_max != usual.iterations_max),
                     ("limits", self.limits != usual.limits),
+                    ("refine", self.refine != usual.refine),
                 ],
             ),
             EngineKind::Harmonic => ("pixel", vec![("rows", self.rows != usual.rows)]),
@@ -194,7 +253,8 @@ impl MapConfig {
             residual_max: _,
             iterations_max: _,
             trace_probes: _,
-            l_max: _, // As `degree`.
+            l_max: _,  // As `degree`.
+            refine: _, // There is no saved state with it.
         } = self;
         let mut settings = vec![
             ("map.nside", nside.to_string()),

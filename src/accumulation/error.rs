@@ -2,6 +2,7 @@
 
 use thiserror::Error;
 
+use crate::response::harmonic::GeometryRefusal;
 use crate::response::pixel::ResponseError;
 use crate::units::{ChannelId, InvalidValue};
 
@@ -51,6 +52,15 @@ pub enum AccumulationError {
          removed than held"
     )]
     Range,
+    /// Positions without a row of B.
+    #[error("a visibility has no row of the beam matrix: {0}")]
+    Rows(GeometryRefusal),
+    /// Visibilities that are held for refinement cannot be kept, merged or removed.
+    #[error(
+        "map.refine holds visibilities in memory until the map is made, and they cannot be saved, merged or retracted; expected \
+         map.refine.passes_max = 0 with a saved state"
+    )]
+    HeldInMemory,
     /// A checkpoint could not be read or written.
     #[error("checkpoint: {0}")]
     Io(#[from] std::io::Error),

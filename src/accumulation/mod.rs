@@ -19,7 +19,7 @@ mod noise;
 mod pixel;
 mod stage;
 
-pub use config::{EngineKind, MapConfig};
+pub use config::{EngineKind, MapConfig, RefineConfig};
 pub use engine::ExactEngine;
 pub use error::AccumulationError;
 pub use fixed_point::automatic_weight_max;
@@ -93,7 +93,7 @@ pub struct Added {
 }
 
 impl Added {
-    fn refuse(&mut self, reason: Refusal) {
+    pub(in crate::accumulation) fn refuse(&mut self, reason: Refusal) {
         *self.refused.entry(reason).or_default() += 1;
     }
 }

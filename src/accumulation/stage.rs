@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 use std::io::{Read, Write};
 use std::sync::Arc;
 
-use super::harmonic::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
+use super::harmonic::{
+    HarmonicEngine, HarmonicSetup, HarmonicSums, RefinedSetup, VisibilityArchive, orbit_of,
+};
 use super::{
     AccumulationError, Added, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine, PixelSetup,
     PixelSums, SumCounts, automatic_weight_max,
@@ -38,6 +40,8 @@ pub enum SnapshotSums {
     Pixel(PixelSums),
     /// Over harmonics.
     Harmonic(Box<HarmonicSums>),
+    /// Visibilities one by one, for a refined map.
+    Refined(Box<VisibilityArchive>),
 }
 
 impl SnapshotSums {
@@ -47,14 +51,16 @@ impl SnapshotSums {
         match self {
             Self::Pixel(sums) => sums.counts(),
             Self::Harmonic(sums) => sums.counts(),
+            Self::Refined(archive) => archive.counts(),
         }
     }
 }
 
-/// Either engine.
+/// Either engine, or visibilities that are held for refinement.
 enum Engine {
     Pixel(Box<PixelEngine>),
     Harmonic(Box<HarmonicEngine>),
+    Refined(Box<VisibilityArchive>),
 }
 
 impl Engine {
@@ -62,6 +68,7 @@ impl Engine {
         match self {
             Self::Pixel(engine) => engine.add(placed),
             Self::Harmonic(engine) => engine.add(placed),
+            Self::Refined(archive) => archive.add(placed),
         }
     }
 
@@ -69,6 +76,7 @@ impl Engine {
         match self {
             Self::Pixel(engine) => engine.remove(placed),
             Self::Harmonic(engine) => engine.remove(placed),
+            Self::Refined(_) => Err(AccumulationError::HeldInMemory),
         }
     }
 
@@ -77,6 +85,7 @@ impl Engine {
         let counts = match self {
             Self::Pixel(engine) => engine.counts(),
             Self::Harmonic(engine) => engine.counts(),
+            Self::Refined(archive) => archive.counts(),
         };
         counts.visibilities == 0
     }
@@ -85,6 +94,7 @@ impl Engine {
         match self {
             Self::Pixel(engine) => SnapshotSums::Pixel(engine.sums()),
             Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.sums())),
+            Self::Refined(archive) => SnapshotSums::Refined(archive.clone()),
         }
     }
 
@@ -92,6 +102,7 @@ impl Engine {
         match self {
             Self::Pixel(engine) => SnapshotSums::Pixel(engine.into_sums()),
             Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.into_sums())),
+            Self::Refined(archive) => SnapshotSums::Refined(archive),
         }
     }
 }
@@ -165,6 +176,7 @@ impl Accumulator {
             match &mut sums.engine {
                 Engine::Pixel(engine) => engine.checkpoint(out)?,
                 Engine::Harmonic(engine) => engine.checkpoint(out)?,
+                Engine::Refined(_) => return Err(AccumulationError::HeldInMemory),
             }
         }
         Ok(())
@@ -382,6 +394,20 @@ fn engine(
             companion_seed: config.companion_seed,
             weight_max,
         })?))),
+        EngineKind::Harmonic if config.refine.is_on() => {
+            Some(Engine::Refined(Box::new(VisibilityArchive::new(RefinedSetup {
+                channel: placed.channel,
+                l_max: config.degree(),
+                frequency_hz,
+                baseline_m_max: config.baseline_m_max(frequency_hz),
+                moon_radius_m,
+                response,
+                companion_seed: config.companion_seed,
+                weight_max,
+                limits: config.limits,
+                visibilities_max: config.refine.visibilities_max,
+            })?)))
+        }
         EngineKind::Harmonic => match orbit_of(placed, config.limits) {
             Some(orbit) => Some(Engine::Harmonic(Box::new(HarmonicEngine::new(HarmonicSetup {
                 l_max: config.degree(),

@@ -1,9 +1,12 @@
 //! Configuration of the array.
 
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::kepler::KeplerElements;
+use super::oem::seconds;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
 
@@ -47,6 +50,10 @@ pub struct ArrayConfig {
     pub arcs_m: Vec<f64>,
     /// Orbits of their own, one a satellite, in place of the circle and its formation; empty for the circle.
     pub kepler: Vec<KeplerElements>,
+    /// Orbits from CCSDS OEM files (KVN), one a satellite, in place of the circle and its formation; empty for the circle.
+    pub oem: Vec<PathBuf>,
+    /// Epoch of the mission in the files' time system, such as 2030-01-31T12:00:00; empty for the latest of their first epochs.
+    pub oem_epoch: String,
     /// The formation's breathing.
     pub breathing: BreathingConfig,
 }
@@ -66,6 +73,8 @@ impl Default for ArrayConfig {
             earth_longitude_deg: 0.0,
             arcs_m: Vec::new(),
             kepler: Vec::new(),
+            oem: Vec::new(),
+            oem_epoch: String::new(),
             breathing: BreathingConfig::default(),
         }
     }
@@ -124,6 +133,14 @@ pub enum ArrayError {
     /// A value of the configuration that is not accepted.
     #[error(transparent)]
     Invalid(#[from] InvalidValue),
+    /// A file of an orbit that cannot be used.
+    #[error("{}: {what}", path.display())]
+    Oem {
+        /// The file.
+        path: PathBuf,
+        /// What was found there, and what was expected.
+        what: String,
+    },
     /// Satellites that are not apart.
     #[error(
         "array.kepler: satellites {first} and {second} are at one place at the epoch: expected orbits or anomalies that differ"
@@ -166,6 +183,17 @@ pub enum ArrayError {
 }
 
 impl ArrayConfig {
+    /// Whether satellites have orbits of their own, in place of a circle.
+    #[must_use]
+    pub fn has_own_orbits(&self) -> bool {
+        !self.kepler.is_empty() || !self.oem.is_empty()
+    }
+
+    /// Epoch of the mission in the seconds of OEM files, if it is given.
+    pub(super) fn oem_epoch_s(&self) -> Option<f64> {
+        seconds(&self.oem_epoch)
+    }
+
     /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
@@ -212,6 +240,24 @@ impl ArrayConfig {
         checks.require("kepler", format_args!("({orbits} orbits)"), fits, "one for each satellite, or none");
         let one = orbits == 0 || arcs == 0;
         checks.require("kepler", format_args!("({orbits} orbits)"), one, "none where array.arcs_m is given");
+        let files = self.oem.len();
+        let fits = files == 0 || files == self.satellites;
+        checks.require("oem", format_args!("({files} files)"), fits, "one for each satellite, or none");
+        let one = files == 0 || (orbits == 0 && arcs == 0);
+        checks.require(
+            "oem",
+            format_args!("({files} files)"),
+            one,
+            "none where array.kepler or array.arcs_m is given",
+        );
+        let epoch = &self.oem_epoch;
+        let good = epoch.is_empty() || seconds(epoch).is_some();
+        checks.require(
+            "oem_epoch",
+            format_args!("{epoch:?}"),
+            good,
+            "an epoch such as 2030-01-31T12:00:00, or nothing",
+        );
         for (key, value) in [
             ("orbital_phase_deg", self.orbital_phase_deg),
             ("node_longitude_deg", self.node_longitude_deg),

@@ -11,6 +11,7 @@ mod ephemeris;
 mod formation;
 mod integration;
 mod kepler;
+mod oem;
 mod orbit;
 mod placing;
 mod state;

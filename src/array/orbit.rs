@@ -5,6 +5,7 @@ use std::f64::consts::TAU;
 use super::config::{ArrayConfig, ArrayError, NodeMotion};
 use super::formation::Formation;
 use super::kepler::KeplerOrbit;
+use super::oem::{self, TableOrbit};
 use super::state::SatelliteState;
 use crate::units::constants::SIDEREAL_MONTH_S;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
@@ -12,13 +13,64 @@ use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
 /// Nearest that two satellites may be at the epoch, m.
 const APART_M: f64 = 1.0;
 
+/// An orbit of one satellite.
+#[derive(Clone, Debug, PartialEq)]
+enum OwnOrbit {
+    Kepler(KeplerOrbit),
+    Table(TableOrbit),
+}
+
+impl OwnOrbit {
+    fn state(&self, t_s: f64) -> SatelliteState {
+        match self {
+            Self::Kepler(orbit) => orbit.state(t_s),
+            Self::Table(orbit) => orbit.state(t_s),
+        }
+    }
+
+    fn normal_hat(&self, t_s: f64) -> Vec3 {
+        match self {
+            Self::Kepler(orbit) => orbit.normal_hat(t_s),
+            Self::Table(orbit) => orbit.normal_hat(t_s),
+        }
+    }
+
+    fn semi_major_axis_m(&self) -> f64 {
+        match self {
+            Self::Kepler(orbit) => orbit.semi_major_axis_m(),
+            Self::Table(orbit) => orbit.semi_major_axis_m(),
+        }
+    }
+
+    fn inclination_rad(&self) -> f64 {
+        match self {
+            Self::Kepler(orbit) => orbit.inclination_rad(),
+            Self::Table(orbit) => orbit.inclination_rad(),
+        }
+    }
+
+    fn period_s(&self) -> f64 {
+        match self {
+            Self::Kepler(orbit) => orbit.period_s(),
+            Self::Table(orbit) => orbit.period_s(),
+        }
+    }
+
+    fn farthest_m(&self) -> f64 {
+        match self {
+            Self::Kepler(orbit) => orbit.apoapsis_m(),
+            Self::Table(orbit) => orbit.farthest_m(),
+        }
+    }
+}
+
 /// The array in motion: positions at any time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Array {
     /// The formation on a circle, if there is one.
     formation: Option<Formation>,
     /// Orbits of their own; none for a formation on a circle.
-    kepler: Vec<KeplerOrbit>,
+    own: Vec<OwnOrbit>,
     orbit_radius_m: f64,
     moon_radius_m: f64,
     inclination_rad: f64,
@@ -41,9 +93,12 @@ impl Array {
         let rate = TAU / config.precession_period_s;
         let kepler: Vec<KeplerOrbit> = config.kepler.iter().map(KeplerOrbit::new).collect();
         require_apart(&kepler)?;
+        let tables = oem::read(&config.oem, config.oem_epoch_s(), config.moon_radius_m)?;
+        let own: Vec<OwnOrbit> =
+            kepler.into_iter().map(OwnOrbit::Kepler).chain(tables.into_iter().map(OwnOrbit::Table)).collect();
         Ok(Self {
-            formation: if kepler.is_empty() { Some(Formation::new(config)?) } else { None },
-            kepler,
+            formation: if own.is_empty() { Some(Formation::new(config)?) } else { None },
+            own,
             orbit_radius_m: config.moon_radius_m + config.altitude_m,
             moon_radius_m: config.moon_radius_m,
             inclination_rad: config.inclination_deg.to_radians(),
@@ -58,10 +113,20 @@ impl Array {
         })
     }
 
+    /// First and last mission time, s, for which positions are known; `None` if that is always.
+    #[must_use]
+    pub fn known_s(&self) -> Option<[f64; 2]> {
+        let spans = self.own.iter().filter_map(|orbit| match orbit {
+            OwnOrbit::Table(orbit) => Some(orbit.span_s()),
+            OwnOrbit::Kepler(_) => None,
+        });
+        spans.reduce(|[from, to], [start, end]| [from.max(start), to.min(end)])
+    }
+
     /// Number of daughters.
     #[must_use]
     pub fn satellites(&self) -> usize {
-        self.formation.as_ref().map_or(self.kepler.len(), Formation::satellites)
+        self.formation.as_ref().map_or(self.own.len(), Formation::satellites)
     }
 
     /// Radius of the Moon, m.
@@ -73,26 +138,26 @@ impl Array {
     /// Radius of the orbit, or the semi-major axis of satellite 1, m.
     #[must_use]
     pub fn orbit_radius_m(&self) -> f64 {
-        self.kepler.first().map_or(self.orbit_radius_m, KeplerOrbit::semi_major_axis_m)
+        self.own.first().map_or(self.orbit_radius_m, OwnOrbit::semi_major_axis_m)
     }
 
     /// Inclination of the orbit, or of that of satellite 1, to the ecliptic, rad.
     #[must_use]
     pub fn inclination_rad(&self) -> f64 {
-        self.kepler.first().map_or(self.inclination_rad, KeplerOrbit::inclination_rad)
+        self.own.first().map_or(self.inclination_rad, OwnOrbit::inclination_rad)
     }
 
     /// Greatest distance of a satellite from the Moon's centre, m.
     #[must_use]
     pub fn farthest_m(&self) -> f64 {
-        let farthest_m = self.kepler.iter().map(KeplerOrbit::apoapsis_m).fold(0.0, f64::max);
-        if self.kepler.is_empty() { self.orbit_radius_m } else { farthest_m }
+        let farthest_m = self.own.iter().map(OwnOrbit::farthest_m).fold(0.0, f64::max);
+        if self.own.is_empty() { self.orbit_radius_m } else { farthest_m }
     }
 
     /// Orbital period, or that of satellite 1, s.
     #[must_use]
     pub fn orbital_period_s(&self) -> f64 {
-        self.kepler.first().map_or(self.orbital_period_s, KeplerOrbit::period_s)
+        self.own.first().map_or(self.orbital_period_s, OwnOrbit::period_s)
     }
 
     /// The daughters' arcs, if they follow each other on a circle.
@@ -107,7 +172,7 @@ impl Array {
     /// with `f = phi - s_n / R` (the paper, Sect. 2).
     #[must_use]
     pub fn state(&self, n: usize, t_s: f64) -> SatelliteState {
-        let Some(formation) = &self.formation else { return self.kepler[n].state(t_s) };
+        let Some(formation) = &self.formation else { return self.own[n].state(t_s) };
         let radius = self.orbit_radius_m;
         let (arc_m, arc_rate_m_s) = formation.arc_m(n, t_s);
         // As in the paper; after 1.3 years the last bit of the phase is worth 7 um along the track.
@@ -154,7 +219,7 @@ impl Array {
     /// Normal of the plane in which satellite `n` (from 0) moves.
     #[must_use]
     pub fn normal_hat(&self, n: usize, t_s: f64) -> Vec3 {
-        if let Some(orbit) = self.kepler.get(n) {
+        if let Some(orbit) = self.own.get(n) {
             return orbit.normal_hat(t_s);
         }
         let (sin_o, cos_o) = (self.node_rad + self.node_rate_rad_s * t_s).sin_cos();

@@ -51,7 +51,7 @@ pub enum VisibilityReason {
     ValueNotFinite,
     /// The engine refused it: its weight, or its value in units of its noise, is out of the range of the sums.
     WeightOutOfRange,
-    /// The engine refused it: the sums have no room for more weight.
+    /// The engine refused it: the sums have no room for more weight, or no more visibilities are held for refinement.
     SumsFull,
     /// The onboard store dropped it.
     StoreFull,
@@ -95,7 +95,9 @@ impl Reason for VisibilityReason {
             Self::WeightOutOfRange => {
                 "refused by the engine: weight above map.weight_max, or value far above its noise"
             }
-            Self::SumsFull => "refused by the engine: sums full at this map.weight_max",
+            Self::SumsFull => {
+                "refused by the engine: full at this map.weight_max, or map.refine.visibilities_max"
+            }
             Self::StoreFull => "full",
             Self::NotReceived => "not received",
             Self::NotReceivedAtLeast => "not received (at least)",

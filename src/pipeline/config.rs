@@ -15,7 +15,7 @@ use crate::products::ProductsConfig;
 use crate::response::model::ModelChoice;
 use crate::runtime::RuntimeConfig;
 use crate::sky::SkyConfig;
-use crate::units::Checks;
+use crate::units::{Checks, InvalidValue};
 
 /// A whole pipeline: the sky, the spacecraft and the ground.
 ///
@@ -75,6 +75,7 @@ impl Config {
                     if let Some(problem) = self.spacecraft.dump_problem(&array) {
                         found.push(|| problem);
                     }
+                    found.extend(self.unknown_positions(&array));
                 }
                 Ok(_) => {}
                 Err(problem) => found.push(|| problem),
@@ -90,9 +91,22 @@ impl Config {
         found
     }
 
+    /// Requires that positions are known for the whole mission.
+    fn unknown_positions(&self, array: &Array) -> Vec<InvalidValue> {
+        let Some([from_s, until_s]) = array.known_s() else { return Vec::new() };
+        let mut checks = Checks::of("spacecraft");
+        let duration_s = self.spacecraft.duration_s;
+        let good = from_s <= 0.0 && until_s >= duration_s;
+        let expected = format!(
+            "at most what the files of array.oem hold: from {from_s:.3} s to {until_s:.3} s after the mission's epoch"
+        );
+        checks.number("duration_s", duration_s, good, expected);
+        checks.finish()
+    }
+
     /// Requires what satellites that do not share a circle can have.
     fn check_orbits(&self, checks: &mut Checks) {
-        if self.array.kepler.is_empty() {
+        if !self.array.has_own_orbits() {
             return;
         }
         let Self { spacecraft, map, .. } = self;
@@ -100,14 +114,20 @@ impl Config {
         let direct = spacecraft.model != ModelChoice::Harmonic;
         let isotropic = spacecraft.antenna == Antenna::Isotropic;
         for (key, value, good, expected) in [
-            ("map.engine", "\"harmonic\"", map.engine == EngineKind::Pixel, "\"pixel\""),
+            (
+                "map.engine",
+                "\"harmonic\"",
+                map.engine == EngineKind::Pixel || map.refine.is_on(),
+                "\"pixel\", or map.refine,",
+            ),
             ("spacecraft.fidelity", "\"samples\"", visibilities, "\"visibilities\""),
             ("spacecraft.model", "\"harmonic\"", direct, "\"auto\" or \"direct\""),
             ("spacecraft.smear_integrations", "true", !spacecraft.smear_integrations, "false"),
             ("spacecraft.antenna", "\"dipole-normal\"", isotropic, "\"isotropic\""),
             ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
         ] {
-            let expected = format!("{expected} with array.kepler: the other needs a common circle");
+            let expected =
+                format!("{expected} with array.kepler or array.oem: the other needs a common circle");
             checks.require(key, value, good, expected);
         }
     }
@@ -146,9 +166,10 @@ impl Config {
     #[must_use]
     pub fn space_hash(&self) -> u64 {
         let Self { name, seed, sky, array, daughters, spacecraft, .. } = self;
-        let mut sky = sky.clone();
+        let (mut sky, mut array) = (sky.clone(), array.clone());
+        array.oem = array.oem.iter().map(|path| contents(path)).collect();
         sky.file = sky.file.map(|files| files.map(|path| contents(path)));
-        hash(&(name, seed, sky, array, daughters, spacecraft))
+        hash(&(name, seed, sky, &array, daughters, spacecraft))
     }
 
     /// A hash of the sections that shape maps from a downlink, and of the contents of the files that they name, for

@@ -107,7 +107,8 @@ impl Plan {
         let fringes_per_s = FRINGES_PER_S * cores();
         let expected = self.visibilities();
         let frequencies = &self.config.spacecraft.channels_hz;
-        let engines: Vec<EngineCost> = frequencies.iter().map(|&f| self.engine_cost(f)).collect();
+        let engines: Vec<EngineCost> =
+            frequencies.iter().zip(&expected).map(|(&f, e)| self.engine_cost(f, e.mapped)).collect();
         let channels: Vec<ChannelCost> = frequencies
             .iter()
             .zip(&expected)

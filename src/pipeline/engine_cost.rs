@@ -2,11 +2,14 @@
 
 use super::plan::Plan;
 use super::rates::{
-    CHOLESKY_MULTIPLY_ADDS_PER_S, HARMONIC_VISIBILITIES_PER_S, RANK_K_MULTIPLY_ADDS_PER_S,
+    CHOLESKY_MULTIPLY_ADDS_PER_S, HARMONIC_VISIBILITIES_PER_S, RANK_K_MULTIPLY_ADDS_PER_S, ROWS_PER_S,
     TRANSFORM_MULTIPLY_ADDS_PER_S, cores,
 };
-use crate::accumulation::harmonic::{SPREAD_MULTIPLY_ADDS, application_size, memory};
+use crate::accumulation::harmonic::{
+    REFINED_VISIBILITY_BYTES, SPREAD_MULTIPLY_ADDS, application_size, memory,
+};
 use crate::accumulation::{EngineKind, PixelEngine};
+use crate::response::general::row_tables_bytes;
 use crate::sky::healpix::pixel_count;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
@@ -50,10 +53,13 @@ pub(super) struct EngineCost {
 }
 
 impl Plan {
-    /// The cost of the engine for a channel at `frequency_hz`.
-    pub(super) fn engine_cost(&self, frequency_hz: f64) -> EngineCost {
+    /// The cost of the engine for a channel at `frequency_hz` with this number of visibilities.
+    pub(super) fn engine_cost(&self, frequency_hz: f64, visibilities: f64) -> EngineCost {
         match self.config.map.engine {
             EngineKind::Pixel => self.pixel_cost(),
+            EngineKind::Harmonic if self.config.map.refine.is_on() => {
+                self.refined_cost(frequency_hz, visibilities)
+            }
             EngineKind::Harmonic => self.harmonic_cost(frequency_hz),
         }
     }
@@ -75,6 +81,28 @@ impl Plan {
             probes_s: 0.0,
             visibility_multiply_adds,
             solution_multiply_adds,
+        }
+    }
+
+    /// The circle's sums and their solution, once a pass; visibilities in memory, and tables of the true rows.
+    fn refined_cost(&self, frequency_hz: f64, visibilities: f64) -> EngineCost {
+        let map = &self.config.map;
+        let circle = self.harmonic_cost(frequency_hz);
+        let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
+        let held = visibilities.min(map.refine.visibilities_max as f64) * REFINED_VISIBILITY_BYTES as f64;
+        let passes = map.refine.passes_max as f64;
+        let rows = row_tables_bytes(map.degree(), u_max, rayon::current_num_threads()) as f64;
+        EngineCost {
+            sums_bytes: held,
+            copy_bytes: 0.0,
+            copies_last: true,
+            other_bytes: circle.other_bytes + 2.0 * circle.sums_bytes + rows,
+            // Forth and back, for the map and its noise, and an inner solution of each.
+            solution_s: (passes + 1.0) * (circle.solution_s + 2.0 * visibilities / (ROWS_PER_S * cores()))
+                + visibilities * circle.visibility_s,
+            visibility_s: 0.0,
+            solution_multiply_adds: (passes + 1.0) * circle.solution_multiply_adds,
+            ..circle
         }
     }
 

@@ -9,7 +9,7 @@ use crate::ground::{Ground, GroundConfig, GroundOutcome};
 use crate::products::{ChannelSummary, MapWatch, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link};
 use crate::sky::fits::{ReadOptions, read_whole_map};
-use crate::solve::{SolveWatch, Solver, SolverSetup, StoppingRule};
+use crate::solve::{RefineRule, SolveWatch, Solver, SolverSetup, StoppingRule};
 
 /// Name of the stage that keeps the state.
 pub(super) const GROUND: &str = "ground";
@@ -66,6 +66,10 @@ pub(super) fn add(
         rule: StoppingRule {
             residual_max: config.map.residual_max,
             iterations_max: config.map.iterations_max,
+        },
+        refine: RefineRule {
+            passes_max: config.map.refine.passes_max,
+            residual_max: config.map.refine.residual_max,
         },
         trace_probes: config.map.trace_probes,
         watch,

@@ -168,6 +168,7 @@ impl ChannelFolder {
             mean_k: solution.map_k.iter().sum::<f64>() / pixels,
             noise_rms_k: (solution.noise_k.iter().map(|x| x * x).sum::<f64>() / pixels).sqrt(),
             diagnostics: solution.diagnostics,
+            refinement: solution.refinement.clone(),
             snapshots: self.snapshots.clone(),
             thermal_noise: !solution.instrument.noiseless,
             post_processing: self.config.processing(),

@@ -5,7 +5,7 @@ use std::fmt;
 use serde::Serialize;
 
 use super::config::PostProcessing;
-use crate::solve::Diagnostics;
+use crate::solve::{Diagnostics, Refinement};
 
 /// One snapshot.
 #[derive(Clone, Debug, Serialize)]
@@ -58,6 +58,9 @@ pub struct ChannelSummary {
     pub noise_rms_k: f64,
     /// Regularisation and solver diagnostics of the final solution.
     pub diagnostics: Diagnostics,
+    /// How it was refined with the positions as they are; absent without `map.refine`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub refinement: Option<Refinement>,
     /// The snapshots, including the final map.
     pub snapshots: Vec<SnapshotSummary>,
     /// Whether the visibilities, and so the map, hold thermal noise; with real data they do.
@@ -94,6 +97,9 @@ impl fmt::Display for ChannelSummary {
             self.mean_k,
             self.noise_rms_k
         )?;
+        if let Some(refinement) = &self.refinement {
+            write!(f, "\n             {refinement}")?;
+        }
         let noise = if self.thermal_noise { "with the map's thermal noise" } else { "without thermal noise" };
         let curves = [(noise, &self.rho), ("noise power subtracted", &self.rho_noise_subtracted)];
         for (what, rho) in curves {

@@ -49,6 +49,9 @@ pub enum SolveError {
         /// Regularisation.
         epsilon: f64,
     },
+    /// Visibilities that could not be summed for refinement.
+    #[error("refinement: {0}")]
+    Refinement(String),
     /// A transform between map and harmonics failed.
     #[error(transparent)]
     Harmonics(#[from] HarmonicsError),

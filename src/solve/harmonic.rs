@@ -13,7 +13,7 @@ use crate::sky::harmonics::{AnalysisOptions, analysis, synthesis};
 use crate::sky::healpix::{nside_of, pixel_area_sr};
 
 /// Relative accuracy of W_max: it only scales R.
-const W_MAX_TOLERANCE: f64 = 1e-4;
+pub(super) const W_MAX_TOLERANCE: f64 = 1e-4;
 
 /// Parameters of a harmonic solution.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -116,7 +116,7 @@ fn iterate(
     (solved, convergence)
 }
 
-fn prior_unknowns(map: &[f64], l_max: usize) -> Result<Vec<f64>, SolveError> {
+pub(super) fn prior_unknowns(map: &[f64], l_max: usize) -> Result<Vec<f64>, SolveError> {
     if nside_of(map.len()).is_none() {
         return Err(SolveError::PriorLength { found: map.len(), expected: 12 });
     }

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use super::harmonic::{HarmonicRequest, solve_harmonics};
+use super::refined::{RefineRule, Refinement, solve_refined};
 use super::tikhonov::solve_pixels_watched;
 use super::{Diagnostics, SolveError, SolveWatch, StoppingRule};
 use crate::accumulation::{Snapshot, SnapshotSums};
@@ -34,6 +35,8 @@ pub struct Solution {
     pub noise_k: Vec<f64>,
     /// Regularisation and convergence.
     pub diagnostics: Diagnostics,
+    /// How it was refined, and the residuals that remain; only with `map.refine`.
+    pub refinement: Option<Refinement>,
 }
 
 /// Regularisation and prior, by channel.
@@ -47,6 +50,8 @@ pub struct SolverSetup {
     pub prior_maps: Vec<Vec<f64>>,
     /// When the iteration of a harmonic map stops.
     pub rule: StoppingRule,
+    /// When the refinement of a harmonic map stops.
+    pub refine: RefineRule,
     /// Random probes for the traces of a final map, where its matrix is too large to be held; 0 for no traces.
     pub trace_probes: usize,
     /// Receives progress, and may interrupt.
@@ -96,6 +101,7 @@ impl Stage for Solver {
         if !watch.goes_on() {
             return Ok(());
         }
+        let mut refinement = None;
         let (map_k, noise_k, diagnostics) = match sums {
             SnapshotSums::Pixel(sums) => {
                 let solved = match solve_pixels_watched(sums, epsilon, prior.as_deref(), probes, watch) {
@@ -116,6 +122,14 @@ impl Stage for Solver {
                 }
                 (solved.map_k, solved.noise_k, solved.diagnostics)
             }
+            SnapshotSums::Refined(archive) => {
+                let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes: 0 };
+                let sums = archive.into_sums()?;
+                let (solved, found) =
+                    solve_refined(&sums, request, self.setup.refine, prior.as_deref(), watch)?;
+                refinement = Some(found);
+                (solved.map_k, solved.noise_k, solved.diagnostics)
+            }
         };
         self.solved += 1;
         out.push(Solution {
@@ -129,6 +143,7 @@ impl Stage for Solver {
             map_k,
             noise_k,
             diagnostics,
+            refinement,
         });
         Ok(())
     }

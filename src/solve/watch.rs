@@ -104,7 +104,13 @@ impl<'a> NamedWatch<'a> {
         let number = state.started;
         let what = format!("{name}: {what}");
         state.now = Some(Solving { number, what, iteration: 0, residual: 1.0, target });
-        SolveTask { named: self, watch, was_cancelled: watch.cancel.is_cancelled() }
+        SolveTask { named: self, watch, was_cancelled: watch.cancel.is_cancelled(), is_part: false }
+    }
+
+    /// A part of a task in progress, which it leaves as it is shown.
+    pub(super) fn part(self) -> SolveTask<'a> {
+        let was_cancelled = self.watch.cancel.is_cancelled();
+        SolveTask { named: self, watch: self.watch, was_cancelled, is_part: true }
     }
 }
 
@@ -113,12 +119,15 @@ pub(super) struct SolveTask<'a> {
     named: NamedWatch<'a>,
     watch: &'a SolveWatch,
     was_cancelled: bool,
+    is_part: bool,
 }
 
 impl SolveTask<'_> {
     /// Reports an iteration; whether to continue.
     pub(super) fn report(&self, iteration: usize, residual: f64) -> bool {
-        if let Some(solving) = &mut self.watch.state().now {
+        if !self.is_part
+            && let Some(solving) = &mut self.watch.state().now
+        {
             solving.iteration = iteration;
             solving.residual = residual;
         }
@@ -132,6 +141,8 @@ impl SolveTask<'_> {
 
 impl Drop for SolveTask<'_> {
     fn drop(&mut self) {
-        self.watch.state().now = None;
+        if !self.is_part {
+            self.watch.state().now = None;
+        }
     }
 }

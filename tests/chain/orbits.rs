@@ -70,3 +70,92 @@ fn what_needs_a_circle_is_refused_for_ellipses() {
         assert!(said.contains(&told) && said.contains("needs a common circle"), "{set}: {said}");
     }
 }
+
+#[test]
+fn a_triple_on_ellipses_is_mapped_by_refinement() {
+    // Altitudes that breathe by 20 km, and satellites that follow each other with cross-track offsets and pitch.
+    let pipeline = TRIPLE
+        .replace(
+            "eccentricity = 0.012, inclination_deg = 60.02",
+            "eccentricity = 0.01001, inclination_deg = 60.0005",
+        )
+        .replace("node_longitude_deg = 0.02", "node_longitude_deg = 0.0005");
+    let place = Workplace::new(&pipeline);
+    let out = place.path("out");
+    let harmonic = [
+        "sky.nside=32", // Direct sums count pixels as points: far finer than the map's degrees.
+        "map.engine=harmonic",
+        "map.rows=average",
+        "map.refine.passes_max=20",
+    ];
+    let sets: Vec<&str> = harmonic.iter().flat_map(|set| ["--set", set]).collect();
+    let run = [&["run", &place.pipeline, "--out", &out], sets.as_slice()].concat();
+    let summary = json(&run);
+    let ledger = &summary["ledger"];
+    // Nothing is refused for its geometry; what is left out is beyond the map's baselines.
+    let sampled = ledger["sampled"].as_u64().unwrap();
+    assert!(ledger["accumulated"].as_u64().unwrap() > 1000, "{ledger}");
+    for reason in ["plane", "altitude", "altitudes"] {
+        assert!(!ledger.to_string().contains(reason), "{sampled}: {ledger}");
+    }
+    let channel = &summary["channels"][0];
+    let refinement = &channel["refinement"];
+    assert!(refinement["convergence"]["converged"].as_bool().unwrap(), "{refinement}");
+    assert!(refinement["departures"]["by_refinement"].as_u64().unwrap() > 500, "{refinement}");
+    assert!(refinement["chi_square"]["by_pair"].as_object().unwrap().len() == 3, "{refinement}");
+    let rho: Vec<f64> =
+        channel["rho"].as_array().unwrap().iter().map(|rho| rho.as_f64().unwrap_or(0.0)).collect();
+    assert!(rho[1..=6].iter().all(|rho| *rho > 0.9), "{rho:?}");
+    // The ground alone makes the same map; with a saved state it says why it cannot.
+    let (downlink, ground) = (format!("{out}/downlink.ccsds"), place.path("ground"));
+    let replay =
+        [&["replay", &downlink, "--map", &place.pipeline, "--out", &ground], sets.as_slice()].concat();
+    succeed(&replay);
+    for (path, bytes) in maps(&ground) {
+        assert!(bytes == maps(&out)[&path], "{} differs", path.display());
+    }
+    let state = place.path("state");
+    let said = fail(&[replay.as_slice(), &["--state", &state]].concat());
+    assert!(said.contains("map.refine holds visibilities in memory"), "{said}");
+}
+
+/// A day of three satellites under the Moon's oblateness, integrated by other code.
+#[test]
+fn orbits_from_files_are_flown_and_mapped() {
+    let Some(python) = common::python() else { return };
+    let kepler = TRIPLE.find("kepler").unwrap()..TRIPLE.find("[spacecraft]").unwrap();
+    let mut pipeline = TRIPLE.replace("every_nth_window = 100", "duration_s = 86400.0\nevery_nth_window = 3");
+    pipeline.replace_range(kepler, "");
+    let place = Workplace::new(&pipeline);
+    let folder = place.path("orbits");
+    std::fs::create_dir(&folder).unwrap();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/oem_orbits.py");
+    let made = std::process::Command::new(python).arg(script).args([&folder, "1.1"]).output().unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let files = format!("array.oem=[\"{folder}/sat1.oem\", \"{folder}/sat2.oem\", \"{folder}/sat3.oem\"]");
+    let out = place.path("out");
+    let run = [
+        "run",
+        &place.pipeline,
+        "--out",
+        &out,
+        "--set",
+        &files,
+        "--set",
+        "map.engine=harmonic",
+        "--set",
+        "map.rows=average",
+        "--set",
+        "map.refine.passes_max=3",
+    ];
+    let summary = json(&run);
+    let accumulated = summary["ledger"]["accumulated"].as_u64().unwrap();
+    let departures = &summary["channels"][0]["refinement"]["departures"];
+    let held = ["on_the_circle", "by_refinement"].map(|key| departures[key].as_u64().unwrap());
+    assert!(accumulated > 100 && held[0] + held[1] == accumulated, "{departures} {accumulated}");
+    assert!((departures["circle_inclination_deg"].as_f64().unwrap() - 60.0).abs() < 0.2, "{departures}");
+    // A mission that lasts longer than the files is refused.
+    let long = [run.as_slice(), &["--set", "spacecraft.duration_s=1e6"]].concat();
+    let said = fail(&long);
+    assert!(said.contains("spacecraft.duration_s = ") && said.contains("array.oem"), "{said}");
+}

@@ -7,5 +7,6 @@ mod common;
 mod closed_loop;
 mod engines;
 mod exact_sums;
+mod refined;
 mod tikhonov;
 mod traces;

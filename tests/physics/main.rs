@@ -6,6 +6,8 @@ mod common;
 
 mod departures;
 mod forward;
+mod general;
 mod geometry;
+mod oem;
 mod patterns;
 mod response;

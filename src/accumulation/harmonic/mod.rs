@@ -24,6 +24,7 @@ mod exact;
 mod grid;
 mod lines;
 mod operator;
+mod refined;
 mod setup;
 mod spread;
 mod sums;
@@ -37,8 +38,11 @@ use std::sync::{Arc, OnceLock};
 pub use blocks::{OrderBlocks, OrderFactors};
 pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
+pub use refined::{
+    Departures, REFINED_VISIBILITY_BYTES, RefinedData, RefinedSetup, RefinedSums, VisibilityArchive,
+};
 pub use setup::{ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, application_size, memory, orbit_of};
-pub use sums::{HarmonicSums, coefficients, unknowns};
+pub use sums::{HarmonicSums, coefficients, unknowns, unknowns_of_gradient};
 
 use self::checkpoint::HarmonicHead;
 use self::exact::{ExactTori, Quanta, SCALES_MAX};

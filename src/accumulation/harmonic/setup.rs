@@ -34,9 +34,9 @@ pub const L_MAX: usize = 383;
 const U_MAX: f64 = 1000.0;
 
 /// Nominal inclinations are multiples of this, so that they do not depend on which data arrives first.
-const INCLINATION_STEP_DEG: f64 = 0.05;
+pub(super) const INCLINATION_STEP_DEG: f64 = 0.05;
 /// Nominal radii likewise.
-const RADIUS_STEP_M: f64 = 100.0;
+pub(super) const RADIUS_STEP_M: f64 = 100.0;
 
 /// The orbit of the first pair with a known orientation; `None` if there is none.
 #[must_use]

@@ -108,7 +108,8 @@ pub fn unknowns(alm: &Alm) -> Vec<f64> {
 }
 
 /// The gradient with respect to the unknowns, from that with respect to `Re T_lm` and `Im T_lm`.
-fn unknowns_of_gradient(gradient: &Alm) -> Vec<f64> {
+#[must_use]
+pub fn unknowns_of_gradient(gradient: &Alm) -> Vec<f64> {
     scaled(gradient, std::f64::consts::FRAC_1_SQRT_2)
 }
 

@@ -175,6 +175,9 @@ pub(super) struct Opened {
 impl Opened {
     /// Opens a folder. Checkpoints that cannot be used get another name if `sets_aside`.
     pub(super) fn new(folder: &Path, config: &GroundConfig, sets_aside: bool) -> Result<Self, GroundError> {
+        if config.map.refine.is_on() {
+            return Err(AccumulationError::HeldInMemory.into());
+        }
         let mut folder = StateFolder::open(folder)?;
         let settings = settings_of(config)?;
         let posts = Ledger::new();

@@ -180,9 +180,9 @@ fn half_separation(geometry: PatternGeometry, u: f64) -> f64 {
 /// A ring of the body frame: its colatitude, the |psi| up to which a satellite at psi = 0 sees it, and whether any
 /// satellite sees all of it.
 #[derive(Clone, Copy, Debug)]
-struct RingPoint {
-    z: f64,
-    sin_theta: f64,
+pub(crate) struct RingPoint {
+    pub(crate) z: f64,
+    pub(crate) sin_theta: f64,
     edge: f64,
     whole: bool,
 }
@@ -190,7 +190,7 @@ struct RingPoint {
 impl RingPoint {
     /// The greatest order with Legendre functions of degree `l_max` that are not negligible here: beyond l sin(theta)
     /// they decay like Airy functions, over a width of its cube root.
-    fn orders(&self, l_max: usize) -> usize {
+    pub(crate) fn orders(&self, l_max: usize) -> usize {
         let turning = l_max as f64 * self.sin_theta;
         l_max.min((turning + 8.0 * turning.cbrt()) as usize + 8)
     }
@@ -198,7 +198,7 @@ impl RingPoint {
 
 /// Rings of the northern hemisphere, equator first, and their weights (for both hemispheres, with the antennas'
 /// response), for degrees up to `l_max` and |u| up to `u_max`; `refine` multiplies the number of points.
-fn ring_points(
+pub(crate) fn ring_points(
     geometry: PatternGeometry,
     l_max: usize,
     u_max: f64,

@@ -1,0 +1,158 @@
+//! Fourier coefficients of a fringe on an arc of a ring.
+//!
+//! On the ring at colatitude theta the pattern is `exp(-i x sin psi)`, `x = 2 pi u sin theta`, where both satellites see
+//! it, `low <= psi <= high`, and nothing beyond. As in the symmetric case (`response/harmonic/ring.rs`), its coefficients
+//!
+//! ```text
+//! I_mu = Int_low^high exp(-i (x sin psi + mu psi)) dpsi,     E_mu(psi) = exp(-i (x sin psi + mu psi))
+//! ```
+//!
+//! obey Bessel's recurrence with boundary terms on the right-hand side,
+//!
+//! ```text
+//! x I_{mu+1} + 2 mu I_mu + x I_{mu-1} = 2 i (E_mu(high) - E_mu(low))
+//! ```
+//!
+//! which is followed upwards from `I_0` and `I_1` for |mu| < x, and solved as a boundary-value problem beyond.
+
+use std::sync::Arc;
+
+use num_complex::Complex64;
+
+use crate::response::harmonic::quadrature::GaussLegendre;
+
+/// Quadrature rules for `I_0` and `I_1`, and buffers for one ring.
+#[derive(Clone, Debug)]
+pub(super) struct ArcSolver {
+    rules: Arc<Vec<GaussLegendre>>,
+    ratio: Vec<f64>,
+    values: Vec<Complex64>,
+}
+
+/// Rules come in steps of this many points.
+const RULE_STEP: usize = 16;
+
+/// Additional orders over which the error of the far end decays.
+const FAR_MARGIN: usize = 40;
+
+impl ArcSolver {
+    /// A solver for 0 <= x <= `x_max`.
+    pub(super) fn new(x_max: f64) -> Self {
+        let points = GaussLegendre::points_for(std::f64::consts::PI * x_max);
+        let rules = (0..=points / RULE_STEP + 1).map(|k| GaussLegendre::new(RULE_STEP * k.max(1))).collect();
+        Self { rules: Arc::new(rules), ratio: Vec::new(), values: Vec::new() }
+    }
+
+    /// Writes `I_mu`, mu = -order_max ..= order_max, for `arc = [low, high]`; `out` has room for these `2 order_max + 1`.
+    pub(super) fn solve(&mut self, x: f64, arc: [f64; 2], out: &mut [Complex64]) {
+        let order_max = out.len() / 2;
+        let start = self.start(x, arc);
+        let edges = arc.map(|psi| Complex64::cis(-x * psi.sin()));
+        let twice = Complex64::new(0.0, 2.0);
+        let below = if x >= 1.0 { twice * (edges[1] - edges[0]) / x - start[1] } else { Complex64::ZERO };
+        self.branch(x, start, edges.map(|e| twice * e), arc.map(|psi| Complex64::cis(-psi)), order_max);
+        out[order_max..].copy_from_slice(&self.values[..=order_max]);
+        // J_n = (-1)^n I_{-n} obeys the same recurrence with the right-hand side of -n times -(-1)^n.
+        let steps = arc.map(|psi| -Complex64::cis(psi));
+        self.branch(x, [start[0], -below], edges.map(|e| -twice * e), steps, order_max);
+        for n in 1..=order_max {
+            out[order_max - n] = if n % 2 == 0 { self.values[n] } else { -self.values[n] };
+        }
+    }
+
+    /// `I_0` and `I_1` by quadrature.
+    fn start(&self, x: f64, [low, high]: [f64; 2]) -> [Complex64; 2] {
+        let points = GaussLegendre::points_for(0.5 * (high - low) * x);
+        let rule = &self.rules[points.div_ceil(RULE_STEP).min(self.rules.len() - 1)];
+        let mut sums = [Complex64::ZERO; 2];
+        for (t, w) in rule.abscissae.iter().zip(&rule.weights) {
+            let psi = low + (high - low) * t;
+            let fringe = w * Complex64::cis(-x * psi.sin());
+            sums[0] += fringe;
+            sums[1] += fringe * Complex64::cis(-psi);
+        }
+        sums.map(|sum| (high - low) * sum)
+    }
+
+    /// Solves `x K_{n+1} + 2 n K_n + x K_{n-1} = b_high s_high^n - b_low s_low^n` for n = 0 ..= `order_max`, given `K_0` and
+    /// `K_1` (the latter used only if x >= 1).
+    fn branch(
+        &mut self,
+        x: f64,
+        start: [Complex64; 2],
+        [mut low, mut high]: [Complex64; 2],
+        [low_step, high_step]: [Complex64; 2],
+        order_max: usize,
+    ) {
+        let turning = x.floor() as usize;
+        let known = turning.min(order_max);
+        let far = order_max.max((x + 10.0 * x.cbrt()) as usize) + FAR_MARGIN;
+        self.values.resize((far + 2).max(self.values.len()), Complex64::ZERO);
+        self.ratio.resize((far + 2).max(self.ratio.len()), 0.0);
+        let (values, ratio) = (&mut self.values, &mut self.ratio);
+        let mut advance = || {
+            (low, high) = (low * low_step, high * high_step);
+            high - low
+        };
+        values[0] = start[0];
+        values[1] = start[1];
+        if known >= 1 {
+            let inverse = 1.0 / x;
+            for n in 1..known {
+                values[n + 1] = (advance() - 2.0 * n as f64 * values[n]) * inverse - values[n - 1];
+            }
+            if turning >= order_max {
+                return;
+            }
+            // The right-hand side at n = `known` belongs to the row that the boundary value replaces.
+            advance();
+        }
+        let mut above = 0.0;
+        let mut carried = values[known];
+        for n in known + 1..=far {
+            let pivot = 1.0 / (2.0 * n as f64 - x * above);
+            carried = (advance() - x * carried) * pivot;
+            above = x * pivot;
+            ratio[n] = above;
+            values[n] = carried;
+        }
+        // By parts: the boundary term over the slope of its phase; the error decays on the way down.
+        let mut next = advance() / (2.0 * (far + 1) as f64);
+        for n in (known + 1..=far).rev() {
+            next = values[n] - ratio[n] * next;
+            values[n] = next;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::PI;
+
+    use super::*;
+
+    #[test]
+    fn coefficients_are_the_integrals() {
+        let rule = GaussLegendre::new(400);
+        let order_max = 30;
+        let mut solver = ArcSolver::new(150.0);
+        let mut out = vec![Complex64::ZERO; 2 * order_max + 1];
+        for x in [0.0, 1e-9, 0.3, 1.0, 2.5, 17.3, 30.0, 31.7, 140.0] {
+            for arc in [[-PI, PI], [-2.1, 2.1], [-2.12, 2.07], [-0.4, 0.3], [1e-3, 2.0]] {
+                solver.solve(x, arc, &mut out);
+                for (place, found) in out.iter().enumerate() {
+                    let mu = place as f64 - order_max as f64;
+                    let value = |t: f64| {
+                        let psi = arc[0] + (arc[1] - arc[0]) * t;
+                        Complex64::cis(-x * psi.sin() - mu * psi)
+                    };
+                    let sum: Complex64 =
+                        rule.abscissae.iter().zip(&rule.weights).map(|(t, w)| w * value(*t)).sum();
+                    let expected = (arc[1] - arc[0]) * sum;
+                    // Both are good to some hundred roundings of numbers of order one.
+                    assert!((found - expected).norm() < 1e-12, "{x} {arc:?} {mu}: {found} {expected}");
+                }
+            }
+        }
+    }
+}

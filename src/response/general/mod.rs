@@ -1,0 +1,69 @@
+//! Rows of B over spherical harmonics for satellites at any positions.
+//!
+//! Nothing is assumed of orbits: a pair's two positions give its own frame, what the Moon hides from either, and so its
+//! pattern, by the quadrature of [`mod@crate::response::harmonic`]; the sky is turned into that frame. On a common circle the
+//! two agree. Along a pass the rows of a pair change slowly, so that few are computed and the others interpolated
+//! (see `plan.rs`): [`GeneralRows::plan`], [`GeneralRows::forward`], [`GeneralRows::adjoint`]. [`GeneralRows::plan_direct`]
+//! computes each row, the reference for the other.
+//!
+//! Results do not depend on the number of threads.
+
+mod arc;
+mod operator;
+mod plan;
+mod turns;
+mod view;
+
+pub use operator::{GeneralRows, row_tables_bytes};
+pub use plan::RowPlan;
+
+use thiserror::Error;
+
+use super::harmonic::GeometryRefusal;
+use crate::frames::AntennaResponse;
+use crate::units::Pair;
+use crate::units::vector::Vec3;
+
+/// What rows depend on besides positions.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RowsSetup {
+    /// Greatest degree of the sky.
+    pub l_max: usize,
+    /// Wavelength, m.
+    pub wavelength_m: f64,
+    /// Radius of the Moon, m.
+    pub moon_radius_m: f64,
+    /// Response of the antennas.
+    pub response: AntennaResponse,
+}
+
+/// Positions of a pair at a time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PairAt {
+    /// Pair.
+    pub pair: Pair,
+    /// Mission time, s.
+    pub time_s: f64,
+    /// Position of satellite i, m.
+    pub r_i_m: Vec3,
+    /// Position of satellite j, m.
+    pub r_j_m: Vec3,
+}
+
+/// A visibility whose positions have no row.
+#[derive(Clone, Copy, Debug, Error, PartialEq)]
+#[error("visibility {index}: {refusal}")]
+pub struct RowsError {
+    /// Its index.
+    pub index: usize,
+    /// What is wrong with its positions.
+    pub refusal: GeometryRefusal,
+}
+
+/// Whether a pair at these positions has a row.
+///
+/// # Errors
+/// What is wrong with the positions.
+pub fn check_positions(r_i_m: Vec3, r_j_m: Vec3, moon_radius_m: f64) -> Result<(), GeometryRefusal> {
+    view::PairView::of(r_i_m, r_j_m, moon_radius_m).map(drop)
+}

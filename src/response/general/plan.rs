@@ -1,0 +1,310 @@
+//! Where rows of B are computed, and from which the others are interpolated.
+//!
+//! With P(t) the axes that follow the normal z(t) of the pair's plane without turning about it, and gamma(t) the angle from
+//! there to the pair's own x, the row of a pair at time t is
+//!
+//! ```text
+//! V(t) = sum_mu exp(-i mu gamma(t)) g_mu(t)
+//! ```
+//!
+//! where g depends on P, on the baseline's length and on the radii: slowly along an orbit, and smoothly however its plane,
+//! altitude, pitch and yaw change. So g is computed at a few of the times of a pass of one pair, near Chebyshev's points, and
+//! interpolated to the others by the polynomial through them. Their number follows from how far the pattern's phases can
+//! move; where it would not be less than that of the visibilities, each is computed for itself.
+
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::view::{Axes, PairView, euler, transported};
+use super::{PairAt, RowsError, RowsSetup};
+use crate::units::vector::{dot, norm, sub};
+
+/// A gap in a pair's data that ends a pass, s: polynomials do not reach across what the array did not observe.
+const GAP_S: f64 = 900.0;
+
+/// Most rows from which others are interpolated together: more are longer to interpolate from, not more exact.
+const NODES_MAX: usize = 40;
+
+/// Classes of altitude that share quadrature points, and the least width of one, m. Within a class the points follow the
+/// Moon's limb as seen from its middle; that its edge lies elsewhere costs up to 1e-4 of a visibility with few classes and few
+/// points, so that there are as many as have room.
+const CLASSES: [f64; 2] = [24.0, 400.0];
+const CLASSES_BYTES: f64 = 3e8;
+const CLASS_M_MIN: f64 = 100.0;
+
+/// Rows that a task computes together.
+pub(super) const GROUP_NODES: usize = 384;
+
+/// One row that is computed.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct RowNode {
+    /// Angles whose multiples turn a sky into P: about z, then between the quarter turns, then about the new z.
+    pub(super) turns_rad: [f64; 3],
+    pub(super) view: PairView,
+    /// Class of altitude.
+    pub(super) class: u32,
+}
+
+/// Consecutive visibilities of a pair, and the nodes of their rows.
+#[derive(Clone, Debug)]
+pub(super) struct Pass {
+    pub(super) rows: Range<usize>,
+    pub(super) nodes: Range<usize>,
+    /// Times of the nodes, -1 to 1, and their barycentric weights; empty if each row has its node.
+    pub(super) tau: Vec<f64>,
+    pub(super) weights: Vec<f64>,
+}
+
+/// How to compute the rows of a list of visibilities.
+#[derive(Clone, Debug)]
+pub struct RowPlan {
+    pub(super) nodes: Vec<RowNode>,
+    pub(super) passes: Vec<Pass>,
+    /// Passes that a task takes together.
+    pub(super) groups: Vec<Range<usize>>,
+    /// By row: angle gamma, rad.
+    pub(super) gamma_rad: Vec<f64>,
+    /// By row: its time within the pass, -1 to 1.
+    pub(super) tau: Vec<f64>,
+    /// Radius of each class, m.
+    pub(super) class_radius_m: Vec<f64>,
+    /// Longest baseline, wavelengths.
+    pub(super) u_max: f64,
+}
+
+impl RowPlan {
+    /// Plans rows for visibilities sorted by pair and time. `direct` computes each row for itself.
+    ///
+    /// # Errors
+    /// The first visibility whose positions have no row.
+    pub(super) fn new(setup: &RowsSetup, pairs: &[PairAt], direct: bool) -> Result<Self, RowsError> {
+        let views: Vec<PairView> = pairs
+            .par_iter()
+            .enumerate()
+            .map(|(index, at)| {
+                PairView::of(at.r_i_m, at.r_j_m, setup.moon_radius_m)
+                    .map_err(|refusal| RowsError { index, refusal })
+            })
+            .collect::<Result<_, _>>()?;
+        let radii = views.iter().map(|view| view.radius_m);
+        let (low, high) = radii.fold((f64::INFINITY, 0.0_f64), |(a, b), r| (a.min(r), b.max(r)));
+        let u_max = views.iter().map(|view| view.baseline_m / setup.wavelength_m).fold(0.0, f64::max);
+        let classes = Classes::new(low, high, classes_max(setup.l_max, u_max));
+        let mut plan = Self {
+            nodes: Vec::new(),
+            passes: Vec::new(),
+            groups: Vec::new(),
+            gamma_rad: vec![0.0; pairs.len()],
+            tau: vec![0.0; pairs.len()],
+            class_radius_m: classes.radii_m(),
+            u_max,
+        };
+        let mut first = 0;
+        while first < pairs.len() {
+            let together = |k: &usize| {
+                pairs[*k].pair == pairs[first].pair && pairs[*k].time_s - pairs[*k - 1].time_s <= GAP_S
+            };
+            let end = (first + 1..pairs.len()).take_while(together).last().map_or(first + 1, |k| k + 1);
+            let pass = PassBuilder { setup, pairs, views: &views, classes: &classes, direct };
+            pass.split(first..end, &mut plan);
+            first = end;
+        }
+        plan.group();
+        Ok(plan)
+    }
+
+    /// Rows.
+    #[must_use]
+    pub fn rows(&self) -> usize {
+        self.gamma_rad.len()
+    }
+
+    /// Rows that are computed; the others are interpolated.
+    #[must_use]
+    pub fn computed(&self) -> usize {
+        self.nodes.len()
+    }
+
+    fn group(&mut self) {
+        let mut start = 0;
+        let mut nodes = 0;
+        for (k, pass) in self.passes.iter().enumerate() {
+            nodes += pass.nodes.len();
+            if nodes >= GROUP_NODES || k + 1 == self.passes.len() {
+                self.groups.push(start..k + 1);
+                (start, nodes) = (k + 1, 0);
+            }
+        }
+    }
+
+    /// The share of each node of its pass in a row.
+    pub(super) fn shares(&self, pass: &Pass, row: usize, shares: &mut Vec<f64>) {
+        shares.clear();
+        let tau = self.tau[row];
+        if let Some(at) = pass.tau.iter().position(|node| *node == tau) {
+            shares.extend((0..pass.tau.len()).map(|k| f64::from(u8::from(k == at))));
+            return;
+        }
+        shares.extend(pass.tau.iter().zip(&pass.weights).map(|(node, weight)| weight / (tau - node)));
+        let sum: f64 = shares.iter().sum();
+        shares.iter_mut().for_each(|share| *share /= sum);
+    }
+}
+
+/// Bytes of one class's tables: Legendre functions of even l + mu at its quadrature points.
+pub(super) fn class_bytes(l_max: usize, u_max: f64) -> f64 {
+    // As `ring_points`: half a point a radian over both zones, and some.
+    let rings = 0.6 * (l_max as f64 + TAU * u_max) + 64.0;
+    8.0 * rings * 0.25 * ((l_max + 2) as f64).powi(2)
+}
+
+/// Most classes of altitude.
+pub(super) fn classes_max(l_max: usize, u_max: f64) -> f64 {
+    (CLASSES_BYTES / class_bytes(l_max, u_max)).clamp(CLASSES[0], CLASSES[1])
+}
+
+/// Classes of altitude.
+struct Classes {
+    first_m: f64,
+    step_m: f64,
+    count: usize,
+}
+
+impl Classes {
+    fn new(low_m: f64, high_m: f64, classes_max: f64) -> Self {
+        let range_m = (high_m - low_m).max(0.0);
+        let step_m = (range_m / classes_max).max(CLASS_M_MIN);
+        let count = (range_m / step_m).ceil().max(1.0) as usize;
+        Self { first_m: low_m + 0.5 * (range_m - step_m * (count - 1) as f64), step_m, count }
+    }
+
+    fn of(&self, radius_m: f64) -> u32 {
+        let class = ((radius_m - self.first_m) / self.step_m).round();
+        class.clamp(0.0, (self.count - 1) as f64) as u32
+    }
+
+    fn radii_m(&self) -> Vec<f64> {
+        (0..self.count).map(|k| self.first_m + self.step_m * k as f64).collect()
+    }
+}
+
+/// Divides passes.
+struct PassBuilder<'a> {
+    setup: &'a RowsSetup,
+    pairs: &'a [PairAt],
+    views: &'a [PairView],
+    classes: &'a Classes,
+    direct: bool,
+}
+
+impl PassBuilder<'_> {
+    /// Plans these rows, as one pass or divided in two.
+    fn split(&self, rows: Range<usize>, plan: &mut RowPlan) {
+        let count = rows.len();
+        let needed = self.nodes_needed(&rows);
+        // The polynomial through the points of equally spaced data that are nearest to Chebyshev's is as good as theirs if
+        // they are fewer than about twice the root of the data's number (Boyd & Xu 2009, Appl. Math. Comput. 210, 158).
+        let is_dense = needed as f64 <= 2.0 * (count as f64).sqrt() && needed <= NODES_MAX;
+        if self.direct || (!is_dense && count <= 16) {
+            return self.each(rows, plan);
+        }
+        if !is_dense {
+            let middle = rows.start + count / 2;
+            self.split(rows.start..middle, plan);
+            return self.split(middle..rows.end, plan);
+        }
+        self.interpolated(rows, needed, plan);
+    }
+
+    /// Nodes that interpolate `exp(i h tau)` to far below 1e-5, h being what the pattern's phases move by.
+    fn nodes_needed(&self, rows: &Range<usize>) -> usize {
+        let views = &self.views[rows.clone()];
+        let middle = views[views.len() / 2].axes[2];
+        let half_range = |of: &dyn Fn(&PairView) -> f64| {
+            let (low, high) = views
+                .iter()
+                .map(of)
+                .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+            0.5 * (high - low)
+        };
+        let tilt = views.iter().map(|view| norm(sub(view.axes[2], middle))).fold(0.0, f64::max);
+        let limb = half_range(&PairView::limb_rad);
+        let pitch = half_range(&|view| 0.5 * (view.angle_rad[0] + view.angle_rad[1]));
+        let length = half_range(&|view| view.baseline_m / self.setup.wavelength_m);
+        let u = views.iter().map(|view| view.baseline_m / self.setup.wavelength_m).fold(0.0, f64::max);
+        let l_max = self.setup.l_max as f64;
+        let h = l_max * tilt + (l_max + TAU * u) * (limb + pitch) + TAU * length;
+        (h + 4.0 * h.cbrt() + 6.0).ceil() as usize
+    }
+
+    /// The axes of P at a row, and the angle to the pair's own.
+    fn place(&self, reference: &Axes, row: usize) -> (Axes, f64) {
+        let axes = self.views[row].axes;
+        let followed = transported(reference, axes[2]);
+        (followed, dot(axes[0], followed[1]).atan2(dot(axes[0], followed[0])))
+    }
+
+    fn node(&self, axes: &Axes, row: usize) -> RowNode {
+        let [alpha, beta, gamma] = euler(axes);
+        RowNode {
+            turns_rad: [alpha + FRAC_PI_2, beta + PI, gamma + FRAC_PI_2],
+            view: self.views[row],
+            class: self.classes.of(self.views[row].radius_m),
+        }
+    }
+
+    /// A node for each row.
+    fn each(&self, rows: Range<usize>, plan: &mut RowPlan) {
+        let first = plan.nodes.len();
+        plan.nodes.extend(rows.clone().map(|row| self.node(&self.views[row].axes, row)));
+        let nodes = first..plan.nodes.len();
+        plan.passes.push(Pass { rows, nodes, tau: Vec::new(), weights: Vec::new() });
+    }
+
+    /// `count` nodes for all rows.
+    fn interpolated(&self, rows: Range<usize>, count: usize, plan: &mut RowPlan) {
+        let times = &self.pairs[rows.clone()];
+        let (from, to) = (times[0].time_s, times[times.len() - 1].time_s);
+        let tau = |row: usize| 2.0 * (self.pairs[row].time_s - from) / (to - from) - 1.0;
+        // Rows of equal times have equal positions.
+        let distinct: Vec<usize> =
+            rows.clone().filter(|&row| row == rows.start || tau(row) > tau(row - 1)).collect();
+        if distinct.len() <= count {
+            return self.each(rows, plan);
+        }
+        let reference = self.views[rows.start + rows.len() / 2].axes;
+        for row in rows.clone() {
+            (plan.gamma_rad[row], plan.tau[row]) = (self.place(&reference, row).1, tau(row));
+        }
+        let first = plan.nodes.len();
+        let mut chosen: Vec<usize> = Vec::with_capacity(count);
+        for k in 0..count {
+            let wanted = -(PI * k as f64 / (count - 1) as f64).cos();
+            let after = distinct.partition_point(|&row| tau(row) < wanted);
+            let nearest = match after {
+                0 => 0,
+                after if after == distinct.len() => after - 1,
+                after if wanted - tau(distinct[after - 1]) < tau(distinct[after]) - wanted => after - 1,
+                after => after,
+            };
+            let least = chosen.last().map_or(0, |last| last + 1);
+            chosen.push(nearest.max(least).min(distinct.len() - count + k));
+        }
+        for &place in &chosen {
+            let row = distinct[place];
+            plan.nodes.push(self.node(&self.place(&reference, row).0, row));
+        }
+        let tau: Vec<f64> = chosen.iter().map(|&place| tau(distinct[place])).collect();
+        let weights = tau
+            .iter()
+            .enumerate()
+            .map(|(k, a)| {
+                let others = tau.iter().enumerate().filter(|(other, _)| *other != k);
+                1.0 / others.map(|(_, b)| 2.0 * (a - b)).product::<f64>()
+            })
+            .collect();
+        plan.passes.push(Pass { rows, nodes: first..plan.nodes.len(), tau, weights });
+    }
+}

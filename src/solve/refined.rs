@@ -1,0 +1,336 @@
+//! Maps from positions as they are: conjugate gradients on the true normal equations, preconditioned by a circle's.
+//!
+//! A circle's rows are of no use for data from another orbit, but its normal matrix tells which modes are measured nearly as
+//! well as the true one does. So
+//!
+//! ```text
+//! (Bt N^-1 B + R) x = Bt N^-1 V,   preconditioned by   M = Bc^t N^-1 Bc + R
+//! ```
+//!
+//! with B the rows of the true positions and Bc those of the nearest circle, converges in a few products with the former. M
+//! is solved by inner conjugate gradients, so that the outer ones are flexible (Notay 2000, SIAM J. Sci. Comput. 22, 1444).
+//! R is that of the circle's greatest eigenvalue. The map and the noise-only map share passes over the visibilities.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use num_complex::Complex64;
+use serde::Serialize;
+
+use super::SolveError;
+use super::conjugate_gradients::{Convergence, StoppingRule, System};
+use super::harmonic::{HarmonicRequest, HarmonicSolution, W_MAX_TOLERANCE, prior_unknowns};
+use super::lanczos::{LargestEigenvalue, largest_eigenvalue};
+use super::tikhonov::{Diagnostics, check_request};
+use super::vectors::{add, dot, subtract};
+use super::watch::NamedWatch;
+use crate::accumulation::AccumulationError;
+use crate::accumulation::harmonic::{Departures, RefinedSums, coefficients, unknowns_of_gradient};
+use crate::sky::harmonics::synthesis;
+use crate::sky::healpix::pixel_area_sr;
+use crate::units::constants::DAY_S;
+
+/// Residual of the inner iterations: far below what one outer step gains.
+const INNER_RESIDUAL: f64 = 1e-5;
+
+/// When a refinement stops.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RefineRule {
+    /// Most products with the true matrix.
+    pub passes_max: usize,
+    /// Greatest residual, relative to the right-hand side, in the preconditioner's norm.
+    pub residual_max: f64,
+}
+
+/// How a map was refined, and what remains of the data.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Refinement {
+    /// How the iteration for the map ended; its iterations are products with the true matrix.
+    pub convergence: Convergence,
+    /// Residual after each product.
+    pub residuals: Vec<f64>,
+    /// How far the positions are from the circle of the preconditioner.
+    pub departures: Departures,
+    /// Rows of B that were computed; the others were interpolated between them.
+    pub rows_computed: u64,
+    /// Mean squares of what the map leaves of the data, in units of their noise.
+    pub chi_square: ChiSquares,
+}
+
+/// `|V - B x|^2 w / 2`, the mean over visibilities: 1 for noise alone that the map does not fit.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct ChiSquares {
+    /// Of all.
+    pub all: f64,
+    /// By pair, `1-2`, counted from 1.
+    pub by_pair: BTreeMap<String, f64>,
+    /// By daughter, from 1: of all pairs that it is part of.
+    pub by_daughter: BTreeMap<u16, f64>,
+    /// By day of mission time, from 0.
+    pub by_day: BTreeMap<i64, f64>,
+}
+
+impl fmt::Display for Refinement {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { convergence, departures, chi_square, .. } = self;
+        write!(
+            f,
+            "refined in {} passes to a residual of {:.1e}{}; {} visibilities on the circle of {:.1} km and {:.2} deg, {} up to \
+             {:.2} km, {:.2} deg off its plane and {:.2} deg off the horizontal; chi-square {:.4}",
+            convergence.iterations,
+            convergence.residual,
+            if convergence.converged { "" } else { " (not converged)" },
+            departures.on_the_circle,
+            departures.circle_radius_m / 1e3,
+            departures.circle_inclination_deg,
+            departures.by_refinement,
+            departures.altitude_m_max / 1e3,
+            departures.tilt_deg_max,
+            departures.radial_deg_max,
+            chi_square.all,
+        )
+    }
+}
+
+impl From<AccumulationError> for SolveError {
+    fn from(error: AccumulationError) -> Self {
+        Self::Refinement(error.to_string())
+    }
+}
+
+/// Solves for the map and the noise-only map with the rows of the true positions.
+///
+/// # Errors
+/// No data, or a prior whose size is not a map's.
+pub fn solve_refined(
+    sums: &RefinedSums,
+    request: HarmonicRequest,
+    rule: RefineRule,
+    prior_k: Option<&[f64]>,
+    watch: NamedWatch<'_>,
+) -> Result<(HarmonicSolution, Refinement), SolveError> {
+    check_request(&sums.circle, request.epsilon)?;
+    let l_max = sums.circle.setup().l_max;
+    let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
+    let LargestEigenvalue { value: w_max, iterations, .. } = {
+        let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
+        largest_eigenvalue(&sums.circle, W_MAX_TOLERANCE, &mut |step, change| task.report(step, change))
+    };
+    let problem = Refining { sums, regularisation: request.epsilon * w_max, inner: request.rule };
+    let mut data = sums.data.value_k_sr.clone();
+    if let Some(prior) = &prior {
+        let predicted = problem.forward(&[prior.as_slice()]);
+        data.iter_mut().zip(&predicted[0]).for_each(|(value, predicted)| *value -= predicted);
+    }
+    let weighted: Vec<Complex64> =
+        data.iter().zip(&sums.data.weight).map(|(value, weight)| value * *weight).collect();
+    let noise: Vec<Complex64> =
+        sums.data.noise.iter().zip(&sums.data.weight).map(|(noise, weight)| noise * weight.sqrt()).collect();
+    let right = problem.adjoint(&[&weighted, &noise]);
+    drop((weighted, noise));
+    let [map, noise] = problem.solve(right, data, rule, watch);
+    let area_sr = pixel_area_sr(request.nside);
+    let synthesised = |x: &[f64]| synthesis(&coefficients(x, l_max), request.nside).map_err(SolveError::from);
+    let mut whole = map.x.clone();
+    if let Some(prior) = prior {
+        add(&mut whole, &prior);
+    }
+    let diagnostics = Diagnostics {
+        epsilon: request.epsilon,
+        w_max: w_max * area_sr,
+        w_max_iterations: iterations,
+        l_max: Some(l_max),
+        convergence: Some(map.convergence()),
+        noise_convergence: Some(noise.convergence()),
+        traces: None,
+        traces_refused: None,
+    };
+    let refinement = Refinement {
+        convergence: map.convergence(),
+        residuals: map.residuals.clone(),
+        departures: sums.departures,
+        rows_computed: sums.plan.computed() as u64,
+        chi_square: chi_squares(sums, &map.data),
+    };
+    let solution = HarmonicSolution {
+        map_k: synthesised(&whole)?,
+        noise_k: synthesised(&noise.x)?,
+        unknowns: [map.x, noise.x],
+        diagnostics,
+    };
+    Ok((solution, refinement))
+}
+
+/// The true normal equations and their preconditioner.
+struct Refining<'a> {
+    sums: &'a RefinedSums,
+    regularisation: f64,
+    /// When inner iterations stop, besides their residual.
+    inner: StoppingRule,
+}
+
+/// One right-hand side on its way.
+struct Column {
+    x: Vec<f64>,
+    residual: Vec<f64>,
+    direction: Vec<f64>,
+    /// `r.Mr` now and `b.Mb`.
+    energy: f64,
+    whole: f64,
+    /// What x leaves of the data; empty where nobody asks.
+    data: Vec<Complex64>,
+    residuals: Vec<f64>,
+    rule: RefineRule,
+    /// Whether rounding errors dominate.
+    is_stuck: bool,
+}
+
+impl Column {
+    fn relative(&self) -> f64 {
+        if self.whole > 0.0 { (self.energy.max(0.0) / self.whole).sqrt() } else { 0.0 }
+    }
+
+    fn is_open(&self) -> bool {
+        !self.is_stuck
+            && self.relative() > self.rule.residual_max
+            && self.residuals.len() < self.rule.passes_max
+    }
+
+    fn convergence(&self) -> Convergence {
+        let residual = self.relative();
+        Convergence {
+            iterations: self.residuals.len(),
+            residual,
+            converged: residual <= self.rule.residual_max,
+        }
+    }
+}
+
+impl Refining<'_> {
+    fn l_max(&self) -> usize {
+        self.sums.circle.setup().l_max
+    }
+
+    /// `B x` for several x.
+    fn forward(&self, x: &[&[f64]]) -> Vec<Vec<Complex64>> {
+        let skies: Vec<_> = x.iter().map(|x| coefficients(x, self.l_max())).collect();
+        self.sums.rows.forward(&self.sums.plan, &skies)
+    }
+
+    /// `Bt v` for several v.
+    fn adjoint(&self, values: &[&[Complex64]]) -> Vec<Vec<f64>> {
+        let gradients = self.sums.rows.adjoint(&self.sums.plan, values);
+        gradients.iter().map(unknowns_of_gradient).collect()
+    }
+
+    /// Solves for two right-hand sides; `data` is what the first is made from.
+    fn solve(
+        &self,
+        right: Vec<Vec<f64>>,
+        data: Vec<Complex64>,
+        rule: RefineRule,
+        watch: NamedWatch<'_>,
+    ) -> [Column; 2] {
+        let task = watch.start("refined map", rule.residual_max);
+        let factors = self.sums.circle.order_blocks().factors(self.regularisation);
+        let circle = System {
+            sums: &self.sums.circle,
+            regularisation: self.regularisation,
+            precondition: &|v| factors.solve(v),
+        };
+        let inner = StoppingRule { residual_max: INNER_RESIDUAL, ..self.inner };
+        let precondition = |r: &[f64]| {
+            let mut z = vec![0.0; r.len()];
+            circle.solve(r, &mut z, inner, &watch.part());
+            z
+        };
+        let mut data = Some(data);
+        let mut right = right.into_iter();
+        let mut columns = [(); 2].map(|()| {
+            let b = right.next().unwrap_or_default();
+            let z = precondition(&b);
+            let energy = dot(&b, &z);
+            Column {
+                x: vec![0.0; b.len()],
+                residual: b,
+                direction: z,
+                energy,
+                whole: energy,
+                data: data.take().unwrap_or_default(),
+                residuals: Vec::new(),
+                rule,
+                is_stuck: false,
+            }
+        });
+        while columns.iter().any(Column::is_open)
+            && task.report(columns[0].residuals.len(), columns[0].relative())
+        {
+            let directions: Vec<&[f64]> =
+                columns.iter().filter(|c| c.is_open()).map(|c| c.direction.as_slice()).collect();
+            let seen = self.forward(&directions);
+            let weighted: Vec<Vec<Complex64>> = seen
+                .iter()
+                .map(|seen| seen.iter().zip(&self.sums.data.weight).map(|(v, w)| v * *w).collect())
+                .collect();
+            let products = self.adjoint(&weighted.iter().map(Vec::as_slice).collect::<Vec<_>>());
+            drop(weighted);
+            let open = columns.iter_mut().filter(|column| column.is_open());
+            for ((column, mut product), seen) in open.zip(products).zip(seen) {
+                product.iter_mut().zip(&column.direction).for_each(|(y, d)| *y += self.regularisation * d);
+                let curvature = dot(&column.direction, &product);
+                if curvature.is_nan() || curvature <= 0.0 {
+                    column.is_stuck = true;
+                    continue;
+                }
+                let step = dot(&column.residual, &column.direction) / curvature;
+                column.x.iter_mut().zip(&column.direction).for_each(|(x, d)| *x += step * d);
+                column.data.iter_mut().zip(&seen).for_each(|(left, seen)| *left -= step * seen);
+                let before = column.residual.clone();
+                subtract(&mut column.residual, step, &product);
+                let z = precondition(&column.residual);
+                let next = dot(&column.residual, &z);
+                let turn = (next - dot(&before, &z)) / column.energy;
+                column.energy = next;
+                column.direction.iter_mut().zip(&z).for_each(|(d, z)| *d = z + turn * *d);
+                column.residuals.push(column.relative());
+            }
+        }
+        columns
+    }
+}
+
+/// Mean squares of residuals in units of their noise.
+fn chi_squares(sums: &RefinedSums, left: &[Complex64]) -> ChiSquares {
+    #[derive(Clone, Copy, Default)]
+    struct Mean(f64, f64);
+    impl Mean {
+        fn add(&mut self, value: f64) {
+            self.0 += value;
+            self.1 += 1.0;
+        }
+        fn value(self) -> f64 {
+            self.0 / self.1.max(1.0)
+        }
+    }
+    let mut all = Mean::default();
+    let (mut pairs, mut daughters, mut days) =
+        (BTreeMap::<_, Mean>::new(), BTreeMap::<_, Mean>::new(), BTreeMap::<_, Mean>::new());
+    for ((at, left), weight) in sums.at.iter().zip(left).zip(&sums.data.weight) {
+        let value = 0.5 * left.norm_sqr() * weight;
+        all.add(value);
+        pairs.entry((at.pair.i, at.pair.j)).or_default().add(value);
+        for daughter in [at.pair.i, at.pair.j] {
+            daughters.entry(u16::from(daughter) + 1).or_default().add(value);
+        }
+        days.entry((at.time_s / DAY_S).floor() as i64).or_default().add(value);
+    }
+    ChiSquares {
+        all: all.value(),
+        by_pair: pairs
+            .into_iter()
+            .map(|((i, j), mean)| (format!("{}-{}", u16::from(i) + 1, u16::from(j) + 1), mean.value()))
+            .collect(),
+        by_daughter: daughters.into_iter().map(|(daughter, mean)| (daughter, mean.value())).collect(),
+        by_day: days.into_iter().map(|(day, mean)| (day, mean.value())).collect(),
+    }
+}

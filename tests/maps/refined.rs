@@ -1,0 +1,358 @@
+//! Refined maps: against a dense solution by other code, on a circle, and whatever the order of arrival.
+
+use crate::common;
+
+use std::f64::consts::TAU;
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use lunarray::accumulation::Refusal;
+use lunarray::accumulation::harmonic::{RefinedSetup, RefinedSums, VisibilityArchive};
+use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::response::general::{GeneralRows, PairAt, RowsSetup};
+use lunarray::response::harmonic::{GeometryLimits, GeometryRefusal};
+use lunarray::sky::fits::{ReadOptions, read_map};
+use lunarray::sky::harmonics::{Alm, AnalysisOptions, analysis};
+use lunarray::sky::healpix::pixel_area_sr;
+use lunarray::solve::{
+    HarmonicRequest, HarmonicSolution, RefineRule, Refinement, SolveWatch, StoppingRule, solve_harmonics,
+    solve_refined,
+};
+use lunarray::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
+use lunarray::units::vector::Vec3;
+use lunarray::units::{ChannelId, Pair};
+use num_complex::Complex64;
+
+const RADIUS_M: f64 = MOON_RADIUS_M + 300e3;
+const WAVELENGTH_M: f64 = 30.0;
+const PERIOD_S: f64 = 8248.68;
+const NSIDE: usize = 8;
+const L_MAX: usize = 12;
+const EPSILON: f64 = 1e-4;
+
+/// Lengths of the baselines, m: for all degrees up to 12, and beyond.
+const BASELINES_M: [f64; 5] = [30.0, 55.0, 95.0, 160.0, 290.0];
+
+/// Thirds of orbits, all nodes of the plane: one satellite of a pair trails the other and swings out of its plane.
+fn geometry(altitude_m: f64, cross: f64, step_s: f64, orbits: usize, baselines_m: &[f64]) -> Vec<PairAt> {
+    let eccentricity = altitude_m / RADIUS_M;
+    let mut all = Vec::new();
+    for (k, baseline_m) in baselines_m.iter().enumerate() {
+        let pair = Pair { i: 0, j: k as u8 + 1 };
+        let lag_s = baseline_m / (TAU * RADIUS_M / PERIOD_S);
+        for orbit in 0..orbits {
+            let node = TAU * (orbit as f64 + 0.1 * k as f64) / orbits as f64;
+            let at = |t_s: f64, tilt: f64| -> Vec3 {
+                let mean = TAU * t_s / PERIOD_S;
+                let anomaly = (0..30).fold(mean, |e, _| mean + eccentricity * e.sin());
+                let x = RADIUS_M * (anomaly.cos() - eccentricity);
+                let y = RADIUS_M * (1.0 - eccentricity * eccentricity).sqrt() * anomaly.sin();
+                let (si, ci) = (30_f64.to_radians() + tilt).sin_cos();
+                let (so, co) = node.sin_cos();
+                [x * co - y * so * ci, x * so + y * co * ci, y * si]
+            };
+            let start_s = PERIOD_S * (orbit as f64 * 13.0 + 0.29 * ((orbit * 7 + k * 3) % 11) as f64);
+            let count = (PERIOD_S / 3.0 / step_s) as usize;
+            all.extend((0..count).map(|n| start_s + step_s * n as f64).map(|time_s| PairAt {
+                pair,
+                time_s,
+                r_i_m: at(time_s, cross * baseline_m / RADIUS_M),
+                r_j_m: at(time_s - lag_s, 0.0),
+            }));
+        }
+    }
+    all
+}
+
+fn weight(at: &PairAt) -> f64 {
+    1e-8 * (1.0 + f64::from(at.pair.j % 3))
+}
+
+/// Blocks of up to `size` visibilities of one pair.
+fn blocks(at: &[PairAt], values: &[Complex64], size: usize) -> Vec<PlacedVisibilities> {
+    let frequency_hz = SPEED_OF_LIGHT_M_S / WAVELENGTH_M;
+    let mut blocks: Vec<PlacedVisibilities> = Vec::new();
+    for (at, value) in at.iter().zip(values) {
+        if blocks.last().is_none_or(|block| block.pair != at.pair || block.len() == size) {
+            let pair = at.pair;
+            blocks.push(PlacedVisibilities { frequency_hz, pair, ..PlacedVisibilities::default() });
+        }
+        let block = blocks.last_mut().unwrap();
+        block.time_s.push(at.time_s);
+        block.r_i_m.push(at.r_i_m);
+        block.r_j_m.push(at.r_j_m);
+        block.value_k_sr.push(*value);
+        block.weight.push(weight(at));
+    }
+    blocks
+}
+
+fn archive(l_max: usize, visibilities_max: u64) -> VisibilityArchive {
+    VisibilityArchive::new(RefinedSetup {
+        channel: ChannelId(0),
+        l_max,
+        frequency_hz: SPEED_OF_LIGHT_M_S / WAVELENGTH_M,
+        baseline_m_max: 2000.0,
+        moon_radius_m: MOON_RADIUS_M,
+        response: AntennaResponse::Isotropic,
+        companion_seed: 3,
+        weight_max: 1e-4,
+        limits: GeometryLimits::default(),
+        visibilities_max,
+    })
+    .unwrap()
+}
+
+fn sums(l_max: usize, blocks: &[PlacedVisibilities]) -> RefinedSums {
+    let mut archive = archive(l_max, 1 << 30);
+    for block in blocks {
+        let added = archive.add(block).unwrap();
+        assert!(added.refused.is_empty() && added.visibilities == block.len() as u64);
+    }
+    archive.into_sums().unwrap()
+}
+
+fn request(nside: usize) -> HarmonicRequest {
+    let rule = StoppingRule { residual_max: 1e-6, iterations_max: 300 };
+    HarmonicRequest { epsilon: EPSILON, nside, rule, probes: 0 }
+}
+
+fn refined(sums: &RefinedSums, nside: usize, passes_max: usize) -> (HarmonicSolution, Refinement) {
+    let rule = RefineRule { passes_max, residual_max: 1e-12 };
+    solve_refined(sums, request(nside), rule, None, SolveWatch::default().named("test")).unwrap()
+}
+
+fn difference(found: &[f64], expected: &[f64]) -> f64 {
+    let square = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>().sqrt();
+    assert_eq!(found.len(), expected.len());
+    square(&mut found.iter().zip(expected).map(|(a, b)| a - b)) / square(&mut expected.iter().copied())
+}
+
+/// Relative difference of one degree.
+fn degree_change(found: &[f64], expected: &[f64], l: usize) -> f64 {
+    let of = |x: &[f64]| {
+        let alm = lunarray::accumulation::harmonic::coefficients(x, L_MAX);
+        (0..=l).flat_map(|m| [alm.get(l, m).re, alm.get(l, m).im]).collect::<Vec<f64>>()
+    };
+    difference(&of(found), &of(expected))
+}
+
+fn write(path: &Path, values: impl Iterator<Item = f64>) {
+    fs::write(path, values.flat_map(f64::to_le_bytes).collect::<Vec<u8>>()).unwrap();
+}
+
+fn read(path: &Path) -> Vec<f64> {
+    fs::read(path).unwrap().as_chunks::<8>().0.iter().map(|&bytes| f64::from_le_bytes(bytes)).collect()
+}
+
+/// Rows, sky, visibilities and the map by `tests/python/general_rows.py`.
+#[test]
+fn refined_maps_are_the_dense_solution_of_other_code() {
+    let Some(python) = common::python() else { return };
+    for (altitude_m, cross) in [(20e3, 0.02), (20e3, 0.2)] {
+        let at = geometry(altitude_m, cross, 130.0, 9, &BASELINES_M);
+        let nothing = vec![Complex64::ZERO; at.len()];
+        let w_max = refined(&sums(L_MAX, &blocks(&at, &nothing, 50)), NSIDE, 1).0.diagnostics.w_max;
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        write(&path("positions"), at.iter().flat_map(|at| [at.r_i_m, at.r_j_m]).flatten());
+        write(&path("weights"), at.iter().map(weight));
+        let regularisation = EPSILON * w_max / pixel_area_sr(NSIDE);
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/general_rows.py");
+        let output = Command::new(&python)
+            .arg(script)
+            .arg(folder.path())
+            .args([L_MAX.to_string(), WAVELENGTH_M.to_string(), MOON_RADIUS_M.to_string()])
+            .arg(regularisation.to_string())
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let (sky, dense) = (read(&path("sky")), read(&path("map")));
+        let values: Vec<Complex64> = read(&path("visibilities"))
+            .as_chunks::<2>()
+            .0
+            .iter()
+            .map(|v| Complex64::new(v[0], v[1]))
+            .collect();
+
+        // Rows: the visibilities of that sky.
+        let rows = GeneralRows::new(RowsSetup {
+            l_max: L_MAX,
+            wavelength_m: WAVELENGTH_M,
+            moon_radius_m: MOON_RADIUS_M,
+            response: AntennaResponse::Isotropic,
+        });
+        let alm: Alm = lunarray::accumulation::harmonic::coefficients(&sky, L_MAX);
+        let seen = rows.forward(&rows.plan_direct(&at).unwrap(), &[alm]).remove(0);
+        let parts = |v: &[Complex64]| v.iter().flat_map(|v| [v.re, v.im]).collect::<Vec<f64>>();
+        let error = difference(&parts(&seen), &parts(&values));
+        // Both have quadrature errors below 1e-6; altitudes within a class share points, which costs some 1e-6.
+        eprintln!("+-{} km, {} %: rows {error:.1e}", altitude_m / 1e3, cross * 100.0);
+        assert!(error < 3e-5, "{error:e}");
+
+        let sums = sums(L_MAX, &blocks(&at, &values, 50));
+        assert_eq!(sums.departures.on_the_circle + sums.departures.by_refinement, at.len() as u64);
+        assert!(sums.departures.by_refinement > at.len() as u64 / 2);
+        // Without refinement the circle's sums give garbage.
+        let circle =
+            solve_harmonics(&sums.circle, request(NSIDE), None, None, SolveWatch::default().named("test"))
+                .unwrap();
+        let first = difference(&circle.unknowns[0][1..], &dense[1..]);
+        let found = [1, 2, 4, 8].map(|passes| refined(&sums, NSIDE, passes));
+        let errors = found.each_ref().map(|found| difference(&found.0.unknowns[0], &dense));
+        let shown = errors.map(|error| format!("{error:.1e}")).join(" ");
+        eprintln!("circle {first:.2}; 1, 2, 4, 8 passes {shown}");
+        // Four passes leave some per cent at most, eight a thousandth.
+        assert!(errors[2] < 5e-2 && errors[3] < 2e-3, "{errors:?}");
+        assert!(first > 0.1 && errors[3] < 0.01 * first, "{first} {errors:?}");
+        let refinement = &found[3].1;
+        assert_eq!(refinement.chi_square.by_pair.len(), BASELINES_M.len());
+        // No noise was added: nothing remains but what the regularisation holds back.
+        assert!(refinement.chi_square.all < 1.0, "{:?}", refinement.chi_square);
+    }
+}
+
+#[test]
+fn refinement_leaves_a_map_of_a_circle_as_it_is() {
+    let at = geometry(0.0, 0.0, 60.0, 48, &BASELINES_M);
+    let rows = GeneralRows::new(RowsSetup {
+        l_max: L_MAX,
+        wavelength_m: WAVELENGTH_M,
+        moon_radius_m: MOON_RADIUS_M,
+        response: AntennaResponse::Isotropic,
+    });
+    let mut alm = Alm::zeros(L_MAX);
+    for l in 0..=L_MAX {
+        for m in 0..=l {
+            let angle = (l * l + 3 * m) as f64;
+            let im = if m == 0 { 0.0 } else { angle.sin() };
+            *alm.get_mut(l, m) = Complex64::new(angle.cos(), im) * (1e5 / (l as f64 + 1.0));
+        }
+    }
+    let values = rows.forward(&rows.plan(&at).unwrap(), &[alm]).remove(0);
+    let sums = sums(L_MAX, &blocks(&at, &values, 1000));
+    assert_eq!(sums.departures.by_refinement, 0);
+    let watch = SolveWatch::default();
+    let plain = solve_harmonics(&sums.circle, request(NSIDE), None, None, watch.named("test")).unwrap();
+    let rule = RefineRule { passes_max: 2, residual_max: 1e-3 };
+    let (map, refinement) = solve_refined(&sums, request(NSIDE), rule, None, watch.named("test")).unwrap();
+    assert!(refinement.convergence.converged, "{refinement}");
+    let change = difference(&map.map_k, &plain.map_k);
+    eprintln!("{refinement}: changed by {change:.1e}");
+    let by_degree: Vec<String> = (0..=L_MAX)
+        .map(|l| format!("{:.1e}", degree_change(&map.unknowns[0], &plain.unknowns[0], l)))
+        .collect();
+    eprintln!("by degree: {}", by_degree.join(" "));
+    // What the fast sums' own approximations, 1e-3 of an eigenvalue, make of a map: refinement takes them away.
+    assert!(change < 3e-3, "{change:e}");
+    let noise = difference(&map.noise_k, &plain.noise_k);
+    // Noise is strongest where the sums are least exact.
+    assert!(noise < 1e-2, "{noise:e}");
+}
+
+#[test]
+fn maps_do_not_depend_on_the_order_of_arrival_or_on_threads() {
+    let at = geometry(20e3, 0.05, 120.0, 8, &BASELINES_M[..3]);
+    let values: Vec<Complex64> = (0..at.len()).map(|k| Complex64::cis(k as f64) * 1e4).collect();
+    let map = |blocks: &[PlacedVisibilities], threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| refined(&sums(10, blocks), 4, 3))
+    };
+    let in_order = map(&blocks(&at, &values, 40), 1);
+    let mut mixed = blocks(&at, &values, 7);
+    mixed.reverse();
+    mixed.sort_by_key(|block| (block.len() * 31 + block.time_s[0] as usize) % 17);
+    assert_eq!(in_order, map(&mixed, 3));
+}
+
+#[test]
+fn what_has_no_row_or_no_room_is_refused_and_counted() {
+    let at = geometry(20e3, 0.02, 300.0, 2, &BASELINES_M[..1]);
+    let values = vec![Complex64::ONE; at.len()];
+    let mut bad = at.clone();
+    bad[0].r_i_m = [f64::NAN; 3];
+    bad[1].r_i_m = bad[1].r_j_m;
+    bad[2].r_i_m = bad[2].r_i_m.map(|x| 0.8 * x);
+    let mut archive = archive(4, at.len() as u64 - 5);
+    let added: Vec<_> = blocks(&bad, &values, 1000).iter().map(|block| archive.add(block).unwrap()).collect();
+    let refused = |reason: Refusal| added.iter().filter_map(|added| added.refused.get(&reason)).sum::<u64>();
+    assert_eq!(refused(Refusal::Geometry(GeometryRefusal::NotFinite)), 1);
+    assert_eq!(refused(Refusal::Geometry(GeometryRefusal::Degenerate)), 1);
+    assert_eq!(refused(Refusal::Geometry(GeometryRefusal::Altitude)), 1);
+    assert_eq!(refused(Refusal::Full), 2);
+    assert_eq!(archive.counts().visibilities, at.len() as u64 - 5);
+}
+
+/// rho_l of two vectors of unknowns.
+fn rho(found: &[f64], expected: &[f64], l_max: usize, l: usize) -> f64 {
+    let of = |x: &[f64]| lunarray::accumulation::harmonic::coefficients(x, l_max);
+    let (a, b) = (of(found), of(expected));
+    let sum = |a: &Alm, b: &Alm| {
+        (0..=l).map(|m| if m == 0 { 1.0 } else { 2.0 } * (a.get(l, m).conj() * b.get(l, m)).re).sum::<f64>()
+    };
+    sum(&a, &b) / (sum(&a, &a) * sum(&b, &b)).sqrt()
+}
+
+/// The error after each pass at nside 16 and 10 MHz, with the real sky's degrees. Takes long, so only with `LUNARRAY_LONG`.
+#[test]
+fn the_table_of_errors_by_pass_at_nside_16() {
+    const NSIDE: usize = 16;
+    const L_MAX: usize = 40;
+    if std::env::var_os("LUNARRAY_LONG").is_none() {
+        return;
+    }
+    let Some(path) = common::shared("sky/ulsa_10mhz_ecliptic_nside64.fits") else { return };
+    let sky = read_map(&path, &ReadOptions::default()).unwrap().values().to_vec();
+    let sky = analysis(&sky, L_MAX, &AnalysisOptions::default()).unwrap().alm;
+    let baselines_m = [100.0, 230.0, 470.0, 930.0];
+    let rows = GeneralRows::new(RowsSetup {
+        l_max: L_MAX,
+        wavelength_m: WAVELENGTH_M,
+        moon_radius_m: MOON_RADIUS_M,
+        response: AntennaResponse::Isotropic,
+    });
+    for (altitude_m, cross) in [(20e3, 0.02), (20e3, 0.2)] {
+        let at = geometry(altitude_m, cross, 12.0, 16, &baselines_m);
+        let plan = rows.plan(&at).unwrap();
+        let begun = std::time::Instant::now();
+        let values = rows.forward(&plan, std::slice::from_ref(&sky)).remove(0);
+        let forward_s = begun.elapsed().as_secs_f64();
+        let begun = std::time::Instant::now();
+        let _ = rows.adjoint(&plan, &[&values]);
+        let adjoint_s = begun.elapsed().as_secs_f64();
+        // Some rows by themselves.
+        let few: Vec<PairAt> = at.iter().step_by(101).copied().collect();
+        let begun = std::time::Instant::now();
+        let direct = rows.forward(&rows.plan_direct(&few).unwrap(), std::slice::from_ref(&sky)).remove(0);
+        let direct_s = begun.elapsed().as_secs_f64() * 101.0;
+        let parts =
+            |v: &mut dyn Iterator<Item = Complex64>| v.flat_map(|v| [v.re, v.im]).collect::<Vec<f64>>();
+        let fast = parts(&mut values.iter().step_by(101).copied());
+        eprintln!(
+            "+-{} km, {} %: {} visibilities, {} rows; forward {forward_s:.1} s, adjoint {adjoint_s:.1} s, row by row \
+             {direct_s:.0} s; interpolation errs by {:.1e}",
+            altitude_m / 1e3,
+            cross * 100.0,
+            plan.rows(),
+            plan.computed(),
+            difference(&fast, &parts(&mut direct.iter().copied()))
+        );
+        let sums = sums(L_MAX, &blocks(&at, &values, 1000));
+        let watch = SolveWatch::default();
+        let circle = solve_harmonics(&sums.circle, request(NSIDE), None, None, watch.named("test")).unwrap();
+        // As far as it goes.
+        let truth = refined(&sums, NSIDE, 12);
+        eprintln!("{}", truth.1);
+        let exact = &truth.0.unknowns[0];
+        let of_circle: Vec<String> =
+            [4, 12, 24].map(|l| format!("{:.2}", rho(&circle.unknowns[0], exact, L_MAX, l))).to_vec();
+        eprintln!("circle alone: rho_l at 4, 12, 24: {}", of_circle.join(" / "));
+        for passes in [1, 2, 4, 8] {
+            let map = refined(&sums, NSIDE, passes).0;
+            let least =
+                (1..=L_MAX).map(|l| rho(&map.unknowns[0], exact, L_MAX, l)).fold(f64::INFINITY, f64::min);
+            eprintln!("{passes}: {:.1e}, least rho_l {least:.4}", difference(&map.unknowns[0], exact));
+        }
+    }
+}

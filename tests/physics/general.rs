@@ -1,0 +1,283 @@
+//! Rows of B for any positions: against the harmonic model on a circle, against direct sums elsewhere, the fast way against
+//! row by row, and the transpose.
+
+use std::f64::consts::TAU;
+
+use lunarray::frames::AntennaResponse;
+use lunarray::response::general::{GeneralRows, PairAt, RowsSetup};
+use lunarray::response::harmonic::{HarmonicModel, ModelSettings, PairState, PatternGeometry};
+use lunarray::response::pixel::{Directions, PairGeometry, sky_sums};
+use lunarray::sky::harmonics::{Alm, synthesis};
+use lunarray::sky::healpix::{pixel_area_sr, pixel_directions};
+use lunarray::units::Pair;
+use lunarray::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
+use lunarray::units::vector::Vec3;
+use num_complex::Complex64;
+
+const RADIUS_M: f64 = MOON_RADIUS_M + 300e3;
+const WAVELENGTH_M: f64 = 30.0;
+const PERIOD_S: f64 = 8248.68;
+
+struct Random(u64);
+
+impl Random {
+    /// Uniform in -0.5 .. 0.5.
+    fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        (self.0 >> 33) as f64 / (1_u64 << 31) as f64 - 0.5
+    }
+}
+
+/// Random coefficients with `C_l` falling as the diffuse sky's do, and a monopole.
+fn sky(l_max: usize) -> Alm {
+    let mut random = Random(5);
+    let mut alm = Alm::zeros(l_max);
+    for m in 0..=l_max {
+        for l in m..=l_max {
+            let size = 1e5 / (l as f64 + 1.0).powf(1.35);
+            let im = if m == 0 { 0.0 } else { random.next() };
+            *alm.get_mut(l, m) = Complex64::new(random.next() * size, im * size);
+        }
+    }
+    *alm.get_mut(0, 0) = Complex64::new(1e6, 0.0);
+    alm
+}
+
+fn setup(l_max: usize, response: AntennaResponse) -> RowsSetup {
+    RowsSetup { l_max, wavelength_m: WAVELENGTH_M, moon_radius_m: MOON_RADIUS_M, response }
+}
+
+/// Shape of an orbit: altitude +- `altitude_m`, cross-track offsets of `cross` of the baseline, inclination.
+#[derive(Clone, Copy)]
+struct Shape {
+    altitude_m: f64,
+    cross: f64,
+    inclination_deg: f64,
+}
+
+/// A third of each of several orbits of a pair: one trails the other by `baseline_m` and swings out of its plane.
+fn passes(shape: Shape, pair: Pair, baseline_m: f64, step_s: f64, orbits: usize) -> Vec<PairAt> {
+    let axis_m = RADIUS_M;
+    let eccentricity = shape.altitude_m / axis_m;
+    let lag_s = baseline_m / (TAU * axis_m / PERIOD_S);
+    let at = |t_s: f64, node: f64, tilt: f64| -> Vec3 {
+        let mean = TAU * t_s / PERIOD_S;
+        let mut e = mean;
+        for _ in 0..30 {
+            e = mean + eccentricity * e.sin();
+        }
+        let (x, y) = (
+            axis_m * (e.cos() - eccentricity),
+            axis_m * (1.0 - eccentricity * eccentricity).sqrt() * e.sin(),
+        );
+        let (si, ci) = (shape.inclination_deg.to_radians() + tilt).sin_cos();
+        let (so, co) = node.sin_cos();
+        [x * co - y * so * ci, x * so + y * co * ci, y * si]
+    };
+    let tilt = shape.cross * baseline_m / axis_m;
+    let mut all = Vec::new();
+    for orbit in 0..orbits {
+        let node = TAU * (orbit as f64 + 0.3) / orbits as f64;
+        let start_s = PERIOD_S * (13 * orbit) as f64 + 1000.0 * orbit as f64;
+        let mut t_s = start_s;
+        while t_s < start_s + PERIOD_S / 3.0 {
+            let (r_i_m, r_j_m) = (at(t_s, node, tilt), at(t_s - lag_s, node, 0.0));
+            all.push(PairAt { pair, time_s: t_s, r_i_m, r_j_m });
+            t_s += step_s;
+        }
+    }
+    all
+}
+
+fn rms(values: &[Complex64]) -> f64 {
+    (values.iter().map(Complex64::norm_sqr).sum::<f64>() / values.len() as f64).sqrt()
+}
+
+fn difference(a: &[Complex64], b: &[Complex64]) -> f64 {
+    let difference: Vec<_> = a.iter().zip(b).map(|(a, b)| a - b).collect();
+    rms(&difference) / rms(b)
+}
+
+#[test]
+fn on_a_circle_rows_are_those_of_the_harmonic_model() {
+    const L_MAX: usize = 48;
+    let sky = sky(L_MAX);
+    for response in [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal] {
+        let rows = GeneralRows::new(setup(L_MAX, response));
+        let geometry = PatternGeometry {
+            orbit_radius_m: RADIUS_M,
+            moon_radius_m: MOON_RADIUS_M,
+            wavelength_m: WAVELENGTH_M,
+            response,
+        };
+        let inclination_rad = 30_f64.to_radians();
+        let mut model =
+            HarmonicModel::new(sky.clone(), ModelSettings::new(geometry, inclination_rad, 40.0)).unwrap();
+        let mut random = Random(2);
+        let mut states: Vec<PairState> = (0..200)
+            .map(|_| PairState {
+                node_rad: TAU * random.next(),
+                phase_rad: TAU * random.next(),
+                baseline_wavelengths: 3.0 + 36.0 * (random.next() + 0.5),
+                span_rad: 0.0,
+            })
+            .collect();
+        states.sort_by(|a, b| a.phase_rad.total_cmp(&b.phase_rad));
+        let pairs: Vec<PairAt> = states
+            .iter()
+            .enumerate()
+            .map(|(k, state)| {
+                let (so, co) = state.node_rad.sin_cos();
+                let (si, ci) = inclination_rad.sin_cos();
+                let half = (0.5 * state.baseline_wavelengths * WAVELENGTH_M / RADIUS_M).asin();
+                let [r_i_m, r_j_m] = [half, -half].map(|off| {
+                    let (s, c) = (state.phase_rad + off).sin_cos();
+                    [c * co - s * so * ci, c * so + s * co * ci, s * si].map(|v| RADIUS_M * v)
+                });
+                PairAt { pair: Pair { i: 0, j: 1 }, time_s: k as f64, r_i_m, r_j_m }
+            })
+            .collect();
+        let mut expected = vec![Complex64::ZERO; states.len()];
+        model.visibilities(&states, &mut expected).unwrap();
+        let plan = rows.plan_direct(&pairs).unwrap();
+        let found = rows.forward(&plan, std::slice::from_ref(&sky)).remove(0);
+        // The model's own error, 1e-5, of a sum whose larger terms cancel.
+        let error = difference(&found, &expected);
+        assert!(error < 3e-5, "{response:?}: {error:e}");
+    }
+}
+
+#[test]
+fn off_a_circle_rows_are_direct_sums() {
+    const L_MAX: usize = 24;
+    const NSIDE: usize = 256;
+    let sky = sky(L_MAX);
+    let values = synthesis(&sky, NSIDE).unwrap();
+    let directions = Directions::from(pixel_directions(NSIDE).as_slice());
+    let values: Vec<f32> = values.iter().map(|v| *v as f32).collect();
+    for (shape, pair) in [
+        (Shape { altitude_m: 20e3, cross: 0.02, inclination_deg: 30.0 }, Pair { i: 0, j: 1 }),
+        (Shape { altitude_m: 40e3, cross: 0.2, inclination_deg: 85.0 }, Pair { i: 2, j: 5 }),
+        (Shape { altitude_m: 100e3, cross: 1.0, inclination_deg: 0.0 }, Pair { i: 0, j: 1 }),
+    ] {
+        let mut pairs = passes(shape, pair, 400.0, 600.0, 3);
+        // The other way round: the conjugate.
+        let turned: Vec<PairAt> =
+            pairs.iter().map(|at| PairAt { r_i_m: at.r_j_m, r_j_m: at.r_i_m, ..*at }).collect();
+        pairs.extend(turned.into_iter().map(|at| PairAt { pair: Pair { i: 6, j: 7 }, ..at }));
+        let rows = GeneralRows::new(setup(L_MAX, AntennaResponse::Isotropic));
+        let found = rows.forward(&rows.plan_direct(&pairs).unwrap(), std::slice::from_ref(&sky)).remove(0);
+        let geometries: Vec<PairGeometry> = pairs
+            .iter()
+            .map(|at| PairGeometry {
+                r_i_m: at.r_i_m,
+                r_j_m: at.r_j_m,
+                frequency_hz: SPEED_OF_LIGHT_M_S / WAVELENGTH_M,
+                moon_radius_m: MOON_RADIUS_M,
+                response: AntennaResponse::Isotropic,
+            })
+            .collect();
+        let expected: Vec<Complex64> = sky_sums(&geometries, &directions, &values, pixel_area_sr(NSIDE))
+            .unwrap()
+            .iter()
+            .map(|sum| sum.visibility_k_sr)
+            .collect();
+        // Direct sums count pixels on the limb whole: some 800 of 4e-6 sr each miss by a third, at random, 1.2e-4 sr K of a
+        // sky of 3e5 K; visibilities are of the order of 1e4 K sr.
+        let error = difference(&found, &expected);
+        assert!(error < 1e-2, "{} {}: {error:e}", shape.altitude_m, shape.cross);
+        let half = found.len() / 2;
+        let conjugate: Vec<Complex64> = found[half..].iter().map(Complex64::conj).collect();
+        assert!(difference(&found[..half], &conjugate) < 1e-12);
+    }
+}
+
+#[test]
+fn interpolated_rows_are_those_computed_one_by_one() {
+    const L_MAX: usize = 30;
+    let skies = [sky(L_MAX)];
+    let rows = GeneralRows::new(setup(L_MAX, AntennaResponse::Isotropic));
+    for shape in [
+        Shape { altitude_m: 0.0, cross: 0.0, inclination_deg: 30.0 },
+        Shape { altitude_m: 20e3, cross: 0.02, inclination_deg: 30.0 },
+        Shape { altitude_m: 40e3, cross: 0.05, inclination_deg: 30.0 },
+        Shape { altitude_m: 20e3, cross: 0.2, inclination_deg: 30.0 },
+        Shape { altitude_m: 20e3, cross: 0.02, inclination_deg: 0.5 },
+        Shape { altitude_m: 60e3, cross: 0.5, inclination_deg: 150.0 },
+    ] {
+        let mut pairs = Vec::new();
+        for (j, baseline_m) in [(1, 150.0), (2, 940.0)] {
+            pairs.extend(passes(shape, Pair { i: 0, j }, baseline_m, 11.0, 1));
+        }
+        let direct = rows.plan_direct(&pairs).unwrap();
+        let plan = rows.plan(&pairs).unwrap();
+        // Where a pair turns fastest, this data is too sparse to interpolate, and each row is computed.
+        let is_interpolated = plan.computed() * 3 < plan.rows();
+        assert!(is_interpolated || shape.cross > 0.3, "{} of {}", plan.computed(), plan.rows());
+        let expected = rows.forward(&direct, &skies).remove(0);
+        let found = rows.forward(&plan, &skies).remove(0);
+        for (j, pair) in [1, 2].into_iter().enumerate() {
+            let of_pair = pairs.len() / 2 * j..pairs.len() / 2 * (j + 1);
+            let error = difference(&found[of_pair.clone()], &expected[of_pair]);
+            eprintln!(
+                "{} {} {pair}: {error:.1e}, {} of {} rows",
+                shape.altitude_m,
+                shape.cross,
+                plan.computed(),
+                plan.rows()
+            );
+            assert!(error < 1e-4, "{} {} {pair}: {error:e}", shape.altitude_m, shape.cross);
+        }
+    }
+}
+
+#[test]
+fn the_adjoint_is_the_transpose() {
+    const L_MAX: usize = 30;
+    let rows = GeneralRows::new(setup(L_MAX, AntennaResponse::Isotropic));
+    let shape = Shape { altitude_m: 20e3, cross: 0.2, inclination_deg: 30.0 };
+    let mut pairs = passes(shape, Pair { i: 0, j: 1 }, 600.0, 15.0, 3);
+    // A few alone, too sparse for interpolation.
+    pairs.extend(passes(shape, Pair { i: 0, j: 2 }, 300.0, 800.0, 3));
+    let mut random = Random(9);
+    for plan in [rows.plan(&pairs).unwrap(), rows.plan_direct(&pairs).unwrap()] {
+        let mut alm = Alm::zeros(L_MAX);
+        for m in 0..=L_MAX {
+            for l in m..=L_MAX {
+                let im = if m == 0 { 0.0 } else { random.next() };
+                *alm.get_mut(l, m) = Complex64::new(random.next(), im);
+            }
+        }
+        let values: Vec<Complex64> =
+            pairs.iter().map(|_| Complex64::new(random.next(), random.next())).collect();
+        let zeros = vec![Complex64::ZERO; values.len()];
+        let seen = rows.forward(&plan, &[alm.clone(), alm.clone()]);
+        assert_eq!(seen[0], seen[1]);
+        let back = rows.adjoint(&plan, &[&values, &zeros]);
+        assert!(back[1].values().iter().all(|x| x.norm() == 0.0));
+        let of_data: f64 = seen[0].iter().zip(&values).map(|(a, b)| (a.conj() * b).re).sum();
+        let of_sky: f64 =
+            alm.values().iter().zip(back[0].values()).map(|(x, g)| x.re * g.re + x.im * g.im).sum();
+        let size = rms(&seen[0]) * rms(&values) * values.len() as f64;
+        assert!((of_data - of_sky).abs() < 1e-12 * size, "{of_data} {of_sky}");
+    }
+}
+
+#[test]
+fn results_do_not_depend_on_threads() {
+    const L_MAX: usize = 12;
+    let skies = [sky(L_MAX)];
+    let rows = GeneralRows::new(setup(L_MAX, AntennaResponse::Isotropic));
+    let shape = Shape { altitude_m: 20e3, cross: 0.05, inclination_deg: 30.0 };
+    let pairs = passes(shape, Pair { i: 0, j: 1 }, 500.0, 20.0, 12);
+    let plan = rows.plan(&pairs).unwrap();
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let seen = rows.forward(&plan, &skies).remove(0);
+            let back = rows.adjoint(&plan, &[&seen]).remove(0);
+            (seen, back)
+        })
+    };
+    assert_eq!(run(1), run(3));
+}
