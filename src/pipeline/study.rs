@@ -390,10 +390,12 @@ impl Making<'_> {
             let (same, rest): (Vec<usize>, Vec<usize>) =
                 left.iter().partition(|&&k| sums_key(&cases[k].plan.config) == key);
             let state = self.out.join(format!("state-{key:016x}"));
+            // A refined map needs its visibilities, which no state keeps.
+            let is_shared = same.len() > 1 && !cases[first].plan.config.map.refine.is_on();
             for (number, &k) in same.iter().enumerate() {
                 // The state has taken the file in once its first case is made.
-                let files = if number == 0 { &[file.to_owned()][..] } else { &[] };
-                if !self.map(k, files, (same.len() > 1).then_some(state.as_path()), &skies, &mut last)? {
+                let files = if number == 0 || !is_shared { &[file.to_owned()][..] } else { &[] };
+                if !self.map(k, files, is_shared.then_some(state.as_path()), &skies, &mut last)? {
                     return Ok(false);
                 }
             }
