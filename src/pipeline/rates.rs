@@ -17,7 +17,8 @@ pub(super) const CHOLESKY_MULTIPLY_ADDS_PER_S: f64 = 0.5 * RANK_K_MULTIPLY_ADDS_
 /// Visibilities that the harmonic engine adds in a second, at any degree (bench `harmonic`).
 pub(super) const HARMONIC_VISIBILITIES_PER_S: f64 = 4e5;
 
-/// Visibilities whose true rows are multiplied in a second, forth or back, two skies together (`tests/maps/refined.rs`).
+/// Visibilities whose true rows are multiplied in a second, forth or back, two skies together: a guess for an optimised build, from
+/// 700 a second in one that was not (nside 16, `tests/maps/refined.rs`).
 pub(super) const ROWS_PER_S: f64 = 1e4;
 
 /// Multiply-adds of Fourier transforms of lines of 300 to 900 points in a second (bench `harmonic`: products with

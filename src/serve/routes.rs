@@ -41,7 +41,7 @@ const PALETTE_STEPS: u32 = 256;
 #[derive(Clone)]
 pub(super) struct Desk {
     pub(super) console: Arc<Console>,
-    /// The newest status in JSON; an empty one is a call to end.
+    /// The newest status in JSON; empty before the first.
     pub(super) news: watch::Receiver<Arc<str>>,
     /// Where the server listens.
     pub(super) own: SocketAddr,

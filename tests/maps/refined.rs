@@ -150,7 +150,9 @@ fn read(path: &Path) -> Vec<f64> {
 #[test]
 fn refined_maps_are_the_dense_solution_of_other_code() {
     let Some(python) = common::python() else { return };
-    for (altitude_m, cross) in [(20e3, 0.02), (20e3, 0.2)] {
+    // Few passes where planes hardly turn, more where the baseline swings by 11 deg; the rows' own error is 4e-7.
+    for (cross, passes, error_max) in [(0.02, [1, 4, 8], 1e-5), (0.2, [2, 8, 14], 2e-3)] {
+        let altitude_m = 20e3;
         let at = geometry(altitude_m, cross, 130.0, 9, &BASELINES_M);
         let nothing = vec![Complex64::ZERO; at.len()];
         let w_max = refined(&sums(L_MAX, &blocks(&at, &nothing, 50)), NSIDE, 1).0.diagnostics.w_max;
@@ -199,14 +201,13 @@ fn refined_maps_are_the_dense_solution_of_other_code() {
             solve_harmonics(&sums.circle, request(NSIDE), None, None, SolveWatch::default().named("test"))
                 .unwrap();
         let first = difference(&circle.unknowns[0][1..], &dense[1..]);
-        let found = [1, 2, 4, 8].map(|passes| refined(&sums, NSIDE, passes));
+        let found = passes.map(|passes| refined(&sums, NSIDE, passes));
         let errors = found.each_ref().map(|found| difference(&found.0.unknowns[0], &dense));
         let shown = errors.map(|error| format!("{error:.1e}")).join(" ");
-        eprintln!("circle {first:.2}; 1, 2, 4, 8 passes {shown}");
-        // Four passes leave some per cent at most, eight a thousandth.
-        assert!(errors[2] < 5e-2 && errors[3] < 2e-3, "{errors:?}");
-        assert!(first > 0.1 && errors[3] < 0.01 * first, "{first} {errors:?}");
-        let refinement = &found[3].1;
+        eprintln!("circle {first:.2}; after {passes:?} passes {shown}");
+        assert!(errors[2] < error_max && errors[2] < errors[1] && errors[1] < errors[0], "{errors:?}");
+        assert!(first > 0.1 && errors[2] < 0.01 * first, "{first} {errors:?}");
+        let refinement = &found[2].1;
         assert_eq!(refinement.chi_square.by_pair.len(), BASELINES_M.len());
         // No noise was added: nothing remains but what the regularisation holds back.
         assert!(refinement.chi_square.all < 1.0, "{:?}", refinement.chi_square);

@@ -149,8 +149,8 @@ mod tests {
                     let sum: Complex64 =
                         rule.abscissae.iter().zip(&rule.weights).map(|(t, w)| w * value(*t)).sum();
                     let expected = (arc[1] - arc[0]) * sum;
-                    // Both are good to some hundred roundings of numbers of order one.
-                    assert!((found - expected).norm() < 1e-12, "{x} {arc:?} {mu}: {found} {expected}");
+                    // Roundings of numbers of order one, which the recurrence multiplies by up to some thousand about |mu| = x.
+                    assert!((found - expected).norm() < 1e-11, "{x} {arc:?} {mu}: {found} {expected}");
                 }
             }
         }
