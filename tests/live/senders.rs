@@ -163,7 +163,8 @@ fn beyond_the_limit_a_connection_that_delivers_stays() {
 /// and connects again. Meanwhile a good sender sends a downlink; returns the ground's summary.
 fn besieged(place: &Place, name: &str, from: &[&str], replayed: &[Vec<u8>]) -> Value {
     let set = ["--set", "downlink.listen.connections_max=4", "--set", "downlink.listen.bytes_per_s_max=0"];
-    let ground = place.ground(name, &set);
+    // It is ended by a signal, and however busy the machine, the maps are made.
+    let ground = place.ground(name, &[&set[..], &["--set", "runtime.grace_s=100000"]].concat());
     let over = AtomicBool::new(false);
     std::thread::scope(|scope| {
         let (ground, over) = (&ground, &over);
