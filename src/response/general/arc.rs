@@ -32,13 +32,17 @@ pub(super) struct ArcSolver {
 /// Rules come in steps of this many points.
 const RULE_STEP: usize = 16;
 
+/// A phase `x sin(psi)` over much of a ring needs more points than a straight one of the same slope: without them `I_0` errs by
+/// 3e-7 at x = 140.
+const MORE_POINTS: f64 = 1.4;
+
 /// Additional orders over which the error of the far end decays.
 const FAR_MARGIN: usize = 40;
 
 impl ArcSolver {
     /// A solver for 0 <= x <= `x_max`.
     pub(super) fn new(x_max: f64) -> Self {
-        let points = GaussLegendre::points_for(std::f64::consts::PI * x_max);
+        let points = GaussLegendre::points_for(MORE_POINTS * std::f64::consts::PI * x_max);
         let rules = (0..=points / RULE_STEP + 1).map(|k| GaussLegendre::new(RULE_STEP * k.max(1))).collect();
         Self { rules: Arc::new(rules), ratio: Vec::new(), values: Vec::new() }
     }
@@ -62,7 +66,7 @@ impl ArcSolver {
 
     /// `I_0` and `I_1` by quadrature.
     fn start(&self, x: f64, [low, high]: [f64; 2]) -> [Complex64; 2] {
-        let points = GaussLegendre::points_for(0.5 * (high - low) * x);
+        let points = GaussLegendre::points_for(MORE_POINTS * 0.5 * (high - low) * x);
         let rule = &self.rules[points.div_ceil(RULE_STEP).min(self.rules.len() - 1)];
         let mut sums = [Complex64::ZERO; 2];
         for (t, w) in rule.abscissae.iter().zip(&rule.weights) {
