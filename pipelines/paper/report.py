@@ -52,7 +52,7 @@ def maps():
              f"{channel['noise_rms_k']:.2e}", f"{summary['report']['elapsed_s'] / 60:.1f}"]
         )
     if not rows:
-        return missing("lunarray run pipelines/paper-10mhz.toml")
+        return "Their numbers are in the README, measured with earlier versions.\n"
     head = ["MHz", "visibilities", *[f"rho_{l}" for l in (8, 16, 32, 64, 96, 128)], "noise, K rms", "minutes"]
     return table(head, rows) + (
         "\nrho_l with the noise's power subtracted. The paper: near 1 for 18 < l < 130 at 10 MHz, falling below l = 18, and the "
@@ -76,9 +76,13 @@ def traces():
         ])
     text = table(["epsilon", "Tr Sigma_n, K²", "Tr Sigma_s", "T Tr Sigma_s, K", "T² Tr Sigma_s, K²"], rows)
     for crossing in study["crossings"]:
+        where = [
+            "nowhere in this range" if crossing[key] is None else f"at epsilon {crossing[key]:.2e}"
+            for key in ("epsilon", "epsilon_first_power")
+        ]
         text += (
-            f"\nTr Sigma_n = T² Tr Sigma_s at epsilon {show(crossing['epsilon'])}; the number of K² equals that of K in "
-            f"T Tr Sigma_s at {show(crossing['epsilon_first_power'])}. The paper: about 2e-3 for its data set.\n"
+            f"\nTr Sigma_n = T² Tr Sigma_s {where[0]}, T the mean of the input; the number of K² equals that of K in "
+            f"T Tr Sigma_s {where[1]}. The paper: they cross at about 2e-3 for its data set.\n"
         )
     return text
 
@@ -125,7 +129,8 @@ def sensitivity():
         jansky = 5 * 2 * BOLTZMANN * noise * (frequency / LIGHT) ** 2 * beam / 1e-26
         rows.append([f"{frequency / 1e6:g}", f"{channel['visibilities']:,}", show(noise), show(jansky)])
     return table(["MHz", "visibilities", "noise, K rms", "5 sigma, Jy a pixel"], rows) + (
-        "\nThe paper: flat above 5 MHz, improving quickly below, as absorption suppresses the sky there.\n"
+        "\nThe paper: flat above 5 MHz, improving quickly below, as absorption suppresses the sky there. Here the beam is a pixel of "
+        "nside 16 at every frequency, not that of the post-processed map.\n"
     )
 
 
@@ -137,7 +142,8 @@ def main():
         ("Fig. 11: a prior of 5 degrees", "`lunarray study pipelines/paper/fig11-prior.toml`",
          correlation("fig11-prior", "rho", (2, 4, 8, 12, 16, 32, 64, 128), "case",
                      "The paper: a prior cures the poles, which the shortest baseline leaves open below l = 18.")),
-        ("Fig. 15: traces against epsilon", "`lunarray study pipelines/paper/fig15-traces.toml`", traces()),
+        ("Fig. 15: traces against epsilon", "`lunarray study pipelines/paper/fig15-traces.toml`",
+         traces() + "\n![rho, SNR, power and traces against epsilon](paper-fig15.png)\n"),
         ("Fig. 16: rows at centres and averaged, rho_l without noise",
          "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("rho", "no noise", "The paper: rows at centres are well below 1 from b_p on; averaged rows are not, and "
