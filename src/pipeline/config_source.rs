@@ -321,7 +321,7 @@ mod tests {
         assert_eq!(config.spacecraft.every_nth_integration.values(), [4, 1]);
         assert_eq!(notes.len(), 2, "{notes:?}");
         assert!(
-            notes.iter().any(|note| note.starts_with("map.epsilon = [1e-6, 0.0001]: as for")),
+            notes.iter().any(|note| note.starts_with("map.epsilon = [0.000001, 0.0001]: as for")),
             "{notes:?}"
         );
         // What is set is as it was set, also if it is wrong.

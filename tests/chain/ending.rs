@@ -119,9 +119,10 @@ fn while_it_sets_up_a_signal_ends_it_at_once() {
     let (status, took) = end(&mut child);
     assert_eq!(status.signal(), Some(SIGINT), "{status:?}");
     assert!(took < SOON, "{took:?}");
-    // No file but the lock, which nobody holds.
+    // No file but its settings, and the lock, which nobody holds.
     assert_eq!(hidden(Path::new(&out)), [Path::new(&out).join(".lock")]);
-    assert_eq!(std::fs::read_dir(&out).unwrap().count(), 1);
+    assert!(Path::new(&out).join("pipeline.toml").exists());
+    assert_eq!(std::fs::read_dir(&out).unwrap().count(), 2);
 }
 
 #[test]
