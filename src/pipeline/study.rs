@@ -390,8 +390,9 @@ impl Making<'_> {
             let (same, rest): (Vec<usize>, Vec<usize>) =
                 left.iter().partition(|&&k| sums_key(&cases[k].plan.config) == key);
             let state = self.out.join(format!("state-{key:016x}"));
-            // A refined map needs its visibilities, which no state keeps.
-            let is_shared = same.len() > 1 && !cases[first].plan.config.map.refine.is_on();
+            // A refined map needs its visibilities, which no state keeps; snapshots need the data to arrive.
+            let map = &cases[first].plan.config.map;
+            let is_shared = same.len() > 1 && !map.refine.is_on() && map.snapshot_every_s == 0.0;
             for (number, &k) in same.iter().enumerate() {
                 // The state has taken the file in once its first case is made.
                 let files = if number == 0 || !is_shared { &[file.to_owned()][..] } else { &[] };

@@ -308,7 +308,13 @@ pub fn draw_runs(title: &str, runs: &[&RunFigures]) -> Result<Picture, PictureEr
         plots.push(Plot { title: "No input to compare with, and no traces".to_owned(), ..Plot::default() });
     }
     let columns = plots.len().min(2);
-    draw_plots(title, &plots, columns)
+    let more = channels.len() > DRAWN_MAX;
+    let title = if more {
+        format!("{title} (the first {DRAWN_MAX} of {})", channels.len())
+    } else {
+        title.to_owned()
+    };
+    draw_plots(title.trim_start(), &plots, columns)
 }
 
 /// The traces against epsilon, if there are at least two.

@@ -101,7 +101,7 @@ impl From<AccumulationError> for SolveError {
 /// Solves for the map and the noise-only map with the rows of the true positions.
 ///
 /// # Errors
-/// No data, or a prior whose size is not a map's.
+/// No data, or a prior whose size is not a map's; [`SolveError::Interrupted`] before the first pass is done.
 pub fn solve_refined(
     sums: &RefinedSums,
     request: HarmonicRequest,
@@ -129,6 +129,9 @@ pub fn solve_refined(
     let right = problem.adjoint(&[&weighted, &noise]);
     drop((weighted, noise));
     let [map, noise] = problem.solve(right, data, rule, watch);
+    if map.residuals.is_empty() && map.is_open() {
+        return Err(SolveError::Interrupted);
+    }
     let area_sr = pixel_area_sr(request.nside);
     let synthesised = |x: &[f64]| synthesis(&coefficients(x, l_max), request.nside).map_err(SolveError::from);
     let mut whole = map.x.clone();

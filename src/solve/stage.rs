@@ -125,8 +125,11 @@ impl Stage for Solver {
             SnapshotSums::Refined(archive) => {
                 let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes: 0 };
                 let sums = archive.into_sums()?;
-                let (solved, found) =
-                    solve_refined(&sums, request, self.setup.refine, prior.as_deref(), watch)?;
+                let rule = self.setup.refine;
+                let (solved, found) = match solve_refined(&sums, request, rule, prior.as_deref(), watch) {
+                    Err(SolveError::Interrupted) => return Ok(()),
+                    solved => solved?,
+                };
                 refinement = Some(found);
                 (solved.map_k, solved.noise_k, solved.diagnostics)
             }

@@ -103,6 +103,21 @@ fn a_study_gives_the_maps_of_separate_runs() {
 }
 
 #[test]
+fn every_case_has_its_snapshots() {
+    let place = Workplace::new(SMALL);
+    let text = "pipeline = \"pipeline.toml\"\nset = [\"map.snapshot_every_s=1.5e7\"]\n\
+                [[axis]]\nkey = \"map.epsilon\"\nvalues = [1e-4, 1e-2]\n";
+    let (study, out) = (place.file("study.toml", text.as_bytes()), place.path("study"));
+    succeed(&["study", &study, "--out", &out]);
+    let snapshots = |case: &str| -> usize {
+        let summary: Value = serde_json::from_slice(&bytes(format!("{out}/{case}/summary.json"))).unwrap();
+        summary["channels"][0]["snapshots"].as_array().unwrap().len()
+    };
+    // In 4.1e7 s: after 1.5e7 and 3e7, and the final map.
+    assert_eq!(["case-epsilon-0.0001", "case-epsilon-0.01"].map(snapshots), [3, 3]);
+}
+
+#[test]
 fn studies_that_cannot_be_made_say_why() {
     let place = Workplace::new(SMALL);
     for (text, part) in [

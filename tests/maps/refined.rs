@@ -6,18 +6,20 @@ use std::f64::consts::TAU;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
+use std::time::Duration;
 
 use lunarray::accumulation::Refusal;
 use lunarray::accumulation::harmonic::{RefinedSetup, RefinedSums, VisibilityArchive};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
 use lunarray::response::general::{GeneralRows, PairAt, RowsSetup};
 use lunarray::response::harmonic::{GeometryLimits, GeometryRefusal};
+use lunarray::runtime::Cancel;
 use lunarray::sky::fits::{ReadOptions, read_map};
 use lunarray::sky::harmonics::{Alm, AnalysisOptions, analysis};
 use lunarray::sky::healpix::pixel_area_sr;
 use lunarray::solve::{
-    HarmonicRequest, HarmonicSolution, RefineRule, Refinement, SolveWatch, StoppingRule, solve_harmonics,
-    solve_refined,
+    HarmonicRequest, HarmonicSolution, RefineRule, Refinement, SolveError, SolveWatch, StoppingRule,
+    solve_harmonics, solve_refined,
 };
 use lunarray::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
 use lunarray::units::vector::Vec3;
@@ -286,6 +288,20 @@ fn what_has_no_row_or_no_room_is_refused_and_counted() {
 }
 
 /// rho_l of two vectors of unknowns.
+/// Before its first pass a map is nothing.
+#[test]
+fn interrupted_before_its_first_pass_there_is_no_map() {
+    let at = geometry(20e3, 0.02, 300.0, 2, &BASELINES_M[..1]);
+    let sums = sums(4, &blocks(&at, &vec![Complex64::ONE; at.len()], 1000));
+    let cancel = Cancel::new();
+    let watch = SolveWatch::new(cancel.clone()).within(Duration::ZERO);
+    let rule = RefineRule { passes_max: 2, residual_max: 1e-9 };
+    assert!(solve_refined(&sums, request(2), rule, None, watch.named("test")).is_ok());
+    cancel.cancel();
+    let found = solve_refined(&sums, request(2), rule, None, watch.named("test"));
+    assert!(matches!(found, Err(SolveError::Interrupted)));
+}
+
 fn rho(found: &[f64], expected: &[f64], l_max: usize, l: usize) -> f64 {
     let of = |x: &[f64]| lunarray::accumulation::harmonic::coefficients(x, l_max);
     let (a, b) = (of(found), of(expected));
