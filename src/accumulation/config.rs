@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::harmonic::L_MAX;
+use super::{AccumulationError, PixelEngine};
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
@@ -280,6 +281,25 @@ impl MapConfig {
     pub fn baseline_m_max(&self, frequency_hz: f64) -> f64 {
         let pixel_rad = pixel_area_sr(self.nside).sqrt();
         self.baseline_bp_max * SPEED_OF_LIGHT_M_S / frequency_hz / pixel_rad
+    }
+
+    /// Requires that the sums of `channels` channels with data take at most `limit_bytes`. Those of the harmonic engine grow
+    /// with the data, so nothing is known of them beforehand.
+    ///
+    /// # Errors
+    /// [`AccumulationError::Memory`].
+    pub fn require_memory(&self, channels: usize, limit_bytes: Option<u64>) -> Result<(), AccumulationError> {
+        let each = match self.engine {
+            EngineKind::Pixel => PixelEngine::memory_bytes(self.nside),
+            EngineKind::Harmonic => 0,
+        };
+        let needed_bytes = each.saturating_mul(channels as u64);
+        match limit_bytes {
+            Some(limit_bytes) if needed_bytes > limit_bytes => {
+                Err(AccumulationError::Memory { channels, needed_bytes, limit_bytes })
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Settings by channel that do not match an instrument of `channels` channels.

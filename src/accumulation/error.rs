@@ -40,6 +40,20 @@ pub enum AccumulationError {
     /// Settings by channel do not match the instrument.
     #[error("the downlink's channels: {0}")]
     Misfit(#[from] InvalidValue),
+    /// The sums of an instrument take more memory than there is.
+    #[error(
+        "the downlink describes {channels} channels, whose sums take at least {:.1} GB: expected at most {:.1} GB; lower \
+         map.nside, or state another limit, as in --memory-max {}GB",
+        *needed_bytes as f64 / 1e9, *limit_bytes as f64 / 1e9, needed_bytes.div_ceil(1_000_000_000)
+    )]
+    Memory {
+        /// Channels of the instrument.
+        channels: usize,
+        /// Estimated need, bytes.
+        needed_bytes: u64,
+        /// The limit, bytes.
+        limit_bytes: u64,
+    },
     /// Engines of different setups.
     #[error("engines of different {what} cannot be merged")]
     Mismatch {

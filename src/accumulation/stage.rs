@@ -135,6 +135,7 @@ pub struct Accumulator {
     next_snapshot_s: Option<f64>,
     accumulated: u64,
     cancel: Cancel,
+    memory_max_bytes: Option<u64>,
 }
 
 impl Accumulator {
@@ -149,7 +150,14 @@ impl Accumulator {
             next_snapshot_s: None,
             accumulated: 0,
             cancel: Cancel::new(),
+            memory_max_bytes: None,
         }
+    }
+
+    /// Refuses instruments whose sums would take more memory, bytes.
+    #[must_use]
+    pub fn within_memory(self, memory_max_bytes: Option<u64>) -> Self {
+        Self { memory_max_bytes, ..self }
     }
 
     /// Once `cancel` is triggered, only final sums are emitted.
@@ -286,6 +294,7 @@ impl Accumulator {
         if let Some(misfit) = self.config.misfits(channels).into_iter().next() {
             return Err(misfit.into());
         }
+        self.config.require_memory(channels, self.memory_max_bytes)?;
         self.channels = (0..channels).map(|_| None).collect();
         self.instrument = Some(Arc::new(instrument));
         Ok(())

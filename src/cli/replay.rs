@@ -6,7 +6,7 @@ use std::sync::Arc;
 use clap::{ArgGroup, Args};
 use crossbeam_channel::{Receiver, bounded};
 
-use super::arguments::not_negative_s;
+use super::arguments::{not_negative_s, size_bytes};
 use super::interrupt::Interrupt;
 use super::lines::next_line;
 use super::output::{
@@ -16,9 +16,9 @@ use super::progress::Progress;
 use super::serving::{Page, ServeArgs};
 use crate::downlink::transport::socket::{SocketError, SocketSource, TcpUrl, Until};
 use crate::downlink::{FileSource, Pace, Paced, Steps};
-use crate::ground::{Ground, WAIT_BYTES};
+use crate::ground::{Ground, GroundConfig, WAIT_BYTES};
 use crate::pipeline::{
-    Config, ConfigSource, GroundSource, PipelineError, READ, RunSummary, replay, use_threads,
+    Config, ConfigSource, GroundSource, MemoryLimit, PipelineError, READ, RunSummary, replay, use_threads,
 };
 
 /// Capacity of the hold buffer when listening without a state, bytes.
@@ -83,6 +83,10 @@ pub(super) struct ReplayArgs {
     /// Mission time between snapshot maps: a number with an optional unit s, h or d, such as 7d; 0 for the final map only.
     #[arg(long, value_name = "TIME", value_parser = not_negative_s)]
     snapshot_every: Option<f64>,
+    /// Greatest memory for the sums of all channels, with a unit, such as 8GB or 16GiB; what the machine has available if
+    /// not given.
+    #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
+    memory_max: Option<u64>,
     /// Replace one setting, for example --set map.nside=8; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
@@ -130,7 +134,7 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
         (None, Some(_)) => WAIT_BYTES_LIVE,
         _ => WAIT_BYTES,
     };
-    let settings = config.ground(args.wait_bytes.unwrap_or(wait_bytes));
+    let settings = args.limited(config.ground(args.wait_bytes.unwrap_or(wait_bytes)));
     let ground = match &args.state {
         Some(folder) => Ground::open(folder, &settings, args.checkpoint_every)?,
         None => Ground::new(&settings)?,
@@ -167,6 +171,14 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     completion.after(printed)
 }
 
+impl ReplayArgs {
+    /// With the limit of memory that was given, or the machine's.
+    fn limited(&self, config: GroundConfig) -> GroundConfig {
+        let limit = self.memory_max.or_else(|| MemoryLimit::of_machine().map(|limit| limit.bytes));
+        GroundConfig { memory_max_bytes: limit, ..config }
+    }
+}
+
 /// What a replay is to do, and what may end it.
 struct Session<'a> {
     args: &'a ReplayArgs,
@@ -179,7 +191,7 @@ impl Session<'_> {
     fn hear_senders(&self, url: &TcpUrl, ground: Ground) -> Result<RunSummary, CommandError> {
         let Self { args, config, .. } = self;
         let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
-        let settings = config.ground(0);
+        let settings = args.limited(config.ground(0));
         let until = Until { idle_s: args.idle_s, connections: args.connections };
         let source = SocketSource::bind(&addresses, &config.downlink.listen, until)
             .map_err(|error| match error {

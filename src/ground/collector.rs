@@ -86,6 +86,10 @@ pub struct DeliveredPacket {
 /// lost. Some 100 MB a kind, whatever a forger sends.
 const INTERVALS_MAX: usize = 1 << 20;
 
+/// Most packets of a state: it has a record of some 200 bytes of each, so 3.4 GB, whatever a forger sends. The mission has
+/// one packet for each window, channel and pair: 30 channels over 1.3 years make some four million.
+const PACKETS_MAX: u64 = 1 << 24;
+
 /// Packets that have been decoded, and what they say.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Delivery {
@@ -118,6 +122,9 @@ pub struct Collector {
     sets_aside: bool,
     /// Most intervals of the received set of a kind.
     intervals_max: usize,
+    /// Packets received, of all kinds, and the most of them.
+    packets: u64,
+    packets_max: u64,
     /// New packets for which the received set has no room, and their bytes.
     beyond: [u64; 2],
 }
@@ -136,6 +143,9 @@ impl Collector {
             has_new_positions: false,
             sets_aside: false,
             intervals_max: INTERVALS_MAX,
+            packets: 0,
+            // Nothing but the received set grows with them.
+            packets_max: u64::MAX,
             beyond: [0; 2],
         }
     }
@@ -146,7 +156,14 @@ impl Collector {
         Self { intervals_max, ..self }
     }
 
-    /// Resumes at the beginning of a stream, with packets that were delivered in earlier sessions and their counters.
+    /// Refuses new packets beyond this number.
+    #[must_use]
+    pub fn with_packets(self, packets_max: u64) -> Self {
+        Self { packets_max, ..self }
+    }
+
+    /// Resumes at the beginning of a stream, with packets that were delivered in earlier sessions and their counters. Their
+    /// records are in memory, so the number of packets is limited.
     #[must_use]
     pub fn resume(
         state: CollectorState,
@@ -156,10 +173,10 @@ impl Collector {
         let CollectorState { held, decoder } = state;
         let candidates = headers(&held);
         let decoder = Decoder::resume(decoder, counters);
-        let mut collector = Self { held, decoder, candidates, ..Self::new(0) };
+        let mut collector = Self { held, decoder, candidates, packets_max: PACKETS_MAX, ..Self::new(0) };
         let waiting = collector.candidates.iter().map(|header| (header.kind, (header.time, header.count)));
         for (kind, (time, count)) in delivered.chain(waiting) {
-            collector.received[kind.index()].insert(count, time);
+            collector.packets += u64::from(collector.received[kind.index()].insert(count, time));
         }
         collector
     }
@@ -255,6 +272,7 @@ impl Collector {
     pub fn remove_held(&mut self, header: &PacketHeader) -> Option<HeldPacket> {
         let removed = self.held.remove(header)?;
         self.received[header.kind.index()].remove(header.count, header.time);
+        self.packets = self.packets.saturating_sub(1);
         Some(removed)
     }
 
@@ -383,8 +401,13 @@ impl Collector {
             return Err(DownlinkError::OtherInstrument { offset });
         }
         let received = &mut self.received[header.kind.index()];
-        match received.insert_within(header.count, header.time, self.intervals_max) {
-            PacketInsertion::New => {}
+        let insertion = match self.packets < self.packets_max || received.contains(header.count, header.time)
+        {
+            true => received.insert_within(header.count, header.time, self.intervals_max),
+            false => PacketInsertion::Full,
+        };
+        match insertion {
+            PacketInsertion::New => self.packets += 1,
             PacketInsertion::Known => {
                 self.link.accept(&Event::Duplicate { offset, header });
                 return Ok(Handled::Event);

@@ -23,17 +23,23 @@ pub struct GroundConfig {
     pub map: MapConfig,
     /// Bytes of visibilities that may wait for their positions. An archive keeps the value that it was made with.
     pub wait_bytes: u64,
+    /// Most memory for the sums, bytes, as far as it is known beforehand; `None` for no limit.
+    pub memory_max_bytes: Option<u64>,
 }
 
 impl GroundConfig {
     /// Whether maps can be made of an instrument, as far as its description says.
     ///
     /// # Errors
-    /// Calibration that was not made for it; settings of the map that do not fit it, or too many channels.
+    /// Calibration that was not made for it; settings of the map that do not fit it; too many channels, or too
+    /// little memory for them.
     pub fn fits(&self, instrument: &Instrument) -> Result<(), GroundError> {
         let described = self.calibration.build(Path::new(""))?.describe(instrument)?;
-        let misfit = self.map.misfits(described.channels.len()).into_iter().next();
-        misfit.map_or(Ok(()), |misfit| Err(AccumulationError::from(misfit).into()))
+        let channels = described.channels.len();
+        if let Some(misfit) = self.map.misfits(channels).into_iter().next() {
+            return Err(AccumulationError::from(misfit).into());
+        }
+        Ok(self.map.require_memory(channels, self.memory_max_bytes)?)
     }
 
     /// A calibrator without data, posting to `ledger`.
@@ -50,6 +56,6 @@ impl GroundConfig {
 
     /// An accumulator without data, posting to `ledger`.
     pub(super) fn accumulator(&self, ledger: &Ledger<VisibilityReason>) -> Accumulator {
-        Accumulator::new(self.map.clone(), ledger.clone())
+        Accumulator::new(self.map.clone(), ledger.clone()).within_memory(self.memory_max_bytes)
     }
 }

@@ -21,7 +21,8 @@ impl Config {
     /// Configuration of the ground, with a hold buffer of `wait_bytes`.
     #[must_use]
     pub fn ground(&self, wait_bytes: u64) -> GroundConfig {
-        GroundConfig { calibration: self.calibration.clone(), map: self.map.clone(), wait_bytes }
+        let (calibration, map) = (self.calibration.clone(), self.map.clone());
+        GroundConfig { calibration, map, wait_bytes, memory_max_bytes: None }
     }
 }
 

@@ -378,7 +378,8 @@ fn a_slow_link_and_a_small_store_lose_what_the_policy_says() {
 /// What a whole ground makes of what arrived: its ledger, and whether it claims to be complete.
 fn ground_of(arrived: &[u8]) -> (LedgerReport<VisibilityReason>, Completeness) {
     let map = MapConfig { nside: 1, baseline_bp_max: 1e6, weight_max: 1e3, ..MapConfig::default() };
-    let config = GroundConfig { calibration: CalibrationConfig::default(), map, wait_bytes: 1 << 24 };
+    let (calibration, wait_bytes) = (CalibrationConfig::default(), 1 << 24);
+    let config = GroundConfig { calibration, map, wait_bytes, memory_max_bytes: None };
     let mut ground = Ground::new(&config).unwrap();
     let outcome = ground.outcome();
     let mut maps = Outlet::collect();
@@ -465,18 +466,34 @@ fn a_mission_of_which_every_pass_is_cut_short_still_tells_what_is_missing() {
     assert!(exact >= 5, "{exact}");
 }
 
+/// A sound packet of visibilities with no payload.
+fn forged(count: u64, s: u64) -> Vec<u8> {
+    let (kind, segment, version) = (Kind::Visibilities, PacketSegment::Whole, FORMAT_VERSION);
+    let header =
+        PacketHeader { kind, segment, count, time: CucTime(s << 24), version, bytes: HEADER_BYTES + 4 };
+    let mut packet = header.to_bytes().to_vec();
+    let check = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc32Iscsi, &packet) as u32;
+    packet.extend(check.to_be_bytes());
+    packet
+}
+
+/// Packets of one time and consecutive counts are one interval, but a state has a record of each.
+#[test]
+fn forged_packets_of_one_time_are_refused_beyond_a_number() {
+    const ROOM: u64 = 100;
+    let mut collector = Collector::new(1 << 20).with_packets(ROOM);
+    let all: Vec<u8> = (0..3 * ROOM).flat_map(|k| forged(k, 5)).collect();
+    for [beyond, duplicates] in [[2 * ROOM, 0], [4 * ROOM, ROOM]] {
+        collector.push(&all);
+        while collector.next_delivery(&|_| true).unwrap().is_some() {}
+        let counters = collector.counters();
+        assert_eq!([counters.packets_beyond, counters.visibilities.duplicates], [beyond, duplicates]);
+        assert_eq!(collector.received().map(|(_, set)| set.len()).sum::<u64>(), ROOM);
+    }
+}
+
 #[test]
 fn forged_packet_times_fill_a_bounded_set_and_are_then_refused() {
-    /// A sound packet of visibilities with no payload.
-    fn forged(count: u64, s: u64) -> Vec<u8> {
-        let (kind, segment, version) = (Kind::Visibilities, PacketSegment::Whole, FORMAT_VERSION);
-        let header =
-            PacketHeader { kind, segment, count, time: CucTime(s << 24), version, bytes: HEADER_BYTES + 4 };
-        let mut packet = header.to_bytes().to_vec();
-        let check = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc32Iscsi, &packet) as u32;
-        packet.extend(check.to_be_bytes());
-        packet
-    }
     const ROOM: usize = 100;
     let mut collector = Collector::new(1 << 20).with_intervals(ROOM);
     let mut push = |packets: Vec<u8>| {

@@ -103,7 +103,8 @@ impl Mission {
         assert_eq!(window, of_frames.into_iter().flatten().max().unwrap() + 1);
         assert!(packets.len() <= 64);
         let map = MapConfig { nside: 2, ..MapConfig::default() };
-        let config = GroundConfig { calibration: CalibrationConfig::default(), map, wait_bytes: 1 << 20 };
+        let (calibration, wait_bytes) = (CalibrationConfig::default(), 1 << 20);
+        let config = GroundConfig { calibration, map, wait_bytes, memory_max_bytes: None };
         Self { config, packets, headers, windows }
     }
 

@@ -13,7 +13,7 @@ use crate::files::is_at;
 use crate::runtime::{Flow, Outlet, Source, Units};
 
 /// Bytes read from a file at a time.
-const READ_BYTES: usize = 1 << 18;
+const READ_BYTES: usize = 1 << 16;
 
 /// Interval at which a followed file is checked for growth.
 const POLL: Duration = Duration::from_millis(100);

@@ -19,18 +19,15 @@ use std::sync::Arc;
 
 use num_complex::Complex64;
 
-use crate::response::harmonic::quadrature::GaussLegendre;
+use crate::response::harmonic::quadrature::{GaussLegendre, Rules};
 
 /// Quadrature rules for `I_0` and `I_1`, and buffers for one ring.
 #[derive(Clone, Debug)]
 pub(super) struct ArcSolver {
-    rules: Arc<Vec<GaussLegendre>>,
+    rules: Arc<Rules>,
     ratio: Vec<f64>,
     values: Vec<Complex64>,
 }
-
-/// Rules come in steps of this many points.
-const RULE_STEP: usize = 16;
 
 /// A phase `x sin(psi)` over much of a ring needs more points than a straight one of the same slope: without them `I_0` errs by
 /// 3e-7 at x = 140.
@@ -43,8 +40,7 @@ impl ArcSolver {
     /// A solver for 0 <= x <= `x_max`.
     pub(super) fn new(x_max: f64) -> Self {
         let points = GaussLegendre::points_for(MORE_POINTS * std::f64::consts::PI * x_max);
-        let rules = (0..=points / RULE_STEP + 1).map(|k| GaussLegendre::new(RULE_STEP * k.max(1))).collect();
-        Self { rules: Arc::new(rules), ratio: Vec::new(), values: Vec::new() }
+        Self { rules: Arc::new(Rules::up_to(points)), ratio: Vec::new(), values: Vec::new() }
     }
 
     /// Writes `I_mu`, mu = -order_max ..= order_max, for `arc = [low, high]`; `out` has room for these `2 order_max + 1`.
@@ -67,7 +63,7 @@ impl ArcSolver {
     /// `I_0` and `I_1` by quadrature.
     fn start(&self, x: f64, [low, high]: [f64; 2]) -> [Complex64; 2] {
         let points = GaussLegendre::points_for(MORE_POINTS * 0.5 * (high - low) * x);
-        let rule = &self.rules[points.div_ceil(RULE_STEP).min(self.rules.len() - 1)];
+        let rule = self.rules.of(points);
         let mut sums = [Complex64::ZERO; 2];
         for (t, w) in rule.abscissae.iter().zip(&rule.weights) {
             let psi = low + (high - low) * t;

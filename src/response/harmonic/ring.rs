@@ -20,27 +20,24 @@
 
 use std::f64::consts::PI;
 
-use super::quadrature::GaussLegendre;
+use super::quadrature::{GaussLegendre, Rules};
 use super::trigonometry::sin_cos;
 
 /// Quadrature rules for `I_0` and `I_1`, and buffers for one ring.
 #[derive(Clone, Debug)]
 pub(crate) struct RingSolver {
-    rules: std::sync::Arc<Vec<GaussLegendre>>,
+    rules: std::sync::Arc<Rules>,
     order_max: usize,
     ratio: Vec<f64>,
     values: Vec<f64>,
 }
 
-/// Rules come in steps of this many points.
-const RULE_STEP: usize = 16;
-
 impl RingSolver {
     /// A solver for |x| <= `x_max`.
     pub(crate) fn new(x_max: f64) -> Self {
         let points = GaussLegendre::points_for(0.5 * PI * x_max.abs());
-        let rules = (0..=points / RULE_STEP + 1).map(|k| GaussLegendre::new(RULE_STEP * k.max(1))).collect();
-        Self { rules: std::sync::Arc::new(rules), order_max: 0, ratio: Vec::new(), values: Vec::new() }
+        let rules = std::sync::Arc::new(Rules::up_to(points));
+        Self { rules, order_max: 0, ratio: Vec::new(), values: Vec::new() }
     }
 
     /// Writes `I_mu`, mu = -order_max ..= order_max, for a ring visible at |psi| <= `edge` <= pi;
@@ -68,7 +65,7 @@ impl RingSolver {
     /// `I_0` and `I_1` by quadrature.
     fn start(&self, x: f64, edge: f64) -> [f64; 2] {
         let points = GaussLegendre::points_for(0.5 * edge * x);
-        let rule = &self.rules[points.div_ceil(RULE_STEP).min(self.rules.len() - 1)];
+        let rule = self.rules.of(points);
         integrate_start(x, edge, &rule.abscissae, &rule.weights)
     }
 
