@@ -334,9 +334,14 @@ fn replay(bytes: &[u8], sent: u64) {
         let bytes = read(&mut graph);
         let map = MapConfig { engine: EngineKind::Harmonic, ..MapConfig::default() };
         let calibration = CalibrationConfig::default();
-        let ground =
-            Ground::new(&GroundConfig { calibration, map, wait_bytes: WAIT_BYTES, memory_max_bytes: None })
-                .unwrap();
+        let ground = Ground::new(&GroundConfig {
+            calibration,
+            map,
+            wait_bytes: WAIT_BYTES,
+            memory_max_bytes: None,
+            group: None,
+        })
+        .unwrap();
         let outcome = ground.outcome();
         let sums = graph.stage("ground", 1, bytes, ground);
         graph.sink("end", sums, End(0, PhantomData));

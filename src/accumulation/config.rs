@@ -1,5 +1,6 @@
 //! Configuration of maps.
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -10,7 +11,7 @@ use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
-use crate::units::{Checks, InvalidValue, PerChannel};
+use crate::units::{ChannelId, Checks, InvalidValue, PerChannel};
 
 /// Greatest nside of the pixel engine: 49152 pixels, 9.7 GB of sums a channel (half of a symmetric matrix, f64).
 pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
@@ -20,6 +21,9 @@ pub const HARMONIC_ENGINE_NSIDE_MAX: usize = 1024;
 
 /// Default number of degrees of a harmonic map per nside: as many as pixels represent to 1e-6.
 const DEGREES_PER_NSIDE: f64 = 2.5;
+
+/// Channels whose sums are in memory at one time.
+pub type ChannelGroup = BTreeSet<ChannelId>;
 
 /// The basis of the normal equations.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -44,6 +48,9 @@ pub struct MapConfig {
     /// Most channels of an instrument. Each takes memory for a map as soon as it has data, so a forged description of
     /// many channels is refused.
     pub channels_max: usize,
+    /// Numbers of the channels that are mapped, from 0; all if empty. Of many channels a machine may have memory for a few
+    /// at a time.
+    pub channels: Vec<u16>,
     /// How the pixel engine computes rows of B.
     pub rows: PixelMethod,
     /// Highest degree of a map from the harmonic engine; 0 for 2.5 nside.
@@ -111,6 +118,7 @@ impl Default for MapConfig {
             nside: 16,
             engine: EngineKind::Pixel,
             channels_max: 64,
+            channels: Vec::new(),
             rows: PixelMethod::Average,
             l_max: 0,
             baseline_bp_max: 2.0,
@@ -245,6 +253,7 @@ impl MapConfig {
             companion_seed,
             limits,
             weight_max,
+            channels: mapped,
             channels_max: _,
             epsilon: _,
             prior_k: _,
@@ -264,6 +273,9 @@ impl MapConfig {
             ("map.companion_seed", companion_seed.to_string()),
             ("map.weight_max", format!("{weight_max:?}")),
         ];
+        if !mapped.is_empty() {
+            settings.push(("map.channels", format!("{mapped:?}")));
+        }
         match engine {
             EngineKind::Pixel => settings.push(("map.rows", format!("{rows:?}"))),
             EngineKind::Harmonic => {
@@ -283,16 +295,30 @@ impl MapConfig {
         self.baseline_bp_max * SPEED_OF_LIGHT_M_S / frequency_hz / pixel_rad
     }
 
-    /// Requires that the sums of `channels` channels with data take at most `limit_bytes`. Those of the harmonic engine grow
-    /// with the data, so nothing is known of them beforehand.
+    /// Whether a channel is mapped.
+    #[must_use]
+    pub fn maps(&self, channel: ChannelId) -> bool {
+        self.channels.is_empty() || self.channels.contains(&channel.0)
+    }
+
+    /// Requires that the sums of the channels of a group, of `channels` in all, take at most `limit_bytes`. Those of the
+    /// harmonic engine grow with the data, so nothing is known of them beforehand.
     ///
     /// # Errors
     /// [`AccumulationError::Memory`].
-    pub fn require_memory(&self, channels: usize, limit_bytes: Option<u64>) -> Result<(), AccumulationError> {
+    pub fn require_memory(
+        &self,
+        channels: usize,
+        limit_bytes: Option<u64>,
+        group: Option<&ChannelGroup>,
+    ) -> Result<(), AccumulationError> {
         let each = match self.engine {
             EngineKind::Pixel => PixelEngine::memory_bytes(self.nside),
             EngineKind::Harmonic => 0,
         };
+        let is_summed =
+            |channel: &ChannelId| self.maps(*channel) && group.is_none_or(|group| group.contains(channel));
+        let channels = (0..channels as u16).map(ChannelId).filter(is_summed).count();
         let needed_bytes = each.saturating_mul(channels as u64);
         match limit_bytes {
             Some(limit_bytes) if needed_bytes > limit_bytes => {
@@ -310,6 +336,10 @@ impl MapConfig {
         let expected =
             format!("at least the {channels} channels of the instrument, each of which needs memory");
         checks.require("channels_max", self.channels_max, channels <= self.channels_max, expected);
+        for (place, &channel) in self.channels.iter().enumerate() {
+            let expected = format!("a channel of the instrument, 0 to {}", channels.saturating_sub(1));
+            checks.require(&format!("channels[{place}]"), channel, usize::from(channel) < channels, expected);
+        }
         for (key, fits, found) in [
             ("epsilon", self.epsilon.fits(channels), self.epsilon.values().len()),
             ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),

@@ -42,8 +42,8 @@ pub enum AccumulationError {
     Misfit(#[from] InvalidValue),
     /// The sums of an instrument take more memory than there is.
     #[error(
-        "the downlink describes {channels} channels, whose sums take at least {:.1} GB: expected at most {:.1} GB; lower \
-         map.nside, or state another limit, as in --memory-max {}GB",
+        "the sums of the downlink's {channels} channels take at least {:.1} GB: expected at most {:.1} GB; lower \
+         map.nside, map some channels at a time (--channels), or state another limit, as in --memory-max {}GB",
         *needed_bytes as f64 / 1e9, *limit_bytes as f64 / 1e9, needed_bytes.div_ceil(1_000_000_000)
     )]
     Memory {

@@ -8,8 +8,8 @@ use super::harmonic::{
     HarmonicEngine, HarmonicSetup, HarmonicSums, RefinedSetup, VisibilityArchive, orbit_of,
 };
 use super::{
-    AccumulationError, Added, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine, PixelSetup,
-    PixelSums, SumCounts, automatic_weight_max,
+    AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine,
+    PixelSetup, PixelSums, SumCounts, automatic_weight_max,
 };
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
 use crate::runtime::{Cancel, Ledger, Outlet, Stage, Units};
@@ -136,6 +136,8 @@ pub struct Accumulator {
     accumulated: u64,
     cancel: Cancel,
     memory_max_bytes: Option<u64>,
+    /// The channels of a group; `None` for all.
+    group: Option<ChannelGroup>,
 }
 
 impl Accumulator {
@@ -151,7 +153,14 @@ impl Accumulator {
             accumulated: 0,
             cancel: Cancel::new(),
             memory_max_bytes: None,
+            group: None,
         }
+    }
+
+    /// Sums the channels of a group alone; `None` for all.
+    #[must_use]
+    pub fn of_group(self, group: Option<ChannelGroup>) -> Self {
+        Self { group, ..self }
     }
 
     /// Refuses instruments whose sums would take more memory, bytes.
@@ -294,7 +303,7 @@ impl Accumulator {
         if let Some(misfit) = self.config.misfits(channels).into_iter().next() {
             return Err(misfit.into());
         }
-        self.config.require_memory(channels, self.memory_max_bytes)?;
+        self.config.require_memory(channels, self.memory_max_bytes, self.group.as_ref())?;
         self.channels = (0..channels).map(|_| None).collect();
         self.instrument = Some(Arc::new(instrument));
         Ok(())
@@ -315,6 +324,11 @@ impl Accumulator {
     }
 
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Option<[f64; 2]>, AccumulationError> {
+        let is_other = self.group.as_ref().is_some_and(|group| !group.contains(&placed.channel));
+        if is_other || !self.config.maps(placed.channel) {
+            self.ledger.left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
+            return Ok(None);
+        }
         let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
         self.ledger.left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - near.len()) as u64);
         if near.is_empty() {

@@ -1,5 +1,6 @@
 //! Arguments that several commands share.
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use clap::Args;
@@ -23,6 +24,9 @@ pub(super) struct PipelineArgs {
     /// Downlink format, in place of the file's: plain space packets, or coded transfer frames (CADUs).
     #[arg(long, value_name = "packets|cadu")]
     format: Option<String>,
+    /// Channels to map, numbered from 0, such as 0-4,7; all if not given. The others are counted as left out.
+    #[arg(long, value_name = "LIST", value_parser = channel_list)]
+    channels: Option<ChannelList>,
     /// Greatest memory that the estimate may come to, with a unit, such as 8GB or 16GiB; what the machine has available
     /// if not given.
     #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
@@ -67,7 +71,8 @@ impl PipelineArgs {
     pub(super) fn source(&self) -> ConfigSource {
         let Self { pipeline, seed, overrides, format, .. } = self;
         let format = format.iter().map(|format| format!("downlink.format={format:?}"));
-        let overrides = overrides.iter().cloned().chain(format).collect();
+        let channels = self.channels.iter().map(ChannelList::setting);
+        let overrides = overrides.iter().cloned().chain(format).chain(channels).collect();
         ConfigSource { file: pipeline.clone(), overrides, seed: *seed }
     }
 
@@ -83,6 +88,31 @@ impl PipelineArgs {
     pub(super) fn memory_limit(&self) -> Option<MemoryLimit> {
         self.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine)
     }
+}
+
+/// Channels to map.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct ChannelList(Vec<u16>);
+
+impl ChannelList {
+    /// As an override of a setting.
+    pub(super) fn setting(&self) -> String {
+        format!("map.channels={:?}", self.0)
+    }
+}
+
+/// Channels from a list of numbers and ranges such as `0-4,7`.
+pub(super) fn channel_list(text: &str) -> Result<ChannelList, String> {
+    const MOST: u16 = 4096;
+    let number = |text: &str| text.trim().parse::<u16>().ok().filter(|&number| number < MOST);
+    let range = |part: &str| match part.split_once('-') {
+        Some((first, last)) => Some(number(first)?..=number(last)?).filter(|range| !range.is_empty()),
+        None => number(part).map(|one| one..=one),
+    };
+    let ranges: Option<Vec<_>> = text.split(',').map(range).collect();
+    let ranges = ranges.ok_or("expected numbers from 0 and ranges of them, such as 0-4,7")?;
+    let channels: BTreeSet<u16> = ranges.into_iter().flatten().collect();
+    Ok(ChannelList(channels.into_iter().collect()))
 }
 
 /// Bytes from a size such as `8GB`, `16GiB` or `500 MB`; a number alone is of bytes.
@@ -133,6 +163,16 @@ pub(super) fn not_negative_s(text: &str) -> Result<f64, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn channels_are_numbers_and_ranges() {
+        let list = |text| channel_list(text).map(|list| list.setting());
+        assert_eq!(list("7, 0-2").unwrap(), "map.channels=[0, 1, 2, 7]");
+        assert_eq!(list("3-3,3").unwrap(), "map.channels=[3]");
+        for text in ["", "a", "2-1", "1-", "-1", "1,,2", "5000", "0-70000", "1..2"] {
+            assert!(list(text).is_err(), "{text}");
+        }
+    }
 
     #[test]
     fn sizes_have_units() {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use clap::{ArgGroup, Args};
 use crossbeam_channel::{Receiver, bounded};
 
-use super::arguments::{not_negative_s, size_bytes};
+use super::arguments::{ChannelList, channel_list, not_negative_s, size_bytes};
 use super::interrupt::Interrupt;
 use super::lines::next_line;
 use super::output::{
@@ -18,7 +18,8 @@ use crate::downlink::transport::socket::{SocketError, SocketSource, TcpUrl, Unti
 use crate::downlink::{FileSource, Pace, Paced, Steps};
 use crate::ground::{Ground, GroundConfig, WAIT_BYTES};
 use crate::pipeline::{
-    Config, ConfigSource, GroundSource, MemoryLimit, PipelineError, READ, RunSummary, replay, use_threads,
+    Config, ConfigSource, GroundSource, GroupSize, MemoryLimit, PipelineError, READ, RunSummary,
+    channel_groups, replay, replay_in_groups, use_threads,
 };
 
 /// Capacity of the hold buffer when listening without a state, bytes.
@@ -83,6 +84,15 @@ pub(super) struct ReplayArgs {
     /// Mission time between snapshot maps: a number with an optional unit s, h or d, such as 7d; 0 for the final map only.
     #[arg(long, value_name = "TIME", value_parser = not_negative_s)]
     snapshot_every: Option<f64>,
+    /// Channels to map, numbered from 0 as `inspect` lists them, such as 0-4,7; all if not given. The others are counted as
+    /// left out.
+    #[arg(long, value_name = "LIST", value_parser = channel_list)]
+    channels: Option<ChannelList>,
+    /// Map the channels in groups and read the files once a group: as many channels at a time as memory allows (auto), or this
+    /// many. Maps and ledger are those of all channels at once.
+    #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, conflicts_with_all = ["live", "pace", "state"])]
+    #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]
+    groups: Option<GroupSize>,
     /// Greatest memory for the sums of all channels, with a unit, such as 8GB or 16GiB; what the machine has available if
     /// not given.
     #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
@@ -123,13 +133,25 @@ fn step(text: &str) -> Result<StepLength, String> {
     }
 }
 
+fn group_size(text: &str) -> Result<GroupSize, String> {
+    match (text.trim(), text.trim().parse()) {
+        ("auto", _) => Ok(GroupSize::Automatic),
+        (_, Ok(channels)) if channels > 0 => Ok(GroupSize::Channels(channels)),
+        _ => Err("expected auto, or a number of channels above 0".into()),
+    }
+}
+
 pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     let mut overrides = args.overrides.clone();
     if let Some(every_s) = args.snapshot_every {
         overrides.push(format!("map.snapshot_every_s={every_s:?}"));
     }
+    overrides.extend(args.channels.iter().map(ChannelList::setting));
     let config = ConfigSource { file: args.map.clone(), overrides, seed: None }.load_ground()?;
     use_threads(&config.runtime)?;
+    if let Some(size) = args.groups {
+        return in_groups(args, &config, size);
+    }
     let wait_bytes = match (&args.state, &args.listen) {
         (None, Some(_)) => WAIT_BYTES_LIVE,
         _ => WAIT_BYTES,
@@ -177,6 +199,35 @@ impl ReplayArgs {
         let limit = self.memory_max.or_else(|| MemoryLimit::of_machine().map(|limit| limit.bytes));
         GroundConfig { memory_max_bytes: limit, ..config }
     }
+}
+
+/// Maps the channels of files in groups.
+fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResult {
+    let limit = args.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine);
+    let groups = channel_groups(&args.files, config, size, limit)?;
+    let interrupt = Interrupt::default();
+    let cancel = interrupt.cancel();
+    let mut progress = None;
+    let summary =
+        replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |number, watched| {
+            if number == 0 {
+                interrupt.arm_or_note();
+            }
+            // The bar of the group before ends first.
+            progress = None;
+            let channels: Vec<String> =
+                groups[number..].iter().take(1).flatten().map(|c| c.to_string()).collect();
+            say(format_args!("group {} of {}: channels {}", number + 1, groups.len(), channels.join(", ")));
+            progress = Some(Progress::watch(watched, READ, 0, cancel));
+        })?;
+    drop(progress);
+    let printed = if args.json {
+        print_json_line(&summary)
+    } else {
+        print_text(&format!("{summary}\nProducts are in {}", args.out.display()))
+    };
+    print_incompleteness(&summary);
+    interrupt.completion(summary.cancelled).after(printed)
 }
 
 /// What a replay is to do, and what may end it.

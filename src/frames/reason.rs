@@ -65,6 +65,29 @@ pub enum VisibilityReason {
     NextSession,
     /// Its flags say that the Earth was in sight of one of its daughters.
     EarthInSight,
+    /// Its channel is not among those that are mapped.
+    ChannelNotMapped,
+}
+
+impl VisibilityReason {
+    /// Whether the sums leave visibilities out for it; calibration and reception do for the others.
+    #[must_use]
+    pub fn is_of_sums(self) -> bool {
+        matches!(
+            self,
+            Self::BaselineBeyondMap
+                | Self::PositionNotFinite
+                | Self::NoDirection
+                | Self::OutOfPlane
+                | Self::OffAltitude
+                | Self::UnequalAltitudes
+                | Self::BaselineBeyondEngine
+                | Self::ValueNotFinite
+                | Self::WeightOutOfRange
+                | Self::SumsFull
+                | Self::ChannelNotMapped
+        )
+    }
 }
 
 impl Reason for VisibilityReason {
@@ -104,6 +127,7 @@ impl Reason for VisibilityReason {
             Self::BadValue => "value or weight that cannot be used, as it was sent",
             Self::NextSession => "left for the next session",
             Self::EarthInSight => "Earth in sight of a daughter",
+            Self::ChannelNotMapped => "channel not among map.channels",
         }
     }
 
@@ -165,7 +189,7 @@ mod tests {
         assert_eq!(texts.len(), all.len());
         // Some of the places, so that none moves unseen.
         assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
-        assert_eq!((all.len(), all[23]), (28, VisibilityReason::NotReceived));
-        assert_eq!(all.last(), Some(&VisibilityReason::EarthInSight));
+        assert_eq!((all.len(), all[23]), (29, VisibilityReason::NotReceived));
+        assert_eq!(all.last(), Some(&VisibilityReason::ChannelNotMapped));
     }
 }

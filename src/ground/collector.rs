@@ -257,6 +257,21 @@ impl Collector {
         require_packets(path, self.bytes(), self.received.iter().map(ReceivedSet::len).sum())
     }
 
+    /// The instrument that a file describes first, read no further than that; `None` if it describes none.
+    ///
+    /// # Errors
+    /// A file that cannot be read.
+    pub fn instrument_of(path: &Path) -> Result<Option<Instrument>, DownlinkError> {
+        let (mut file, mut collector) = (ByteFeed::open(path)?, Self::new(0));
+        while file.feed(&mut collector.intake)? {
+            while collector.next_delivery(&|_| true)?.is_some() {}
+            if let Some(instrument) = collector.instrument() {
+                return Ok(Some(instrument.clone()));
+            }
+        }
+        Ok(None)
+    }
+
     /// Packets received of each kind.
     pub fn received(&self) -> impl Iterator<Item = (Kind, &ReceivedSet)> {
         Kind::ALL.into_iter().map(|kind| (kind, &self.received[kind.index()]))

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::GroundError;
-use crate::accumulation::{AccumulationError, Accumulator, MapConfig};
+use crate::accumulation::{AccumulationError, Accumulator, ChannelGroup, MapConfig};
 use crate::calibration::{CalibrationConfig, CalibrationError, Calibrator};
 use crate::frames::{Instrument, VisibilityReason};
 use crate::runtime::Ledger;
@@ -25,6 +25,8 @@ pub struct GroundConfig {
     pub wait_bytes: u64,
     /// Most memory for the sums, bytes, as far as it is known beforehand; `None` for no limit.
     pub memory_max_bytes: Option<u64>,
+    /// The channels that are summed; `None` for all.
+    pub group: Option<ChannelGroup>,
 }
 
 impl GroundConfig {
@@ -34,12 +36,19 @@ impl GroundConfig {
     /// Calibration that was not made for it; settings of the map that do not fit it; too many channels, or too
     /// little memory for them.
     pub fn fits(&self, instrument: &Instrument) -> Result<(), GroundError> {
-        let described = self.calibration.build(Path::new(""))?.describe(instrument)?;
-        let channels = described.channels.len();
+        let channels = self.described(instrument)?.channels.len();
         if let Some(misfit) = self.map.misfits(channels).into_iter().next() {
             return Err(AccumulationError::from(misfit).into());
         }
-        Ok(self.map.require_memory(channels, self.memory_max_bytes)?)
+        Ok(self.map.require_memory(channels, self.memory_max_bytes, self.group.as_ref())?)
+    }
+
+    /// The instrument as it is after calibration.
+    ///
+    /// # Errors
+    /// Calibration that was not made for it.
+    pub fn described(&self, instrument: &Instrument) -> Result<Instrument, GroundError> {
+        Ok(self.calibration.build(Path::new(""))?.describe(instrument)?)
     }
 
     /// A calibrator without data, posting to `ledger`.
@@ -56,6 +65,8 @@ impl GroundConfig {
 
     /// An accumulator without data, posting to `ledger`.
     pub(super) fn accumulator(&self, ledger: &Ledger<VisibilityReason>) -> Accumulator {
-        Accumulator::new(self.map.clone(), ledger.clone()).within_memory(self.memory_max_bytes)
+        Accumulator::new(self.map.clone(), ledger.clone())
+            .within_memory(self.memory_max_bytes)
+            .of_group(self.group.clone())
     }
 }

@@ -7,12 +7,13 @@ use serde::Serialize;
 use super::engine_cost::EngineCost;
 use super::error::PipelineError;
 use super::memory::MemoryLimit;
-use super::plan::Plan;
+use super::plan::{Expected, Plan};
 use super::rates::{FRINGES_PER_S, SAMPLES_PER_S, cores};
 use crate::frames::ObservingWindow;
 use crate::mother::{Fidelity, VISIBILITY_BYTES};
 use crate::response::model::{ModelKind, ModelPlan};
 use crate::sky::healpix::pixel_count;
+use crate::units::ChannelId;
 
 /// Visibilities that wait for a batch of the model, at most, and the memory of one with its position, bytes.
 const QUEUED_VISIBILITIES_MAX: f64 = 1e6;
@@ -107,8 +108,11 @@ impl Plan {
         let fringes_per_s = FRINGES_PER_S * cores();
         let expected = self.visibilities();
         let frequencies = &self.config.spacecraft.channels_hz;
-        let engines: Vec<EngineCost> =
-            frequencies.iter().zip(&expected).map(|(&f, e)| self.engine_cost(f, e.mapped)).collect();
+        let engine = |(channel, (&frequency_hz, expected)): (usize, (&f64, &Expected))| {
+            let is_mapped = map.maps(ChannelId(channel as u16));
+            if is_mapped { self.engine_cost(frequency_hz, expected.mapped) } else { EngineCost::default() }
+        };
+        let engines: Vec<EngineCost> = frequencies.iter().zip(&expected).enumerate().map(engine).collect();
         let channels: Vec<ChannelCost> = frequencies
             .iter()
             .zip(&expected)
@@ -133,7 +137,7 @@ impl Plan {
         let solutions = self.solutions(sent);
         let simulation_memory_bytes = self.simulation_bytes(sent, &nsides)
             + channels.iter().map(|channel| channel.simulation.bytes).sum::<f64>();
-        let memory_bytes = self.memory_bytes(simulation_memory_bytes, &engines, solutions);
+        let memory_bytes = memory_bytes(simulation_memory_bytes, &engines, solutions);
         let solving_s = solutions as f64 * engines.iter().map(|engine| engine.solution_s).sum::<f64>()
             + engines.iter().map(|engine| engine.probes_s).sum::<f64>();
         let sampling_s = self.sampling_s();
@@ -213,22 +217,22 @@ impl Plan {
         let skies = pixels.iter().sum::<f64>() + 3.0 * pixels.iter().copied().fold(0.0, f64::max);
         8.0 * skies + sent.min(QUEUED_VISIBILITIES_MAX) * QUEUED_VISIBILITY_BYTES
     }
+}
 
-    /// Memory of all, at the time when it is greatest: while the sums grow, or at the end, when the space segment is gone.
-    fn memory_bytes(&self, simulation_bytes: f64, engines: &[EngineCost], solutions: u64) -> f64 {
-        let greatest = |of: fn(&EngineCost) -> f64| engines.iter().map(of).fold(0.0, f64::max);
-        let sums = engines.iter().map(|engine| engine.sums_bytes).sum::<f64>()
-            + solutions as f64 * engines.len() as f64 * SNAPSHOT_RECORD_BYTES;
-        let copy = greatest(|engine| engine.copy_bytes);
-        // One copy is made, one waits in the queue, and one is in the solver.
-        let solving = |copies: usize| match copies {
-            0 => 0.0,
-            copies => copies.min(3) as f64 * copy + greatest(|engine| engine.other_bytes),
-        };
-        let growing = simulation_bytes + sums + solving(if solutions > 1 { 3 } else { 0 });
-        let last = if engines.iter().any(|engine| engine.copies_last) { engines.len() } else { 0 };
-        growing.max(sums + solving(last)) + BASE_BYTES
-    }
+/// Memory of all, bytes, at the time when it is greatest: while the sums grow, or at the end, when the space segment is gone.
+pub(super) fn memory_bytes(simulation_bytes: f64, engines: &[EngineCost], solutions: u64) -> f64 {
+    let greatest = |of: fn(&EngineCost) -> f64| engines.iter().map(of).fold(0.0, f64::max);
+    let sums = engines.iter().map(|engine| engine.sums_bytes).sum::<f64>()
+        + solutions as f64 * engines.len() as f64 * SNAPSHOT_RECORD_BYTES;
+    let copy = greatest(|engine| engine.copy_bytes);
+    // One copy is made, one waits in the queue, and one is in the solver.
+    let solving = |copies: usize| match copies {
+        0 => 0.0,
+        copies => copies.min(3) as f64 * copy + greatest(|engine| engine.other_bytes),
+    };
+    let growing = simulation_bytes + sums + solving(if solutions > 1 { 3 } else { 0 });
+    let last = if engines.iter().any(|engine| engine.copies_last) { engines.len() } else { 0 };
+    growing.max(sums + solving(last)) + BASE_BYTES
 }
 
 impl Cost {

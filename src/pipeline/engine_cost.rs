@@ -8,7 +8,7 @@ use super::rates::{
 use crate::accumulation::harmonic::{
     REFINED_VISIBILITY_BYTES, SPREAD_MULTIPLY_ADDS, application_size, memory,
 };
-use crate::accumulation::{EngineKind, PixelEngine};
+use crate::accumulation::{EngineKind, MapConfig, PixelEngine};
 use crate::response::general::row_tables_bytes;
 use crate::sky::healpix::pixel_count;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
@@ -30,7 +30,7 @@ const BASIS_VECTORS: [f64; 2] = [60.0, 120.0];
 const TRANSFORMS_PER_LINE: f64 = 4.0;
 
 /// Cost of one channel's engine.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct EngineCost {
     /// Memory of the sums, bytes.
     pub(super) sums_bytes: f64,
@@ -52,25 +52,42 @@ pub(super) struct EngineCost {
     pub(super) solution_multiply_adds: f64,
 }
 
+/// What is known of a channel before its sums are made.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct ChannelData {
+    /// Centre frequency, Hz.
+    pub(super) frequency_hz: f64,
+    /// Visibilities within the map's longest baseline.
+    pub(super) visibilities: f64,
+    /// Windows in which they are observed.
+    pub(super) windows: f64,
+}
+
 impl Plan {
     /// The cost of the engine for a channel at `frequency_hz` with this number of visibilities.
     pub(super) fn engine_cost(&self, frequency_hz: f64, visibilities: f64) -> EngineCost {
-        match self.config.map.engine {
-            EngineKind::Pixel => self.pixel_cost(),
-            EngineKind::Harmonic if self.config.map.refine.is_on() => {
-                self.refined_cost(frequency_hz, visibilities)
-            }
-            EngineKind::Harmonic => self.harmonic_cost(frequency_hz),
+        let windows = self.windows.len() as f64;
+        EngineCost::of(&self.config.map, ChannelData { frequency_hz, visibilities, windows })
+    }
+}
+
+impl EngineCost {
+    /// The cost of the engine for a channel.
+    pub(super) fn of(map: &MapConfig, data: ChannelData) -> Self {
+        match map.engine {
+            EngineKind::Pixel => Self::pixel(map),
+            EngineKind::Harmonic if map.refine.is_on() => Self::refined(map, data),
+            EngineKind::Harmonic => Self::harmonic(map, data),
         }
     }
 
-    fn pixel_cost(&self) -> EngineCost {
-        let nside = self.config.map.nside;
+    fn pixel(map: &MapConfig) -> Self {
+        let nside = map.nside;
         let pixels = pixel_count(nside) as f64;
         // Two rows of B for each visibility, and half of a symmetric matrix.
         let visibility_multiply_adds = pixels * pixels;
         let solution_multiply_adds = pixels.powi(3) / 6.0;
-        EngineCost {
+        Self {
             sums_bytes: PixelEngine::memory_bytes(nside) as f64,
             copy_bytes: PixelEngine::memory_bytes(nside) as f64,
             copies_last: false,
@@ -85,14 +102,14 @@ impl Plan {
     }
 
     /// The circle's sums and their solution, once a pass; visibilities in memory, and tables of the true rows.
-    fn refined_cost(&self, frequency_hz: f64, visibilities: f64) -> EngineCost {
-        let map = &self.config.map;
-        let circle = self.harmonic_cost(frequency_hz);
+    fn refined(map: &MapConfig, data: ChannelData) -> Self {
+        let ChannelData { frequency_hz, visibilities, .. } = data;
+        let circle = Self::harmonic(map, data);
         let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
         let held = visibilities.min(map.refine.visibilities_max as f64) * REFINED_VISIBILITY_BYTES as f64;
         let passes = map.refine.passes_max as f64;
         let rows = row_tables_bytes(map.degree(), u_max, rayon::current_num_threads()) as f64;
-        EngineCost {
+        Self {
             sums_bytes: held,
             copy_bytes: 0.0,
             copies_last: true,
@@ -106,8 +123,7 @@ impl Plan {
         }
     }
 
-    fn harmonic_cost(&self, frequency_hz: f64) -> EngineCost {
-        let map = &self.config.map;
+    fn harmonic(map: &MapConfig, ChannelData { frequency_hz, windows, .. }: ChannelData) -> Self {
         let l_max = map.degree();
         let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
         let memory = memory(l_max, u_max, rayon::current_num_threads());
@@ -117,11 +133,11 @@ impl Plan {
         let transform_multiply_adds = 2.5 * points * points.log2();
         let application_multiply_adds = size.lines as f64 * TRANSFORMS_PER_LINE * transform_multiply_adds;
         // A window's pairs share a plane, and so the alphas that its weights are spread to; others take no memory.
-        let reached = (WINDOW_ALPHAS * self.windows.len() as f64 / points).min(1.0);
+        let reached = (WINDOW_ALPHAS * windows / points).min(1.0);
         let application_s = application_multiply_adds / (TRANSFORM_MULTIPLY_ADDS_PER_S * cores());
         let vector_bytes = 8.0 * ((l_max + 1) as f64).powi(2);
         let vectors = BASIS_VECTORS[usize::from(map.trace_probes > 0)];
-        EngineCost {
+        Self {
             sums_bytes: memory.sums as f64 * reached,
             copy_bytes: memory.sums as f64 * reached,
             // Integers are freed node by node, in pieces too small to go back to the system.

@@ -95,10 +95,37 @@ pub enum PipelineError {
         /// Distance between used windows, windows.
         every_nth: u64,
     },
+    /// A downlink that cannot be read more than once.
+    #[error("{}: not a regular file; expected one with --groups, which reads the downlink once a group", path.display())]
+    NotRepeatable {
+        /// What was named.
+        path: std::path::PathBuf,
+    },
+    /// A downlink that describes no instrument.
+    #[error(
+        "{}: no description of the instrument; expected one, as every downlink of ours has near its beginning: is a file \
+         before it missing?",
+        path.display()
+    )]
+    NoInstrument {
+        /// The first file.
+        path: std::path::PathBuf,
+    },
+    /// Files that changed while they were read once a group.
+    #[error(
+        "the files hold {now} visibilities, and held {before} when the group of channels before was mapped; expected \
+         files that stay: repeat the command once they are complete"
+    )]
+    FilesChanged {
+        /// Visibilities at first.
+        before: u64,
+        /// Visibilities now.
+        now: u64,
+    },
     /// More memory needed than there is.
     #[error(
         "an estimated {} of memory are needed, and {} are available ({}): expected at most that; lower map.nside, \
-         map.l_max or the number of channels, or state another limit, as in --memory-max {}GB",
+         map.l_max or the number of channels, map some of them at a time (replay --groups auto), or state another limit, as in --memory-max {}GB",
         gigabytes(*needed_bytes), gigabytes(limit.bytes as f64), limit.source, (needed_bytes / 1e9).ceil()
     )]
     Memory {

@@ -22,7 +22,7 @@ impl Config {
     #[must_use]
     pub fn ground(&self, wait_bytes: u64) -> GroundConfig {
         let (calibration, map) = (self.calibration.clone(), self.map.clone());
-        GroundConfig { calibration, map, wait_bytes, memory_max_bytes: None }
+        GroundConfig { calibration, map, wait_bytes, memory_max_bytes: None, group: None }
     }
 }
 

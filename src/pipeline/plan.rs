@@ -8,7 +8,7 @@ use crate::array::Array;
 use crate::daughters::DaughtersConfig;
 use crate::frames::{Instrument, ObservingWindow};
 use crate::mother::{Fidelity, Observer, Schedule, SpacecraftConfig};
-use crate::units::{MissionTime, all_pairs};
+use crate::units::{ChannelId, MissionTime, all_pairs};
 
 /// A configuration that has been checked, with what follows from it.
 #[derive(Clone, Debug)]
@@ -126,7 +126,8 @@ impl Plan {
     pub fn visibilities(&self) -> Vec<Expected> {
         let map = &self.config.map;
         let bands = self.config.spacecraft.sub_bands as f64;
-        let expected = |schedule: &Schedule| {
+        let expected = |(channel, schedule): (usize, &Schedule)| {
+            let is_mapped = map.maps(ChannelId(channel as u16));
             let limit_m = map.baseline_m_max(schedule.frequency_hz);
             let mut expected = Expected::default();
             for &window in &self.windows {
@@ -134,14 +135,14 @@ impl Plan {
                     let (count, length_m) = schedule.estimate(&self.array, window, pair);
                     let count = count * bands;
                     expected.sent += count;
-                    if length_m < limit_m {
+                    if is_mapped && length_m < limit_m {
                         expected.mapped += count;
                     }
                 }
             }
             expected
         };
-        self.schedules.iter().map(expected).collect()
+        self.schedules.iter().enumerate().map(expected).collect()
     }
 }
 

@@ -129,7 +129,7 @@ pub fn run(
     let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
     let samples = close_samples(&counts, plan, &report)?;
     let ended = Ended { report, outcome, listening: None, samples };
-    conclude(RunScope::Whole, &plan.config, out, ended)
+    finish(summarise(RunScope::Whole, &plan.config, out, ended)?, out)
 }
 
 /// The space segment alone, to a downlink file, a ground that listens, or both.
@@ -210,6 +210,20 @@ pub(super) fn replay_knowing<S: GroundSource + 'static>(
     watch: Watcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
     let _lock = lock_folder(out)?;
+    let ended = ground_alone(truth, source, config, ground, out, cancel, watch)?;
+    finish(summarise(RunScope::Ground, config, out, ended)?, out)
+}
+
+/// Runs the ground on a source; the output folder is locked.
+pub(super) fn ground_alone<S: GroundSource + 'static>(
+    truth: Truth,
+    source: S,
+    config: &Config,
+    ground: Ground,
+    out: &Path,
+    cancel: &Cancel,
+    watch: Watcher<'_>,
+) -> Result<Ended, PipelineError> {
     let mut graph = Graph::new();
     let listening = source.listening();
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
@@ -222,7 +236,7 @@ pub(super) fn replay_knowing<S: GroundSource + 'static>(
     let ground = Some(outcome.ground.clone());
     let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone(), ground, maps };
     let report = start(graph, &config.runtime, cancel, (watched, watch))?;
-    conclude(RunScope::Ground, config, out, Ended { report, outcome, listening, samples: None })
+    Ok(Ended { report, outcome, listening, samples: None })
 }
 
 impl Config {
@@ -270,7 +284,7 @@ fn write_settings(config: &Config, out: &Path) -> Result<(), PipelineError> {
 }
 
 /// Creates and locks the folder before anything is computed, so that an error shows at once.
-fn lock_folder(out: &Path) -> Result<FolderLock, PipelineError> {
+pub(super) fn lock_folder(out: &Path) -> Result<FolderLock, PipelineError> {
     let locked = FolderLock::acquire(out, ".lock", true);
     locked.map_err(|source| ProductsError::Write { path: out.to_owned(), source }.into())
 }
@@ -306,14 +320,15 @@ fn start(
 }
 
 /// Results of a run that ended without a failure.
-struct Ended {
+pub(super) struct Ended {
     report: Report,
     outcome: SegmentOutcome,
     listening: Option<Listening>,
     samples: Option<SampleSummary>,
 }
 
-fn conclude(
+/// The summary of a run; writes the auto-correlations.
+pub(super) fn summarise(
     segment: RunScope,
     config: &Config,
     out: &Path,
@@ -334,6 +349,11 @@ fn conclude(
     (summary.listening, summary.samples) = (listening, samples);
     summary.completeness = ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
     summary.saving = ground.saving.report();
+    Ok(summary)
+}
+
+/// Writes the summary of a run, and says what failed in the end.
+pub(super) fn finish(summary: RunSummary, out: &Path) -> Result<RunSummary, PipelineError> {
     let path = summary.write(out)?;
     if let Some(reason) = summary.saving.as_ref().and_then(|saving| saving.unsaved.clone()) {
         return Err(PipelineError::Unsaved { summary: path, reason });

@@ -62,8 +62,11 @@ pub struct RunSummary {
     /// Checkpoints of the ground's state, if it keeps one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub saving: Option<SavingReport>,
-    /// Stages: throughput, times, queues.
+    /// Stages: throughput, times, queues; of the last pass, if the channels were mapped in groups.
     pub report: Report,
+    /// Of the passes before it.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub earlier_reports: Vec<Report>,
 }
 
 impl RunSummary {
@@ -93,6 +96,24 @@ impl RunSummary {
             listening: None,
             saving: None,
             report,
+            earlier_reports: Vec::new(),
+        }
+    }
+
+    /// The summary of this pass and a later one over the same downlink, for other channels.
+    pub(super) fn and(self, later: Self) -> Self {
+        let elsewhere = VisibilityReason::ChannelNotMapped;
+        let ledger = self.ledger.of_two_passes(&later.ledger, VisibilityReason::is_of_sums, elsewhere);
+        let (mut channels, mut earlier_reports) = (self.channels, self.earlier_reports);
+        channels.extend(later.channels);
+        earlier_reports.push(self.report);
+        Self {
+            seed: self.seed.or(later.seed),
+            space_hash: self.space_hash.or(later.space_hash),
+            channels,
+            ledger,
+            earlier_reports,
+            ..later
         }
     }
 

@@ -130,6 +130,25 @@ impl<R: Reason> LedgerReport<R> {
         }
     }
 
+    /// The ledger of two passes over the same samples, each of which took some of them to its result. Reasons of which
+    /// `is_of_pass` are those of one pass alone, the others of both; what neither pass took counts under `elsewhere`.
+    #[must_use]
+    pub fn of_two_passes(&self, other: &Self, is_of_pass: impl Fn(R) -> bool, elsewhere: R) -> Self {
+        let mut both = self.clone();
+        add(&mut both.accumulated, other.accumulated);
+        for (&reason, &count) in &other.left_out {
+            if is_of_pass(reason) {
+                both.leave_out(reason, count);
+            } else {
+                both.left_out.entry(reason).or_insert(count);
+            }
+        }
+        both.left_out.remove(&elsewhere);
+        let rest = both.unaccounted();
+        both.leave_out(elsewhere, u64::try_from(rest).unwrap_or(0));
+        both
+    }
+
     /// Samples left out for one reason.
     #[must_use]
     pub fn count(&self, reason: R) -> u64 {

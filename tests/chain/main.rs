@@ -8,6 +8,7 @@ mod bench;
 mod coded;
 mod command_line;
 mod ending;
+mod groups;
 mod harmonic;
 mod orbits;
 mod outputs;

@@ -56,7 +56,9 @@ fn more_memory_than_there_is_is_refused_before_anything_starts() {
     // A ground learns from the downlink how many channels there are.
     let said =
         fail(&[&["replay", &downlink, "--map", &place.pipeline, "--out", &out], &limited[..]].concat());
-    for part in ["describes 2 channels", "at least 19.", "expected at most 8.0 GB", "--memory-max 20GB"] {
+    for part in
+        ["sums of the downlink's 2 channels", "at least 19.", "expected at most 8.0 GB", "--memory-max 20GB"]
+    {
         assert!(said.contains(part), "{said}");
     }
     assert!(!std::path::Path::new(&out).join("summary.json").exists());
