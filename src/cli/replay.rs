@@ -84,7 +84,7 @@ pub(super) struct ReplayArgs {
     /// Mission time between snapshot maps: a number with an optional unit s, h or d, such as 7d; 0 for the final map only.
     #[arg(long, value_name = "TIME", value_parser = not_negative_s)]
     snapshot_every: Option<f64>,
-    /// Channels to map, numbered from 0 as `inspect` lists them, such as 0-4,7; all if not given. The others are counted as
+    /// Channels to map, numbered from 0 in the order of the instrument, such as 0-4,7; all if not given. The others are counted as
     /// left out.
     #[arg(long, value_name = "LIST", value_parser = channel_list)]
     channels: Option<ChannelList>,
