@@ -8,6 +8,7 @@ mod bench;
 mod check;
 mod compare;
 mod corrupt;
+mod export;
 mod gaps;
 mod geometry;
 mod inspect;
@@ -29,6 +30,7 @@ mod simulate;
 mod sky;
 mod study;
 
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
@@ -59,6 +61,7 @@ enum Command {
     Replay(replay::ReplayArgs),
     Inspect(inspect::InspectArgs),
     Corrupt(corrupt::CorruptArgs),
+    Export(export::ExportArgs),
     Gaps(gaps::GapsArgs),
     Merge(merge::MergeArgs),
     Retract(retract::RetractArgs),
@@ -71,6 +74,9 @@ enum Command {
     Study(study::StudyArgs),
 }
 
+/// Exit code of a failure.
+const FAILED: u8 = 1;
+
 /// Runs the command on the process's command line and returns the exit code.
 ///
 /// 0: done, also if the reader of standard output has gone. 1: failed, with the reason on standard error. 2: wrong usage.
@@ -78,12 +84,26 @@ enum Command {
 /// signal ends the process at once with the same code. For a ground that listens or follows, SIGTERM is the regular end: 0.
 #[must_use]
 pub fn main() -> ExitCode {
-    let result = match Cli::parse().command {
+    ExitCode::from(run_command(std::env::args_os()))
+}
+
+/// As [`main`], for a command line of which the first word is the program's name; returns the exit code.
+pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
+    let command = match Cli::try_parse_from(words) {
+        Ok(cli) => cli.command,
+        Err(error) => {
+            // Help and version are such errors too. Nobody may be there to read it.
+            let _ = error.print();
+            return u8::try_from(error.exit_code()).unwrap_or(FAILED);
+        }
+    };
+    let result = match command {
         Command::Run(args) => run::execute(&args),
         Command::Simulate(args) => simulate::execute(&args),
         Command::Replay(args) => replay::execute(&args),
         Command::Inspect(args) => inspect::execute(&args),
         Command::Corrupt(args) => corrupt::execute(&args),
+        Command::Export(args) => export::execute(&args),
         Command::Gaps(args) => gaps::execute(&args),
         Command::Merge(args) => merge::execute(&args),
         Command::Retract(args) => retract::execute(&args),
@@ -96,12 +116,12 @@ pub fn main() -> ExitCode {
         Command::Study(args) => study::execute(&args),
     };
     match result {
-        Ok(Completion::Done) => ExitCode::SUCCESS,
-        Ok(Completion::Interrupted(code)) => ExitCode::from(code),
-        Err(error) if is_broken_pipe(error.as_ref()) => ExitCode::SUCCESS,
+        Ok(Completion::Done) => 0,
+        Ok(Completion::Interrupted(code)) => code,
+        Err(error) if is_broken_pipe(error.as_ref()) => 0,
         Err(error) => {
             print_error(error.as_ref());
-            ExitCode::FAILURE
+            FAILED
         }
     }
 }

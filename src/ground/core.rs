@@ -118,6 +118,21 @@ impl Ground {
         Ok(())
     }
 
+    /// Applies what is held, without its positions.
+    pub(super) fn flush(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
+        while let Some(delivery) = self.collector.flush_next() {
+            match &delivery.frame {
+                Some(GroundFrame::Visibilities(block))
+                    if self.archive.is_some() && self.cancel.is_cancelled() =>
+                {
+                    self.calibrator.leave_for_later(block);
+                }
+                _ => self.apply(delivery, out)?,
+            }
+        }
+        Ok(())
+    }
+
     /// Packets of visibilities that are known to be missing.
     fn missing_packets(&self) -> MissingPackets {
         let latest = self.calibrator.blocks().latest_report().0;
@@ -178,16 +193,7 @@ impl Stage for Ground {
         self.advance(out)?;
         // The checkpoint keeps held packets as they are; the final maps use them without their positions.
         self.last_checkpoint();
-        while let Some(delivery) = self.collector.flush_next() {
-            match &delivery.frame {
-                Some(GroundFrame::Visibilities(block))
-                    if self.archive.is_some() && self.cancel.is_cancelled() =>
-                {
-                    self.calibrator.leave_for_later(block);
-                }
-                _ => self.apply(delivery, out)?,
-            }
-        }
+        self.flush(out)?;
         fill(&self.outcome.completeness, self.calibrator.close(self.missing_packets()));
         if let Some(archive) = &self.archive {
             self.outcome.ledger.post_report(&archive.take_posts());

@@ -56,6 +56,9 @@ pub enum PipelineError {
     /// Products cannot be written.
     #[error(transparent)]
     Products(#[from] crate::products::ProductsError),
+    /// A map cannot be made of sums.
+    #[error(transparent)]
+    Solve(#[from] crate::solve::SolveError),
     /// The ground failed.
     #[error(transparent)]
     Ground(#[from] crate::ground::GroundError),

@@ -24,6 +24,23 @@ impl Config {
         let (calibration, map) = (self.calibration.clone(), self.map.clone());
         GroundConfig { calibration, map, wait_bytes, memory_max_bytes: None, group: None }
     }
+
+    /// Setup of the solver, which `watch` follows.
+    ///
+    /// # Errors
+    /// Prior maps that cannot be read.
+    pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
+        let map = &self.map;
+        Ok(SolverSetup {
+            epsilon: map.epsilon.clone(),
+            prior_k: map.prior_k.clone(),
+            prior_maps: prior_maps(self)?,
+            rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
+            refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
+            trace_probes: map.trace_probes,
+            watch,
+        })
+    }
 }
 
 /// What the ground segment leaves behind besides its files.
@@ -60,21 +77,7 @@ pub(super) fn add(
 ) -> Result<SegmentOutcome, PipelineError> {
     let Mapping { out, truth, watch, viewers } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
-    let setup = SolverSetup {
-        epsilon: config.map.epsilon.clone(),
-        prior_k: config.map.prior_k.clone(),
-        prior_maps: prior_maps(config)?,
-        rule: StoppingRule {
-            residual_max: config.map.residual_max,
-            iterations_max: config.map.iterations_max,
-        },
-        refine: RefineRule {
-            passes_max: config.map.refine.passes_max,
-            residual_max: config.map.refine.residual_max,
-        },
-        trace_probes: config.map.trace_probes,
-        watch,
-    };
+    let setup = config.solver(watch)?;
     let provenance = Provenance { ground_hash: config.ground_hash(), map: config.map.clone() };
     let channels = Arc::clone(&outcome.channels);
     let publisher =

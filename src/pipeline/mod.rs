@@ -22,6 +22,7 @@ mod run;
 mod sample_summary;
 pub(crate) mod sampling;
 pub(crate) mod space_segment;
+mod state;
 mod study;
 mod summary;
 
@@ -40,6 +41,7 @@ pub use run::{
 pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
 pub use sampling::sample_stages;
 pub use space_segment::{INTEGRATE, sky_notes};
+pub use state::solve_state;
 pub use study::{
     CaseSummary, Study, StudyCase, StudyError, StudyPhase, StudySummary, StudyWatcher, run_study,
 };

@@ -43,6 +43,24 @@ pub enum ProductsError {
         /// The encoder's reason.
         reason: String,
     },
+    /// A downlink file that cannot be read.
+    #[error(transparent)]
+    Downlink {
+        /// Why.
+        source: Box<crate::downlink::DownlinkError>,
+    },
+    /// A downlink file without a description of the instrument.
+    #[error("{}: no description of the instrument; expected a file from the start of a pass", path.display())]
+    NoInstrument {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Reading was interrupted.
+    #[error("{}: interrupted before its end", path.display())]
+    Interrupted {
+        /// The file.
+        path: PathBuf,
+    },
     /// An invalid map.
     #[error(transparent)]
     Map(#[from] MapError),

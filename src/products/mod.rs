@@ -3,7 +3,7 @@
 //! [`Publisher`] is the sink that writes every [`crate::solve::Solution`]; [`write_autos`] writes the
 //! auto-correlations. [`pictures`] draws. A [`MapViewer`] sees maps as they are published.
 //!
-//! May use [`crate::solve`], [`crate::ground`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
+//! May use [`crate::solve`], [`crate::ground`], [`crate::downlink`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
 //! equal bytes, and every map carries its provenance: configuration hashes, seed, program version and data span.
 
 mod autos;
@@ -18,6 +18,7 @@ mod summary;
 mod time_coverage;
 mod truth;
 mod viewer;
+mod visibility_table;
 
 pub use autos::{AutoSummary, summarise, write_autos};
 pub use channel::{draw_comparison, draw_relative_error};
@@ -33,3 +34,4 @@ pub use summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 pub use time_coverage::draw_coverage;
 pub use truth::{MapShape, Truth};
 pub use viewer::{MapViewer, MapWatch, PublishedMap};
+pub use visibility_table::{VisibilityRow, VisibilityTable, jansky_per_k_sr};

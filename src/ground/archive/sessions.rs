@@ -3,10 +3,12 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use super::checkpoint;
 use super::folder::{StateFolder, checkpoints};
 use super::store::{Archive, Opened};
+use crate::accumulation::Snapshot;
 use crate::ground::{Ground, GroundConfig, GroundError};
-use crate::runtime::Outlet;
+use crate::runtime::{Outlet, Stage};
 
 impl Ground {
     /// A ground that resumes from the newest checkpoint in `folder`, or starts a new archive there.
@@ -51,6 +53,39 @@ impl Ground {
         ground.advance(&mut Outlet::collect())?;
         ground.checkpoint()?;
         Ok(ground)
+    }
+
+    /// The settings on which the sums of an archive depend, keys and values, as its newest usable checkpoint has them.
+    ///
+    /// # Errors
+    /// A folder without a usable checkpoint, or in use.
+    pub fn settings_in(folder: &Path) -> Result<Vec<(String, String)>, GroundError> {
+        if checkpoints(folder)?.is_empty() {
+            return Err(GroundError::without_checkpoint(folder));
+        }
+        let (found, _) = StateFolder::open(folder)?.load(false, |path| {
+            checkpoint::read(path, |head, engines| {
+                std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
+                Ok(head.settings)
+            })
+        })?;
+        found.ok_or_else(|| GroundError::without_checkpoint(folder))
+    }
+
+    /// The sums of an archive, with the packets that it holds, as at the end of a session. The archive stays as it is.
+    ///
+    /// # Errors
+    /// As [`Ground::open`]; a folder without a checkpoint.
+    pub fn sums_in(folder: &Path, config: &GroundConfig) -> Result<Vec<Snapshot>, GroundError> {
+        if checkpoints(folder)?.is_empty() {
+            return Err(GroundError::without_checkpoint(folder));
+        }
+        let mut ground = Opened::new(folder, config, false)?.resume(config, u64::MAX)?;
+        let mut out = Outlet::collect();
+        ground.advance(&mut out)?;
+        ground.flush(&mut out)?;
+        ground.accumulator.finish(&mut out)?;
+        Ok(out.into_vec())
     }
 
     /// Packets of visibilities in the archive.

@@ -5,6 +5,7 @@
 //! allocated. Writing produces healpy's cards in healpy's order, and whole files or none. General FITS libraries in
 //! Rust trust the header (a forged TFIELDS aborts the process) or need a C library.
 
+mod alm;
 mod card;
 mod error;
 mod frequency;
@@ -13,6 +14,7 @@ mod read;
 mod table;
 mod write;
 
+pub use alm::write_alm;
 pub use card::{Card, CardValue};
 pub use error::{FitsError, FitsProblem};
 pub use frequency::read_sky;

@@ -279,7 +279,7 @@ impl<'a> Table<'a> {
     }
 }
 
-fn primary_cards() -> [Card; 4] {
+pub(super) fn primary_cards() -> [Card; 4] {
     [
         Card::logical("SIMPLE", true, "conforms to FITS standard"),
         Card::integer("BITPIX", 8, "array data type"),
@@ -288,14 +288,14 @@ fn primary_cards() -> [Card; 4] {
     ]
 }
 
-fn end_header(header: &mut Vec<u8>) {
+pub(super) fn end_header(header: &mut Vec<u8>) {
     header.extend_from_slice(b"END");
     header.resize(header.len().next_multiple_of(BLOCK_BYTES), b' ');
 }
 
 /// Runs `write` on a temporary file beside `path`, flushes it to disk and renames it to `path`; removes it on
 /// failure.
-fn write_whole(
+pub(super) fn write_whole(
     path: &Path,
     write: impl FnOnce(&mut AtomicFile) -> Result<(), FitsProblem>,
 ) -> Result<(), FitsProblem> {

@@ -1,0 +1,167 @@
+"""Running the chain, and its ground alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from os import PathLike
+from typing import Any, Callable, Iterable
+
+from . import _native
+from ._map import Map
+from ._settings import Settings, overrides
+
+
+class Run:
+    """What a run of the whole chain leaves: ``summary`` (as in summary.json), the final ``maps`` by channel, the folder ``out`` of
+    its products, and its ``downlink`` file."""
+
+    def __init__(self, summary: str, maps: list[dict[str, Any]], out: str | PathLike[str]) -> None:
+        self.summary: dict[str, Any] = json.loads(summary)
+        self.maps = sorted((Map(**found) for found in maps), key=lambda found: found.channel)
+        self.out = os.fspath(out)
+
+    @property
+    def downlink(self) -> str:
+        """The downlink file."""
+        names = ("downlink.ccsds", "downlink.cadu")
+        return next(path for path in (os.path.join(self.out, name) for name in names) if os.path.exists(path))
+
+    def __repr__(self):
+        return f"<lunarray.Run {self.summary['name']!r}: {len(self.maps)} maps in {self.out!r}>"
+
+
+def run(
+    pipeline: str | PathLike[str] | None = None,
+    set: Settings = None,
+    seed: int | None = None,
+    out: str | PathLike[str] | None = None,
+    progress: Callable[[dict[str, tuple[int, str]]], object] | None = None,
+) -> Run:
+    """Runs the whole chain: sky, spacecraft, downlink, ground, maps. As ``lunarray run``.
+
+    ``pipeline`` is a file (the quicklook if not given), ``set`` replaces some of its settings, ``out`` is the folder of the products
+    (out/NAME if not given). ``progress`` is called some times a second with what each stage has done so far; an exception in it
+    ends the run, as Ctrl-C does: in order, with products of the data so far.
+    """
+    return Run(*_native.run(pipeline, overrides(set), seed, out, progress))
+
+
+class Replay:
+    """The maps of a ground segment that takes downlink files, one by one as they are made; see :func:`replay`.
+
+    ``summary`` is there once all maps have been taken. ``close()`` ends it early, as does the end of a ``with`` block.
+    """
+
+    def __init__(self, native: _native.NativeReplay, truth: Any, folder: Any) -> None:
+        self._native, self._truth, self._folder = native, truth, folder
+
+    def __iter__(self) -> Replay:
+        return self
+
+    def __next__(self) -> Map:
+        found = self._native.next_map()
+        if found is None:
+            raise StopIteration
+        made = Map(**found)
+        if self._truth is not None:
+            made.compare(*self._truth[made.channel] if isinstance(self._truth, list) else self._truth)
+        return made
+
+    def __enter__(self) -> Replay:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends it; what was received is saved if there is a state."""
+        self._native.close()
+
+    @property
+    def summary(self) -> dict[str, Any] | None:
+        """The summary, as in summary.json; None before the last map was taken."""
+        text = self._native.summary()
+        return None if text is None else json.loads(text)
+
+
+def replay(
+    files: str | PathLike[str] | Iterable[str | PathLike[str]],
+    map: str | PathLike[str] | None = None,
+    every: float | None = None,
+    set: Settings = None,
+    state: str | PathLike[str] | None = None,
+    out: str | PathLike[str] | None = None,
+    truth: Any = None,
+) -> Replay:
+    """Runs the ground segment on downlink files; iterate over what it returns to get its maps. As ``lunarray replay``.
+
+    ``map`` is a map file (a pipeline file is one), ``every`` the mission time between two snapshots, s (none if not given), ``state`` a
+    folder that keeps everything received, ``out`` a folder for products (none are kept if not given). ``truth`` is the true sky:
+    a file or pixels, or ``[(sky, frame), ..]`` by channel; then maps have ``rho_l``. The next map is made while one is looked at, and
+    no more than that.
+    """
+    files = [files] if isinstance(files, (str, os.PathLike)) else list(files)
+    folder = None
+    more = {}
+    if out is None:
+        folder = tempfile.TemporaryDirectory(prefix="lunarray-", ignore_cleanup_errors=True)
+        out = folder.name
+        more = {"products__pictures": False}
+    settings = overrides(None, **more, map__snapshot_every_s=None if every is None else float(every)) + overrides(set)
+    if truth is not None and not isinstance(truth, list):
+        truth = (truth,)
+    return Replay(_native.NativeReplay(files, out, map, settings, state), truth, folder)
+
+
+class State:
+    """The state folder of a ground (``replay(state=..)``): everything that it has received."""
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self.path = os.fspath(path)
+
+    def solve(
+        self,
+        epsilon: float | Iterable[float] | None = None,
+        map: str | PathLike[str] | None = None,
+        set: Settings = None,
+    ) -> list[Map]:
+        """Maps of the sums, without new data; the state stays as it is.
+
+        ``epsilon`` is one regularisation or a list of them, each for all channels; that of the settings if not given. Settings on
+        which the sums depend are those of the state; ``map`` and ``set`` give others, such as ``map.prior_k``.
+        """
+        values = [] if epsilon is None else [epsilon] if isinstance(epsilon, (int, float)) else list(epsilon)
+        found = _native.solve_state(self.path, map, overrides(set), [float(value) for value in values])
+        return [Map(**one) for one in found]
+
+
+class Ground:
+    """A ground that is fed with bytes as they arrive: every packet counts once.
+
+    ``map``, ``set``, ``every`` and ``state`` are those of :func:`replay`.
+    """
+
+    def __init__(
+        self,
+        map: str | PathLike[str] | None = None,
+        set: Settings = None,
+        every: float | None = None,
+        state: str | PathLike[str] | None = None,
+    ) -> None:
+        settings = overrides(None, map__snapshot_every_s=None if every is None else float(every)) + overrides(set)
+        self._native = _native.NativeGround(map, settings, state)
+
+    def feed(self, data: bytes | bytearray | memoryview) -> list[Map]:
+        """Takes bytes of the downlink, in pieces of any size; returns the snapshots that became due (with ``every``)."""
+        return [Map(**found) for found in self._native.feed(bytes(data))]
+
+    def finish(self) -> list[Map]:
+        """Ends the downlink, saves the state if there is one, and returns the final maps."""
+        return [Map(**found) for found in self._native.finish()]
+
+    @property
+    def ledger(self) -> dict[str, Any]:
+        """What became of every visibility so far."""
+        return json.loads(self._native.ledger())

@@ -1,0 +1,97 @@
+"""Downlink files as arrays."""
+
+from __future__ import annotations
+
+import json
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import _native
+from ._rows import AUTO, VISIBILITY
+
+
+def open(path: str | PathLike[str]) -> Downlink:
+    """Reads a downlink file (packets or CADUs) into memory, 21 bytes a visibility."""
+    return Downlink(path)
+
+
+class Downlink:
+    """A downlink file, as it came down: nothing is calibrated.
+
+    ``instrument`` has its name, epoch (TAI seconds since 1958), channels, number of satellites and what else it says of itself.
+    """
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self.path = path
+        self._native = _native.NativeDownlink(path)
+        self.instrument: dict[str, Any] = json.loads(self._native.instrument())
+
+    def __repr__(self):
+        channels = ", ".join(f"{hz / 1e6:g}" for hz in self.channels_hz)
+        return f"<lunarray.Downlink {str(self.path)!r}: {self.satellites} satellites, {channels} MHz>"
+
+    @property
+    def channels_hz(self) -> NDArray[np.float64]:
+        """Centre frequencies of the channels, Hz."""
+        return np.array(self.instrument["channels_hz"])
+
+    @property
+    def satellites(self) -> int:
+        """Number of satellites that are correlated."""
+        return self.instrument["satellites"]
+
+    @property
+    def epoch(self) -> np.datetime64:
+        """The mission's epoch, TAI as ``datetime64``."""
+        return np.datetime64("1958-01-01", "ns") + np.timedelta64(round(self.instrument["epoch_tai_s"] * 1e9), "ns")
+
+    def visibilities(self, channel: int = 0) -> NDArray[np.void]:
+        """The visibilities of a channel, a structured array in the order of the file.
+
+        ``time_s`` is the middle of an integration, s since the epoch, ``tai`` and ``utc`` the same as ``datetime64``, ``dt_s`` its
+        length; ``i`` and ``j`` the satellites, from 1; ``uvw_m`` the baseline r_i - r_j and ``r_i_m``, ``r_j_m`` the positions, m in
+        Moon-centred ecliptic axes, NaN where the file has none; ``value_k_sr`` the visibility and ``value_jy`` the same times
+        2 k nu^2 / c^2; ``weight`` the inverse variance of the real part, (K sr)^-2; ``flag`` is 0 for a good one. UTC is TAI less
+        37 s, as since 2017.
+        """
+        return self._native.visibilities(channel).view(VISIBILITY)
+
+    def autos(self) -> NDArray[np.void]:
+        """The auto-correlations of all channels, a structured array with the frequency of each; power in K sr."""
+        rows, frequencies_hz = self._native.autos()
+        rows = rows.view(VISIBILITY)
+        found = np.empty(len(rows), AUTO)
+        for name in ("time_s", "tai", "utc", "dt_s", "weight", "flag"):
+            found[name] = rows[name]
+        found["satellite"], found["power_k_sr"] = rows["i"], rows["value_k_sr"].real
+        found["frequency_hz"] = frequencies_hz
+        return found
+
+    def ephemeris(self, t: ArrayLike) -> NDArray[np.float64]:
+        """Positions of the satellites at a time or times, s since the epoch: shape ``t.shape + (satellites, 3)``, m, Moon-centred
+        ecliptic axes; NaN where the file has none."""
+        times = np.asarray(t, dtype=float)
+        return self._native.positions(times.ravel()).reshape(*times.shape, self.satellites, 3)
+
+    def write_uvh5(
+        self,
+        path: str | PathLike[str],
+        channel: int = 0,
+        phase_centre: tuple[float, float] = (266.405, -28.936),
+    ) -> int:
+        """Writes the good visibilities of a channel as UVH5, for pyuvdata and what reads its files; returns their number.
+
+        Values are in Jy, phased to a centre (right ascension and declination, degrees, ICRS; that of the Galaxy if not given).
+        UVH5 holds one position an antenna; the true ones are in the file's group ``lunarray``. Needs h5py and pyuvdata
+        (``pip install lunarray[uvh5]``).
+        """
+        from ._uvh5 import write_uvh5
+
+        return write_uvh5(self, path, channel, phase_centre)
+
+    def inspect(self) -> dict[str, Any]:
+        """What the file holds, and its defects: what ``lunarray inspect --json`` prints."""
+        return json.loads(_native.inspect(self.path))

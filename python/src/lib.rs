@@ -1,0 +1,45 @@
+//! The native module of the Python package `lunarray`: what the library does, with arrays at its doors.
+//!
+//! Everything that takes time runs on a thread of its own without the interpreter's lock, while the caller looks for Ctrl-C
+//! ([`wait`]). Names, defaults and documentation for users are in `lunarray/__init__.py`.
+
+mod array;
+mod chain;
+mod downlink;
+mod error;
+mod ground;
+mod maps;
+mod wait;
+
+use std::ffi::OsString;
+
+use pyo3::prelude::*;
+
+/// Runs a command line and returns its exit code; `words` begins with the program's name.
+#[pyfunction]
+fn run_command(py: Python<'_>, words: Vec<OsString>) -> u8 {
+    py.detach(|| lunarray::cli::run_command(words))
+}
+
+/// Native part of the package.
+#[pymodule]
+#[pyo3(name = "_native")]
+mod native {
+    #[pymodule_export]
+    use super::array::{NativeArray, NativeEphemeris, predict};
+    #[pymodule_export]
+    use super::chain::{NativeReplay, run, solve_state};
+    #[pymodule_export]
+    use super::downlink::{NativeDownlink, inspect};
+    #[pymodule_export]
+    use super::error::{ConfigurationError, LunarrayError};
+    #[pymodule_export]
+    use super::ground::NativeGround;
+    #[pymodule_export]
+    use super::maps::{analysis, compare, read_map};
+    #[pymodule_export]
+    use super::run_command;
+
+    #[pymodule_export]
+    const VERSION: &str = env!("CARGO_PKG_VERSION");
+}

@@ -1,0 +1,178 @@
+"""Exports, read by other people's software."""
+
+import csv
+import subprocess
+import sys
+
+import healpy
+import numpy as np
+import pytest
+from conftest import SMALL
+
+import lunarray
+
+SPEED_OF_LIGHT, MOON_RADIUS_M = 299_792_458.0, 1_737_100.0
+
+
+@pytest.fixture(scope="module")
+def exact(tmp_path_factory):
+    """A run without thermal noise and smearing of a sky that is a file."""
+    folder = tmp_path_factory.mktemp("exact")
+    pixels = 1e5 * (2 + np.random.default_rng(3).standard_normal(12 * 8**2))
+    healpy.write_map(folder / "sky.fits", pixels, coord="E", dtype=np.float64, column_units="K", extra_header=[("FREQ", 3e6)])
+    settings = {
+        **SMALL,
+        "sky.file": folder / "sky.fits",
+        "spacecraft.channels_hz": [3e6],
+        "spacecraft.thermal_noise": False,
+        "spacecraft.smear_integrations": False,
+        "spacecraft.model": "direct",
+    }
+    return pixels, lunarray.run(set=settings, out=folder / "out")
+
+
+@pytest.fixture(autouse=True)
+def offline(monkeypatch):
+    """Sidereal times of an epoch beyond the table of the Earth's rotation; nothing is fetched."""
+    from astropy.utils import iers
+
+    for name, value in {"auto_download": False, "auto_max_age": None, "iers_degraded_accuracy": "ignore"}.items():
+        monkeypatch.setattr(iers.conf, name, value)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_uvh5_has_the_sign_frame_and_phase_of_pyuvdata(exact, tmp_path):
+    """Exported phased to one centre and phased to another by pyuvdata, it is what is exported phased to that."""
+    from pyuvdata import UVData
+
+    _, run = exact
+    first, second = (187.7, 12.4), (300.0, -40.0)
+    downlink = lunarray.open(run.downlink)
+    count = downlink.write_uvh5(tmp_path / "first.uvh5", 0, first)
+    downlink.write_uvh5(tmp_path / "second.uvh5", 0, second)
+    turned, expected = (UVData.from_file(tmp_path / f"{name}.uvh5") for name in ("first", "second"))
+    assert turned.check() and turned.Nblts == count > 1000
+    turned.phase(lon=np.radians(second[0]), lat=np.radians(second[1]), cat_name="second", phase_frame="icrs", use_ant_pos=False)
+    # Aberration turns directions by up to 1e-4 rad, which pyuvdata applies and a telescope in space has no use for.
+    longest = np.linalg.norm(expected.uvw_array, axis=1).max()
+    np.testing.assert_allclose(turned.uvw_array, expected.uvw_array, atol=4e-4 * longest)
+    most = 2 * np.pi * 3e6 / SPEED_OF_LIGHT * 4e-4 * longest
+    assert most < 0.1
+    phases = np.angle(turned.data_array / expected.data_array)
+    assert np.abs(phases).max() < most
+    # It would not have been so for another sign: phases differ by turns from one centre to the other.
+    unturned = UVData.from_file(tmp_path / "first.uvh5", run_check=False)
+    assert np.abs(np.angle(unturned.data_array / expected.data_array)).max() > 3
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_sky_predicted_from_the_exported_baselines_is_what_was_exported(exact, tmp_path):
+    """V = sum of T exp(+2 pi i (nu / c) (n - s) . b), b = r_2 - r_1, of directions that the Moon hides from neither."""
+    import h5py
+    from astropy.coordinates import BarycentricMeanEcliptic, SkyCoord
+    from pyuvdata import UVData
+
+    pixels, run = exact
+    lunarray.open(run.downlink).write_uvh5(tmp_path / "sky.uvh5", 0, (187.7, 12.4))
+    data = UVData.from_file(tmp_path / "sky.uvh5", run_check=False)
+    with h5py.File(tmp_path / "sky.uvh5") as file:
+        places = [file["lunarray"][f"position_{n}_m"][:] for n in (1, 2)]
+    # Directions of pixels in the exported frame, by astropy: ecliptic to ICRS, then east, north, towards the centre.
+    lon, lat = healpy.pix2ang(8, np.arange(len(pixels)), lonlat=True)
+    ecliptic = SkyCoord(lon, lat, unit="deg", frame=BarycentricMeanEcliptic(equinox="J2000"))
+    n = ecliptic.icrs.cartesian.xyz.value.T
+    ra, dec = np.radians(187.7), np.radians(12.4)
+    centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    n = np.stack([n @ east, n @ np.cross(centre, east), n @ centre], axis=1)
+    moonward = np.array(healpy.pix2vec(8, np.arange(len(pixels)))).T
+    jansky = 2 * 1.380649e-23 * (3e6 / SPEED_OF_LIGHT) ** 2 * 1e26
+    scale = np.abs(data.data_array).max()
+    for k in range(0, data.Nblts, data.Nblts // 60):
+        seen = np.ones(len(pixels), bool)
+        for r in (places[0][k], places[1][k]):
+            along = moonward @ r
+            seen &= ~((along < 0) & (r @ r - along**2 < MOON_RADIUS_M**2))
+        phase = np.exp(2j * np.pi * 3e6 / SPEED_OF_LIGHT * ((n - [0, 0, 1]) @ data.uvw_array[k]))
+        expected = jansky * np.sum(pixels * seen * phase) * healpy.nside2pixarea(8)
+        # The simulation evaluates fringes to 1e-6; a pixel at the Moon's limb may be seen in one and not in the other.
+        limb = jansky * np.abs(pixels).max() * healpy.nside2pixarea(8)
+        assert abs(data.data_array[k, 0, 0] - expected) < 1e-4 * scale + 0.01 * limb, k
+
+
+def export(*words):
+    return subprocess.run([sys.executable, "-m", "lunarray", "export", *map(str, words)], capture_output=True, text=True)
+
+
+def test_csv_has_the_same_visibilities(small, tmp_path):
+    told = export("visibilities", small.downlink, "--channel", 1, "--out", tmp_path / "v.csv")
+    assert told.returncode == 0, told.stderr
+    downlink = lunarray.open(small.downlink)
+    expected = downlink.visibilities(1)
+    with open(tmp_path / "v.csv") as file:
+        found = list(csv.DictReader(file))
+    assert len(found) == len(expected) and f"{len(found)} visibilities are in" in told.stdout
+
+    def column(name):
+        return np.array([float(row[name]) for row in found])
+
+    for name, values in [
+        ("time_s", expected["time_s"]),
+        ("dt_s", expected["dt_s"]),
+        ("i", expected["i"]),
+        ("flag", expected["flag"]),
+        ("u_m", expected["uvw_m"][:, 0]),
+        ("w_m", expected["uvw_m"][:, 2]),
+        ("z_j_m", expected["r_j_m"][:, 2]),
+        ("im_jy", expected["value_jy"].imag),
+    ]:
+        # Written with all digits that tell numbers apart, times to half a microsecond.
+        np.testing.assert_allclose(column(name), values, rtol=1e-15, atol=1e-8 if name == "time_s" else 0)
+    assert (column("re_k_sr").astype(np.float32) == expected["value_k_sr"].real).all()
+    assert (column("weight").astype(np.float32) == expected["weight"]).all()
+    tai = (expected["tai"] - np.datetime64("1958-01-01", "ns")).astype(float) * 1e-9
+    # Doubles of 2e9 s are half a microsecond apart.
+    np.testing.assert_allclose(column("tai_s"), tai, atol=1e-6, rtol=0)
+    wrong = export("visibilities", small.downlink, "--channel", 2, "--out", tmp_path / "w.csv")
+    assert wrong.returncode == 1 and "expected one of the file's 2 channels, from 0" in wrong.stderr
+
+
+def test_spectra_and_coefficients_are_exported(small, tmp_path):
+    assert export("spectra", small.out, "--out", tmp_path / "s.csv").returncode == 0
+    with open(tmp_path / "s.csv") as file:
+        rows = [row for row in csv.DictReader(file) if float(row["frequency_hz"]) == 3e6]
+    rho = np.array([float(row["rho"]) for row in rows])
+    np.testing.assert_allclose(rho, small.summary["channels"][1]["rho"], rtol=1e-12)
+    path = f"{small.out}/3.000MHz/map.fits"
+    told = export("alm", path, "--l-max", 9, "--out", tmp_path / "alm.fits")
+    assert told.returncode == 0, told.stderr
+    found, mmax = healpy.read_alm(tmp_path / "alm.fits", return_mmax=True)
+    expected = healpy.map2alm(healpy.read_map(path, dtype=None), lmax=9, iter=3)
+    assert mmax == 9
+    np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_the_packet_definition_in_xtce_describes_every_packet(small):
+    from collections import Counter
+
+    from conftest import REPOSITORY
+    from space_packet_parser.generators import ccsds_generator
+    from space_packet_parser.xtce.definitions import XtcePacketDefinition
+
+    definition = XtcePacketDefinition.from_xtce(REPOSITORY / "docs/packets.xtce.xml")
+    kinds, values = Counter(), {0: [], 1: []}
+    with open(small.downlink, "rb") as file:
+        for octets in ccsds_generator(file):
+            packet = definition.parse_bytes(octets)
+            # Whole and nothing left: the last field is the checksum at the end of the packet.
+            assert packet["PACKET_CHECK"] == int.from_bytes(octets[-4:], "big")
+            assert (packet["MAGIC"], packet["P_FIELD"]) == (0x4C, 0x1F)
+            kinds[packet["PKT_APID"]] += 1
+            if packet["PKT_APID"] == 259 and packet["I"] != packet["J"]:
+                count = packet["COUNT"]
+                values[packet["CHANNEL"]].append(np.frombuffer(packet["ARRAYS"], "<c8", count, 8 * count))
+    for channel, found in values.items():
+        assert (np.concatenate(found) == lunarray.open(small.downlink).visibilities(channel)["value_k_sr"]).all()
+    counted = {entry["kind"]: entry["packets"] for entry in lunarray.inspect(small.downlink)["packets"]}
+    names = {257: "instrument", 258: "ephemeris", 259: "visibilities", 261: "housekeeping"}
+    assert {names[apid]: number for apid, number in kinds.items()} == {k: n for k, n in counted.items() if n}

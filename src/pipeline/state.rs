@@ -1,0 +1,111 @@
+//! A state on its own: the settings that it was made with, and maps of its sums without new data.
+
+use std::path::Path;
+
+use super::config::Config;
+use super::config_source::ConfigSource;
+use super::error::PipelineError;
+use crate::ground::{Ground, GroundError, WAIT_BYTES};
+use crate::runtime::{Outlet, Stage};
+use crate::solve::{Solution, SolveWatch, Solver, SolverSetup};
+use crate::units::PerChannel;
+
+impl ConfigSource {
+    /// This source with the settings of the state in `folder` before its own overrides, so that the state can be used without
+    /// naming them again. Only without a file: what a file says stands, and is compared with the state.
+    ///
+    /// # Errors
+    /// A folder without a usable state.
+    pub fn of_state(mut self, folder: &Path) -> Result<Self, GroundError> {
+        if self.file.is_none() {
+            let settings = Ground::settings_in(folder)?;
+            let overrides =
+                settings.iter().filter_map(|(key, value)| Some(format!("{key}={}", toml_of(value)?)));
+            self.overrides = overrides.chain(std::mem::take(&mut self.overrides)).collect();
+        }
+        Ok(self)
+    }
+}
+
+/// A setting as a checkpoint has it (Rust's debug form: `16`, `AntennaGains`, `Limits { a: 1.0, b: 2.0 }`) as a value of TOML;
+/// `None` for a file, of which only the checksum is known.
+fn toml_of(value: &str) -> Option<String> {
+    if value.starts_with("a file of") {
+        return None;
+    }
+    if let Some((_, fields)) = value.split_once(" { ") {
+        return Some(format!("{{ {}", fields.replace(": ", " = ")));
+    }
+    if !value.starts_with(|c: char| c.is_ascii_uppercase()) {
+        return Some(value.to_owned());
+    }
+    // A variant, which files write in kebab case.
+    let mut text = String::new();
+    for (k, c) in value.char_indices() {
+        if c.is_ascii_uppercase() && k > 0 {
+            text.push('-');
+        }
+        text.push(c.to_ascii_lowercase());
+    }
+    Some(format!("{text:?}"))
+}
+
+/// Maps of the sums in a state, without new data: of every channel, with each of these epsilons, or those of the
+/// configuration if there are none. The state stays as it is. `found` gets each map as soon as it is made, with its epsilon;
+/// `watch` follows, and ends it early.
+///
+/// # Errors
+/// A state that cannot be read or was made with other settings; a solution that fails.
+pub fn solve_state(
+    folder: &Path,
+    config: &Config,
+    epsilons: &[f64],
+    watch: &SolveWatch,
+    found: &mut dyn FnMut(Solution),
+) -> Result<(), PipelineError> {
+    let given = epsilons.iter().map(|&epsilon| PerChannel::All(epsilon));
+    let each: Vec<_> = if epsilons.is_empty() { vec![config.map.epsilon.clone()] } else { given.collect() };
+    for epsilon in each {
+        // Solving takes the sums: they are read again for the next.
+        let sums = Ground::sums_in(folder, &config.ground(WAIT_BYTES))?;
+        let mut solver = Solver::new(SolverSetup { epsilon, ..config.solver(watch.clone())? });
+        for snapshot in sums {
+            let mut out = Outlet::collect();
+            solver.step(snapshot, &mut out)?;
+            out.into_vec().into_iter().for_each(&mut *found);
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::accumulation::{EngineKind, MapConfig};
+    use crate::calibration::{CalibrationConfig, CalibrationHook};
+    use crate::response::harmonic::GeometryLimits;
+    use crate::response::pixel::PixelMethod;
+
+    #[test]
+    fn settings_of_a_state_are_read_back() {
+        let calibration =
+            CalibrationConfig { quantiser_bits: 2, sub_bands: 1, ..CalibrationConfig::default() };
+        let pixel =
+            MapConfig { nside: 4, rows: PixelMethod::AverageExact, weight_max: 2e-9, ..MapConfig::default() };
+        let limits = GeometryLimits { altitude_m_max: 1e-3, ..GeometryLimits::default() };
+        let harmonic = MapConfig { engine: EngineKind::Harmonic, l_max: 7, limits, ..MapConfig::default() };
+        for map in [pixel, harmonic] {
+            let mut overrides: Vec<String> = map
+                .of_sums()
+                .iter()
+                .filter_map(|(key, value)| Some(format!("{key}={}", toml_of(value)?)))
+                .collect();
+            overrides.push(format!("calibration.quantiser_bits={}", calibration.quantiser_bits));
+            let config = ConfigSource { overrides, ..ConfigSource::default() }.load_ground().unwrap();
+            assert_eq!((config.map, config.calibration), (map, calibration.clone()));
+        }
+        let hook = toml_of(&format!("{:?}", CalibrationHook::AntennaGains));
+        assert_eq!(hook.as_deref(), Some("\"antenna-gains\""));
+        assert_eq!(toml_of("a file of checksum 0123"), None);
+    }
+}

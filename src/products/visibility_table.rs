@@ -1,0 +1,180 @@
+//! The visibilities of a downlink file as a table, for those who work on them elsewhere.
+
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+use num_complex::Complex32;
+use rayon::prelude::*;
+
+use super::error::ProductsError;
+use crate::array::Ephemeris;
+use crate::downlink::{DownlinkError, DownlinkReader};
+use crate::files::{AtomicFile, IfUnfinished};
+use crate::frames::{Flags, GroundFrame, Instrument, VisibilityBlock};
+use crate::runtime::Cancel;
+use crate::units::constants::{BOLTZMANN_J_K, SPEED_OF_LIGHT_M_S};
+use crate::units::vector::{Vec3, sub};
+use crate::units::{ChannelId, Pair};
+
+/// Segments of positions that are kept: more than two years of windows.
+const SEGMENTS_MAX: usize = 8192;
+
+/// Columns of the table that [`VisibilityTable::write_csv`] writes.
+const CSV_HEADER: &str = "time_s,tai_s,dt_s,i,j,u_m,v_m,w_m,x_i_m,y_i_m,z_i_m,x_j_m,y_j_m,z_j_m,re_k_sr,im_k_sr,re_jy,im_jy,weight,flag";
+
+/// W m^-2 Hz^-1 in a jansky.
+const JANSKY: f64 = 1e-26;
+
+/// What a visibility of 1 K sr is in Jy: 2 k nu^2 / c^2, of both polarisations.
+#[must_use]
+pub fn jansky_per_k_sr(frequency_hz: f64) -> f64 {
+    2.0 * BOLTZMANN_J_K * (frequency_hz / SPEED_OF_LIGHT_M_S).powi(2) / JANSKY
+}
+
+/// One visibility as it came down, with the positions of its satellites. Nothing is calibrated.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VisibilityRow {
+    /// Middle of the integration, half microseconds since the mission epoch: exact.
+    pub middle_half_us: i64,
+    /// Length of the integration, us.
+    pub duration_us: u32,
+    /// Pair; a satellite with itself for an auto-correlation.
+    pub pair: Pair,
+    /// Positions of both satellites at that time, m, Moon-centred ecliptic axes; `None` where the downlink has none.
+    pub positions_m: Option<[Vec3; 2]>,
+    /// Visibility, K sr.
+    pub value_k_sr: Complex32,
+    /// Inverse variance of the real part, (K sr)^-2.
+    pub weight: f32,
+    /// Flags.
+    pub flags: Flags,
+}
+
+/// What a downlink file holds, in memory: 21 bytes a visibility.
+#[derive(Clone, Debug)]
+pub struct VisibilityTable {
+    instrument: Instrument,
+    ephemeris: Ephemeris,
+    blocks: Vec<VisibilityBlock>,
+}
+
+impl VisibilityTable {
+    /// Reads a file of either format. Damage is passed over; `lunarray inspect` counts it.
+    ///
+    /// # Errors
+    /// A file that cannot be read or describes no instrument; the end of `cancel`.
+    pub fn read(path: &Path, cancel: &Cancel) -> Result<Self, ProductsError> {
+        let failed = |error: DownlinkError| ProductsError::Downlink { source: Box::new(error) };
+        let mut reader = DownlinkReader::open(path).map_err(failed)?;
+        let (mut described, mut ephemeris, mut blocks) = (None, Ephemeris::new(SEGMENTS_MAX), Vec::new());
+        while let Some(frame) = reader.next_frame().map_err(failed)? {
+            match frame {
+                GroundFrame::Instrument(instrument) => described = Some(instrument),
+                GroundFrame::Ephemeris(segment) => {
+                    ephemeris.insert(segment);
+                }
+                GroundFrame::Visibilities(block) => blocks.push(block),
+                GroundFrame::Housekeeping(_) => {}
+            }
+            if cancel.is_cancelled() {
+                return Err(ProductsError::Interrupted { path: path.to_owned() });
+            }
+        }
+        let instrument = described.ok_or_else(|| ProductsError::NoInstrument { path: path.to_owned() })?;
+        Ok(Self { instrument, ephemeris, blocks })
+    }
+
+    /// The instrument.
+    #[must_use]
+    pub fn instrument(&self) -> &Instrument {
+        &self.instrument
+    }
+
+    /// Positions of the satellites.
+    #[must_use]
+    pub fn ephemeris(&self) -> &Ephemeris {
+        &self.ephemeris
+    }
+
+    /// Visibilities of one channel (correlations of two satellites), in the order of the file.
+    #[must_use]
+    pub fn visibilities(&self, channel: ChannelId) -> Vec<VisibilityRow> {
+        self.rows(|block| block.channel == channel && block.pair.i != block.pair.j)
+            .into_iter()
+            .map(|(_, row)| row)
+            .collect()
+    }
+
+    /// Auto-correlations of all channels, with their channel.
+    #[must_use]
+    pub fn autos(&self) -> Vec<(ChannelId, VisibilityRow)> {
+        self.rows(|block| block.pair.i == block.pair.j)
+    }
+
+    /// Writes the visibilities of one channel as a table with commas, a line each; returns their number.
+    ///
+    /// Times are s since the mission epoch and TAI s since 1958, satellites are counted from 1, u, v, w is the baseline
+    /// r_i - r_j and x, y, z are positions, m, Moon-centred ecliptic axes, empty where the downlink has none.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn write_csv(&self, channel: ChannelId, path: &Path) -> Result<usize, ProductsError> {
+        let failed = |source| ProductsError::Write { path: path.to_owned(), source };
+        let frequency_hz =
+            self.instrument.channels.get(usize::from(channel.0)).map_or(f64::NAN, |c| c.frequency_hz);
+        let rows = self.visibilities(channel);
+        let file = AtomicFile::create(path, IfUnfinished::Remove).map_err(failed)?;
+        let mut out = BufWriter::new(file);
+        writeln!(out, "{CSV_HEADER}").map_err(failed)?;
+        for row in &rows {
+            self.write_line(&mut out, row, jansky_per_k_sr(frequency_hz)).map_err(failed)?;
+        }
+        let file = out.into_inner().map_err(|error| failed(error.into_error()))?;
+        file.finish().map_err(failed)?;
+        Ok(rows.len())
+    }
+
+    fn write_line(&self, out: &mut impl Write, row: &VisibilityRow, jansky_per_k_sr: f64) -> io::Result<()> {
+        let time_s = row.middle_half_us as f64 * 0.5e-6;
+        let tai_s = self.instrument.epoch_tai_s + time_s;
+        let dt_s = f64::from(row.duration_us) * 1e-6;
+        write!(out, "{time_s:.7},{tai_s:.6},{dt_s:.6},{},{}", row.pair.i + 1, row.pair.j + 1)?;
+        match row.positions_m {
+            Some([r_i_m, r_j_m]) => {
+                for value in [sub(r_i_m, r_j_m), r_i_m, r_j_m].into_iter().flatten() {
+                    write!(out, ",{value}")?;
+                }
+            }
+            None => write!(out, ",,,,,,,,,")?,
+        }
+        let Complex32 { re, im } = row.value_k_sr;
+        let jansky = |part: f32| f64::from(part) * jansky_per_k_sr;
+        writeln!(out, ",{re},{im},{},{},{},{}", jansky(re), jansky(im), row.weight, row.flags.0)
+    }
+
+    fn rows(&self, is_wanted: impl Fn(&VisibilityBlock) -> bool) -> Vec<(ChannelId, VisibilityRow)> {
+        let wanted: Vec<&VisibilityBlock> = self.blocks.iter().filter(|block| is_wanted(block)).collect();
+        wanted
+            .par_iter()
+            .flat_map_iter(|block| (0..block.len()).map(|k| (block.channel, self.row(block, k))))
+            .collect()
+    }
+
+    fn row(&self, block: &VisibilityBlock, k: usize) -> VisibilityRow {
+        let (offset, duration_us) = (i64::from(block.offset_ticks[k]), block.duration_ticks[k]);
+        let middle_half_us = 2 * block.start.plus_ticks(offset).0 + i64::from(duration_us);
+        let time_s = middle_half_us as f64 * 0.5e-6;
+        let position = |satellite: u8| self.ephemeris.position_at(time_s, satellite.into());
+        let positions_m = position(block.pair.i).zip(position(block.pair.j)).map(|(i, j)| [i, j]);
+        let (value_k_sr, weight, flags) = (block.value_k_sr[k], block.weight[k], block.flags[k]);
+        VisibilityRow {
+            middle_half_us,
+            duration_us,
+            pair: block.pair,
+            positions_m,
+            value_k_sr,
+            weight,
+            flags,
+        }
+    }
+}

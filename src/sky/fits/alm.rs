@@ -1,0 +1,79 @@
+//! Writing of harmonic coefficients, as healpy's `write_alm` does.
+
+use std::io::Write;
+use std::path::Path;
+
+use super::card::Card;
+use super::error::{FitsError, FitsProblem};
+use super::header::BLOCK_BYTES;
+use super::write::{end_header, primary_cards, write_whole};
+use crate::sky::harmonics::Alm;
+
+/// Bytes of a row: an index of 32 bits and two doubles.
+const ROW_BYTES: usize = 20;
+
+/// Writes coefficients as a table INDEX = l^2 + l + m + 1, REAL, IMAG, which healpy's `read_alm` reads; replaces any file at `path`.
+///
+/// # Errors
+/// [`FitsError`]: cards that FITS cannot represent, or an error of the operating system.
+pub fn write_alm(path: &Path, alm: &Alm, cards: &[Card]) -> Result<(), FitsError> {
+    let write = || {
+        let mut header = Vec::new();
+        for card in primary_cards() {
+            card.write_to(&mut header)?;
+        }
+        end_header(&mut header);
+        for card in structure(alm).iter().chain(cards) {
+            card.write_to(&mut header)?;
+        }
+        end_header(&mut header);
+        write_whole(path, |out| {
+            out.write_all(&header).map_err(FitsProblem::io("write"))?;
+            out.write_all(&rows(alm)).map_err(FitsProblem::io("write"))
+        })
+    };
+    write().map_err(|problem| FitsError::new(path, problem))
+}
+
+fn structure(alm: &Alm) -> Vec<Card> {
+    let mut cards = vec![
+        Card::text("XTENSION", "BINTABLE", "binary table extension"),
+        Card::integer("BITPIX", 8, "array data type"),
+        Card::integer("NAXIS", 2, "number of array dimensions"),
+        Card::integer("NAXIS1", ROW_BYTES as i64, "length of dimension 1"),
+        Card::integer("NAXIS2", alm.values().len() as i64, "length of dimension 2"),
+        Card::integer("PCOUNT", 0, "number of group parameters"),
+        Card::integer("GCOUNT", 1, "number of groups"),
+        Card::integer("TFIELDS", 3, "number of table fields"),
+    ];
+    for (number, (name, form, unit)) in
+        (1..).zip([("INDEX", "J", ""), ("REAL", "D", "K"), ("IMAG", "D", "K")])
+    {
+        cards.push(Card::text(&format!("TTYPE{number}"), name, ""));
+        cards.push(Card::text(&format!("TFORM{number}"), form, ""));
+        if !unit.is_empty() {
+            cards.push(Card::text(&format!("TUNIT{number}"), unit, ""));
+        }
+    }
+    let l_max = alm.l_max() as i64;
+    cards.push(Card::text("EXTNAME", "ALM", "harmonic coefficients of a real field, m >= 0"));
+    cards.push(Card::integer("MAX-LPOL", l_max, "greatest degree l"));
+    cards.push(Card::integer("MAX-MPOL", l_max, "greatest order m"));
+    cards
+}
+
+/// The rows by degree, then order, so that the index increases; padded to whole blocks.
+fn rows(alm: &Alm) -> Vec<u8> {
+    let mut rows = Vec::with_capacity(ROW_BYTES * alm.values().len() + BLOCK_BYTES);
+    for l in 0..=alm.l_max() {
+        for m in 0..=l {
+            let value = alm.get(l, m);
+            // Degrees are bounded by those of a map: some thousands.
+            rows.extend_from_slice(&((l * l + l + m + 1) as i32).to_be_bytes());
+            rows.extend_from_slice(&value.re.to_be_bytes());
+            rows.extend_from_slice(&value.im.to_be_bytes());
+        }
+    }
+    rows.resize(rows.len().next_multiple_of(BLOCK_BYTES), 0);
+    rows
+}
