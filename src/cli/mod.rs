@@ -8,6 +8,8 @@ mod bench;
 mod check;
 mod compare;
 mod corrupt;
+mod cutout;
+mod figure;
 mod gaps;
 mod geometry;
 mod inspect;
@@ -64,6 +66,8 @@ enum Command {
     Retract(retract::RetractArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
+    Figure(figure::FigureArgs),
+    Cutout(cutout::CutoutArgs),
     Predict(predict::PredictArgs),
     Check(check::CheckArgs),
     Bench(bench::BenchArgs),
@@ -89,6 +93,8 @@ pub fn main() -> ExitCode {
         Command::Retract(args) => retract::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
+        Command::Figure(args) => figure::execute(&args),
+        Command::Cutout(args) => cutout::execute(&args),
         Command::Predict(args) => predict::execute(&args),
         Command::Check(args) => check::execute(&args),
         Command::Bench(args) => bench::execute(&args),

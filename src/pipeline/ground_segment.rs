@@ -61,6 +61,7 @@ pub(super) fn add(
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let setup = SolverSetup {
         epsilon: config.map.epsilon.clone(),
+        moon_reflection: config.map.moon_reflection,
         prior_k: config.map.prior_k.clone(),
         prior_maps: prior_maps(config)?,
         rule: StoppingRule {

@@ -348,6 +348,7 @@ fn sums_key(config: &Config) -> u64 {
     let usual = crate::accumulation::MapConfig::default();
     (map.epsilon, map.prior_k, map.prior_files) = (usual.epsilon, usual.prior_k, usual.prior_files);
     (map.prior_fwhm_deg, map.residual_max) = (usual.prior_fwhm_deg, usual.residual_max);
+    map.moon_reflection = usual.moon_reflection;
     (map.iterations_max, map.trace_probes) = (usual.iterations_max, usual.trace_probes);
     let text = serde_json::to_vec(&(map, &config.calibration)).unwrap_or_default();
     crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
