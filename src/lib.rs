@@ -85,6 +85,8 @@ pub mod products;
 
 pub mod pipeline;
 
+pub mod figures;
+
 #[cfg(feature = "serve")]
 pub mod serve;
 

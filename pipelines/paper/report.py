@@ -4,16 +4,21 @@
 Run from the top of the checkout after the runs and studies that the page names; needs Python only:
 
     python3 pipelines/paper/report.py "2 cores of an Intel Xeon" > docs/paper.md
+
+Pictures that the page shows are copied beside it, into docs/.
 """
 
 import json
 import math
+import shutil
 import sys
 from pathlib import Path
 
 OUT = Path("out")
 BOLTZMANN = 1.380649e-23
 LIGHT = 299792458.0
+# Larger pictures stay where they are.
+PICTURE_BYTES_MAX = 700_000
 
 
 def load(name):
@@ -34,9 +39,209 @@ def show(x, form="{:.2e}"):
     return "-" if x is None else form.format(x)
 
 
+def picture(path, name, what):
+    if not (OUT / path).exists():
+        return ""
+    if (OUT / path).stat().st_size > PICTURE_BYTES_MAX:
+        return f"\n(Its picture is `out/{path}`.)\n"
+    shutil.copyfile(OUT / path, Path("docs") / name)
+    return f"\n![{what}]({name})\n"
+
+
 def missing(command):
     return f"Not made here yet: `{command}`.\n"
 
+
+
+FIGURE = "lunarray figure {} pipelines/paper-10mhz.toml"
+
+
+def figure(name, text, command=None, what=""):
+    numbers = load(f"figures/{name}.json")
+    if numbers is None:
+        return missing(command or FIGURE.format(name))
+    return text(numbers) + picture(f"figures/{name}.png", f"paper-{name}.png", what or name)
+
+
+def full_sky():
+    return (
+        "The generated sky with small scales and sources, Galactic coordinates, logarithmic.\n"
+        + picture("sky-10mhz.png", "paper-sky.png", "the sky at 10 MHz")
+        if (OUT / "sky-10mhz.png").exists()
+        else missing(SKY)
+    )
+
+
+SKY = "lunarray sky pipelines/paper-10mhz.toml --freq-hz 10e6 --nside 512 --out out/sky-10mhz.fits --sources out/sources.csv"
+CUTOUT = "lunarray cutout out/sky-10mhz.fits --centre 30,40 --subtract-fwhm 5 --out out/patch.png"
+
+
+def counts():
+    path = OUT / "sources.csv"
+    if not path.exists():
+        return missing(SKY)
+    fluxes = [float(line.split(",")[2]) for line in path.read_text().splitlines()[1:]]
+    # Franzen et al. 2019: log10(S^2.5 dN/dS) = sum a_k (log10 S)^k, integrated in ln S by the midpoint rule.
+    a = [3.52, 0.307, -0.388, -0.0404, 0.0351, 0.00600]
+
+    def expected(low, high=75.0, steps=4000):
+        total, step = 0.0, math.log(high / low) / steps
+        for k in range(steps):
+            s = low * math.exp((k + 0.5) * step)
+            x = math.log10(s)
+            total += s * 10 ** (sum(c * x**n for n, c in enumerate(a)) - 2.5 * x) * step
+        return 4 * math.pi * total
+
+    rows = [
+        [f"{s:g}", f"{sum(flux > s for flux in fluxes):,}", f"{expected(s):,.0f}"] for s in (4.36, 6, 10, 20, 40)
+    ]
+    return table(["S at 154 MHz, Jy", "N(>S) of the sky", "of the counts of Franzen et al. (2019)"], rows) + picture(
+        "patch.png", "paper-patch.png", "a patch of 20 x 20 degrees with scales above 5 degrees subtracted"
+    )
+
+
+def spacing(n):
+    rows = []
+    for r in (2, 3, 4, 6, 10):
+        row = [str(r)]
+        for curve in n["curves"]:
+            row.append(show(curve["q0"][curve["ratio"].index(r)], "{:.4f}"))
+        rows.append(row)
+    head = ["R", *[f"R_2 = {curve['first_ratio']:g}" for curve in n["curves"]]]
+    return table(head, rows) + f"\nq0 = {n['q0']:.5f} for R = 3, R_2 = 6. The paper: 2.02479.\n"
+
+
+def pair_time(n):
+    channel = n["channels"][0]
+    text = (
+        f"{n['windows']:,} windows, {n['observed_s'] / 3600:,.0f} h; {n['pair_s'] / 3600:,.0f} pair hours, lengths from "
+        f"{n['shortest_m']:.0f} m to {n['longest_m'] / 1e3:.1f} km.\n\n"
+    )
+    rows = [
+        ["visibilities, all baselines", f"{channel['visibilities_all']:.3e}", "1.9e9 (independent count)"],
+        [f"b < {channel['limit_m']:.0f} m = 2 b_p", f"{channel['visibilities']:.3e}", "2.60e7 (independent count)"],
+        ["pairs within it", str(channel["pairs"]), "9 (independent count)"],
+        ["pair hours within it", f"{channel['pair_s'] / 3600:,.0f}", "-"],
+        ["integrations cut by lambda / 8", f"{100 * channel['cut_by_motion']:.1f} %", "> 99 %"],
+    ]
+    return text + table(["10 MHz, nside 64", "ours", "the paper"], rows)
+
+
+def uvw(n):
+    return table(
+        ["", "ours", "by geometry"],
+        [
+            ["greatest |w| / b", f"{n['w_share_max']:.4f}", "sin 30 deg = 0.5"],
+            ["mean of (w / b)^2", f"{n['w_share_square_mean']:.4f}", "sin^2 30 deg / 2 = 0.125"],
+            ["filled share of the plane u, v", f"{n['filled'][0]:.3f}", "1"],
+            ["of u, w and v, w", f"{n['filled'][1]:.3f}, {n['filled'][2]:.3f}", "-"],
+        ],
+    )
+
+
+def coverage():
+    n = load("figures/coverage.json")
+    command = "lunarray figure coverage pipelines/paper-10mhz.toml --set spacecraft.channels_hz=[10e6,3e6]"
+    if n is None:
+        return missing(command)
+    ten, three = n["channels"]
+    rows = []
+    for a, b in zip(ten["bands"], three["bands"]):
+        rows.append([
+            f"{a['latitude_deg'][0]:g} to {a['latitude_deg'][1]:g}", f"{a['pair_h']:,.0f}", f"{b['pair_h']:,.0f}",
+            f"{b['pair_h'] / a['pair_h']:.2f}", f"{a['shortest_wavelengths']:.2f}", f"{b['shortest_wavelengths']:.2f}",
+            f"{a['uv_filled']:.2f}", f"{b['uv_filled']:.2f}",
+        ])
+    head = ["degrees from the ecliptic", "pair hours, 10 MHz", "3 MHz", "3 over 10 MHz", "shortest projected, wavelengths",
+            "3 MHz", "uv filled", "3 MHz"]
+    return f"`{command}`\n\n" + table(head, rows) + (
+        "\nAs in Sect. 3.3 of the paper: for baselines below 2 b_p of each frequency, more pairs see a direction at 3 MHz. At the "
+        "poles the shortest projected baseline is 100 m cos 30 deg = 2.9 wavelengths at 10 MHz, so scales above l = 18 are "
+        "missing there.\n"
+    ) + picture("figures/coverage.png", "paper-coverage.png", "coverage by direction")
+
+
+def beam_row(n):
+    return (
+        f"Pair {n['pair']}, {n['length_m']:.0f} m = {n['length_bp']:.2f} b_p at {n['frequency_hz'] / 1e6:g} MHz, nside "
+        f"{n['nside']}: the Moon leaves {100 * n['seen']:.1f} % of the pixels; mean square of the row there "
+        f"{n['centre_power']:.3f} at centres, {n['average_power']:.3f} averaged. Where the fringe is narrower than a pixel, the "
+        "average is small, and the centre aliases.\n"
+    )
+
+
+def waterfall(n):
+    rows = []
+    for c in n["classes"]:
+        end = "" if c["to_bp"] is None else f"{c['to_bp']:g}"
+        rows.append([f"{c['from_bp']:g} to {end}", f"{c['count']:,}", f"{c['centre']:.3f}", f"{c['average']:.3f}"])
+    return (
+        f"Pair {n['pair']}, a window, {n['band_hz'][0] / 1e6:g} to {n['band_hz'][1] / 1e6:g} MHz, the sky of 10 MHz at nside "
+        f"{n['nside_fine']}, averaged to {n['nside']}.\n\n"
+        + table(["baseline, b_p", "visibilities", "error at centres", "averaged"], rows)
+        + "\nErrors are rms, over the rms visibility of the fine sky. The paper: centres differ visibly from the fine sky, averages "
+        "do not as long as b < b_p.\n"
+    )
+
+
+def sub_pixel(n):
+    rows = []
+    for case in n["cases"]:
+        by = {c["to_bp"]: c for c in case["classes"]}
+        rows.append([
+            str(case["nside"]), case["rows"], f"{case['visibilities']:,}",
+            *[show(by[to]["of_visibility"] if to in by else None, "{:.3f}") for to in (0.5, 1.0, 1.5, 2.0)],
+            f"{case['sigma_b_k']:.2e}", f"{case['tr_sigma_b_k2']:.2e}",
+        ])
+    head = ["nside", "rows", "visibilities", *[f"N_b, b < {to} b_p" for to in (0.5, 1.0, 1.5, 2.0)], "Sigma_b, K rms",
+            "Tr Sigma_b, K²"]
+    return table(head, rows) + (
+        f"\nN_b is the covariance of V - B T over {n['skies']} skies, T the means over pixels; shown is the root of its diagonal over "
+        "the rms visibility, in the class of lengths that ends there. Sigma_b is that of the map, epsilon "
+        f"{n['epsilon']:g}, from a sample of the mission's integrations. The paper's text of the appendix was not at hand: these "
+        "are the definitions that its abstract's words (sub-pixel noise) suggest.\n"
+    ) + picture("figures/sub-pixel-maps.png", "paper-sub-pixel-maps.png", "root of the diagonal of Sigma_b")
+
+
+def latitudes(name, command, said):
+    study = load(f"{name}/study.json")
+    if study is None:
+        return missing(command)
+    rows, head = [], []
+    for case in study["cases"]:
+        channel = case["figures"]["channels"][0]
+        bands = channel.get("latitudes") or []
+        head = [f"{band['from_deg']:g} to {band['to_deg']:g} deg" for band in bands]
+        rows.append([case["figures"]["name"], show(channel["mean_k"], "{:.3e}"),
+                     *[f"{100 * band['mean']:+.1f}, {100 * band['rms']:.1f}" for band in bands]])
+    return table(["case", "mean, K", *head], rows) + (
+        f"\nMean and rms of (map - input) / input, %, by distance from the ecliptic. {said}\n"
+    )
+
+
+def sizes():
+    study = load("traces-nside/study.json")
+    if study is None:
+        return ""
+    rows = {}
+    for case in study["cases"]:
+        label = case["figures"]["name"].split(",")[0]
+        channel = case["figures"]["channels"][0]
+        found = channel["diagnostics"]["traces"]
+        if found is None:
+            continue
+        mean = math.sqrt(channel["power"]["input_k2"][0] / (4 * math.pi))
+        # 40 times fewer visibilities than the mission has.
+        n, s = found["sigma_n_k2"]["value"] / 40, found["sigma_s"]["value"]
+        rows.setdefault(label, []).append((channel["diagnostics"]["epsilon"], n, s, mean))
+    lines = []
+    for label, points in rows.items():
+        for epsilon, n, s, mean in points:
+            if epsilon in (1e-4, 2e-3, 1e-2):
+                lines.append([label, f"{epsilon:.0e}", show(n), show(s), show(mean**2 * s), show(math.sqrt(n / s))])
+    return "\nThe same by the size of the map, `lunarray study pipelines/paper/traces-nside.toml`, scaled to all visibilities:\n\n" + table(
+        ["map", "epsilon", "Tr Sigma_n, K²", "Tr Sigma_s", "T² Tr Sigma_s, K²", "T at which they are equal, K"], lines
+    )
 
 
 def maps():
@@ -119,31 +324,101 @@ def rows_of_b(key, wanted, said):
 def sensitivity():
     study = load("fig19-sensitivity/study.json")
     if study is None:
-        return missing("lunarray study pipelines/paper/fig19-sensitivity.toml")
+        return missing("lunarray study pipelines/paper/fig19-sensitivity.toml") + pair_sensitivity()
     rows = []
-    # Pixels of nside 16 as beams: a lower limit of the effective beam.
-    beam = 4 * math.pi / (12 * 16 * 16)
+    # Pixels of nside 16 as beams, where the beam is not known.
+    pixel = 4 * math.pi / (12 * 16 * 16)
     for case in study["cases"]:
         channel = case["figures"]["channels"][0]
         frequency, noise = channel["frequency_hz"], channel["noise_rms_k"]
-        jansky = 5 * 2 * BOLTZMANN * noise * (frequency / LIGHT) ** 2 * beam / 1e-26
-        rows.append([f"{frequency / 1e6:g}", f"{channel['visibilities']:,}", show(noise), show(jansky)])
-    return table(["MHz", "visibilities", "noise, K rms", "5 sigma, Jy a pixel"], rows) + (
-        "\nThe paper: flat above 5 MHz, improving quickly below, as absorption suppresses the sky there. Here the beam is a pixel of "
-        "nside 16 at every frequency, not that of the post-processed map.\n"
+        beam = channel.get("beam") or {}
+        jansky = 5 * 2 * BOLTZMANN * noise * (frequency / LIGHT) ** 2 / 1e-26
+        rows.append([
+            f"{frequency / 1e6:g}", f"{channel['visibilities']:,}", show(noise), show(jansky * pixel),
+            show(beam.get("fwhm_deg"), "{:.2f}"),
+            show(None if beam.get("area_sr") is None else jansky * beam["area_sr"]),
+        ])
+    head = ["MHz", "visibilities", "noise, K rms", "5 sigma, Jy a pixel", "beam, deg", "5 sigma, Jy a beam"]
+    return table(head, rows) + (
+        "\nThe paper: flat above 5 MHz, improving quickly below, as absorption suppresses the sky there.\n"
+    ) + pair_sensitivity()
+
+
+def pair_sensitivity():
+    """Fig. 19 from the radiometer equation alone: 2 k T_sys nu^2 / c^2 / sqrt(2 dnu t), t the pair-time within 2 b_p.
+
+    From `lunarray figure pair-time pipelines/paper-10mhz.toml` with the study's channels, every 4th window, into
+    out/figures-nside16 and -nside64, with map.nside and spacecraft.baseline_wavelengths_max 31.3 and 125.1.
+    """
+    found = [load(f"figures-nside{nside}/pair-time.json") for nside in (16, 64)]
+    if None in found:
+        return ""
+    rows = []
+    small, large = ({c["frequency_hz"]: c for c in n["channels"]} for n in found)
+    # Mean sky of Cane (1979), seen by 76 % of the sphere.
+    def sky(f):
+        tau = 5 * (f / 1e6) ** -2.1
+        i = 2.48e-20 * (f / 1e6) ** -0.52 * (1 - math.exp(-tau)) / tau + 1.06e-20 * (f / 1e6) ** -0.80 * math.exp(-tau)
+        return i * LIGHT**2 / (2 * BOLTZMANN * f**2)
+    for f in sorted(small):
+        power = sky(f) * 4 * math.pi * 0.761
+        def sigma(c):
+            # Every fourth window.
+            return 5 * 2 * BOLTZMANN * power * (f / LIGHT) ** 2 / math.sqrt(2 * 8000 * 4 * c["pair_s"]) / 1e-26
+        rows.append([f"{f / 1e6:g}", f"{4 * small[f]['pair_s'] / 3600:,.0f}", f"{4 * large[f]['pair_s'] / 3600:,.0f}",
+                     show(sigma(small[f]), "{:.1f}"), show(sigma(large[f]), "{:.1f}")])
+    head = ["MHz", "pair hours, nside 16", "nside 64", "5 sigma, Jy, nside 16", "nside 64"]
+    # Independent: the paper's formula in numpy, rows averaged over pixels of nside 8, epsilon 1e-3, b < 2 b_p.
+    dense = {"2": (247, 63.7), "5": (446, 105.0), "10": (568, 111.7), "20": (947, 126.4), "30": (1495, 157.2)}
+    return (
+        "\n**Why it rises here.** By the radiometer equation alone, 2 k T_sys nu² / c² over sqrt(2 dnu t), with the mean sky of Cane "
+        "(1979) and t the time of all pairs within 2 b_p (`lunarray figure pair-time` with these channels), sensitivity is as the "
+        "paper says, flat above 5 MHz and better below; the more so at nside 64, where more pairs are within 2 b_p:\n\n"
+        + table(head, rows)
+        + "\nThe noise of a map is the trace of Q W (W + eps)^-2 Qt, which counts every mode alike. A dense calculation of that formula "
+        "in numpy, at nside 8, epsilon 1e-3, which shares no code with this program:\n\n"
+        + table(
+            ["MHz", "5 sigma, Jy a pixel", "radiometer, Jy", "ratio"],
+            [[f, f"{jy:,}", f"{rad:g}", f"{jy / rad:.1f}"] for f, (jy, rad) in dense.items()],
+        )
+        + "\nIt rises by 3.4 from 5 to 30 MHz, as the study does: in pixels of a fixed nside the few pairs that are left at high "
+        "frequencies measure modes less evenly, and a map has the noise of the worst of them. So the paper's formula gives the rise "
+        "for small maps, and neither T_sys nor the beam's area is its cause. At nside 64 the radiometer alone falls by a fifth from "
+        "5 to 30 MHz; whether the map's noise is then flat needs the study at that size "
+        "(`lunarray study pipelines/paper/fig19-nside64.toml`, not made here).\n"
     )
 
 
 def main():
     machine = sys.argv[1] if len(sys.argv) > 1 else "an unnamed machine"
+    cutouts = "lunarray cutout out/paper-10mhz/10.000MHz/input-smooth.fits out/paper-10mhz/10.000MHz/map-smooth.fits"
     parts = [
+        ("Fig. 1: a patch, and N(>S)", f"`{SKY}`, `{CUTOUT}`", counts()),
+        ("Fig. 2: the full sky", "By the same command.", full_sky()),
+        ("Fig. 3: q0 against R and R_2", f"`{FIGURE.format('spacing')}`", figure("spacing", spacing)),
+        ("Fig. 4: time by baseline length", f"`{FIGURE.format('pair-time')}`",
+         figure("pair-time", pair_time) + "\n### Time by direction (Sect. 3.3)\n\n" + coverage()),
+        ("Fig. 5: density of u, v, w", f"`{FIGURE.format('uvw')}`", figure("uvw", uvw)),
+        ("Fig. 6: the sky reflected by the Moon", "`lunarray study pipelines/paper/fig6-reflection.toml`",
+         latitudes("fig6-reflection", "lunarray study pipelines/paper/fig6-reflection.toml",
+                   "A flat mirror below a horizontal baseline repeats the visibility of the sky above the horizontal, so that "
+                   "1 / (1 + xi_R) takes it back but for the band between the horizontal and the limb, 31.5 degrees lower, "
+                   "which such a mirror does not show.")),
+        ("Fig. 7: a row of B", f"`{FIGURE.format('rows')}`", figure("rows", beam_row)),
+        ("Fig. 8: waterfalls of one pair", f"`{FIGURE.format('waterfall')}`", figure("waterfall", waterfall)),
         ("Fig. 9 and 10: the maps at 10 and 3 MHz, full size", "`lunarray run pipelines/paper-10mhz.toml`, "
          "`lunarray run pipelines/paper-3mhz.toml`", maps()),
         ("Fig. 11: a prior of 5 degrees", "`lunarray study pipelines/paper/fig11-prior.toml`",
          correlation("fig11-prior", "rho", (2, 4, 8, 12, 16, 32, 64, 128), "case",
                      "The paper: a prior cures the poles, which the shortest baseline leaves open below l = 18.")),
+        ("Fig. 12: a wrong prior", "`lunarray study pipelines/paper/fig12-wrong-prior.toml` (its head says how the priors are made)",
+         latitudes("fig12-wrong-prior", "lunarray study pipelines/paper/fig12-wrong-prior.toml",
+                   "The paper: with a prior of correlation 0.8 the equator is still right, the poles are off by more than 20 %.")),
+        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted",
+         f"After `lunarray run pipelines/paper-10mhz.toml --set products.smooth_fwhm_deg=1`: `{cutouts} --frame ecliptic "
+         "--centre LON,LAT --subtract-fwhm 5 --out out/patch-1.png`; the same of 3 MHz", "Not made here yet.\n"),
         ("Fig. 15: traces against epsilon", "`lunarray study pipelines/paper/fig15-traces.toml`",
-         traces() + "\n![rho, SNR, power and traces against epsilon](paper-fig15.png)\n"),
+         traces() + "\n![rho, SNR, power and traces against epsilon](paper-fig15.png)\n" + sizes()),
         ("Fig. 16: rows at centres and averaged, rho_l without noise",
          "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("rho", "no noise", "The paper: rows at centres are well below 1 from b_p on; averaged rows are not, and "
@@ -154,13 +429,13 @@ def main():
          correlation("fig18-epsilon", "rho", (8, 16, 32, 64, 96, 128), "epsilon",
                      "The paper: rho_l does not depend on epsilon below 1e-2.")),
         ("Fig. 19: sensitivity against frequency", "`lunarray study pipelines/paper/fig19-sensitivity.toml`", sensitivity()),
+        ("Fig. 20 and the appendix: N_b and Sigma_b", f"`{FIGURE.format('sub-pixel')}`", figure("sub-pixel", sub_pixel)),
     ]
     print("# The paper, figure by figure\n")
     print("What arXiv:2511.18494 shows, from this program: the command, our numbers, the paper's words. Written by "
           f"`pipelines/paper/report.py` from results on {machine}; each study leaves its curves in `study.png`. Sizes are in "
           "the study files; where they are smaller than the paper's the file says so. The sky is generated, with the paper's "
           "small scales and sources; the paper's is ULSA.\n")
-    print("Not here yet: figures 1 to 8, 12 to 14 and 20.\n")
     for title, command, text in parts:
         print(f"## {title}\n\n{command}\n\n{text}")
 

@@ -65,6 +65,9 @@ pub struct MapConfig {
     pub prior_files: Vec<PathBuf>,
     /// FWHM to which prior maps are smoothed, degrees.
     pub prior_fwhm_deg: f64,
+    /// Share of the power of the sky that the Moon is taken to reflect, xi_R: the map is that of visibilities divided by
+    /// 1 + this; 0 for none.
+    pub moon_reflection: f64,
     /// Mission time between snapshot maps, s; 0 for a final map only.
     pub snapshot_every_s: f64,
     /// Greatest weight of a visibility that is accepted, (K sr)^-2; it sets the resolution of the sums. 0 for 1024 times
@@ -126,6 +129,7 @@ impl Default for MapConfig {
             prior_k: PerChannel::All(0.0),
             prior_files: Vec::new(),
             prior_fwhm_deg: 5.0,
+            moon_reflection: 0.0,
             snapshot_every_s: 0.0,
             weight_max: 0.0,
             companion_seed: 1,
@@ -156,6 +160,8 @@ impl MapConfig {
         checks.numbers("prior_k", self.prior_k.values(), |k| k >= 0.0, "K, not negative");
         let fwhm = self.prior_fwhm_deg;
         checks.number("prior_fwhm_deg", fwhm, (0.0..=180.0).contains(&fwhm), "0 to 180");
+        let share = self.moon_reflection;
+        checks.number("moon_reflection", share, (0.0..=1.0).contains(&share), "0 to 1");
         if is_harmonic {
             let l_max = self.l_max as f64;
             checks.number("l_max", l_max, self.l_max < 3 * self.nside, "0, or 1 to 3 nside - 1");
@@ -259,6 +265,7 @@ impl MapConfig {
             prior_k: _,
             prior_files: _,
             prior_fwhm_deg: _,
+            moon_reflection: _,
             snapshot_every_s: _,
             residual_max: _,
             iterations_max: _,

@@ -130,7 +130,7 @@ fn draw(
     let plot = args.plot.clone().unwrap_or_else(|| beside(map, "-spectra"));
     let error = beside(&plot, "-error");
     draw_comparison(&title, comparison)?.write(&plot)?;
-    draw_relative_error(&title, "", comparison)?.write(&error)?;
+    draw_relative_error(&title, "", comparison, Frame::Galactic)?.write(&error)?;
     Ok(vec![plot, error])
 }
 

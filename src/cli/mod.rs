@@ -8,7 +8,9 @@ mod bench;
 mod check;
 mod compare;
 mod corrupt;
+mod cutout;
 mod export;
+mod figure;
 mod gaps;
 mod geometry;
 mod inspect;
@@ -67,6 +69,8 @@ enum Command {
     Retract(retract::RetractArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
+    Figure(figure::FigureArgs),
+    Cutout(cutout::CutoutArgs),
     Predict(predict::PredictArgs),
     Check(check::CheckArgs),
     Bench(bench::BenchArgs),
@@ -109,6 +113,8 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Retract(args) => retract::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
+        Command::Figure(args) => figure::execute(&args),
+        Command::Cutout(args) => cutout::execute(&args),
         Command::Predict(args) => predict::execute(&args),
         Command::Check(args) => check::execute(&args),
         Command::Bench(args) => bench::execute(&args),

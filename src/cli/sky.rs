@@ -1,15 +1,17 @@
 //! `lunarray sky`: write the generated sky.
 
-use std::path::PathBuf;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::output::{CommandResult, Completion, print_text};
+use super::output::{CommandError, CommandResult, Completion, print_text};
+use crate::files::write_atomically;
 use crate::mother::{BAND_HZ, NINTH_BAND_HZ};
 use crate::pipeline::{Config, ConfigSource};
 use crate::products::pictures::{ColourScale, MapPanel, Palette, Scaling, View, draw_map};
-use crate::sky::fits::{WriteOptions, write_map};
-use crate::sky::generated::generate;
+use crate::sky::fits::{ReadOptions, WriteOptions, read_whole_map, write_map};
+use crate::sky::generated::{GeneratedSky, catalogue, generate};
 use crate::sky::{Frame, GENERATED_NSIDE_MAX, SkyMap};
 
 /// Write the generated sky as a HEALPix FITS map, and a picture of it.
@@ -18,21 +20,33 @@ use crate::sky::{Frame, GENERATED_NSIDE_MAX, SkyMap};
 /// coordinates: the sky that `lunarray run` observes with the same pipeline file, seed and settings. The same seed gives
 /// the same sky at every frequency and nside.
 ///
-/// Example: lunarray sky --freq-hz 10e6 --out sky.fits
+/// With --like, writes instead a sky with the mean and the angular power of another map, and a given correlation with it at
+/// every degree: a wrong prior.
+///
+/// Examples: lunarray sky --freq-hz 10e6 --out sky.fits; lunarray sky --like sky.fits --correlation 0.8 --out wrong.fits
 #[derive(Debug, Args)]
 pub(super) struct SkyArgs {
     /// Pipeline file (TOML) with seed and sky.generated; the embedded quicklook if none is given.
     #[arg(value_name = "PIPELINE.toml")]
     pipeline: Option<PathBuf>,
     /// Frequency, Hz: 0.1 MHz to 120 MHz.
-    #[arg(long)]
-    freq_hz: f64,
+    #[arg(long, required_unless_present = "like")]
+    freq_hz: Option<f64>,
     /// HEALPix nside: a power of two up to 1024.
     #[arg(long, default_value_t = 64)]
     nside: usize,
     /// Map to write (FITS); its picture goes beside it with the extension .png.
     #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
+    /// Map (FITS) to resemble, at its own nside.
+    #[arg(long, value_name = "MAP.fits", requires = "correlation", conflicts_with_all = ["freq_hz", "sources"])]
+    like: Option<PathBuf>,
+    /// Correlation with that map at every degree from 1 to 2 nside: 0 to 1.
+    #[arg(long, requires = "like")]
+    correlation: Option<f64>,
+    /// Table of the point sources (CSV): place, flux density at 154 MHz and at the frequency, unabsorbed.
+    #[arg(long, value_name = "FILE")]
+    sources: Option<PathBuf>,
     /// Seed of fluctuations and sources, in place of the file's.
     #[arg(long)]
     seed: Option<u64>,
@@ -45,7 +59,11 @@ pub(super) struct SkyArgs {
 }
 
 pub(super) fn execute(args: &SkyArgs) -> CommandResult {
-    let SkyArgs { freq_hz, nside, seed, .. } = *args;
+    let SkyArgs { nside, seed, .. } = *args;
+    if let (Some(path), Some(correlation)) = (&args.like, args.correlation) {
+        return resemble(args, path, correlation);
+    }
+    let freq_hz = args.freq_hz.unwrap_or_default();
     let band_hz = [BAND_HZ[0], NINTH_BAND_HZ[1]];
     if !(band_hz[0]..=band_hz[1]).contains(&freq_hz) {
         return Err(format!("--freq-hz {freq_hz}: expected {} Hz to {} Hz", band_hz[0], band_hz[1]).into());
@@ -58,20 +76,60 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
         );
     }
     let values = generate(&sky.generated, freq_hz, nside, seed)?;
-    let mean = values.iter().sum::<f64>() / values.len() as f64;
     let map = SkyMap::new(Frame::Ecliptic, values)?;
-    write_map(&args.out, &map, &WriteOptions::default())?;
-    print_text(&format!("{}: nside {nside}, {freq_hz} Hz, mean {mean:.4e} K", args.out.display()))?;
+    write(args, &map, &format!("{freq_hz} Hz"))?;
+    if let Some(path) = &args.sources {
+        let count = write_sources(path, &sky.generated, freq_hz, seed)?;
+        print_text(&format!("{}: {count} sources", path.display()))?;
+    }
+    draw(args, &map, format!("Generated sky, {} MHz", freq_hz / 1e6), &format!("seed {seed}, nside {nside}"))
+}
+
+/// Writes a sky that resembles another.
+fn resemble(args: &SkyArgs, path: &Path, correlation: f64) -> CommandResult {
+    if !(0.0..=1.0).contains(&correlation) {
+        return Err(format!("--correlation {correlation}: expected 0 to 1").into());
+    }
+    let options = ReadOptions { frame_if_missing: Some(Frame::Ecliptic), ..ReadOptions::default() };
+    let (other, seed) = (read_whole_map(path, &options)?, args.seed.unwrap_or(0));
+    let map = other.correlated(correlation, seed)?;
+    write(args, &map, &format!("correlation {correlation} with {}", path.display()))?;
+    let title = format!("A sky of correlation {correlation} with another");
+    draw(args, &map, title, &format!("seed {seed}, nside {}", map.nside()))
+}
+
+fn write(args: &SkyArgs, map: &SkyMap, what: &str) -> Result<(), CommandError> {
+    let mean = map.values().iter().sum::<f64>() / map.values().len() as f64;
+    write_map(&args.out, map, &WriteOptions::default())?;
+    print_text(&format!("{}: nside {}, {what}, mean {mean:.4e} K", args.out.display(), map.nside()))
+}
+
+/// Writes the point sources, brightest first; how many there are.
+fn write_sources(path: &Path, config: &GeneratedSky, freq_hz: f64, seed: u64) -> Result<usize, CommandError> {
+    let sources = catalogue(config, freq_hz, seed);
+    let mut csv = "ecliptic_longitude_deg,ecliptic_latitude_deg,flux_154mhz_jy,flux_jy\n".to_owned();
+    for source in &sources {
+        let [longitude, latitude] = source.place_deg;
+        // Writing to a string cannot fail.
+        let _ =
+            writeln!(csv, "{longitude:.6},{latitude:.6},{:.6},{:.6}", source.flux_154mhz_jy, source.flux_jy);
+    }
+    write_atomically(path, csv.as_bytes())
+        .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+    Ok(sources.len())
+}
+
+/// Draws the sky beside its file.
+fn draw(args: &SkyArgs, map: &SkyMap, title: String, subtitle: &str) -> CommandResult {
     if !args.no_picture {
         let picture = args.out.with_extension("png");
-        let title = format!("Generated sky, {} MHz", freq_hz / 1e6);
         let panel = MapPanel {
             values: map.values(),
             caption: title,
             scale: ColourScale::robust(map.values(), Scaling::Log, Palette::default()),
             unit: "K".to_owned(),
         };
-        draw_map(&panel, &format!("seed {seed}, nside {nside}"), &View::default())?.write(&picture)?;
+        draw_map(&panel, subtitle, &View::of(Frame::Galactic, map.frame()))?.write(&picture)?;
         print_text(&format!("{}: picture", picture.display()))?;
     }
     Ok(Completion::Done)

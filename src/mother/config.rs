@@ -64,6 +64,8 @@ pub struct SpacecraftConfig {
     pub thermal_noise: bool,
     /// Receiver noise T_rec / zeta, referred to the sky, K sr.
     pub receiver_noise_k_sr: f64,
+    /// Share of the power of the sky that the Moon reflects, xi_R; 0 for none. The paper has 0.07.
+    pub moon_reflection: f64,
     /// Antenna response of the daughters.
     pub antenna: Antenna,
     /// Sub-bands into which each channel of samples is divided before correlation: a power of two, 1 for none.
@@ -151,6 +153,7 @@ impl Default for SpacecraftConfig {
             smear_bandwidth: false,
             thermal_noise: true,
             receiver_noise_k_sr: 0.0,
+            moon_reflection: 0.0,
             antenna: Antenna::default(),
             sub_bands: 1,
             delay_centre_deg: Vec::new(),
@@ -375,6 +378,8 @@ impl SpacecraftConfig {
         checks.number("wait_blocks", wait as f64, (1..=1024).contains(&wait), "1 to 1024 blocks");
         let noise = self.receiver_noise_k_sr;
         checks.number("receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
+        let share = self.moon_reflection;
+        checks.number("moon_reflection", share, (0.0..=1.0).contains(&share), "0 to 1");
         checks.number(
             "every_nth_window",
             self.every_nth_window as f64,

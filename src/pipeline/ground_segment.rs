@@ -33,6 +33,7 @@ impl Config {
         let map = &self.map;
         Ok(SolverSetup {
             epsilon: map.epsilon.clone(),
+            moon_reflection: map.moon_reflection,
             prior_k: map.prior_k.clone(),
             prior_maps: prior_maps(self)?,
             rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },

@@ -10,7 +10,7 @@ use crate::mother::{Fidelity, Schedule};
 use crate::response::harmonic::RotationTable;
 use crate::response::model::{
     BandAverage, DirectSum, HarmonicSum, HarmonicSumSetup, Load, ModelChoice, ModelKind, ModelPlan,
-    VisibilityModel,
+    Reflected, VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
@@ -108,24 +108,44 @@ pub(crate) fn build(plan: &Plan, skies: &[SkyMap]) -> Result<Vec<Box<dyn Visibil
     for ((model, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {
         let (frequency_hz, response) = (schedule.frequency_hz, plan.instrument.response);
         if model.kind == ModelKind::Direct {
-            let direct = DirectSum::new(sky, frequency_hz, array.moon_radius_m(), response);
-            models.push(averaged(plan, Box::new(direct), frequency_hz));
+            let direct = |moon_m| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+                Ok(Box::new(DirectSum::new(sky, frequency_hz, moon_m, response)))
+            };
+            models.push(averaged(plan, reflected(plan, direct)?, frequency_hz));
             continue;
         }
         let alm = coefficients(sky, model.l_max)?;
-        let setup = HarmonicSumSetup {
+        let setup = |moon_radius_m| HarmonicSumSetup {
             frequency_hz,
             orbit_radius_m: array.orbit_radius_m(),
             inclination_rad: array.inclination_rad(),
-            moon_radius_m: array.moon_radius_m(),
+            moon_radius_m,
             baseline_wavelengths_max: model.baseline_wavelengths_max,
             response,
         };
         let table = || Arc::new(RotationTable::new(model.l_max, array.inclination_rad()));
         let rotation = Arc::clone(rotations.entry(model.l_max).or_insert_with(table));
-        models.push(averaged(plan, Box::new(HarmonicSum::new(alm, setup, rotation)?), frequency_hz));
+        let harmonic = |moon_m| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+            Ok(Box::new(HarmonicSum::new(alm.clone(), setup(moon_m), Arc::clone(&rotation))?))
+        };
+        models.push(averaged(plan, reflected(plan, harmonic)?, frequency_hz));
     }
     Ok(models)
+}
+
+/// The model that `of` makes for a radius of the Moon, m, with the image of the sky if the configuration asks for it.
+fn reflected(
+    plan: &Plan,
+    of: impl Fn(f64) -> Result<Box<dyn VisibilityModel>, PipelineError>,
+) -> Result<Box<dyn VisibilityModel>, PipelineError> {
+    let sky = of(plan.array.moon_radius_m())?;
+    let share = plan.config.spacecraft.moon_reflection;
+    if share == 0.0 {
+        return Ok(sky);
+    }
+    // A Moon that all but touches the orbit hides what is below the horizontal: to 5e-5 rad.
+    let above = of(plan.array.orbit_radius_m() * (1.0 - 1e-9))?;
+    Ok(Box::new(Reflected::new(sky, above, share)))
 }
 
 /// The model, averaged over its channel if the configuration asks for it.

@@ -2,8 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use super::beam::EffectiveBeam;
 use super::config::{PostProcessing, ProductsConfig};
 use super::error::ProductsError;
+use super::latitudes::latitude_errors;
 use super::pictures::{
     Axis, Bars, ColourScale, Curve, MapPanel, Palette, Picture, PictureError, Plot, Sampling, Scaling, Sheet,
     View, draw_map, draw_plots, draw_sheet,
@@ -13,7 +15,8 @@ use super::summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 use super::truth::ChannelTruth;
 use super::viewer::{MapWatch, PublishedMap};
 use crate::sky::fits::{WriteOptions, write_map};
-use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with};
+use crate::sky::spectra::gaussian_beam;
+use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with, is_unseen};
 use crate::solve::Solution;
 use crate::units::constants::DAY_S;
 
@@ -99,7 +102,7 @@ impl ChannelFolder {
         }
         self.show(comparison.as_ref(), origin, viewers);
         if solution.is_final {
-            self.summary = Some(self.summarise(solution, comparison));
+            self.summary = Some(self.summarise(solution, shown, comparison));
         }
         Ok(())
     }
@@ -148,8 +151,20 @@ impl ChannelFolder {
         });
     }
 
-    fn summarise(&self, solution: &Solution, comparison: Option<Comparison>) -> ChannelSummary {
+    fn summarise(
+        &self,
+        solution: &Solution,
+        shown: &ShownMaps,
+        comparison: Option<Comparison>,
+    ) -> ChannelSummary {
         let pixels = solution.map_k.len() as f64;
+        let beam = comparison.as_ref().map(|comparison| {
+            let l_max = comparison.cl_map.len().saturating_sub(1);
+            let smoothing = shown.processing.map_or(0.0, PostProcessing::fwhm_rad);
+            let smoothing = gaussian_beam(smoothing, l_max);
+            EffectiveBeam::new(comparison, &smoothing, shown.noise.values(), self.frequency_hz)
+        });
+        let latitudes = comparison.as_ref().map(latitude_errors);
         let power = comparison.as_ref().map(|c| PowerSpectra {
             map_k2: c.cl_map.clone(),
             input_k2: c.cl_truth.clone(),
@@ -176,6 +191,8 @@ impl ChannelFolder {
             rho_noise_subtracted,
             snr,
             power,
+            beam,
+            latitudes,
             files: Vec::new(),
         }
     }
@@ -232,7 +249,8 @@ impl ChannelFolder {
         let panel = self.panel(map, "", self.scale(shown));
         let path = self.file(&format!("snapshot-{:03}.png", solution.number));
         // Half the size of the final picture, because there are many.
-        let sheet = Sheet { title, subtitle, width_px: 800, view: view(), ..Sheet::default() };
+        let sheet =
+            Sheet { title, subtitle, width_px: 800, view: view(self.config.frame), ..Sheet::default() };
         Ok(draw_sheet(&[panel], &sheet)?.write(&path)?)
     }
 
@@ -249,16 +267,16 @@ impl ChannelFolder {
         let subtitle = format!("{} visibilities, {}; {how}", solution.visibilities, shown.resolution());
         let panel = self.panel(map, &format!("Map at {mhz} MHz"), scale);
         let path = self.file("map.png");
-        draw_map(&panel, &subtitle, &view())?.write(&path)?;
+        draw_map(&panel, &subtitle, &view(self.config.frame))?.write(&path)?;
         if let Some(input) = self.input(shown.processing).cloned() {
             let panel = self.panel(input.map.values(), &format!("Input at {mhz} MHz"), scale);
             let path = self.file("input.png");
-            draw_map(&panel, &shown.resolution(), &view())?.write(&path)?;
+            draw_map(&panel, &shown.resolution(), &view(self.config.frame))?.write(&path)?;
         }
         if let Some(comparison) = comparison {
             let path = self.file("error.png");
             let title = format!("Relative error at {mhz} MHz");
-            draw_relative_error(&title, &subtitle, comparison)?.write(&path)?;
+            draw_relative_error(&title, &subtitle, comparison, self.config.frame)?.write(&path)?;
             let path = self.file("spectra.png");
             let noise = if solution.instrument.noiseless { "without" } else { "with" };
             let title = format!("{mhz} MHz, {}, {noise} thermal noise", shown.resolution());
@@ -281,7 +299,7 @@ impl ChannelFolder {
             columns: 3,
             width_px: 1800,
             bars: Bars::Shared,
-            view: view(),
+            view: view(self.config.frame),
             ..Sheet::default()
         };
         let picture = draw_sheet(&panels, &sheet)?;
@@ -374,8 +392,9 @@ fn caption(solution: &Solution) -> String {
     format!("after {:.0} days", (solution.span_s[1] - solution.span_s[0]) / DAY_S)
 }
 
-fn view() -> View {
-    View { sampling: Sampling::Interpolated, ..View::default() }
+/// Maps of the chain are on ecliptic axes.
+fn view(frame: Frame) -> View {
+    View { sampling: Sampling::Interpolated, ..View::of(frame, Frame::Ecliptic) }
 }
 
 /// RMS of (map - truth) divided by RMS of truth.
@@ -391,7 +410,7 @@ fn mean_rho(rho: &[f64], l_max: usize) -> f64 {
     range.iter().sum::<f64>() / range.len().max(1) as f64
 }
 
-/// Draws (map - truth) / truth over the sky.
+/// Draws (map - truth) / truth over the sky, percent, in a celestial frame.
 ///
 /// # Errors
 /// None in practice: only a page that is too large, which one map is not.
@@ -399,15 +418,19 @@ pub fn draw_relative_error(
     title: &str,
     subtitle: &str,
     comparison: &Comparison,
+    frame: Frame,
 ) -> Result<Picture, PictureError> {
-    let values = comparison.relative_error_map.values();
+    let map = &comparison.relative_error_map;
+    let percent = |&value: &f64| if is_unseen(value) { value } else { 100.0 * value };
+    let values: Vec<f64> = map.values().iter().map(percent).collect();
     let panel = MapPanel {
-        values,
+        values: &values,
         caption: title.to_owned(),
-        scale: ColourScale::symmetric(values),
-        unit: "(map - truth) / truth".to_owned(),
+        scale: ColourScale::symmetric(&values),
+        unit: "% of the truth".to_owned(),
     };
-    draw_map(&panel, subtitle, &view())
+    let view = View { sampling: Sampling::Interpolated, ..View::of(frame, map.frame()) };
+    draw_map(&panel, subtitle, &view)
 }
 
 /// Draws rho_l, the angular power spectra and SNR_l as curves.

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::sky::harmonics::Alm;
 use crate::sky::spectra::{gaussian_beam, multiply_degrees};
-use crate::sky::{MapError, SkyMap};
+use crate::sky::{Frame, MapError, SkyMap};
 use crate::units::{Checks, InvalidValue};
 
 /// The `[products]` section: products besides the final maps.
@@ -15,6 +15,8 @@ pub struct ProductsConfig {
     pub pictures: bool,
     /// Whether every snapshot is written as a FITS map, too.
     pub snapshot_maps: bool,
+    /// Celestial frame of pictures; maps are on ecliptic axes in any case.
+    pub frame: Frame,
     /// FWHM to which maps, noise and input, with split pixels, are smoothed before they are compared and drawn, degrees; 0
     /// for none.
     pub smooth_fwhm_deg: f64,
@@ -22,7 +24,7 @@ pub struct ProductsConfig {
 
 impl Default for ProductsConfig {
     fn default() -> Self {
-        Self { pictures: true, snapshot_maps: false, smooth_fwhm_deg: 0.0 }
+        Self { pictures: true, snapshot_maps: false, frame: Frame::Galactic, smooth_fwhm_deg: 0.0 }
     }
 }
 

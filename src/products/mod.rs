@@ -7,9 +7,11 @@
 //! equal bytes, and every map carries its provenance: configuration hashes, seed, program version and data span.
 
 mod autos;
+mod beam;
 mod channel;
 mod config;
 mod error;
+mod latitudes;
 pub mod pictures;
 mod provenance;
 mod publisher;
@@ -21,14 +23,16 @@ mod viewer;
 mod visibility_table;
 
 pub use autos::{AutoSummary, summarise, write_autos};
+pub use beam::EffectiveBeam;
 pub use channel::{draw_comparison, draw_relative_error};
 pub use config::{PostProcessing, ProductsConfig};
 pub use error::ProductsError;
+pub use latitudes::LatitudeError;
 pub use provenance::Provenance;
 pub use publisher::Publisher;
 pub use runs::{
-    ChannelFigures, Crossing, DiagnosticFigures, EstimateFigures, PowerFigures, RunFigures, TraceFigures,
-    crossings, draw_runs, runs_csv, spectra_csv,
+    BeamFigures, ChannelFigures, Crossing, DiagnosticFigures, EstimateFigures, PowerFigures, RunFigures,
+    TraceFigures, crossings, draw_runs, runs_csv, spectra_csv,
 };
 pub use summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 pub use time_coverage::draw_coverage;

@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::error::ProductsError;
+use super::latitudes::LatitudeError;
 use super::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
 
 /// Most runs that are drawn over one another: more cannot be told apart.
@@ -48,6 +49,10 @@ pub struct ChannelFigures {
     pub snr: Option<Vec<Option<f64>>>,
     /// Angular power.
     pub power: Option<PowerFigures>,
+    /// The effective beam.
+    pub beam: Option<BeamFigures>,
+    /// Relative error by distance from the ecliptic.
+    pub latitudes: Option<Vec<LatitudeError>>,
 }
 
 /// Regularisation of a solution, and its traces.
@@ -77,6 +82,19 @@ pub struct EstimateFigures {
     pub value: f64,
     /// Error.
     pub error: Option<f64>,
+}
+
+/// The effective beam of a map, and its noise.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct BeamFigures {
+    /// FWHM, degrees.
+    pub fwhm_deg: Option<f64>,
+    /// Solid angle, sr.
+    pub area_sr: Option<f64>,
+    /// RMS of the noise-only map as compared, K.
+    pub noise_rms_k: f64,
+    /// The same in the beam, Jy.
+    pub noise_rms_jy: Option<f64>,
 }
 
 /// Angular power, K^2.
@@ -191,7 +209,7 @@ fn number(value: Option<f64>) -> String {
 pub fn runs_csv(runs: &[&RunFigures]) -> String {
     let mut text =
         "run,frequency_hz,nside,visibilities,epsilon,w_max,mean_k,input_mean_k,noise_rms_k,tr_sigma_n_k2,\
-                    tr_sigma_n_error_k2,tr_sigma_s,tr_sigma_s_error,rho_mean_20_120\n"
+                    tr_sigma_n_error_k2,tr_sigma_s,tr_sigma_s_error,rho_mean_20_120,beam_fwhm_deg,noise_rms_jy_beam\n"
             .to_owned();
     for (run, channel) in runs.iter().flat_map(|run| run.channels.iter().map(move |channel| (run, channel))) {
         let DiagnosticFigures { epsilon, w_max, traces } = &channel.diagnostics;
@@ -214,6 +232,8 @@ pub fn runs_csv(runs: &[&RunFigures]) -> String {
             s.map(|s| s.value),
             s.and_then(|s| s.error),
             channel.rho_mean(20, 120.min(2 * channel.nside)),
+            channel.beam.as_ref().and_then(|beam| beam.fwhm_deg),
+            channel.beam.as_ref().and_then(|beam| beam.noise_rms_jy),
         ];
         let fields: Vec<String> = start.into_iter().chain(numbers.map(number)).collect();
         text.push_str(&fields.join(","));
@@ -379,6 +399,8 @@ mod tests {
             rho_noise_subtracted: None,
             snr: None,
             power: Some(power),
+            beam: None,
+            latitudes: None,
         };
         RunFigures { label: label.to_owned(), cancelled: false, channels: vec![channel] }
     }

@@ -4,7 +4,9 @@ use std::fmt;
 
 use serde::Serialize;
 
+use super::beam::EffectiveBeam;
 use super::config::PostProcessing;
+use super::latitudes::LatitudeError;
 use crate::solve::{Diagnostics, Refinement};
 
 /// One snapshot.
@@ -82,6 +84,12 @@ pub struct ChannelSummary {
     /// Angular power of the final map, its input and its noise; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub power: Option<PowerSpectra>,
+    /// The effective beam, and noise in it; absent without a truth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub beam: Option<EffectiveBeam>,
+    /// Relative error by distance from the ecliptic; absent without a truth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub latitudes: Option<Vec<LatitudeError>>,
     /// Files written, relative to the output folder.
     pub files: Vec<String>,
 }
@@ -99,6 +107,14 @@ impl fmt::Display for ChannelSummary {
         )?;
         if let Some(refinement) = &self.refinement {
             write!(f, "\n             {refinement}")?;
+        }
+        if let Some((fwhm_deg, noise_jy)) =
+            self.beam.as_ref().and_then(|beam| Some((beam.fwhm_deg?, beam.noise_rms_jy?)))
+        {
+            write!(
+                f,
+                "\n             effective beam: FWHM {fwhm_deg:.2} deg, noise {noise_jy:.3e} Jy rms in it"
+            )?;
         }
         let noise = if self.thermal_noise { "with the map's thermal noise" } else { "without thermal noise" };
         let curves = [(noise, &self.rho), ("noise power subtracted", &self.rho_noise_subtracted)];

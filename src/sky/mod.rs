@@ -13,6 +13,8 @@
 
 mod compare;
 mod config;
+mod correlated;
+mod cutout;
 mod error;
 pub mod fits;
 mod frame;
@@ -25,6 +27,7 @@ pub mod spectra;
 
 pub use compare::{Comparison, ErrorSummary, InputSky, compare, compare_with};
 pub use config::{GENERATED_NSIDE_MAX, MapFrequency, SkyConfig};
+pub use cutout::{Cutout, Projection};
 pub use error::MapError;
 pub use frame::{Frame, Rotation, rotate};
 pub use map::{SkyMap, is_unseen};

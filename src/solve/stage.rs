@@ -48,6 +48,8 @@ pub struct SolverSetup {
     pub prior_k: PerChannel<f64>,
     /// Prior maps by channel, K, at the map's nside; empty for none.
     pub prior_maps: Vec<Vec<f64>>,
+    /// Share of the sky's power that the Moon is taken to reflect: visibilities are divided by 1 + this.
+    pub moon_reflection: f64,
     /// When the iteration of a harmonic map stops.
     pub rule: StoppingRule,
     /// When the refinement of a harmonic map stops.
@@ -73,12 +75,21 @@ impl Solver {
         Self { setup, solved: 0, last: HashMap::new() }
     }
 
+    /// The prior of the map that [`Solver::reduced`] divides by the same factor.
     fn prior(&self, channel: usize, pixels: usize) -> Option<Vec<f64>> {
+        let factor = 1.0 + self.setup.moon_reflection;
         if let Some(map) = self.setup.prior_maps.get(channel) {
-            return Some(map.clone());
+            return Some(map.iter().map(|value| factor * value).collect());
         }
         let level_k = self.setup.prior_k.get(channel).filter(|&level_k| level_k != 0.0)?;
-        Some(vec![level_k; pixels])
+        Some(vec![factor * level_k; pixels])
+    }
+
+    /// The map of visibilities divided by 1 + xi_R: a solution is linear in visibilities and prior together.
+    fn reduced(&self, mut map_k: Vec<f64>) -> Vec<f64> {
+        let factor = 1.0 + self.setup.moon_reflection;
+        map_k.iter_mut().for_each(|value| *value /= factor);
+        map_k
     }
 }
 
@@ -143,8 +154,8 @@ impl Stage for Solver {
             span_s,
             visibilities,
             nside,
-            map_k,
-            noise_k,
+            map_k: self.reduced(map_k),
+            noise_k: self.reduced(noise_k),
             diagnostics,
             refinement,
         });

@@ -31,7 +31,7 @@ fn write(folder: &Path, name: &str, text: &str) -> String {
 fn every_command_has_help_that_teaches() {
     for command in [
         "run", "simulate", "replay", "inspect", "compare", "geometry", "predict", "check", "sky", "corrupt",
-        "gaps", "merge", "retract", "bench",
+        "figure", "cutout", "gaps", "merge", "retract", "bench",
     ] {
         let output = lunarray().args([command, "--help"]).output().unwrap();
         assert!(output.status.success());

@@ -4,6 +4,7 @@
 #[path = "../common/mod.rs"]
 mod common;
 
+mod cutouts;
 mod files;
 mod harmonics;
 mod python_files;

@@ -17,7 +17,7 @@ use std::path::Path;
 use source::{File, ModulePath, parse};
 
 /// Folders (and files) directly below `src/`, each after all that it may use.
-const ORDER: [&str; 20] = [
+const ORDER: [&str; 21] = [
     "units",
     "files",
     "frames",
@@ -34,6 +34,7 @@ const ORDER: [&str; 20] = [
     "solve",
     "products",
     "pipeline",
+    "figures",
     "serve",
     "bench",
     "cli",

@@ -58,7 +58,7 @@ pub struct Plot {
 /// Width and height of one plot, pixels.
 const PLOT_PX: (usize, usize) = (900, 520);
 /// Size of text, pixels.
-const FONT: f64 = 19.0;
+pub(super) const FONT: f64 = 19.0;
 
 /// Draws plots on one page in `columns` columns, below a title (none if empty).
 ///
@@ -92,14 +92,14 @@ pub fn draw_plots(title: &str, plots: &[Plot], columns: usize) -> Result<Picture
 }
 
 /// An axis with fixed limits.
-struct Range {
-    low: f64,
-    high: f64,
+pub(super) struct Range {
+    pub low: f64,
+    pub high: f64,
     log: bool,
 }
 
 impl Range {
-    fn new(axis: &Axis, values: impl Iterator<Item = f64>, room: f64) -> Self {
+    pub fn new(axis: &Axis, values: impl Iterator<Item = f64>, room: f64) -> Self {
         let usable = |v: &f64| v.is_finite() && v.abs() < 1e300 && (!axis.log || *v > 1e-300);
         if let Some((low, high)) = axis.limits
             && usable(&low)
@@ -122,7 +122,7 @@ impl Range {
         Self { low: low - room * span, high: high + room * span, log: false }
     }
 
-    fn place(&self, value: f64) -> f64 {
+    pub fn place(&self, value: f64) -> f64 {
         if self.log {
             if value > 0.0 { (value / self.low).ln() / (self.high / self.low).ln() } else { f64::NAN }
         } else {
@@ -130,7 +130,7 @@ impl Range {
         }
     }
 
-    fn ticks(&self, wanted: usize) -> Ticks {
+    pub fn ticks(&self, wanted: usize) -> Ticks {
         if self.log {
             labels::logarithmic(self.low, self.high, wanted)
         } else {
@@ -204,7 +204,7 @@ fn grid(
     }
 }
 
-fn write_axes(
+pub(super) fn write_axes(
     canvas: &mut Canvas,
     frame: Rect,
     plot: &Plot,

@@ -1,4 +1,4 @@
-//! Pictures: sky maps in Mollweide projection, curves, PNG files.
+//! Pictures: sky maps in Mollweide projection, curves, values over two axes, PNG files.
 //!
 //! Everything is drawn here, antialiased, with an embedded font. The result does not depend on the machine's fonts or
 //! libraries, so equal data give equal bytes. May use [`crate::sky`] and [`crate::files`].
@@ -8,8 +8,10 @@ mod curves;
 mod error;
 mod labels;
 mod mollweide;
+mod patch;
 mod png_file;
 mod projection;
+mod raster;
 mod scale;
 mod sheet;
 mod text;
@@ -17,7 +19,9 @@ mod text;
 pub use curves::{Axis, Curve, Plot, draw_plots};
 pub use error::PictureError;
 pub use mollweide::{Sampling, View};
+pub use patch::{Patch, draw_patches};
 pub use png_file::Picture;
+pub use raster::{Raster, draw_rasters};
 pub use scale::{ColourScale, Palette, Scaling};
 pub use sheet::{Bars, MapPanel, Sheet, draw_map, draw_sheet};
 

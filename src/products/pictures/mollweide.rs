@@ -9,6 +9,7 @@ use super::projection::{Parallel, forward};
 use super::scale::{ColourScale, is_seen};
 use super::text;
 use super::text::{Align, Style};
+use crate::sky::Frame;
 use crate::sky::healpix::{Ring, pixel_of, ring};
 use crate::units::vector::{Vec3, dot};
 
@@ -50,6 +51,19 @@ impl Default for View {
             sampling: Sampling::Pixels,
             graticule: true,
         }
+    }
+}
+
+impl View {
+    /// A map on the axes of `map`, drawn in `frame`.
+    #[must_use]
+    pub fn of(frame: Frame, map: Frame) -> Self {
+        let frame_name = match frame {
+            Frame::Galactic => "Galactic coordinates",
+            Frame::Ecliptic => "ecliptic coordinates",
+            Frame::Equatorial => "equatorial coordinates",
+        };
+        Self { rotation: frame.to_frame(map), frame: frame_name.to_owned(), ..Self::default() }
     }
 }
 

@@ -26,6 +26,9 @@ pub enum Palette {
     Diverging,
 }
 
+/// Colour of values that a logarithmic scale does not have: zero and below.
+pub(super) const NEGATIVE: Colour = [70, 130, 220];
+
 /// Colour of pixels without a value.
 pub(super) const UNSEEN: Colour = [160, 160, 160];
 
@@ -109,9 +112,20 @@ impl ColourScale {
         }
     }
 
-    /// Colour of a value; grey if unseen.
+    /// Colour of a value; grey if unseen, blue if a logarithmic scale lacks it.
     pub(super) fn colour(&self, value: f64) -> Colour {
-        if is_seen(value) { self.colour_at(self.place(value)) } else { UNSEEN }
+        if !is_seen(value) {
+            UNSEEN
+        } else if self.lacks(value) {
+            NEGATIVE
+        } else {
+            self.colour_at(self.place(value))
+        }
+    }
+
+    /// Whether the scale has no place for a value that is known.
+    pub(super) fn lacks(&self, value: f64) -> bool {
+        self.scaling == Scaling::Log && value <= 0.0 && is_seen(value)
     }
 
     /// Colour at a position of the scale.

@@ -4,7 +4,7 @@ use super::canvas::{Canvas, FAINT, INK, Rect, Stroke};
 use super::error::PictureError;
 use super::mollweide::{MapField, View};
 use super::png_file::Picture;
-use super::scale::ColourScale;
+use super::scale::{ColourScale, is_seen};
 use super::text::{Align, Style};
 use super::{mollweide, text};
 use crate::sky::healpix::nside_of;
@@ -12,7 +12,7 @@ use crate::sky::healpix::nside_of;
 /// One map of a page.
 #[derive(Clone, Debug)]
 pub struct MapPanel<'a> {
-    /// `12 nside^2` values in RING order; NaN and UNSEEN are drawn grey.
+    /// `12 nside^2` values in RING order; NaN and UNSEEN are drawn grey, values that a logarithmic scale lacks blue.
     pub values: &'a [f64],
     /// Line above the map.
     pub caption: String,
@@ -114,7 +114,7 @@ pub fn draw_sheet(panels: &[MapPanel<'_>], sheet: &Sheet) -> Result<Picture, Pic
         if sheet.bars == Bars::Each {
             let y = map.bottom() + layout.gap;
             let bar = Rect { x: map.x + 0.15 * map.width, y, width: 0.7 * map.width, height: layout.bar };
-            draw_bar(&mut canvas, bar, panel, layout.font);
+            draw_bar(&mut canvas, bar, (&panel.scale, &panel.unit), layout.font);
         }
     }
     if sheet.bars == Bars::Shared {
@@ -125,7 +125,13 @@ pub fn draw_sheet(panels: &[MapPanel<'_>], sheet: &Sheet) -> Result<Picture, Pic
             width,
             height: layout.bar,
         };
-        draw_bar(&mut canvas, bar, &panels[0], layout.font);
+        draw_bar(&mut canvas, bar, (&panels[0].scale, &panels[0].unit), layout.font);
+    }
+    let footnote = footnote(panels);
+    if !footnote.is_empty() {
+        let size = 0.85 * layout.font;
+        let anchor = (1.2 * size, layout.height as f64 - 1.2 * size);
+        text::draw(&mut canvas, &footnote, anchor, Align::Start, Style::new(size, FAINT));
     }
     if !sheet.view.frame.is_empty() {
         let size = 0.85 * layout.font;
@@ -133,6 +139,14 @@ pub fn draw_sheet(panels: &[MapPanel<'_>], sheet: &Sheet) -> Result<Picture, Pic
         text::draw(&mut canvas, &sheet.view.frame, anchor, Align::End, Style::new(size, FAINT));
     }
     Ok(Picture::from_canvas(canvas, sheet.width_px, layout.height, &sheet.title))
+}
+
+/// What colours outside the bars mean, if there are any.
+fn footnote(panels: &[MapPanel<'_>]) -> String {
+    let negative = panels.iter().any(|p| p.values.iter().any(|&value| p.scale.lacks(value)));
+    let unseen = panels.iter().any(|p| p.values.iter().any(|&value| !is_seen(value)));
+    let notes = [(negative, "blue: negative"), (unseen, "grey: not measured")];
+    notes.into_iter().filter(|(is_shown, _)| *is_shown).map(|(_, note)| note).collect::<Vec<_>>().join("; ")
 }
 
 /// The layout of a page, pixels.
@@ -226,8 +240,7 @@ impl Layout {
 }
 
 /// A horizontal colour bar with ticks below and the unit at its right end.
-fn draw_bar(canvas: &mut Canvas, bar: Rect, panel: &MapPanel<'_>, font: f64) {
-    let scale = &panel.scale;
+pub(super) fn draw_bar(canvas: &mut Canvas, bar: Rect, (scale, unit): (&ColourScale, &str), font: f64) {
     let (first, last) = (bar.x.floor() as usize, bar.right().ceil() as usize);
     for x in first..last {
         let colour = scale.colour_at((x as f64 + 0.5 - bar.x) / bar.width);
@@ -250,5 +263,5 @@ fn draw_bar(canvas: &mut Canvas, bar: Rect, panel: &MapPanel<'_>, font: f64) {
         text::draw(canvas, label, anchor, Align::Middle, Style::new(font, INK));
     }
     let anchor = (bar.right() + 0.7 * font, bar.middle_y());
-    text::draw(canvas, &ticks.unit(&panel.unit), anchor, Align::Start, Style::new(font, INK));
+    text::draw(canvas, &ticks.unit(unit), anchor, Align::Start, Style::new(font, INK));
 }

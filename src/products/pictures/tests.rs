@@ -61,6 +61,38 @@ fn unseen_pixels_are_grey() {
 }
 
 #[test]
+fn negative_values_are_not_painted_as_cold() {
+    let scale = ColourScale::new(1.0, 10.0, Scaling::Log, Palette::Inferno).unwrap();
+    for (value, is_marked) in [(-3.0, true), (0.0, true), (0.1, false), (1e9, false)] {
+        let values = vec![value; pixel_count(2)];
+        let picture = draw_sheet(&[panel(&values, scale)], &bare()).unwrap();
+        // Inferno goes from black to light yellow, with little blue at both ends.
+        let [red, _, blue] = colour_at(&picture, 400.0, 200.0);
+        assert_eq!(blue > 200 && red < 100, is_marked, "{value}");
+    }
+}
+
+#[test]
+fn a_view_in_another_frame_shows_the_galaxy_where_it_is() {
+    // Bright around the Galactic centre, which ecliptic maps have at longitude 266.84, latitude -5.54 degrees.
+    let (l, b) = (266.84_f64.to_radians(), -5.54_f64.to_radians());
+    let centre = [l.cos() * b.cos(), l.sin() * b.cos(), b.sin()];
+    let near = |n: &[f64; 3]| n.iter().zip(centre).map(|(a, b)| a * b).sum::<f64>();
+    let values: Vec<f64> = pixel_directions(32).iter().map(near).collect();
+    let scale = ColourScale::new(-1.0, 1.0, Scaling::Linear, Palette::Inferno).unwrap();
+    let galactic =
+        View { graticule: false, ..View::of(crate::sky::Frame::Galactic, crate::sky::Frame::Ecliptic) };
+    let sheet = Sheet { view: View { frame: String::new(), ..galactic }, ..bare() };
+    let picture = draw_sheet(&[panel(&values, scale)], &sheet).unwrap();
+    let brightness = |x: f64, y: f64| colour_at(&picture, x, y).into_iter().map(u32::from).sum::<u32>();
+    // The brightest place is the middle of the picture.
+    let middle = brightness(400.0, 193.0);
+    for (x, y) in [(330.0, 193.0), (470.0, 193.0), (400.0, 150.0), (400.0, 236.0)] {
+        assert!(middle > brightness(x, y), "{x} {y}");
+    }
+}
+
+#[test]
 fn scales_suit_their_values() {
     let ramp: Vec<f64> = (0..=1000).map(f64::from).collect();
     let scale = ColourScale::robust(&ramp, Scaling::Linear, Palette::Inferno);

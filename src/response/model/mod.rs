@@ -1,18 +1,20 @@
 //! Noise-free visibilities and auto-correlation powers of a given sky.
 //!
 //! [`VisibilityModel`] is the interface, for one sky at one frequency. [`DirectSum`] sums over the sky's pixels,
-//! [`HarmonicSum`] uses spherical harmonics, [`BandAverage`] averages either over a channel, and [`ModelPlan`] chooses
+//! [`HarmonicSum`] uses spherical harmonics, [`Reflected`] adds the image of the sky in the Moon, [`BandAverage`] averages either over a channel, and [`ModelPlan`] chooses
 //! between the two by cost. Equal arguments give equal results, whatever the threads.
 
 mod band_average;
 mod choice;
 mod direct;
 mod harmonic;
+mod reflection;
 
 pub use band_average::BandAverage;
 pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
 pub use direct::DirectSum;
 pub use harmonic::{HarmonicSum, HarmonicSumSetup};
+pub use reflection::Reflected;
 
 use num_complex::Complex64;
 use thiserror::Error;

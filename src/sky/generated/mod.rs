@@ -23,6 +23,7 @@ mod galaxy;
 mod sources;
 
 pub use config::{GeneratedSky, GeneratedSkyError};
+pub use sources::{CatalogueSource, catalogue};
 
 use rayon::prelude::*;
 

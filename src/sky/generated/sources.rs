@@ -91,6 +91,37 @@ pub(super) fn draw(config: &GeneratedSky, seed: u64) -> Vec<PointSource> {
         .collect()
 }
 
+/// A point source of a generated sky, as a catalogue has it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CatalogueSource {
+    /// Ecliptic longitude and latitude, degrees.
+    pub place_deg: [f64; 2],
+    /// Flux density at 154 MHz, Jy.
+    pub flux_154mhz_jy: f64,
+    /// Flux density at the frequency asked for, Jy, before Galactic gas absorbs it.
+    pub flux_jy: f64,
+}
+
+/// The point sources of a generated sky at `frequency_hz`, brightest first; none without `config.point_sources`.
+#[must_use]
+pub fn catalogue(config: &GeneratedSky, frequency_hz: f64, seed: u64) -> Vec<CatalogueSource> {
+    if !config.point_sources {
+        return Vec::new();
+    }
+    let factor = (frequency_hz / COUNTS_HZ).powf(config.source_spectral_index);
+    let entry = |source: PointSource| {
+        let [x, y, z] = source.direction;
+        CatalogueSource {
+            place_deg: [y.atan2(x).to_degrees().rem_euclid(360.0), z.clamp(-1.0, 1.0).asin().to_degrees()],
+            flux_154mhz_jy: source.flux_jy,
+            flux_jy: factor * source.flux_jy,
+        }
+    };
+    let mut sources: Vec<CatalogueSource> = draw(config, seed).into_iter().map(entry).collect();
+    sources.sort_by(|a, b| b.flux_jy.total_cmp(&a.flux_jy));
+    sources
+}
+
 /// Mean temperature that the sources add to the sky at `frequency_hz`, K.
 pub(super) fn mean_k(config: &GeneratedSky, frequency_hz: f64) -> f64 {
     let counts = Counts::new(config.source_flux_jy_min, config.source_flux_jy_max);
@@ -134,6 +165,24 @@ mod tests {
             // Five standard deviations of a Poisson number.
             assert!((counted as f64 - expected).abs() < 5.0 * expected.sqrt(), "{counted} {expected}");
         }
+    }
+
+    #[test]
+    fn a_catalogue_is_what_is_drawn() {
+        let config = GeneratedSky::default();
+        let (found, drawn) = (catalogue(&config, 77e6, 5), draw(&config, 5));
+        assert_eq!(found.len(), drawn.len());
+        assert!(found.windows(2).all(|two| two[0].flux_jy >= two[1].flux_jy));
+        for source in &found {
+            // Half the frequency and a spectral index of -0.8.
+            assert!((source.flux_jy / source.flux_154mhz_jy - 2f64.powf(0.8)).abs() < 1e-12);
+            let [(sin_l, cos_l), (sin_b, cos_b)] = source.place_deg.map(|deg| deg.to_radians().sin_cos());
+            let n = [cos_l * cos_b, sin_l * cos_b, sin_b];
+            let same = |one: &&PointSource| one.flux_jy == source.flux_154mhz_jy;
+            let one = drawn.iter().find(same).unwrap();
+            assert!(one.direction.iter().zip(n).all(|(a, b)| (a - b).abs() < 1e-12));
+        }
+        assert!(catalogue(&GeneratedSky { point_sources: false, ..config }, 77e6, 5).is_empty());
     }
 
     #[test]

@@ -1,0 +1,64 @@
+//! `lunarray figure`: figures of the array and its beam matrix.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::arguments::time_s;
+use super::output::{CommandResult, Completion, print_json_line, print_text};
+use crate::figures::{FIGURES, FigureRequest, make_figure};
+use crate::pipeline::{ConfigSource, Plan, use_threads};
+use crate::units::Pair;
+
+/// Draw figures of the array and its beam matrix, which need no map.
+///
+/// Leaves a picture (PNG), a table (CSV) and numbers (JSON) of each:
+/// spacing: the ratio q0 of the formation's steps against R and R_2;
+/// pair-time: time of pairs and visibilities by baseline length;
+/// uvw: where baselines lie on ecliptic axes;
+/// coverage: time of pairs, visibilities, shortest projected baseline and uv coverage by direction, also as FITS maps;
+/// rows: a row of B at pixel centres and averaged over pixels;
+/// waterfall: visibilities of one pair over time and frequency, of a fine sky and of the sky in the map's pixels;
+/// sub-pixel: what the sky's structure within pixels of nside 8 and 16 does to visibilities and maps.
+///
+/// Example: lunarray figure pair-time pipelines/paper-10mhz.toml --out out/figures
+#[derive(Debug, Args)]
+pub(super) struct FigureArgs {
+    /// Which figure.
+    #[arg(value_name = "NAME", value_parser = FIGURES)]
+    name: String,
+    /// Pipeline file (TOML); the embedded quicklook if none is given.
+    #[arg(value_name = "PIPELINE.toml")]
+    pipeline: Option<PathBuf>,
+    /// Replace one setting, for example --set spacecraft.channels_hz=[3e6,10e6]; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+    /// Output folder.
+    #[arg(short, long, value_name = "DIR", default_value = "out/figures")]
+    out: PathBuf,
+    /// Pair of rows and waterfall, such as 1-2; the one closest to 2 b_p if not given.
+    #[arg(long)]
+    pair: Option<Pair>,
+    /// Time of rows and waterfall since the mission epoch: a number with an optional unit s, h or d; the middle of the first
+    /// window if not given.
+    #[arg(long = "at", value_name = "TIME", value_parser = time_s)]
+    at_s: Option<f64>,
+    /// Print the numbers as one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn execute(args: &FigureArgs) -> CommandResult {
+    let source = ConfigSource { file: args.pipeline.clone(), overrides: args.overrides.clone(), seed: None };
+    let plan = Plan::new(source.load()?)?;
+    use_threads(&plan.config.runtime)?;
+    let request = FigureRequest { name: args.name.clone(), pair: args.pair, at_s: args.at_s };
+    let made = make_figure(&request, &plan, &args.out)?;
+    if args.json {
+        print_json_line(&made)?;
+    } else {
+        let files: Vec<String> = made.files.iter().map(|path| path.display().to_string()).collect();
+        print_text(&files.join("\n"))?;
+    }
+    Ok(Completion::Done)
+}

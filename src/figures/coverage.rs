@@ -1,0 +1,322 @@
+//! What the array sees of each direction: time of pairs, visibilities, projected baselines (the paper, Sect. 3.3).
+
+use std::f64::consts::FRAC_PI_2;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use super::error::FigureError;
+use super::exposure::{Instant, gather, limit_m};
+use super::output::FigureParts;
+use crate::array::{hidden_by_moon, integration_time_s};
+use crate::pipeline::Plan;
+use crate::products::ProductsError;
+use crate::products::pictures::{ColourScale, MapPanel, Palette, Scaling, Sheet, View, draw_sheet};
+use crate::sky::Frame;
+use crate::sky::fits::{Card, Column, WriteOptions, write_columns};
+use crate::sky::healpix::pixel_directions;
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+use crate::units::vector::{Vec3, cross, dot, norm, scale, sub};
+
+/// nside of the maps: the horizon is wide, and pixels of 7 degrees are small against it.
+const NSIDE: usize = 8;
+/// Distance of instants, s: a daughter turns by five degrees.
+const STEP_S: f64 = 120.0;
+/// Cells along a side of the plane of projected baselines.
+const CELLS: usize = 32;
+/// Words of 64 cells.
+const WORDS: usize = CELLS * CELLS / 64;
+/// Latitudes of the bands that are told: from the ecliptic to the pole, degrees.
+const BANDS_DEG: [[f64; 2]; 6] =
+    [[0.0, 15.0], [15.0, 30.0], [30.0, 45.0], [45.0, 60.0], [60.0, 75.0], [75.0, 90.0]];
+
+#[derive(Serialize)]
+struct CoverageNumbers {
+    nside: usize,
+    channels: Vec<ChannelCoverageNumbers>,
+    /// Time of the first channel over that of each, by direction: least, mean, greatest.
+    first_over_channel: Vec<[f64; 3]>,
+}
+
+#[derive(Serialize)]
+struct ChannelCoverageNumbers {
+    frequency_hz: f64,
+    limit_m: f64,
+    limit_wavelengths: f64,
+    /// Means over the sky, and the least and the greatest.
+    pair_h: [f64; 3],
+    visibilities: [f64; 3],
+    shortest_wavelengths: [f64; 3],
+    uv_filled: [f64; 3],
+    bands: Vec<BandNumbers>,
+}
+
+/// Means over directions at a distance from the ecliptic, both north and south.
+#[derive(Serialize)]
+struct BandNumbers {
+    latitude_deg: [f64; 2],
+    pair_h: f64,
+    visibilities: f64,
+    shortest_wavelengths: f64,
+    uv_filled: f64,
+}
+
+/// A direction with axes of its plane.
+struct Place {
+    n_hat: Vec3,
+    axes: [Vec3; 2],
+}
+
+/// What is counted of one channel, by direction.
+#[derive(Clone)]
+struct ChannelMaps {
+    limit_m: f64,
+    pair_s: Vec<f64>,
+    visibilities: Vec<f64>,
+    shortest_square_m2: Vec<f64>,
+    cells: Vec<[u64; WORDS]>,
+}
+
+impl ChannelMaps {
+    fn new(limit_m: f64, pixels: usize) -> Self {
+        Self {
+            limit_m,
+            pair_s: vec![0.0; pixels],
+            visibilities: vec![0.0; pixels],
+            shortest_square_m2: vec![f64::INFINITY; pixels],
+            cells: vec![[0; WORDS]; pixels],
+        }
+    }
+
+    fn merge(&mut self, other: &Self) {
+        for k in 0..self.pair_s.len() {
+            self.pair_s[k] += other.pair_s[k];
+            self.visibilities[k] += other.visibilities[k];
+            self.shortest_square_m2[k] = self.shortest_square_m2[k].min(other.shortest_square_m2[k]);
+            self.cells[k].iter_mut().zip(other.cells[k]).for_each(|(to, from)| *to |= from);
+        }
+    }
+
+    /// Hours, visibilities, shortest projected baseline in wavelengths, and the filled share of the plane.
+    fn columns(&self, frequency_hz: f64) -> [Vec<f64>; 4] {
+        let wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz;
+        let inside = (0..CELLS * CELLS).filter(|&cell| is_inside(cell)).count() as f64;
+        let filled =
+            |cells: &[u64; WORDS]| cells.iter().map(|word| word.count_ones()).sum::<u32>() as f64 / inside;
+        [
+            self.pair_s.iter().map(|s| s / 3600.0).collect(),
+            self.visibilities.clone(),
+            self.shortest_square_m2.iter().map(|square| square.sqrt() / wavelength_m).collect(),
+            self.cells.iter().map(filled).collect(),
+        ]
+    }
+}
+
+fn add(maps: &mut [ChannelMaps], plan: &Plan, places: &[Place], instant: &Instant<'_>) {
+    let moon_m = plan.array.moon_radius_m();
+    let sees: Vec<Vec<bool>> = instant
+        .states
+        .iter()
+        .map(|state| places.iter().map(|p| !hidden_by_moon(state.position_m, p.n_hat, moon_m)).collect())
+        .collect();
+    for pair in instant.pairs {
+        let [i, j] = [pair.i, pair.j].map(usize::from);
+        let (a, b) = (instant.states[i], instant.states[j]);
+        let baseline_m = sub(a.position_m, b.position_m);
+        let square_m2 = dot(baseline_m, baseline_m);
+        for (maps, schedule) in maps.iter_mut().zip(&plan.schedules) {
+            if square_m2 >= maps.limit_m * maps.limit_m {
+                continue;
+            }
+            let dt_s =
+                integration_time_s(schedule.rule, schedule.frequency_hz, a.velocity_m_s, b.velocity_m_s);
+            let per_m = 0.5 * CELLS as f64 / maps.limit_m;
+            for (k, place) in places.iter().enumerate().filter(|&(k, _)| sees[i][k] && sees[j][k]) {
+                maps.pair_s[k] += instant.length_s;
+                maps.visibilities[k] += instant.length_s / dt_s;
+                let along_m = dot(baseline_m, place.n_hat);
+                let across_m2 = square_m2 - along_m * along_m;
+                maps.shortest_square_m2[k] = maps.shortest_square_m2[k].min(across_m2);
+                let u = place.axes.map(|axis| per_m * dot(baseline_m, axis));
+                for sign in [1.0, -1.0] {
+                    let [x, y] = u.map(|u| {
+                        let place = sign * u + 0.5 * CELLS as f64;
+                        (place.max(0.0) as usize).min(CELLS - 1)
+                    });
+                    let cell = y * CELLS + x;
+                    if is_inside(cell) {
+                        maps.cells[k][cell / 64] |= 1 << (cell % 64);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Whether the centre of a cell lies within the limit.
+fn is_inside(cell: usize) -> bool {
+    let at = |k: usize| 2.0 * (k as f64 + 0.5) / CELLS as f64 - 1.0;
+    at(cell % CELLS).hypot(at(cell / CELLS)) < 1.0
+}
+
+pub(super) fn make(plan: &Plan, folder: &Path) -> Result<FigureParts, FigureError> {
+    let places: Vec<Place> = pixel_directions(NSIDE).into_iter().map(place).collect();
+    let empty = || -> Vec<ChannelMaps> {
+        (0..plan.schedules.len()).map(|k| ChannelMaps::new(limit_m(plan, k), places.len())).collect()
+    };
+    let maps = gather(
+        plan,
+        STEP_S,
+        empty,
+        |maps, instant| add(maps, plan, &places, instant),
+        |maps, other| maps.iter_mut().zip(&other).for_each(|(to, from)| to.merge(from)),
+    );
+    if let Some(bare) = maps.iter().find(|maps| maps.pair_s.iter().all(|&s| s == 0.0)) {
+        return Err(FigureError::NoBaseline { limit_m: bare.limit_m });
+    }
+    let columns: Vec<[Vec<f64>; 4]> = maps
+        .iter()
+        .zip(&plan.schedules)
+        .map(|(maps, schedule)| maps.columns(schedule.frequency_hz))
+        .collect();
+    let channels = maps.iter().zip(&plan.schedules).zip(&columns);
+    let numbers = CoverageNumbers {
+        nside: NSIDE,
+        channels: channels
+            .map(|((maps, schedule), columns)| channel(maps.limit_m, schedule.frequency_hz, columns, &places))
+            .collect(),
+        first_over_channel: columns
+            .iter()
+            .map(|of| {
+                let ratio: Vec<f64> = columns[0][0].iter().zip(&of[0]).map(|(a, b)| a / b).collect();
+                let [mean, least, greatest] = spread(&ratio);
+                [least, mean, greatest]
+            })
+            .collect(),
+    };
+    let mut more = Vec::new();
+    for (columns, channel) in columns.iter().zip(&numbers.channels) {
+        more.push(write_maps(columns, channel.frequency_hz, folder)?);
+    }
+    let picture = draw(&columns, &numbers)?;
+    Ok(FigureParts { more, ..FigureParts::new(&numbers, table(&numbers, &columns, &places), picture) })
+}
+
+/// Axes across a direction; pixel centres are never poles.
+fn place(n_hat: Vec3) -> Place {
+    let east = cross([0.0, 0.0, 1.0], n_hat);
+    let east = scale(1.0 / norm(east), east);
+    Place { n_hat, axes: [east, cross(n_hat, east)] }
+}
+
+/// Mean, least and greatest.
+fn spread(values: &[f64]) -> [f64; 3] {
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
+    let least = values.iter().copied().fold(f64::INFINITY, f64::min);
+    let greatest = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    [mean, least, greatest]
+}
+
+fn channel(
+    limit_m: f64,
+    frequency_hz: f64,
+    columns: &[Vec<f64>; 4],
+    places: &[Place],
+) -> ChannelCoverageNumbers {
+    let band = |latitude_deg: [f64; 2]| {
+        let mean = |column: &Vec<f64>| {
+            let within = |n_hat: Vec3| {
+                let latitude_deg_here = (FRAC_PI_2 - n_hat[2].abs().acos()).to_degrees();
+                (latitude_deg[0]..latitude_deg[1]).contains(&latitude_deg_here)
+            };
+            let values = places.iter().zip(column).filter(|(place, _)| within(place.n_hat));
+            let (sum, count) = values.fold((0.0, 0.0), |(sum, count), (_, v)| (sum + v, count + 1.0));
+            sum / count
+        };
+        let [pair_h, visibilities, shortest_wavelengths, uv_filled] = columns.each_ref().map(mean);
+        BandNumbers { latitude_deg, pair_h, visibilities, shortest_wavelengths, uv_filled }
+    };
+    let [pair_h, visibilities, shortest_wavelengths, uv_filled] =
+        columns.each_ref().map(|column| spread(column));
+    ChannelCoverageNumbers {
+        frequency_hz,
+        limit_m,
+        limit_wavelengths: limit_m * frequency_hz / SPEED_OF_LIGHT_M_S,
+        pair_h,
+        visibilities,
+        shortest_wavelengths,
+        uv_filled,
+        bands: BANDS_DEG.into_iter().map(band).collect(),
+    }
+}
+
+fn table(numbers: &CoverageNumbers, columns: &[[Vec<f64>; 4]], places: &[Place]) -> String {
+    let mut csv =
+        "frequency_hz,pixel,longitude_deg,latitude_deg,pair_h,visibilities,shortest_wavelengths,uv_filled\n"
+            .to_owned();
+    for (channel, [hours, visibilities, shortest, filled]) in numbers.channels.iter().zip(columns) {
+        for (k, Place { n_hat: [x, y, z], .. }) in places.iter().enumerate() {
+            let longitude_deg = y.atan2(*x).to_degrees().rem_euclid(360.0);
+            let latitude_deg = z.asin().to_degrees();
+            // Writing to a string cannot fail.
+            let _ = writeln!(
+                csv,
+                "{},{k},{longitude_deg:.4},{latitude_deg:.4},{:.4},{:.0},{:.4},{:.4}",
+                channel.frequency_hz, hours[k], visibilities[k], shortest[k], filled[k]
+            );
+        }
+    }
+    csv
+}
+
+fn write_maps(columns: &[Vec<f64>; 4], frequency_hz: f64, folder: &Path) -> Result<PathBuf, FigureError> {
+    let path = folder.join(format!("coverage-{:.3}MHz.fits", frequency_hz / 1e6));
+    let [hours, visibilities, shortest, filled] = columns;
+    let column = |name, unit, values: &'_ Vec<f64>| (name, unit, values.clone());
+    let columns = [
+        column("PAIRTIME", "h", hours),
+        column("HITS", "", visibilities),
+        column("SHORTEST", "wavelengths", shortest),
+        column("UVFILL", "", filled),
+    ];
+    let columns: Vec<Column<'_>> =
+        columns.iter().map(|(name, unit, values)| Column { name, unit, values }).collect();
+    let options =
+        WriteOptions { cards: vec![Card::real("FREQ", frequency_hz, "Hz")], ..WriteOptions::default() };
+    write_columns(&path, Frame::Ecliptic, &columns, &options).map_err(ProductsError::from)?;
+    Ok(path)
+}
+
+fn draw(
+    columns: &[[Vec<f64>; 4]],
+    numbers: &CoverageNumbers,
+) -> Result<crate::products::pictures::Picture, FigureError> {
+    let kinds = [
+        ("time of pairs", "h"),
+        ("visibilities", ""),
+        ("shortest projected baseline", "wavelengths"),
+        ("filled share of the uv plane", ""),
+    ];
+    let mut panels = Vec::new();
+    for (kind, (what, unit)) in kinds.into_iter().enumerate() {
+        for (columns, channel) in columns.iter().zip(&numbers.channels).take(4) {
+            let values = &columns[kind];
+            panels.push(MapPanel {
+                values,
+                caption: format!("{} MHz: {what}", channel.frequency_hz / 1e6),
+                scale: ColourScale::robust(values, Scaling::Linear, Palette::default()),
+                unit: unit.to_owned(),
+            });
+        }
+    }
+    let columns = numbers.channels.len().min(4);
+    let sheet = Sheet {
+        title: "Coverage by direction".to_owned(),
+        columns,
+        width_px: 900 * columns,
+        view: View { sampling: crate::products::pictures::Sampling::Interpolated, ..View::default() },
+        ..Sheet::default()
+    };
+    Ok(draw_sheet(&panels, &sheet)?)
+}

@@ -1,0 +1,43 @@
+//! Figures of an array and its beam matrix that need no map: where baselines lie, for how long, and what pixels do to them.
+//!
+//! Each is a picture, a table and a few numbers, computed from a [`Plan`]; the figures of the paper are among them. Maps and
+//! their spectra are [`crate::products`], series of them studies ([`crate::pipeline::Study`]). May use every folder before it.
+
+mod coverage;
+mod error;
+mod exposure;
+mod output;
+mod pair_time;
+mod request;
+mod rows;
+mod spacing;
+mod sub_pixel;
+mod uvw;
+mod waterfall;
+
+use std::path::Path;
+
+pub use error::FigureError;
+pub use output::MadeFigure;
+pub use request::{FIGURES, FigureRequest};
+
+use crate::pipeline::Plan;
+
+/// Makes a figure and writes `NAME.png`, `NAME.csv` and `NAME.json` into `folder`.
+///
+/// # Errors
+/// An unknown name, a pair that the array does not have, a figure that this array does not have, or files that cannot be
+/// written.
+pub fn make_figure(request: &FigureRequest, plan: &Plan, folder: &Path) -> Result<MadeFigure, FigureError> {
+    let made = match request.name.as_str() {
+        "spacing" => spacing::make(plan)?,
+        "pair-time" => pair_time::make(plan)?,
+        "uvw" => uvw::make(plan)?,
+        "coverage" => coverage::make(plan, folder)?,
+        "rows" => rows::make(plan, request)?,
+        "waterfall" => waterfall::make(plan, request)?,
+        "sub-pixel" => sub_pixel::make(plan, folder)?,
+        _ => return Err(FigureError::Unknown { name: request.name.clone() }),
+    };
+    made.write(&request.name, folder)
+}

@@ -1,0 +1,57 @@
+//! What a figure leaves behind.
+
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use serde_json::Value;
+
+use super::error::FigureError;
+use crate::files::write_atomically;
+use crate::products::ProductsError;
+use crate::products::pictures::Picture;
+
+/// A figure that has been written.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct MadeFigure {
+    /// Its name.
+    pub figure: String,
+    /// What it shows, in numbers.
+    pub numbers: Value,
+    /// Its files.
+    pub files: Vec<PathBuf>,
+}
+
+/// A figure before it is written.
+pub(super) struct FigureParts {
+    /// What it shows, in numbers.
+    pub numbers: Value,
+    /// Its table (CSV).
+    pub csv: String,
+    /// Its picture.
+    pub picture: Picture,
+    /// Files that have been written already.
+    pub more: Vec<PathBuf>,
+}
+
+impl FigureParts {
+    /// Of numbers that have a JSON form, as all of ours do.
+    pub fn new(numbers: &impl Serialize, csv: String, picture: Picture) -> Self {
+        Self { numbers: serde_json::to_value(numbers).unwrap_or_default(), csv, picture, more: Vec::new() }
+    }
+
+    /// Writes picture, table and numbers into `folder`.
+    pub fn write(self, name: &str, folder: &Path) -> Result<MadeFigure, FigureError> {
+        let path = |ending: &str| folder.join(format!("{name}.{ending}"));
+        let encoded = |error: serde_json::Error| ProductsError::Encode {
+            path: path("json"),
+            reason: error.to_string(),
+        };
+        let json = serde_json::to_vec_pretty(&self.numbers).map_err(encoded)?;
+        for (path, bytes) in [(path("csv"), self.csv.into_bytes()), (path("json"), json)] {
+            write_atomically(&path, &bytes).map_err(|source| ProductsError::Write { path, source })?;
+        }
+        self.picture.write(&path("png"))?;
+        let files = ["png", "csv", "json"].map(path).into_iter().chain(self.more).collect();
+        Ok(MadeFigure { figure: name.to_owned(), numbers: self.numbers, files })
+    }
+}

@@ -1,0 +1,249 @@
+//! Time that pairs observe at each baseline length, and the visibilities that it makes (the paper, Fig. 4).
+
+use std::fmt::Write;
+
+use serde::Serialize;
+
+use super::error::FigureError;
+use super::exposure::{Instant, gather, limit_m};
+use super::output::FigureParts;
+use crate::array::integration_time_s;
+use crate::pipeline::Plan;
+use crate::products::pictures::{Axis, Curve, Plot, draw_plots};
+use crate::units::all_pairs;
+use crate::units::vector::{norm, sub};
+
+/// Length of the first bin's beginning, m; those of all others follow.
+const FIRST_M: f64 = 50.0;
+/// Bins in a factor of ten.
+const PER_DECADE: f64 = 20.0;
+/// Bins: up to 500 km.
+const BINS: usize = 80;
+/// Distance of instants, s; lengths change by millimetres in a second.
+const STEP_S: f64 = 60.0;
+
+#[derive(Serialize)]
+struct PairTimeNumbers {
+    /// Observing windows, and their sum.
+    windows: usize,
+    observed_s: f64,
+    /// Sum over pairs, without those that see the Earth.
+    pair_s: f64,
+    shortest_m: f64,
+    longest_m: f64,
+    bins: Vec<LengthBin>,
+    channels: Vec<ChannelTime>,
+}
+
+#[derive(Serialize)]
+struct LengthBin {
+    from_m: f64,
+    to_m: f64,
+    pair_s: f64,
+}
+
+#[derive(Serialize)]
+struct ChannelTime {
+    frequency_hz: f64,
+    /// Longest baseline of the map, m and wavelengths.
+    limit_m: f64,
+    limit_wavelengths: f64,
+    /// Pairs that are within it at some time.
+    pairs: usize,
+    /// Their time within it.
+    pair_s: f64,
+    visibilities: f64,
+    /// Of all baselines.
+    visibilities_all: f64,
+    /// Share of the time of all pairs in which the baseline's motion cuts integrations short.
+    cut_by_motion: f64,
+    /// By length, as in `bins`.
+    visibilities_by_length: Vec<f64>,
+}
+
+/// Counts of a part of the windows.
+struct Counts {
+    bins_s: Vec<f64>,
+    pair_s: f64,
+    observed_s: f64,
+    range_m: [f64; 2],
+    channels: Vec<ChannelCounts>,
+}
+
+struct ChannelCounts {
+    pair_s: f64,
+    within: f64,
+    all: f64,
+    cut: f64,
+    seen: Vec<bool>,
+    by_length: Vec<f64>,
+}
+
+impl Counts {
+    fn new(channels: usize, pairs: usize) -> Self {
+        let channel = || ChannelCounts {
+            pair_s: 0.0,
+            within: 0.0,
+            all: 0.0,
+            cut: 0.0,
+            seen: vec![false; pairs],
+            by_length: vec![0.0; BINS],
+        };
+        Self {
+            bins_s: vec![0.0; BINS],
+            pair_s: 0.0,
+            observed_s: 0.0,
+            range_m: [f64::INFINITY, 0.0],
+            channels: (0..channels).map(|_| channel()).collect(),
+        }
+    }
+
+    fn add(&mut self, plan: &Plan, limits_m: &[f64], instant: &Instant<'_>) {
+        self.observed_s += instant.length_s;
+        let all = all_pairs(instant.states.len());
+        for pair in instant.pairs {
+            let [i, j] = [pair.i, pair.j].map(|n| instant.states[usize::from(n)]);
+            let length_m = norm(sub(i.position_m, j.position_m));
+            let bin = bin_of(length_m);
+            self.pair_s += instant.length_s;
+            self.bins_s[bin] += instant.length_s;
+            self.range_m = [self.range_m[0].min(length_m), self.range_m[1].max(length_m)];
+            let number = all.iter().position(|other| other == pair).unwrap_or(0);
+            for ((counts, schedule), limit_m) in self.channels.iter_mut().zip(&plan.schedules).zip(limits_m) {
+                let rule = schedule.rule;
+                let dt_s = integration_time_s(rule, schedule.frequency_hz, i.velocity_m_s, j.velocity_m_s);
+                let count = instant.length_s / dt_s;
+                counts.all += count;
+                counts.by_length[bin] += count;
+                if dt_s < rule.duration_s_max {
+                    counts.cut += instant.length_s;
+                }
+                if length_m < *limit_m {
+                    counts.pair_s += instant.length_s;
+                    counts.within += count;
+                    counts.seen[number] = true;
+                }
+            }
+        }
+    }
+
+    fn merge(&mut self, other: Self) {
+        let join = |to: &mut [f64], from: &[f64]| to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
+        join(&mut self.bins_s, &other.bins_s);
+        self.pair_s += other.pair_s;
+        self.observed_s += other.observed_s;
+        self.range_m = [self.range_m[0].min(other.range_m[0]), self.range_m[1].max(other.range_m[1])];
+        for (to, from) in self.channels.iter_mut().zip(other.channels) {
+            to.pair_s += from.pair_s;
+            to.within += from.within;
+            to.all += from.all;
+            to.cut += from.cut;
+            join(&mut to.by_length, &from.by_length);
+            to.seen.iter_mut().zip(from.seen).for_each(|(to, from)| *to |= from);
+        }
+    }
+}
+
+fn bin_of(length_m: f64) -> usize {
+    let place = (length_m / FIRST_M).log10() * PER_DECADE;
+    (place.max(0.0) as usize).min(BINS - 1)
+}
+
+fn edge_m(bin: usize) -> f64 {
+    FIRST_M * 10f64.powf(bin as f64 / PER_DECADE)
+}
+
+pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
+    let limits_m: Vec<f64> = (0..plan.schedules.len()).map(|channel| limit_m(plan, channel)).collect();
+    let pairs = all_pairs(plan.array.satellites()).len();
+    let counts = gather(
+        plan,
+        STEP_S,
+        || Counts::new(limits_m.len(), pairs),
+        |counts, instant| counts.add(plan, &limits_m, instant),
+        Counts::merge,
+    );
+    let bin = |(k, &pair_s): (usize, &f64)| LengthBin { from_m: edge_m(k), to_m: edge_m(k + 1), pair_s };
+    let all_s = counts.pair_s;
+    let channel = |((counts, schedule), &limit_m): ((ChannelCounts, _), &f64)| {
+        let &crate::mother::Schedule { frequency_hz, .. } = schedule;
+        ChannelTime {
+            frequency_hz,
+            limit_m,
+            limit_wavelengths: limit_m * frequency_hz / crate::units::constants::SPEED_OF_LIGHT_M_S,
+            pairs: counts.seen.iter().filter(|seen| **seen).count(),
+            pair_s: counts.pair_s,
+            visibilities: counts.within,
+            visibilities_all: counts.all,
+            cut_by_motion: counts.cut / all_s,
+            visibilities_by_length: counts.by_length,
+        }
+    };
+    let numbers = PairTimeNumbers {
+        windows: plan.windows.len(),
+        observed_s: counts.observed_s,
+        pair_s: counts.pair_s,
+        shortest_m: counts.range_m[0],
+        longest_m: counts.range_m[1],
+        bins: counts.bins_s.iter().enumerate().map(bin).collect(),
+        channels: counts.channels.into_iter().zip(&plan.schedules).zip(&limits_m).map(channel).collect(),
+    };
+    let picture = draw_plots("", &plots(&numbers), 1)?;
+    Ok(FigureParts::new(&numbers, table(&numbers), picture))
+}
+
+fn table(numbers: &PairTimeNumbers) -> String {
+    let mut csv = "from_m,to_m,pair_s".to_owned();
+    for channel in &numbers.channels {
+        // Writing to a string cannot fail.
+        let _ = write!(csv, ",visibilities_{}hz", channel.frequency_hz);
+    }
+    csv.push('\n');
+    for (k, bin) in numbers.bins.iter().enumerate() {
+        let _ = write!(csv, "{:.3},{:.3},{:.1}", bin.from_m, bin.to_m, bin.pair_s);
+        for channel in &numbers.channels {
+            let _ = write!(csv, ",{:.0}", channel.visibilities_by_length[k]);
+        }
+        csv.push('\n');
+    }
+    csv
+}
+
+fn plots(numbers: &PairTimeNumbers) -> [Plot; 2] {
+    let x = Axis {
+        label: "baseline length (m)".to_owned(),
+        log: true,
+        limits: Some((0.95 * numbers.shortest_m, numbers.longest_m)),
+    };
+    // A step over every bin.
+    let steps = |value: &dyn Fn(usize, &LengthBin) -> f64| {
+        let corners =
+            |(k, bin): (usize, &LengthBin)| [(bin.from_m, value(k, bin)), (bin.to_m, value(k, bin))];
+        numbers.bins.iter().enumerate().flat_map(corners).collect::<Vec<_>>()
+    };
+    let density = |_: usize, bin: &LengthBin| {
+        // The last bin ends with the longest baseline.
+        bin.pair_s / 3600.0 / (bin.to_m.min(numbers.longest_m) - bin.from_m)
+    };
+    let curve = |label: String, points| Curve { label, points, dashed: false };
+    let by_channel = numbers.channels.iter().map(|channel| {
+        let label = format!("{} MHz", channel.frequency_hz / 1e6);
+        curve(label, steps(&|k, _| channel.visibilities_by_length[k]))
+    });
+    [
+        Plot {
+            title: format!("Time of all pairs, {} windows", numbers.windows),
+            x: x.clone(),
+            y: Axis { label: "pair hours per metre".to_owned(), log: true, limits: None },
+            curves: vec![curve(String::new(), steps(&density))],
+            levels: Vec::new(),
+        },
+        Plot {
+            title: "Visibilities".to_owned(),
+            x,
+            y: Axis { label: "in a twentieth of a decade".to_owned(), log: true, limits: None },
+            curves: by_channel.collect(),
+            levels: Vec::new(),
+        },
+    ]
+}

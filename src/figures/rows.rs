@@ -1,0 +1,158 @@
+//! A row of the beam matrix: at pixel centres and averaged over pixels (the paper, Fig. 7).
+
+use std::fmt::Write;
+
+use serde::Serialize;
+
+use super::error::FigureError;
+use super::output::FigureParts;
+use super::request::FigureRequest;
+use crate::pipeline::Plan;
+use crate::products::pictures::{ColourScale, MapPanel, Palette, Sampling, Scaling, Sheet, View, draw_sheet};
+use crate::response::pixel::{PairGeometry, PixelMethod, RowMaker};
+use crate::sky::healpix::pixel_area_sr;
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+use crate::units::vector::{Vec3, norm, sub};
+use crate::units::{Pair, all_pairs};
+
+#[derive(Serialize)]
+struct RowNumbers {
+    frequency_hz: f64,
+    nside: usize,
+    pair: String,
+    t_s: f64,
+    r_i_m: Vec3,
+    r_j_m: Vec3,
+    length_m: f64,
+    /// In units of b_p = lambda / theta_p.
+    length_bp: f64,
+    /// Share of pixels that the Moon does not hide.
+    seen: f64,
+    /// Mean square of the row over the pixels that are seen.
+    centre_power: f64,
+    average_power: f64,
+}
+
+/// Where a pair is, at which the figure looks.
+pub(super) struct Look {
+    pub pair: Pair,
+    pub t_s: f64,
+    pub geometry: PairGeometry,
+    pub length_m: f64,
+    /// In units of b_p.
+    pub length_bp: f64,
+}
+
+impl Look {
+    /// The pair and time asked for, at the frequency of the first channel; by default the middle of the first window, and
+    /// the pair whose baseline is closest to 2 b_p.
+    pub fn new(plan: &Plan, request: &FigureRequest) -> Result<Self, FigureError> {
+        let satellites = plan.array.satellites();
+        let window = plan.windows[0];
+        let t_s = request.at_s.unwrap_or(0.5 * (window.start.seconds() + window.end.seconds()));
+        if let Some(known_s) = plan.array.known_s()
+            && !(known_s[0]..=known_s[1]).contains(&t_s)
+        {
+            return Err(FigureError::NoTime { at_s: t_s, known_s });
+        }
+        let frequency_hz = plan.schedules[0].frequency_hz;
+        let bp_m = SPEED_OF_LIGHT_M_S / frequency_hz / pixel_area_sr(plan.config.map.nside).sqrt();
+        let of = |pair: Pair| {
+            let [r_i_m, r_j_m] = [pair.i, pair.j].map(|n| plan.array.position_m(n.into(), t_s));
+            let length_m = norm(sub(r_i_m, r_j_m));
+            let geometry = PairGeometry {
+                r_i_m,
+                r_j_m,
+                frequency_hz,
+                moon_radius_m: plan.array.moon_radius_m(),
+                response: plan.config.spacecraft.antenna.into(),
+            };
+            Self { pair, t_s, geometry, length_m, length_bp: length_m / bp_m }
+        };
+        if let Some(pair) = request.pair {
+            if usize::from(pair.j) >= satellites {
+                return Err(FigureError::NoPair { pair, satellites });
+            }
+            return Ok(of(pair));
+        }
+        let off = |look: &Self| (look.length_bp / 2.0).ln().abs();
+        let looks = all_pairs(satellites).into_iter().map(of);
+        let best = looks.min_by(|a, b| off(a).total_cmp(&off(b)));
+        best.ok_or(FigureError::NoBaseline { limit_m: 2.0 * bp_m })
+    }
+}
+
+pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, FigureError> {
+    let look = Look::new(plan, request)?;
+    let nside = plan.config.map.nside;
+    let row = |method: PixelMethod| -> Result<[Vec<f64>; 2], FigureError> {
+        let maker = RowMaker::new(nside, method)?;
+        maker.prepare(&look.geometry);
+        let (mut re, mut im) = (vec![0.0_f64; maker.pixels()], vec![0.0_f64; maker.pixels()]);
+        maker.fill(&look.geometry, 1.0, &mut re, &mut im);
+        Ok([re, im])
+    };
+    let (centre, average) = (row(PixelMethod::Centre)?, row(PixelMethod::Average)?);
+    let square = |[re, im]: &[Vec<f64>; 2], k: usize| re[k] * re[k] + im[k] * im[k];
+    let pixels = centre[0].len();
+    let seen: Vec<usize> = (0..pixels).filter(|&k| square(&centre, k) > 0.0).collect();
+    let power = |row: &[Vec<f64>; 2]| seen.iter().map(|&k| square(row, k)).sum::<f64>() / seen.len() as f64;
+    let numbers = RowNumbers {
+        frequency_hz: look.geometry.frequency_hz,
+        nside,
+        pair: look.pair.to_string(),
+        t_s: look.t_s,
+        r_i_m: look.geometry.r_i_m,
+        r_j_m: look.geometry.r_j_m,
+        length_m: look.length_m,
+        length_bp: look.length_bp,
+        seen: seen.len() as f64 / pixels as f64,
+        centre_power: power(&centre),
+        average_power: power(&average),
+    };
+    let mut csv = "pixel,centre_re,centre_im,average_re,average_im\n".to_owned();
+    for k in 0..pixels {
+        // Writing to a string cannot fail.
+        let _ = writeln!(
+            csv,
+            "{k},{:.7},{:.7},{:.7},{:.7}",
+            centre[0][k], centre[1][k], average[0][k], average[1][k]
+        );
+    }
+    let picture = draw(&numbers, [&centre, &average])?;
+    Ok(FigureParts::new(&numbers, csv, picture))
+}
+
+fn draw(
+    numbers: &RowNumbers,
+    rows: [&[Vec<f64>; 2]; 2],
+) -> Result<crate::products::pictures::Picture, FigureError> {
+    let scale = ColourScale::new(-1.0, 1.0, Scaling::Linear, Palette::Diverging)?;
+    let panel = |(values, caption): (&'_ Vec<f64>, &str)| (values.clone(), caption.to_owned());
+    let drawn = [
+        panel((&rows[0][0], "at pixel centres, real part")),
+        panel((&rows[1][0], "averaged over pixels, real part")),
+        panel((&rows[0][1], "at pixel centres, imaginary part")),
+        panel((&rows[1][1], "averaged over pixels, imaginary part")),
+    ];
+    let panels: Vec<MapPanel<'_>> = drawn
+        .iter()
+        .map(|(values, caption)| MapPanel { values, caption: caption.clone(), scale, unit: String::new() })
+        .collect();
+    let sheet = Sheet {
+        title: format!(
+            "A row of B: pair {}, {:.0} m = {:.2} b_{{p}}, {} MHz, nside {}",
+            numbers.pair,
+            numbers.length_m,
+            numbers.length_bp,
+            numbers.frequency_hz / 1e6,
+            numbers.nside
+        ),
+        columns: 2,
+        width_px: 1800,
+        bars: crate::products::pictures::Bars::Shared,
+        view: View { sampling: Sampling::Pixels, ..View::default() },
+        ..Sheet::default()
+    };
+    Ok(draw_sheet(&panels, &sheet)?)
+}

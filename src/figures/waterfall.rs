@@ -1,0 +1,207 @@
+//! Visibilities of one pair over time and frequency: of the fine sky, and of the sky in pixels of the map by averaged rows
+//! and by rows at pixel centres (the paper, Fig. 8).
+
+use std::fmt::Write;
+
+use num_complex::Complex64;
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::error::FigureError;
+use super::output::FigureParts;
+use super::request::FigureRequest;
+use super::rows::Look;
+use crate::pipeline::Plan;
+use crate::products::pictures::{Axis, ColourScale, Palette, Raster, Scaling, draw_rasters};
+use crate::response::pixel::{CHILDREN, Comb, Directions, PairGeometry, PixelMethod, RowMaker, comb_sums};
+use crate::sky::generated::generate;
+use crate::sky::healpix::pixel_area_sr;
+use crate::sky::{Frame, SkyMap};
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+use crate::units::vector::{norm, sub};
+
+/// Times through the window.
+const TIMES: usize = 60;
+/// Frequencies of the waterfall.
+const FREQUENCIES: usize = 60;
+/// Lowest and highest frequency in units of the channel's.
+const BAND: [f64; 2] = [0.1, 3.0];
+/// Largest nside of the fine sky.
+const FINE_NSIDE_MAX: usize = 1024;
+/// Edges of the classes of baselines whose errors are told, in units of b_p.
+const CLASSES_BP: [f64; 6] = [0.0, 0.5, 1.0, 2.0, 4.0, f64::INFINITY];
+
+#[derive(Serialize)]
+struct WaterfallNumbers {
+    pair: String,
+    /// Beginning and end of the window, s.
+    window_s: [f64; 2],
+    /// Lowest and highest frequency, Hz.
+    band_hz: [f64; 2],
+    nside: usize,
+    nside_fine: usize,
+    classes: Vec<ErrorClass>,
+}
+
+/// Errors of the visibilities of a class of baselines, relative to the rms of those of the fine sky.
+#[derive(Serialize)]
+struct ErrorClass {
+    from_bp: f64,
+    /// Absent for the last, which has no end.
+    to_bp: Option<f64>,
+    count: usize,
+    centre: f64,
+    average: f64,
+}
+
+/// One visibility of the waterfall, three times.
+struct Cell {
+    t_s: f64,
+    frequency_hz: f64,
+    length_bp: f64,
+    /// Of the fine sky, by averaged rows, by rows at centres, K sr.
+    values: [Complex64; 3],
+}
+
+pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, FigureError> {
+    let look = Look::new(plan, request)?;
+    let nside = plan.config.map.nside;
+    let nside_fine = (CHILDREN * nside).min(FINE_NSIDE_MAX).max(nside);
+    let frequency_hz = look.geometry.frequency_hz;
+    // One sky for all frequencies, so that the fringes alone differ.
+    let sky = generate(&plan.config.sky.generated, frequency_hz, nside_fine, plan.config.seed)?;
+    let fine = SkyMap::new(Frame::Ecliptic, sky)?;
+    let window =
+        plan.windows.iter().find(|window| window.end.seconds() > look.t_s).unwrap_or(&plan.windows[0]);
+    let [start_s, end_s] = [window.start, window.end].map(|time| time.seconds());
+    let cells = cells(plan, &look, &fine, [start_s, end_s])?;
+    let numbers = WaterfallNumbers {
+        pair: look.pair.to_string(),
+        window_s: [start_s, end_s],
+        band_hz: BAND.map(|factor| factor * frequency_hz),
+        nside,
+        nside_fine,
+        classes: classes(&cells),
+    };
+    let mut csv =
+        "t_s,frequency_hz,length_bp,fine_re,fine_im,average_re,average_im,centre_re,centre_im\n".to_owned();
+    for Cell { t_s, frequency_hz, length_bp, values: [fine, average, centre] } in &cells {
+        // Writing to a string cannot fail.
+        let _ = writeln!(
+            csv,
+            "{t_s:.3},{frequency_hz:.0},{length_bp:.4},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e}",
+            fine.re, fine.im, average.re, average.im, centre.re, centre.im
+        );
+    }
+    let picture = draw(&numbers, &cells)?;
+    Ok(FigureParts::new(&numbers, csv, picture))
+}
+
+/// The waterfall, frequency by frequency at each time.
+fn cells(
+    plan: &Plan,
+    look: &Look,
+    fine: &SkyMap,
+    [start_s, end_s]: [f64; 2],
+) -> Result<Vec<Cell>, FigureError> {
+    let nside = plan.config.map.nside;
+    let coarse = fine.degrade(nside)?;
+    let directions = Directions::from(fine.directions_ecliptic().as_slice());
+    let fine_k: Vec<f32> = fine.values().iter().map(|&value| value as f32).collect();
+    let makers = [PixelMethod::Average, PixelMethod::Centre].map(|method| RowMaker::new(nside, method));
+    let [average, centre] = makers;
+    let makers = [average?, centre?];
+    let bp_per_wavelength = pixel_area_sr(nside).sqrt();
+    let comb = Comb {
+        first: BAND[0] - 1.0,
+        step: (BAND[1] - BAND[0]) / (FREQUENCIES - 1) as f64,
+        count: FREQUENCIES,
+    };
+    let factor = |k: usize| 1.0 + comb.first + comb.step * k as f64;
+    // Tables are built before tasks ask for them.
+    for k in 0..FREQUENCIES {
+        let geometry = PairGeometry { frequency_hz: factor(k) * look.geometry.frequency_hz, ..look.geometry };
+        makers[0].prepare(&geometry);
+    }
+    let at = |n: usize| -> Result<Vec<Cell>, FigureError> {
+        let t_s = start_s + (n as f64 + 0.5) / TIMES as f64 * (end_s - start_s);
+        let [r_i_m, r_j_m] = [look.pair.i, look.pair.j].map(|n| plan.array.position_m(n.into(), t_s));
+        let geometry = PairGeometry { r_i_m, r_j_m, ..look.geometry };
+        let length_m = norm(sub(r_i_m, r_j_m));
+        let of_fine = comb_sums(&[geometry], comb, &directions, &fine_k, pixel_area_sr(fine.nside()))?;
+        let mut row = [vec![0.0_f64; makers[0].pixels()], vec![0.0_f64; makers[0].pixels()]];
+        let of_rows = |maker: &RowMaker, geometry: &PairGeometry, [re, im]: &mut [Vec<f64>; 2]| {
+            maker.fill(geometry, pixel_area_sr(nside), re, im);
+            let sum = |part: &[f64]| part.iter().zip(coarse.values()).map(|(b, t)| b * t).sum::<f64>();
+            Complex64::new(sum(re), sum(im))
+        };
+        Ok((0..FREQUENCIES)
+            .map(|k| {
+                let frequency_hz = factor(k) * look.geometry.frequency_hz;
+                let geometry = PairGeometry { frequency_hz, ..geometry };
+                let [average, centre] = makers.each_ref().map(|maker| of_rows(maker, &geometry, &mut row));
+                let length_bp = length_m * frequency_hz / SPEED_OF_LIGHT_M_S * bp_per_wavelength;
+                Cell { t_s, frequency_hz, length_bp, values: [of_fine[k], average, centre] }
+            })
+            .collect())
+    };
+    let columns: Vec<Vec<Cell>> = (0..TIMES).into_par_iter().map(at).collect::<Result<_, _>>()?;
+    Ok(columns.into_iter().flatten().collect())
+}
+
+fn classes(cells: &[Cell]) -> Vec<ErrorClass> {
+    let class = |edges: &[f64]| {
+        let inside = || cells.iter().filter(|cell| (edges[0]..edges[1]).contains(&cell.length_bp));
+        let power: f64 = inside().map(|cell| cell.values[0].norm_sqr()).sum();
+        let error = |k: usize| {
+            let square: f64 = inside().map(|cell| (cell.values[k] - cell.values[0]).norm_sqr()).sum();
+            (square / power).sqrt()
+        };
+        let count = inside().count();
+        let to_bp = Some(edges[1]).filter(|edge| edge.is_finite());
+        (count > 0).then(|| ErrorClass {
+            from_bp: edges[0],
+            to_bp,
+            count,
+            centre: error(2),
+            average: error(1),
+        })
+    };
+    CLASSES_BP.windows(2).filter_map(class).collect()
+}
+
+fn draw(
+    numbers: &WaterfallNumbers,
+    cells: &[Cell],
+) -> Result<crate::products::pictures::Picture, FigureError> {
+    // Rows of the picture are times, columns frequencies.
+    let amplitude = |k: usize| cells.iter().map(|cell| cell.values[k].norm()).collect::<Vec<f64>>();
+    let drawn = [
+        (format!("nside {}", numbers.nside_fine), amplitude(0)),
+        (format!("nside {}, averaged", numbers.nside), amplitude(1)),
+        (format!("nside {}, at centres", numbers.nside), amplitude(2)),
+    ];
+    let scale = ColourScale::robust(&drawn[0].1, Scaling::Log, Palette::default());
+    let minutes = (numbers.window_s[1] - numbers.window_s[0]) / 60.0;
+    let rasters: Vec<Raster<'_>> = drawn
+        .iter()
+        .map(|(title, values)| Raster {
+            title: title.clone(),
+            x: Axis {
+                label: "frequency (MHz)".to_owned(),
+                log: false,
+                limits: Some((numbers.band_hz[0] / 1e6, numbers.band_hz[1] / 1e6)),
+            },
+            y: Axis {
+                label: "time into the window (min)".to_owned(),
+                log: false,
+                limits: Some((0.0, minutes)),
+            },
+            values,
+            columns: FREQUENCIES,
+            scale,
+            unit: "K sr".to_owned(),
+        })
+        .collect();
+    Ok(draw_rasters(&format!("Visibilities of pair {}", numbers.pair), &rasters, 3)?)
+}

@@ -1,0 +1,223 @@
+//! Square pieces of the sky with a graticule.
+
+use super::canvas::{Canvas, FAINT, INK, Rect, Stroke, WHITE};
+use super::error::PictureError;
+use super::png_file::Picture;
+use super::scale::ColourScale;
+use super::sheet::draw_bar;
+use super::text;
+use super::text::{Align, Style};
+use crate::sky::{Cutout, Frame};
+
+/// A piece of the sky.
+#[derive(Clone, Debug)]
+pub struct Patch<'a> {
+    /// Line above; none if empty.
+    pub caption: String,
+    /// What is shown of the sky.
+    pub cutout: Cutout,
+    /// Its values, as [`Cutout::values`] gives them.
+    pub values: &'a [f64],
+    /// Colours.
+    pub scale: ColourScale,
+    /// Unit of the values.
+    pub unit: String,
+}
+
+/// Side of a piece, and width and height of its share of the page, pixels.
+const SIDE_PX: f64 = 600.0;
+const SHARE_PX: (usize, usize) = (740, 840);
+const FONT: f64 = 19.0;
+/// Distances of the lines of a graticule, degrees.
+const STEPS_DEG: [f64; 9] = [0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 45.0, 60.0];
+
+/// Draws pieces of the sky on one page in `columns` columns, below a title (none if empty).
+///
+/// # Errors
+/// [`PictureError::Size`] without pieces, with too many for a page, or with values that are not those of their piece.
+pub fn draw_patches(title: &str, patches: &[Patch<'_>], columns: usize) -> Result<Picture, PictureError> {
+    if patches.is_empty() || patches.len() > 64 {
+        let value = patches.len();
+        return Err(PictureError::Size { what: "number of pieces", value, expected: "1 to 64" });
+    }
+    if let Some(bad) =
+        patches.iter().find(|p| p.values.is_empty() || p.values.len() != p.cutout.pixels.pow(2))
+    {
+        let value = bad.values.len();
+        return Err(PictureError::Size { what: "number of values", value, expected: "pixels squared" });
+    }
+    let columns = columns.clamp(1, patches.len());
+    let head = if title.is_empty() { 0 } else { 62 };
+    let (width, height) = (SHARE_PX.0 * columns, head + SHARE_PX.1 * patches.len().div_ceil(columns));
+    Picture::check_size(width, height)?;
+    let mut canvas = Canvas::new(width, height);
+    if !title.is_empty() {
+        let style = Style::new(1.3 * FONT, INK).medium();
+        text::draw(&mut canvas, title, (0.5 * width as f64, 38.0), Align::Middle, style);
+    }
+    for (number, patch) in patches.iter().enumerate() {
+        let frame = Rect {
+            x: (number % columns * SHARE_PX.0) as f64 + 90.0,
+            y: (head + number / columns * SHARE_PX.1) as f64 + 50.0,
+            width: SIDE_PX,
+            height: SIDE_PX,
+        };
+        draw_patch(&mut canvas, frame, patch);
+    }
+    let title = if title.is_empty() { patches[0].caption.as_str() } else { title };
+    Ok(Picture::from_canvas(canvas, width, height, title))
+}
+
+fn draw_patch(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
+    let pixels = patch.cutout.pixels;
+    let cell = |place: f64| ((place / SIDE_PX * pixels as f64) as usize).min(pixels - 1);
+    for y in 0..SIDE_PX as usize {
+        for x in 0..SIDE_PX as usize {
+            let row = cell(SIDE_PX - y as f64 - 0.5);
+            let value = patch.values[row * pixels + cell(x as f64 + 0.5)];
+            let colour = patch.scale.colour(value);
+            canvas.blend(frame.x as usize + x, frame.y as usize + y, colour, 1.0);
+        }
+    }
+    graticule(canvas, frame, patch);
+    canvas.outline(frame, Stroke::solid(INK, 1.0, 1.4));
+    if !patch.caption.is_empty() {
+        let style = Style::new(1.1 * FONT, INK).medium();
+        text::draw(canvas, &patch.caption, (frame.middle_x(), frame.y - 0.95 * FONT), Align::Middle, style);
+    }
+    let name = match patch.cutout.frame {
+        Frame::Galactic => "Galactic",
+        Frame::Ecliptic => "ecliptic",
+        Frame::Equatorial => "equatorial",
+    };
+    let below = (frame.middle_x(), frame.bottom() + 2.7 * FONT);
+    text::draw(
+        canvas,
+        &format!("{name} longitude and latitude"),
+        below,
+        Align::Middle,
+        Style::new(FONT, FAINT),
+    );
+    let bar = Rect {
+        x: frame.x + 0.08 * frame.width,
+        y: frame.bottom() + 4.2 * FONT,
+        width: 0.76 * frame.width,
+        height: FONT,
+    };
+    draw_bar(canvas, bar, (&patch.scale, &patch.unit), FONT);
+}
+
+/// The least usual distance of lines that leaves at most six of them.
+fn step_deg(span_deg: f64) -> f64 {
+    STEPS_DEG.into_iter().find(|step| span_deg / step <= 6.0).unwrap_or(90.0)
+}
+
+fn graticule(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
+    let Cutout { centre_deg: [longitude, latitude], size_deg, .. } = patch.cutout;
+    let half = 0.5 * size_deg;
+    let to_page = |[right, up]: [f64; 2]| {
+        (frame.middle_x() + right / size_deg * SIDE_PX, frame.middle_y() - up / size_deg * SIDE_PX)
+    };
+    // Meridians as far as the corner reaches; all of them around a pole.
+    let reach = 1.5 * half;
+    let most = latitude.abs() + reach;
+    let wide = if most < 89.0 { (reach / most.to_radians().cos()).min(180.0) } else { 180.0 };
+    let (along, up) = (step_deg(2.0 * half / latitude.to_radians().cos().max(0.05)), step_deg(size_deg));
+    let (low, high) = ((latitude - reach).max(-90.0), (latitude + reach).min(90.0));
+    let steps = |from: f64, to: f64, step: f64| {
+        let first = (from / step).ceil() as i64;
+        (first..=(to / step).floor() as i64).map(move |k| k as f64 * step)
+    };
+    let inside = |p: &[f64; 2]| p[0].abs() <= half && p[1].abs() <= half;
+    let (colour, alpha) = if patch.scale.is_light() { (INK, 0.35) } else { (WHITE, 0.45) };
+    let thin = Stroke::solid(colour, alpha, 1.0);
+    let label = Style::new(0.85 * FONT, INK);
+    canvas.set_clip(Some(frame));
+    let fine = |k: usize, from: f64, to: f64| from + (to - from) * k as f64 / 200.0;
+    let line = |canvas: &mut Canvas, points: Vec<Option<[f64; 2]>>| {
+        let page = |p: Option<[f64; 2]>| p.map_or((f64::NAN, f64::NAN), to_page);
+        canvas.polyline(&points.into_iter().map(page).collect::<Vec<_>>(), thin);
+    };
+    let meridians: Vec<f64> = steps(longitude - wide, longitude + wide - 1e-9, along).collect();
+    let parallels: Vec<f64> = steps(low, high, up).collect();
+    let meridian =
+        |l: f64| (0..=200).map(|k| patch.cutout.place_deg(l, fine(k, low, high))).collect::<Vec<_>>();
+    let parallel = |b: f64| {
+        let at = |k| patch.cutout.place_deg(fine(k, longitude - wide, longitude + wide), b);
+        (0..=200).map(at).collect::<Vec<_>>()
+    };
+    meridians.iter().for_each(|&l| line(canvas, meridian(l)));
+    parallels.iter().for_each(|&b| line(canvas, parallel(b)));
+    canvas.set_clip(None);
+    // Where lines leave the piece below, and to the left.
+    for &l in &meridians {
+        let crossing = edge(&meridian(l), 1, -half).filter(inside);
+        if let Some(place) = crossing {
+            let (x, y) = to_page(place);
+            let text = format!("{}°", shown(l.rem_euclid(360.0)));
+            text::draw(canvas, &text, (x, y + 0.9 * FONT), Align::Middle, label);
+        }
+    }
+    for &b in &parallels {
+        if let Some(place) = edge(&parallel(b), 0, -half).filter(inside) {
+            let (x, y) = to_page(place);
+            let sign = if b > 0.0 { "+" } else { "" };
+            let text = format!("{sign}{}°", shown(b)).replace('-', "−");
+            text::draw(canvas, &text, (x - 0.4 * FONT, y), Align::End, label);
+        }
+    }
+}
+
+/// A number of degrees, which is whole or half.
+fn shown(degrees: f64) -> String {
+    if degrees.fract() == 0.0 { format!("{degrees:.0}") } else { format!("{degrees:.1}") }
+}
+
+/// Where a line crosses the edge on which coordinate `axis` is `value`.
+fn edge(line: &[Option<[f64; 2]>], axis: usize, value: f64) -> Option<[f64; 2]> {
+    line.windows(2).find_map(|two| {
+        let (a, b) = (two[0]?, two[1]?);
+        let (da, db) = (a[axis] - value, b[axis] - value);
+        // A jump from one side of the plane to the other is no crossing.
+        let near = (a[0] - b[0]).abs() + (a[1] - b[1]).abs() < 30.0;
+        (da * db <= 0.0 && da != db && near).then(|| {
+            let t = da / (da - db);
+            let mut place = [a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])];
+            place[axis] = value;
+            place
+        })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::products::pictures::{Palette, Scaling};
+    use crate::sky::Projection;
+
+    #[test]
+    fn pieces_of_any_place_are_drawn_and_wrong_ones_refused() {
+        let values = vec![0.5; 16];
+        for projection in [Projection::Gnomonic, Projection::Cartesian] {
+            for centre_deg in [[0.0, 0.0], [359.0, 89.9], [120.0, -90.0], [200.0, 45.0]] {
+                let patch = Patch {
+                    caption: "p".to_owned(),
+                    cutout: Cutout {
+                        projection,
+                        frame: Frame::Galactic,
+                        centre_deg,
+                        size_deg: 20.0,
+                        pixels: 4,
+                    },
+                    values: &values,
+                    scale: ColourScale::new(0.0, 1.0, Scaling::Linear, Palette::Inferno).unwrap(),
+                    unit: "K".to_owned(),
+                };
+                assert!(draw_patches("", std::slice::from_ref(&patch), 1).is_ok());
+                let short = Patch { values: &values[1..], ..patch };
+                assert!(matches!(draw_patches("", &[short], 1), Err(PictureError::Size { .. })));
+            }
+        }
+        assert!(matches!(draw_patches("", &[], 1), Err(PictureError::Size { .. })));
+    }
+}
