@@ -65,6 +65,8 @@ pub enum VisibilityReason {
     NextSession,
     /// Its flags say that the Earth was in sight of one of its daughters.
     EarthInSight,
+    /// Its flags say that the artificial signal for calibration was on.
+    Beacon,
 }
 
 impl Reason for VisibilityReason {
@@ -104,6 +106,7 @@ impl Reason for VisibilityReason {
             Self::BadValue => "value or weight that cannot be used, as it was sent",
             Self::NextSession => "left for the next session",
             Self::EarthInSight => "Earth in sight of a daughter",
+            Self::Beacon => "artificial signal on",
         }
     }
 
@@ -165,7 +168,7 @@ mod tests {
         assert_eq!(texts.len(), all.len());
         // Some of the places, so that none moves unseen.
         assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
-        assert_eq!((all.len(), all[23]), (28, VisibilityReason::NotReceived));
-        assert_eq!(all.last(), Some(&VisibilityReason::EarthInSight));
+        assert_eq!((all.len(), all[23]), (29, VisibilityReason::NotReceived));
+        assert_eq!(all.last(), Some(&VisibilityReason::Beacon));
     }
 }
