@@ -5,6 +5,7 @@
 
 mod arguments;
 mod bench;
+mod calibrate;
 mod check;
 mod compare;
 mod corrupt;
@@ -64,6 +65,7 @@ enum Command {
     Retract(retract::RetractArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
+    Calibrate(calibrate::CalibrateArgs),
     Predict(predict::PredictArgs),
     Check(check::CheckArgs),
     Bench(bench::BenchArgs),
@@ -89,6 +91,7 @@ pub fn main() -> ExitCode {
         Command::Retract(args) => retract::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
+        Command::Calibrate(args) => calibrate::execute(&args),
         Command::Predict(args) => predict::execute(&args),
         Command::Check(args) => check::execute(&args),
         Command::Bench(args) => bench::execute(&args),

@@ -37,7 +37,8 @@ impl PairTroubles<'_> {
     /// Artificial signal and interference at a time.
     pub(super) fn signals(&self, t_s: f64) -> Signals {
         let Self { array, pair, frequency_hz, .. } = *self;
-        let beacon = if self.beacon_is_on(t_s) { self.errors.config().beacon.signal() } else { Default::default() };
+        let beacon =
+            if self.beacon_is_on(t_s) { self.errors.config().beacon.signal() } else { Default::default() };
         let burst_k_sr = self.errors.burst_k_sr(t_s);
         if !beacon.is_on() && burst_k_sr == 0.0 {
             return Signals { power_k_sr: 0.0, visibility_k_sr: Complex64::ZERO };

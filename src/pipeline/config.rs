@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::problems::Problems;
 use crate::accumulation::{EngineKind, MapConfig};
 use crate::array::{Array, ArrayConfig};
+use crate::calibration::solver::SolverConfig;
 use crate::calibration::{CalibrationConfig, VanVleck};
 use crate::daughters::{DaughtersConfig, InstrumentConfig};
 use crate::downlink::DownlinkConfig;
@@ -19,7 +20,7 @@ use crate::units::{Checks, InvalidValue};
 
 /// A whole pipeline: the sky, the spacecraft and the ground.
 ///
-/// Sections are in the order of the data path. A ground segment reads only `calibration`, `map`, `products` and
+/// Sections are in the order of the data path. A ground segment reads only `calibration`, `calibrate`, `map`, `products` and
 /// `runtime`, and `downlink.listen` when it listens.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -42,6 +43,8 @@ pub struct Config {
     pub downlink: DownlinkConfig,
     /// Calibration.
     pub calibration: CalibrationConfig,
+    /// The solver of calibrations.
+    pub calibrate: SolverConfig,
     /// Map making.
     pub map: MapConfig,
     /// Products.
@@ -158,6 +161,7 @@ impl Config {
         let mut found = Problems::default();
         found.extend(self.downlink.listen.problems());
         found.extend(self.calibration.problems());
+        found.extend(self.calibrate.problems());
         found.extend(self.map.problems());
         found.extend(self.products.problems());
         found.extend(self.runtime.problems());

@@ -283,7 +283,7 @@ fn write_settings(config: &Config, out: &Path) -> Result<(), PipelineError> {
 }
 
 /// Creates and locks the folder before anything is computed, so that an error shows at once.
-fn lock_folder(out: &Path) -> Result<FolderLock, PipelineError> {
+pub(super) fn lock_folder(out: &Path) -> Result<FolderLock, PipelineError> {
     let locked = FolderLock::acquire(out, ".lock", true);
     locked.map_err(|source| ProductsError::Write { path: out.to_owned(), source }.into())
 }

@@ -5,10 +5,12 @@
 mod common;
 
 mod bench;
+mod calibrate;
 mod coded;
 mod command_line;
 mod ending;
 mod harmonic;
+mod instrument;
 mod orbits;
 mod outputs;
 mod paper;

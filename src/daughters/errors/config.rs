@@ -135,7 +135,12 @@ impl ErrorTerms {
         for (key, list) in [("constant", &self.constant), ("rate_per_day", &self.rate_per_day)] {
             let (key, count) = (format!("{name}.{key}"), list.len());
             let fits = count == 0 || count == satellites;
-            checks.require(&key, format!("({count} values)"), fits, format!("none, or {satellites}: one a daughter"));
+            checks.require(
+                &key,
+                format!("({count} values)"),
+                fits,
+                format!("none, or {satellites}: one a daughter"),
+            );
             checks.numbers(&key, list, |_| true, "finite numbers");
         }
         for (key, rms) in [
@@ -154,9 +159,19 @@ impl ErrorTerms {
         }
         let time_s = self.drift_time_s;
         let expected = "60 s to 1e9 s";
-        checks.number(format!("{name}.drift_time_s"), time_s, (DRIFT_TIME_S_MIN..=1e9).contains(&time_s), expected);
+        checks.number(
+            format!("{name}.drift_time_s"),
+            time_s,
+            (DRIFT_TIME_S_MIN..=1e9).contains(&time_s),
+            expected,
+        );
         let every_s = self.step_every_s;
-        checks.number(format!("{name}.step_every_s"), every_s, (1.0..=1e9).contains(&every_s), "1 s to 1e9 s");
+        checks.number(
+            format!("{name}.step_every_s"),
+            every_s,
+            (1.0..=1e9).contains(&every_s),
+            "1 s to 1e9 s",
+        );
     }
 }
 
@@ -212,12 +227,22 @@ impl InstrumentConfig {
         let known = |number: u32, count: usize| (1..=count).contains(&(number as usize));
         for (index, &daughter) in self.dead_daughters.iter().enumerate() {
             let expected = format!("a daughter, 1 to {satellites}");
-            checks.require(format!("dead_daughters[{index}]"), daughter, known(daughter, satellites), expected);
+            checks.require(
+                format!("dead_daughters[{index}]"),
+                daughter,
+                known(daughter, satellites),
+                expected,
+            );
         }
         for (index, &[daughter, channel]) in self.dead_channels.iter().enumerate() {
             let good = known(daughter, satellites) && known(channel, channels);
             let expected = format!("a daughter, 1 to {satellites}, and a channel, 1 to {channels}");
-            checks.require(format!("dead_channels[{index}]"), format!("[{daughter}, {channel}]"), good, expected);
+            checks.require(
+                format!("dead_channels[{index}]"),
+                format!("[{daughter}, {channel}]"),
+                good,
+                expected,
+            );
         }
         let probability = self.outlier_probability;
         checks.number("outlier_probability", probability, (0.0..=1.0).contains(&probability), "0 to 1");

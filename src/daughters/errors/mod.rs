@@ -18,9 +18,9 @@ use std::f64::consts::TAU;
 use num_complex::Complex64;
 use rand_chacha::ChaCha8Rng;
 
-use crate::array::Array;
+use crate::array::{Array, track_offset_m};
 use crate::frames::{Channel, EphemerisSegment, ObservingWindow};
-use crate::units::vector::{Vec3, add, cross, scale, unit};
+use crate::units::vector::add;
 use crate::units::{MissionTime, Pair, StreamKind, TICKS_PER_SECOND, random_stream};
 use series::{Draws, Series};
 
@@ -156,14 +156,12 @@ impl PassErrors {
             let (node, daughter) = ((place / satellites) as i64, place % satellites);
             let time = segment.start.0 + node * i64::from(segment.step_ticks);
             let t_s = MissionTime(time).0 as f64 / TICKS_PER_SECOND as f64;
-            let moved = displacement_m(*position_m, array.normal_hat(daughter, t_s), self.offset_m(daughter, t_s));
+            let moved =
+                track_offset_m(*position_m, array.normal_hat(daughter, t_s), self.offset_m(daughter, t_s));
             *position_m = add(*position_m, moved);
         }
     }
 }
 
-/// An offset along the track, along the orbit's normal and away from the Moon, on ecliptic axes, m.
-fn displacement_m(r_m: Vec3, normal_hat: Vec3, [along, across, radial]: [f64; 3]) -> Vec3 {
-    let up = unit(r_m);
-    add(add(scale(along, unit(cross(normal_hat, up))), scale(across, normal_hat)), scale(radial, up))
-}
+#[cfg(test)]
+mod tests;

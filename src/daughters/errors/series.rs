@@ -60,8 +60,8 @@ pub(super) struct Series {
     /// Factors of the cosine and the sine of the orbit's phase since the epoch.
     orbit: [f64; 2],
     orbit_rad_per_s: f64,
-    /// Time of the first node, step, values.
-    drift: Option<(f64, f64, Vec<f64>)>,
+    /// Number of the first node, step (s), values.
+    drift: Option<(i64, f64, Vec<f64>)>,
     /// Level since each of these times, s; the first holds before, too.
     steps: Vec<(f64, f64)>,
 }
@@ -97,11 +97,12 @@ impl Series {
             let (sin, cos) = (self.orbit_rad_per_s * t_s).sin_cos();
             value += self.orbit[0] * cos + self.orbit[1] * sin;
         }
-        if let Some((first_s, step_s, nodes)) = &self.drift {
-            let place = ((t_s - first_s) / step_s).clamp(0.0, (nodes.len() - 1) as f64);
-            let node = (place as usize).min(nodes.len().saturating_sub(2));
-            let next = nodes.get(node + 1).copied().unwrap_or(nodes[node]);
-            value += nodes[node] + (next - nodes[node]) * (place - node as f64);
+        if let Some((first, step_s, nodes)) = &self.drift {
+            // From whole nodes since the epoch, so that no bit depends on where the pass begins.
+            let place = t_s / step_s;
+            let node = (place.floor() as i64).clamp(*first, first + nodes.len() as i64 - 2);
+            let [before, after] = [0, 1].map(|k| nodes[(node - first) as usize + k]);
+            value += before + (after - before) * (place - node as f64).clamp(0.0, 1.0);
         }
         let begun = self.steps.partition_point(|(since_s, _)| *since_s <= t_s);
         value + self.steps.get(begun.max(1) - 1).map_or(0.0, |(_, level)| *level)
@@ -110,7 +111,7 @@ impl Series {
 
 /// A stationary Gauss-Markov process at its nodes over an interval. Its value at a node is drawn between two nodes that
 /// are known, from the coarsest to the finest, so that any interval has the same values without what was before.
-fn drift(terms: &ErrorTerms, draws: Draws, [from_s, to_s]: [f64; 2]) -> (f64, f64, Vec<f64>) {
+fn drift(terms: &ErrorTerms, draws: Draws, [from_s, to_s]: [f64; 2]) -> (i64, f64, Vec<f64>) {
     let step_s = terms.drift_time_s / NODES_PER_TIME;
     let [first, last] = [(from_s / step_s).floor() as i64, (to_s / step_s).ceil() as i64 + 1];
     let mut nodes = vec![0.0; (last - first + 1) as usize];
@@ -126,7 +127,7 @@ fn drift(terms: &ErrorTerms, draws: Draws, [from_s, to_s]: [f64; 2]) -> (f64, f6
         left = right;
     }
     nodes.iter_mut().for_each(|node| *node *= terms.drift_rms);
-    (first as f64 * step_s, step_s, nodes)
+    (first, step_s, nodes)
 }
 
 /// Nodes between two known ones.

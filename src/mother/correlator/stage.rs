@@ -119,7 +119,17 @@ impl Correlator {
         let rule = DumpRule { dump_samples: dump / bands, width_hz, complete_min: COMPLETE_MIN };
         let divider = (setup.division != Division::NONE).then(|| Divider::new(setup.division));
         lock(&counts).autos = vec![vec![(0.0, 0); setup.array.satellites()]; setup.schedules.len()];
-        Self { setup, rule, divider, arch: Arch::new(), running: None, counts, sampled: 0, samples: 0, errors: None }
+        Self {
+            setup,
+            rule,
+            divider,
+            arch: Arch::new(),
+            running: None,
+            counts,
+            sampled: 0,
+            samples: 0,
+            errors: None,
+        }
     }
 
     /// Adds errors of the positions in packets.
