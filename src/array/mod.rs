@@ -15,6 +15,7 @@ mod oem;
 mod orbit;
 mod placing;
 mod state;
+mod track;
 mod windows;
 
 pub use baseline::scaled_baseline;
@@ -26,4 +27,5 @@ pub use kepler::KeplerElements;
 pub use orbit::{Array, hidden_by_moon};
 pub use placing::PlacingCounts;
 pub use state::SatelliteState;
+pub use track::{orbit_normal_hat, track_axes, track_offset_m};
 pub use windows::{EarthShadow, ObservingWindows, earth_in_sight_s};

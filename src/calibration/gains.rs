@@ -4,9 +4,11 @@ use std::path::Path;
 
 use num_complex::Complex64;
 
-use super::{Calibration, CalibrationError, CalibrationReport, GainsFile, Interpolation};
+use super::{Calibration, CalibrationError, CalibrationReport, GainsFile, Interpolation, PositionSolution};
+use crate::array::track_offset_m;
 use crate::frames::PlacedVisibilities;
 use crate::units::Pair;
+use crate::units::vector::sub;
 
 /// Complex voltage gains of every antenna, by channel and time.
 ///
@@ -26,6 +28,7 @@ pub struct AntennaGains {
     frequency_tolerance_hz: f64,
     satellites: usize,
     channels: Vec<ChannelTable>,
+    positions: Vec<PositionSolution>,
 }
 
 /// Gains of one channel, ready for interpolation.
@@ -78,6 +81,7 @@ impl AntennaGains {
             frequency_tolerance_hz: file.frequency_tolerance_hz,
             satellites: file.satellites(),
             channels,
+            positions: file.positions.clone(),
         })
     }
 
@@ -89,6 +93,23 @@ impl AntennaGains {
     pub fn factor(&self, frequency_hz: f64, pair: Pair, time_s: f64) -> Result<Complex64, CalibrationError> {
         let table = self.table(frequency_hz, pair)?;
         Ok(table.factor(self.interpolation, self.satellites, pair, time_s))
+    }
+
+    /// Takes the errors of positions off those of a pair.
+    fn correct_positions(&self, block: &mut PlacedVisibilities) {
+        // An auto-correlation has no position.
+        if self.positions.is_empty() || block.pair.i == block.pair.j {
+            return;
+        }
+        let [i, j] = [block.pair.i, block.pair.j].map(usize::from);
+        for (k, &time_s) in block.time_s.iter().enumerate() {
+            let next = self.positions.partition_point(|position| position.from_s <= time_s);
+            let known = next.checked_sub(1).and_then(|at| self.positions.get(at));
+            let Some(known) = known.filter(|known| time_s <= known.until_s) else { continue };
+            for (r_m, n) in [(&mut block.r_i_m[k], i), (&mut block.r_j_m[k], j)] {
+                *r_m = sub(*r_m, track_offset_m(*r_m, known.normals_hat[n], known.offsets_m[n]));
+            }
+        }
     }
 
     /// The table for a channel, after checking that it has both satellites.
@@ -168,6 +189,7 @@ impl Calibration for AntennaGains {
             kept += 1;
         }
         truncate(block, kept);
+        self.correct_positions(block);
         Ok(CalibrationReport { kept, unusable_gain: count - kept })
     }
 }

@@ -46,6 +46,23 @@ pub struct GainsFile {
     pub frequency_tolerance_hz: f64,
     /// Gains by channel, in any order.
     pub channels: Vec<ChannelGains>,
+    /// Errors of the positions in packets, by time; none where there is no entry.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub positions: Vec<PositionSolution>,
+}
+
+/// Errors of the positions of all satellites over an interval: what packets say less what was flown.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PositionSolution {
+    /// Start of the interval, s since the mission epoch; after the end of the one before.
+    pub from_s: f64,
+    /// Its end, s.
+    pub until_s: f64,
+    /// Normal of every satellite's orbit: a unit vector on ecliptic axes.
+    pub normals_hat: Vec<[f64; 3]>,
+    /// Error of every satellite along its track, along the normal, and away from the Moon, m.
+    pub offsets_m: Vec<[f64; 3]>,
 }
 
 /// Half the width of the paper's channels, Hz.
@@ -106,6 +123,26 @@ impl GainsFile {
             let is_new = self.channels[..index].iter().all(|earlier| earlier.frequency_hz != frequency_hz);
             checks.require(&frequency_key, frequency_hz, is_new, "every frequency once");
             channel.check(&key, satellites, &mut checks);
+        }
+        let mut before_s = f64::NEG_INFINITY;
+        for (index, position) in self.positions.iter().enumerate() {
+            let key = format!("positions[{index}]");
+            let [from_s, until_s] = [position.from_s, position.until_s];
+            let expected = "a finite time, not before the end of the one before";
+            checks.number(format!("{key}.from_s"), from_s, from_s >= before_s, expected);
+            checks.number(format!("{key}.until_s"), until_s, until_s > from_s, "a finite time after from_s");
+            before_s = before_s.max(until_s);
+            for (name, list) in [("normals_hat", &position.normals_hat), ("offsets_m", &position.offsets_m)] {
+                let key = format!("{key}.{name}");
+                let found = format!("({} satellites)", list.len());
+                checks.require(
+                    &key,
+                    found,
+                    list.len() == satellites,
+                    "as many satellites as in the first solution",
+                );
+                checks.numbers(&key, list.as_flattened(), |_| true, "finite numbers");
+            }
         }
         checks.finish()
     }

@@ -2,8 +2,8 @@
 //!
 //! The [`Calibrator`] gives visibilities their positions and applies corrections in order: [`VanVleck`] undoes the effect
 //! of coarse quantisers on correlations; a [`Calibration`] turns them into what ideal antennas would have measured
-//! ([`Identity`] changes nothing, [`AntennaGains`] divides by complex gains from a file); [`SubBands`] combines sub-bands
-//! of a channel. [`CalibrationConfig`] chooses.
+//! ([`Identity`] changes nothing, [`AntennaGains`] divides by complex gains from a file, and corrects positions); [`SubBands`] combines sub-bands
+//! of a channel. [`CalibrationConfig`] chooses. The [`solver`] finds the gains of such a file from the data.
 //!
 //! Uses [`crate::frames`] and [`crate::array`]. Every block is used once; every visibility that is left out is in the
 //! ledger with its reason.
@@ -14,6 +14,7 @@ mod config;
 mod error;
 mod gains;
 mod gains_file;
+pub mod solver;
 mod stage;
 mod sub_bands;
 mod van_vleck;
@@ -23,7 +24,7 @@ pub use blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
 pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 pub use gains::AntennaGains;
-pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation};
+pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation, PositionSolution};
 pub use stage::Calibrator;
 pub use sub_bands::SubBands;
 pub use van_vleck::{QuantiserBitsError, VanVleck};

@@ -5,6 +5,7 @@
 
 mod arguments;
 mod bench;
+mod calibrate;
 mod check;
 mod compare;
 mod corrupt;
@@ -71,6 +72,7 @@ enum Command {
     Geometry(geometry::GeometryArgs),
     Figure(figure::FigureArgs),
     Cutout(cutout::CutoutArgs),
+    Calibrate(calibrate::CalibrateArgs),
     Predict(predict::PredictArgs),
     Check(check::CheckArgs),
     Bench(bench::BenchArgs),
@@ -115,6 +117,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Geometry(args) => geometry::execute(&args),
         Command::Figure(args) => figure::execute(&args),
         Command::Cutout(args) => cutout::execute(&args),
+        Command::Calibrate(args) => calibrate::execute(&args),
         Command::Predict(args) => predict::execute(&args),
         Command::Check(args) => check::execute(&args),
         Command::Bench(args) => bench::execute(&args),

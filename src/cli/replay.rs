@@ -43,6 +43,9 @@ pub(super) struct ReplayArgs {
     /// Map file (TOML): settings of the ground segment; the defaults of pipelines/reference.toml if not given.
     #[arg(long, value_name = "MAP.toml")]
     map: Option<PathBuf>,
+    /// Gains that `lunarray calibrate` found: as calibration.hook = "antenna-gains" with calibration.gains_file.
+    #[arg(long, value_name = "GAINS.json")]
+    calibration: Option<PathBuf>,
     /// Output folder for the products.
     #[arg(short, long, value_name = "DIR")]
     out: PathBuf,
@@ -147,6 +150,10 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
         overrides.push(format!("map.snapshot_every_s={every_s:?}"));
     }
     overrides.extend(args.channels.iter().map(ChannelList::setting));
+    if let Some(path) = &args.calibration {
+        overrides.push("calibration.hook=antenna-gains".to_owned());
+        overrides.push(format!("calibration.gains_file={:?}", path.display().to_string()));
+    }
     let config = ConfigSource { file: args.map.clone(), overrides, seed: None }.load_ground()?;
     use_threads(&config.runtime)?;
     if let Some(size) = args.groups {

@@ -6,6 +6,7 @@ use num_complex::{Complex32, Complex64};
 use rand::Rng;
 
 use super::config::Disturbances;
+use super::errors::PassErrors;
 use super::synthesis::Response;
 use crate::array::Array;
 use crate::frames::Channel;
@@ -59,6 +60,20 @@ impl Disturbances {
     }
 }
 
+impl Response {
+    /// The response of a daughter in a channel (numbers from 0) with the errors of the instrument at a time.
+    pub(super) fn after(
+        self,
+        pass: &PassErrors,
+        (daughter, number): (usize, usize),
+        channel: Channel,
+        t_s: f64,
+    ) -> Self {
+        let turns = self.turns - channel.width_hz * pass.clock_s(daughter, t_s);
+        Self { gain: self.gain * pass.gain(daughter, number, t_s), turns }
+    }
+}
+
 /// The tones in one block of samples of a daughter.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct BlockTones<'a> {
@@ -72,6 +87,10 @@ pub(super) struct BlockTones<'a> {
     pub first: u64,
     /// Seed of the interference's phase.
     pub seed: u64,
+    /// Errors of the instrument.
+    pub pass: Option<&'a PassErrors>,
+    /// Number of the channel, from 0.
+    pub number: usize,
 }
 
 impl BlockTones<'_> {
@@ -79,7 +98,10 @@ impl BlockTones<'_> {
     pub(super) fn add_to(&self, re: &mut [f32], im: &mut [f32]) {
         let d = self.disturbances;
         let t_s = self.window_s + self.first as f64 / self.channel.width_hz;
-        let response = d.response(self.daughter, self.channel, t_s);
+        let mut response = d.response(self.daughter, self.channel, t_s);
+        if let Some(pass) = self.pass {
+            response = response.after(pass, (self.daughter, self.number), self.channel, t_s);
+        }
         let gain_at = |offset_hz: f64| {
             response.gain * Complex64::cis(TAU * response.turns * offset_hz / self.channel.width_hz)
         };

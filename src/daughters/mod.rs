@@ -3,7 +3,7 @@
 //! [`Sampler`] is the source. For each channel it draws complex Gaussian samples of all daughters at once, at the
 //! channel's own width (8 kHz). Their covariance is that of a [`crate::response::model::VisibilityModel`] as the array
 //! moves, plus receiver noise (`covariance`, `synthesis`). Each daughter then applies its instrumental errors
-//! ([`Disturbances`]), level control and quantiser. [`SampleLink`] carries the blocks to the mother at a limited rate.
+//! ([`Disturbances`], and [`InstrumentErrors`] for either fidelity), level control and quantiser. [`SampleLink`] carries the blocks to the mother at a limited rate.
 //!
 //! May use [`crate::frames`], [`crate::array`], [`crate::response`] and [`crate::runtime`]; never the mother.
 //! Samples depend on the seed alone, not on the number of threads or the size of queues.
@@ -14,6 +14,7 @@ mod config;
 mod covariance;
 mod disturbances;
 mod epochs;
+mod errors;
 mod link;
 mod nodes;
 mod normal;
@@ -24,6 +25,7 @@ mod synthesis;
 mod tile;
 
 pub use config::{DaughtersConfig, Disturbances, DropPolicy, FLOAT_BITS};
+pub use errors::{BeaconSchedule, ErrorTerms, InstrumentConfig, InstrumentErrors, PassErrors, truth_csv};
 pub use link::{LinkCounts, SampleLink};
 pub use repair::Repairs;
 pub(crate) use sampler::sample_ticks;

@@ -8,6 +8,7 @@ use super::bins::HOP;
 use super::config::DaughtersConfig;
 use super::covariance::{CovarianceRequest, Covariances, Epochs, Tables};
 use super::disturbances::BlockTones;
+use super::errors::{InstrumentErrors, PassErrors};
 use super::quantiser::Quantiser;
 use super::repair::Repairs;
 use super::synthesis::{Draft, DrawKey, Planes, Response, SampleSlot, SampleSynthesis};
@@ -59,6 +60,9 @@ pub struct Sampler {
     /// Workspaces that no thread uses at the moment.
     spare: Mutex<Vec<ChannelWorkspace>>,
     counts: Arc<Mutex<SamplerCounts>>,
+    errors: Option<Arc<InstrumentErrors>>,
+    /// Errors in the current window.
+    pass: Option<PassErrors>,
 }
 
 /// Memory for the samples of one channel.
@@ -103,7 +107,15 @@ impl Sampler {
             tables: Tables::default(),
             spare: Mutex::default(),
             counts,
+            errors: None,
+            pass: None,
         }
+    }
+
+    /// Adds errors of the instrument.
+    #[must_use]
+    pub fn with_errors(self, errors: Option<Arc<InstrumentErrors>>) -> Self {
+        Self { errors, ..self }
     }
 
     fn begin(&self, mut window: ObservingWindow) -> WindowProgress {
@@ -272,12 +284,18 @@ impl ChannelWork<'_> {
         draft: &mut Draft,
         out: SampleSlot<'_>,
     ) -> Repairs {
-        let Sampler { scene, config, synthesis, .. } = self.sampler;
+        let Sampler { scene, config, synthesis, pass, .. } = self.sampler;
         let time = self.sampler.time(self.window.start, self.first + epoch * HOP);
         let key = DrawKey { seed: scene.seed, channel: self.id.0, ticks: time.0 };
         let channel = scene.channels[usize::from(self.id.0)];
-        let responses: Vec<Response> = if config.disturbances.changes_responses() {
-            let response = |n| config.disturbances.response(n, channel, time.seconds());
+        let responses: Vec<Response> = if config.disturbances.changes_responses() || pass.is_some() {
+            let response = |n| {
+                let response = config.disturbances.response(n, channel, time.seconds());
+                match pass {
+                    Some(pass) => response.after(pass, (n, usize::from(self.id.0)), channel, time.seconds()),
+                    None => response,
+                }
+            };
             (0..covariances.daughters()).map(response).collect()
         } else {
             Vec::new()
@@ -305,6 +323,8 @@ impl ChannelWork<'_> {
                 window_s: self.window.start.seconds(),
                 first: first as u64,
                 seed: scene.seed,
+                pass: self.sampler.pass.as_ref(),
+                number: usize::from(self.id.0),
             };
             tones.add_to(re, im);
         }
@@ -329,6 +349,7 @@ impl Source for Sampler {
             Some(progress) => progress,
             None => {
                 let Some(window) = self.windows.next() else { return Ok(Flow::Done) };
+                self.pass = self.errors.as_ref().map(|errors| errors.pass(window));
                 let progress = self.begin(window);
                 out.push(SpaceFrame::WindowStart(progress.window));
                 progress

@@ -19,6 +19,8 @@ impl Flags {
     pub const UNCALIBRATED: Self = Self(8);
     /// The Earth was in sight of one of the two daughters during part of the integration.
     pub const EARTH: Self = Self(16);
+    /// The artificial signal for calibration was on.
+    pub const BEACON: Self = Self(32);
 
     /// Whether no bit is set.
     #[must_use]
@@ -36,6 +38,7 @@ impl Flags {
             Self::SATURATED => Some(VisibilityReason::Saturated),
             Self::UNCALIBRATED => Some(VisibilityReason::Uncalibrated),
             Self::EARTH => Some(VisibilityReason::EarthInSight),
+            Self::BEACON => Some(VisibilityReason::Beacon),
             _ => Some(VisibilityReason::UnknownFlag),
         }
     }

@@ -67,6 +67,8 @@ pub enum VisibilityReason {
     EarthInSight,
     /// Its channel is not among those that are mapped.
     ChannelNotMapped,
+    /// Its flags say that the artificial signal for calibration was on.
+    Beacon,
 }
 
 impl VisibilityReason {
@@ -128,6 +130,7 @@ impl Reason for VisibilityReason {
             Self::NextSession => "left for the next session",
             Self::EarthInSight => "Earth in sight of a daughter",
             Self::ChannelNotMapped => "channel not among map.channels",
+            Self::Beacon => "artificial signal on",
         }
     }
 
@@ -189,7 +192,7 @@ mod tests {
         assert_eq!(texts.len(), all.len());
         // Some of the places, so that none moves unseen.
         assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
-        assert_eq!((all.len(), all[23]), (29, VisibilityReason::NotReceived));
-        assert_eq!(all.last(), Some(&VisibilityReason::ChannelNotMapped));
+        assert_eq!((all.len(), all[23]), (30, VisibilityReason::NotReceived));
+        assert_eq!(all.last(), Some(&VisibilityReason::Beacon));
     }
 }

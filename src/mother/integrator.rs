@@ -10,7 +10,9 @@ use rayon::prelude::*;
 
 use super::powers::SkyPowers;
 use super::schedule::{Integration, Schedule};
+use super::troubles::PairTroubles;
 use crate::array::{Array, EarthShadow, segments_for};
+use crate::daughters::{InstrumentErrors, PassErrors};
 use crate::frames::{Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, VisibilityBlock};
 use crate::response::model::{ModelError, PairPosition, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
@@ -37,6 +39,7 @@ pub struct Integrator {
     options: MeasurementOptions,
     queued: Vec<QueuedWindow>,
     sampled: u64,
+    errors: Option<Arc<InstrumentErrors>>,
 }
 
 /// How a prediction becomes a measurement.
@@ -73,6 +76,8 @@ struct WindowChannel<'a> {
     powers: &'a SkyPowers,
     /// Present if the Earth in sight is flagged.
     shadow: Option<&'a EarthShadow>,
+    /// Present if the instrument has errors.
+    pass: Option<&'a PassErrors>,
 }
 
 impl WindowChannel<'_> {
@@ -124,7 +129,13 @@ impl Integrator {
         schedules: Vec<Schedule>,
         options: MeasurementOptions,
     ) -> Self {
-        Self { array, models, instrument, schedules, options, queued: Vec::new(), sampled: 0 }
+        Self { array, models, instrument, schedules, options, queued: Vec::new(), sampled: 0, errors: None }
+    }
+
+    /// Adds errors of the instrument.
+    #[must_use]
+    pub fn with_errors(self, errors: Option<Arc<InstrumentErrors>>) -> Self {
+        Self { errors, ..self }
     }
 
     /// The integrations of every channel and pair in a window.
@@ -158,12 +169,16 @@ impl Integrator {
         let queued = std::mem::take(&mut self.queued);
         let windows: Vec<ObservingWindow> = queued.iter().map(|queued| queued.window).collect();
         let shadows = self.shadows(&windows);
+        let passes: Vec<PassErrors> = match &self.errors {
+            Some(errors) => windows.par_iter().map(|window| errors.pass(*window)).collect(),
+            None => Vec::new(),
+        };
         // By channel, then by window.
         let mut blocks: Vec<std::vec::IntoIter<Vec<VisibilityBlock>>> = Vec::new();
         let mut powers: Vec<Vec<SkyPowers>> = Vec::new();
         for channel in 0..self.schedules.len() {
             let sky = SkyPowers::predict(self.models[channel].as_mut(), &self.array, &windows)?;
-            blocks.push(self.channel_blocks(&queued, channel, &sky, &shadows)?.into_iter());
+            blocks.push(self.channel_blocks(&queued, channel, &sky, (&shadows, &passes))?.into_iter());
             powers.push(sky);
             if out.is_closed() {
                 return Ok(());
@@ -171,13 +186,16 @@ impl Integrator {
         }
         for (k, window) in windows.into_iter().enumerate() {
             out.push(GroundFrame::Instrument(self.instrument.clone()));
-            for segment in segments_for(&self.array, window.start, window.end, EPHEMERIS_STEP_S) {
+            for mut segment in segments_for(&self.array, window.start, window.end, EPHEMERIS_STEP_S) {
+                if let Some(pass) = passes.get(k) {
+                    pass.mislead(&mut segment, &self.array);
+                }
                 out.push(GroundFrame::Ephemeris(segment));
             }
             let visibilities = blocks.iter_mut().flat_map(|windows| windows.next().unwrap_or_default());
             let autos = powers.iter().zip(0..).flat_map(|(powers, channel)| {
-                let (channel, shadow) = (ChannelId(channel), shadows.get(k));
-                self.autos(WindowChannel { window, channel, powers: &powers[k], shadow })
+                let (channel, shadow, pass) = (ChannelId(channel), shadows.get(k), passes.get(k));
+                self.autos(WindowChannel { window, channel, powers: &powers[k], shadow, pass })
             });
             let mut sampled = 0;
             for block in visibilities.chain(autos) {
@@ -208,15 +226,16 @@ impl Integrator {
         queued: &[QueuedWindow],
         channel: usize,
         powers: &[SkyPowers],
-        shadows: &[EarthShadow],
+        (shadows, passes): (&[EarthShadow], &[PassErrors]),
     ) -> Result<Vec<Vec<VisibilityBlock>>, ModelError> {
         let scheduled: Vec<(WindowChannel, &Scheduled)> = queued
             .iter()
             .zip(powers)
             .enumerate()
             .flat_map(|(k, (queued, powers))| {
-                let (window, shadow) = (queued.window, shadows.get(k));
-                let context = WindowChannel { window, channel: ChannelId(channel as u16), powers, shadow };
+                let (window, shadow, pass) = (queued.window, shadows.get(k), passes.get(k));
+                let channel_id = ChannelId(channel as u16);
+                let context = WindowChannel { window, channel: channel_id, powers, shadow, pass };
                 queued.channels[channel].iter().map(move |pair| (context, pair))
             })
             .collect();
@@ -270,26 +289,59 @@ impl Integrator {
         let (pair, noise_model) = (scheduled.pair, self.options.noise);
         let width_hz = self.instrument.channels[usize::from(channel.0)].width_hz;
         let mut noise = noise_model.stream(window, channel, pair);
+        let mut troubles = self.troubles(context, pair);
         let mut block = VisibilityBlock { channel, pair, start: window.start, ..VisibilityBlock::default() };
         for (integration, prediction) in scheduled.integrations.iter().zip(predictions) {
             let dt_s = f64::from(integration.duration_ticks) / TICKS_PER_SECOND as f64;
             let from = window.start.plus_ticks(i64::from(integration.offset_ticks));
             let middle_s = from.seconds() + 0.5 * dt_s;
-            let own = [pair.i, pair.j].map(|n| powers.at(&self.array, n.into(), middle_s));
-            let sigma = noise_model.sigma_k_sr(own, width_hz, dt_s);
+            let mut own = [pair.i, pair.j].map(|n| powers.at(&self.array, n.into(), middle_s));
             let mut value = *prediction;
+            let mut gain = Complex64::ONE;
+            if let Some(troubles) = &troubles {
+                let signals = troubles.signals(middle_s);
+                value += signals.visibility_k_sr;
+                own = own.map(|power| power + signals.power_k_sr);
+                gain = troubles.gain(middle_s);
+                // A dead receiver delivers noise of the same power.
+                value = if troubles.is_dead() { Complex64::ZERO } else { value * gain };
+            }
+            let sigma = noise_model.sigma_k_sr(own, width_hz, dt_s) * gain.norm();
             if let Some(stream) = &mut noise {
                 let draw: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(stream));
                 value.re += sigma * draw[0];
                 value.im += sigma * draw[1];
             }
+            let mut flags = context.flags(pair, from, integration.duration_ticks);
+            if let Some(troubles) = &mut troubles {
+                value += sigma * troubles.outlier();
+                if troubles.beacon_is_on(middle_s) {
+                    flags.0 |= Flags::BEACON.0;
+                }
+            }
             block.offset_ticks.push(integration.offset_ticks);
             block.duration_ticks.push(integration.duration_ticks);
             block.value_k_sr.push(Complex32::new(value.re as f32, value.im as f32));
             block.weight.push((sigma * sigma).recip() as f32);
-            block.flags.push(context.flags(pair, from, integration.duration_ticks));
+            block.flags.push(flags);
         }
         block
+    }
+
+    /// What is wrong with a pair, if anything is.
+    fn troubles<'a>(&'a self, context: WindowChannel<'a>, pair: Pair) -> Option<PairTroubles<'a>> {
+        let (errors, pass) = (self.errors.as_deref()?, context.pass?);
+        let channel = usize::from(context.channel.0);
+        Some(PairTroubles {
+            errors,
+            pass,
+            array: &self.array,
+            window: context.window,
+            pair,
+            channel,
+            frequency_hz: self.instrument.channels[channel].frequency_hz,
+            outliers: errors.outliers(context.window, channel, pair),
+        })
     }
 
     /// Auto-correlations over a window, if configured: contiguous integrations, the last one cut at the window's end.
@@ -305,6 +357,7 @@ impl Integrator {
         let block = |n: u8| {
             let pair = Pair { i: n, j: n };
             let mut noise = noise_model.stream(window, channel, pair);
+            let troubles = self.troubles(context, pair);
             let mut block =
                 VisibilityBlock { channel, pair, start: window.start, ..VisibilityBlock::default() };
             for offset in (0..length).step_by(step as usize) {
@@ -312,8 +365,16 @@ impl Integrator {
                 let dt_s = f64::from(duration) / TICKS_PER_SECOND as f64;
                 let from = window.start.plus_ticks(offset.into());
                 let middle_s = from.seconds() + 0.5 * dt_s;
-                let expected_k_sr =
+                let mut expected_k_sr =
                     noise_model.receiver_noise_k_sr + powers.at(&self.array, n.into(), middle_s);
+                let mut flags = context.flags(pair, from, duration);
+                if let Some(troubles) = &troubles {
+                    expected_k_sr += troubles.signals(middle_s).power_k_sr;
+                    expected_k_sr *= troubles.gain(middle_s).norm();
+                    if troubles.beacon_is_on(middle_s) {
+                        flags.0 |= Flags::BEACON.0;
+                    }
+                }
                 let samples = width_hz * dt_s;
                 // The last integration may be shorter than one sample, which has no power.
                 if samples < 1.0 {
@@ -326,7 +387,7 @@ impl Integrator {
                 block.duration_ticks.push(duration);
                 block.value_k_sr.push(Complex32::new(power as f32, 0.0));
                 block.weight.push((samples / (power * power)) as f32);
-                block.flags.push(context.flags(pair, from, duration));
+                block.flags.push(flags);
             }
             block
         };

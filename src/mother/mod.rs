@@ -17,6 +17,7 @@ mod observer;
 mod powers;
 mod schedule;
 mod store;
+mod troubles;
 
 pub use config::{
     Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, IntegrationTooShort, SpacecraftConfig, StoreDrop,

@@ -7,8 +7,9 @@ use serde::{Deserialize, Serialize};
 use super::problems::Problems;
 use crate::accumulation::{EngineKind, MapConfig};
 use crate::array::{Array, ArrayConfig};
+use crate::calibration::solver::SolverConfig;
 use crate::calibration::{CalibrationConfig, VanVleck};
-use crate::daughters::DaughtersConfig;
+use crate::daughters::{DaughtersConfig, InstrumentConfig};
 use crate::downlink::DownlinkConfig;
 use crate::mother::{Antenna, Fidelity, SpacecraftConfig};
 use crate::products::ProductsConfig;
@@ -19,7 +20,7 @@ use crate::units::{Checks, InvalidValue};
 
 /// A whole pipeline: the sky, the spacecraft and the ground.
 ///
-/// Sections are in the order of the data path. A ground segment reads only `calibration`, `map`, `products` and
+/// Sections are in the order of the data path. A ground segment reads only `calibration`, `calibrate`, `map`, `products` and
 /// `runtime`, and `downlink.listen` when it listens.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -34,12 +35,16 @@ pub struct Config {
     pub array: ArrayConfig,
     /// The daughters' samples.
     pub daughters: DaughtersConfig,
+    /// Errors of the instrument.
+    pub instrument: InstrumentConfig,
     /// The spacecraft.
     pub spacecraft: SpacecraftConfig,
     /// The downlink.
     pub downlink: DownlinkConfig,
     /// Calibration.
     pub calibration: CalibrationConfig,
+    /// The solver of calibrations.
+    pub calibrate: SolverConfig,
     /// Map making.
     pub map: MapConfig,
     /// Products.
@@ -84,6 +89,8 @@ impl Config {
         found.extend(array);
         let width_hz = self.spacecraft.channel_width_hz;
         found.extend(self.daughters.problems(self.array.satellites, width_hz));
+        let samples = self.spacecraft.fidelity == Fidelity::Samples;
+        found.extend(self.instrument.problems(self.array.satellites, channels, samples));
         found.extend(spacecraft);
         found.extend(self.downlink.problems());
         found.extend(self.map.misfits(channels));
@@ -154,6 +161,7 @@ impl Config {
         let mut found = Problems::default();
         found.extend(self.downlink.listen.problems());
         found.extend(self.calibration.problems());
+        found.extend(self.calibrate.problems());
         found.extend(self.map.problems());
         found.extend(self.products.problems());
         found.extend(self.runtime.problems());
@@ -165,11 +173,15 @@ impl Config {
     /// formats.
     #[must_use]
     pub fn space_hash(&self) -> u64 {
-        let Self { name, seed, sky, array, daughters, spacecraft, .. } = self;
+        let Self { name, seed, sky, array, daughters, instrument, spacecraft, .. } = self;
         let (mut sky, mut array) = (sky.clone(), array.clone());
         array.oem = array.oem.iter().map(|path| contents(path)).collect();
         sky.file = sky.file.map(|files| files.map(|path| contents(path)));
-        hash(&(name, seed, sky, &array, daughters, spacecraft))
+        // Data of an ideal instrument are those of before there were errors, byte for byte.
+        match instrument.is_on() {
+            true => hash(&(name, seed, sky, &array, daughters, spacecraft, instrument)),
+            false => hash(&(name, seed, sky, &array, daughters, spacecraft)),
+        }
     }
 
     /// A hash of the sections that shape maps from a downlink, and of the contents of the files that they name, for

@@ -2,6 +2,8 @@
 //!
 //! The only place where space and ground meet, and where concrete stages are connected. Uses every folder before it.
 
+mod calibrate;
+mod calibrate_products;
 mod channel_lists;
 pub(crate) mod config;
 mod config_reader;
@@ -26,6 +28,7 @@ mod state;
 mod study;
 mod summary;
 
+pub use calibrate::{CalibrateJob, CalibrateRound, CalibrateSummary, calibrate};
 pub use config::Config;
 pub use config_reader::ReadProblem;
 pub use config_source::{ConfigError, ConfigSource, QUICKLOOK};

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::config::Config;
 use super::error::PipelineError;
 use crate::array::Array;
-use crate::daughters::DaughtersConfig;
+use crate::daughters::{DaughtersConfig, InstrumentErrors, truth_csv};
 use crate::frames::{Instrument, ObservingWindow};
 use crate::mother::{Fidelity, Observer, Schedule, SpacecraftConfig};
 use crate::units::{ChannelId, MissionTime, all_pairs};
@@ -80,6 +80,19 @@ impl Plan {
         let needed = self.samples_bits_per_s()? / self.array.satellites() as f64;
         let limit = self.config.daughters.link_bits_per_s_max;
         (limit > 0.0).then_some([needed, limit])
+    }
+
+    /// Errors of the instrument; `None` if it is ideal.
+    #[must_use]
+    pub fn instrument_errors(&self) -> Option<Arc<InstrumentErrors>> {
+        let Config { instrument, seed, spacecraft, .. } = &self.config;
+        InstrumentErrors::new(instrument, *seed, &self.array, &spacecraft.channels()).map(Arc::new)
+    }
+
+    /// The true errors of the instrument in every pass as a table (CSV); `None` if it is ideal.
+    #[must_use]
+    pub fn instrument_truth(&self) -> Option<String> {
+        self.instrument_errors().map(|errors| truth_csv(&errors, &self.windows))
     }
 
     /// Keys for samples that differ from their defaults while the fidelity has no samples.

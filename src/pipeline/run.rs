@@ -108,6 +108,7 @@ pub fn run(
     let _lock = lock_folder(out)?;
     write_settings(&plan.config, out)?;
     let file = out.join(downlink_file(plan.config.downlink.format));
+    write_instrument_truth(plan, &file)?;
     let recorder = Recorder::create(&file)?;
     let skies = space_segment::skies(plan)?;
     let mut graph = Graph::new();
@@ -145,6 +146,9 @@ pub fn simulate(
     let to = to.into();
     if plan.config.downlink.link.is_on() && to.file.is_none() {
         return Err(DownlinkError::from(SocketError::TruthNowhere).into());
+    }
+    if let Some(file) = &to.file {
+        write_instrument_truth(plan, file)?;
     }
     let recorder = to.file.as_deref().map(Recorder::create).transpose()?;
     let skies = space_segment::skies(plan)?;
@@ -268,6 +272,15 @@ fn add_link(
         Some(link) => graph.stage("link", config.runtime.queue_capacity, bytes, link),
         None => bytes,
     })
+}
+
+/// Leaves the true errors of the instrument beside a downlink file, if it has any.
+fn write_instrument_truth(plan: &Plan, file: &Path) -> Result<(), PipelineError> {
+    let Some(text) = plan.instrument_truth() else { return Ok(()) };
+    let mut name = file.as_os_str().to_owned();
+    name.push(".instrument.csv");
+    let path = PathBuf::from(name);
+    Ok(write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?)
 }
 
 /// Leaves all settings of a run beside its products, as a pipeline file that repeats it.

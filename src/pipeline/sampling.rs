@@ -27,7 +27,9 @@ pub fn sample_stages(
         seed: config.seed,
     };
     let daughters = &config.daughters;
-    let sampler = Sampler::new(scene, daughters.clone(), windows.clone(), Arc::clone(&counts.sampler));
+    let errors = plan.instrument_errors();
+    let sampler = Sampler::new(scene, daughters.clone(), windows.clone(), Arc::clone(&counts.sampler))
+        .with_errors(errors.clone());
     let link = SampleLink::new(daughters, array, Arc::clone(&counts.link));
     let division = config.spacecraft.division();
     // On the downlink each sub-band is a channel of its own.
@@ -47,7 +49,8 @@ pub fn sample_stages(
         block_samples: daughters.block_samples,
         wait_blocks: config.spacecraft.wait_blocks,
     };
-    (sampler, link, Correlator::new(setup, Arc::clone(&counts.correlator)))
+    let correlator = Correlator::new(setup, Arc::clone(&counts.correlator)).with_errors(errors);
+    (sampler, link, correlator)
 }
 
 /// Adds the stages of sample fidelity to `graph`.

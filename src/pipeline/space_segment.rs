@@ -86,7 +86,8 @@ pub fn add(
         flag_earth: config.spacecraft.flag_earth,
     };
     let integrator =
-        Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options);
+        Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options)
+            .with_errors(plan.instrument_errors());
     // A window itself is small; its visibilities are not.
     let windows = graph.source("observe", 1, Observer::new(windows.clone()));
     let frames = graph.stage(INTEGRATE, capacity, windows, integrator);

@@ -8,11 +8,13 @@
 //! | [`pixel`] | rows of B over HEALPix pixels, and direct sums over a sky |
 //! | [`harmonic`] | rows of B over spherical harmonics, for satellites on one circle |
 //! | [`general`] | the same for satellites at any positions |
+//! | [`beacon`] | an artificial signal |
 //! | [`model`] | visibilities of a given sky, by either of the two |
 //!
 //! Uses [`crate::units`], [`crate::frames`], [`crate::sky`] and [`mod@crate::array`]. Simulation and mapping share it,
 //! so a bug here would cancel out unseen: tests compare it with reference values made by other code.
 
+pub mod beacon;
 pub mod general;
 pub mod harmonic;
 pub mod model;

@@ -23,6 +23,8 @@ pub enum StreamKind {
     Interference = 7,
     /// Noise of the ninth daughter's spectra.
     Spectrometer = 8,
+    /// Errors of the instrument.
+    Instrument = 9,
     /// Faults of a simulated link.
     Link = 20,
 }

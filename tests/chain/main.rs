@@ -5,12 +5,14 @@
 mod common;
 
 mod bench;
+mod calibrate;
 mod coded;
 mod command_line;
 mod ending;
 mod figures;
 mod groups;
 mod harmonic;
+mod instrument;
 mod orbits;
 mod outputs;
 mod paper;

@@ -80,6 +80,7 @@ fn gains_and_phases_scale_visibilities_and_calibration_corrects_them() {
         interpolation: Interpolation::LogLinear,
         frequency_tolerance_hz: 1.0,
         channels: vec![ChannelGains { frequency_hz: 1e6, solutions }],
+        positions: Vec::new(),
     })
     .unwrap();
     let (mut squares, mut count) = (0.0, 0.0);

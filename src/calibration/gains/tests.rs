@@ -18,6 +18,7 @@ fn file(interpolation: Interpolation, solutions: Vec<(f64, Vec<Complex64>)>) -> 
         interpolation,
         frequency_tolerance_hz: 4e3,
         channels: vec![ChannelGains { frequency_hz: FREQUENCY_HZ, solutions }],
+        positions: Vec::new(),
     }
 }
 

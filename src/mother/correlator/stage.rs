@@ -11,6 +11,7 @@ use super::integrate::{COMPLETE_MIN, DumpRule, GroupIntegrator, Presence, WINDOW
 use super::kernel::{LANES, Packed, SLICE, correlate, no_sums};
 use super::spectra::{Divider, Division, Spectra};
 use crate::array::{Array, EarthShadow, segments_for};
+use crate::daughters::InstrumentErrors;
 use crate::frames::{
     GroundFrame, Housekeeping, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame, VisibilityBlock,
 };
@@ -81,6 +82,8 @@ pub struct Correlator {
     counts: Arc<Mutex<CorrelatorCounts>>,
     sampled: u64,
     samples: u64,
+    /// Errors of the positions in packets.
+    errors: Option<Arc<InstrumentErrors>>,
 }
 
 /// The window being correlated.
@@ -116,7 +119,23 @@ impl Correlator {
         let rule = DumpRule { dump_samples: dump / bands, width_hz, complete_min: COMPLETE_MIN };
         let divider = (setup.division != Division::NONE).then(|| Divider::new(setup.division));
         lock(&counts).autos = vec![vec![(0.0, 0); setup.array.satellites()]; setup.schedules.len()];
-        Self { setup, rule, divider, arch: Arch::new(), running: None, counts, sampled: 0, samples: 0 }
+        Self {
+            setup,
+            rule,
+            divider,
+            arch: Arch::new(),
+            running: None,
+            counts,
+            sampled: 0,
+            samples: 0,
+            errors: None,
+        }
+    }
+
+    /// Adds errors of the positions in packets.
+    #[must_use]
+    pub fn with_errors(self, errors: Option<Arc<InstrumentErrors>>) -> Self {
+        Self { errors, ..self }
     }
 
     /// Rate of the daughters' samples, Hz.
@@ -126,12 +145,16 @@ impl Correlator {
 
     fn begin(&mut self, mut window: ObservingWindow, out: &mut Outlet<GroundFrame>) {
         let rate_hz = self.rate_hz();
-        let Self { setup, rule, .. } = self;
+        let Self { setup, rule, errors, .. } = self;
+        let pass = errors.as_ref().map(|errors| errors.pass(window));
         // A window is a third of an orbit; longer ones are cut to the range of time tags.
         let end = MissionTime::from_seconds(window.start.seconds() + WINDOW_S_MAX);
         window.end = window.end.min(end);
         out.push(GroundFrame::Instrument(setup.instrument.clone()));
-        for segment in segments_for(&setup.array, window.start, window.end, EPHEMERIS_STEP_S) {
+        for mut segment in segments_for(&setup.array, window.start, window.end, EPHEMERIS_STEP_S) {
+            if let Some(pass) = &pass {
+                pass.mislead(&mut segment, &setup.array);
+            }
             out.push(GroundFrame::Ephemeris(segment));
         }
         let streams = StreamShape {

@@ -1,0 +1,196 @@
+//! Configuration of the solver.
+
+use serde::{Deserialize, Serialize};
+
+use crate::response::beacon::Beacon;
+use crate::units::{Checks, InvalidValue};
+
+/// The signal whose visibilities are known.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CalibrationMode {
+    /// The sky, from a map.
+    #[default]
+    Sky,
+    /// An artificial signal, in the integrations flagged for it; the sky under it counts as an error.
+    Beacon,
+    /// Both: the sky everywhere, and the artificial signal where it is on.
+    Joint,
+}
+
+/// What fixes the common amplitude of all daughters.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum AmplitudeScale {
+    /// The model: its strength is true.
+    #[default]
+    Model,
+    /// A geometric mean of one over the daughters: the sky keeps its scale.
+    UnitMean,
+}
+
+/// The `[calibrate]` section, for `lunarray calibrate`. Standard deviations are those of what is expected before the
+/// data are seen; a parameter with 0 is not solved for.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SolverConfig {
+    /// The signal whose visibilities are known.
+    pub mode: CalibrationMode,
+    /// What fixes the common amplitude.
+    pub amplitude_scale: AmplitudeScale,
+    /// Daughter whose phase, clock and position are the reference, from 1.
+    pub reference_daughter: u32,
+    /// Of the natural logarithm of a gain's amplitude.
+    pub amplitude_sigma: f64,
+    /// Of a gain's phase, deg.
+    pub phase_sigma_deg: f64,
+    /// Of a clock's offset, ns.
+    pub clock_sigma_ns: f64,
+    /// Of a position along each axis, m.
+    pub position_sigma_m: f64,
+    /// Solutions of equal length in a pass.
+    pub solutions_per_pass: u32,
+    /// Time without data after which a new pass begins, s.
+    pub pass_gap_s: f64,
+    /// Residual beyond which a visibility is left out of a solution, in units of its spread.
+    pub outlier_sigma: f64,
+    /// Most rounds of leaving out outliers.
+    pub outlier_rounds: u32,
+    /// Most Gauss-Newton iterations of a round.
+    pub iterations_max: u32,
+    /// Most predictions of the model at positions found before.
+    pub position_rounds: u32,
+    /// Standard deviation of a phase, deg, beyond which a daughter's data are left out of maps.
+    pub phase_sigma_deg_max: f64,
+    /// Gain amplitude below which a receiver is taken to be dead.
+    pub dead_amplitude: f64,
+    /// nside to which the model map's pixels are split; 0 for its own.
+    pub model_nside: usize,
+    /// Power of the artificial signal at a daughter, K sr.
+    pub beacon_k_sr: f64,
+    /// Ecliptic longitude and latitude that it comes from, deg.
+    pub beacon_direction_deg: [f64; 2],
+    /// Most times that the map is made and calibrated with; 0 for the given model alone.
+    pub map_rounds: u32,
+    /// Root mean square change of the gains, relative to one, at which map and solutions are taken as settled.
+    pub settled: f64,
+    /// Every n-th pass is left out of the maps that calibrate, and tests them; 0 for none.
+    pub hold_out_every: u32,
+}
+
+impl Default for SolverConfig {
+    fn default() -> Self {
+        Self {
+            mode: CalibrationMode::default(),
+            amplitude_scale: AmplitudeScale::default(),
+            reference_daughter: 1,
+            amplitude_sigma: 0.3,
+            phase_sigma_deg: 120.0,
+            clock_sigma_ns: 0.0,
+            position_sigma_m: 0.0,
+            solutions_per_pass: 1,
+            pass_gap_s: 900.0,
+            outlier_sigma: 6.0,
+            outlier_rounds: 3,
+            iterations_max: 50,
+            position_rounds: 3,
+            phase_sigma_deg_max: 30.0,
+            dead_amplitude: 0.05,
+            model_nside: 0,
+            beacon_k_sr: 0.0,
+            beacon_direction_deg: [0.0, 0.0],
+            map_rounds: 0,
+            settled: 1e-3,
+            hold_out_every: 0,
+        }
+    }
+}
+
+impl SolverConfig {
+    /// The artificial signal.
+    #[must_use]
+    pub fn beacon(&self) -> Beacon {
+        Beacon { k_sr: self.beacon_k_sr, direction_deg: self.beacon_direction_deg }
+    }
+
+    /// What the data do not determine, and what decides it instead.
+    #[must_use]
+    pub fn conventions(&self) -> Vec<String> {
+        let mut told = vec![format!(
+            "phases, clocks and positions are relative to daughter {}: a phase that all have leaves no trace, and a shift of all \
+             positions only a rotation of the sky",
+            self.reference_daughter
+        )];
+        told.push(match self.amplitude_scale {
+            AmplitudeScale::Model => {
+                "the common amplitude is that of the model: a sky of other strength gives other gains"
+                    .to_owned()
+            }
+            AmplitudeScale::UnitMean => {
+                "the geometric mean of the amplitudes is one: what all gains share goes into the map"
+                    .to_owned()
+            }
+        });
+        if self.clock_sigma_ns > 0.0 && self.phase_sigma_deg > 0.0 {
+            told.push(
+                "a clock and the phases of its channels differ by their priors alone; their sum is what is measured".to_owned(),
+            );
+        }
+        told
+    }
+
+    /// Everything that is wrong with the section; empty if it is good.
+    #[must_use]
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("calibrate");
+        for (key, value, most) in [
+            ("amplitude_sigma", self.amplitude_sigma, 10.0),
+            ("phase_sigma_deg", self.phase_sigma_deg, 1e4),
+            ("clock_sigma_ns", self.clock_sigma_ns, 1e9),
+            ("position_sigma_m", self.position_sigma_m, 1e6),
+        ] {
+            let expected = format!("0 (not solved for) to {most:e}");
+            checks.number(key, value, (0.0..=most).contains(&value), expected);
+        }
+        for (key, value, least, most) in [
+            ("reference_daughter", self.reference_daughter, 1, 64),
+            ("solutions_per_pass", self.solutions_per_pass, 1, 1000),
+            ("outlier_rounds", self.outlier_rounds, 0, 100),
+            ("iterations_max", self.iterations_max, 1, 1000),
+            ("position_rounds", self.position_rounds, 1, 20),
+            ("map_rounds", self.map_rounds, 0, 100),
+            ("hold_out_every", self.hold_out_every, 0, 1_000_000),
+        ] {
+            checks.require(key, value, (least..=most).contains(&value), format!("{least} to {most}"));
+        }
+        let one = self.hold_out_every;
+        checks.require("hold_out_every", one, one != 1, "0 or at least 2: some passes have to make the map");
+        let gap_s = self.pass_gap_s;
+        checks.number("pass_gap_s", gap_s, (1.0..=1e6).contains(&gap_s), "1 s to 1e6 s");
+        let cut = self.outlier_sigma;
+        checks.number("outlier_sigma", cut, (3.0..=1e6).contains(&cut), "3 to 1e6");
+        let most = self.phase_sigma_deg_max;
+        checks.number("phase_sigma_deg_max", most, most > 0.0, "degrees, above 0");
+        let dead = self.dead_amplitude;
+        checks.number("dead_amplitude", dead, (0.0..1.0).contains(&dead), "0 to below 1");
+        let solves = [self.amplitude_sigma, self.phase_sigma_deg, self.clock_sigma_ns, self.position_sigma_m];
+        let expected = "something to solve for: a positive sigma of amplitude, phase, clock or position";
+        checks.require(
+            "phase_sigma_deg",
+            "0, as the others",
+            solves.iter().any(|sigma| *sigma > 0.0),
+            expected,
+        );
+        let single = self.position_sigma_m == 0.0 || self.solutions_per_pass == 1;
+        checks.require("solutions_per_pass", self.solutions_per_pass, single, "1 with position_sigma_m");
+        checks.number("settled", self.settled, self.settled > 0.0, "above 0");
+        let nside = self.model_nside;
+        let good = nside == 0 || (nside.is_power_of_two() && nside <= 1024);
+        checks.require("model_nside", nside, good, "0, or a power of two up to 1024");
+        self.beacon().check("beacon", &mut checks);
+        let lit = self.mode == CalibrationMode::Sky || self.beacon_k_sr > 0.0;
+        let expected = "the power of the artificial signal, K sr, for mode = \"beacon\" and \"joint\"";
+        checks.number("beacon_k_sr", self.beacon_k_sr, lit, expected);
+        checks.finish()
+    }
+}

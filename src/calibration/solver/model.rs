@@ -1,0 +1,143 @@
+//! Visibilities of a known signal: the sky of a map, an artificial signal, or both.
+
+use std::f64::consts::TAU;
+
+use num_complex::Complex64;
+
+use super::config::{CalibrationMode, SolverConfig};
+use super::sums::{MODEL_TERMS, ModelTerms};
+use crate::array::{track_axes, track_offset_m};
+use crate::frames::{Channel, Instrument, PlacedVisibilities};
+use crate::response::beacon::Beacon;
+use crate::response::model::{DirectSum, ModelError, PairPosition, VisibilityModel};
+use crate::sky::{MapError, SkyMap};
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+use crate::units::vector::{Vec3, sub};
+
+/// Sums over a map and, where positions are solved for, over the map times each component of the direction, which
+/// give the derivatives by the baseline.
+struct ChannelSky {
+    value: DirectSum,
+    gradient: Option<[DirectSum; 3]>,
+}
+
+/// The known signal in every channel.
+pub struct KnownSignal {
+    sky: Vec<ChannelSky>,
+    beacon: Beacon,
+    frequencies_hz: Vec<f64>,
+    moves: bool,
+}
+
+/// Position errors of all daughters about which the model is linear, and the normals of their orbits.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Offsets {
+    /// Along the track, across it, away from the Moon, by daughter, m.
+    pub offset_m: Vec<[f64; 3]>,
+    /// Normal of each daughter's orbit.
+    pub normal_hat: Vec<Vec3>,
+}
+
+impl KnownSignal {
+    /// The signal for an instrument: a map (K) for each channel, or none with mode `beacon`.
+    ///
+    /// # Errors
+    /// A map with pixels that have no value.
+    pub fn new(config: &SolverConfig, instrument: &Instrument, maps: &[SkyMap]) -> Result<Self, MapError> {
+        let moves = config.position_sigma_m > 0.0;
+        let uses_sky = config.mode != CalibrationMode::Beacon;
+        let sky = |(map, channel): (&SkyMap, &Channel)| {
+            map.check_whole()?;
+            let map = match config.model_nside {
+                nside if nside > map.nside() => map.upgrade(nside)?,
+                _ => map.clone(),
+            };
+            let sum = |map: &SkyMap| {
+                DirectSum::new(map, channel.frequency_hz, instrument.moon_radius_m, instrument.response)
+            };
+            let directions = map.directions_ecliptic();
+            let times = |axis: usize| {
+                let mut times = map.clone();
+                let values = times.values_mut().iter_mut().zip(&directions);
+                values.for_each(|(value, n_hat)| *value *= n_hat[axis]);
+                sum(&times)
+            };
+            let gradient = moves.then(|| [times(0), times(1), times(2)]);
+            Ok(ChannelSky { value: sum(&map), gradient })
+        };
+        let skies = maps.iter().zip(&instrument.channels).filter(|_| uses_sky).map(sky);
+        Ok(Self {
+            sky: skies.collect::<Result<_, MapError>>()?,
+            beacon: config.beacon(),
+            frequencies_hz: instrument.channels.iter().map(|channel| channel.frequency_hz).collect(),
+            moves,
+        })
+    }
+
+    /// The model of placed visibilities of a channel, about offsets of the positions; `with_beacon` says whether the
+    /// artificial signal is on in them.
+    ///
+    /// # Errors
+    /// Positions that the model does not cover.
+    pub fn model(
+        &mut self,
+        placed: &PlacedVisibilities,
+        offsets: &Offsets,
+        with_beacon: bool,
+    ) -> Result<Vec<ModelTerms>, ModelError> {
+        let channel = usize::from(placed.channel.0);
+        let [i, j] = [placed.pair.i, placed.pair.j].map(usize::from);
+        let flown =
+            |r_m: Vec3, n: usize| sub(r_m, track_offset_m(r_m, offsets.normal_hat[n], offsets.offset_m[n]));
+        let positions: Vec<PairPosition> = placed
+            .r_i_m
+            .iter()
+            .zip(&placed.r_j_m)
+            .map(|(&r_i_m, &r_j_m)| match self.moves {
+                true => PairPosition { r_i_m: flown(r_i_m, i), r_j_m: flown(r_j_m, j), span_rad: 0.0 },
+                false => PairPosition { r_i_m, r_j_m, span_rad: 0.0 },
+            })
+            .collect();
+        let frequency_hz = self.frequencies_hz[channel];
+        let mut values = vec![Complex64::ZERO; positions.len()];
+        let mut gradients = vec![[Complex64::ZERO; 3]; if self.moves { positions.len() } else { 0 }];
+        let per_m = Complex64::new(0.0, -TAU * frequency_hz / SPEED_OF_LIGHT_M_S);
+        if let Some(sky) = self.sky.get_mut(channel) {
+            sky.value.predict(&positions, &mut values)?;
+            for (axis, sum) in sky.gradient.iter_mut().flatten().enumerate() {
+                let mut part = vec![Complex64::ZERO; positions.len()];
+                sum.predict(&positions, &mut part)?;
+                for (gradient, part) in gradients.iter_mut().zip(part) {
+                    gradient[axis] = per_m * part;
+                }
+            }
+        }
+        if with_beacon {
+            let from_hat = self.beacon.from_hat();
+            for (k, position) in positions.iter().enumerate() {
+                let wave = self.beacon.visibility_k_sr(position.r_i_m, position.r_j_m, frequency_hz);
+                values[k] += wave;
+                if let Some(gradient) = gradients.get_mut(k) {
+                    (0..3).for_each(|axis| gradient[axis] += per_m * from_hat[axis] * wave);
+                }
+            }
+        }
+        let terms = |(k, &value): (usize, &Complex64)| {
+            let mut terms = [Complex64::ZERO; MODEL_TERMS];
+            terms[0] = value;
+            let Some(gradient) = gradients.get(k) else { return terms };
+            let along = |axis: Vec3| -> Complex64 { (0..3).map(|a| gradient[a] * axis[a]).sum() };
+            // Packets say more than was flown by the offset: it is subtracted from r_i, and so from the baseline.
+            for (first, sign, r_m, n) in [(1, -1.0, placed.r_i_m[k], i), (4, 1.0, placed.r_j_m[k], j)] {
+                let axes = track_axes(r_m, offsets.normal_hat[n]);
+                for (axis, axis_hat) in axes.into_iter().enumerate() {
+                    let term = sign * along(axis_hat);
+                    terms[first + axis] = term;
+                    terms[0] -= offsets.offset_m[n][axis] * term;
+                }
+            }
+            terms
+        };
+        Ok(values.iter().enumerate().map(terms).collect())
+    }
+}

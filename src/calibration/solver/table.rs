@@ -1,0 +1,111 @@
+//! Solutions as a table, and as a file of gains that a replay applies.
+
+use std::fmt::Write;
+
+use super::solution::{GainState, PassSolution};
+use crate::calibration::{ChannelGains, GainSolution, GainsFile, Interpolation, PositionSolution};
+use crate::frames::Channel;
+
+/// Comma-separated values, one line a solution, daughter and channel.
+#[must_use]
+pub fn solutions_csv(solutions: &[PassSolution]) -> String {
+    let mut text = String::from(
+        "pass,from_s,until_s,daughter,frequency_hz,amplitude,ln_amplitude_sigma,phase_deg,phase_sigma_deg,clock_ns,\
+         clock_sigma_ns,along_m,along_sigma_m,across_m,across_sigma_m,radial_m,radial_sigma_m,visibilities,outliers,\
+         chi_square,converged,held_out,state\n",
+    );
+    for solution in solutions {
+        for daughter in &solution.daughters {
+            for gain in &daughter.gains {
+                let state = match gain.state {
+                    GainState::Good => "good",
+                    GainState::NoData => "no-data",
+                    GainState::Dead => "dead",
+                    GainState::Uncertain => "uncertain",
+                    GainState::NotConverged => "not-converged",
+                };
+                let ([x, y, z], [sx, sy, sz]) = (daughter.position_m, daughter.position_sigma_m);
+                // Writing to a String cannot fail.
+                let _ = writeln!(
+                    text,
+                    "{},{:.6},{:.6},{},{},{:.7},{:.3e},{:.6},{:.3e},{:.6},{:.3e},{x:.5},{sx:.3e},{y:.5},{sy:.3e},{z:.5},\
+                     {sz:.3e},{},{},{:.5},{},{},{state}",
+                    solution.pass,
+                    solution.from_s,
+                    solution.until_s,
+                    daughter.daughter,
+                    gain.frequency_hz,
+                    gain.amplitude,
+                    gain.amplitude_sigma,
+                    gain.phase_deg,
+                    gain.phase_sigma_deg,
+                    daughter.clock_ns,
+                    daughter.clock_sigma_ns,
+                    gain.visibilities,
+                    gain.outliers,
+                    solution.chi_square,
+                    u8::from(solution.converged),
+                    u8::from(solution.is_held_out),
+                );
+            }
+        }
+    }
+    text
+}
+
+/// The gains as a file for `antenna-gains`: nothing is left of a gain that is not known, which removes its visibilities.
+/// With `without_held_out`, passes that test have no gains either.
+///
+/// Gains hold over the whole of a pass with one solution; those of several are joined by their middles.
+#[must_use]
+pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held_out: bool) -> GainsFile {
+    let gains = |c: usize, solution: &PassSolution| -> Vec<[f64; 2]> {
+        let of = |daughter: &super::DaughterEstimate| {
+            let gain = &daughter.gains[c];
+            if gain.state != GainState::Good || (without_held_out && solution.is_held_out) {
+                return [0.0, 0.0];
+            }
+            let (sin, cos) = gain.phase_deg.to_radians().sin_cos();
+            [gain.amplitude * cos, gain.amplitude * sin]
+        };
+        solution.daughters.iter().map(of).collect()
+    };
+    let channel = |(c, channel): (usize, &Channel)| {
+        let mut found: Vec<GainSolution> = Vec::new();
+        let mut push = |time_s: f64, solution: &PassSolution| {
+            // Times increase; of two that are equal the first holds.
+            if found.last().is_none_or(|last| last.time_s < time_s) {
+                found.push(GainSolution { time_s, gains: gains(c, solution) });
+            }
+        };
+        for (k, solution) in solutions.iter().enumerate() {
+            let is_first = k == 0 || solutions[k - 1].pass != solution.pass;
+            let is_last = solutions.get(k + 1).is_none_or(|next| next.pass != solution.pass);
+            if is_first {
+                push(solution.from_s, solution);
+            }
+            if !(is_first && is_last) {
+                push(0.5 * (solution.from_s + solution.until_s), solution);
+            }
+            if is_last {
+                push(solution.until_s, solution);
+            }
+        }
+        ChannelGains { frequency_hz: channel.frequency_hz, solutions: found }
+    };
+    let moved =
+        |solution: &&PassSolution| solution.daughters.iter().any(|daughter| daughter.position_m != [0.0; 3]);
+    let position = |solution: &PassSolution| PositionSolution {
+        from_s: solution.from_s,
+        until_s: solution.until_s,
+        normals_hat: solution.normal_hat.clone(),
+        offsets_m: solution.daughters.iter().map(|daughter| daughter.position_m).collect(),
+    };
+    let half_hz = |channel: &Channel| 0.5 * channel.width_hz;
+    GainsFile {
+        interpolation: Interpolation::LogLinear,
+        frequency_tolerance_hz: channels.iter().map(half_hz).fold(f64::INFINITY, f64::min),
+        channels: channels.iter().enumerate().map(channel).collect(),
+        positions: solutions.iter().filter(moved).map(position).collect(),
+    }
+}

@@ -1,0 +1,105 @@
+//! `lunarray calibrate`: find gains, clocks and positions from the data.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::interrupt::Interrupt;
+use super::output::{CommandResult, print_json_line, print_notes, print_text};
+use crate::pipeline::{CalibrateJob, CalibrateSummary, ConfigSource, calibrate, use_threads};
+use crate::sky::Frame;
+use crate::sky::fits::{ReadOptions, read_whole_map};
+
+/// Find the gains of every daughter, pass by pass, from the visibilities of a known signal.
+///
+/// The signal is the sky of a map, the mother's artificial signal, or both (calibrate.mode). Solves for amplitudes and
+/// phases, and if asked for clocks and positions, with priors (section [calibrate]). With calibrate.map_rounds, map and
+/// solutions are made in turn until they settle. Writes gains.json, which `lunarray replay --calibration` applies, tables
+/// (solutions.csv, solutions.json) and a picture. Everything is written at the end: an interrupted command leaves no
+/// gains, and its repetition the same bytes.
+///
+/// Example: lunarray calibrate sky.ccsds --model model.fits --map map.toml --out calibration/
+#[derive(Debug, Args)]
+pub(super) struct CalibrateArgs {
+    /// Downlink files in the order of time.
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// HEALPix map of the sky in K; one a channel of the downlink, in their order.
+    #[arg(long, value_name = "MAP.fits", num_args = 1..)]
+    model: Vec<PathBuf>,
+    /// Map file (TOML): settings of the ground segment; the defaults of pipelines/reference.toml if not given.
+    #[arg(long, value_name = "MAP.toml")]
+    map: Option<PathBuf>,
+    /// Output folder.
+    #[arg(short, long, value_name = "DIR")]
+    out: PathBuf,
+    /// Replace one setting, for example --set calibrate.clock_sigma_ns=50; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+    /// Print the summary as one JSON object instead of text.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
+    let source = ConfigSource { file: args.map.clone(), overrides: args.overrides.clone(), seed: None };
+    let config = source.load_ground()?;
+    use_threads(&config.runtime)?;
+    let options = ReadOptions { frame_if_missing: Some(Frame::Ecliptic), ..ReadOptions::default() };
+    let models = args.model.iter().map(|path| read_whole_map(path, &options)).collect::<Result<_, _>>()?;
+    let interrupt = Interrupt::default();
+    interrupt.arm_or_note();
+    let job = CalibrateJob { config: &config, files: &args.files, models, out: &args.out };
+    let summary = calibrate(job, interrupt.cancel())?;
+    print_notes(&summary.conventions);
+    interrupt.completion(summary.cancelled).after(if args.json {
+        print_json_line(&summary)
+    } else {
+        print_text(&told(&summary, args))
+    })
+}
+
+fn told(summary: &CalibrateSummary, args: &CalibrateArgs) -> String {
+    let [bad, all] = summary.gains_not_good;
+    let mut lines = vec![format!(
+        "{} passes: {} solutions, {} of them converged; {} visibilities, {} outliers, {} unused, {} late; {bad} of {all} gains \
+         are not good",
+        summary.passes,
+        summary.solutions,
+        summary.converged,
+        summary.visibilities,
+        summary.outliers,
+        summary.unused,
+        summary.late,
+    )];
+    for round in &summary.rounds {
+        let number = |value: Option<f64>| value.map_or_else(|| "-".to_owned(), |value| format!("{value:.4}"));
+        lines.push(format!(
+            "round {}: chi-square {:.4}, held out {}, change of gains {}",
+            round.round,
+            round.chi_square,
+            number(round.chi_square_held_out),
+            number(round.change_rms)
+        ));
+    }
+    for (channel, sigmas) in summary.phase_sigma_deg.iter().enumerate() {
+        let sigmas: Vec<String> = sigmas.iter().map(|sigma| format!("{sigma:.2}")).collect();
+        lines.push(format!(
+            "channel {}: phases known to {} deg (median, by daughter)",
+            channel + 1,
+            sigmas.join(", ")
+        ));
+    }
+    const SHOWN: usize = 20;
+    for event in summary.events.iter().take(SHOWN) {
+        lines.push(format!("event: {event:?}"));
+    }
+    if summary.events.len() > SHOWN {
+        lines.push(format!("and {} more events, in solutions.json", summary.events.len() - SHOWN));
+    }
+    match summary.cancelled {
+        true => lines.push("Ended early: nothing is written".to_owned()),
+        false => lines.push(format!("Solutions are in {}", args.out.display())),
+    }
+    lines.join("\n")
+}

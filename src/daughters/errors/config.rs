@@ -1,0 +1,275 @@
+//! Configuration of the instrument's errors.
+
+use serde::{Deserialize, Serialize};
+
+use crate::response::beacon::Beacon;
+use crate::units::{Checks, InvalidValue};
+
+/// Shortest correlation time of a drift, s: some thousand nodes in a pass.
+const DRIFT_TIME_S_MIN: f64 = 60.0;
+
+/// The `[instrument]` section: what is wrong with the daughters, in either fidelity. Without any of it, data are as
+/// they are without the section.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct InstrumentConfig {
+    /// Number of the realisation: other random errors with the same sky and noise.
+    pub realisation: u32,
+    /// Natural logarithm of the amplitude of the voltage gain, by daughter and channel.
+    pub amplitude: ErrorTerms,
+    /// Phase of the voltage gain, deg, by daughter and channel.
+    pub phase_deg: ErrorTerms,
+    /// Offset of the clock, ns; positive if samples are late. By daughter, for all channels.
+    pub clock_ns: ErrorTerms,
+    /// Error of the position in the packets along the track, m: what they say less what was flown.
+    pub along_m: ErrorTerms,
+    /// The same across the track, along the orbit's normal, m.
+    pub across_m: ErrorTerms,
+    /// The same away from the Moon, m.
+    pub radial_m: ErrorTerms,
+    /// Daughters that deliver noise and no signal, from 1.
+    pub dead_daughters: Vec<u32>,
+    /// Daughter and channel, from 1, of receivers that deliver noise and no signal.
+    pub dead_channels: Vec<[u32; 2]>,
+    /// Probability that a visibility is an outlier.
+    pub outlier_probability: f64,
+    /// Standard deviation of either part of what is added to an outlier, in units of the thermal noise.
+    pub outlier_sigma: f64,
+    /// Mean time between bursts of interference from the Earth, s; 0 for none.
+    pub burst_every_s: f64,
+    /// Length of a burst, s.
+    pub burst_s: f64,
+    /// Power of a burst at a daughter, K sr.
+    pub burst_k_sr: f64,
+    /// Artificial signal.
+    pub beacon: BeaconSchedule,
+}
+
+/// Terms of one error, which add up. Random terms are Gaussian, zero on average, and independent from daughter to daughter
+/// (and from channel to channel, where the error is one of channels).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ErrorTerms {
+    /// Given values, one a daughter, or none.
+    pub constant: Vec<f64>,
+    /// Given rates, 1/day since the epoch, one a daughter, or none.
+    pub rate_per_day: Vec<f64>,
+    /// Standard deviation of a constant of the whole mission.
+    pub constant_rms: f64,
+    /// Standard deviation of a constant that every pass draws anew.
+    pub pass_rms: f64,
+    /// Standard deviation of an oscillation with the period of the orbit.
+    pub orbit_rms: f64,
+    /// Standard deviation of a Gauss-Markov process: correlation exp(-|t| / drift_time_s).
+    pub drift_rms: f64,
+    /// Its correlation time, s.
+    pub drift_time_s: f64,
+    /// Standard deviation of a level that jumps.
+    pub step_rms: f64,
+    /// Time in which it jumps once, at a random instant, s.
+    pub step_every_s: f64,
+}
+
+impl Default for ErrorTerms {
+    fn default() -> Self {
+        Self {
+            constant: Vec::new(),
+            rate_per_day: Vec::new(),
+            constant_rms: 0.0,
+            pass_rms: 0.0,
+            orbit_rms: 0.0,
+            drift_rms: 0.0,
+            drift_time_s: 3600.0,
+            step_rms: 0.0,
+            step_every_s: 86_400.0,
+        }
+    }
+}
+
+/// The artificial signal and its times.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BeaconSchedule {
+    /// Power at a daughter, K sr, in every channel; 0 for no signal.
+    pub k_sr: f64,
+    /// Ecliptic longitude and latitude that it comes from, deg.
+    pub direction_deg: [f64; 2],
+    /// Time for which it is on, s, from the start of each pass.
+    pub on_s: f64,
+    /// Time from one start to the next in a pass, s; 0 for once a pass.
+    pub every_s: f64,
+}
+
+impl BeaconSchedule {
+    /// The signal.
+    #[must_use]
+    pub fn signal(&self) -> Beacon {
+        Beacon { k_sr: self.k_sr, direction_deg: self.direction_deg }
+    }
+
+    /// Whether it is on at a time after the start of a pass, s.
+    #[must_use]
+    pub fn is_on(&self, after_s: f64) -> bool {
+        let since_s = if self.every_s > 0.0 { after_s.rem_euclid(self.every_s) } else { after_s };
+        self.k_sr > 0.0 && since_s < self.on_s
+    }
+}
+
+impl ErrorTerms {
+    /// Whether there is no error.
+    #[must_use]
+    pub fn is_none(&self) -> bool {
+        let given = self.constant.iter().chain(&self.rate_per_day).all(|value| *value == 0.0);
+        let rms = [self.constant_rms, self.pass_rms, self.orbit_rms, self.drift_rms, self.step_rms];
+        given && rms.iter().all(|value| *value == 0.0)
+    }
+
+    /// Whether it may change within a pass.
+    #[must_use]
+    pub fn changes_in_a_pass(&self) -> bool {
+        let rms = [self.orbit_rms, self.drift_rms, self.step_rms];
+        rms.iter().chain(&self.rate_per_day).any(|value| *value != 0.0)
+    }
+
+    fn check(&self, name: &str, satellites: usize, smooth: bool, checks: &mut Checks) {
+        for (key, list) in [("constant", &self.constant), ("rate_per_day", &self.rate_per_day)] {
+            let (key, count) = (format!("{name}.{key}"), list.len());
+            let fits = count == 0 || count == satellites;
+            checks.require(
+                &key,
+                format!("({count} values)"),
+                fits,
+                format!("none, or {satellites}: one a daughter"),
+            );
+            checks.numbers(&key, list, |_| true, "finite numbers");
+        }
+        for (key, rms) in [
+            ("constant_rms", self.constant_rms),
+            ("pass_rms", self.pass_rms),
+            ("orbit_rms", self.orbit_rms),
+            ("drift_rms", self.drift_rms),
+            ("step_rms", self.step_rms),
+        ] {
+            checks.number(format!("{name}.{key}"), rms, rms >= 0.0, "a standard deviation, not negative");
+        }
+        if smooth {
+            let expected = "0: positions in packets are interpolated, and their errors have to be smooth";
+            checks.number(format!("{name}.drift_rms"), self.drift_rms, self.drift_rms == 0.0, expected);
+            checks.number(format!("{name}.step_rms"), self.step_rms, self.step_rms == 0.0, expected);
+        }
+        let time_s = self.drift_time_s;
+        let expected = "60 s to 1e9 s";
+        checks.number(
+            format!("{name}.drift_time_s"),
+            time_s,
+            (DRIFT_TIME_S_MIN..=1e9).contains(&time_s),
+            expected,
+        );
+        let every_s = self.step_every_s;
+        checks.number(
+            format!("{name}.step_every_s"),
+            every_s,
+            (1.0..=1e9).contains(&every_s),
+            "1 s to 1e9 s",
+        );
+    }
+}
+
+impl InstrumentConfig {
+    /// Whether anything differs from an ideal instrument.
+    #[must_use]
+    pub fn is_on(&self) -> bool {
+        let has_outliers = self.outlier_probability > 0.0 && self.outlier_sigma > 0.0;
+        self.terms().iter().any(|(_, terms)| !terms.is_none())
+            || !(self.dead_daughters.is_empty() && self.dead_channels.is_empty())
+            || has_outliers
+            || self.has_bursts()
+            || self.beacon.k_sr > 0.0
+    }
+
+    /// Whether there are bursts of interference.
+    #[must_use]
+    pub fn has_bursts(&self) -> bool {
+        self.burst_every_s > 0.0 && self.burst_s > 0.0 && self.burst_k_sr > 0.0
+    }
+
+    /// Whether positions in packets differ from those flown.
+    #[must_use]
+    pub fn moves_positions(&self) -> bool {
+        [&self.along_m, &self.across_m, &self.radial_m].iter().any(|terms| !terms.is_none())
+    }
+
+    /// Whether anything changes within a pass.
+    #[must_use]
+    pub fn changes_in_a_pass(&self) -> bool {
+        self.terms().iter().any(|(_, terms)| terms.changes_in_a_pass())
+    }
+
+    fn terms(&self) -> [(&'static str, &ErrorTerms); 6] {
+        [
+            ("amplitude", &self.amplitude),
+            ("phase_deg", &self.phase_deg),
+            ("clock_ns", &self.clock_ns),
+            ("along_m", &self.along_m),
+            ("across_m", &self.across_m),
+            ("radial_m", &self.radial_m),
+        ]
+    }
+
+    /// Everything that is wrong with the section for an array of `satellites` and a number of channels; `samples` says
+    /// whether it is of samples. Empty if it is good.
+    #[must_use]
+    pub fn problems(&self, satellites: usize, channels: usize, samples: bool) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("instrument");
+        for (name, terms) in self.terms() {
+            terms.check(name, satellites, name.ends_with("_m"), &mut checks);
+        }
+        let known = |number: u32, count: usize| (1..=count).contains(&(number as usize));
+        for (index, &daughter) in self.dead_daughters.iter().enumerate() {
+            let expected = format!("a daughter, 1 to {satellites}");
+            checks.require(
+                format!("dead_daughters[{index}]"),
+                daughter,
+                known(daughter, satellites),
+                expected,
+            );
+        }
+        for (index, &[daughter, channel]) in self.dead_channels.iter().enumerate() {
+            let good = known(daughter, satellites) && known(channel, channels);
+            let expected = format!("a daughter, 1 to {satellites}, and a channel, 1 to {channels}");
+            checks.require(
+                format!("dead_channels[{index}]"),
+                format!("[{daughter}, {channel}]"),
+                good,
+                expected,
+            );
+        }
+        let probability = self.outlier_probability;
+        checks.number("outlier_probability", probability, (0.0..=1.0).contains(&probability), "0 to 1");
+        for (key, value) in [
+            ("outlier_sigma", self.outlier_sigma),
+            ("burst_every_s", self.burst_every_s),
+            ("burst_s", self.burst_s),
+            ("burst_k_sr", self.burst_k_sr),
+            ("beacon.on_s", self.beacon.on_s),
+            ("beacon.every_s", self.beacon.every_s),
+        ] {
+            checks.number(key, value, (0.0..=1e12).contains(&value), "0 or more, at most 1e12");
+        }
+        let (burst_s, every_s) = (self.burst_s, self.burst_every_s);
+        checks.number("burst_s", burst_s, every_s == 0.0 || burst_s <= every_s, "at most burst_every_s");
+        self.beacon.signal().check("beacon", &mut checks);
+        // Samples have tones and interference of their own.
+        let expected = "none with spacecraft.fidelity = \"samples\", which have daughters.disturbances";
+        for (key, on) in [
+            ("dead_daughters", !self.dead_daughters.is_empty()),
+            ("dead_channels", !self.dead_channels.is_empty()),
+            ("outlier_probability", probability > 0.0),
+            ("burst_k_sr", self.has_bursts()),
+            ("beacon.k_sr", self.beacon.k_sr > 0.0),
+        ] {
+            checks.require(key, "(on)", !(samples && on), expected);
+        }
+        checks.finish()
+    }
+}

@@ -1,0 +1,167 @@
+//! Errors of the instrument, the same for integrated visibilities and for samples: gains, clocks, positions, dead
+//! receivers, outliers and bursts.
+//!
+//! A daughter's signal is multiplied by its voltage gain `g = exp(a + i p)`, `p = phase - 2 pi nu tau` (signals rotate
+//! as exp(-2 pi i nu t), so a clock that is late by tau turns them back), and a visibility by `g_i conj(g_j)`. Noise
+//! passes the same gain. The packets' positions are those flown plus an error along the track, along the orbit's normal
+//! and away from the Moon.
+
+mod config;
+mod series;
+mod truth;
+
+pub use config::{BeaconSchedule, ErrorTerms, InstrumentConfig};
+pub use truth::truth_csv;
+
+use std::f64::consts::TAU;
+
+use num_complex::Complex64;
+use rand_chacha::ChaCha8Rng;
+
+use crate::array::{Array, track_offset_m};
+use crate::frames::{Channel, EphemerisSegment, ObservingWindow};
+use crate::units::vector::add;
+use crate::units::{MissionTime, Pair, StreamKind, TICKS_PER_SECOND, random_stream};
+use series::{Draws, Series};
+
+/// The errors of an instrument, drawn from a seed.
+#[derive(Clone, Debug)]
+pub struct InstrumentErrors {
+    config: InstrumentConfig,
+    seed: u64,
+    satellites: usize,
+    channels: Vec<Channel>,
+    orbital_period_s: f64,
+}
+
+/// The errors over one pass.
+#[derive(Clone, Debug)]
+pub struct PassErrors {
+    channels: Vec<Channel>,
+    /// By daughter and channel.
+    amplitude: Vec<Vec<Series>>,
+    phase_deg: Vec<Vec<Series>>,
+    dead: Vec<Vec<bool>>,
+    /// By daughter.
+    clock_ns: Vec<Series>,
+    /// By daughter: along, across, radial.
+    offset_m: Vec<[Series; 3]>,
+}
+
+impl InstrumentErrors {
+    /// The errors of an array with these channels; `None` if there are none.
+    #[must_use]
+    pub fn new(config: &InstrumentConfig, seed: u64, array: &Array, channels: &[Channel]) -> Option<Self> {
+        config.is_on().then(|| Self {
+            config: config.clone(),
+            // Realisations are far from each other and from seeds that users choose.
+            seed: seed.wrapping_add(u64::from(config.realisation).wrapping_mul(0x9E37_79B9_7F4A_7C15)),
+            satellites: array.satellites(),
+            channels: channels.to_vec(),
+            orbital_period_s: array.orbital_period_s(),
+        })
+    }
+
+    /// The configuration.
+    #[must_use]
+    pub fn config(&self) -> &InstrumentConfig {
+        &self.config
+    }
+
+    /// The errors over a pass.
+    #[must_use]
+    pub fn pass(&self, window: ObservingWindow) -> PassErrors {
+        let Self { config, seed, satellites, channels, orbital_period_s } = self;
+        let span = (window.index, [window.start.seconds(), window.end.seconds()]);
+        let series = |error: u8, terms: &ErrorTerms, daughter: usize, channel: usize| {
+            Series::new(terms, Draws { seed: *seed, error, daughter, channel }, span, *orbital_period_s)
+        };
+        let by_channel = |error: u8, terms: &ErrorTerms| -> Vec<Vec<Series>> {
+            let of = |n: usize| (0..channels.len()).map(|c| series(error, terms, n, c)).collect();
+            (0..*satellites).map(of).collect()
+        };
+        let dead = |n: usize, c: usize| {
+            config.dead_daughters.iter().any(|dead| *dead as usize == n + 1)
+                || config.dead_channels.iter().any(|dead| dead.map(|k| k as usize) == [n + 1, c + 1])
+        };
+        PassErrors {
+            channels: channels.clone(),
+            amplitude: by_channel(0, &config.amplitude),
+            phase_deg: by_channel(1, &config.phase_deg),
+            dead: (0..*satellites).map(|n| (0..channels.len()).map(|c| dead(n, c)).collect()).collect(),
+            clock_ns: (0..*satellites).map(|n| series(2, &config.clock_ns, n, 0)).collect(),
+            offset_m: (0..*satellites)
+                .map(|n| {
+                    let axes = [(3, &config.along_m), (4, &config.across_m), (5, &config.radial_m)];
+                    axes.map(|(error, terms)| series(error, terms, n, 0))
+                })
+                .collect(),
+        }
+    }
+
+    /// Random stream of the outliers of a pair in a channel and pass.
+    #[must_use]
+    pub fn outliers(&self, window: ObservingWindow, channel: usize, pair: Pair) -> Option<ChaCha8Rng> {
+        let identity = 254_u64 << 40 | (channel as u64) << 16 | u64::from(pair.i) << 8 | u64::from(pair.j);
+        let stream = || random_stream(self.seed, StreamKind::Instrument, [identity, window.start.0 as u64]);
+        (self.config.outlier_probability > 0.0 && self.config.outlier_sigma > 0.0).then(stream)
+    }
+
+    /// Power of a burst of interference at a time, K sr.
+    #[must_use]
+    pub fn burst_k_sr(&self, t_s: f64) -> f64 {
+        let InstrumentConfig { burst_every_s, burst_s, burst_k_sr, .. } = self.config;
+        let on = self.config.has_bursts() && series::burst_is_on(self.seed, [burst_every_s, burst_s], t_s);
+        if on { burst_k_sr } else { 0.0 }
+    }
+}
+
+impl PassErrors {
+    /// Voltage gain of a daughter in a channel at a time, without its clock.
+    fn receiver_gain(&self, daughter: usize, channel: usize, t_s: f64) -> Complex64 {
+        let amplitude = self.amplitude[daughter][channel].at(t_s);
+        let phase_rad = self.phase_deg[daughter][channel].at(t_s).to_radians();
+        Complex64::from_polar(amplitude.exp(), phase_rad)
+    }
+
+    /// Time by which a daughter's clock is late, s.
+    #[must_use]
+    pub fn clock_s(&self, daughter: usize, t_s: f64) -> f64 {
+        1e-9 * self.clock_ns[daughter].at(t_s)
+    }
+
+    /// Voltage gain of a daughter in a channel at a time, clock included; that of the noise if it is dead.
+    #[must_use]
+    pub fn gain(&self, daughter: usize, channel: usize, t_s: f64) -> Complex64 {
+        let turns = self.channels[channel].frequency_hz * self.clock_s(daughter, t_s);
+        self.receiver_gain(daughter, channel, t_s) * Complex64::cis(-TAU * turns.fract())
+    }
+
+    /// Whether a daughter delivers no signal in a channel.
+    #[must_use]
+    pub fn is_dead(&self, daughter: usize, channel: usize) -> bool {
+        self.dead[daughter][channel]
+    }
+
+    /// Error of a position, m: along the track, along the orbit's normal, away from the Moon.
+    #[must_use]
+    pub fn offset_m(&self, daughter: usize, t_s: f64) -> [f64; 3] {
+        self.offset_m[daughter].each_ref().map(|series| series.at(t_s))
+    }
+
+    /// Replaces the positions flown of a segment by those that packets say.
+    pub fn mislead(&self, segment: &mut EphemerisSegment, array: &Array) {
+        let satellites = usize::from(segment.satellites);
+        for (place, position_m) in segment.positions_m.iter_mut().enumerate() {
+            let (node, daughter) = ((place / satellites) as i64, place % satellites);
+            let time = segment.start.0 + node * i64::from(segment.step_ticks);
+            let t_s = MissionTime(time).0 as f64 / TICKS_PER_SECOND as f64;
+            let moved =
+                track_offset_m(*position_m, array.normal_hat(daughter, t_s), self.offset_m(daughter, t_s));
+            *position_m = add(*position_m, moved);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

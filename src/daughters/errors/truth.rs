@@ -1,0 +1,44 @@
+//! The true errors as a table.
+
+use std::fmt::Write;
+
+use super::InstrumentErrors;
+use crate::frames::ObservingWindow;
+
+/// Comma-separated values, one line a pass, instant (its middle; also start and end if
+/// errors change within a pass), daughter and channel: the natural
+/// logarithm of the gain's amplitude, its phase without the clock (deg), the clock (ns), the error of the position (m,
+/// along, across and away from the Moon), and 1 for a dead receiver.
+#[must_use]
+pub fn truth_csv(errors: &InstrumentErrors, windows: &[ObservingWindow]) -> String {
+    let mut text = String::from(
+        "pass,time_s,daughter,channel,frequency_hz,ln_amplitude,phase_deg,clock_ns,along_m,across_m,radial_m,dead\n",
+    );
+    for window in windows {
+        let pass = errors.pass(*window);
+        let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
+        let instants = [0.5 * (start_s + end_s), start_s, end_s];
+        let count = if errors.config.changes_in_a_pass() { 3 } else { 1 };
+        for t_s in instants.into_iter().take(count) {
+            for daughter in 0..errors.satellites {
+                let [along, across, radial] = pass.offset_m(daughter, t_s);
+                let clock_ns = pass.clock_ns[daughter].at(t_s);
+                for (channel, of) in errors.channels.iter().enumerate() {
+                    // Writing to a String cannot fail.
+                    let _ = writeln!(
+                        text,
+                        "{},{t_s:.6},{},{},{},{:.9},{:.7},{clock_ns:.7},{along:.6},{across:.6},{radial:.6},{}",
+                        window.index,
+                        daughter + 1,
+                        channel + 1,
+                        of.frequency_hz,
+                        pass.amplitude[daughter][channel].at(t_s),
+                        pass.phase_deg[daughter][channel].at(t_s),
+                        u8::from(pass.is_dead(daughter, channel)),
+                    );
+                }
+            }
+        }
+    }
+    text
+}
