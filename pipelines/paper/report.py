@@ -72,7 +72,7 @@ def full_sky():
     )
 
 
-SKY = "lunarray sky pipelines/paper-10mhz.toml --freq-hz 10e6 --nside 512 --out out/sky-10mhz.fits --sources out/sources.csv"
+SKY = "lunarray sky pipelines/paper-10mhz.toml --freq-hz 10e6 --nside 256 --out out/sky-10mhz.fits --sources out/sources.csv"
 CUTOUT = "lunarray cutout out/sky-10mhz.fits --centre 30,40 --subtract-fwhm 5 --out out/patch.png"
 
 
