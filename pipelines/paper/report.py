@@ -402,7 +402,8 @@ def main():
                    "1 / (1 + xi_R) takes it back but for the band between the horizontal and the limb, 31.5 degrees lower, "
                    "which such a mirror does not show.")),
         ("Fig. 7: a row of B", f"`{FIGURE.format('rows')}`", figure("rows", beam_row)),
-        ("Fig. 8: waterfalls of one pair", f"`{FIGURE.format('waterfall')}`", figure("waterfall", waterfall)),
+        ("Fig. 8: waterfalls of one pair",
+         f"`{FIGURE.format('waterfall')}`, here with `--set map.nside=8 --set spacecraft.baseline_wavelengths_max=15.7`", figure("waterfall", waterfall)),
         ("Fig. 9 and 10: the maps at 10 and 3 MHz, full size", "`lunarray run pipelines/paper-10mhz.toml`, "
          "`lunarray run pipelines/paper-3mhz.toml`", maps()),
         ("Fig. 11: a prior of 5 degrees", "`lunarray study pipelines/paper/fig11-prior.toml`",
