@@ -179,8 +179,8 @@ def waterfall(n):
         f"Pair {n['pair']}, a window, {n['band_hz'][0] / 1e6:g} to {n['band_hz'][1] / 1e6:g} MHz, the sky of 10 MHz at nside "
         f"{n['nside_fine']}, averaged to {n['nside']}.\n\n"
         + table(["baseline, b_p", "visibilities", "error at centres", "averaged"], rows)
-        + "\nErrors are rms, over the rms visibility of the fine sky. The paper: centres differ visibly from the fine sky, averages "
-        "do not as long as b < b_p.\n"
+        + "\nErrors are rms, over the rms visibility of the fine sky. The paper: baselines beyond b_p alias in rows at centres and are "
+        "harmless in averaged ones.\n"
     )
 
 
