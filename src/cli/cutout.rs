@@ -10,7 +10,7 @@ use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::files::write_atomically;
 use crate::products::pictures::{ColourScale, Palette, Patch, Scaling, draw_patches};
 use crate::sky::fits::{ReadOptions, read_whole_map};
-use crate::sky::{Cutout, Frame, Projection};
+use crate::sky::{Cutout, Frame, PlaneProjection};
 
 /// Cut the same square piece out of one or more maps, and draw them side by side.
 ///
@@ -98,8 +98,8 @@ pub(super) fn execute(args: &CutoutArgs) -> CommandResult {
     }
     let cutout = Cutout {
         projection: match args.projection {
-            ProjectionName::Gnomonic => Projection::Gnomonic,
-            ProjectionName::Cartesian => Projection::Cartesian,
+            ProjectionName::Gnomonic => PlaneProjection::Gnomonic,
+            ProjectionName::Cartesian => PlaneProjection::Cartesian,
         },
         frame: match args.frame {
             FrameName::Galactic => Frame::Galactic,

@@ -10,7 +10,7 @@ use crate::units::vector::Vec3;
 /// How the sphere is laid on a plane around the centre of a piece.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Projection {
+pub enum PlaneProjection {
     /// From the centre of the sphere onto the tangent plane: great circles are straight.
     #[default]
     Gnomonic,
@@ -22,7 +22,7 @@ pub enum Projection {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cutout {
     /// Projection.
-    pub projection: Projection,
+    pub projection: PlaneProjection,
     /// Frame whose north is up.
     pub frame: Frame,
     /// Longitude and latitude of the centre in that frame, degrees.
@@ -52,8 +52,10 @@ impl Cutout {
     pub fn place_deg(&self, longitude_deg: f64, latitude_deg: f64) -> Option<[f64; 2]> {
         let [x, y, z] = rotate(&transpose(&self.plane_axes()), direction(longitude_deg, latitude_deg));
         match self.projection {
-            Projection::Gnomonic => (x > 1e-6).then(|| [(-y / x).to_degrees(), (z / x).to_degrees()]),
-            Projection::Cartesian => Some([-y.atan2(x).to_degrees(), z.clamp(-1.0, 1.0).asin().to_degrees()]),
+            PlaneProjection::Gnomonic => (x > 1e-6).then(|| [(-y / x).to_degrees(), (z / x).to_degrees()]),
+            PlaneProjection::Cartesian => {
+                Some([-y.atan2(x).to_degrees(), z.clamp(-1.0, 1.0).asin().to_degrees()])
+            }
         }
     }
 
@@ -68,11 +70,11 @@ impl Cutout {
     fn on_sphere(&self, right_deg: f64, up_deg: f64) -> Vec3 {
         let (right, up) = (right_deg.to_radians(), up_deg.to_radians());
         match self.projection {
-            Projection::Gnomonic => {
+            PlaneProjection::Gnomonic => {
                 let length = (1.0 + right * right + up * up).sqrt();
                 [1.0 / length, -right / length, up / length]
             }
-            Projection::Cartesian => {
+            PlaneProjection::Cartesian => {
                 let ((sin_l, cos_l), (sin_b, cos_b)) = ((-right).sin_cos(), up.sin_cos());
                 [cos_l * cos_b, sin_l * cos_b, sin_b]
             }
@@ -93,7 +95,7 @@ mod tests {
 
     #[test]
     fn east_is_left_and_north_is_up() {
-        for projection in [Projection::Gnomonic, Projection::Cartesian] {
+        for projection in [PlaneProjection::Gnomonic, PlaneProjection::Cartesian] {
             let cutout = Cutout {
                 projection,
                 frame: Frame::Galactic,
@@ -120,7 +122,7 @@ mod tests {
     #[test]
     fn places_are_those_of_the_pixels() {
         let cutout = Cutout {
-            projection: Projection::Gnomonic,
+            projection: PlaneProjection::Gnomonic,
             frame: Frame::Ecliptic,
             centre_deg: [310.0, -35.0],
             size_deg: 20.0,

@@ -27,7 +27,7 @@ pub mod spectra;
 
 pub use compare::{Comparison, ErrorSummary, InputSky, compare, compare_with};
 pub use config::{GENERATED_NSIDE_MAX, MapFrequency, SkyConfig};
-pub use cutout::{Cutout, Projection};
+pub use cutout::{Cutout, PlaneProjection};
 pub use error::MapError;
 pub use frame::{Frame, Rotation, rotate};
 pub use map::{SkyMap, is_unseen};

@@ -193,12 +193,12 @@ fn edge(line: &[Option<[f64; 2]>], axis: usize, value: f64) -> Option<[f64; 2]> 
 mod tests {
     use super::*;
     use crate::products::pictures::{Palette, Scaling};
-    use crate::sky::Projection;
+    use crate::sky::PlaneProjection;
 
     #[test]
     fn pieces_of_any_place_are_drawn_and_wrong_ones_refused() {
         let values = vec![0.5; 16];
-        for projection in [Projection::Gnomonic, Projection::Cartesian] {
+        for projection in [PlaneProjection::Gnomonic, PlaneProjection::Cartesian] {
             for centre_deg in [[0.0, 0.0], [359.0, 89.9], [120.0, -90.0], [200.0, 45.0]] {
                 let patch = Patch {
                     caption: "p".to_owned(),
