@@ -14,6 +14,7 @@ seed = 6
 nside = 4
 [spacecraft]
 channels_hz = [3.0e6, 5.0e6]
+channel_width_hz = 2e5              # little noise
 duration_s = 8e5
 every_nth_window = 12
 every_nth_integration = 60

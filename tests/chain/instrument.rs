@@ -106,7 +106,7 @@ fn visibilities_weights_and_dead_receivers_follow_the_truth() {
         "instrument.phase_deg={pass_rms=40.0}",
         "instrument.amplitude={constant_rms=0.2}",
         "instrument.clock_ns={constant=[0.0,30.0,-20.0,5.0]}",
-        "instrument.dead_channels=[[3,2]]",
+        "instrument.dead_channels=[[2,2]]",
     ];
     simulate(&place, "errors.ccsds", &set);
     let found = blocks(&place.path("errors.ccsds"));
@@ -199,13 +199,13 @@ fn a_map_of_random_phases_keeps_exp_of_less_their_variance() {
         format!("{out}/3.000MHz/map.fits")
     };
     let ideal = run("ideal", &[]);
-    let sigma_deg = 40.0_f64;
+    let sigma_deg = 20.0_f64;
     let phase = format!("instrument.phase_deg={{pass_rms={}}}", sigma_deg / 2.0_f64.sqrt());
     let spectra = json(&["compare", &run("spoilt", &[&phase]), &ideal, "--no-plot"]);
     let of = |name: &str| spectra[name].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).sum::<f64>();
     let kept = of("cl_cross") / of("cl_truth");
     let law = (-0.5 * sigma_deg.to_radians().powi(2)).exp();
     eprintln!("{sigma_deg} deg: amplitude {kept:.4} for {law:.4}");
-    // The mean of cos over 404 passes of a few pairs that share daughters: 0.3 / sqrt(404) = 1.5 % for one.
-    assert!((kept / law - 1.0).abs() < 0.05, "{sigma_deg} deg: {kept} for {law}");
+    // The cosine of such a phase varies by 0.08; over the some 80 of 404 passes in which baselines are short, 1 %.
+    assert!((kept / law - 1.0).abs() < 0.03, "{sigma_deg} deg: {kept} for {law}");
 }
