@@ -30,6 +30,9 @@ epsilon = 1e-4
 pictures = false
 "#;
 
+/// Time, gain with its clock, and whether it is dead.
+type Receiver = (f64, Complex64, bool);
+
 const ERRORS: [&str; 6] = [
     "instrument.phase_deg={pass_rms=40.0,drift_rms=10.0,drift_time_s=2000.0}",
     "instrument.amplitude={constant_rms=0.2}",
@@ -113,7 +116,7 @@ fn visibilities_weights_and_dead_receivers_follow_the_truth() {
     assert_eq!(ideal.len(), found.len());
     // The truth as it is written: gain, clock and whether dead, by daughter and channel and pass.
     let table = std::fs::read_to_string(place.path("errors.ccsds.instrument.csv")).unwrap();
-    let mut truth: BTreeMap<(u16, u8), Vec<(f64, Complex64, bool)>> = BTreeMap::new();
+    let mut truth: BTreeMap<(u16, u8), Vec<Receiver>> = BTreeMap::new();
     for line in table.lines().skip(1) {
         let number: Vec<f64> = line.split(',').map(|field| field.parse().unwrap()).collect();
         let [_, t_s, daughter, channel, hz, ln, deg, ns, ..] = number[..] else { panic!("{line}") };
@@ -126,7 +129,7 @@ fn visibilities_weights_and_dead_receivers_follow_the_truth() {
         assert_eq!(key, other);
         let (channel, i, j, time) = *key;
         let at = |n: u8| {
-            let near = |row: &&(f64, Complex64, bool)| ((row.0 - time as f64 * 1e-6).abs() * 1e3) as u64;
+            let near = |row: &&Receiver| ((row.0 - time as f64 * 1e-6).abs() * 1e3) as u64;
             *truth[&(channel, n)].iter().min_by_key(near).unwrap()
         };
         let (a, b) = (at(i), at(j));
