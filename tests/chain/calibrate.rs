@@ -4,7 +4,7 @@ use crate::common;
 
 use std::path::Path;
 
-use common::workplace::{Workplace, fail, json, maps, succeed};
+use common::workplace::{Workplace, fail, json, succeed};
 
 /// Eight daughters whose data are direct sums over the map's own pixels, so that the input is a perfect model.
 const SMALL: &str = r#"
@@ -14,6 +14,7 @@ seed = 6
 nside = 4
 [spacecraft]
 channels_hz = [3.0e6, 5.0e6]
+channel_width_hz = 2e5              # little noise
 duration_s = 8e5
 every_nth_window = 12
 every_nth_integration = 60
@@ -150,7 +151,6 @@ fn perfect_data_stay_as_they_are() {
         eprintln!("{channel}: the map changes by {:.3} of its noise", changed / noise);
         assert!(changed < noise, "{channel}: {changed} K for a noise of {noise} K");
     }
-    assert_eq!(maps(&ideal).len(), maps(&solved).len());
 }
 
 const BEACON: [&str; 4] = [

@@ -30,6 +30,9 @@ epsilon = 1e-4
 pictures = false
 "#;
 
+/// Time, gain with its clock, and whether it is dead.
+type Receiver = (f64, Complex64, bool);
+
 const ERRORS: [&str; 6] = [
     "instrument.phase_deg={pass_rms=40.0,drift_rms=10.0,drift_time_s=2000.0}",
     "instrument.amplitude={constant_rms=0.2}",
@@ -106,14 +109,14 @@ fn visibilities_weights_and_dead_receivers_follow_the_truth() {
         "instrument.phase_deg={pass_rms=40.0}",
         "instrument.amplitude={constant_rms=0.2}",
         "instrument.clock_ns={constant=[0.0,30.0,-20.0,5.0]}",
-        "instrument.dead_channels=[[3,2]]",
+        "instrument.dead_channels=[[2,2]]",
     ];
     simulate(&place, "errors.ccsds", &set);
     let found = blocks(&place.path("errors.ccsds"));
     assert_eq!(ideal.len(), found.len());
     // The truth as it is written: gain, clock and whether dead, by daughter and channel and pass.
     let table = std::fs::read_to_string(place.path("errors.ccsds.instrument.csv")).unwrap();
-    let mut truth: BTreeMap<(u16, u8), Vec<(f64, Complex64, bool)>> = BTreeMap::new();
+    let mut truth: BTreeMap<(u16, u8), Vec<Receiver>> = BTreeMap::new();
     for line in table.lines().skip(1) {
         let number: Vec<f64> = line.split(',').map(|field| field.parse().unwrap()).collect();
         let [_, t_s, daughter, channel, hz, ln, deg, ns, ..] = number[..] else { panic!("{line}") };
@@ -126,7 +129,7 @@ fn visibilities_weights_and_dead_receivers_follow_the_truth() {
         assert_eq!(key, other);
         let (channel, i, j, time) = *key;
         let at = |n: u8| {
-            let near = |row: &&(f64, Complex64, bool)| ((row.0 - time as f64 * 1e-6).abs() * 1e3) as u64;
+            let near = |row: &&Receiver| ((row.0 - time as f64 * 1e-6).abs() * 1e3) as u64;
             *truth[&(channel, n)].iter().min_by_key(near).unwrap()
         };
         let (a, b) = (at(i), at(j));
@@ -199,13 +202,13 @@ fn a_map_of_random_phases_keeps_exp_of_less_their_variance() {
         format!("{out}/3.000MHz/map.fits")
     };
     let ideal = run("ideal", &[]);
-    let sigma_deg = 40.0_f64;
+    let sigma_deg = 20.0_f64;
     let phase = format!("instrument.phase_deg={{pass_rms={}}}", sigma_deg / 2.0_f64.sqrt());
     let spectra = json(&["compare", &run("spoilt", &[&phase]), &ideal, "--no-plot"]);
     let of = |name: &str| spectra[name].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).sum::<f64>();
     let kept = of("cl_cross") / of("cl_truth");
     let law = (-0.5 * sigma_deg.to_radians().powi(2)).exp();
     eprintln!("{sigma_deg} deg: amplitude {kept:.4} for {law:.4}");
-    // The mean of cos over 404 passes of a few pairs that share daughters: 0.3 / sqrt(404) = 1.5 % for one.
-    assert!((kept / law - 1.0).abs() < 0.05, "{sigma_deg} deg: {kept} for {law}");
+    // The cosine of such a phase varies by 0.08; over the some 80 of 404 passes in which baselines are short, 1 %.
+    assert!((kept / law - 1.0).abs() < 0.03, "{sigma_deg} deg: {kept} for {law}");
 }

@@ -94,10 +94,10 @@ pub fn instrument_events(solutions: &[PassSolution]) -> Vec<InstrumentEvent> {
     widen(&mut changes, |change| &mut change.phases);
     widen(&mut changes, |change| &mut change.amplitudes);
     let mut events = Vec::new();
-    for at in 0..solutions.len() {
+    for (at, solution) in solutions.iter().enumerate() {
         let of_pass: Vec<&Change> = changes.iter().filter(|change| change.at == at).collect();
-        daughters(&of_pass, &solutions[at], &mut events);
-        disturbances(&solutions[at], &mut events);
+        daughters(&of_pass, solution, &mut events);
+        disturbances(solution, &mut events);
     }
     events
 }

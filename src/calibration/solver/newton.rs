@@ -402,7 +402,7 @@ impl ParameterLayout {
             let moved = (0..order).map(|k| step[k].abs() * matrix[k * order + k].sqrt()).fold(0.0, f64::max);
             // Costs are sums of large numbers: their rounding is no rise.
             let rounding = 1e-12 * sums.iter().map(|sums| sums.power).sum::<f64>();
-            if !(next_cost <= cost + rounding) {
+            if next_cost > cost + rounding || next_cost.is_nan() {
                 damping = (8.0 * damping).max(0.05);
                 if damping > 1e12 {
                     break;

@@ -66,8 +66,8 @@ impl PairSums {
             for a in 0..terms {
                 let weighted = weight * model[a].conj();
                 sums.cross[a] += weighted * value;
-                for b in 0..terms {
-                    sums.gram[a][b] += weighted * model[b];
+                for (gram, term) in sums.gram[a].iter_mut().zip(&model[..terms]) {
+                    *gram += weighted * term;
                 }
             }
         }

@@ -1,4 +1,5 @@
 //! The solver against data whose errors are known, and against bounds computed here.
+#![allow(clippy::print_stderr)] // They say what they measured.
 
 use std::f64::consts::TAU;
 
@@ -225,7 +226,7 @@ fn outliers_are_counted_and_do_not_matter() {
     let mut spoilt = 0;
     for block in &mut blocks {
         for k in 0..block.value_k_sr.len() {
-            if stream.next_u32() % 50 == 0 {
+            if stream.next_u32().is_multiple_of(50) {
                 let turn = Complex64::cis(f64::from(stream.next_u32() % 628) * 0.01);
                 block.value_k_sr[k] += 40.0 * block.weight[k].powf(-0.5) * turn;
                 spoilt += 1;
