@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::harmonic::L_MAX;
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
+use crate::sky::Frame;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::{Checks, InvalidValue, PerChannel};
@@ -55,6 +56,9 @@ pub struct MapConfig {
     pub prior_k: PerChannel<f64>,
     /// Prior maps: HEALPix FITS files, one per channel, in K; empty for none.
     pub prior_files: Vec<PathBuf>,
+    /// Frame of prior maps without COORDSYS; without it such files are refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub prior_frame: Option<Frame>,
     /// FWHM to which prior maps are smoothed, degrees.
     pub prior_fwhm_deg: f64,
     /// Mission time between snapshot maps, s; 0 for a final map only.
@@ -116,6 +120,7 @@ impl Default for MapConfig {
             epsilon: PerChannel::All(1e-4),
             prior_k: PerChannel::All(0.0),
             prior_files: Vec::new(),
+            prior_frame: None,
             prior_fwhm_deg: 5.0,
             snapshot_every_s: 0.0,
             weight_max: 0.0,
@@ -248,6 +253,7 @@ impl MapConfig {
             epsilon: _,
             prior_k: _,
             prior_files: _,
+            prior_frame: _,
             prior_fwhm_deg: _,
             snapshot_every_s: _,
             residual_max: _,

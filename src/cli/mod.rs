@@ -8,6 +8,7 @@ mod bench;
 mod check;
 mod compare;
 mod corrupt;
+mod explain;
 mod export;
 mod gaps;
 mod geometry;
@@ -26,6 +27,7 @@ mod run;
 mod serving;
 #[cfg(feature = "serve")]
 mod serving;
+mod shell;
 mod simulate;
 mod sky;
 mod study;
@@ -33,7 +35,7 @@ mod study;
 use std::ffi::OsString;
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 
 use output::{Completion, is_broken_pipe, print_error};
 
@@ -72,6 +74,10 @@ enum Command {
     Bench(bench::BenchArgs),
     Sky(sky::SkyArgs),
     Study(study::StudyArgs),
+    Explain(explain::ExplainArgs),
+    Config(explain::ConfigArgs),
+    Completions(shell::CompletionsArgs),
+    Man(shell::ManArgs),
 }
 
 /// Exit code of a failure.
@@ -114,6 +120,10 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Bench(args) => bench::execute(&args),
         Command::Sky(args) => sky::execute(&args),
         Command::Study(args) => study::execute(&args),
+        Command::Explain(args) => explain::explain(&args),
+        Command::Config(args) => explain::config(&args),
+        Command::Completions(args) => shell::completions(&args, Cli::command()),
+        Command::Man(args) => shell::man(&args, Cli::command()),
     };
     match result {
         Ok(Completion::Done) => 0,

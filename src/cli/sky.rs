@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::output::{CommandResult, Completion, print_text};
+use super::arguments::frequency_hz;
+use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::mother::{BAND_HZ, NINTH_BAND_HZ};
 use crate::pipeline::{Config, ConfigSource};
 use crate::products::pictures::{ColourScale, MapPanel, Palette, Scaling, View, draw_map};
@@ -24,8 +25,8 @@ pub(super) struct SkyArgs {
     /// Pipeline file (TOML) with seed and sky.generated; the embedded quicklook if none is given.
     #[arg(value_name = "PIPELINE.toml")]
     pipeline: Option<PathBuf>,
-    /// Frequency, Hz: 0.1 MHz to 120 MHz.
-    #[arg(long)]
+    /// Frequency, Hz, or with a unit, such as 3MHz: 0.1 MHz to 120 MHz.
+    #[arg(long, value_parser = frequency_hz)]
     freq_hz: f64,
     /// HEALPix nside: a power of two up to 1024.
     #[arg(long, default_value_t = 64)]
@@ -42,6 +43,9 @@ pub(super) struct SkyArgs {
     /// Draw no picture.
     #[arg(long)]
     no_picture: bool,
+    /// Print one JSON object instead of text: file, nside, freq_hz, mean_k, picture.
+    #[arg(long)]
+    json: bool,
 }
 
 pub(super) fn execute(args: &SkyArgs) -> CommandResult {
@@ -61,9 +65,9 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
     let mean = values.iter().sum::<f64>() / values.len() as f64;
     let map = SkyMap::new(Frame::Ecliptic, values)?;
     write_map(&args.out, &map, &WriteOptions::default())?;
-    print_text(&format!("{}: nside {nside}, {freq_hz} Hz, mean {mean:.4e} K", args.out.display()))?;
-    if !args.no_picture {
-        let picture = args.out.with_extension("png");
+    let mut said = vec![format!("{}: nside {nside}, {freq_hz} Hz, mean {mean:.4e} K", args.out.display())];
+    let picture = (!args.no_picture).then(|| args.out.with_extension("png"));
+    if let Some(picture) = &picture {
         let title = format!("Generated sky, {} MHz", freq_hz / 1e6);
         let panel = MapPanel {
             values: map.values(),
@@ -71,8 +75,15 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
             scale: ColourScale::robust(map.values(), Scaling::Log, Palette::default()),
             unit: "K".to_owned(),
         };
-        draw_map(&panel, &format!("seed {seed}, nside {nside}"), &View::default())?.write(&picture)?;
-        print_text(&format!("{}: picture", picture.display()))?;
+        draw_map(&panel, &format!("seed {seed}, nside {nside}"), &View::default())?.write(picture)?;
+        said.push(format!("{}: picture", picture.display()));
+    }
+    if args.json {
+        print_json_line(&serde_json::json!({
+            "file": args.out, "nside": nside, "freq_hz": freq_hz, "mean_k": mean, "picture": picture,
+        }))?;
+    } else {
+        print_text(&said.join("\n"))?;
     }
     Ok(Completion::Done)
 }
