@@ -60,8 +60,8 @@ impl NativeArray {
     #[pyo3(signature = (pipeline=None, overrides=Vec::new()))]
     fn new(pipeline: Option<PathBuf>, overrides: Vec<String>) -> PyResult<Self> {
         let source = ConfigSource { file: pipeline, overrides, seed: None };
-        let config = source.load().map_err(|error| exception(error))?;
-        let array = Array::new(&config.array).map_err(|error| exception(error))?;
+        let config = source.load().map_err(exception)?;
+        let array = Array::new(&config.array).map_err(exception)?;
         Ok(Self { array, config })
     }
 
@@ -177,6 +177,7 @@ impl NativeEphemeris {
 /// Visibilities, K sr, of a sky (K, RING order, in the frame of a letter) at positions (a row a time, three columns a
 /// satellite): a row a time, a column a pair (satellites from 0). Sums over pixel centres in double precision.
 #[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "the arguments of the Python function")]
 pub(crate) fn predict<'py>(
     py: Python<'py>,
     sky: PyReadonlyArray1<'py, f64>,
@@ -191,7 +192,7 @@ pub(crate) fn predict<'py>(
     let positions = positions_m.as_array();
     require_pairs(&pairs, positions.ncols() / 3)?;
     let map = sky_map(&sky, frame)?;
-    map.check_whole().map_err(|error| exception(error))?;
+    map.check_whole().map_err(exception)?;
     let response = if dipoles { AntennaResponse::DipoleNormal } else { AntennaResponse::Isotropic };
     let mut geometry = Vec::with_capacity(positions.nrows() * pairs.len());
     for (time, row) in positions.outer_iter().enumerate() {

@@ -81,7 +81,7 @@ pub(crate) fn run<'py>(
 ) -> PyResult<(String, Vec<Bound<'py, PyDict>>, PathBuf)> {
     let mut notes = Vec::new();
     let source = ConfigSource { file: pipeline, overrides, seed };
-    let config = source.load_noting(&mut notes).map_err(|error| exception(error))?;
+    let config = source.load_noting(&mut notes).map_err(exception)?;
     notes.extend(config.notes().iter().map(ToString::to_string));
     warn(py, notes)?;
     let (cancel, watch, maps) = (Cancel::new(), Watch::default(), Collected::default());
@@ -180,7 +180,7 @@ impl NativeReplay {
             Ok(serde_json::to_string(&summary)?)
         };
         let thread = std::thread::Builder::new().name("lunarray".to_owned()).spawn(work);
-        let thread = thread.map_err(|error| exception(error))?;
+        let thread = thread.map_err(exception)?;
         let summary = OnceLock::new();
         Ok(Self { cancel, maps: Mutex::new(Some(receiver)), thread: Mutex::new(Some(thread)), summary })
     }

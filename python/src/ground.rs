@@ -86,6 +86,6 @@ impl NativeGround {
         let held = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let segment = held.as_ref().ok_or_else(|| refused("ledger: this ground has finished".to_owned()))?;
         let report = segment.ground.outcome().ledger.report();
-        serde_json::to_string(&report).map_err(|error| exception(error))
+        serde_json::to_string(&report).map_err(exception)
     }
 }

@@ -108,7 +108,7 @@ pub(crate) fn frame(letter: &str) -> PyResult<Frame> {
 
 /// A map from an array.
 pub(crate) fn sky_map(pixels: &PyReadonlyArray1<'_, f64>, letter: &str) -> PyResult<SkyMap> {
-    SkyMap::new(frame(letter)?, pixels.as_array().to_vec()).map_err(|error| exception(error))
+    SkyMap::new(frame(letter)?, pixels.as_array().to_vec()).map_err(exception)
 }
 
 /// A map file: its pixels in RING order, K, and the letter of its frame.

@@ -29,7 +29,7 @@ pub(crate) fn wait_for<T: Send + 'static>(
             // Nobody may wait any more.
             let _ = sender.send(work());
         })
-        .map_err(|error| exception(error))?;
+        .map_err(exception)?;
     let mut raised: Option<PyErr> = None;
     loop {
         let (back, found) = py.detach(move || {

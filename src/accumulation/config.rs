@@ -9,6 +9,7 @@ use super::harmonic::L_MAX;
 use super::{AccumulationError, PixelEngine};
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
+use crate::sky::Frame;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::{ChannelId, Checks, InvalidValue, PerChannel};
@@ -63,6 +64,9 @@ pub struct MapConfig {
     pub prior_k: PerChannel<f64>,
     /// Prior maps: HEALPix FITS files, one per channel, in K; empty for none.
     pub prior_files: Vec<PathBuf>,
+    /// Frame of prior maps without COORDSYS; without it such files are refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub prior_frame: Option<Frame>,
     /// FWHM to which prior maps are smoothed, degrees.
     pub prior_fwhm_deg: f64,
     /// Share of the power of the sky that the Moon is taken to reflect, xi_R: the map is that of visibilities divided by
@@ -128,6 +132,7 @@ impl Default for MapConfig {
             epsilon: PerChannel::All(1e-4),
             prior_k: PerChannel::All(0.0),
             prior_files: Vec::new(),
+            prior_frame: None,
             prior_fwhm_deg: 5.0,
             moon_reflection: 0.0,
             snapshot_every_s: 0.0,
@@ -264,6 +269,7 @@ impl MapConfig {
             epsilon: _,
             prior_k: _,
             prior_files: _,
+            prior_frame: _,
             prior_fwhm_deg: _,
             moon_reflection: _,
             snapshot_every_s: _,
@@ -345,7 +351,7 @@ impl MapConfig {
         checks.require("channels_max", self.channels_max, channels <= self.channels_max, expected);
         for (place, &channel) in self.channels.iter().enumerate() {
             let expected = format!("a channel of the instrument, 0 to {}", channels.saturating_sub(1));
-            checks.require(&format!("channels[{place}]"), channel, usize::from(channel) < channels, expected);
+            checks.require(format!("channels[{place}]"), channel, usize::from(channel) < channels, expected);
         }
         for (key, fits, found) in [
             ("epsilon", self.epsilon.fits(channels), self.epsilon.values().len()),

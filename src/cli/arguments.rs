@@ -1,13 +1,16 @@
 //! Arguments that several commands share.
 
 use std::collections::BTreeSet;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 
 use super::output::print_notes;
+use crate::ground::GroundError;
 use crate::pipeline::{Config, ConfigError, ConfigSource, MemoryLimit};
-use crate::units::constants::DAY_S;
+use crate::sky::Frame;
+use crate::sky::fits::ReadOptions;
+use crate::units::Dimension;
 
 /// A pipeline file, and settings that replace some of its own.
 #[derive(Debug, Args)]
@@ -44,10 +47,28 @@ pub(super) struct ArrayArgs {
     overrides: Vec<String>,
 }
 
+/// What is to be known of map files that do not say it themselves.
+#[derive(Clone, Copy, Debug, Args)]
+pub(super) struct MapFileArgs {
+    /// Frame of map files without COORDSYS: ecliptic, galactic or equatorial; without it they are refused.
+    #[arg(long, value_name = "FRAME", value_parser = frame)]
+    frame: Option<Frame>,
+}
+
+impl MapFileArgs {
+    pub(super) fn options(self) -> ReadOptions {
+        ReadOptions { frame_if_missing: self.frame, ..ReadOptions::default() }
+    }
+}
+
+fn frame(text: &str) -> Result<Frame, String> {
+    Frame::from_coordsys(text).ok_or_else(|| "expected ecliptic, galactic or equatorial".to_owned())
+}
+
 /// The map file of an existing state.
 #[derive(Debug, Args)]
 pub(super) struct StateMapArgs {
-    /// Map file (TOML) with which the state was made; the embedded quicklook's settings if none is given.
+    /// Map file (TOML) with which the state was made; the settings that the state itself holds if none is given.
     #[arg(long, value_name = "MAP.toml")]
     map: Option<PathBuf>,
     /// Replace one setting, for example --set map.nside=8; may be repeated.
@@ -62,8 +83,9 @@ impl ArrayArgs {
 }
 
 impl StateMapArgs {
-    pub(super) fn source(&self) -> ConfigSource {
-        ConfigSource { file: self.map.clone(), overrides: self.overrides.clone(), seed: None }
+    /// The settings of the state in this folder, unless a file names them.
+    pub(super) fn source(&self, state: &Path) -> Result<ConfigSource, GroundError> {
+        ConfigSource { file: self.map.clone(), overrides: self.overrides.clone(), seed: None }.of_state(state)
     }
 }
 
@@ -139,17 +161,15 @@ pub(super) fn size_bytes(text: &str) -> Result<u64, String> {
 
 /// Seconds from a time such as `7d`, `12h`, `90s` or `90`; at most 1e9 s either way.
 pub(super) fn time_s(text: &str) -> Result<f64, String> {
-    let text = text.trim();
-    let (number, unit_s) = match text.strip_suffix(['s', 'h', 'd']) {
-        Some(number) if text.ends_with('d') => (number, DAY_S),
-        Some(number) if text.ends_with('h') => (number, 3600.0),
-        Some(number) => (number, 1.0),
-        None => (text, 1.0),
-    };
-    match number.trim().parse::<f64>() {
-        Ok(value) if (value * unit_s).abs() <= 1e9 => Ok(value * unit_s),
-        _ => Err("expected a number with s, h or d, such as 90s or 7d, at most 1e9 s".into()),
+    match Dimension::Time.parse(text)? {
+        value if value.abs() <= 1e9 => Ok(value),
+        _ => Err("expected at most 1e9 s".to_owned()),
     }
+}
+
+/// Hz from a frequency such as `3MHz` or `3e6`.
+pub(super) fn frequency_hz(text: &str) -> Result<f64, String> {
+    Dimension::Frequency.parse(text)
 }
 
 /// As [`time_s`], but not negative.

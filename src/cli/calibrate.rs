@@ -4,11 +4,11 @@ use std::path::PathBuf;
 
 use clap::Args;
 
+use super::arguments::MapFileArgs;
 use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_json_line, print_notes, print_text};
 use crate::pipeline::{CalibrateJob, CalibrateSummary, ConfigSource, calibrate, use_threads};
-use crate::sky::Frame;
-use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::fits::read_whole_map;
 
 /// Find the gains of every daughter, pass by pass, from the visibilities of a known signal.
 ///
@@ -36,6 +36,8 @@ pub(super) struct CalibrateArgs {
     /// Replace one setting, for example --set calibrate.clock_sigma_ns=50; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
+    #[command(flatten)]
+    maps: MapFileArgs,
     /// Print the summary as one JSON object instead of text.
     #[arg(long)]
     json: bool,
@@ -45,7 +47,7 @@ pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
     let source = ConfigSource { file: args.map.clone(), overrides: args.overrides.clone(), seed: None };
     let config = source.load_ground()?;
     use_threads(&config.runtime)?;
-    let options = ReadOptions { frame_if_missing: Some(Frame::Ecliptic), ..ReadOptions::default() };
+    let options = args.maps.options();
     let models = args.model.iter().map(|path| read_whole_map(path, &options)).collect::<Result<_, _>>()?;
     let interrupt = Interrupt::default();
     interrupt.arm_or_note();

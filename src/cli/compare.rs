@@ -4,10 +4,12 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
+use super::arguments::MapFileArgs;
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::products::{RunFigures, draw_comparison, draw_relative_error, draw_runs, runs_csv};
-use crate::sky::fits::{ReadOptions, read_whole_map_file};
-use crate::sky::{Comparison, Frame, SkyMap, compare};
+use crate::sky::Frame;
+use crate::sky::fits::read_whole_map_file;
+use crate::sky::{Comparison, SkyMap, compare};
 
 /// Compare a map with the truth, degree by degree; or runs with one another.
 ///
@@ -28,6 +30,8 @@ pub(super) struct CompareArgs {
     /// Noise-only map (FITS), for SNR_l.
     #[arg(long, value_name = "NOISE.fits")]
     noise: Option<PathBuf>,
+    #[command(flatten)]
+    maps: MapFileArgs,
     /// Limit the truth to degrees up to L instead of averaging it over the map's pixels; for maps of harmonics up to
     /// degree L.
     #[arg(long, value_name = "L")]
@@ -52,6 +56,7 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     if map_path.is_dir() {
         return compare_runs(args);
     }
+    let read = |path: &Path| read(path, args.maps);
     let (map, map_hz) = read(map_path)?;
     let (mut truth, truth_hz) = read(truth_path)?;
     if let (Some(map_hz), Some(truth_hz)) = (map_hz, truth_hz)
@@ -81,11 +86,9 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     Ok(Completion::Done)
 }
 
-/// Reads a map in K, and its frequency, Hz, if the file has one. A file without a frame is taken to be ecliptic, like all
-/// maps of this program.
-fn read(path: impl AsRef<Path>) -> Result<(SkyMap, Option<f64>), CommandError> {
-    let options = ReadOptions { frame_if_missing: Some(Frame::Ecliptic), ..ReadOptions::default() };
-    let file = read_whole_map_file(path.as_ref(), &options)?;
+/// Reads a map in K, and its frequency, Hz, if the file has one.
+fn read(path: &Path, maps: MapFileArgs) -> Result<(SkyMap, Option<f64>), CommandError> {
+    let file = read_whole_map_file(path, &maps.options())?;
     let frequency_hz = file.header.real("FREQ");
     Ok((file.map, frequency_hz))
 }

@@ -112,9 +112,7 @@ pub(super) fn execute(args: &CutoutArgs) -> CommandResult {
     };
     let mut pieces: Vec<Vec<f64>> = Vec::new();
     for path in &args.maps {
-        // A file without a frame is taken to be ecliptic, like all maps of this program.
-        let options = ReadOptions { frame_if_missing: Some(Frame::Ecliptic), ..ReadOptions::default() };
-        let mut map = read_whole_map(path, &options)?;
+        let mut map = read_whole_map(path, &ReadOptions::default())?;
         if let Some(fwhm) = args.subtract_fwhm {
             let smooth = map.smoothed(fwhm.to_radians())?;
             map.values_mut().iter_mut().zip(smooth.values()).for_each(|(value, smooth)| *value -= smooth);

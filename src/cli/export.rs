@@ -4,11 +4,12 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 
+use super::arguments::MapFileArgs;
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::files::write_atomically;
 use crate::products::{RunFigures, VisibilityTable, spectra_csv};
 use crate::runtime::Cancel;
-use crate::sky::fits::{Card, ReadOptions, read_whole_map, write_alm};
+use crate::sky::fits::{Card, read_whole_map, write_alm};
 use crate::sky::harmonics::AnalysisOptions;
 use crate::units::ChannelId;
 
@@ -59,6 +60,8 @@ struct AlmArgs {
     /// HEALPix map, K (FITS).
     #[arg(value_name = "MAP.fits")]
     map: PathBuf,
+    #[command(flatten)]
+    maps: MapFileArgs,
     /// Maximum degree; 3 nside - 1 if not given.
     #[arg(long)]
     l_max: Option<usize>,
@@ -119,7 +122,7 @@ fn spectra(args: &SpectraArgs) -> Result<usize, CommandError> {
 }
 
 fn alm(args: &AlmArgs) -> Result<usize, CommandError> {
-    let map = read_whole_map(&args.map, &ReadOptions::default())?;
+    let map = read_whole_map(&args.map, &args.maps.options())?;
     let l_max = args.l_max.unwrap_or(3 * map.nside() - 1);
     let alm = map.harmonics(l_max, &AnalysisOptions::default())?;
     let frame = Card::text(

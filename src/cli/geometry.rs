@@ -3,7 +3,7 @@
 use clap::Args;
 use serde::Serialize;
 
-use super::arguments::{ArrayArgs, time_s};
+use super::arguments::{ArrayArgs, frequency_hz, time_s};
 use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
 use crate::array::{Array, integration_time_s};
 use crate::mother::BAND_HZ;
@@ -21,8 +21,8 @@ pub(super) struct GeometryArgs {
     /// Times since the mission epoch: numbers with an optional unit s, h or d, such as 7d.
     #[arg(long = "at", value_name = "TIME", num_args = 1.., required = true, allow_negative_numbers = true, value_parser = time_s)]
     at_s: Vec<f64>,
-    /// Frequency for the integration times, Hz.
-    #[arg(long, default_value_t = 10e6)]
+    /// Frequency for the integration times, Hz, or with a unit, such as 3MHz.
+    #[arg(long, default_value = "10MHz", value_parser = frequency_hz)]
     freq_hz: f64,
     /// Print one JSON object per line: t_s, observing, earth_hat, satellites_m, pairs.
     #[arg(long)]

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::arguments::StateMapArgs;
-use super::output::{CommandResult, Completion, print_notes, print_text};
+use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::use_threads;
 
@@ -27,13 +27,23 @@ pub(super) struct MergeArgs {
     out: PathBuf,
     #[command(flatten)]
     map: StateMapArgs,
+    /// Print one JSON object instead of text: states, packets, out.
+    #[arg(long)]
+    json: bool,
 }
 
 pub(super) fn execute(args: &MergeArgs) -> CommandResult {
-    let config = args.map.source().load_ground()?;
+    // All have to agree, which merging requires.
+    let first = args.states.first().map_or(args.out.as_path(), PathBuf::as_path);
+    let config = args.map.source(first)?.load_ground()?;
     use_threads(&config.runtime)?;
     let whole = Ground::merge(&args.out, &args.states, &config.ground(WAIT_BYTES))?;
     print_notes(whole.notes());
+    if args.json {
+        let (states, packets) = (args.states.len(), whole.packets());
+        print_json_line(&serde_json::json!({ "states": states, "packets": packets, "out": args.out }))?;
+        return Ok(Completion::Done);
+    }
     let (packets, out) = (whole.packets(), args.out.display());
     let states = match args.states.len() {
         1 => "1 state".to_owned(),

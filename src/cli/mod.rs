@@ -10,6 +10,7 @@ mod check;
 mod compare;
 mod corrupt;
 mod cutout;
+mod explain;
 mod export;
 mod figure;
 mod gaps;
@@ -29,6 +30,7 @@ mod run;
 mod serving;
 #[cfg(feature = "serve")]
 mod serving;
+mod shell;
 mod simulate;
 mod sky;
 mod study;
@@ -36,7 +38,7 @@ mod study;
 use std::ffi::OsString;
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 
 use output::{Completion, is_broken_pipe, print_error};
 
@@ -78,6 +80,10 @@ enum Command {
     Bench(bench::BenchArgs),
     Sky(sky::SkyArgs),
     Study(study::StudyArgs),
+    Explain(explain::ExplainArgs),
+    Config(explain::ConfigArgs),
+    Completions(shell::CompletionsArgs),
+    Man(shell::ManArgs),
 }
 
 /// Exit code of a failure.
@@ -123,6 +129,10 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Bench(args) => bench::execute(&args),
         Command::Sky(args) => sky::execute(&args),
         Command::Study(args) => study::execute(&args),
+        Command::Explain(args) => explain::explain(&args),
+        Command::Config(args) => explain::config(&args),
+        Command::Completions(args) => shell::completions(&args, Cli::command()),
+        Command::Man(args) => shell::man(&args, Cli::command()),
     };
     match result {
         Ok(Completion::Done) => 0,

@@ -5,13 +5,13 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::arguments::{ArrayArgs, time_s};
+use super::arguments::{ArrayArgs, MapFileArgs, frequency_hz, time_s};
 use super::lines::next_line;
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
 use crate::array::Array;
 use crate::mother::BAND_HZ;
 use crate::response::pixel::{PairGeometry, exact};
-use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::fits::read_whole_map;
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::{Pair, echo};
 
@@ -29,8 +29,10 @@ pub(super) struct PredictArgs {
     /// HEALPix map, K (FITS).
     #[arg(long, value_name = "MAP.fits")]
     sky: PathBuf,
-    /// Frequency, Hz.
-    #[arg(long, requires = "at_s")]
+    #[command(flatten)]
+    maps: MapFileArgs,
+    /// Frequency, Hz, or with a unit, such as 3MHz.
+    #[arg(long, requires = "at_s", value_parser = frequency_hz)]
     freq_hz: Option<f64>,
     /// Time since the mission epoch: a number with an optional unit s, h or d, such as 7d.
     #[arg(long = "at", value_name = "TIME", requires_all = ["freq_hz", "pair"], value_parser = time_s)]
@@ -65,7 +67,7 @@ struct Answer {
 pub(super) fn execute(args: &PredictArgs) -> CommandResult {
     let config = args.array.source().load()?;
     let array = Array::new(&config.array)?;
-    let map = read_whole_map(&args.sky, &ReadOptions::default())?;
+    let map = read_whole_map(&args.sky, &args.maps.options())?;
     let directions = map.directions_ecliptic();
     let area_sr = pixel_area_sr(map.nside());
     let answer = |query: VisibilityQuery| -> Result<(), CommandError> {

@@ -41,7 +41,7 @@ pub(super) struct RetractArgs {
 }
 
 pub(super) fn execute(args: &RetractArgs) -> CommandResult {
-    let config = args.map.source().load_ground()?;
+    let config = args.map.source(&args.state)?.load_ground()?;
     use_threads(&config.runtime)?;
     let ticks = |s: Option<f64>, otherwise: i64| s.map_or(MissionTime(otherwise), MissionTime::from_seconds);
     let span = match (args.from_s, args.to_s) {

@@ -5,12 +5,13 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::output::{CommandError, CommandResult, Completion, print_text};
+use super::arguments::{MapFileArgs, frequency_hz};
+use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
 use crate::files::write_atomically;
 use crate::mother::{BAND_HZ, NINTH_BAND_HZ};
 use crate::pipeline::{Config, ConfigSource};
 use crate::products::pictures::{ColourScale, MapPanel, Palette, Scaling, View, draw_map};
-use crate::sky::fits::{ReadOptions, WriteOptions, read_whole_map, write_map};
+use crate::sky::fits::{WriteOptions, read_whole_map, write_map};
 use crate::sky::generated::{GeneratedSky, catalogue, generate};
 use crate::sky::{Frame, GENERATED_NSIDE_MAX, SkyMap};
 
@@ -29,8 +30,8 @@ pub(super) struct SkyArgs {
     /// Pipeline file (TOML) with seed and sky.generated; the embedded quicklook if none is given.
     #[arg(value_name = "PIPELINE.toml")]
     pipeline: Option<PathBuf>,
-    /// Frequency, Hz: 0.1 MHz to 120 MHz.
-    #[arg(long, required_unless_present = "like")]
+    /// Frequency, Hz, or with a unit, such as 3MHz: 0.1 MHz to 120 MHz.
+    #[arg(long, value_parser = frequency_hz, required_unless_present = "like")]
     freq_hz: Option<f64>,
     /// HEALPix nside: a power of two up to 1024.
     #[arg(long, default_value_t = 64)]
@@ -56,6 +57,11 @@ pub(super) struct SkyArgs {
     /// Draw no picture.
     #[arg(long)]
     no_picture: bool,
+    #[command(flatten)]
+    maps: MapFileArgs,
+    /// Print one JSON object instead of text: file, nside, freq_hz, mean_k, picture, sources.
+    #[arg(long)]
+    json: bool,
 }
 
 pub(super) fn execute(args: &SkyArgs) -> CommandResult {
@@ -77,12 +83,14 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
     }
     let values = generate(&sky.generated, freq_hz, nside, seed)?;
     let map = SkyMap::new(Frame::Ecliptic, values)?;
-    write(args, &map, &format!("{freq_hz} Hz"))?;
+    let mut made = Made::write(args, &map, &format!("{freq_hz} Hz"))?;
     if let Some(path) = &args.sources {
         let count = write_sources(path, &sky.generated, freq_hz, seed)?;
-        print_text(&format!("{}: {count} sources", path.display()))?;
+        made.lines.push(format!("{}: {count} sources", path.display()));
     }
-    draw(args, &map, format!("Generated sky, {} MHz", freq_hz / 1e6), &format!("seed {seed}, nside {nside}"))
+    let title = format!("Generated sky, {} MHz", freq_hz / 1e6);
+    made.draw(args, &map, title, &format!("seed {seed}, nside {nside}"))?;
+    made.print(args)
 }
 
 /// Writes a sky that resembles another.
@@ -90,18 +98,66 @@ fn resemble(args: &SkyArgs, path: &Path, correlation: f64) -> CommandResult {
     if !(0.0..=1.0).contains(&correlation) {
         return Err(format!("--correlation {correlation}: expected 0 to 1").into());
     }
-    let options = ReadOptions { frame_if_missing: Some(Frame::Ecliptic), ..ReadOptions::default() };
-    let (other, seed) = (read_whole_map(path, &options)?, args.seed.unwrap_or(0));
+    let (other, seed) = (read_whole_map(path, &args.maps.options())?, args.seed.unwrap_or(0));
     let map = other.correlated(correlation, seed)?;
-    write(args, &map, &format!("correlation {correlation} with {}", path.display()))?;
+    let mut made = Made::write(args, &map, &format!("correlation {correlation} with {}", path.display()))?;
     let title = format!("A sky of correlation {correlation} with another");
-    draw(args, &map, title, &format!("seed {seed}, nside {}", map.nside()))
+    made.draw(args, &map, title, &format!("seed {seed}, nside {}", map.nside()))?;
+    made.print(args)
 }
 
-fn write(args: &SkyArgs, map: &SkyMap, what: &str) -> Result<(), CommandError> {
-    let mean = map.values().iter().sum::<f64>() / map.values().len() as f64;
-    write_map(&args.out, map, &WriteOptions::default())?;
-    print_text(&format!("{}: nside {}, {what}, mean {mean:.4e} K", args.out.display(), map.nside()))
+/// What was written, for programs and in words.
+struct Made {
+    nside: usize,
+    mean_k: f64,
+    picture: Option<PathBuf>,
+    lines: Vec<String>,
+}
+
+impl Made {
+    /// Writes the sky.
+    fn write(args: &SkyArgs, map: &SkyMap, what: &str) -> Result<Self, CommandError> {
+        let (nside, mean_k) = (map.nside(), map.values().iter().sum::<f64>() / map.values().len() as f64);
+        write_map(&args.out, map, &WriteOptions::default())?;
+        let lines = vec![format!("{}: nside {nside}, {what}, mean {mean_k:.4e} K", args.out.display())];
+        Ok(Self { nside, mean_k, picture: None, lines })
+    }
+
+    /// Draws it beside its file.
+    fn draw(
+        &mut self,
+        args: &SkyArgs,
+        map: &SkyMap,
+        title: String,
+        subtitle: &str,
+    ) -> Result<(), CommandError> {
+        if args.no_picture {
+            return Ok(());
+        }
+        let path = args.out.with_extension("png");
+        let panel = MapPanel {
+            values: map.values(),
+            caption: title,
+            scale: ColourScale::robust(map.values(), Scaling::Log, Palette::default()),
+            unit: "K".to_owned(),
+        };
+        draw_map(&panel, subtitle, &View::of(Frame::Galactic, map.frame()))?.write(&path)?;
+        self.lines.push(format!("{}: picture", path.display()));
+        self.picture = Some(path);
+        Ok(())
+    }
+
+    fn print(&self, args: &SkyArgs) -> CommandResult {
+        if args.json {
+            print_json_line(&serde_json::json!({
+                "file": args.out, "nside": self.nside, "freq_hz": args.freq_hz, "mean_k": self.mean_k,
+                "picture": self.picture, "sources": args.sources,
+            }))?;
+        } else {
+            print_text(&self.lines.join("\n"))?;
+        }
+        Ok(Completion::Done)
+    }
 }
 
 /// Writes the point sources, brightest first; how many there are.
@@ -117,20 +173,4 @@ fn write_sources(path: &Path, config: &GeneratedSky, freq_hz: f64, seed: u64) ->
     write_atomically(path, csv.as_bytes())
         .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
     Ok(sources.len())
-}
-
-/// Draws the sky beside its file.
-fn draw(args: &SkyArgs, map: &SkyMap, title: String, subtitle: &str) -> CommandResult {
-    if !args.no_picture {
-        let picture = args.out.with_extension("png");
-        let panel = MapPanel {
-            values: map.values(),
-            caption: title,
-            scale: ColourScale::robust(map.values(), Scaling::Log, Palette::default()),
-            unit: "K".to_owned(),
-        };
-        draw_map(&panel, subtitle, &View::of(Frame::Galactic, map.frame()))?.write(&picture)?;
-        print_text(&format!("{}: picture", picture.display()))?;
-    }
-    Ok(Completion::Done)
 }

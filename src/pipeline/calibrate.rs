@@ -18,10 +18,10 @@ use crate::downlink::{DownlinkReader, FileSource};
 use crate::frames::{Flags, GroundFrame, Instrument, PlacedVisibilities, VisibilityBlock};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::runtime::Cancel;
+use crate::sky::SkyMap;
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::AnalysisOptions;
 use crate::sky::spectra::auto_cl;
-use crate::sky::{Frame, SkyMap};
 use crate::units::InvalidValue;
 
 /// Time between the two positions that give an orbit's plane, s.
@@ -491,8 +491,7 @@ fn make_maps(
     }
     let read = |channel: &crate::frames::Channel| {
         let path = folder.join(format!("{:.3}MHz", channel.frequency_hz / 1e6)).join("map.fits");
-        let options = ReadOptions { frame_if_missing: Some(Frame::Ecliptic), ..ReadOptions::default() };
-        Ok(read_whole_map(&path, &options)?)
+        Ok(read_whole_map(&path, &ReadOptions::default())?)
     };
     instrument.channels.iter().map(read).collect()
 }

@@ -9,6 +9,7 @@ use super::channel_lists;
 use super::config::Config;
 use super::config_reader::{Lines, Reading, SHOWN_MAX, parse_table};
 use super::problems::Problems;
+use super::quantities::read_units;
 use crate::units::shortened;
 
 /// Name of the default pipeline in messages.
@@ -157,6 +158,7 @@ impl ConfigSource {
             Ok(table) => table,
             Err(problems) => return Err(ConfigError::Values { origin, problems }),
         };
+        read_units(&mut table);
         let mut lines = Lines::of(text);
         let mut bad_overrides = Vec::new();
         let channels_hz = channel_lists::channels_hz(&table);
@@ -170,6 +172,7 @@ impl ConfigSource {
                 Err(error) => bad_overrides.push(error),
             }
         }
+        read_units(&mut table);
         if let Some(before) = channels_hz {
             notes.extend(channel_lists::follow(&mut table, &before, |key| keys.contains(&key)));
         }
@@ -304,6 +307,27 @@ mod tests {
         assert_eq!(found.len(), 4, "{found:#?}");
         for key in ["array.satellites: ", "daughters.bits: ", "spacecraft.channels_hz: "] {
             assert!(found.iter().any(|line| line.contains(key)), "{key} is not in {found:#?}");
+        }
+    }
+
+    #[test]
+    fn values_may_have_units() {
+        let text = "[spacecraft]\nchannels_hz = [\"1MHz\", 3e6]\nduration_s = \"30d\"\n[array]\naltitude_m = \"300km\"\n";
+        let load = |text: &str, overrides: &[&str]| {
+            let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
+            ConfigSource { overrides, ..ConfigSource::default() }.parse_text(text)
+        };
+        let config = load(text, &["map.snapshot_every_s=12h", "array.inclination_deg=90arcmin"]).unwrap();
+        assert_eq!(config.spacecraft.channels_hz, [1e6, 3e6]);
+        assert_eq!((config.spacecraft.duration_s, config.array.altitude_m), (2_592_000.0, 300e3));
+        assert_eq!((config.map.snapshot_every_s, config.array.inclination_deg), (43_200.0, 1.5));
+        let config =
+            load("", &["spacecraft.channels_hz=[3MHz, 10 MHz]", "spacecraft.window_s_max=5min"]).unwrap();
+        assert_eq!((config.spacecraft.channels_hz, config.spacecraft.window_s_max), (vec![3e6, 10e6], 300.0));
+        // Other units, and keys without one, stay texts of the wrong type.
+        for bad in ["spacecraft.duration_s=3MHz", "map.nside=16m", "spacecraft.channels_hz=[3MHz, 1d]"] {
+            let told = load("", &[bad]).unwrap_err().to_string();
+            assert!(told.contains("invalid type: string"), "{bad}: {told}");
         }
     }
 

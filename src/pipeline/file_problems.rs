@@ -12,12 +12,14 @@ impl Plan {
     pub fn file_problems(&self) -> Problems {
         let mut found = Problems::default();
         let (sky, spacecraft) = (&self.config.sky, &self.config.spacecraft);
-        let skies = sky.file.iter().flat_map(|files| files.values());
-        let skies = skies.zip(&spacecraft.channels_hz).map(|(path, &frequency_hz)| {
-            read_sky(path, frequency_hz, sky.frequency, spacecraft.receiver_noise_k_sr > 0.0)
+        let channels = spacecraft.channels_hz.iter().enumerate();
+        let skies = channels.filter_map(|(k, hz)| Some((sky.file.as_ref()?.get(k)?, hz)));
+        let skies = skies.map(|(path, &frequency_hz)| {
+            read_sky(&path, frequency_hz, sky, spacecraft.receiver_noise_k_sr > 0.0)
         });
         let priors = self.config.map.prior_files.iter();
-        let priors = priors.map(|path| read_whole_map(path, &ReadOptions::default()));
+        let options = ReadOptions { frame_if_missing: self.config.map.prior_frame, ..ReadOptions::default() };
+        let priors = priors.map(|path| read_whole_map(path, &options));
         for problem in skies.chain(priors).filter_map(Result::err) {
             found.push(|| problem);
         }

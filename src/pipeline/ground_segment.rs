@@ -92,8 +92,9 @@ pub(super) fn add(
 
 fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {
     let map = &config.map;
+    let options = ReadOptions { frame_if_missing: map.prior_frame, ..ReadOptions::default() };
     let read = |path: &std::path::PathBuf| {
-        let prior = read_whole_map(path, &ReadOptions::default())?.to_ecliptic();
+        let prior = read_whole_map(path, &options)?.to_ecliptic();
         let smooth = prior.smoothed(map.prior_fwhm_deg.to_radians())?;
         Ok(smooth.resized(map.nside)?.into_values())
     };

@@ -19,7 +19,9 @@ pub(crate) mod models;
 mod notes;
 pub(crate) mod plan;
 mod problems;
+mod quantities;
 mod rates;
+mod reference;
 mod run;
 mod sample_summary;
 pub(crate) mod sampling;
@@ -38,6 +40,7 @@ pub use groups::{GroupSize, GroupWatcher, channel_groups, replay_in_groups};
 pub use memory::{MemoryLimit, MemorySource};
 pub use plan::{Expected, Plan};
 pub use problems::{Problem, Problems};
+pub use reference::{KeyDescription, REFERENCE, key_descriptions};
 pub use run::{
     Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, simulate, use_threads,
 };

@@ -66,9 +66,10 @@ impl Plan {
     #[must_use]
     pub fn sky_nsides(&self) -> Vec<usize> {
         let sky = &self.config.sky;
+        let options = ReadOptions { frame_if_missing: sky.frame, ..ReadOptions::default() };
         let nside = |channel: usize| {
             let path = sky.file.as_ref().and_then(|files| files.get(channel));
-            let map = path.and_then(|path| read_whole_map(&path, &ReadOptions::default()).ok());
+            let map = path.and_then(|path| read_whole_map(&path, &options).ok());
             map.map_or(sky.nside, |map| map.nside())
         };
         (0..self.schedules.len()).map(nside).collect()

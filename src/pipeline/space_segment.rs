@@ -32,7 +32,7 @@ pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
         Some(files) => {
             let path = files.get(channel).unwrap_or_default();
             let may_be_dark = plan.config.spacecraft.receiver_noise_k_sr > 0.0;
-            Ok(read_sky(&path, frequency_hz, config.frequency, may_be_dark)?)
+            Ok(read_sky(&path, frequency_hz, config, may_be_dark)?)
         }
         None => {
             let values = generate(&config.generated, frequency_hz, config.nside, plan.config.seed)?;

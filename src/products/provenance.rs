@@ -2,6 +2,7 @@
 
 use super::config::PostProcessing;
 use crate::accumulation::{EngineKind, MapConfig};
+use crate::downlink::receive::inspect::tai_text;
 use crate::frames::{AntennaResponse, Instrument};
 use crate::sky::fits::Card;
 use crate::solve::Solution;
@@ -34,6 +35,11 @@ impl Provenance {
             Card::integer("NVIS", solution.visibilities.try_into().unwrap_or(i64::MAX), "visibilities used"),
             Card::real("TSTART", solution.span_s[0], "[s] first data, since the mission epoch"),
             Card::real("TSTOP", solution.span_s[1], "[s] last data, since the mission epoch"),
+            Card::text("TELESCOP", "lunarray", "array of satellites in lunar orbit"),
+            Card::text("INSTRUME", &in_ascii(&name.chars().take(60).collect::<String>()), "as PIPELINE"),
+            Card::text("TIMESYS", "TAI", "scale of DATE-BEG and DATE-END"),
+            Card::text("DATE-BEG", &tai_text(epoch_tai_s + solution.span_s[0]), "first data"),
+            Card::text("DATE-END", &tai_text(epoch_tai_s + solution.span_s[1]), "last data"),
             Card::real("EPOCHTAI", *epoch_tai_s, "[s] mission epoch, TAI since 1958-01-01"),
             Card::real("EPSILON", solution.diagnostics.epsilon, "regularisation, of W_max"),
             Card::real("WMAX", solution.diagnostics.w_max, "[K-2] greatest eigenvalue of BtN^-1B"),

@@ -94,6 +94,15 @@ pub struct ChannelSummary {
     pub files: Vec<String>,
 }
 
+impl ChannelSummary {
+    /// Whether the noise of a pixel exceeds the mean of the map, so that single pixels show little but noise. Without thermal
+    /// noise in the visibilities there is none in the map.
+    #[must_use]
+    pub fn is_noise(&self) -> bool {
+        self.thermal_noise && self.noise_rms_k > self.mean_k.abs()
+    }
+}
+
 impl fmt::Display for ChannelSummary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
@@ -105,6 +114,13 @@ impl fmt::Display for ChannelSummary {
             self.mean_k,
             self.noise_rms_k
         )?;
+        if self.is_noise() {
+            write!(
+                f,
+                "\n             mostly noise, {:.1} times the mean: more data, a larger map.epsilon or a smaller map.nside lowers it",
+                self.noise_rms_k / self.mean_k.abs()
+            )?;
+        }
         if let Some(refinement) = &self.refinement {
             write!(f, "\n             {refinement}")?;
         }

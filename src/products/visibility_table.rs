@@ -154,27 +154,34 @@ impl VisibilityTable {
 
     fn rows(&self, is_wanted: impl Fn(&VisibilityBlock) -> bool) -> Vec<(ChannelId, VisibilityRow)> {
         let wanted: Vec<&VisibilityBlock> = self.blocks.iter().filter(|block| is_wanted(block)).collect();
-        wanted
-            .par_iter()
-            .flat_map_iter(|block| (0..block.len()).map(|k| (block.channel, self.row(block, k))))
-            .collect()
+        let rows = |block: &&VisibilityBlock| {
+            let channel = block.channel;
+            self.rows_of(block).into_iter().map(move |row| (channel, row))
+        };
+        wanted.par_iter().flat_map_iter(rows).collect()
     }
 
-    fn row(&self, block: &VisibilityBlock, k: usize) -> VisibilityRow {
-        let (offset, duration_us) = (i64::from(block.offset_ticks[k]), block.duration_ticks[k]);
-        let middle_half_us = 2 * block.start.plus_ticks(offset).0 + i64::from(duration_us);
-        let time_s = middle_half_us as f64 * 0.5e-6;
-        let position = |satellite: u8| self.ephemeris.position_at(time_s, satellite.into());
-        let positions_m = position(block.pair.i).zip(position(block.pair.j)).map(|(i, j)| [i, j]);
-        let (value_k_sr, weight, flags) = (block.value_k_sr[k], block.weight[k], block.flags[k]);
-        VisibilityRow {
-            middle_half_us,
-            duration_us,
-            pair: block.pair,
-            positions_m,
-            value_k_sr,
-            weight,
-            flags,
-        }
+    /// The rows of a block. Visibilities with flags are placed too.
+    fn rows_of(&self, block: &VisibilityBlock) -> Vec<VisibilityRow> {
+        let all = VisibilityBlock { flags: vec![Flags::GOOD; block.len()], ..block.clone() };
+        let (placed, _) = self.ephemeris.place(&all, 0.0);
+        // Those that could be placed, in the order of the block.
+        let mut places = placed.time_s.iter().zip(placed.r_i_m.iter().zip(&placed.r_j_m)).peekable();
+        let row = |k: usize| {
+            let (offset, duration_us) = (i64::from(block.offset_ticks[k]), block.duration_ticks[k]);
+            let middle_half_us = 2 * block.start.plus_ticks(offset).0 + i64::from(duration_us);
+            let time_s = middle_half_us as f64 / 2e6;
+            let place = places.next_if(|(placed_s, _)| **placed_s == time_s);
+            VisibilityRow {
+                middle_half_us,
+                duration_us,
+                pair: block.pair,
+                positions_m: place.map(|(_, (r_i_m, r_j_m))| [*r_i_m, *r_j_m]),
+                value_k_sr: block.value_k_sr[k],
+                weight: block.weight[k],
+                flags: block.flags[k],
+            }
+        };
+        (0..block.len()).map(row).collect()
     }
 }

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use super::frame::Frame;
 use super::generated::GeneratedSky;
 use super::healpix::is_valid_nside;
 use crate::units::{Checks, InvalidValue, PerChannel};
@@ -26,6 +27,9 @@ pub enum MapFrequency {
 pub struct SkyConfig {
     /// HEALPix FITS maps in K, one or one a channel; without them the sky is generated.
     pub file: Option<PerChannel<PathBuf>>,
+    /// Frame of map files without COORDSYS; without it such files are refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub frame: Option<Frame>,
     /// What is done with a map file whose FREQ is not the channel's.
     pub frequency: MapFrequency,
     /// nside of the generated sky.
@@ -40,6 +44,7 @@ impl Default for SkyConfig {
     fn default() -> Self {
         Self {
             file: None,
+            frame: None,
             frequency: MapFrequency::default(),
             nside: 64,
             l_max: 0,
@@ -88,9 +93,9 @@ impl SkyConfig {
         checks.require("l_max", self.l_max, good, Self::l_max_expected(most));
         if let Some(files) = &self.file {
             let files = files.values().len();
-            let expected =
-                format!("one a channel, of which there are {channels}: a map holds for one frequency");
-            checks.require("file", format!("({files} files)"), files == channels, expected);
+            // Whether one file can stand for all channels is seen by its frequency.
+            let expected = format!("one, or one a channel, of which there are {channels}");
+            checks.require("file", format!("({files} files)"), files == 1 || files == channels, expected);
         }
         if let MapFrequency::SpectralIndex(index) = self.frequency {
             let (key, good) = ("frequency.spectral_index", (-10.0..=10.0).contains(&index));

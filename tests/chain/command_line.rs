@@ -6,6 +6,7 @@ use std::path::Path;
 
 use assert_cmd::Command;
 use lunarray::sky::fits::{Precision, WriteOptions, write_map};
+use lunarray::sky::{Frame, SkyMap};
 use serde_json::Value;
 
 fn lunarray() -> Command {
@@ -30,14 +31,150 @@ fn write(folder: &Path, name: &str, text: &str) -> String {
 #[test]
 fn every_command_has_help_that_teaches() {
     for command in [
-        "run", "simulate", "replay", "inspect", "compare", "geometry", "predict", "check", "sky", "corrupt",
-        "figure", "cutout", "gaps", "merge", "retract", "bench",
+        "run",
+        "simulate",
+        "replay",
+        "inspect",
+        "compare",
+        "geometry",
+        "predict",
+        "check",
+        "sky",
+        "corrupt",
+        "figure",
+        "cutout",
+        "gaps",
+        "merge",
+        "retract",
+        "bench",
+        "export",
+        "explain",
+        "config",
+        "completions",
+        "man",
+        "calibrate",
     ] {
         let output = lunarray().args([command, "--help"]).output().unwrap();
         assert!(output.status.success());
         let text = String::from_utf8(output.stdout).unwrap();
         assert!(text.lines().count() > 8, "{command}: {text}");
     }
+}
+
+fn said(args: &[&str]) -> String {
+    let output = lunarray().args(args).output().unwrap();
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+#[test]
+fn an_installed_program_explains_itself() {
+    let epsilon = said(&["explain", "map.epsilon"]);
+    assert!(epsilon.starts_with("map.epsilon = 1e-4\n") && epsilon.contains("regularisation"), "{epsilon}");
+    // A section with its keys; a part of a name; all sections.
+    assert!(said(&["explain", "map.refine"]).contains("map.refine.passes_max = 0"));
+    assert!(said(&["explain", "gains_file"]).contains("calibration.gains_file (none)"));
+    let sections = said(&["explain"]);
+    assert!(sections.contains("[spacecraft]") && !sections.contains("channels_hz ="), "{sections}");
+    let line: Value = serde_json::from_str(&said(&["explain", "map.nside", "--json"])).unwrap();
+    assert_eq!((&line["key"], &line["default"]), (&"map.nside".into(), &"16".into()));
+    assert!(complaint(&["explain", "epsilom"]).contains("epsilom: no such key; expected a key such as"));
+
+    // What is printed is a pipeline file that holds.
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["quicklook", "reference"] {
+        let text = said(&["config", "--print", name]);
+        let file = write(folder.path(), &format!("{name}.toml"), &text);
+        let printed: Value = serde_json::from_str(&said(&["config", "--print", name, "--json"])).unwrap();
+        assert!(printed["map"]["nside"].is_number());
+        said(&["check", &file, "--memory-max", "1TB", "--json"]);
+    }
+}
+
+#[test]
+fn completions_and_manuals_name_every_command() {
+    let help = said(&["--help"]);
+    let commands: Vec<&str> = help
+        .lines()
+        .skip_while(|line| *line != "Commands:")
+        .skip(1)
+        .take_while(|line| !line.is_empty())
+        .filter_map(|line| line.strip_prefix("  ")?.split(' ').next().filter(|word| !word.is_empty()))
+        .filter(|word| *word != "help")
+        .collect();
+    assert!(commands.len() > 15, "{commands:?}");
+    for shell in ["bash", "zsh", "fish"] {
+        let script = said(&["completions", shell]);
+        assert!(commands.iter().all(|command| script.contains(command)), "{shell}");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("man1");
+    said(&["man", "--out", out.to_str().unwrap()]);
+    for command in commands {
+        let page = std::fs::read_to_string(out.join(format!("lunarray-{command}.1"))).unwrap();
+        assert!(page.contains(".SH SYNOPSIS"), "{command}");
+    }
+    assert!(out.join("lunarray.1").exists());
+}
+
+#[test]
+fn units_are_accepted_in_arguments_and_settings() {
+    assert_eq!(
+        said(&["geometry", "--at", "1.5h", "--freq-hz", "3MHz"]),
+        said(&["geometry", "--at", "5400", "--freq-hz", "3e6"])
+    );
+    let with = |keys: [&str; 2]| {
+        let keys = keys.iter().flat_map(|key| ["--set", key]);
+        let args: Vec<&str> = ["check", "--json"].into_iter().chain(keys).collect();
+        said(&args)
+    };
+    assert_eq!(
+        with(["spacecraft.channels_hz=[3MHz]", "spacecraft.duration_s=30d"]),
+        with(["spacecraft.channels_hz=[3e6]", "spacecraft.duration_s=2592000.0"])
+    );
+    assert!(complaint(&["geometry", "--at", "0", "--freq-hz", "3mhz"]).contains("such as 3MHz"));
+}
+
+#[test]
+fn a_map_without_a_frame_is_refused_until_one_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let values: Vec<f64> = (0..12).map(|pixel| 1e5 + 1e3 * f64::from(pixel)).collect();
+    let whole = folder.path().join("whole.fits");
+    let map = SkyMap::new(Frame::Galactic, values).unwrap();
+    write_map(&whole, &map, &WriteOptions { precision: Precision::Double, ..WriteOptions::default() })
+        .unwrap();
+    // As healpy writes it by default: without the keyword.
+    let bytes = std::fs::read(&whole).unwrap();
+    let at = bytes.windows(8).position(|key| key == b"COORDSYS").unwrap();
+    let mut without = bytes;
+    without[at..at + 8].copy_from_slice(b"COMMENT ");
+    let bare = folder.path().join("bare.fits");
+    std::fs::write(&bare, without).unwrap();
+    let [whole, bare] = [whole, bare].map(|path| path.to_str().unwrap().to_owned());
+
+    let at = ["--at", "0", "--pair", "1-2", "--freq-hz", "3MHz"];
+    let predict = |file: &str, more: &[&str]| [&["predict", "--sky", file][..], &at, more].concat().join(" ");
+    let refused = |words: String| complaint(&words.split(' ').collect::<Vec<_>>());
+    let done = |words: String| said(&words.split(' ').collect::<Vec<_>>());
+    for told in [
+        refused(predict(&bare, &[])),
+        refused(format!("compare {bare} {whole} --no-plot")),
+        refused(format!("export alm {bare} --out {bare}.alm")),
+        refused(format!("check --set sky.file={bare} --set spacecraft.channels_hz=[3e6]")),
+    ] {
+        assert!(
+            told.contains("COORDSYS") && told.contains("--frame") && told.contains("sky.frame"),
+            "{told}"
+        );
+    }
+    assert_eq!(done(predict(&bare, &["--frame", "galactic"])), done(predict(&whole, &[])));
+    assert_ne!(done(predict(&bare, &["--frame", "ecliptic"])), done(predict(&whole, &[])));
+    // The same map: correlated at all degrees.
+    let compared = done(format!("compare {bare} {whole} --frame galactic --json"));
+    let compared: Value = serde_json::from_str(&compared).unwrap();
+    assert!((compared["rho"][2].as_f64().unwrap() - 1.0).abs() < 1e-9);
+    // One file stands for all channels where it says no frequency.
+    done(format!("check --set sky.file={bare} --set sky.frame=galactic"));
 }
 
 #[test]

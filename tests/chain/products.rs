@@ -111,9 +111,14 @@ fn headers_and_summaries_say_how_a_map_was_made() {
         ("ROWS", "average"),
         ("ANTENNA", "isotropic"),
         ("PRIOR", "uniform, 2e6 K"),
+        ("TELESCOP", "lunarray"),
+        ("TIMESYS", "TAI"),
     ] {
         assert_eq!(cards.text(key), Some(text), "{key}");
     }
+    // The mission begins on 2027-01-01; ISO dates are in the order of their letters.
+    let [first, last] = ["DATE-BEG", "DATE-END"].map(|key| cards.text(key).unwrap());
+    assert!("2027-01-01T00:00:00" < first && first < last && last < "2028-05", "{first} {last}");
     // 2 b_p = 2 wavelength / sqrt(4 pi / N_pix).
     let limit_m = 2.0 * 299_792_458.0 / 3e6 / (4.0 * std::f64::consts::PI / 768.0_f64).sqrt();
     assert!((cards.real("BASEMAX").unwrap() / limit_m - 1.0).abs() < 1e-12);
@@ -122,6 +127,10 @@ fn headers_and_summaries_say_how_a_map_was_made() {
     assert_eq!(noisy.channel["thermal_noise"], true);
     assert!(noisy.printed.contains("with the map's thermal noise"), "{}", noisy.printed);
     assert!(noisy.printed.contains("noise power subtracted"), "{}", noisy.printed);
+    assert!(!noisy.printed.contains("mostly noise"), "{}", noisy.printed);
+    // A receiver a thousand times louder than the sky.
+    let loud = run(folder.path(), "loud", &["spacecraft.receiver_noise_k_sr=1e10"]);
+    assert!(loud.printed.contains("mostly noise"), "{}", loud.printed);
 
     let keys = ["spacecraft.thermal_noise=false", "map.engine=harmonic", "spacecraft.antenna=dipole-normal"];
     let quiet = run(folder.path(), "quiet", &keys);

@@ -49,6 +49,12 @@ fn states_make_one_whatever_their_order() {
             place.replay(&out, &[&file], &[]);
             assert!(place.maps(&out) == place.maps("once"), "{engine}");
         }
+        // Without a map file the settings are those that the states hold.
+        let mut unnamed = merge(&place, &orders[0], "unnamed");
+        unnamed.drain(4..6);
+        assert!(!unnamed.contains(&"--map".to_owned()));
+        succeed(&strs(&unnamed));
+        assert!(place.bytes("unnamed") == place.bytes("once"), "{engine}");
     }
 }
 

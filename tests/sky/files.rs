@@ -2,12 +2,13 @@
 
 use std::fs;
 use std::io::Cursor;
+use std::path::Path;
 
 use lunarray::sky::fits::{
     Card, CardValue, Column, FitsError, FitsProblem, MapFile, Ordering, Precision, ReadOptions, WriteOptions,
     read_map, read_map_file, read_map_from, read_sky, read_unit, read_whole_map, write_columns, write_map,
 };
-use lunarray::sky::{Frame, MapError, MapFrequency, SkyMap};
+use lunarray::sky::{Frame, MapError, MapFrequency, SkyConfig, SkyMap};
 use lunarray::units::constants::HEALPIX_UNSEEN;
 use proptest::prelude::*;
 
@@ -276,6 +277,16 @@ fn pixels_of_another_scheme_are_refused() {
     }
 }
 
+/// The map of a sky by a rule for its frequency.
+fn read_for(
+    path: &Path,
+    frequency_hz: f64,
+    frequency: MapFrequency,
+    may_be_dark: bool,
+) -> Result<SkyMap, FitsError> {
+    read_sky(path, frequency_hz, &SkyConfig { frequency, ..SkyConfig::default() }, may_be_dark)
+}
+
 #[test]
 fn a_sky_that_is_none_is_refused_with_file_pixel_and_value() {
     let folder = tempfile::tempdir().unwrap();
@@ -286,7 +297,7 @@ fn a_sky_that_is_none_is_refused_with_file_pixel_and_value() {
         let map = SkyMap::new(Frame::Ecliptic, values).unwrap();
         let options = WriteOptions { precision: Precision::Double, ..WriteOptions::default() };
         write_map(&path, &map, &options).unwrap();
-        read_sky(&path, 3e6, MapFrequency::MustMatch, may_be_dark).map_err(|error| error.to_string())
+        read_for(&path, 3e6, MapFrequency::MustMatch, may_be_dark).map_err(|error| error.to_string())
     };
     assert!(read(1e7, false).is_ok() && read(0.0, true).is_ok());
     // -1.5 K in 48 pixels.
@@ -315,24 +326,24 @@ fn a_sky_of_another_frequency_is_refused_or_scaled() {
     let worded = write("worded.fits", vec![Card::text("FREQ", "3 MHz", "")]);
     let scaled = MapFrequency::SpectralIndex(-2.5);
 
-    let said = read_sky(&at_3, 10e6, MapFrequency::MustMatch, true).unwrap_err().to_string();
+    let said = read_for(&at_3, 10e6, MapFrequency::MustMatch, true).unwrap_err().to_string();
     for part in ["3.fits", "FREQ is 3000000 Hz", "10000000 Hz", "sky.frequency = { spectral_index"] {
         assert!(said.contains(part), "{said}");
     }
-    assert_eq!(read_sky(&at_3, 3e6, MapFrequency::MustMatch, true).unwrap(), map(4));
-    assert_eq!(read_sky(&at_3, 3e6, scaled, true).unwrap(), map(4));
+    assert_eq!(read_for(&at_3, 3e6, MapFrequency::MustMatch, true).unwrap(), map(4));
+    assert_eq!(read_for(&at_3, 3e6, scaled, true).unwrap(), map(4));
     // (10 / 3)^-2.5 = 0.3^2 sqrt(0.3).
     let factor = 0.09 * 0.547_722_557_505;
-    let found = read_sky(&at_3, 10e6, scaled, true).unwrap();
+    let found = read_for(&at_3, 10e6, scaled, true).unwrap();
     for (found, value) in found.values().iter().zip(map(4).values()) {
         assert!((found / value / factor - 1.0).abs() < 1e-11, "{found} {value}");
     }
     // A map that does not say its frequency may be of any, but cannot be scaled.
-    assert_eq!(read_sky(&unknown, 10e6, MapFrequency::MustMatch, true).unwrap(), map(4));
-    let said = read_sky(&unknown, 10e6, scaled, true).unwrap_err().to_string();
+    assert_eq!(read_for(&unknown, 10e6, MapFrequency::MustMatch, true).unwrap(), map(4));
+    let said = read_for(&unknown, 10e6, scaled, true).unwrap_err().to_string();
     assert!(said.contains("FREQ is missing"), "{said}");
     for rule in [MapFrequency::MustMatch, scaled] {
-        let said = read_sky(&worded, 10e6, rule, true).unwrap_err().to_string();
+        let said = read_for(&worded, 10e6, rule, true).unwrap_err().to_string();
         assert!(
             said.contains("FREQ") && said.contains("3 MHz") && said.contains("a positive number"),
             "{said}"

@@ -107,8 +107,9 @@ pub enum FitsProblem {
     },
     /// The file does not state the frame of its map.
     #[error(
-        "the keyword COORDSYS is missing, so the map's frame is unknown; expected 'E', 'G' or 'C': add \
-             the keyword, or state the frame to assume"
+        "the keyword COORDSYS is missing, so the map's frame is unknown; expected 'E', 'G' or 'C': add the keyword, or name the \
+         frame with --frame (compare, predict, export, calibrate, sky) or the keys sky.frame and map.prior_frame (pipelines): ecliptic, \
+         galactic or equatorial"
     )]
     NoFrame,
     /// A map of a quantity other than temperature.

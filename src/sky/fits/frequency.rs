@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::error::{FitsError, FitsProblem};
 use super::read::{MapFile, ReadOptions, read_whole_map_file};
-use crate::sky::{MapError, MapFrequency, SkyMap};
+use crate::sky::{MapError, MapFrequency, SkyConfig, SkyMap};
 
 /// Relative difference up to which two frequencies are the same: a digit lost in a header.
 const SAME: f64 = 1e-6;
@@ -13,7 +13,7 @@ const SAME: f64 = 1e-6;
 /// `may_be_dark`.
 ///
 /// A map says by FREQ (Hz) for which frequency it holds. One of another frequency is refused, or scaled by a power law, as
-/// `rule` says. One without FREQ is taken as it is, but cannot be scaled.
+/// `config` says. One without FREQ is taken as it is, but cannot be scaled.
 ///
 /// # Errors
 /// As [`super::read_whole_map`]; [`FitsProblem::Keyword`] or [`FitsProblem::Missing`] for FREQ;
@@ -21,10 +21,10 @@ const SAME: f64 = 1e-6;
 pub fn read_sky(
     path: &Path,
     frequency_hz: f64,
-    rule: MapFrequency,
+    config: &SkyConfig,
     may_be_dark: bool,
 ) -> Result<SkyMap, FitsError> {
-    let map = read_at(path, frequency_hz, rule)?;
+    let map = read_at(path, frequency_hz, config)?;
     let refuse = |problem: MapError| FitsError::new(path, problem.into());
     map.check_temperatures().map_err(refuse)?;
     let mean_k = map.values().iter().sum::<f64>() / map.values().len() as f64;
@@ -35,8 +35,10 @@ pub fn read_sky(
 }
 
 /// The map at the channel's frequency.
-fn read_at(path: &Path, frequency_hz: f64, rule: MapFrequency) -> Result<SkyMap, FitsError> {
-    let MapFile { mut map, header, .. } = read_whole_map_file(path, &ReadOptions::default())?;
+fn read_at(path: &Path, frequency_hz: f64, config: &SkyConfig) -> Result<SkyMap, FitsError> {
+    let rule = config.frequency;
+    let options = ReadOptions { frame_if_missing: config.frame, ..ReadOptions::default() };
+    let MapFile { mut map, header, .. } = read_whole_map_file(path, &options)?;
     let refuse = |problem| FitsError::new(path, problem);
     let scales = matches!(rule, MapFrequency::SpectralIndex(_));
     let Some(found) = header.get("FREQ") else {

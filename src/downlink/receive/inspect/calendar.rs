@@ -5,7 +5,8 @@ const DAY_S: i64 = 86_400;
 /// The ISO 8601 date and time of day, to the millisecond, of TAI seconds since 1958-01-01T00:00:00.
 ///
 /// Gregorian calendar by Hinnant's algorithm (civil from days, in eras of 400 years that begin in March).
-pub(super) fn tai_text(tai_s: f64) -> String {
+#[must_use]
+pub fn tai_text(tai_s: f64) -> String {
     let ms = (tai_s * 1e3).round() as i64;
     let (s, ms) = (ms.div_euclid(1_000), ms.rem_euclid(1_000));
     let (day, s) = (s.div_euclid(DAY_S), s.rem_euclid(DAY_S));

@@ -8,7 +8,7 @@ mod contents;
 mod inspector;
 mod table;
 
-use calendar::tai_text;
+pub use calendar::tai_text;
 pub use contents::{
     ChannelContents, Contents, DamagedEntry, EphemerisSummary, FaultEntry, GapEntry, GarbageEntry,
     HousekeepingSummary, InstrumentSummary, KindSummary, PairSummary, TimeSpan, VisibilityCounts,

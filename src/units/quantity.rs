@@ -1,0 +1,142 @@
+//! Numbers with units, as people write them: `3MHz`, `30d`, `10km`. One parser for arguments and pipeline files.
+
+use super::constants::DAY_S;
+
+/// What a number measures, and in what it is kept.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Dimension {
+    /// Hz.
+    Frequency,
+    /// s.
+    Time,
+    /// m.
+    Length,
+    /// Degrees.
+    Angle,
+}
+
+/// Units of frequency and what they are in Hz; longer names before those that they end with.
+const FREQUENCIES: [(&str, f64); 4] = [("GHz", 1e9), ("MHz", 1e6), ("kHz", 1e3), ("Hz", 1.0)];
+const TIMES: [(&str, f64); 7] = [
+    ("min", 60.0),
+    ("ms", 1e-3),
+    ("us", 1e-6),
+    ("yr", 365.25 * DAY_S),
+    ("s", 1.0),
+    ("h", 3600.0),
+    ("d", DAY_S),
+];
+const LENGTHS: [(&str, f64); 2] = [("km", 1e3), ("m", 1.0)];
+const ANGLES: [(&str, f64); 3] = [("arcmin", 1.0 / 60.0), ("arcsec", 1.0 / 3600.0), ("deg", 1.0)];
+
+impl Dimension {
+    /// What a key measures, by the unit at the end of its name: `channels_hz`, `duration_s`, `altitude_m`, `inclination_deg`, also
+    /// before `_max` and `_min`. `None` for other units, and rates such as `_m_s`.
+    #[must_use]
+    pub fn of_key(key: &str) -> Option<Self> {
+        let name = key.rsplit('.').next().unwrap_or(key);
+        let name = name.strip_suffix("_max").or_else(|| name.strip_suffix("_min")).unwrap_or(name);
+        let (stem, unit) = name.rsplit_once('_')?;
+        let dimension = match unit {
+            "hz" => Self::Frequency,
+            "s" => Self::Time,
+            "m" => Self::Length,
+            "deg" => Self::Angle,
+            _ => return None,
+        };
+        // A quotient of units (bits_per_s, km_s) is none of them.
+        let of_quotient =
+            ["per", "m", "km", "deg", "k", "s"].contains(&stem.rsplit('_').next().unwrap_or(stem));
+        (!of_quotient).then_some(dimension)
+    }
+
+    fn units(self) -> &'static [(&'static str, f64)] {
+        match self {
+            Self::Frequency => &FREQUENCIES,
+            Self::Time => &TIMES,
+            Self::Length => &LENGTHS,
+            Self::Angle => &ANGLES,
+        }
+    }
+
+    /// What is accepted, for messages.
+    #[must_use]
+    pub fn expected(self) -> &'static str {
+        match self {
+            Self::Frequency => "a number of Hz, or one with Hz, kHz, MHz or GHz, such as 3MHz",
+            Self::Time => "a number of seconds, or one with us, ms, s, min, h, d or yr, such as 90s or 7d",
+            Self::Length => "a number of metres, or one with m or km, such as 10km",
+            Self::Angle => "a number of degrees, or one with deg, arcmin or arcsec",
+        }
+    }
+
+    /// The value of a text, in the unit that this dimension is kept in; a number alone is in that unit.
+    ///
+    /// # Errors
+    /// Text that is no finite number with one of the units: what is expected.
+    pub fn parse(self, text: &str) -> Result<f64, String> {
+        let text = text.trim();
+        let found = self.units().iter().find_map(|(unit, size)| Some((text.strip_suffix(unit)?, *size)));
+        let (number, size) = found.unwrap_or((text, 1.0));
+        let plain = number.trim();
+        // Words such as `inf` and `nan` are numbers to Rust, and none here.
+        let is_number = plain.starts_with(|c: char| c.is_ascii_digit() || "+-.".contains(c));
+        match plain.replace('_', "").parse::<f64>() {
+            Ok(value) if is_number && (value * size).is_finite() => Ok(value * size),
+            _ => Err(format!("expected {}", self.expected())),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_have_units() {
+        for (dimension, text, expected) in [
+            (Dimension::Frequency, "3MHz", 3e6),
+            (Dimension::Frequency, " 8.5 kHz", 8500.0),
+            (Dimension::Frequency, "30e6", 30e6),
+            (Dimension::Time, "30d", 2_592_000.0),
+            (Dimension::Time, "1.5 h", 5400.0),
+            (Dimension::Time, "-90s", -90.0),
+            (Dimension::Time, "2min", 120.0),
+            (Dimension::Time, "5ms", 5e-3),
+            (Dimension::Length, "10km", 1e4),
+            (Dimension::Length, "1_737_100 m", 1_737_100.0),
+            (Dimension::Angle, "30arcmin", 0.5),
+        ] {
+            assert_eq!(dimension.parse(text), Ok(expected), "{text}");
+        }
+        for (dimension, text) in [
+            (Dimension::Frequency, "3mhz"),
+            (Dimension::Frequency, "3m"),
+            (Dimension::Time, ""),
+            (Dimension::Time, "d"),
+            (Dimension::Time, "infd"),
+            (Dimension::Time, "nan"),
+            (Dimension::Time, "7w"),
+            (Dimension::Length, "1e308km"),
+            (Dimension::Length, "3 feet"),
+        ] {
+            assert!(dimension.parse(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn keys_say_what_they_measure() {
+        for (key, expected) in [
+            ("spacecraft.channels_hz", Some(Dimension::Frequency)),
+            ("spacecraft.window_s_max", Some(Dimension::Time)),
+            ("array.altitude_m", Some(Dimension::Length)),
+            ("map.limits.altitude_m_max", Some(Dimension::Length)),
+            ("array.inclination_deg", Some(Dimension::Angle)),
+            ("daughters.link_bits_per_s_max", None),
+            ("map.nside", None),
+            ("map.prior_k", None),
+        ] {
+            assert_eq!(Dimension::of_key(key), expected, "{key}");
+        }
+    }
+}
