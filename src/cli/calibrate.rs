@@ -88,7 +88,7 @@ fn told(summary: &CalibrateSummary, args: &CalibrateArgs) -> String {
         let sigmas: Vec<String> = sigmas.iter().map(|sigma| format!("{sigma:.2}")).collect();
         lines.push(format!(
             "channel {}: phases known to {} deg (median, by daughter)",
-            channel + 1,
+            channel,
             sigmas.join(", ")
         ));
     }

@@ -109,7 +109,7 @@ fn visibilities_weights_and_dead_receivers_follow_the_truth() {
         "instrument.phase_deg={pass_rms=40.0}",
         "instrument.amplitude={constant_rms=0.2}",
         "instrument.clock_ns={constant=[0.0,30.0,-20.0,5.0]}",
-        "instrument.dead_channels=[[2,2]]",
+        "instrument.dead_channels=[[2,1]]",
     ];
     simulate(&place, "errors.ccsds", &set);
     let found = blocks(&place.path("errors.ccsds"));
@@ -122,7 +122,7 @@ fn visibilities_weights_and_dead_receivers_follow_the_truth() {
         let [_, t_s, daughter, channel, hz, ln, deg, ns, ..] = number[..] else { panic!("{line}") };
         let gain = Complex64::from_polar(ln.exp(), deg.to_radians() - std::f64::consts::TAU * hz * ns * 1e-9);
         let dead = number[11] == 1.0;
-        truth.entry((channel as u16 - 1, daughter as u8 - 1)).or_default().push((t_s, gain, dead));
+        truth.entry((channel as u16, daughter as u8 - 1)).or_default().push((t_s, gain, dead));
     }
     let mut dead_seen = 0;
     for ((key, ideal), (other, found)) in ideal.iter().zip(&found) {

@@ -44,7 +44,7 @@ pub enum InstrumentEvent {
         pass: u64,
         /// Daughter, from 1.
         daughter: u32,
-        /// Channels, from 1, and changes, deg.
+        /// Channels, from 0, and changes, deg.
         channels: Vec<(usize, f64)>,
     },
     /// Amplitudes changed.
@@ -53,14 +53,14 @@ pub enum InstrumentEvent {
         pass: u64,
         /// Daughter, from 1.
         daughter: u32,
-        /// Channels, from 1, and factors.
+        /// Channels, from 0, and factors.
         channels: Vec<(usize, f64)>,
     },
     /// A channel is disturbed.
     Interference {
         /// Pass.
         pass: u64,
-        /// Channel, from 1.
+        /// Channel, from 0.
         channel: usize,
         /// Part of its visibilities that are outliers.
         outliers: f64,
@@ -166,7 +166,7 @@ fn daughters(changes: &[&Change], solution: &PassSolution, events: &mut Vec<Inst
     for change in changes {
         let daughter = change.daughter as u32 + 1;
         let list = |list: &[(usize, f64, f64)], of: fn(f64) -> f64| -> Vec<(usize, f64)> {
-            list.iter().filter(jumped).map(|(channel, change, _)| (channel + 1, of(*change))).collect()
+            list.iter().filter(jumped).map(|(channel, change, _)| (*channel, of(*change))).collect()
         };
         let amplitudes = list(&change.amplitudes, f64::exp);
         if !amplitudes.is_empty() {
@@ -241,7 +241,7 @@ fn disturbances(solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
         let times: Vec<f64> =
             parts.by_channel_and_time[channel].iter().copied().filter(|part| part.is_finite()).collect();
         let outliers = times.iter().sum::<f64>() / times.len() as f64;
-        events.push(InstrumentEvent::Interference { pass, channel: channel + 1, outliers });
+        events.push(InstrumentEvent::Interference { pass, channel, outliers });
     }
     let bins = parts.by_channel_and_time.first().map_or(0, Vec::len);
     let is_hit = |bin: usize| {

@@ -356,7 +356,7 @@ fn gain_and_phase_steps_are_told_with_their_channels() {
     let [InstrumentEvent::GainStep { pass: 2, daughter: 2, ref channels }] = events[..] else {
         panic!("{events:?}")
     };
-    assert!(channels.len() == 1 && channels[0].0 == 2 && (channels[0].1 - 1.5).abs() < 0.15, "{events:?}");
+    assert!(channels.len() == 1 && channels[0].0 == 1 && (channels[0].1 - 1.5).abs() < 0.15, "{events:?}");
     let events = monitored(|pass, truth, _| {
         if pass >= 2 {
             truth.gains[3][1] *= Complex64::cis(2.0);
@@ -365,7 +365,7 @@ fn gain_and_phase_steps_are_told_with_their_channels() {
     let [InstrumentEvent::PhaseStep { pass: 2, daughter: 2, ref channels }] = events[..] else {
         panic!("{events:?}")
     };
-    assert!(channels.len() == 1 && channels[0].0 == 4, "{events:?}");
+    assert!(channels.len() == 1 && channels[0].0 == 3, "{events:?}");
 }
 
 #[test]
@@ -386,7 +386,7 @@ fn interference_and_bursts_are_told_apart() {
         });
     });
     let of_pass =
-        |event: &InstrumentEvent| matches!(event, InstrumentEvent::Interference { pass: 4, channel: 3, .. });
+        |event: &InstrumentEvent| matches!(event, InstrumentEvent::Interference { pass: 4, channel: 2, .. });
     assert!(events.len() == 1 && of_pass(&events[0]), "{events:?}");
     let events = monitored(|pass, _, blocks| {
         blocks(&|block| {

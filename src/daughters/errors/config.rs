@@ -29,7 +29,7 @@ pub struct InstrumentConfig {
     pub radial_m: ErrorTerms,
     /// Daughters that deliver noise and no signal, from 1.
     pub dead_daughters: Vec<u32>,
-    /// Daughter and channel, from 1, of receivers that deliver noise and no signal.
+    /// Daughter, from 1, and channel, from 0, of receivers that deliver noise and no signal.
     pub dead_channels: Vec<[u32; 2]>,
     /// Probability that a visibility is an outlier.
     pub outlier_probability: f64,
@@ -235,8 +235,9 @@ impl InstrumentConfig {
             );
         }
         for (index, &[daughter, channel]) in self.dead_channels.iter().enumerate() {
-            let good = known(daughter, satellites) && known(channel, channels);
-            let expected = format!("a daughter, 1 to {satellites}, and a channel, 1 to {channels}");
+            let good = known(daughter, satellites) && (channel as usize) < channels;
+            let expected =
+                format!("a daughter, 1 to {satellites}, and a channel, 0 to {}", channels.saturating_sub(1));
             checks.require(
                 format!("dead_channels[{index}]"),
                 format!("[{daughter}, {channel}]"),

@@ -82,7 +82,7 @@ impl InstrumentErrors {
         };
         let dead = |n: usize, c: usize| {
             config.dead_daughters.iter().any(|dead| *dead as usize == n + 1)
-                || config.dead_channels.iter().any(|dead| dead.map(|k| k as usize) == [n + 1, c + 1])
+                || config.dead_channels.iter().any(|dead| dead.map(|k| k as usize) == [n + 1, c])
         };
         PassErrors {
             channels: channels.clone(),

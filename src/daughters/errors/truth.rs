@@ -30,7 +30,7 @@ pub fn truth_csv(errors: &InstrumentErrors, windows: &[ObservingWindow]) -> Stri
                         "{},{t_s:.6},{},{},{},{:.9},{:.7},{clock_ns:.7},{along:.6},{across:.6},{radial:.6},{}",
                         window.index,
                         daughter + 1,
-                        channel + 1,
+                        channel,
                         of.frequency_hz,
                         pass.amplitude[daughter][channel].at(t_s),
                         pass.phase_deg[daughter][channel].at(t_s),
