@@ -1,5 +1,6 @@
 """The chain, its ground alone, and their maps."""
 
+import functools
 import os
 import signal
 import subprocess
@@ -150,7 +151,10 @@ lunarray.run(set=settings, out=sys.argv[1], progress=progress)
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_ctrl_c_ends_a_run_in_order(tmp_path):
     command = [sys.executable, "-c", LONG, tmp_path]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    # A shell's background jobs ignore the signal, and what they start does, too, unless told otherwise.
+    heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, preexec_fn=heed) as process:
         assert process.stdout.readline() == "at work\n"
         process.send_signal(signal.SIGINT)
         _, told = process.communicate(timeout=300)
