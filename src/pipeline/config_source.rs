@@ -300,7 +300,7 @@ mod tests {
     #[test]
     fn what_may_follow_from_an_unreadable_value_is_not_told() {
         // As many values as the channels that cannot be read, and a quantiser that the ground would correct.
-        let text = "[spacecraft]\nchannels_hz = [1e6, \"2 MHz\"]\nevery_nth_integration = [1, 1]\nfidelity = \"samples\"\n\
+        let text = "[spacecraft]\nchannels_hz = [1e6, \"two MHz\"]\nevery_nth_integration = [1, 1]\nfidelity = \"samples\"\n\
                     [daughters]\nbits = \"two\"\n[calibration]\nquantiser_bits = 2\n[map]\nepsilon = [1e-4, 1e-4]\n\
                     [array]\nsatellites = \"four\"\n[daughters.disturbances]\ngain_error = [0.1, 0.1, 0.1, 0.1]\n";
         let found = told(text, &[]);
