@@ -6,7 +6,7 @@ use crate::common::workplace::{SMALL, Workplace, fail, files, json, lunarray, su
 
 /// Three channels.
 fn place() -> Workplace {
-    Workplace::new(&SMALL.replace("[3.0e6, 10.0e6]", "[3.0e6, 10.0e6, 20.0e6]"))
+    Workplace::new(&SMALL.replace("[3.0e6, 10.0e6]", "[3.0e6, 5.0e6, 10.0e6]"))
 }
 
 #[test]
