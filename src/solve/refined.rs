@@ -129,7 +129,7 @@ pub fn solve_refined(
     let right = problem.adjoint(&[&weighted, &noise]);
     drop((weighted, noise));
     let [map, noise] = problem.solve(right, data, rule, watch);
-    if map.residuals.is_empty() && map.is_open() {
+    if map.was_left() {
         return Err(SolveError::Interrupted);
     }
     let area_sr = pixel_area_sr(request.nside);
@@ -197,6 +197,12 @@ impl Column {
         !self.is_stuck
             && self.relative() > self.rule.residual_max
             && self.residuals.len() < self.rule.passes_max
+    }
+
+    /// Whether nothing was done about it, although there was something to do.
+    fn was_left(&self) -> bool {
+        // The circle's solution, too, may have been interrupted, so that its energy says nothing.
+        self.residuals.is_empty() && !self.is_stuck && self.residual.iter().any(|r| *r != 0.0)
     }
 
     fn convergence(&self) -> Convergence {

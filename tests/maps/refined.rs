@@ -287,7 +287,6 @@ fn what_has_no_row_or_no_room_is_refused_and_counted() {
     assert_eq!(archive.counts().visibilities, at.len() as u64 - 5);
 }
 
-/// rho_l of two vectors of unknowns.
 /// Before its first pass a map is nothing.
 #[test]
 fn interrupted_before_its_first_pass_there_is_no_map() {
@@ -302,6 +301,7 @@ fn interrupted_before_its_first_pass_there_is_no_map() {
     assert!(matches!(found, Err(SolveError::Interrupted)));
 }
 
+/// rho_l of two vectors of unknowns.
 fn rho(found: &[f64], expected: &[f64], l_max: usize, l: usize) -> f64 {
     let of = |x: &[f64]| lunarray::accumulation::harmonic::coefficients(x, l_max);
     let (a, b) = (of(found), of(expected));
