@@ -90,9 +90,13 @@ fn interrupted_at_any_moment_it_goes_on_to_the_same_bits() {
 fn waiting(place: &Ground, file: &str) -> std::process::Child {
     let args = place.session("state", &[file], &["--follow", "--checkpoint-every", "1000"]);
     let mut child = start(&args.iter().map(String::as_str).collect::<Vec<_>>());
-    wait_until("a checkpoint", || {
+    let state = place.path("state");
+    wait_until("a checkpoint that no other follows", || {
         assert!(child.try_wait().unwrap().is_none());
-        !checkpoints(Path::new(&place.path("state"))).is_empty()
+        let found = checkpoints(Path::new(&state));
+        // A checkpoint takes milliseconds.
+        std::thread::sleep(Duration::from_millis(if found.is_empty() { 0 } else { 1000 }));
+        !found.is_empty() && found == checkpoints(Path::new(&state))
     });
     child
 }
