@@ -26,7 +26,7 @@ use super::vectors::{add, dot, subtract};
 use super::watch::NamedWatch;
 use crate::accumulation::AccumulationError;
 use crate::accumulation::harmonic::{Departures, RefinedSums, coefficients, unknowns_of_gradient};
-use crate::sky::harmonics::synthesis;
+use crate::sky::harmonics::{Alm, synthesis};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::constants::DAY_S;
 
@@ -274,15 +274,12 @@ impl Refining<'_> {
         while columns.iter().any(Column::is_open)
             && task.report(columns[0].residuals.len(), columns[0].relative())
         {
-            let directions: Vec<&[f64]> =
-                columns.iter().filter(|c| c.is_open()).map(|c| c.direction.as_slice()).collect();
-            let seen = self.forward(&directions);
-            let weighted: Vec<Vec<Complex64>> = seen
-                .iter()
-                .map(|seen| seen.iter().zip(&self.sums.data.weight).map(|(v, w)| v * *w).collect())
-                .collect();
-            let products = self.adjoint(&weighted.iter().map(Vec::as_slice).collect::<Vec<_>>());
-            drop(weighted);
+            let open = columns.iter().filter(|column| column.is_open());
+            let directions: Vec<Alm> =
+                open.map(|column| coefficients(&column.direction, self.l_max())).collect();
+            let (seen, products) =
+                self.sums.rows.normal(&self.sums.plan, &directions, &self.sums.data.weight);
+            let products = products.iter().map(unknowns_of_gradient);
             let open = columns.iter_mut().filter(|column| column.is_open());
             for ((column, mut product), seen) in open.zip(products).zip(seen) {
                 product.iter_mut().zip(&column.direction).for_each(|(y, d)| *y += self.regularisation * d);

@@ -260,6 +260,12 @@ fn the_adjoint_is_the_transpose() {
             alm.values().iter().zip(back[0].values()).map(|(x, g)| x.re * g.re + x.im * g.im).sum();
         let size = rms(&seen[0]) * rms(&values) * values.len() as f64;
         assert!((of_data - of_sky).abs() < 1e-12 * size, "{of_data} {of_sky}");
+        // Both at once are the same operations.
+        let weight: Vec<f64> = pairs.iter().map(|_| random.next().abs()).collect();
+        let weighted: Vec<Complex64> = seen[0].iter().zip(&weight).map(|(v, w)| v * *w).collect();
+        let (again, product) = rows.normal(&plan, &[alm], &weight);
+        assert_eq!(again[0], seen[0]);
+        assert_eq!(product[0], rows.adjoint(&plan, &[&weighted])[0]);
     }
 }
 

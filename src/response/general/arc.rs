@@ -15,11 +15,13 @@
 //!
 //! which is followed upwards from `I_0` and `I_1` for |mu| < x, and solved as a boundary-value problem beyond.
 
+use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
 
 use num_complex::Complex64;
 
 use crate::response::harmonic::quadrature::{GaussLegendre, Rules};
+use crate::response::harmonic::trigonometry::sin_cos;
 
 /// Quadrature rules for `I_0` and `I_1`, and buffers for one ring.
 #[derive(Clone, Debug)]
@@ -27,6 +29,50 @@ pub(super) struct ArcSolver {
     rules: Arc<Rules>,
     ratio: Vec<f64>,
     values: Vec<Complex64>,
+}
+
+/// `I_0` and `I_1` by a rule whose number of points is a multiple of the lanes.
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+fn integrate_start(x: f64, [low, high]: [f64; 2], abscissae: &[f64], weights: &[f64]) -> [Complex64; 2] {
+    const LANES: usize = 8;
+    let mut sums = [[0.0; LANES]; 4];
+    let length = high - low;
+    for (t, w) in abscissae.chunks_exact(LANES).zip(weights.chunks_exact(LANES)) {
+        for k in 0..LANES {
+            let (sin, cos) = sin_cos(low + length * t[k]);
+            let (fringe_sin, fringe_cos) = sin_cos(x * sin);
+            // exp(-i x sin psi), and that times exp(-i psi).
+            sums[0][k] += w[k] * fringe_cos;
+            sums[1][k] -= w[k] * fringe_sin;
+            sums[2][k] += w[k] * (fringe_cos * cos - fringe_sin * sin);
+            sums[3][k] -= w[k] * (fringe_sin * cos + fringe_cos * sin);
+        }
+    }
+    let [a, b, c, d] = sums.map(|lanes| length * lanes.iter().sum::<f64>());
+    [Complex64::new(a, b), Complex64::new(c, d)]
+}
+
+/// From here on Hankel's series gives Bessel functions to rounding.
+const BESSEL_X_MIN: f64 = 30.0;
+
+/// `J_0` and `J_1` for x of at least [`BESSEL_X_MIN`] (DLMF 10.17.3): the terms of the series fall to 1e-17 of the first.
+fn bessel(x: f64) -> [f64; 2] {
+    [0.0, 1.0].map(|order: f64| {
+        let (mut p, mut q, mut term) = (0.0, 0.0, 1.0);
+        for k in 0..16 {
+            // i^k: P takes the even terms, Q the odd ones, with alternating signs.
+            let sign = if k % 4 < 2 { 1.0 } else { -1.0 };
+            if k % 2 == 0 {
+                p += sign * term
+            } else {
+                q += sign * term
+            }
+            let odd = (2 * k + 1) as f64;
+            term *= (4.0 * order * order - odd * odd) / (8.0 * (k + 1) as f64 * x);
+        }
+        let (sin, cos) = (x - (0.5 * order + 0.25) * PI).sin_cos();
+        (2.0 / (PI * x)).sqrt() * (p * cos - q * sin)
+    })
 }
 
 /// A phase `x sin(psi)` over much of a ring needs more points than a straight one of the same slope: without them `I_0` errs by
@@ -39,7 +85,7 @@ const FAR_MARGIN: usize = 40;
 impl ArcSolver {
     /// A solver for 0 <= x <= `x_max`.
     pub(super) fn new(x_max: f64) -> Self {
-        let points = GaussLegendre::points_for(MORE_POINTS * std::f64::consts::PI * x_max);
+        let points = GaussLegendre::points_for(MORE_POINTS * PI * x_max);
         Self { rules: Arc::new(Rules::up_to(points)), ratio: Vec::new(), values: Vec::new() }
     }
 
@@ -62,16 +108,19 @@ impl ArcSolver {
 
     /// `I_0` and `I_1` by quadrature.
     fn start(&self, x: f64, [low, high]: [f64; 2]) -> [Complex64; 2] {
-        let points = GaussLegendre::points_for(MORE_POINTS * 0.5 * (high - low) * x);
-        let rule = self.rules.of(points);
-        let mut sums = [Complex64::ZERO; 2];
-        for (t, w) in rule.abscissae.iter().zip(&rule.weights) {
-            let psi = low + (high - low) * t;
-            let fringe = w * Complex64::cis(-x * psi.sin());
-            sums[0] += fringe;
-            sums[1] += fringe * Complex64::cis(-psi);
+        let integrate = |arc: [f64; 2]| {
+            let points = GaussLegendre::points_for(MORE_POINTS * 0.5 * (arc[1] - arc[0]) * x);
+            let rule = self.rules.of(points);
+            integrate_start(x, arc, &rule.abscissae, &rule.weights)
+        };
+        let hidden = [high, low + TAU];
+        if x < BESSEL_X_MIN || hidden[1] - hidden[0] > high - low {
+            return integrate([low, high]);
         }
-        sums.map(|sum| (high - low) * sum)
+        // All of the ring, less what is hidden.
+        let [zero, one] = bessel(x);
+        let rest = if hidden[1] > hidden[0] { integrate(hidden) } else { [Complex64::ZERO; 2] };
+        [TAU * zero - rest[0], -TAU * one - rest[1]]
     }
 
     /// Solves `x K_{n+1} + 2 n K_n + x K_{n-1} = b_high s_high^n - b_low s_low^n` for n = 0 ..= `order_max`, given `K_0` and
@@ -127,8 +176,6 @@ impl ArcSolver {
 
 #[cfg(test)]
 mod tests {
-    use std::f64::consts::PI;
-
     use super::*;
 
     #[test]

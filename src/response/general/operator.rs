@@ -1,6 +1,7 @@
 //! Products with B and its transpose.
 
 use std::f64::consts::TAU;
+use std::ops::Range;
 
 use faer::{Accum, MatMut, MatRef, Par};
 use num_complex::Complex64;
@@ -60,52 +61,83 @@ impl GeneralRows {
     /// Visibilities, K sr, of skies given by coefficients up to `l_max`: `B x`, one vector a sky.
     #[must_use]
     pub fn forward(&self, plan: &RowPlan, skies: &[Alm]) -> Vec<Vec<Complex64>> {
-        let classes = self.classes(plan);
-        let groups: Vec<Vec<Vec<Complex64>>> = plan
-            .groups
-            .par_iter()
-            .map(|group| {
-                let passes = &plan.passes[group.clone()];
-                let amplitudes = self.amplitudes(plan, passes, &classes, skies);
-                skies
-                    .iter()
-                    .enumerate()
-                    .map(|(sky, _)| self.interpolate(plan, passes, &amplitudes, sky))
-                    .collect()
-            })
-            .collect();
-        let mut out = vec![Vec::with_capacity(plan.rows()); skies.len()];
-        for group in groups {
-            for (out, values) in out.iter_mut().zip(group) {
-                out.extend(values);
+        let tables = Tables::new(&self.setup, plan);
+        let values = plan.groups.par_iter().map(|group| {
+            let passes = &plan.passes[group.clone()];
+            let mut amplitudes = self.no_amplitudes(passes, skies.len());
+            let mut solver = tables.solver.clone();
+            for places in Self::batches(plan, passes) {
+                let Some(batch) = self.batch(plan, passes, &tables, &mut solver, places) else { continue };
+                self.amplitudes(&batch, skies, &mut amplitudes);
             }
-        }
-        out
+            self.interpolate(plan, passes, &amplitudes, skies.len())
+        });
+        joined(plan, skies.len(), values.collect())
     }
 
     /// `sum_t Re(conj(dV_t/dx) v_t)` with respect to `Re T_lm` and `Im T_lm`, as real and imaginary part: `Bt v` for each of
     /// several vectors of one value a row.
     #[must_use]
     pub fn adjoint(&self, plan: &RowPlan, values: &[&[Complex64]]) -> Vec<Alm> {
-        let classes = self.classes(plan);
+        let tables = Tables::new(&self.setup, plan);
         let mut out = vec![Alm::zeros(self.setup.l_max); values.len()];
         // The order of sums is that of the groups, whatever the threads.
         for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
-            let parts: Vec<Vec<Alm>> = groups
-                .par_iter()
-                .map(|group| {
-                    let passes = &plan.passes[group.clone()];
-                    let amplitudes = self.spread(plan, passes, values);
-                    self.gradients(plan, passes, &classes, &amplitudes, values.len())
-                })
-                .collect();
-            for part in parts {
-                for (out, part) in out.iter_mut().zip(part) {
-                    out.values_mut().iter_mut().zip(part.values()).for_each(|(sum, x)| *sum += x);
+            let parts = groups.par_iter().map(|group| {
+                let passes = &plan.passes[group.clone()];
+                let rows = rows_of(passes);
+                let values: Vec<&[Complex64]> = values.iter().map(|values| &values[rows.clone()]).collect();
+                let amplitudes = self.spread(plan, passes, &values);
+                let mut gradients = vec![Alm::zeros(self.setup.l_max); values.len()];
+                let mut solver = tables.solver.clone();
+                for places in Self::batches(plan, passes) {
+                    let Some(batch) = self.batch(plan, passes, &tables, &mut solver, places) else {
+                        continue;
+                    };
+                    self.gradients(&batch, &amplitudes, &mut gradients);
                 }
-            }
+                gradients
+            });
+            let parts: Vec<_> = parts.collect();
+            parts.iter().for_each(|part| add_to(&mut out, part));
         }
         out
+    }
+
+    /// `B x` and `Bt W B x` for several x, W being the rows' weights: [`Self::forward`] and [`Self::adjoint`] with each row
+    /// computed once for both.
+    #[must_use]
+    pub fn normal(&self, plan: &RowPlan, skies: &[Alm], weight: &[f64]) -> (Vec<Vec<Complex64>>, Vec<Alm>) {
+        let tables = Tables::new(&self.setup, plan);
+        let mut out = vec![Alm::zeros(self.setup.l_max); skies.len()];
+        let mut seen = Vec::with_capacity(plan.groups.len());
+        for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
+            let parts = groups.par_iter().map(|group| {
+                let passes = &plan.passes[group.clone()];
+                let mut amplitudes = self.no_amplitudes(passes, skies.len());
+                let mut solver = tables.solver.clone();
+                let batches: Vec<Batch> = Self::batches(plan, passes)
+                    .into_iter()
+                    .filter_map(|places| self.batch(plan, passes, &tables, &mut solver, places))
+                    .collect();
+                batches.iter().for_each(|batch| self.amplitudes(batch, skies, &mut amplitudes));
+                let seen = self.interpolate(plan, passes, &amplitudes, skies.len());
+                let weight = &weight[rows_of(passes)];
+                let weighted: Vec<Vec<Complex64>> =
+                    seen.iter().map(|seen| seen.iter().zip(weight).map(|(v, w)| v * *w).collect()).collect();
+                let weighted: Vec<&[Complex64]> = weighted.iter().map(Vec::as_slice).collect();
+                let amplitudes = self.spread(plan, passes, &weighted);
+                let mut gradients = vec![Alm::zeros(self.setup.l_max); skies.len()];
+                batches.iter().for_each(|batch| self.gradients(batch, &amplitudes, &mut gradients));
+                (seen, gradients)
+            });
+            let parts: Vec<_> = parts.collect();
+            for (values, gradients) in parts {
+                add_to(&mut out, &gradients);
+                seen.push(values);
+            }
+        }
+        (joined(plan, skies.len(), seen), out)
     }
 
     /// Orders of an amplitude: mu = -l_max ..= l_max.
@@ -113,112 +145,90 @@ impl GeneralRows {
         2 * self.setup.l_max + 1
     }
 
-    /// The classes that nodes are of, by number.
-    fn classes(&self, plan: &RowPlan) -> Vec<Option<RingClass>> {
-        let mut is_used = vec![false; plan.class_radius_m.len()];
-        plan.nodes.iter().for_each(|node| is_used[node.class as usize] = true);
-        let radii_m = plan.class_radius_m.par_iter().zip(is_used);
-        radii_m
-            .map(|(&radius_m, used)| used.then(|| RingClass::new(&self.setup, radius_m, plan.u_max)))
-            .collect()
+    /// Room for the amplitudes g of the passes' nodes: `[node][sky][order]`.
+    fn no_amplitudes(&self, passes: &[Pass], skies: usize) -> Vec<Complex64> {
+        vec![Complex64::ZERO; nodes_of(passes).len() * skies * self.orders()]
     }
 
     /// Nodes of passes, in batches of one class: places among the passes' nodes.
-    fn batches(plan: &RowPlan, passes: &[Pass]) -> Vec<(u32, Vec<usize>)> {
-        let Some((first, last)) = passes.first().zip(passes.last()) else { return Vec::new() };
-        let nodes = &plan.nodes[first.nodes.start..last.nodes.end];
+    fn batches(plan: &RowPlan, passes: &[Pass]) -> Vec<Vec<usize>> {
+        let nodes = &plan.nodes[nodes_of(passes)];
         let mut order: Vec<usize> = (0..nodes.len()).collect();
         order.sort_by_key(|&k| nodes[k].class);
         order
             .chunk_by(|&a, &b| nodes[a].class == nodes[b].class)
-            .flat_map(|same| same.chunks(BATCH).map(|batch| (nodes[batch[0]].class, batch.to_vec())))
+            .flat_map(|same| same.chunks(BATCH).map(<[usize]>::to_vec))
             .collect()
     }
 
-    /// Amplitudes g of the passes' nodes: `[node][sky][order]`.
-    fn amplitudes(
+    /// The patterns of a batch; `None` if there is nothing in it.
+    fn batch(
         &self,
         plan: &RowPlan,
         passes: &[Pass],
-        classes: &[Option<RingClass>],
-        skies: &[Alm],
-    ) -> Vec<Complex64> {
-        let first = passes.first().map_or(0, |pass| pass.nodes.start);
-        let end = passes.last().map_or(first, |pass| pass.nodes.end);
-        let (orders, l_max) = (self.orders(), self.setup.l_max);
-        let mut out = vec![Complex64::ZERO; (end - first) * skies.len() * orders];
-        let mut solver = ArcSolver::new(TAU * plan.u_max);
-        for (class, batch) in Self::batches(plan, passes) {
-            let Some(class) = &classes[class as usize] else { continue };
-            let nodes: Vec<RowNode> = batch.iter().map(|&k| plan.nodes[first + k]).collect();
-            let patterns = self.patterns(class, &nodes, &mut solver);
-            let turned = self.turned(&nodes, skies);
-            for mu in 0..=l_max {
-                let count = degrees(l_max, mu);
-                for (n, &node) in batch.iter().enumerate() {
-                    let pattern = patterns[mu].node(n);
-                    for sky in 0..skies.len() {
-                        let start = (n * skies.len() + sky) * count;
-                        let [re, im] = turned[mu].each_ref().map(|part| &part[start..start + count]);
-                        let (mut plus, mut minus) = (Complex64::ZERO, Complex64::ZERO);
-                        for k in 0..count {
-                            let t = Complex64::new(re[k], im[k]);
-                            plus += t * Complex64::new(pattern[0][k], pattern[1][k]);
-                            minus += t.conj() * Complex64::new(pattern[2][k], pattern[3][k]);
-                        }
-                        let place = (node * skies.len() + sky) * orders + l_max;
-                        out[place + mu] = plus;
-                        if mu > 0 {
-                            out[place - mu] = minus;
-                        }
-                    }
-                }
-            }
-        }
-        out
+        tables: &Tables,
+        solver: &mut ArcSolver,
+        places: Vec<usize>,
+    ) -> Option<Batch> {
+        let first = nodes_of(passes).start;
+        let nodes: Vec<RowNode> = places.iter().map(|&k| plan.nodes[first + k]).collect();
+        let class = tables.classes[nodes.first()?.class as usize].as_ref()?;
+        let patterns = self.patterns(class, &nodes, solver);
+        Some(Batch { places, nodes, patterns })
     }
 
-    /// The transpose of [`Self::amplitudes`].
-    fn gradients(
-        &self,
-        plan: &RowPlan,
-        passes: &[Pass],
-        classes: &[Option<RingClass>],
-        amplitudes: &[Complex64],
-        skies: usize,
-    ) -> Vec<Alm> {
-        let first = passes.first().map_or(0, |pass| pass.nodes.start);
+    /// Writes the amplitudes of a batch.
+    fn amplitudes(&self, batch: &Batch, skies: &[Alm], out: &mut [Complex64]) {
         let (orders, l_max) = (self.orders(), self.setup.l_max);
-        let mut out = vec![Alm::zeros(l_max); skies];
-        let mut solver = ArcSolver::new(TAU * plan.u_max);
-        for (class, batch) in Self::batches(plan, passes) {
-            let Some(class) = &classes[class as usize] else { continue };
-            let nodes: Vec<RowNode> = batch.iter().map(|&k| plan.nodes[first + k]).collect();
-            let patterns = self.patterns(class, &nodes, &mut solver);
-            let mut turned: Vec<[Vec<f64>; 2]> = Vec::with_capacity(l_max + 1);
-            for mu in 0..=l_max {
-                let count = degrees(l_max, mu);
-                let mut parts = [0, 1].map(|_| vec![0.0; nodes.len() * skies * count]);
-                for (n, &node) in batch.iter().enumerate() {
-                    let pattern = patterns[mu].node(n);
-                    for sky in 0..skies {
-                        let place = (node * skies + sky) * orders + l_max;
-                        let plus = amplitudes[place + mu];
-                        let minus = if mu > 0 { amplitudes[place - mu] } else { Complex64::ZERO };
-                        let start = (n * skies + sky) * count;
-                        for k in 0..count {
-                            let t = Complex64::new(pattern[0][k], -pattern[1][k]) * plus
-                                + Complex64::new(pattern[2][k], pattern[3][k]) * minus.conj();
-                            parts[0][start + k] = t.re;
-                            parts[1][start + k] = t.im;
-                        }
+        let turned = self.turned(&batch.nodes, skies);
+        for mu in 0..=l_max {
+            let count = degrees(l_max, mu);
+            for (n, &node) in batch.places.iter().enumerate() {
+                let pattern = batch.patterns[mu].node(n);
+                for sky in 0..skies.len() {
+                    let start = (n * skies.len() + sky) * count;
+                    let [re, im] = turned[mu].each_ref().map(|part| &part[start..start + count]);
+                    let (mut plus, mut minus) = (Complex64::ZERO, Complex64::ZERO);
+                    for k in 0..count {
+                        let t = Complex64::new(re[k], im[k]);
+                        plus += t * Complex64::new(pattern[0][k], pattern[1][k]);
+                        minus += t.conj() * Complex64::new(pattern[2][k], pattern[3][k]);
+                    }
+                    let place = (node * skies.len() + sky) * orders + l_max;
+                    out[place + mu] = plus;
+                    if mu > 0 {
+                        out[place - mu] = minus;
                     }
                 }
-                turned.push(parts);
             }
-            self.turn_back(&nodes, &turned, &mut out);
         }
-        out
+    }
+
+    /// The transpose of [`Self::amplitudes`], added to `out`.
+    fn gradients(&self, batch: &Batch, amplitudes: &[Complex64], out: &mut [Alm]) {
+        let (orders, l_max, skies) = (self.orders(), self.setup.l_max, out.len());
+        let mut turned: Vec<[Vec<f64>; 2]> = Vec::with_capacity(l_max + 1);
+        for mu in 0..=l_max {
+            let count = degrees(l_max, mu);
+            let mut parts = [0, 1].map(|_| vec![0.0; batch.nodes.len() * skies * count]);
+            for (n, &node) in batch.places.iter().enumerate() {
+                let pattern = batch.patterns[mu].node(n);
+                for sky in 0..skies {
+                    let place = (node * skies + sky) * orders + l_max;
+                    let plus = amplitudes[place + mu];
+                    let minus = if mu > 0 { amplitudes[place - mu] } else { Complex64::ZERO };
+                    let start = (n * skies + sky) * count;
+                    for k in 0..count {
+                        let t = Complex64::new(pattern[0][k], -pattern[1][k]) * plus
+                            + Complex64::new(pattern[2][k], pattern[3][k]) * minus.conj();
+                        parts[0][start + k] = t.re;
+                        parts[1][start + k] = t.im;
+                    }
+                }
+            }
+            turned.push(parts);
+        }
+        self.turn_back(&batch.nodes, &turned, out);
     }
 
     /// Skies in the frames of nodes, by mu: real and imaginary parts of `t_{l mu}`, `[node][sky][l = mu, mu + 2, ..]`.
@@ -306,37 +316,33 @@ impl GeneralRows {
     /// Patterns of nodes of one class, by mu.
     fn patterns(&self, class: &RingClass, nodes: &[RowNode], solver: &mut ArcSolver) -> Vec<NodePatterns> {
         let l_max = self.setup.l_max;
-        let rings = class.rings.len();
         let values = 4 * nodes.len();
-        // By mu: for each node real and imaginary part of I_mu, then of I_{-mu}, over the rings.
-        let mut arcs: Vec<Vec<f64>> = (0..=l_max).map(|mu| vec![0.0; values * class.reached(mu)]).collect();
-        let mut orders = vec![Complex64::ZERO; self.orders()];
-        for (k, ring) in class.rings.iter().enumerate().take(rings) {
-            let reach = ring.orders(l_max);
-            let orders = &mut orders[..2 * reach + 1];
-            for (n, node) in nodes.iter().enumerate() {
+        // By mu, over the rings: for each node real and imaginary part of I_mu, then of I_{-mu}.
+        let mut arcs: Vec<Vec<f64>> =
+            class.reached.iter().map(|reached| vec![0.0; values * reached]).collect();
+        let mut orders = vec![Complex64::ZERO; self.orders() * nodes.len()];
+        for (k, (ring, &reach)) in class.rings.iter().zip(&class.reach).enumerate() {
+            let stride = 2 * reach + 1;
+            for (node, orders) in nodes.iter().zip(orders.chunks_exact_mut(stride)) {
                 let u = node.view.baseline_m / self.setup.wavelength_m;
                 solver.solve(TAU * u * ring.sin_theta, node.view.arc(ring.sin_theta), orders);
-                for mu in 0..=reach {
-                    let reached = class.reached(mu);
-                    if k >= reached {
-                        continue;
-                    }
+            }
+            for (mu, arcs) in arcs.iter_mut().enumerate().take(reach + 1) {
+                let values = arcs[values * k..values * (k + 1)].chunks_exact_mut(4);
+                for (four, orders) in values.zip(orders.chunks_exact(stride)) {
                     let [plus, minus] = [orders[reach + mu], orders[reach - mu]];
-                    for (part, value) in [plus.re, plus.im, minus.re, minus.im].into_iter().enumerate() {
-                        arcs[mu][(4 * n + part) * reached + k] = value;
-                    }
+                    four.copy_from_slice(&[plus.re, plus.im, minus.re, minus.im]);
                 }
             }
         }
         let product = |(mu, arcs): (usize, Vec<f64>)| {
-            let (count, reached) = (degrees(l_max, mu), class.reached(mu));
+            let (count, reached) = (degrees(l_max, mu), class.reached[mu]);
             let mut coefficients = vec![0.0; values * count];
             faer::linalg::matmul::matmul(
                 MatMut::from_column_major_slice_mut(&mut coefficients, count, values),
                 Accum::Replace,
                 MatRef::from_row_major_slice(&class.legendre[mu], count, reached),
-                MatRef::from_column_major_slice(&arcs, reached, values),
+                MatRef::from_row_major_slice(&arcs, reached, values),
                 1.0,
                 Par::Seq,
             );
@@ -345,35 +351,37 @@ impl GeneralRows {
         arcs.into_iter().enumerate().map(product).collect()
     }
 
-    /// Values at all rows of passes.
+    /// Values at all rows of passes, one vector a sky.
     fn interpolate(
         &self,
         plan: &RowPlan,
         passes: &[Pass],
         amplitudes: &[Complex64],
-        sky: usize,
-    ) -> Vec<Complex64> {
-        let first = passes.first().map_or(0, |pass| pass.nodes.start);
-        let end = passes.last().map_or(first, |pass| pass.nodes.end);
+        skies: usize,
+    ) -> Vec<Vec<Complex64>> {
+        let first = nodes_of(passes).start;
         let orders = self.orders();
-        let stride = amplitudes.len() / (end - first).max(1);
-        let node = |k: usize| &amplitudes[(k - first) * stride + sky * orders..][..orders];
-        let mut out = Vec::new();
+        let mut out = vec![Vec::with_capacity(rows_of(passes).len()); skies];
         let (mut shares, mut sums) = (Vec::new(), vec![Complex64::ZERO; orders]);
         for pass in passes {
             for (row, own) in
                 pass.rows.clone().zip(pass.nodes.clone().chain(std::iter::repeat(pass.nodes.start)))
             {
-                if pass.tau.is_empty() {
-                    out.push(self.at_phase(node(own), plan.gamma_rad[row]));
-                    continue;
+                if !pass.tau.is_empty() {
+                    plan.shares(pass, row, &mut shares);
                 }
-                plan.shares(pass, row, &mut shares);
-                sums.fill(Complex64::ZERO);
-                for (k, share) in pass.nodes.clone().zip(&shares) {
-                    sums.iter_mut().zip(node(k)).for_each(|(sum, g)| *sum += share * g);
+                for (sky, out) in out.iter_mut().enumerate() {
+                    let node = |k: usize| &amplitudes[((k - first) * skies + sky) * orders..][..orders];
+                    if pass.tau.is_empty() {
+                        out.push(self.at_phase(node(own), plan.gamma_rad[row]));
+                        continue;
+                    }
+                    sums.fill(Complex64::ZERO);
+                    for (k, share) in pass.nodes.clone().zip(&shares) {
+                        sums.iter_mut().zip(node(k)).for_each(|(sum, g)| *sum += share * g);
+                    }
+                    out.push(self.at_phase(&sums, plan.gamma_rad[row]));
                 }
-                out.push(self.at_phase(&sums, plan.gamma_rad[row]));
             }
         }
         out
@@ -387,12 +395,11 @@ impl GeneralRows {
         sum * Complex64::cis(self.setup.l_max as f64 * gamma_rad)
     }
 
-    /// The transpose of [`Self::interpolate`], for several vectors: `[node][sky][order]`.
+    /// The transpose of [`Self::interpolate`], for several vectors over the rows of the passes: `[node][sky][order]`.
     fn spread(&self, plan: &RowPlan, passes: &[Pass], values: &[&[Complex64]]) -> Vec<Complex64> {
-        let first = passes.first().map_or(0, |pass| pass.nodes.start);
-        let end = passes.last().map_or(first, |pass| pass.nodes.end);
+        let (first, first_row) = (nodes_of(passes).start, rows_of(passes).start);
         let (orders, skies) = (self.orders(), values.len());
-        let mut out = vec![Complex64::ZERO; (end - first) * skies * orders];
+        let mut out = self.no_amplitudes(passes, skies);
         let mut shares = Vec::new();
         for pass in passes {
             for (row, own) in
@@ -410,7 +417,7 @@ impl GeneralRows {
                 for (sky, values) in values.iter().enumerate() {
                     for (k, share) in nodes.clone().zip(&shares) {
                         let place = ((k - first) * skies + sky) * orders;
-                        let mut term = *share * values[row] * lowest;
+                        let mut term = *share * values[row - first_row] * lowest;
                         for g in &mut out[place..place + orders] {
                             *g += term;
                             term *= turn;
@@ -421,6 +428,61 @@ impl GeneralRows {
         }
         out
     }
+}
+
+/// Nodes of consecutive passes.
+fn nodes_of(passes: &[Pass]) -> Range<usize> {
+    passes.first().map_or(0, |pass| pass.nodes.start)..passes.last().map_or(0, |pass| pass.nodes.end)
+}
+
+/// Rows of consecutive passes.
+fn rows_of(passes: &[Pass]) -> Range<usize> {
+    passes.first().map_or(0, |pass| pass.rows.start)..passes.last().map_or(0, |pass| pass.rows.end)
+}
+
+/// Values of groups one after the other, by sky.
+fn joined(plan: &RowPlan, skies: usize, groups: Vec<Vec<Vec<Complex64>>>) -> Vec<Vec<Complex64>> {
+    let mut out = vec![Vec::with_capacity(plan.rows()); skies];
+    for group in groups {
+        for (out, values) in out.iter_mut().zip(group) {
+            out.extend(values);
+        }
+    }
+    out
+}
+
+fn add_to(sums: &mut [Alm], part: &[Alm]) {
+    for (sum, part) in sums.iter_mut().zip(part) {
+        sum.values_mut().iter_mut().zip(part.values()).for_each(|(sum, x)| *sum += x);
+    }
+}
+
+/// What the rows of a plan share.
+struct Tables {
+    /// The classes that nodes are of, by number.
+    classes: Vec<Option<RingClass>>,
+    solver: ArcSolver,
+}
+
+impl Tables {
+    fn new(setup: &RowsSetup, plan: &RowPlan) -> Self {
+        let mut is_used = vec![false; plan.class_radius_m.len()];
+        plan.nodes.iter().for_each(|node| is_used[node.class as usize] = true);
+        let radii_m = plan.class_radius_m.par_iter().zip(is_used);
+        let classes = radii_m
+            .map(|(&radius_m, used)| used.then(|| RingClass::new(setup, radius_m, plan.u_max)))
+            .collect();
+        Self { classes, solver: ArcSolver::new(TAU * plan.u_max) }
+    }
+}
+
+/// Nodes of one class, and their patterns.
+struct Batch {
+    /// Places among the nodes of the group's passes.
+    places: Vec<usize>,
+    nodes: Vec<RowNode>,
+    /// By mu.
+    patterns: Vec<NodePatterns>,
 }
 
 /// Columns of a batch: node and sky.
@@ -476,7 +538,8 @@ pub fn row_tables_bytes(l_max: usize, u_max: f64, threads: usize) -> u64 {
     let coefficients = 0.25 * ((l_max + 2) as f64).powi(2);
     let turns = ((l_max + 2) as f64).powi(3) / 3.0;
     let gradients = (2 * GROUPS_AT_ONCE) as f64 * 16.0 * 2.0 * coefficients;
-    let group = 1.5 * (2 * GROUP_NODES) as f64 * 16.0 * (2 * l_max + 1) as f64;
+    // Amplitudes of two skies before and after the weights, and the patterns.
+    let group = 1.5 * GROUP_NODES as f64 * (4.0 * 16.0 * (2 * l_max + 1) as f64 + 32.0 * coefficients);
     let batch = BATCH as f64 * (4.0 * 8.0 * (rings * l_max as f64 + coefficients) + 64.0 * coefficients);
     let classes = classes_max(l_max, u_max) * class_bytes(l_max, u_max);
     (classes + 8.0 * turns + gradients + threads as f64 * (group + batch)) as u64
@@ -485,9 +548,12 @@ pub fn row_tables_bytes(l_max: usize, u_max: f64, threads: usize) -> u64 {
 /// Quadrature points of one class of altitude, and the Legendre functions there.
 struct RingClass {
     rings: Vec<RingPoint>,
+    /// By ring: the greatest order that is not negligible there.
+    reach: Vec<usize>,
+    /// By mu: on how many rings, from the first, it is not negligible.
+    reached: Vec<usize>,
     /// By mu: for l = mu, mu + 2, .. a row over the rings that it reaches, with their weights.
     legendre: Vec<Vec<f64>>,
-    l_max: usize,
 }
 
 impl RingClass {
@@ -501,16 +567,13 @@ impl RingClass {
         let l_max = setup.l_max;
         let (rings, weights) = ring_points(geometry, l_max, u_max, 1);
         let functions = Legendre::new(l_max, rings.iter().map(|ring| (ring.z, ring.sin_theta)));
-        let mut class = Self { rings, legendre: Vec::new(), l_max };
-        class.legendre = (0..=l_max)
+        let reach: Vec<usize> = rings.iter().map(|ring| ring.orders(l_max)).collect();
+        let reached: Vec<usize> =
+            (0..=l_max).map(|mu| reach.partition_point(|orders| *orders >= mu)).collect();
+        let legendre = (0..=l_max)
             .into_par_iter()
-            .map(|mu| functions.even_rows::<f64>(mu, &weights[..class.reached(mu)]))
+            .map(|mu| functions.even_rows::<f64>(mu, &weights[..reached[mu]]))
             .collect();
-        class
-    }
-
-    /// Rings on which orders up to `mu` are not negligible.
-    fn reached(&self, mu: usize) -> usize {
-        self.rings.partition_point(|ring| ring.orders(self.l_max) >= mu)
+        Self { rings, reach, reached, legendre }
     }
 }

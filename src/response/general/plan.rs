@@ -34,8 +34,8 @@ const CLASSES: [f64; 2] = [24.0, 400.0];
 const CLASSES_BYTES: f64 = 3e8;
 const CLASS_M_MIN: f64 = 100.0;
 
-/// Rows that a task computes together.
-pub(super) const GROUP_NODES: usize = 384;
+/// Rows that a task computes together, and whose patterns a product with `Bt W B` holds: 0.3 MB each at l = 191.
+pub(super) const GROUP_NODES: usize = 256;
 
 /// One row that is computed.
 #[derive(Clone, Copy, Debug)]
@@ -218,7 +218,10 @@ impl PassBuilder<'_> {
         self.interpolated(rows, needed, plan);
     }
 
-    /// Nodes that interpolate `exp(i h tau)` to far below 1e-5, h being what the pattern's phases move by.
+    /// Nodes that interpolate `exp(i h tau)` to far below 1e-4, h being what the pattern's phases move by.
+    ///
+    /// Where the limb moves by an angle, the phase of a harmonic moves by up to l times that, and that of the fringe by the
+    /// slope along the limb's normal: the baseline lies in the horizontal, the normal as much above it as the limb is below.
     fn nodes_needed(&self, rows: &Range<usize>) -> usize {
         let views = &self.views[rows.clone()];
         let middle = views[views.len() / 2].axes[2];
@@ -230,13 +233,15 @@ impl PassBuilder<'_> {
             0.5 * (high - low)
         };
         let tilt = views.iter().map(|view| norm(sub(view.axes[2], middle))).fold(0.0, f64::max);
-        let limb = half_range(&PairView::limb_rad);
-        let pitch = half_range(&|view| 0.5 * (view.angle_rad[0] + view.angle_rad[1]));
-        let length = half_range(&|view| view.baseline_m / self.setup.wavelength_m);
-        let u = views.iter().map(|view| view.baseline_m / self.setup.wavelength_m).fold(0.0, f64::max);
+        let pitch = |view: &PairView| 0.5 * (view.angle_rad[0] + view.angle_rad[1]);
+        // Pitch lowers the limb ahead and raises it behind; in between it does less.
+        let limb = half_range(&|view| view.limb_rad() + pitch(view))
+            .max(half_range(&|view| view.limb_rad() - pitch(view)));
+        let wavelengths = |view: &PairView| view.baseline_m / self.setup.wavelength_m;
+        let slope = views.iter().map(|view| wavelengths(view) * view.limb_rad().sin()).fold(0.0, f64::max);
         let l_max = self.setup.l_max as f64;
-        let h = l_max * tilt + (l_max + TAU * u) * (limb + pitch) + TAU * length;
-        (h + 4.0 * h.cbrt() + 6.0).ceil() as usize
+        let h = l_max * tilt + (l_max + TAU * slope) * limb + TAU * half_range(&wavelengths);
+        (h + 3.0 * h.cbrt() + 5.0).ceil() as usize
     }
 
     /// The axes of P at a row, and the angle to the pair's own.

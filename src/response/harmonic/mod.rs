@@ -31,7 +31,7 @@ mod ring;
 pub(crate) mod rotation;
 mod runs;
 pub(crate) mod sizes;
-mod trigonometry;
+pub(crate) mod trigonometry;
 
 pub use error::HarmonicError;
 pub use geometry::{GeometryLimits, GeometryRefusal, NominalOrbit, NominalPair, PairOrientation};
