@@ -27,7 +27,7 @@ pub enum NodeMotion {
 pub struct ArrayConfig {
     /// Number of daughters on the circle.
     pub satellites: usize,
-    /// Altitude of the circular orbit, m.
+    /// Altitude of the circular orbit, or of the semi-major axis, m.
     pub altitude_m: f64,
     /// Radius of the Moon, m.
     pub moon_radius_m: f64,
@@ -43,6 +43,15 @@ pub struct ArrayConfig {
     pub orbital_phase_deg: f64,
     /// Longitude of the ascending node at the epoch, degrees.
     pub node_longitude_deg: f64,
+    /// Eccentricity of the formation's orbit; 0 for the circle.
+    pub eccentricity: f64,
+    /// Argument of the periapsis at the epoch, degrees.
+    pub periapsis_deg: f64,
+    /// Motion of the argument of the periapsis, degrees a day.
+    pub periapsis_rate_deg_per_day: f64,
+    /// Greatest distance of each daughter from daughter 1 across the track, in units of that along it: their planes are
+    /// inclined to each other by that much.
+    pub cross_track_ratio: f64,
     /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch, degrees.
     pub earth_longitude_deg: f64,
     /// Arcs by which daughter 2 and those after it trail daughter 1 at their greatest, m, in ascending order; empty for
@@ -70,6 +79,10 @@ impl Default for ArrayConfig {
             node_motion: NodeMotion::Regress,
             orbital_phase_deg: 0.0,
             node_longitude_deg: 0.0,
+            eccentricity: 0.0,
+            periapsis_deg: 0.0,
+            periapsis_rate_deg_per_day: 0.0,
+            cross_track_ratio: 0.0,
             earth_longitude_deg: 0.0,
             arcs_m: Vec::new(),
             kepler: Vec::new(),
@@ -183,10 +196,16 @@ pub enum ArrayError {
 }
 
 impl ArrayConfig {
-    /// Whether satellites have orbits of their own, in place of a circle.
+    /// Whether satellites have orbits of their own, in place of a formation on one.
     #[must_use]
     pub fn has_own_orbits(&self) -> bool {
         !self.kepler.is_empty() || !self.oem.is_empty()
+    }
+
+    /// Whether all satellites follow each other on one circle.
+    #[must_use]
+    pub fn is_circle(&self) -> bool {
+        !self.has_own_orbits() && self.eccentricity == 0.0 && self.cross_track_ratio == 0.0
     }
 
     /// Epoch of the mission in the seconds of OEM files, if it is given.
@@ -224,6 +243,19 @@ impl ArrayConfig {
         checks.number("orbital_period_s", period, period >= 1e3, "at least 1000 s");
         let inclination = self.inclination_deg;
         checks.number("inclination_deg", inclination, (0.0..=180.0).contains(&inclination), "0 to 180");
+        let eccentricity = self.eccentricity;
+        checks.number("eccentricity", eccentricity, (0.0..1.0).contains(&eccentricity), "0 to less than 1");
+        let least_m = (self.moon_radius_m + self.altitude_m) * (1.0 - eccentricity);
+        let above = !(0.0..1.0).contains(&eccentricity) || least_m > self.moon_radius_m;
+        let expected = format!("a periapsis above the surface, not {:.0} m", least_m - self.moon_radius_m);
+        checks.number("eccentricity", eccentricity, above, expected);
+        let (rate, ratio) = (self.periapsis_rate_deg_per_day, self.cross_track_ratio);
+        checks.number("periapsis_rate_deg_per_day", rate, rate.abs() <= 10.0, "-10 to 10 degrees a day");
+        checks.number("cross_track_ratio", ratio, ratio.abs() <= 1.0, "-1 to 1");
+        let shaped = eccentricity != 0.0 || ratio != 0.0;
+        let shape = format_args!("{eccentricity}, array.cross_track_ratio = {ratio}");
+        let one = !(shaped && self.has_own_orbits());
+        checks.require("eccentricity", shape, one, "0 and 0 where array.kepler or array.oem is given");
         let arcs = self.arcs_m.len();
         let expected = "an arc for each daughter but the first, or none";
         let fits = arcs == 0 || arcs + 1 == self.satellites;
@@ -261,6 +293,7 @@ impl ArrayConfig {
         for (key, value) in [
             ("orbital_phase_deg", self.orbital_phase_deg),
             ("node_longitude_deg", self.node_longitude_deg),
+            ("periapsis_deg", self.periapsis_deg),
             ("earth_longitude_deg", self.earth_longitude_deg),
         ] {
             checks.number(key, value, true, FINITE);

@@ -147,7 +147,7 @@ impl KeplerOrbit {
 }
 
 /// E of `E - e sin E = M`, by Newton's method.
-fn eccentric_anomaly(mean_rad: f64, eccentricity: f64) -> f64 {
+pub(super) fn eccentric_anomaly(mean_rad: f64, eccentricity: f64) -> f64 {
     // From -pi to pi, where the start converges for every ellipse.
     let mean = mean_rad - TAU * (mean_rad / TAU).round();
     let mut anomaly = if eccentricity > 0.8 { std::f64::consts::PI.copysign(mean) } else { mean };
@@ -283,6 +283,82 @@ mod tests {
         assert!(found.len() > 10 && found.len() == expected.len());
         // Both search to a tick.
         assert!(found.iter().zip(&expected).all(|(found, expected)| (found - expected).abs() < 3e-6));
+    }
+
+    #[test]
+    fn a_formation_follows_the_ellipses_of_its_elements() {
+        let axis_m = 2_037_100.0;
+        let still = ArrayConfig {
+            satellites: 3,
+            arcs_m: vec![5e3, 9e3],
+            breathing: crate::array::BreathingConfig {
+                first_ratio: 1.0,
+                ratio: 1.0,
+                ..crate::array::BreathingConfig::default()
+            },
+            orbital_period_s: TAU / (MOON_GM_M3_S2 / f64::powi(axis_m, 3)).sqrt(),
+            orbital_phase_deg: 50.0,
+            node_longitude_deg: 20.0,
+            eccentricity: 0.1,
+            periapsis_deg: 30.0,
+            periapsis_rate_deg_per_day: 1.25,
+            cross_track_ratio: 0.02,
+            ..ArrayConfig::default()
+        };
+        let array = Array::new(&still).unwrap();
+        assert!(array.formation().is_none() && !still.is_circle());
+        let elements = |arc_m: f64| KeplerElements {
+            semi_major_axis_m: axis_m,
+            eccentricity: 0.1,
+            inclination_deg: 30.0 + (0.02 * arc_m / axis_m).to_degrees(),
+            node_longitude_deg: 20.0,
+            periapsis_deg: 30.0,
+            mean_anomaly_deg: 20.0 - (arc_m / axis_m).to_degrees(),
+            node_rate_deg_per_day: -360.0 / (1.3 * 365.25),
+            periapsis_rate_deg_per_day: 1.25,
+        };
+        for (n, arc_m) in [0.0, 5e3, 9e3].into_iter().enumerate() {
+            // The mean anomaly is counted from the periapsis, which moves; an orbit's own elements do not follow it.
+            let drift = 1.25_f64.to_radians() / DAY_S;
+            for t_s in [0.0, 1e3, 1e5] {
+                let mut own = elements(arc_m);
+                own.mean_anomaly_deg -= (drift * t_s).to_degrees();
+                let expected = KeplerOrbit::new(&own).state(t_s);
+                let found = array.state(n, t_s);
+                assert!(norm(sub(found.position_m, expected.position_m)) < 1e-5, "{n} {t_s}");
+                assert!(dot(array.normal_hat(n, t_s), unit(found.position_m)).abs() < 1e-12);
+            }
+        }
+        // While it breathes, too, the velocity is the rate of the position.
+        let breathing = ArrayConfig { arcs_m: Vec::new(), breathing: Default::default(), ..still };
+        let array = Array::new(&breathing).unwrap();
+        for n in 0..3 {
+            let [before, at, after] = [-1.0, 0.0, 1.0].map(|s| array.state(n, 3e5 + s));
+            let rate = scale(0.5, sub(after.position_m, before.position_m));
+            // As above: h^2 / 6 of the third derivative.
+            assert!(norm(sub(rate, at.velocity_m_s)) < 1e-3, "{n}");
+        }
+    }
+
+    #[test]
+    fn impossible_shapes_of_a_formation_are_refused_by_name() {
+        let refused = |change: fn(&mut ArrayConfig), expected: &str| {
+            let mut config = ArrayConfig::default();
+            change(&mut config);
+            let told = Array::new(&config).unwrap_err().to_string();
+            assert!(told.contains(expected), "{told}");
+        };
+        refused(|c| c.eccentricity = 1.0, "array.eccentricity = 1: expected 0 to less than 1");
+        refused(|c| c.eccentricity = f64::NAN, "array.eccentricity = NaN");
+        refused(|c| c.eccentricity = 0.2, "array.eccentricity = 0.2: expected a periapsis above the surface");
+        refused(|c| c.cross_track_ratio = 2.0, "array.cross_track_ratio = 2");
+        refused(
+            |c| {
+                c.eccentricity = 0.01;
+                c.kepler = vec![ELEMENTS; 8];
+            },
+            "0 and 0 where array.kepler",
+        );
     }
 
     fn config(kepler: Vec<KeplerElements>) -> ArrayConfig {

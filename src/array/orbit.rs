@@ -4,10 +4,10 @@ use std::f64::consts::TAU;
 
 use super::config::{ArrayConfig, ArrayError, NodeMotion};
 use super::formation::Formation;
-use super::kepler::KeplerOrbit;
+use super::kepler::{KeplerOrbit, eccentric_anomaly};
 use super::oem::{self, TableOrbit};
 use super::state::SatelliteState;
-use crate::units::constants::SIDEREAL_MONTH_S;
+use crate::units::constants::{DAY_S, SIDEREAL_MONTH_S};
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
 
 /// Nearest that two satellites may be at the epoch, m.
@@ -64,12 +64,38 @@ impl OwnOrbit {
     }
 }
 
+/// A formation on an ellipse, in planes that are inclined to each other.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Shape {
+    eccentricity: f64,
+    /// Argument of the periapsis at the epoch, rad, and its rate, rad/s.
+    periapsis: [f64; 2],
+    /// Distance across the track at its greatest, in units of that along it.
+    cross_track_ratio: f64,
+}
+
+impl Shape {
+    fn new(config: &ArrayConfig) -> Option<Self> {
+        let shape = Self {
+            eccentricity: config.eccentricity,
+            periapsis: [
+                config.periapsis_deg.to_radians(),
+                config.periapsis_rate_deg_per_day.to_radians() / DAY_S,
+            ],
+            cross_track_ratio: config.cross_track_ratio,
+        };
+        (!config.is_circle()).then_some(shape)
+    }
+}
+
 /// The array in motion: positions at any time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Array {
-    /// The formation on a circle, if there is one.
+    /// The formation on one orbit, if there is one.
     formation: Option<Formation>,
-    /// Orbits of their own; none for a formation on a circle.
+    /// What makes it more than a circle.
+    shape: Option<Shape>,
+    /// Orbits of their own; none for a formation.
     own: Vec<OwnOrbit>,
     orbit_radius_m: f64,
     moon_radius_m: f64,
@@ -98,6 +124,7 @@ impl Array {
             kepler.into_iter().map(OwnOrbit::Kepler).chain(tables.into_iter().map(OwnOrbit::Table)).collect();
         Ok(Self {
             formation: if own.is_empty() { Some(Formation::new(config)?) } else { None },
+            shape: Shape::new(config),
             own,
             orbit_radius_m: config.moon_radius_m + config.altitude_m,
             moon_radius_m: config.moon_radius_m,
@@ -151,7 +178,8 @@ impl Array {
     #[must_use]
     pub fn farthest_m(&self) -> f64 {
         let farthest_m = self.own.iter().map(OwnOrbit::farthest_m).fold(0.0, f64::max);
-        if self.own.is_empty() { self.orbit_radius_m } else { farthest_m }
+        let eccentricity = self.shape.map_or(0.0, |shape| shape.eccentricity);
+        if self.own.is_empty() { self.orbit_radius_m * (1.0 + eccentricity) } else { farthest_m }
     }
 
     /// Orbital period, or that of satellite 1, s.
@@ -163,6 +191,11 @@ impl Array {
     /// The daughters' arcs, if they follow each other on a circle.
     #[must_use]
     pub fn formation(&self) -> Option<&Formation> {
+        self.formation.as_ref().filter(|_| self.shape.is_none())
+    }
+
+    /// The formation whose breathing changes the speeds, on a circle or not.
+    pub(super) fn breathing(&self) -> Option<&Formation> {
         self.formation.as_ref()
     }
 
@@ -173,6 +206,9 @@ impl Array {
     #[must_use]
     pub fn state(&self, n: usize, t_s: f64) -> SatelliteState {
         let Some(formation) = &self.formation else { return self.own[n].state(t_s) };
+        if let Some(shape) = &self.shape {
+            return self.shaped_state(shape, formation.arc_m(n, t_s), t_s);
+        }
         let radius = self.orbit_radius_m;
         let (arc_m, arc_rate_m_s) = formation.arc_m(n, t_s);
         // As in the paper; after 1.3 years the last bit of the phase is worth 7 um along the track.
@@ -200,6 +236,38 @@ impl Array {
         }
     }
 
+    /// State of a daughter on an ellipse: it trails daughter 1 by `arc / a` of mean anomaly, in a plane whose inclination
+    /// differs by `cross_track_ratio` of that.
+    fn shaped_state(&self, shape: &Shape, (arc_m, arc_rate_m_s): (f64, f64), t_s: f64) -> SatelliteState {
+        let (axis_m, e) = (self.orbit_radius_m, shape.eccentricity);
+        let [periapsis, periapsis_rate] = [shape.periapsis[0] + shape.periapsis[1] * t_s, shape.periapsis[1]];
+        let mean = self.phase_rad + TAU * t_s / self.orbital_period_s - arc_m / axis_m - periapsis;
+        let mean_rate = TAU / self.orbital_period_s - arc_rate_m_s / axis_m - periapsis_rate;
+        let anomaly = eccentric_anomaly(mean, e);
+        let (sin, cos) = anomaly.sin_cos();
+        let anomaly_rate = mean_rate / (1.0 - e * cos);
+        let beside_m = axis_m * (1.0 - e * e).sqrt();
+        let plane_m = [axis_m * (cos - e), beside_m * sin];
+        let plane_m_s = [-axis_m * anomaly_rate * sin, beside_m * anomaly_rate * cos];
+        let (sin_w, cos_w) = periapsis.sin_cos();
+        let (sin_o, cos_o) = (self.node_rad + self.node_rate_rad_s * t_s).sin_cos();
+        let (sin_i, cos_i) = (self.inclination_rad + shape.cross_track_ratio * arc_m / axis_m).sin_cos();
+        let inclination_rate = shape.cross_track_ratio * arc_rate_m_s / axis_m;
+        let node_hat = [cos_o, sin_o, 0.0];
+        let across_hat = [-sin_o * cos_i, cos_o * cos_i, sin_i];
+        let normal_hat = [sin_i * sin_o, -sin_i * cos_o, cos_i];
+        let in_space = |[x, y]: [f64; 2]| {
+            add(scale(x * cos_w - y * sin_w, node_hat), scale(x * sin_w + y * cos_w, across_hat))
+        };
+        let position_m = in_space(plane_m);
+        // The line of apsides turns about the orbit's normal, the plane about its node, the node about the pole.
+        let turning = add(
+            add(scale(periapsis_rate, normal_hat), scale(inclination_rate, node_hat)),
+            [0.0, 0.0, self.node_rate_rad_s],
+        );
+        SatelliteState { position_m, velocity_m_s: add(in_space(plane_m_s), cross(turning, position_m)) }
+    }
+
     /// Position of a satellite that trails daughter 1 by an arc `arc_m` on its osculating circle, m.
     #[must_use]
     pub fn trailing_m(&self, arc_m: f64, t_s: f64) -> Vec3 {
@@ -223,7 +291,10 @@ impl Array {
             return orbit.normal_hat(t_s);
         }
         let (sin_o, cos_o) = (self.node_rad + self.node_rate_rad_s * t_s).sin_cos();
-        let (sin_i, cos_i) = self.inclination_rad.sin_cos();
+        let arc_rad = |formation: &Formation| formation.arc_m(n, t_s).0 / self.orbit_radius_m;
+        let across = self.shape.zip(self.formation.as_ref());
+        let offset = across.map_or(0.0, |(shape, formation)| shape.cross_track_ratio * arc_rad(formation));
+        let (sin_i, cos_i) = (self.inclination_rad + offset).sin_cos();
         [sin_i * sin_o, -sin_i * cos_o, cos_i]
     }
 

@@ -113,7 +113,7 @@ impl Config {
 
     /// Requires what satellites that do not share a circle can have.
     fn check_orbits(&self, checks: &mut Checks) {
-        if !self.array.has_own_orbits() {
+        if self.array.is_circle() {
             return;
         }
         let Self { spacecraft, map, .. } = self;
@@ -133,8 +133,10 @@ impl Config {
             ("spacecraft.antenna", "\"dipole-normal\"", isotropic, "\"isotropic\""),
             ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
         ] {
-            let expected =
-                format!("{expected} with array.kepler or array.oem: the other needs a common circle");
+            let expected = format!(
+                "{expected} with array.kepler, array.oem, array.eccentricity or array.cross_track_ratio: the other needs a \
+                     common circle"
+            );
             checks.require(key, value, good, expected);
         }
     }

@@ -24,8 +24,8 @@ impl Config {
         let kepler_s = TAU * (radius_m.powi(3) / MOON_GM_M3_S2).sqrt();
         let differs = (array.orbital_period_s / kepler_s - 1.0).abs() > PERIOD_PART;
         // Another body than the Moon has another mass.
-        let is_circle = !array.has_own_orbits();
-        (differs && is_circle && array.moon_radius_m == MOON_RADIUS_M).then(|| {
+        let is_formation = !array.has_own_orbits();
+        (differs && is_formation && array.moon_radius_m == MOON_RADIUS_M).then(|| {
             format!(
                 "array.orbital_period_s = {}, but an orbit {:.0} km above the Moon takes {kepler_s:.2} s; \
                  array.precession_period_s does not follow the altitude, either",
