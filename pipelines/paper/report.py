@@ -241,6 +241,33 @@ def basis():
     )
 
 
+# Galactic longitude and latitude of the centres of three patches: near the pole, at middle latitudes, near the plane's anticentre.
+PATCHES = ("30,60", "100,-40", "200,20")
+
+
+def patch_command(mhz, k):
+    folder = f"out/paper-{mhz}mhz/{mhz}.000MHz"
+    return (f"lunarray cutout {folder}/input-smooth.fits {folder}/map-smooth.fits --centre {PATCHES[k]} --subtract-fwhm 5 "
+            f"--out out/patch-{mhz}-{k + 1}.png --json > out/patch-{mhz}-{k + 1}.json")
+
+
+def patches():
+    rows, shown = [], ""
+    for mhz in ("10", "3"):
+        for k, centre in enumerate(PATCHES):
+            found = load(f"patch-{mhz}-{k + 1}.json")
+            if found is None:
+                continue
+            truth, ours = found["pieces"]
+            rows.append([mhz, centre, show(truth["rms_k"]), show(ours["rms_k"]), f"{ours['correlation']:.4f}"])
+            shown += picture(f"patch-{mhz}-{k + 1}.png", f"paper-patch-{mhz}-{k + 1}.png",
+                             f"input and map at {mhz} MHz around {centre} degrees, scales above 5 degrees subtracted")
+    if not rows:
+        return missing(patch_command("10", 0))
+    head = ["MHz", "centre, Galactic degrees", "rms of the input, K", "of the map, K", "correlation"]
+    return table(head, rows) + shown
+
+
 def maps():
     rows = []
     for name, noise in (("paper-10mhz", "10"), ("paper-3mhz", "3")):
@@ -262,10 +289,10 @@ def maps():
     )
 
 
-def traces():
-    study = load("fig15-traces/study.json")
+def traces(name="fig15-traces"):
+    study = load(f"{name}/study.json")
     if study is None:
-        return missing("lunarray study pipelines/paper/fig15-traces.toml")
+        return missing(f"lunarray study pipelines/paper/{name}.toml")
     rows = []
     for case in study["cases"]:
         channel = case["figures"]["channels"][0]
@@ -318,13 +345,13 @@ def rows_of_b(key, wanted, said):
     return table(["rows, limit", "visibilities", *[f"{name}_{l}" for l in ls]], rows) + f"\n{said}\n"
 
 
-def sensitivity():
-    study = load("fig19-sensitivity/study.json")
+def sensitivity(name="fig19-sensitivity", nside=16):
+    study = load(f"{name}/study.json")
     if study is None:
-        return missing("lunarray study pipelines/paper/fig19-sensitivity.toml") + pair_sensitivity()
+        return missing(f"lunarray study pipelines/paper/{name}.toml")
     rows = []
-    # Pixels of nside 16 as beams, where the beam is not known.
-    pixel = 4 * math.pi / (12 * 16 * 16)
+    # Pixels as beams, where the beam is not known.
+    pixel = 4 * math.pi / (12 * nside * nside)
     for case in study["cases"]:
         channel = case["figures"]["channels"][0]
         frequency, noise = channel["frequency_hz"], channel["noise_rms_k"]
@@ -338,7 +365,7 @@ def sensitivity():
     head = ["MHz", "visibilities", "noise, K rms", "5 sigma, Jy a pixel", "beam, deg", "5 sigma, Jy a beam"]
     return table(head, rows) + (
         "\nThe paper: flat above 5 MHz, improving quickly below, as absorption suppresses the sky there.\n"
-    ) + pair_sensitivity()
+    )
 
 
 def pair_sensitivity():
@@ -381,14 +408,12 @@ def pair_sensitivity():
         + "\nIt rises by 3.8 from 5 to 30 MHz, as the study does by 3.2: in pixels of a fixed nside the few pairs that are left at high "
         "frequencies measure modes less evenly, and a map has the noise of the worst of them. So the paper's formula gives the rise "
         "for small maps, and neither T_sys nor the beam's area is its cause. At nside 64 the radiometer alone falls by a fifth from "
-        "5 to 30 MHz; whether the map's noise is then flat needs the study at that size "
-        "(`lunarray study pipelines/paper/fig19-nside64.toml`, not made here).\n"
+        "5 to 30 MHz; whether the map's noise is then flat is the study at that size, below.\n"
     )
 
 
 def main():
     machine = sys.argv[1] if len(sys.argv) > 1 else "an unnamed machine"
-    cutouts = "lunarray cutout out/paper-10mhz/10.000MHz/input-smooth.fits out/paper-10mhz/10.000MHz/map-smooth.fits"
     parts = [
         ("Fig. 1: a patch, and N(>S)", f"`{SKY}`, `{CUTOUT}`", counts()),
         ("Fig. 2: the full sky", "By the same command.", full_sky()),
@@ -413,10 +438,11 @@ def main():
          latitudes("fig12-wrong-prior", "lunarray study pipelines/paper/fig12-wrong-prior.toml",
                    "The paper: with a prior of correlation 0.8 the equator is still right, the poles are off by more than 20 %.")),
         ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted",
-         f"After `lunarray run pipelines/paper-10mhz.toml --set products.smooth_fwhm_deg=1`: `{cutouts} --frame ecliptic "
-         "--centre LON,LAT --subtract-fwhm 5 --out out/patch-1.png`; the same of 3 MHz", "Not made here yet.\n"),
+         "After `lunarray run pipelines/paper-10mhz.toml --set products.smooth_fwhm_deg=1 --out out/paper-10mhz` (3 MHz alike): "
+         f"`{patch_command('10', 0)}` and so on", patches()),
         ("Fig. 15: traces against epsilon", "`lunarray study pipelines/paper/fig15-traces.toml`",
-         traces() + "\n![rho, SNR, power and traces against epsilon](paper-fig15.png)\n" + basis()),
+         traces() + "\n![rho, SNR, power and traces against epsilon](paper-fig15.png)\n" + basis()
+         + "\n### In pixels, nside 16\n\n`lunarray study pipelines/paper/fig15-pixels.toml`\n\n" + traces("fig15-pixels")),
         ("Fig. 16: rows at centres and averaged, rho_l without noise",
          "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("rho", "no noise", "The paper: rows at centres are well below 1 from b_p on; averaged rows are not, and "
@@ -426,7 +452,10 @@ def main():
         ("Fig. 18: rho_l without noise for epsilon from 1e-9 to 1", "`lunarray study pipelines/paper/fig18-epsilon.toml`",
          correlation("fig18-epsilon", "rho", (8, 16, 32, 64, 96, 128), "epsilon",
                      "The paper: rho_l does not depend on epsilon below 1e-2.")),
-        ("Fig. 19: sensitivity against frequency", "`lunarray study pipelines/paper/fig19-sensitivity.toml`", sensitivity()),
+        ("Fig. 19: sensitivity against frequency", "`lunarray study pipelines/paper/fig19-sensitivity.toml`",
+         sensitivity() + pair_sensitivity()
+         + "\n### At nside 64\n\n`lunarray study pipelines/paper/fig19-nside64.toml`, from every 40th window\n\n"
+         + sensitivity("fig19-nside64", 64)),
         ("Fig. 20 and the appendix: N_b and Sigma_b", f"`{FIGURE.format('sub-pixel')}`", figure("sub-pixel", sub_pixel)),
     ]
     print("# The paper, figure by figure\n")
