@@ -1,9 +1,11 @@
 //! What the normal equations of a channel cost: memory, operations, and an estimate of the time.
 
+use std::f64::consts::TAU;
+
 use super::plan::Plan;
 use super::rates::{
-    CHOLESKY_MULTIPLY_ADDS_PER_S, HARMONIC_VISIBILITIES_PER_S, RANK_K_MULTIPLY_ADDS_PER_S, ROWS_PER_S,
-    TRANSFORM_MULTIPLY_ADDS_PER_S, cores,
+    CHOLESKY_MULTIPLY_ADDS_PER_S, HARMONIC_VISIBILITIES_PER_S, INTERPOLATION_S, RANK_K_MULTIPLY_ADDS_PER_S,
+    ROW_S, TRANSFORM_MULTIPLY_ADDS_PER_S, VISIBILITIES_PER_ROW, cores,
 };
 use crate::accumulation::harmonic::{
     REFINED_VISIBILITY_BYTES, SPREAD_MULTIPLY_ADDS, application_size, memory,
@@ -108,6 +110,9 @@ impl EngineCost {
         let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
         let held = visibilities.min(map.refine.visibilities_max as f64) * REFINED_VISIBILITY_BYTES as f64;
         let passes = map.refine.passes_max as f64;
+        let l_max = map.degree() as f64;
+        let row_s = ROW_S * l_max * (l_max + TAU * u_max);
+        let pass_s = visibilities * (row_s / VISIBILITIES_PER_ROW + INTERPOLATION_S) / cores();
         let rows = row_tables_bytes(map.degree(), u_max, rayon::current_num_threads()) as f64;
         Self {
             sums_bytes: held,
@@ -115,8 +120,7 @@ impl EngineCost {
             copies_last: true,
             other_bytes: circle.other_bytes + 2.0 * circle.sums_bytes + rows,
             // Forth and back, for the map and its noise, and an inner solution of each.
-            solution_s: (passes + 1.0) * (circle.solution_s + 2.0 * visibilities / (ROWS_PER_S * cores()))
-                + visibilities * circle.visibility_s,
+            solution_s: (passes + 1.0) * (circle.solution_s + pass_s) + visibilities * circle.visibility_s,
             visibility_s: 0.0,
             solution_multiply_adds: (passes + 1.0) * circle.solution_multiply_adds,
             ..circle
