@@ -4,6 +4,7 @@
 #[path = "../common/mod.rs"]
 mod common;
 mod pace;
+mod page;
 mod senders;
 mod serving;
 mod soak;
