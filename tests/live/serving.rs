@@ -172,6 +172,8 @@ fn what_is_served_is_what_is_on_disk() {
             assert!(pixels == expected, "{path}");
             if is_last {
                 assert!(served.get(&format!("/api/maps/{number}/latest.f32")).body == expected);
+                let latest = std::fs::read(place.path(&format!("{folder}/latest.fits"))).unwrap();
+                assert!(latest == fits.body, "{folder}");
             }
         }
         for (kind, name) in [("noise", "noise.fits"), ("input", "input.fits")] {
