@@ -10,6 +10,7 @@ mod check;
 mod compare;
 mod corrupt;
 mod cutout;
+mod events;
 mod explain;
 mod export;
 mod figure;

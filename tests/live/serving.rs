@@ -9,7 +9,7 @@ use super::common::workplace::{files, maps};
 use super::*;
 
 /// A pipeline that keeps a map for every snapshot.
-const SNAPSHOTS: [&str; 4] = ["--set", "products.snapshot_maps=true", "--set", "map.snapshot_every_s=20e6"];
+pub(super) const SNAPSHOTS: [&str; 4] = ["--set", "products.snapshot_maps=true", "--set", "map.snapshot_every_s=20e6"];
 
 /// A command that serves; ends when dropped.
 struct Served {
