@@ -20,6 +20,8 @@ mod inspect;
 mod interrupt;
 mod lines;
 mod merge;
+#[cfg(unix)]
+mod notify;
 mod output;
 mod predict;
 mod progress;

@@ -301,9 +301,15 @@ impl Session<'_> {
         let Self { args, config, interrupt, page, events } = self;
         let cancel = interrupt.cancel();
         let mut progress = None;
+        #[cfg(unix)]
+        let mut notifier = None;
         replay(source, config, ground, &args.out, cancel, &mut |watched| {
             interrupt.arm_or_note();
             begun();
+            #[cfg(unix)]
+            if args.follow || args.listen.is_some() {
+                notifier = super::notify::Notifier::start(&watched, cancel);
+            }
             page.watch(&watched);
             events.watch(&watched);
             progress = Some(Progress::watch(watched, READ, 0, cancel));

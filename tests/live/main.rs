@@ -7,6 +7,7 @@ mod events;
 mod pace;
 mod page;
 mod senders;
+mod service;
 mod serving;
 mod soak;
 mod stations;
