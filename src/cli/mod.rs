@@ -10,6 +10,7 @@ mod check;
 mod compare;
 mod corrupt;
 mod cutout;
+mod events;
 mod explain;
 mod export;
 mod figure;
@@ -19,6 +20,8 @@ mod inspect;
 mod interrupt;
 mod lines;
 mod merge;
+#[cfg(unix)]
+mod notify;
 mod output;
 mod predict;
 mod progress;

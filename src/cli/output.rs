@@ -49,7 +49,7 @@ pub(super) fn print_json_line(value: &impl serde::Serialize) -> Result<(), Comma
 }
 
 /// A JSON object whose strings hold no character that a terminal would obey. JSON itself allows some of them.
-fn json_text(value: &impl serde::Serialize) -> Result<String, serde_json::Error> {
+pub(super) fn json_text(value: &impl serde::Serialize) -> Result<String, serde_json::Error> {
     let text = serde_json::to_string(value)?;
     let escaped = |c: char| match printable(c.encode_utf8(&mut [0; 4])) {
         std::borrow::Cow::Borrowed(_) => c.to_string(),

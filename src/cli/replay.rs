@@ -7,6 +7,7 @@ use clap::{ArgGroup, Args};
 use crossbeam_channel::{Receiver, bounded};
 
 use super::arguments::{ChannelList, channel_list, not_negative_s, size_bytes};
+use super::events::{Events, EventsArgs};
 use super::interrupt::Interrupt;
 use super::lines::next_line;
 use super::output::{
@@ -107,6 +108,8 @@ pub(super) struct ReplayArgs {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
+    events: EventsArgs,
+    #[command(flatten)]
     serve: ServeArgs,
 }
 
@@ -172,12 +175,14 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     let saving = ground.outcome().saving;
     let interrupt = Interrupt::default();
     let page = args.serve.start(&config, "ground", args.state.as_deref())?;
-    let session = Session { args, config: &config, interrupt: &interrupt, page: &page };
+    let events = args.events.start(&config, "ground")?;
+    let session = Session { args, config: &config, interrupt: &interrupt, page: &page, events: &events };
     let ended = match &args.listen {
         Some(url) => session.hear_senders(url, ground),
         None => session.read_files(ground),
     };
     let ended = page.conclude(ended, |summary| summary.cancelled);
+    events.conclude(&ended, |summary| summary.cancelled);
     let summary = ended.inspect_err(|error| {
         let told = matches!(error.downcast_ref::<PipelineError>(), Some(PipelineError::Unsaved { .. }));
         // Another failure must not hide that nothing was saved.
@@ -190,17 +195,22 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
         }
         false => interrupt.completion(summary.cancelled),
     };
-    let printed = if args.json {
-        print_json_line(&summary)
-    } else {
-        print_text(&format!("{summary}\nProducts are in {}", args.out.display()))
-    };
+    let printed = args.print(&summary);
     print_incompleteness(&summary);
     page.stay(&interrupt);
     completion.after(printed)
 }
 
 impl ReplayArgs {
+    /// Prints the summary, unless standard output holds events.
+    fn print(&self, summary: &RunSummary) -> Result<(), CommandError> {
+        match self.json {
+            _ if self.events.take_stdout() => Ok(()),
+            true => print_json_line(summary),
+            false => print_text(&format!("{summary}\nProducts are in {}", self.out.display())),
+        }
+    }
+
     /// With the limit of memory that was given, or the machine's.
     fn limited(&self, config: GroundConfig) -> GroundConfig {
         let limit = self.memory_max.or_else(|| MemoryLimit::of_machine().map(|limit| limit.bytes));
@@ -214,25 +224,25 @@ fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResu
     let groups = channel_groups(&args.files, config, size, limit)?;
     let interrupt = Interrupt::default();
     let cancel = interrupt.cancel();
+    let events = args.events.start(config, "ground")?;
     let mut progress = None;
-    let summary =
-        replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |number, watched| {
-            if number == 0 {
-                interrupt.arm_or_note();
-            }
-            // The bar of the group before ends first.
-            progress = None;
-            let channels: Vec<String> =
-                groups[number..].iter().take(1).flatten().map(|c| c.to_string()).collect();
-            say(format_args!("group {} of {}: channels {}", number + 1, groups.len(), channels.join(", ")));
-            progress = Some(Progress::watch(watched, READ, 0, cancel));
-        })?;
+    let ended = replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |number, watched| {
+        if number == 0 {
+            interrupt.arm_or_note();
+        }
+        // The bar of the group before ends first.
+        progress = None;
+        let channels: Vec<String> =
+            groups[number..].iter().take(1).flatten().map(|c| c.to_string()).collect();
+        say(format_args!("group {} of {}: channels {}", number + 1, groups.len(), channels.join(", ")));
+        events.watch(&watched);
+        progress = Some(Progress::watch(watched, READ, 0, cancel));
+    });
     drop(progress);
-    let printed = if args.json {
-        print_json_line(&summary)
-    } else {
-        print_text(&format!("{summary}\nProducts are in {}", args.out.display()))
-    };
+    let ended = ended.map_err(CommandError::from);
+    events.conclude(&ended, |summary| summary.cancelled);
+    let summary = ended?;
+    let printed = args.print(&summary);
     print_incompleteness(&summary);
     interrupt.completion(summary.cancelled).after(printed)
 }
@@ -243,6 +253,7 @@ struct Session<'a> {
     config: &'a Config,
     interrupt: &'a Interrupt,
     page: &'a Page,
+    events: &'a Events,
 }
 
 impl Session<'_> {
@@ -287,13 +298,20 @@ impl Session<'_> {
         ground: Ground,
         begun: &dyn Fn(),
     ) -> Result<RunSummary, PipelineError> {
-        let Self { args, config, interrupt, page } = self;
+        let Self { args, config, interrupt, page, events } = self;
         let cancel = interrupt.cancel();
         let mut progress = None;
+        #[cfg(unix)]
+        let mut notifier = None;
         replay(source, config, ground, &args.out, cancel, &mut |watched| {
             interrupt.arm_or_note();
             begun();
+            #[cfg(unix)]
+            if args.follow || args.listen.is_some() {
+                notifier = super::notify::Notifier::start(&watched, cancel);
+            }
             page.watch(&watched);
+            events.watch(&watched);
             progress = Some(Progress::watch(watched, READ, 0, cancel));
         })
     }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::arguments::PipelineArgs;
+use super::events::EventsArgs;
 use super::interrupt::Interrupt;
 use super::output::{
     CommandResult, print_config_notes, print_incompleteness, print_json_line, print_notes, print_text,
@@ -32,6 +33,8 @@ pub(super) struct RunArgs {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
+    events: EventsArgs,
+    #[command(flatten)]
     serve: ServeArgs,
 }
 
@@ -45,19 +48,23 @@ pub(super) fn execute(args: &RunArgs) -> CommandResult {
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
     let interrupt = Interrupt::default();
     let page = args.serve.start(&plan.config, "whole", None)?;
+    let events = args.events.start(&plan.config, "whole")?;
     let mut progress = None;
     let windows = plan.windows_watched();
     let ended = run(&plan, &out, interrupt.cancel(), &mut |watched| {
         interrupt.arm_or_note();
         page.watch(&watched);
+        events.watch(&watched);
         progress = Some(Progress::watch(watched, INTEGRATE, windows, interrupt.cancel()));
     });
     drop(progress);
-    let summary = page.conclude(ended, |summary| summary.cancelled)?;
-    let printed = if args.json {
-        print_json_line(&summary)
-    } else {
-        print_text(&format!("{summary}\nProducts are in {}", out.display()))
+    let ended = page.conclude(ended, |summary| summary.cancelled);
+    events.conclude(&ended, |summary| summary.cancelled);
+    let summary = ended?;
+    let printed = match args.json {
+        _ if args.events.take_stdout() => Ok(()),
+        true => print_json_line(&summary),
+        false => print_text(&format!("{summary}\nProducts are in {}", out.display())),
     };
     print_incompleteness(&summary);
     page.stay(&interrupt);

@@ -6,6 +6,7 @@ use std::sync::atomic::Ordering;
 use clap::Args;
 
 use super::arguments::{PipelineArgs, not_negative_s};
+use super::events::EventsArgs;
 use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_config_notes, print_json_line, print_notes, print_text};
 use super::progress::Progress;
@@ -42,6 +43,8 @@ pub(super) struct SimulateArgs {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
+    events: EventsArgs,
+    #[command(flatten)]
     serve: ServeArgs,
 }
 
@@ -65,16 +68,20 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let options = SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s };
     let socket = args.send.as_ref().map(|url| SocketSink::new(url, options, cancel)).transpose()?;
     let confirmed = socket.as_ref().map(SocketSink::confirmed);
+    let events = args.events.start(&plan.config, "space")?;
     let mut progress = None;
     let windows = plan.windows_watched();
     let to = Destination { file: args.out.clone(), socket };
     let ended = simulate(&plan, to, cancel, &mut |watched| {
         interrupt.arm_or_note();
         page.watch(&watched);
+        events.watch(&watched);
         progress = Some(Progress::watch(watched, INTEGRATE, windows, cancel));
     });
     drop(progress);
-    let report = page.conclude(ended, |report| report.cancelled)?;
+    let ended = page.conclude(ended, |report| report.cancelled);
+    events.conclude(&ended, |report| report.cancelled);
+    let report = ended?;
     let is_written = report.stage("record").is_some_and(|record| record.units > 0);
     let mut places: Vec<String> = args
         .out
@@ -90,10 +97,10 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
             bytes => format!("{url} confirmed all {bytes} bytes"),
         });
     }
-    let printed = if args.json {
-        print_json_line(&report)
-    } else {
-        print_text(&format!("{report}\n{}", places.join("\n")))
+    let printed = match args.json {
+        _ if args.events.take_stdout() => Ok(()),
+        true => print_json_line(&report),
+        false => print_text(&format!("{report}\n{}", places.join("\n"))),
     };
     page.stay(&interrupt);
     interrupt.completion(report.cancelled).after(printed)

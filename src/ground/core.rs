@@ -14,7 +14,7 @@ use crate::runtime::{Cancel, Outlet, Stage, Units};
 /// Waits before the last checkpoint of a session is tried again: what lacks may be there a moment later.
 const LAST_WAITS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(1)];
 
-/// Steps after which the counters of the reception are shown again; counting gaps takes a while.
+/// Steps after which a ground that never rests shows the counters of the reception again; counting gaps takes a while.
 const STEPS_SHOWN: u64 = 32;
 
 /// Takes the bytes of a downlink and emits sums.
@@ -133,6 +133,11 @@ impl Ground {
         Ok(())
     }
 
+    /// Shows the counters of the reception.
+    fn show(&self) {
+        fill(&self.outcome.reception, self.collector.counters());
+    }
+
     /// Packets of visibilities that are known to be missing.
     fn missing_packets(&self) -> MissingPackets {
         let latest = self.calibrator.blocks().latest_report().0;
@@ -183,9 +188,14 @@ impl Stage for Ground {
         self.advance(out)?;
         self.steps += 1;
         if self.steps.is_power_of_two() || self.steps.is_multiple_of(STEPS_SHOWN) {
-            fill(&self.outcome.reception, self.collector.counters());
+            self.show();
         }
         Ok(())
+    }
+
+    /// Who watches a link that falls silent sees all that came.
+    fn rest(&mut self) {
+        self.show();
     }
 
     fn finish(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
@@ -198,7 +208,7 @@ impl Stage for Ground {
         if let Some(archive) = &self.archive {
             self.outcome.ledger.post_report(&archive.take_posts());
         }
-        fill(&self.outcome.reception, self.collector.counters());
+        self.show();
         fill(&self.outcome.autos, self.calibrator.auto_powers());
         Ok(self.accumulator.finish(out)?)
     }

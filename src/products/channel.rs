@@ -23,6 +23,11 @@ use crate::units::constants::DAY_S;
 /// Maximum number of maps on the sheet of snapshots: the first, the last and some between.
 const SHEET_MAPS_MAX: usize = 6;
 
+/// The last map and its picture under names that stay. They are files of their own: a link breaks where a folder is copied, packed or
+/// moved to a system without links.
+const LATEST_MAP: &str = "latest.fits";
+const LATEST_PICTURE: &str = "latest.png";
+
 /// A channel's output folder, and the summary of its maps so far.
 pub(super) struct ChannelFolder {
     config: ProductsConfig,
@@ -92,6 +97,7 @@ impl ChannelFolder {
             self.shown.offer(shown.map.values(), &caption(solution));
             self.draw_snapshot(solution, shown)?;
         }
+        self.write_named(LATEST_MAP, &map_name(solution), &solved.map, None, origin)?;
         if solution.is_final {
             for maps in [Some(&solved), processed.as_ref()].into_iter().flatten() {
                 self.write_final(maps, origin)?;
@@ -201,7 +207,9 @@ impl ChannelFolder {
     fn file(&mut self, name: &str) -> PathBuf {
         let relative = format!("{}/{name}", self.name);
         let path = self.root.join(&relative);
-        self.files.push(relative);
+        if !self.files.contains(&relative) {
+            self.files.push(relative);
+        }
         path
     }
 
@@ -210,9 +218,20 @@ impl ChannelFolder {
         name: &str,
         map: &SkyMap,
         processing: Option<PostProcessing>,
+        origin: Origin<'_>,
+    ) -> Result<(), ProductsError> {
+        self.write_named(name, name.trim_end_matches(".fits"), map, processing, origin)
+    }
+
+    /// Writes a map whose header says `what` it is.
+    fn write_named(
+        &mut self,
+        name: &str,
+        what: &str,
+        map: &SkyMap,
+        processing: Option<PostProcessing>,
         Origin { provenance, solution }: Origin<'_>,
     ) -> Result<(), ProductsError> {
-        let what = name.trim_end_matches(".fits");
         let cards = provenance.cards(solution, what, processing);
         let options = WriteOptions { cards, ..WriteOptions::default() };
         let path = self.file(name);
@@ -251,7 +270,13 @@ impl ChannelFolder {
         // Half the size of the final picture, because there are many.
         let sheet =
             Sheet { title, subtitle, width_px: 800, view: view(self.config.frame), ..Sheet::default() };
-        Ok(draw_sheet(&[panel], &sheet)?.write(&path)?)
+        let picture = draw_sheet(&[panel], &sheet)?;
+        picture.write(&path)?;
+        // The picture of the final map is another.
+        if !solution.is_final {
+            picture.write(&self.file(LATEST_PICTURE))?;
+        }
+        Ok(())
     }
 
     fn draw_final(
@@ -267,7 +292,9 @@ impl ChannelFolder {
         let subtitle = format!("{} visibilities, {}; {how}", solution.visibilities, shown.resolution());
         let panel = self.panel(map, &format!("Map at {mhz} MHz"), scale);
         let path = self.file("map.png");
-        draw_map(&panel, &subtitle, &view(self.config.frame))?.write(&path)?;
+        let picture = draw_map(&panel, &subtitle, &view(self.config.frame))?;
+        picture.write(&path)?;
+        picture.write(&self.file(LATEST_PICTURE))?;
         if let Some(input) = self.input(shown.processing).cloned() {
             let panel = self.panel(input.map.values(), &format!("Input at {mhz} MHz"), scale);
             let path = self.file("input.png");

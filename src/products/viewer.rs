@@ -1,7 +1,7 @@
 //! The hook for those who look on: every map, as it is published.
 
 use std::fmt;
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use super::summary::SnapshotSummary;
 use crate::sky::fits::Card;
@@ -29,26 +29,28 @@ pub trait MapViewer: Send + Sync {
     fn view(&self, map: PublishedMap<'_>);
 }
 
-/// Where a viewer may join; clones share it. Without one nothing is done.
+/// Where viewers may join; clones share them. Without one nothing is done.
 #[derive(Clone, Default)]
-pub struct MapWatch(Arc<OnceLock<Box<dyn MapViewer>>>);
+pub struct MapWatch(Arc<Mutex<Vec<Box<dyn MapViewer>>>>);
 
 impl MapWatch {
-    /// Shows every map from now on to `viewer`; the first who joins stays.
-    pub fn join(&self, viewer: Box<dyn MapViewer>) {
-        let _ = self.0.set(viewer);
+    fn viewers(&self) -> MutexGuard<'_, Vec<Box<dyn MapViewer>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Shows what `map` makes, if anybody looks on.
-    pub(super) fn offer<'a>(&self, show: impl FnOnce(&dyn MapViewer) + 'a) {
-        if let Some(viewer) = self.0.get() {
-            show(viewer.as_ref());
-        }
+    /// Shows every map from now on to `viewer`, too.
+    pub fn join(&self, viewer: Box<dyn MapViewer>) {
+        self.viewers().push(viewer);
+    }
+
+    /// Shows what `map` makes, to each who looks on.
+    pub(super) fn offer(&self, show: impl Fn(&dyn MapViewer)) {
+        self.viewers().iter().for_each(|viewer| show(viewer.as_ref()));
     }
 }
 
 impl fmt::Debug for MapWatch {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("MapWatch").field("viewed", &self.0.get().is_some()).finish()
+        f.debug_struct("MapWatch").field("viewers", &self.viewers().len()).finish()
     }
 }

@@ -40,6 +40,10 @@ pub trait Stage: Send {
         Ok(())
     }
 
+    /// Called after a step when no further input waits, so that what it shows of itself need not be shown in every step to be the
+    /// newest while nothing comes.
+    fn rest(&mut self) {}
+
     /// Units processed so far; the name of the unit must not change.
     fn units(&self) -> Units {
         Units::default()

@@ -218,6 +218,9 @@ impl<S: Stage> Worker for StageWorker<S> {
                     out.descend_from(born);
                     stage.step(item, out)?;
                     watch.worked_into(out, Some(born), stage.units());
+                    if inlet.receiver.is_empty() {
+                        stage.rest();
+                    }
                 }
                 Input::End => break,
                 Input::Halt => return Ok(Ending::Halted),

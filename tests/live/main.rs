@@ -3,8 +3,11 @@
 
 #[path = "../common/mod.rs"]
 mod common;
+mod events;
 mod pace;
+mod page;
 mod senders;
+mod service;
 mod serving;
 mod soak;
 mod stations;

@@ -9,16 +9,19 @@ use super::common::workplace::{files, maps};
 use super::*;
 
 /// A pipeline that keeps a map for every snapshot.
-const SNAPSHOTS: [&str; 4] = ["--set", "products.snapshot_maps=true", "--set", "map.snapshot_every_s=20e6"];
+pub(super) const SNAPSHOTS: [&str; 4] =
+    ["--set", "products.snapshot_maps=true", "--set", "map.snapshot_every_s=20e6"];
 
 /// A command that serves; ends when dropped.
-struct Served {
+pub(super) struct Served {
     child: Child,
-    address: String,
+    pub(super) address: String,
+    /// What it says after that.
+    said: Arc<Mutex<String>>,
 }
 
 impl Served {
-    fn start(args: &[&str]) -> Self {
+    pub(super) fn start(args: &[&str]) -> Self {
         let mut command = Process::new(assert_cmd::cargo::cargo_bin("lunarray"));
         command.args(args).args(["--serve", "0"]).stdout(Stdio::null()).stderr(Stdio::piped());
         let mut child = command.spawn().unwrap();
@@ -29,9 +32,24 @@ impl Served {
                 break url.trim_end_matches('/').to_owned();
             }
         };
-        // So that it never waits for a reader.
-        std::thread::spawn(move || lines.for_each(drop));
-        Self { child, address }
+        let said = Arc::new(Mutex::new(String::new()));
+        let heard = Arc::clone(&said);
+        // It never waits for a reader.
+        std::thread::spawn(move || {
+            lines.for_each(|line| *heard.lock().unwrap() += &format!("{}\n", line.unwrap_or_default()));
+        });
+        Self { child, address, said }
+    }
+
+    /// Where it listens for packets.
+    pub(super) fn listening(&self) -> String {
+        let mut found = None;
+        wait_until("listening", || {
+            let said = self.said.lock().unwrap();
+            found = said.lines().find_map(|line| line.strip_prefix("listening on tcp://")).map(str::to_owned);
+            found.is_some()
+        });
+        found.unwrap()
     }
 
     fn connect(&self) -> TcpStream {
@@ -54,11 +72,11 @@ impl Served {
         self.raw(format!("{method} {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").as_bytes())
     }
 
-    fn get(&self, path: &str) -> Reply {
+    pub(super) fn get(&self, path: &str) -> Reply {
         self.request("GET", path, &self.address)
     }
 
-    fn json(&self, path: &str) -> Value {
+    pub(super) fn json(&self, path: &str) -> Value {
         let reply = self.get(path);
         assert_eq!((reply.status, reply.header("content-type")), (200, "application/json"), "{path}");
         serde_json::from_slice(&reply.body).unwrap()
@@ -71,12 +89,12 @@ impl Served {
         line.unwrap_or_else(|| panic!("no {name} in {text}")).rsplit(' ').next().unwrap().parse().unwrap()
     }
 
-    fn wait_for_phase(&self, phase: &str) {
+    pub(super) fn wait_for_phase(&self, phase: &str) {
         wait_until(phase, || self.json("/api/status")["phase"] == phase);
     }
 
     /// Ends it in order.
-    fn end(mut self) -> ExitStatus {
+    pub(super) fn end(mut self) -> ExitStatus {
         signal(&self.child, "TERM");
         self.child.wait().unwrap()
     }
@@ -90,7 +108,7 @@ impl Drop for Served {
 }
 
 #[derive(Debug)]
-struct Reply {
+pub(super) struct Reply {
     /// 0 if there was no answer.
     status: u16,
     headers: BTreeMap<String, String>,
@@ -113,7 +131,7 @@ impl Reply {
         self.headers.get(name).map_or("", String::as_str)
     }
 
-    fn text(&self) -> String {
+    pub(super) fn text(&self) -> String {
         String::from_utf8_lossy(&self.body).into_owned()
     }
 }
@@ -172,6 +190,8 @@ fn what_is_served_is_what_is_on_disk() {
             assert!(pixels == expected, "{path}");
             if is_last {
                 assert!(served.get(&format!("/api/maps/{number}/latest.f32")).body == expected);
+                let latest = std::fs::read(place.path(&format!("{folder}/latest.fits"))).unwrap();
+                assert!(latest == fits.body, "{folder}");
             }
         }
         for (kind, name) in [("noise", "noise.fits"), ("input", "input.fits")] {
@@ -364,7 +384,7 @@ fn events_tell_of_the_run_step_by_step() {
         }
     };
     let reader = std::thread::spawn(move || lines.for_each(drop));
-    let served = Served { child, address };
+    let served = Served { child, address, said: Arc::default() };
     served.wait_for_phase("running");
     assert_eq!(served.get("/readyz").status, 200);
     let received = |status: &Value| status["reception"]["visibilities"]["packets"].as_u64().unwrap_or(0);

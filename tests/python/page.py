@@ -1,0 +1,449 @@
+"""The page in a real browser: its counts are those of /api/status, its pixels those of the FITS files, and its controls work.
+
+page.py LUNARRAY PIPELINE DOWNLINK FOLDER PICTURES
+
+LUNARRAY is the command, PIPELINE a pipeline file without pictures, DOWNLINK a file of its packets. Runs write below FOLDER,
+pictures of the page go to PICTURES. Directions are healpy's: its pixel centres, its Mollweide projection, its rotations.
+"""
+
+import json
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from pathlib import Path
+
+import healpy
+import numpy as np
+from browser import Browser, wait_until
+from healpy.projector import MollweideProj
+
+SNAPSHOTS = ["--set", "products.snapshot_maps=true", "--set", "map.snapshot_every_s=20e6"]
+WINDOW = (1280, 1000)
+MARGIN = 0.985  # Of the canvas; the rest is the rim.
+
+# Published ends and middles of the colour maps, by which the server's are known to be what their names say.
+KNOWN_COLOURS = {
+    "inferno": [(0x00, 0x00, 0x04), (0xBC, 0x37, 0x54), (0xFC, 0xFF, 0xA4)],
+    "viridis": [(0x44, 0x01, 0x54), (0x21, 0x91, 0x8C), (0xFD, 0xE7, 0x25)],
+}
+
+
+class Served:
+    """A command that serves; is ended with its `with` block."""
+
+    def __init__(self, *words, port="0"):
+        self.process = subprocess.Popen(
+            [*words, "--serve", port], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        said = []
+        for line in self.process.stderr:
+            said.append(line)
+            if line.startswith("serving on "):
+                self.url = line.split()[-1].rstrip("/")
+                break
+        else:
+            raise AssertionError(f"it does not serve: {said}")
+        # So that it never waits for a reader.
+        threading.Thread(target=lambda: [None for _ in self.process.stderr], daemon=True).start()
+
+    @property
+    def port(self):
+        return self.url.rsplit(":", 1)[1]
+
+    def json(self, path):
+        with urllib.request.urlopen(self.url + path, timeout=60) as answer:
+            return json.load(answer)
+
+    def status(self):
+        return self.json("/api/status")
+
+    def wait_for_phase(self, phase):
+        wait_until(phase, lambda: self.status()["phase"] == phase)
+
+    def end(self):
+        self.process.terminate()
+        self.process.wait()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.wait()
+
+
+class Colours:
+    """The colour map of values on a scale between limits."""
+
+    def __init__(self, palette, scale, low, high):
+        self.palette, self.scale, self.low, self.high = palette, scale, low, high
+
+    @classmethod
+    def robust(cls, palette, values):
+        """A logarithmic scale from 0.5 % to 99.5 % of the positive values."""
+        rising = np.sort(values[values > 0])
+        low, high = (rising[round(q * (len(rising) - 1))] for q in (0.005, 0.995))
+        return cls(palette, "log", low, high)
+
+    @classmethod
+    def symmetric(cls, palette, values):
+        sizes = np.sort(np.abs(values))
+        high = sizes[round(0.99 * (len(sizes) - 1))]
+        return cls(palette, "linear", -high, high)
+
+    def index(self, values):
+        if self.scale == "log":
+            positive = np.where(values > 0, values, self.low)
+            place = np.log(positive / self.low) / np.log(self.high / self.low)
+        elif self.scale == "asinh":
+            knee = 0.02 * max(abs(self.low), abs(self.high))
+            low, high = np.arcsinh(self.low / knee), np.arcsinh(self.high / knee)
+            place = (np.arcsinh(values / knee) - low) / (high - low)
+        else:
+            place = (values - self.low) / (self.high - self.low)
+        return np.round(255 * np.clip(place, 0, 1)).astype(int)
+
+    def distance(self, values, seen, shade):
+        """Greatest difference of a component from the colour, or its neighbour in the palette: the page computes in 32 bits."""
+        index = self.index(values)
+        near = [self.palette[np.clip(index + by, 0, 255)] * shade[:, None] for by in (-1, 0, 1)]
+        return np.min([np.abs(colour - seen).max(axis=1) for colour in near], axis=0)
+
+
+def centres(nside, frame, projection):
+    """Places of the pixel centres on the sky's disk (-1 to 1 to the right and up), those on the far side left out: numbers of
+    pixels, x, y."""
+    pixels = np.arange(healpy.nside2npix(nside))
+    axes = {"galactic": "G", "ecliptic": "E", "equatorial": "C"}[frame]
+    there = healpy.Rotator(coord=["E", axes])(np.array(healpy.pix2vec(nside, pixels)))
+    if projection == "globe":
+        x, y = -there[1], there[2]
+        # At the rim a point of the canvas holds many degrees.
+        keep = there[0] > 0.3
+    else:
+        x, y = MollweideProj().vec2xy(there)
+        x = np.asarray(x) / 2
+        keep = np.hypot(x, y) < 0.98
+    return pixels[keep], np.asarray(x)[keep], np.asarray(y)[keep]
+
+
+class Page:
+    def __init__(self, browser, constants):
+        self.browser, self.urls, self.console = browser, [], []
+        self.palettes = {
+            name: np.array([int(digits[k : k + 2], 16) for k in range(0, len(digits), 2)]).reshape(256, 3)
+            for name, digits in constants["palettes"]
+        }
+        self.view = {"frame": "galactic", "projection": "mollweide"}
+
+    def text(self, selector):
+        return self.browser.js("return document.querySelector(arguments[0]).textContent", selector)
+
+    def value(self, selector):
+        return self.browser.js("return document.querySelector(arguments[0]).value", selector)
+
+    def wait_for_text(self, selector, words):
+        wait_until(f"{selector}: {words}", lambda: words in self.text(selector))
+
+    def box(self, selector):
+        script = "const b = document.querySelector(arguments[0]).getBoundingClientRect(); return [b.x, b.y, b.width, b.height]"
+        return self.browser.js(script, selector)
+
+    def on_canvas(self, x, y, size):
+        """Places on the sky's disk in pixels of its canvas."""
+        width, height = size
+        if self.view["projection"] == "globe":
+            half_x = half_y = MARGIN * min(width, height) / 2
+        else:
+            half_x = MARGIN * min(width / 2, height)
+            half_y = half_x / 2
+        return width / 2 + x * half_x, height / 2 - y * half_y
+
+    def size(self):
+        return self.browser.js("const c = document.getElementById('gl'); return [c.width, c.height]")
+
+    def assert_sky(self, what, values, colours, is_marked=False):
+        """The canvas has the colours of the values at all pixel centres in sight. With `is_marked`, negative ones are striped."""
+        nside = healpy.npix2nside(len(values))
+        pixels, x, y = centres(nside, **self.view)
+        if is_marked:
+            keep = values[pixels] > 0
+            pixels, x, y = pixels[keep], x[keep], y[keep]
+        shade = 0.72 + 0.28 * np.sqrt(1 - x**2 - y**2) if self.view["projection"] == "globe" else np.ones(len(x))
+        px, py = (np.floor(place).astype(int).tolist() for place in self.on_canvas(x, y, self.size()))
+        script = """
+            const canvas = document.getElementById("gl"), { width, height } = canvas, gl = canvas.getContext("webgl2");
+            const data = gl ? new Uint8Array(4 * width * height) : canvas.getContext("2d").getImageData(0, 0, width, height).data;
+            if (gl) gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
+            // WebGL counts rows from below.
+            const row = (y) => gl ? height - 1 - y : y;
+            return arguments[0].map((x, k) => { const at = 4 * (row(arguments[1][k]) * width + x); return [...data.slice(at, at + 3)]; });"""
+        used = len(set(colours.index(values[pixels]).tolist()))
+        assert len(pixels) > 40 and used > 20, f"{what}: {len(pixels)} pixels of {used} colours say little"
+        seen = []
+
+        def is_right():
+            found = np.array(self.browser.js(script, px, py))
+            seen[:] = [colours.distance(values[pixels], found, shade), found]
+            # One for the rounding of a component, on the globe of a shaded one too.
+            return np.all(seen[0] <= (2 if self.view["projection"] == "globe" else 1))
+
+        try:
+            wait_until(what, is_right)
+        except AssertionError as error:
+            wrong = np.flatnonzero(seen[0] > 2)[:9]
+            what += f": pixels {pixels[wrong]} are {seen[1][wrong].tolist()}"
+            raise AssertionError(f"{what}, expected {colours.palette[colours.index(values[pixels[wrong]])].tolist()}") from error
+
+    def listen(self):
+        """Collects the addresses of all requests, and what the console says."""
+        for entry in self.browser.log("performance"):
+            message = json.loads(entry["message"])["message"]
+            if message["method"] in ("Network.requestWillBeSent", "Network.webSocketCreated"):
+                params = message["params"]
+                self.urls.append(params["request"]["url"] if "request" in params else params["url"])
+        self.console += self.browser.log("browser")
+
+    def counts(self):
+        """What the panels say: packets by kind, the ledger's entries, units by stage."""
+        return self.browser.js("""
+            const count = (text) => Number(text.replaceAll(",", ""));
+            const rows = [...document.querySelectorAll("#packets tr")].slice(1).map((row) => [...row.cells].map((cell) => cell.textContent));
+            const keys = [...document.querySelectorAll("#ledgerkeys li")].map((item) => [item.children[1].textContent, count(item.children[2].textContent)]);
+            const stages = [...document.querySelectorAll("#stages .box")].map((box) => box.title.match(/^(\\S+): ([\\d,]+) /));
+            return {
+              packets: Object.fromEntries(rows.map(([kind, ...rest]) => [kind, rest.map(count)])),
+              ledger: Object.fromEntries(keys),
+              stages: Object.fromEntries(stages.map(([, name, units]) => [name, count(units)])),
+            };""")
+
+    def assert_counts(self, status):
+        """All counts in the page are those of the interface, once what is on its way has arrived."""
+
+        def of_interface():
+            now = status()
+            kinds = ["instrument", "ephemeris", "visibilities", "housekeeping"]
+            fields = ["packets", "missing", "damaged", "duplicates"]
+            ledger = now["ledger"]
+            entries = {"accumulated": ledger["accumulated"]}
+            entries |= {f"flagged: {reason}": count for reason, count in ledger["flagged"].items()}
+            entries |= {f"lost in {lost['stage']}: {lost['reason']}": lost["count"] for lost in ledger["lost"]}
+            return {
+                "packets": {kind: [now["reception"][kind][field] for field in fields] for kind in kinds},
+                "ledger": entries,
+                "stages": {stage["name"]: stage["units"] for stage in now["stages"]},
+            }
+
+        def are_equal():
+            expected, found = of_interface(), self.counts()
+            # Without the rows that are no entry: a count before the end is a text, and what is on its way is a difference.
+            found["ledger"] = {name: found["ledger"].get(name) for name in expected["ledger"]}
+            last[:] = [expected, found]
+            return expected == found
+
+        last = []
+        try:
+            wait_until("equal counts", are_equal)
+        except AssertionError as error:
+            raise AssertionError(f"interface {last[0]}\npage {last[1]}") from error
+
+
+def read(path):
+    """A map's pixels, as 32-bit numbers."""
+    return healpy.read_map(path, dtype=np.float32).astype(float)
+
+
+def shows_a_run(page, served, out, pictures):
+    browser, palettes = page.browser, page.palettes
+    page.wait_for_text("#link", "live")
+    page.wait_for_text("#phase", "ended")
+    page.wait_for_text("#verdict", "closed")
+    page.assert_counts(served.status)
+    status = served.status()
+    held = status["channels"][0]["held"]
+    assert len(held) > 1, held
+
+    # Final map, on all axes and as a globe.
+    final, source = read(out / "3.000MHz/map.fits"), read(out / "3.000MHz/input.fits")
+    first = read(out / f"3.000MHz/snapshot-{held[0]:03}.fits")
+    inferno = palettes["inferno"]
+    browser.click("#marks")
+    page.wait_for_text("#which", "final map")
+    browser.screenshot(pictures / "page-dark.png")
+    for frame in ["galactic", "ecliptic", "equatorial"]:
+        assert page.value("#frame") == frame
+        page.view["frame"] = frame
+        page.assert_sky(f"final map, {frame}", final, Colours.robust(inferno, final))
+        browser.press("f")
+    page.view["frame"] = "galactic"
+    browser.press("p")
+    page.view["projection"] = "globe"
+    page.assert_sky("globe", final, Colours.robust(inferno, final))
+    browser.press("t")
+    browser.screenshot(pictures / "page-light-globe.png")
+    browser.press("t")
+    # A quarter turn to the left and back.
+    for _ in range(9):
+        browser.press("Shift", "ArrowLeft")
+    browser.press("0")
+    page.assert_sky("globe, turned and back", final, Colours.robust(inferno, final))
+    browser.press("p")
+    page.view["projection"] = "mollweide"
+
+    # Scales, palettes, marks.
+    browser.press("s")
+    assert page.value("#scale") == "linear"
+    low, high = (np.sort(final)[round(q * (len(final) - 1))] for q in (0.005, 0.995))
+    page.assert_sky("linear", final, Colours(inferno, "linear", low, high))
+    browser.press("s")
+    page.assert_sky("asinh", final, Colours(inferno, "asinh", low, high))
+    browser.press("s")
+    browser.press("c")
+    browser.press("c")
+    assert page.value("#palette") == "viridis"
+    page.assert_sky("viridis", final, Colours.robust(palettes["viridis"], final))
+    browser.press("c")
+    browser.click("#marks")
+    page.assert_sky("with marks", final, Colours.robust(inferno, final), is_marked=True)
+    browser.click("#marks")
+
+    # Value and coordinates under the cursor.
+    pixels, x, y = centres(healpy.npix2nside(len(final)), **page.view)
+    left, top, *_ = page.box("#gl")
+    k = int(np.argmax(final[pixels]))
+    px, py = page.on_canvas(x[k], y[k], page.size())
+    browser.move(left + px, top + py)
+    page.wait_for_text("#cursor", f"pixel {pixels[k]}")
+    said = page.text("#cursor").split()
+    assert abs(float(said[0]) / final[pixels[k]] - 1) < 1e-3, said
+    lon, lat = healpy.Rotator(coord=["E", "G"])(*healpy.pix2ang(4, int(pixels[k]), lonlat=True), lonlat=True)
+    across = (float(said[4].rstrip("°")) - lon + 180) % 360 - 180
+    # The mouse is on whole points, of which some 3 make a degree.
+    assert abs(across) < 2 and abs(float(said[6].rstrip("°")) - lat) < 1, (said, lon, lat)
+
+    # Slider, by mouse and by keys; difference; blink; channels.
+    left, top, width, height = page.box("#slider")
+    browser.click_at(left + 3, top + height / 2)
+    page.wait_for_text("#which", f"snapshot {held[0]}")
+    page.assert_sky("first snapshot", first, Colours.robust(inferno, first))
+    browser.press("ArrowRight")
+    page.wait_for_text("#which", f"snapshot {held[1]}" if len(held) > 2 else "final map")
+    before = read(out / f"3.000MHz/snapshot-{held[-2]:03}.fits")
+    while "final map" not in page.text("#which"):
+        browser.press("ArrowRight")
+    browser.press("d")
+    page.assert_sky("difference", final - before, Colours.symmetric(palettes["difference"], final - before))
+    browser.press("d")
+    browser.press("b")
+    of_input = Colours.robust(inferno, source)
+    page.assert_sky("blink: input", source, of_input)
+    page.assert_sky("blink: map", final, of_input)
+    page.assert_sky("blink: input again", source, of_input)
+    browser.press("b")
+    page.assert_sky("no blink", final, Colours.robust(inferno, final))
+    browser.press("2")
+    other = read(out / "10.000MHz/map.fits")
+    page.assert_sky("second channel", other, Colours.robust(inferno, other))
+    browser.press("1")
+    browser.press(" ")
+    assert browser.js("return document.getElementById('play').getAttribute('aria-pressed')") == "true"
+    wait_until("the last map played", lambda: browser.js("return document.getElementById('play').getAttribute('aria-pressed')") == "false")
+    page.wait_for_text("#which", "final map")
+    browser.press("?")
+    assert browser.js("return document.getElementById('keys').open")
+    browser.press("Escape")
+    wait_until("the keys closed", lambda: not browser.js("return document.getElementById('keys').open"))
+
+
+def fits_a_phone(page, pictures):
+    def metrics(**values):
+        page.browser.post("goog/cdp/execute", cmd="Emulation.setDeviceMetricsOverride", params=values)
+
+    metrics(width=390, height=844, deviceScaleFactor=1, mobile=True)
+    wide = page.browser.js("return [document.documentElement.scrollWidth, innerWidth]")
+    assert wide[0] <= wide[1], f"the page is {wide[0]} points wide on a phone of {wide[1]}"
+    page.browser.screenshot(pictures / "page-phone.png")
+    page.browser.post("goog/cdp/execute", cmd="Emulation.clearDeviceMetricsOverride", params={})
+
+
+def follows_a_replay(page, replay, out, pictures):
+    """Another run has taken the place; the page, which was not loaded again, shows it step by step."""
+    page.wait_for_text("#link", "live")
+    page.wait_for_text("#name", "ground")
+    replay.wait_for_phase("running")
+
+    def packets():
+        return replay.status()["reception"]["visibilities"]["packets"]
+
+    for _ in range(3):
+        before = packets()
+        print(file=replay.process.stdin, flush=True)
+        wait_until("a step", lambda: packets() > before)
+        page.assert_counts(replay.status)
+    replay.process.stdin.close()
+    replay.wait_for_phase("ended")
+    page.wait_for_text("#phase", "ended")
+    page.wait_for_text("#verdict", "closed")
+    page.assert_counts(replay.status)
+    page.wait_for_text("#which", "final map")
+    final = read(out / "3.000MHz/map.fits")
+    page.assert_sky("map of the replay", final, Colours.robust(page.palettes["inferno"], final))
+    page.wait_for_text("#log", "the run is complete")
+    page.browser.screenshot(pictures / "page-replay.png")
+
+
+def main():
+    lunarray, pipeline, downlink, folder, pictures = sys.argv[1:]
+    folder, pictures = Path(folder), Path(pictures)
+    pictures.mkdir(parents=True, exist_ok=True)
+    since = time.monotonic()
+    run = [lunarray, "run", pipeline, *SNAPSHOTS, "--out", str(folder / "run"), "--serve-after"]
+    with Served(*run) as served, Browser(WINDOW) as browser:
+        page = Page(browser, served.json("/page.json"))
+        # Its own first page is none of ours.
+        browser.get("about:blank")
+        browser.log("performance")
+        for name, known in KNOWN_COLOURS.items():
+            # A middle may be rounded to either of two.
+            assert np.abs(page.palettes[name][[0, 128, 255]] - known).max() <= 3, name
+        served.wait_for_phase("ended")
+        browser.get(served.url)
+        assert browser.js("return !!document.getElementById('gl').getContext('webgl2')"), "no WebGL2"
+        shows_a_run(page, served, folder / "run", pictures)
+        fits_a_phone(page, pictures)
+        page.listen()
+        assert not [entry for entry in page.console if entry["level"] == "SEVERE"], page.console
+
+        # A cut: the page says so, and finds the next run by itself.
+        served.end()
+        page.wait_for_text("#link", "not connected")
+        page.listen()
+        replay = [lunarray, "replay", downlink, "--map", pipeline, "--out", str(folder / "replay")]
+        with Served(*replay, "--step", "pass", "--serve-after", port=served.port) as replay:
+            follows_a_replay(page, replay, folder / "replay", pictures)
+            without_webgl(replay, folder / "replay", page.palettes)
+        page.listen()
+        # What the browser says itself of the cut.
+        errors = [entry for entry in page.console if entry["level"] == "SEVERE"]
+        assert all(e["source"] == "network" and f"{served.url}/events" in e["message"] for e in errors), errors
+        own = [url for url in page.urls if url.startswith(f"{served.url}/")]
+        foreign = [url for url in page.urls if url not in own and not url.startswith("data:")]
+        assert len(own) > 10 and not foreign, foreign
+    print(f"{len(own)} requests, none foreign; {time.monotonic() - since:.1f} s")
+
+
+def without_webgl(served, out, palettes):
+    """The page draws the same by itself."""
+    with Browser(WINDOW, ["--disable-3d-apis"]) as browser:
+        browser.get(served.url)
+        page = Page(browser, served.json("/page.json"))
+        page.wait_for_text("#which", "final map")
+        assert browser.js("return !document.getElementById('gl').getContext('webgl2')"), "WebGL2 is there"
+        browser.click("#marks")
+        final = read(out / "3.000MHz/map.fits")
+        page.assert_sky("without WebGL", final, Colours.robust(palettes["inferno"], final))
+
+
+main()
