@@ -11,6 +11,7 @@ use super::grid::{Grids, NODE_GROUP, NODES};
 use super::lines::multiply_line;
 use super::tori::{NodeSums, Tori};
 use super::workspace::{ALPHAS, NodeRange, Workspace};
+use crate::accumulation::fixed_point::parts::sum_of_parts;
 use crate::response::harmonic::filter::FilteredPatterns;
 use crate::response::harmonic::rotation::{RotationTable, orders};
 use crate::response::harmonic::{PatternGeometry, PatternTable, degrees};
@@ -84,11 +85,11 @@ impl Operator {
     pub(super) fn matrix_product_flops(&self, tori: &Tori) -> f64 {
         let reach = self.reach(tori);
         let used = tori.alphas(self.grids.points, |node| &node.weights);
-        let alphas = used.iter().filter(|used| **used).count().next_multiple_of(ALPHAS);
+        let blocks = used.chunks(ALPHAS).filter(|block| block.contains(&true)).count();
         let patterns: usize = (0..=self.l_max).map(|mu| 2 * reach.count * degrees(self.l_max, mu)).sum();
         let rotations: usize = (0..=self.l_max).map(|l| orders(l) * (l + 1)).sum();
         // Forth and back, real and imaginary parts, multiplications and additions.
-        (2 * 2 * 2 * alphas * (patterns + rotations)) as f64
+        (2 * 2 * 2 * ALPHAS * blocks * (patterns + rotations)) as f64
     }
 
     fn reach(&self, tori: &Tori) -> NodeRange {
@@ -102,7 +103,7 @@ impl Operator {
         let reach = self.reach(tori);
         let circle = Circle { points: self.grids.points };
         let used = tori.alphas(circle.points, |node| &node.weights);
-        self.over_blocks(&used, circle.points, reach, |work, alphas| {
+        self.over_blocks(&used, reach, |work, alphas| {
             self.turn(sky, circle, alphas, &mut work.turned);
             self.multiply_patterns(work, reach);
             for (place, &alpha) in alphas.iter().enumerate() {
@@ -117,7 +118,7 @@ impl Operator {
         let reach = self.reach(tori);
         let circle = Circle { points: self.grids.data_points() };
         let used = tori.alphas(circle.points, |node| &node.right);
-        self.over_blocks(&used, circle.points, reach, |work, alphas| {
+        self.over_blocks(&used, reach, |work, alphas| {
             work.products.fill(0.0);
             for (place, &alpha) in alphas.iter().enumerate() {
                 for group in (0..reach.count).step_by(NODE_GROUP) {
@@ -139,23 +140,28 @@ impl Operator {
         })
     }
 
-    /// Sums `block` over blocks of the alphas in use; the order of the sum does not depend on threads.
+    /// Sums `block` over blocks of alphas: of each fixed range of them those in use. The sum has the same bits in any order,
+    /// so that it does not depend on who computes which block.
     fn over_blocks(
         &self,
         used: &[bool],
-        points: usize,
         reach: NodeRange,
-        block: impl Fn(&mut Workspace, &[usize]) -> Vec<Complex64> + Sync,
+        block: impl Fn(&mut Workspace, &[usize]) -> Vec<f64> + Sync,
     ) -> Alm {
-        let alphas: Vec<usize> = (0..points).filter(|&alpha| used[alpha]).collect();
-        let blocks: Vec<&[usize]> = alphas.chunks(ALPHAS).collect();
-        let parts: Vec<Vec<Complex64>> = blocks
-            .into_par_iter()
+        let points = used.len();
+        let of_range = |first: usize| -> Vec<usize> {
+            (first..points.min(first + ALPHAS)).filter(|&alpha| used[alpha]).collect()
+        };
+        let blocks: Vec<Vec<usize>> =
+            (0..points).step_by(ALPHAS).map(of_range).filter(|alphas| !alphas.is_empty()).collect();
+        let parts: Vec<Vec<f64>> = blocks
+            .par_iter()
             .map_init(|| Workspace::new(self.l_max, points, reach), |work, alphas| block(work, alphas))
             .collect();
         let mut sum = Alm::zeros(self.l_max);
-        for part in parts {
-            sum.values_mut().iter_mut().zip(part).for_each(|(sum, term)| *sum += term);
+        let sums = sum_of_parts(&parts, 2 * sum.values().len(), points.div_ceil(ALPHAS));
+        for (value, sums) in sum.values_mut().iter_mut().zip(sums.as_chunks::<2>().0) {
+            *value = Complex64::new(sums[0], sums[1]);
         }
         sum
     }
@@ -286,7 +292,7 @@ impl Operator {
         circle: Circle,
         alphas: &[usize],
         factor: Option<&[f64]>,
-    ) -> Vec<Complex64> {
+    ) -> Vec<f64> {
         let len = 2 * ALPHAS * 2 * reach.count;
         for (mu, products) in work.products.chunks_exact(len).enumerate() {
             let (start, rows) = (self.turned_start(mu), degrees(self.l_max, mu));
@@ -310,7 +316,7 @@ impl Operator {
         circle: Circle,
         alphas: &[usize],
         factor: Option<&[f64]>,
-    ) -> Vec<Complex64> {
+    ) -> Vec<f64> {
         let starts: Vec<usize> = (0..=self.l_max).map(|mu| self.turned_start(mu)).collect();
         let count = alphas.len();
         let turns = self.turns(circle, alphas);
@@ -347,6 +353,6 @@ impl Operator {
                 *sum.get_mut(l, m) = total * factor.map_or(1.0, |factor| factor[m]);
             }
         }
-        sum.values().to_vec()
+        sum.values().iter().flat_map(|value| [value.re, value.im]).collect()
     }
 }
