@@ -17,6 +17,7 @@ mod gaps;
 mod geometry;
 mod inspect;
 mod interrupt;
+mod job;
 mod lines;
 mod merge;
 mod output;

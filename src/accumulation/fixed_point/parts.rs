@@ -1,9 +1,10 @@
-//! Sums of numbers that come in parts, the same bits in any order of the parts.
+//! Sums of numbers that come in parts, the same bits in any order of the parts and however ranks share them.
 //!
 //! Every part is rounded to multiples of one power of two, which follows from the greatest number of all parts, and the
 //! multiples are added as integers. The greatest number has 51 bits, so that a sum is as exact as one in f64 relative to it.
 
 use super::rounding::{BIAS, above_bias};
+use crate::ranks::Ranks;
 
 /// Bits of the greatest multiple: what a rounding by [`BIAS`] leaves.
 const BITS: i64 = 51;
@@ -12,10 +13,19 @@ const PARTS_BITS: i64 = 11;
 /// Least exponent of the quantum, so that its inverse is a number.
 const EXPONENT_MIN: i64 = -1000;
 
-/// The sum of parts of `len` numbers each, of which there are at most `parts_max`; NaN if any number is not finite.
-pub(in crate::accumulation) fn sum_of_parts(parts: &[Vec<f64>], len: usize, parts_max: usize) -> Vec<f64> {
+/// The sum of the parts of all ranks, of `len` numbers each; NaN if any number is not finite. Each rank gives its own parts; of
+/// all ranks there are at most `parts_max`.
+pub(in crate::accumulation) fn sum_of_parts(
+    ranks: &Ranks,
+    parts: &[Vec<f64>],
+    len: usize,
+    parts_max: usize,
+) -> Vec<f64> {
     let sizes = parts.iter().flatten().map(|x| x.abs().to_bits());
-    let greatest = f64::from_bits(sizes.max().unwrap_or(0));
+    // Sizes are ordered as their bits are.
+    let mut greatest = [sizes.max().unwrap_or(0).cast_signed()];
+    ranks.greatest(&mut greatest);
+    let greatest = f64::from_bits(greatest[0].cast_unsigned());
     let Some(exponent) = quantum_exponent(greatest, parts_max) else { return vec![f64::NAN; len] };
     let (quantum, inverse) = (power_of_two(exponent), power_of_two(-exponent));
     let mut sums = vec![0_i64; len];
@@ -24,6 +34,7 @@ pub(in crate::accumulation) fn sum_of_parts(parts: &[Vec<f64>], len: usize, part
             *sum = sum.wrapping_add(above_bias(x * inverse + BIAS));
         }
     }
+    ranks.sum(&mut sums);
     sums.into_iter().map(|sum| sum as f64 * quantum).collect()
 }
 
@@ -44,6 +55,7 @@ fn power_of_two(exponent: i64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ranks::on_threads;
 
     /// Numbers of very different sizes.
     fn parts(count: usize, len: usize) -> Vec<Vec<f64>> {
@@ -56,13 +68,25 @@ mod tests {
         (0..count).map(|_| (0..len).map(|_| number()).collect()).collect()
     }
 
+    fn bits(values: &[f64]) -> Vec<u64> {
+        values.iter().map(|x| x.to_bits()).collect()
+    }
+
     #[test]
     fn sums_do_not_depend_on_the_order_of_parts() {
         let mut parts = parts(90, 40);
-        let forth = sum_of_parts(&parts, 40, 90);
+        let forth = sum_of_parts(&Ranks::one(), &parts, 40, 90);
         parts.reverse();
-        let back = sum_of_parts(&parts, 40, 90);
-        assert!(forth.iter().zip(&back).all(|(a, b)| a.to_bits() == b.to_bits()));
+        let back = sum_of_parts(&Ranks::one(), &parts, 40, 90);
+        assert_eq!(bits(&forth), bits(&back));
+        for count in 1..4 {
+            let shared = on_threads(count, |ranks| {
+                let own: Vec<_> =
+                    (0..90).filter(|k| ranks.share().holds(*k)).map(|k| parts[k].clone()).collect();
+                sum_of_parts(ranks, &own, 40, 90)
+            });
+            assert!(shared.iter().all(|sum| bits(sum) == bits(&forth)), "{count} ranks");
+        }
         // Half a quantum for each part, of numbers below 10^8.
         let tolerance = 90.0 * 0.5 * 1.35e8 / 2_f64.powi(51);
         for (k, sum) in forth.iter().enumerate() {
@@ -74,14 +98,18 @@ mod tests {
     #[test]
     fn sums_have_room_for_all_parts() {
         for (count, value) in [(2048, f64::MAX / 4096.0), (5000, -1.0), (3, 1e-300), (1, 0.0)] {
-            let sum = sum_of_parts(&vec![vec![value]; count], 1, count);
+            let sum = sum_of_parts(&Ranks::one(), &vec![vec![value]; count], 1, count);
             let expected = value * count as f64;
             // The least number of these is 2^-996, four quanta of the least kind and a half.
             assert!((sum[0] - expected).abs() <= 0.2 * expected.abs(), "{count} {value:e}: {}", sum[0]);
         }
-        assert_eq!(sum_of_parts(&[], 2, 1), [0.0, 0.0]);
+        assert_eq!(sum_of_parts(&Ranks::one(), &[], 2, 1), [0.0, 0.0]);
         for bad in [f64::NAN, f64::INFINITY] {
-            assert!(sum_of_parts(&[vec![1.0, bad], vec![1.0, 1.0]], 2, 2).iter().all(|x| x.is_nan()));
+            assert!(
+                sum_of_parts(&Ranks::one(), &[vec![1.0, bad], vec![1.0, 1.0]], 2, 2)
+                    .iter()
+                    .all(|x| x.is_nan())
+            );
         }
     }
 }
