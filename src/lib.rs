@@ -57,6 +57,8 @@ pub mod units;
 
 pub mod files;
 
+pub mod ranks;
+
 pub mod frames;
 
 pub mod runtime;

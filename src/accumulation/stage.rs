@@ -12,6 +12,7 @@ use super::{
     PixelSetup, PixelSums, SumCounts, automatic_weight_max,
 };
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
+use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Ledger, Outlet, Stage, Units};
 use crate::units::ChannelId;
 use crate::units::vector::{norm, sub};
@@ -64,6 +65,14 @@ enum Engine {
 }
 
 impl Engine {
+    /// As one rank's of several. Other engines than the harmonic one hold all sums on every rank.
+    fn among(self, ranks: &Ranks) -> Self {
+        match self {
+            Self::Harmonic(engine) => Self::Harmonic(Box::new(engine.among(ranks))),
+            other => other,
+        }
+    }
+
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
         match self {
             Self::Pixel(engine) => engine.add(placed),
@@ -138,6 +147,8 @@ pub struct Accumulator {
     memory_max_bytes: Option<u64>,
     /// The channels of a group; `None` for all.
     group: Option<ChannelGroup>,
+    /// Those that hold the other parts of the sums.
+    ranks: Ranks,
 }
 
 impl Accumulator {
@@ -154,7 +165,20 @@ impl Accumulator {
             cancel: Cancel::new(),
             memory_max_bytes: None,
             group: None,
+            ranks: Ranks::one(),
         }
+    }
+
+    /// As one rank's of several: it takes all visibilities, and holds its part of the sums of the harmonic engine.
+    #[must_use]
+    pub fn among(self, ranks: &Ranks) -> Self {
+        Self { ranks: ranks.clone(), ..self }
+    }
+
+    /// Those that hold parts of the sums.
+    #[must_use]
+    pub fn ranks(&self) -> &Ranks {
+        &self.ranks
     }
 
     /// Sums the channels of a group alone; `None` for all.
@@ -318,6 +342,7 @@ impl Accumulator {
         let slot = self.channels.get_mut(index).ok_or_else(unknown)?;
         if slot.is_none() {
             let Some(engine) = engine(&self.config, instrument, placed)? else { return Ok(None) };
+            let engine = engine.among(&self.ranks);
             *slot = Some(ChannelSums { engine, span_s: NO_SPAN_S, snapshots: 0 });
         }
         Ok(slot.as_mut())

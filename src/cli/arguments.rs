@@ -100,9 +100,16 @@ impl PipelineArgs {
 
     /// The configuration; what follows from it without being said is noted on standard error.
     pub(super) fn load(&self) -> Result<Config, ConfigError> {
+        self.load_noting(true)
+    }
+
+    /// As [`PipelineArgs::load`]; silent unless it `says` so.
+    pub(super) fn load_noting(&self, says: bool) -> Result<Config, ConfigError> {
         let mut notes = Vec::new();
         let config = self.source().load_noting(&mut notes)?;
-        print_notes(notes);
+        if says {
+            print_notes(notes);
+        }
         Ok(config)
     }
 

@@ -17,6 +17,10 @@ use crate::pipeline::{ConfigError, Plan, Segment};
 pub(super) struct CheckArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
+    /// As one of so many ranks that share the sums of each map (run --mpi): prints memory a rank, bytes exchanged, and the nodes
+    /// needed, each with the memory of --memory-max or of this machine. Fails if not even one rank fits a node.
+    #[arg(long, value_name = "NUMBER", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
+    ranks: u16,
     /// Print one JSON object instead of a table.
     #[arg(long)]
     json: bool,
@@ -31,7 +35,9 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     if !problems.is_empty() {
         return Err(Box::new(ConfigError::Values { origin: source.origin(), problems }));
     }
-    let cost = plan.cost();
+    let ranks = usize::from(args.ranks);
+    plan.config.require_shareable(ranks)?;
+    let cost = plan.cost_among(ranks).on_nodes(args.pipeline.memory_limit());
     if args.json {
         print_json_line(&cost)?;
     } else {

@@ -18,6 +18,7 @@ mod gaps;
 mod geometry;
 mod inspect;
 mod interrupt;
+mod job;
 mod lines;
 mod merge;
 #[cfg(unix)]

@@ -9,6 +9,7 @@ use crossbeam_channel::{Receiver, bounded};
 use super::arguments::{ChannelList, channel_list, not_negative_s, size_bytes};
 use super::events::{Events, EventsArgs};
 use super::interrupt::Interrupt;
+use super::job::Job;
 use super::lines::next_line;
 use super::output::{
     CommandError, CommandResult, print_incompleteness, print_json_line, print_notes, print_text, say,
@@ -101,6 +102,12 @@ pub(super) struct ReplayArgs {
     /// not given.
     #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
     memory_max: Option<u64>,
+    /// Share the sums of each map of the harmonic engine with the other ranks of an MPI job: mpirun -n 4 lunarray replay --mpi ...
+    /// Every rank reads the files; the first writes the products, which are those of one process. Needs a program built with
+    /// --features mpi.
+    #[arg(long, conflicts_with_all = ["live", "pace", "state", "groups", "events"])]
+    #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]
+    mpi: bool,
     /// Replace one setting, for example --set map.nside=8; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
@@ -148,6 +155,12 @@ fn group_size(text: &str) -> Result<GroupSize, String> {
 }
 
 pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
+    let job = Job::join(args.mpi)?;
+    let result = work(args, &job);
+    job.conclude(result)
+}
+
+fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     let mut overrides = args.overrides.clone();
     if let Some(every_s) = args.snapshot_every {
         overrides.push(format!("map.snapshot_every_s={every_s:?}"));
@@ -169,18 +182,21 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     let settings = args.limited(config.ground(args.wait_bytes.unwrap_or(wait_bytes)));
     let ground = match &args.state {
         Some(folder) => Ground::open(folder, &settings, args.checkpoint_every)?,
-        None => Ground::new(&settings)?,
+        None => Ground::new(&settings)?.among(job.ranks()),
     };
     print_notes(ground.notes());
     let saving = ground.outcome().saving;
     let interrupt = Interrupt::default();
     let page = args.serve.start(&config, "ground", args.state.as_deref())?;
     let events = args.events.start(&config, "ground")?;
-    let session = Session { args, config: &config, interrupt: &interrupt, page: &page, events: &events };
+    let session = Session { args, config: &config, job, interrupt: &interrupt, page: &page, events: &events };
     let ended = match &args.listen {
         Some(url) => session.hear_senders(url, ground),
         None => session.read_files(ground),
     };
+    if let Some(completion) = job.interrupted(&ended, &interrupt) {
+        return Ok(completion);
+    }
     let ended = page.conclude(ended, |summary| summary.cancelled);
     events.conclude(&ended, |summary| summary.cancelled);
     let summary = ended.inspect_err(|error| {
@@ -195,6 +211,9 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
         }
         false => interrupt.completion(summary.cancelled),
     };
+    if !job.is_first() {
+        return Ok(completion);
+    }
     let printed = args.print(&summary);
     print_incompleteness(&summary);
     page.stay(&interrupt);
@@ -251,6 +270,7 @@ fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResu
 struct Session<'a> {
     args: &'a ReplayArgs,
     config: &'a Config,
+    job: &'a Job,
     interrupt: &'a Interrupt,
     page: &'a Page,
     events: &'a Events,
@@ -298,7 +318,7 @@ impl Session<'_> {
         ground: Ground,
         begun: &dyn Fn(),
     ) -> Result<RunSummary, PipelineError> {
-        let Self { args, config, interrupt, page, events } = self;
+        let Self { args, config, job, interrupt, page, events } = self;
         let cancel = interrupt.cancel();
         let mut progress = None;
         #[cfg(unix)]
@@ -312,7 +332,9 @@ impl Session<'_> {
             }
             page.watch(&watched);
             events.watch(&watched);
-            progress = Some(Progress::watch(watched, READ, 0, cancel));
+            if job.is_first() {
+                progress = Some(Progress::watch(watched, READ, 0, cancel));
+            }
         })
     }
 }

@@ -7,12 +7,13 @@ use clap::Args;
 use super::arguments::PipelineArgs;
 use super::events::EventsArgs;
 use super::interrupt::Interrupt;
+use super::job::Job;
 use super::output::{
     CommandResult, print_config_notes, print_incompleteness, print_json_line, print_notes, print_text,
 };
 use super::progress::Progress;
 use super::serving::ServeArgs;
-use crate::pipeline::{INTEGRATE, Plan, Segment, run, sky_notes, use_threads};
+use crate::pipeline::{INTEGRATE, Plan, Segment, run_among, sky_notes, use_threads};
 
 /// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
 ///
@@ -32,6 +33,11 @@ pub(super) struct RunArgs {
     /// Print the summary as one JSON object instead of tables.
     #[arg(long)]
     json: bool,
+    /// Share the sums of each map of the harmonic engine with the other ranks of an MPI job: mpirun -n 4 lunarray run --mpi. The
+    /// first rank writes the products, which are those of one process. Needs a program built with --features mpi.
+    #[arg(long, conflicts_with = "events")]
+    #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]
+    mpi: bool,
     #[command(flatten)]
     events: EventsArgs,
     #[command(flatten)]
@@ -39,28 +45,47 @@ pub(super) struct RunArgs {
 }
 
 pub(super) fn execute(args: &RunArgs) -> CommandResult {
-    let config = args.pipeline.load()?;
-    print_config_notes(&config);
+    let job = Job::join(args.mpi)?;
+    let result = work(args, &job);
+    job.conclude(result)
+}
+
+fn work(args: &RunArgs, job: &Job) -> CommandResult {
+    let config = args.pipeline.load_noting(job.is_first())?;
+    if job.is_first() {
+        print_config_notes(&config);
+    }
     let plan = Plan::new(config)?;
-    print_notes(sky_notes(&plan)?);
+    if job.is_first() {
+        print_notes(sky_notes(&plan)?);
+    }
     use_threads(&plan.config.runtime)?;
-    plan.cost().require_memory(Segment::Whole, args.pipeline.memory_limit())?;
+    let cost = plan.cost_among(job.ranks().share().count);
+    cost.require_memory(Segment::Whole, job.memory_limit(args.pipeline.memory_limit()))?;
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
     let interrupt = Interrupt::default();
     let page = args.serve.start(&plan.config, "whole", None)?;
     let events = args.events.start(&plan.config, "whole")?;
     let mut progress = None;
     let windows = plan.windows_watched();
-    let ended = run(&plan, &out, interrupt.cancel(), &mut |watched| {
+    let ended = run_among(job.ranks(), &plan, &out, interrupt.cancel(), &mut |watched| {
         interrupt.arm_or_note();
         page.watch(&watched);
         events.watch(&watched);
-        progress = Some(Progress::watch(watched, INTEGRATE, windows, interrupt.cancel()));
+        if job.is_first() {
+            progress = Some(Progress::watch(watched, INTEGRATE, windows, interrupt.cancel()));
+        }
     });
     drop(progress);
+    if let Some(completion) = job.interrupted(&ended, &interrupt) {
+        return Ok(completion);
+    }
     let ended = page.conclude(ended, |summary| summary.cancelled);
     events.conclude(&ended, |summary| summary.cancelled);
     let summary = ended?;
+    if !job.is_first() {
+        return Ok(interrupt.completion(summary.cancelled));
+    }
     let printed = match args.json {
         _ if args.events.take_stdout() => Ok(()),
         true => print_json_line(&summary),

@@ -9,6 +9,7 @@ use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::{Calibrator, MissingPackets};
 use crate::downlink::{CucTime, Kind};
 use crate::frames::{GroundFrame, Instrument, PlacedFrame};
+use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Outlet, Stage, Units};
 
 /// Waits before the last checkpoint of a session is tried again: what lacks may be there a moment later.
@@ -61,6 +62,18 @@ impl Ground {
     pub fn cancelled_by(mut self, cancel: &Cancel, linger: Duration) -> Self {
         self.accumulator = self.accumulator.cancelled_by(cancel);
         Self { cancel: cancel.clone(), linger, ..self }
+    }
+
+    /// As one rank's of several: it receives everything, and holds its part of the sums.
+    #[must_use]
+    pub fn among(self, ranks: &Ranks) -> Self {
+        Self { accumulator: self.accumulator.among(ranks), ..self }
+    }
+
+    /// Those that hold parts of the sums.
+    #[must_use]
+    pub fn ranks(&self) -> &Ranks {
+        self.accumulator.ranks()
     }
 
     /// The instrument, once it is known.

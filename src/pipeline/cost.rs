@@ -74,10 +74,24 @@ pub struct Cost {
     pub without_effect: Vec<String>,
     /// Rate of the ninth daughter's spectra on the downlink while the array observes, bit/s; with it alone.
     pub ninth_bits_per_s: Option<f64>,
+    /// What ranks exchange that share the sums; memory and time are then those of one of them. With several alone.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ranks: Option<RankCost>,
     /// Estimated time to draw, quantise, send and correlate the samples, s; with samples alone.
     pub sampling_s: Option<f64>,
     /// Estimated time of the whole run, s, at the rates of one machine and with as many cores as this one.
     pub predicted_s: f64,
+}
+
+/// Ranks that share the sums of each channel.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct RankCost {
+    /// Number of ranks.
+    pub ranks: usize,
+    /// Bytes that each gives to the others, and gets, in all solutions.
+    pub reduced_bytes: f64,
+    /// Memory of a node, bytes, and the number of nodes that hold all ranks, once [`Cost::on_nodes`] has been asked.
+    pub nodes: Option<(f64, usize)>,
 }
 
 /// Part of a pipeline that is to run.
@@ -103,6 +117,12 @@ impl Plan {
     /// What the pipeline will cost. Nothing is measured: times are estimates at rates measured once.
     #[must_use]
     pub fn cost(&self) -> Cost {
+        self.cost_among(1)
+    }
+
+    /// As [`Plan::cost`], for one of some ranks that share the sums.
+    #[must_use]
+    pub fn cost_among(&self, ranks: usize) -> Cost {
         let map = &self.config.map;
         let nsides = self.sky_nsides();
         let fringes_per_s = FRINGES_PER_S * cores();
@@ -110,7 +130,8 @@ impl Plan {
         let frequencies = &self.config.spacecraft.channels_hz;
         let engine = |(channel, (&frequency_hz, expected)): (usize, (&f64, &Expected))| {
             let is_mapped = map.maps(ChannelId(channel as u16));
-            if is_mapped { self.engine_cost(frequency_hz, expected.mapped) } else { EngineCost::default() }
+            let cost = || self.engine_cost(frequency_hz, expected.mapped).among(ranks, map);
+            if is_mapped { cost() } else { EngineCost::default() }
         };
         let engines: Vec<EngineCost> = frequencies.iter().zip(&expected).enumerate().map(engine).collect();
         let channels: Vec<ChannelCost> = frequencies
@@ -161,6 +182,11 @@ impl Plan {
             link_bits_per_s: self.link_bits_per_s(),
             without_effect: self.without_effect(),
             ninth_bits_per_s: self.ninth_bits_per_s(),
+            ranks: (ranks > 1).then(|| RankCost {
+                ranks,
+                reduced_bytes: solutions as f64 * engines.len() as f64 * EngineCost::reduced_bytes(map),
+                nodes: None,
+            }),
             sampling_s,
             predicted_s,
         }
@@ -236,6 +262,17 @@ pub(super) fn memory_bytes(simulation_bytes: f64, engines: &[EngineCost], soluti
 }
 
 impl Cost {
+    /// With the number of nodes of so much memory that hold all ranks, unless not even one rank fits.
+    #[must_use]
+    pub fn on_nodes(mut self, limit: Option<MemoryLimit>) -> Self {
+        if let (Some(limit), Some(cost)) = (limit, &mut self.ranks) {
+            let bytes = limit.bytes as f64;
+            let on_one = (bytes / self.memory_bytes) as usize;
+            cost.nodes = (on_one > 0).then(|| (bytes, cost.ranks.div_ceil(on_one)));
+        }
+        self
+    }
+
     /// Requires that the memory that a segment needs is within the limit.
     ///
     /// # Errors
@@ -292,6 +329,16 @@ impl fmt::Display for Cost {
         writeln!(f, "maps per channel {}", self.solutions)?;
         writeln!(f, "downlink         {:.1} MB", self.downlink_bytes / 1e6)?;
         writeln!(f, "memory           {:.2} GB", self.memory_bytes / 1e9)?;
+        if let Some(RankCost { ranks, reduced_bytes, nodes }) = self.ranks {
+            writeln!(
+                f,
+                "ranks            {ranks}: memory and time are those of one; each gives {:.2} GB to the others and gets as much",
+                reduced_bytes / 1e9
+            )?;
+            if let Some((bytes, nodes)) = nodes {
+                writeln!(f, "nodes            {nodes} of {:.2} GB hold all ranks", bytes / 1e9)?;
+            }
+        }
         if let Some(rate) = self.samples_bits_per_s {
             writeln!(f, "samples          {:.3} Mbit/s from all daughters", rate / 1e6)?;
         }

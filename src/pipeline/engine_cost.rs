@@ -8,7 +8,7 @@ use super::rates::{
     ROW_S, TRANSFORM_MULTIPLY_ADDS_PER_S, VISIBILITIES_PER_ROW, cores,
 };
 use crate::accumulation::harmonic::{
-    REFINED_VISIBILITY_BYTES, SPREAD_MULTIPLY_ADDS, application_size, memory,
+    REFINED_VISIBILITY_BYTES, SPREAD_MULTIPLY_ADDS, application_size, memory, shared_size,
 };
 use crate::accumulation::{EngineKind, MapConfig, PixelEngine};
 use crate::response::general::row_tables_bytes;
@@ -74,6 +74,25 @@ impl Plan {
 }
 
 impl EngineCost {
+    /// The cost for one of some ranks that share the sums of the harmonic engine: for the one that has most of them.
+    pub(super) fn among(self, ranks: usize, map: &MapConfig) -> Self {
+        let blocks = shared_size(map.degree()).blocks;
+        let share = blocks.div_ceil(ranks.max(1)) as f64 / blocks as f64;
+        Self {
+            sums_bytes: share * self.sums_bytes,
+            copy_bytes: share * self.copy_bytes,
+            visibility_s: share * self.visibility_s,
+            solution_s: share * self.solution_s,
+            probes_s: share * self.probes_s,
+            ..self
+        }
+    }
+
+    /// Bytes that a rank gives to the others in one solution.
+    pub(super) fn reduced_bytes(map: &MapConfig) -> f64 {
+        APPLICATIONS * shared_size(map.degree()).product_bytes as f64
+    }
+
     /// The cost of the engine for a channel.
     pub(super) fn of(map: &MapConfig, data: ChannelData) -> Self {
         match map.engine {

@@ -85,6 +85,19 @@ pub enum PipelineError {
         /// Why it could not be written.
         reason: String,
     },
+    /// One rank of several was interrupted, so that there is no common sum.
+    #[error(
+        "interrupted: ranks hold no common sums of the data so far, so there is no map of them; maps made before stay"
+    )]
+    RankInterrupted,
+    /// Settings with which ranks cannot share the sums.
+    #[error("--mpi: found {found}, expected {expected}")]
+    NotShareable {
+        /// What was set.
+        found: &'static str,
+        /// What can be shared.
+        expected: &'static str,
+    },
     /// No observing window.
     #[error(
         "spacecraft.duration_s = {duration_s}: there is no observing window in it. The first begins when the Earth sets for \

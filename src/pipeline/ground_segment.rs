@@ -6,10 +6,10 @@ use std::sync::{Arc, Mutex};
 use super::config::Config;
 use super::error::PipelineError;
 use crate::ground::{Ground, GroundConfig, GroundOutcome};
-use crate::products::{ChannelSummary, MapWatch, Provenance, Publisher, Truth};
-use crate::runtime::{Graph, Link};
+use crate::products::{ChannelSummary, MapWatch, ProductsError, Provenance, Publisher, Truth};
+use crate::runtime::{Graph, Link, Sink};
 use crate::sky::fits::{ReadOptions, read_whole_map};
-use crate::solve::{RefineRule, SolveWatch, Solver, SolverSetup, StoppingRule};
+use crate::solve::{RefineRule, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
 
 /// Name of the stage that keeps the state.
 pub(super) const GROUND: &str = "ground";
@@ -78,7 +78,14 @@ pub(super) fn add(
 ) -> Result<SegmentOutcome, PipelineError> {
     let Mapping { out, truth, watch, viewers } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
-    let setup = config.solver(watch)?;
+    let ranks = ground.ranks().clone();
+    let setup = config.solver(watch.among(&ranks))?;
+    if !ranks.is_first() {
+        let sums = graph.stage(GROUND, 1, bytes, ground);
+        let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));
+        graph.sink("publish", maps, Bystander);
+        return Ok(outcome);
+    }
     let provenance = Provenance { ground_hash: config.ground_hash(), map: config.map.clone() };
     let channels = Arc::clone(&outcome.channels);
     let publisher =
@@ -88,6 +95,18 @@ pub(super) fn add(
     let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));
     graph.sink("publish", maps, publisher);
     Ok(outcome)
+}
+
+/// Takes the maps of a rank that are those of the first rank, which publishes them.
+struct Bystander;
+
+impl Sink for Bystander {
+    type In = Solution;
+    type Error = ProductsError;
+
+    fn take(&mut self, _solution: Solution) -> Result<(), ProductsError> {
+        Ok(())
+    }
 }
 
 fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {

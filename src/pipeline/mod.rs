@@ -34,7 +34,7 @@ pub use calibrate::{CalibrateJob, CalibrateRound, CalibrateSummary, calibrate};
 pub use config::Config;
 pub use config_reader::ReadProblem;
 pub use config_source::{ConfigError, ConfigSource, QUICKLOOK};
-pub use cost::{ChannelCost, Cost, Segment};
+pub use cost::{ChannelCost, Cost, RankCost, Segment};
 pub use error::PipelineError;
 pub use groups::{GroupSize, GroupWatcher, channel_groups, replay_in_groups};
 pub use memory::{MemoryLimit, MemorySource};
@@ -42,7 +42,8 @@ pub use plan::{Expected, Plan};
 pub use problems::{Problem, Problems};
 pub use reference::{KeyDescription, REFERENCE, key_descriptions};
 pub use run::{
-    Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, simulate, use_threads,
+    Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, run_among, simulate,
+    use_threads,
 };
 pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
 pub use sampling::sample_stages;

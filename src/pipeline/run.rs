@@ -14,10 +14,11 @@ use super::{ground_segment, space_segment};
 use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
-use crate::downlink::{DownlinkError, FileSource, Format, Paced, Recorder};
+use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, Paced, Recorder};
 use crate::files::{FolderLock, write_atomically};
 use crate::ground::{Ground, GroundOutcome, WAIT_BYTES};
 use crate::products::{MapShape, MapWatch, ProductsError, Truth, write_autos};
+use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
 use crate::solve::SolveWatch;
@@ -105,32 +106,62 @@ pub fn run(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    let _lock = lock_folder(out)?;
-    write_settings(&plan.config, out)?;
+    run_among(&Ranks::one(), plan, out, cancel, watch)
+}
+
+/// As [`run`], as one rank of several that share the sums. Each simulates and receives everything; the first alone writes into
+/// `out`, and its summary alone has maps. A rank whose run ends early or with an error has to end the job.
+///
+/// # Errors
+/// Those of a run; settings with which sums cannot be shared.
+pub fn run_among(
+    ranks: &Ranks,
+    plan: &Plan,
+    out: &Path,
+    cancel: &Cancel,
+    watch: Watcher<'_>,
+) -> Result<RunSummary, PipelineError> {
+    plan.config.require_shareable(ranks.share().count)?;
+    let DownlinkConfig { link, rate_bits_per_s_max, .. } = &plan.config.downlink;
+    if ranks.are_many() && (link.is_on() || *rate_bits_per_s_max > 0.0) {
+        let found = "downlink.link with faults, or downlink.rate_bits_per_s_max";
+        return Err(PipelineError::NotShareable {
+            found,
+            expected: "neither: simulate first, then replay --mpi",
+        });
+    }
+    let _lock = ranks.is_first().then(|| lock_folder(out)).transpose()?;
     let file = out.join(downlink_file(plan.config.downlink.format));
-    write_instrument_truth(plan, &file)?;
-    let recorder = Recorder::create(&file)?;
+    let recorder = if ranks.is_first() {
+        write_settings(&plan.config, out)?;
+        write_instrument_truth(plan, &file)?;
+        Some(Recorder::create(&file)?)
+    } else {
+        None
+    };
     let skies = space_segment::skies(plan)?;
     let mut graph = Graph::new();
     let counts = SampleCounts::default();
     let bytes = space_segment::add(&mut graph, plan, &skies, &counts)?;
-    let bytes = add_link(&mut graph, bytes, &plan.config, &file)?;
-    let capacity = plan.config.runtime.queue_capacity;
-    let bytes = graph.stage(RECORD, capacity, bytes, recorder);
+    let mut bytes = add_link(&mut graph, bytes, &plan.config, &file)?;
+    if let Some(recorder) = recorder {
+        bytes = graph.stage(RECORD, plan.config.runtime.queue_capacity, bytes, recorder);
+    }
     let truth = Truth::new(&skies, plan.config.map_shape())?;
     drop(skies);
     let grace = Grace::of(&plan.config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
-    let ground = Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add);
+    let ground =
+        Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add).among(ranks);
     let maps = MapWatch::default();
     let mapping = Mapping { out, truth, watch: solving.clone(), viewers: maps.clone() };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
     let ground = Some(outcome.ground.clone());
     let watched = Watched { metrics: graph.metrics(), solving, listening: None, ground, maps };
-    let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
+    let report = start(graph, ranks, &plan.config.runtime, cancel, (watched, watch))?;
     let samples = close_samples(&counts, plan, &report)?;
     let ended = Ended { report, outcome, listening: None, samples };
-    finish(summarise(RunScope::Whole, &plan.config, out, ended)?, out)
+    conclude(RunScope::Whole, ranks, &plan.config, out, ended)
 }
 
 /// The space segment alone, to a downlink file, a ground that listens, or both.
@@ -182,12 +213,14 @@ pub(super) fn simulate_sky(
     }
     let (solving, maps) = (SolveWatch::default(), MapWatch::default());
     let watched = Watched { metrics: graph.metrics(), solving, listening: None, ground: None, maps };
-    let report = start(graph, &plan.config.runtime, cancel, (watched, watch))?;
+    let report = start(graph, &Ranks::one(), &plan.config.runtime, cancel, (watched, watch))?;
     close_samples(&counts, plan, &report)?;
     Ok(report)
 }
 
 /// The ground segment alone: `ground`, made with the same configuration, takes downlink files or what senders send.
+///
+/// Of a ground that is one rank's ([`Ground::among`]), as [`run_among`].
 ///
 /// # Errors
 /// A file that cannot be read; the first failure of any stage; a last checkpoint that could not be written; no
@@ -213,9 +246,11 @@ pub(super) fn replay_knowing<S: GroundSource + 'static>(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    let _lock = lock_folder(out)?;
+    let ranks = ground.ranks().clone();
+    config.require_shareable(ranks.share().count)?;
+    let _lock = ranks.is_first().then(|| lock_folder(out)).transpose()?;
     let ended = ground_alone(truth, source, config, ground, out, cancel, watch)?;
-    finish(summarise(RunScope::Ground, config, out, ended)?, out)
+    conclude(RunScope::Ground, &ranks, config, out, ended)
 }
 
 /// Runs the ground on a source; the output folder is locked.
@@ -233,17 +268,37 @@ pub(super) fn ground_alone<S: GroundSource + 'static>(
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
     let grace = Grace::of(&config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
+    let ranks = ground.ranks().clone();
     let ground = ground.cancelled_by(cancel, grace.to_add);
     let maps = MapWatch::default();
     let mapping = Mapping { out, truth, watch: solving.clone(), viewers: maps.clone() };
     let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
     let ground = Some(outcome.ground.clone());
     let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone(), ground, maps };
-    let report = start(graph, &config.runtime, cancel, (watched, watch))?;
+    let report = start(graph, &ranks, &config.runtime, cancel, (watched, watch))?;
     Ok(Ended { report, outcome, listening, samples: None })
 }
 
 impl Config {
+    /// Requires settings with which so many ranks can share the sums.
+    ///
+    /// # Errors
+    /// [`PipelineError::NotShareable`].
+    pub fn require_shareable(&self, ranks: usize) -> Result<(), PipelineError> {
+        let found = match self {
+            _ if ranks < 2 => None,
+            Self { map, .. } if map.engine != EngineKind::Harmonic => {
+                Some(("map.engine = \"pixel\"", "\"harmonic\""))
+            }
+            Self { map, .. } if map.refine.is_on() => Some(("map.refine.passes_max above 0", "0")),
+            _ => None,
+        };
+        match found {
+            Some((found, expected)) => Err(PipelineError::NotShareable { found, expected }),
+            None => Ok(()),
+        }
+    }
+
     /// The maps that a truth is compared with.
     pub(super) fn map_shape(&self) -> MapShape {
         let Self { map, products, .. } = self;
@@ -317,8 +372,12 @@ impl Grace {
     }
 }
 
+/// How long stages of one rank of several have to end after a failure: they may be waiting for the others.
+const SHUTDOWN_OF_RANK: Duration = Duration::from_secs(3);
+
 fn start(
     mut graph: Graph,
+    ranks: &Ranks,
     config: &RuntimeConfig,
     cancel: &Cancel,
     (watched, watch): (Watched, Watcher<'_>),
@@ -329,7 +388,8 @@ fn start(
     // What these save is to be whole, however long it takes.
     graph.cut_after(Duration::from_secs_f64(config.grace_s), &[RECORD, ground_segment::GROUND]);
     watch(watched);
-    Ok(graph.run(cancel, Duration::from_secs_f64(config.shutdown_s))?)
+    let shutdown = Duration::from_secs_f64(config.shutdown_s);
+    Ok(graph.run(cancel, if ranks.are_many() { shutdown.min(SHUTDOWN_OF_RANK) } else { shutdown })?)
 }
 
 /// Results of a run that ended without a failure.
@@ -338,6 +398,26 @@ pub(super) struct Ended {
     outcome: SegmentOutcome,
     listening: Option<Listening>,
     samples: Option<SampleSummary>,
+}
+
+/// The summary of a run, which the first rank writes.
+fn conclude(
+    segment: RunScope,
+    ranks: &Ranks,
+    config: &Config,
+    out: &Path,
+    ended: Ended,
+) -> Result<RunSummary, PipelineError> {
+    if ranks.are_many() && ended.report.cancelled {
+        return Err(PipelineError::RankInterrupted);
+    }
+    if ranks.is_first() {
+        return finish(summarise(segment, config, out, ended)?, out);
+    }
+    let Ended { report, outcome, .. } = ended;
+    let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let ledger = outcome.ground.ledger.close()?;
+    Ok(RunSummary::new(segment, config, report, ledger, reception, Vec::new()))
 }
 
 /// The summary of a run; writes the auto-correlations.

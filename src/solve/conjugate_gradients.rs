@@ -70,16 +70,18 @@ impl System<'_> {
         let mut energy = dot(&residual, &z);
         let mut direction = z.clone();
         let relative = |energy: f64| (energy.max(0.0) / whole).sqrt();
-        while relative(energy) > rule.residual_max
-            && iterations < rule.iterations_max
-            && task.report(iterations, relative(energy))
-        {
+        let mut is_stuck = false;
+        let wants = |energy: f64, iterations: usize| {
+            relative(energy) > rule.residual_max && iterations < rule.iterations_max
+        };
+        while task.report_wanting(!is_stuck && wants(energy, iterations), iterations, relative(energy)) {
             self.apply(&direction, &mut product);
             iterations += 1;
             let curvature = dot(&direction, &product);
             // Rounding errors dominate: no further gain is possible.
             if curvature.is_nan() || curvature <= 0.0 {
-                break;
+                is_stuck = true;
+                continue;
             }
             let step = energy / curvature;
             x.iter_mut().zip(&direction).for_each(|(x, d)| *x += step * d);

@@ -12,6 +12,12 @@ pub enum SolveError {
     /// The run was cancelled, and there is no time for the solution.
     #[error("the run was cancelled before the map was made")]
     Interrupted,
+    /// Ranks that were to solve for different maps.
+    #[error(
+        "the ranks of the job hold sums of different data; expected each to take the same downlink with the same settings: is a file \
+         growing, or was one of them interrupted?"
+    )]
+    Ranks,
     /// Nothing to solve.
     #[error("there is no data for a map")]
     NoData,

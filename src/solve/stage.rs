@@ -7,7 +7,7 @@ use super::harmonic::{HarmonicRequest, solve_harmonics};
 use super::refined::{RefineRule, Refinement, solve_refined};
 use super::tikhonov::solve_pixels_watched;
 use super::{Diagnostics, SolveError, SolveWatch, StoppingRule};
-use crate::accumulation::{Snapshot, SnapshotSums};
+use crate::accumulation::{Snapshot, SnapshotSums, SumCounts};
 use crate::frames::Instrument;
 use crate::runtime::{Outlet, Stage, Units};
 use crate::sky::healpix::pixel_count;
@@ -38,6 +38,9 @@ pub struct Solution {
     /// How it was refined, and the residuals that remain; only with `map.refine`.
     pub refinement: Option<Refinement>,
 }
+
+/// Numbers in which ranks agree before they solve.
+const QUESTIONS: usize = 7;
 
 /// Regularisation and prior, by channel.
 #[derive(Clone, Debug)]
@@ -100,10 +103,15 @@ impl Stage for Solver {
 
     fn step(&mut self, snapshot: Snapshot, out: &mut Outlet<Solution>) -> Result<(), SolveError> {
         let Snapshot { instrument, channel, number, is_final, span_s, nside, sums } = snapshot;
+        let SumCounts { visibilities, weight } = sums.counts();
+        let data = [span_s[0], span_s[1], weight].map(|x| x.to_bits().cast_signed());
+        let which = [i64::from(channel.0), i64::from(number), i64::from(is_final), visibilities as i64];
+        if !self.setup.watch.agrees(&[which.as_slice(), &data].concat()) {
+            return Err(SolveError::Ranks);
+        }
         let index = usize::from(channel.0);
         let epsilon = self.setup.epsilon.get(index).ok_or(SolveError::NoEpsilon(channel))?;
         let prior = self.prior(index, pixel_count(nside));
-        let visibilities = sums.counts().visibilities;
         let probes = if is_final { self.setup.trace_probes } else { 0 };
         let frequency_hz = instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
         let name = format!("{:.3} MHz", frequency_hz / 1e6);
@@ -160,6 +168,11 @@ impl Stage for Solver {
             refinement,
         });
         Ok(())
+    }
+
+    fn finish(&mut self, _out: &mut Outlet<Solution>) -> Result<(), SolveError> {
+        // Others may have one more to solve.
+        if self.setup.watch.agrees(&[-1; QUESTIONS]) { Ok(()) } else { Err(SolveError::Ranks) }
     }
 
     fn units(&self) -> Units {

@@ -274,11 +274,12 @@ fn probe(sums: &dyn NormalSums, functions: Functions, probes: usize, watch: Name
             } else {
                 f64::INFINITY
             };
-            if !is_open || distance < CLOSED {
+            let wants = is_open && distance >= CLOSED;
+            if !task.report_wanting(wants, step, distance.min(1.0)) {
+                if wants {
+                    return Probed::Interrupted;
+                }
                 break;
-            }
-            if !task.report(step, distance.min(1.0)) {
-                return Probed::Interrupted;
             }
         }
         match bounds {

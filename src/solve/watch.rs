@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use crate::ranks::Ranks;
 use crate::runtime::Cancel;
 
 /// Progress of a solution.
@@ -21,12 +22,14 @@ pub struct Solving {
 }
 
 /// Shared between a solver, the progress display and the interrupt handler.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct SolveWatch {
     cancel: Cancel,
     /// Time for iterations after cancellation; `None` for no limit.
     time: Option<Duration>,
     state: Arc<Mutex<WatchState>>,
+    /// Those who solve together: what one of them ends, all end.
+    ranks: Ranks,
 }
 
 #[derive(Debug, Default)]
@@ -49,11 +52,28 @@ pub struct NamedWatch<'a> {
 /// a map.
 const ITERATIONS_WHEN_CANCELLED: usize = 12;
 
+impl Default for SolveWatch {
+    fn default() -> Self {
+        Self::new(Cancel::new())
+    }
+}
+
 impl SolveWatch {
     /// A watch whose solutions end early when `cancel` is triggered.
     #[must_use]
     pub fn new(cancel: Cancel) -> Self {
-        Self { cancel, ..Self::default() }
+        Self { cancel, time: None, state: Arc::default(), ranks: Ranks::one() }
+    }
+
+    /// The watch of one rank, whose solutions end when any of the ranks ends its own.
+    #[must_use]
+    pub fn among(self, ranks: &Ranks) -> Self {
+        Self { ranks: ranks.clone(), ..self }
+    }
+
+    /// Whether all ranks are to solve the same.
+    pub(super) fn agrees(&self, on: &[i64]) -> bool {
+        self.ranks.agree(on)
     }
 
     /// Ends all iterations `time` after cancellation.
@@ -91,8 +111,12 @@ impl<'a> NamedWatch<'a> {
         Self { wanted, ..self }
     }
 
-    /// Whether it is worth while to go on.
+    /// Whether it is worth while to go on, for all ranks.
     pub(super) fn goes_on(self) -> bool {
+        self.watch.ranks.all(self.goes_on_here())
+    }
+
+    fn goes_on_here(self) -> bool {
         if self.wanted { !self.watch.is_over() } else { !self.watch.cancel.is_cancelled() }
     }
 
@@ -123,8 +147,18 @@ pub(super) struct SolveTask<'a> {
 }
 
 impl SolveTask<'_> {
-    /// Reports an iteration; whether to continue.
+    /// Reports an iteration; whether to continue, for all ranks.
     pub(super) fn report(&self, iteration: usize, residual: f64) -> bool {
+        self.report_wanting(true, iteration, residual)
+    }
+
+    /// As [`SolveTask::report`], of an iteration that is to continue if it `wants` to.
+    pub(super) fn report_wanting(&self, wants: bool, iteration: usize, residual: f64) -> bool {
+        // One that has come to its end says so as well: where processors round in other ways, others may not have.
+        self.watch.ranks.all(wants && self.report_here(iteration, residual))
+    }
+
+    fn report_here(&self, iteration: usize, residual: f64) -> bool {
         if !self.is_part
             && let Some(solving) = &mut self.watch.state().now
         {
@@ -132,7 +166,7 @@ impl SolveTask<'_> {
             solving.residual = residual;
         }
         if self.was_cancelled {
-            iteration < ITERATIONS_WHEN_CANCELLED && self.named.goes_on()
+            iteration < ITERATIONS_WHEN_CANCELLED && self.named.goes_on_here()
         } else {
             !self.watch.cancel.is_cancelled()
         }

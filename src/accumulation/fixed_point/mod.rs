@@ -4,6 +4,7 @@
 //! fixed before any data arrived. Integers add up to the same bits in any order, batch, number of threads or tree of
 //! merges, and what was added can be removed without a trace.
 
+pub(super) mod parts;
 pub(super) mod rounding;
 pub(super) mod rows;
 mod scale;

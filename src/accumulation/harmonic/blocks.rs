@@ -7,6 +7,9 @@ use rayon::prelude::*;
 use super::HarmonicSetup;
 use super::grid::{Grids, NODES};
 use super::tori::Tori;
+use super::workspace::ALPHAS;
+use crate::accumulation::fixed_point::parts::sum_of_parts;
+use crate::ranks::Ranks;
 use crate::response::harmonic::degrees;
 use crate::response::harmonic::filter::FilteredPatterns;
 use crate::sky::harmonics::WignerTable;
@@ -34,9 +37,10 @@ impl OrderBlocks {
         grids: &Grids,
         tori: &Tori,
         setup: &HarmonicSetup,
+        ranks: &Ranks,
     ) -> Self {
         let l_max = setup.l_max;
-        let totals = totals(grids, tori);
+        let totals = totals(grids, tori, ranks);
         let wigner = WignerTable::new(l_max, setup.orbit.inclination_rad);
         let mut blocks: Vec<[Mat<f64>; 2]> = (0..=l_max)
             .map(|m| [0, 1].map(|parity| Mat::zeros(size(l_max, m, parity), size(l_max, m, parity))))
@@ -108,20 +112,25 @@ fn size(l_max: usize, m: usize, parity: usize) -> usize {
 }
 
 /// Weights of each pair of neighbouring nodes, summed over alpha and gamma: `[node][diagonal]`.
-fn totals(grids: &Grids, tori: &Tori) -> Vec<[f64; NODES]> {
+fn totals(grids: &Grids, tori: &Tori, ranks: &Ranks) -> Vec<[f64; NODES]> {
     let stride = grids.weight_stride();
-    tori.nodes
-        .par_iter()
-        .map(|node| {
-            let mut totals = [0.0; NODES];
-            for rows in node.iter().flat_map(|node| node.weights.chunks_exact(NODES * stride)) {
+    let len = NODES * tori.nodes.len();
+    // Block by block of alphas, as products are summed.
+    let part = |first: usize| {
+        let mut totals = vec![0.0; len];
+        for (node, totals) in tori.nodes.iter().zip(totals.as_chunks_mut::<NODES>().0) {
+            let rows = node.iter().flat_map(|node| node.weights.chunks_exact(NODES * stride));
+            for rows in rows.skip(first).take(ALPHAS) {
                 for (total, row) in totals.iter_mut().zip(rows.chunks_exact(stride)) {
                     *total += row.iter().map(|w| f64::from(*w)).sum::<f64>();
                 }
             }
-            totals
-        })
-        .collect()
+        }
+        totals
+    };
+    let firsts: Vec<usize> = (0..grids.rows(grids.points)).step_by(ALPHAS).collect();
+    let parts: Vec<Vec<f64>> = firsts.into_par_iter().map(part).collect();
+    sum_of_parts(ranks, &parts, len, grids.points.div_ceil(ALPHAS)).as_chunks().0.to_vec()
 }
 
 /// The banded matrix of weights times the patterns of order mu, for both signs of mu.

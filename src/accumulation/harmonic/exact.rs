@@ -72,7 +72,8 @@ impl ExactNode {
             (&self.right, &mut node.right, grids.data_row(), quanta.right),
         ];
         for (rows, out, layout, quantum) in parts {
-            for (row, out) in rows.iter().zip(out.chunks_exact_mut(layout.len())) {
+            let held = (0..).zip(rows).filter(|(alpha, _)| grids.holds(*alpha)).map(|(_, row)| row);
+            for (row, out) in held.zip(out.chunks_exact_mut(layout.len())) {
                 row.values(layout, quantum, out);
             }
         }
@@ -107,7 +108,7 @@ impl ExactTori {
         let locate = |visibility| Located::new(grids, quanta, visibility, direction);
         let located: Vec<Located> = batch.par_iter().map(locate).collect();
         let mut reaching: Vec<Vec<&Located>> = vec![Vec::new(); self.nodes.len()];
-        for visibility in &located {
+        for visibility in located.iter().filter(|visibility| visibility.reaches(grids)) {
             for list in reaching.iter_mut().skip(visibility.first_node).take(NODES) {
                 list.push(visibility);
             }

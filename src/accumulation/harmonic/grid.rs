@@ -2,7 +2,9 @@
 
 use std::f64::consts::TAU;
 
+use super::workspace::ALPHAS;
 use crate::accumulation::fixed_point::rows::RowLayout;
+use crate::ranks::RankShare;
 use crate::response::harmonic::NodeGrid;
 use crate::response::harmonic::filter::FilteredPatterns;
 use crate::response::harmonic::kernel::{Kernel, LANES};
@@ -42,6 +44,8 @@ pub(super) struct Grids {
     pub(super) weight_alpha: Kernel,
     pub(super) weight_gamma: Kernel,
     pub(super) data: Kernel,
+    /// The blocks of alphas whose sums this process holds.
+    pub(super) share: RankShare,
 }
 
 impl Grids {
@@ -61,7 +65,27 @@ impl Grids {
             weight_alpha: Kernel::windowed_sinc(WEIGHT_ALPHAS, WEIGHT_BETAS[0]),
             weight_gamma: Kernel::windowed_sinc(LANES, WEIGHT_BETAS[1]),
             data: Kernel::new(DATA_TOLERANCE, (points / 2) as f64 / (2 * l_max + 1) as f64),
+            share: RankShare::WHOLE,
         }
+    }
+
+    /// Whether this process holds the sums at an alpha.
+    #[inline(always)]
+    pub(super) fn holds(&self, alpha: usize) -> bool {
+        self.share.holds(alpha / ALPHAS)
+    }
+
+    /// The row of an alpha that this process holds.
+    #[inline(always)]
+    pub(super) fn row(&self, alpha: usize) -> usize {
+        alpha / ALPHAS / self.share.count * ALPHAS + alpha % ALPHAS
+    }
+
+    /// Rows that this process holds of a grid of so many alphas.
+    pub(super) fn rows(&self, points: usize) -> usize {
+        let blocks = points.div_ceil(ALPHAS);
+        let missing = if self.share.holds(blocks - 1) { blocks * ALPHAS - points } else { 0 };
+        self.share.of(blocks) * ALPHAS - missing
     }
 
     /// Points in alpha and in gamma of the sums of data.
@@ -107,14 +131,14 @@ impl Grids {
         self.data_points() + OVERHANG
     }
 
-    /// Floats of a node's weights: `[alpha][diagonal][gamma]`.
+    /// Floats of a node's weights that this process holds: `[alpha][diagonal][gamma]`.
     pub(super) fn weights_len(&self) -> usize {
-        self.points * NODES * self.weight_stride()
+        self.rows(self.points) * NODES * self.weight_stride()
     }
 
-    /// Floats of a node's right-hand sides: `[alpha][data re, data im, noise re, noise im][gamma]`.
+    /// Floats of a node's right-hand sides that this process holds: `[alpha][data re, data im, noise re, noise im][gamma]`.
     pub(super) fn right_len(&self) -> usize {
-        self.data_points() * 4 * self.data_stride()
+        self.rows(self.data_points()) * 4 * self.data_stride()
     }
 
     /// Where `angle_rad` lies on a circle of `points`: the first point a kernel reaches, and its values.

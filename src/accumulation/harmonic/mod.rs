@@ -41,7 +41,10 @@ pub use grid::SPREAD_MULTIPLY_ADDS;
 pub use refined::{
     Departures, REFINED_VISIBILITY_BYTES, RefinedData, RefinedSetup, RefinedSums, VisibilityArchive,
 };
-pub use setup::{ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, application_size, memory, orbit_of};
+pub use setup::{
+    ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, SharedSize, application_size, memory, orbit_of,
+    shared_size,
+};
 pub use sums::{HarmonicSums, coefficients, unknowns, unknowns_of_gradient};
 
 use self::checkpoint::HarmonicHead;
@@ -54,6 +57,7 @@ use super::checkpoint::{BasisKind, FrameReader, FrameWriter};
 use super::engine::{Accepted, CommonSetup, ExactEngine, SkyBasis};
 use super::fixed_point::{Direction, WeightScale};
 use super::{AccumulationError, Refusal, SumCounts};
+use crate::ranks::Ranks;
 use crate::response::harmonic::PairOrientation;
 use crate::units::vector::Vec3;
 
@@ -66,6 +70,23 @@ pub struct HarmonicBasis {
     quanta: Quanta,
     grids: Arc<Grids>,
     tables: Arc<OnceLock<Operator>>,
+    ranks: Ranks,
+}
+
+impl HarmonicEngine {
+    /// This engine, without data yet, as one rank's of several: it takes all visibilities, and holds its part of their sums. Every
+    /// rank has such an engine of the same setup, and uses its sums as the others do.
+    #[must_use]
+    pub fn among(mut self, ranks: &Ranks) -> Self {
+        let grids = Grids { share: ranks.share(), ..Grids::clone(&self.basis.grids) };
+        self.basis = HarmonicBasis {
+            grids: Arc::new(grids),
+            tables: Arc::default(),
+            ranks: ranks.clone(),
+            ..self.basis
+        };
+        self
+    }
 }
 
 impl HarmonicBasis {
@@ -75,6 +96,8 @@ impl HarmonicBasis {
             grids: Arc::clone(&self.grids),
             tables: Arc::clone(&self.tables),
             tori,
+            ranks: self.ranks.clone(),
+            reached: OnceLock::new(),
             counts,
             right: OnceLock::new(),
             noise: OnceLock::new(),
@@ -101,6 +124,7 @@ impl SkyBasis for HarmonicBasis {
             quanta: Quanta::new(scale),
             grids: Arc::new(setup.grids()),
             tables: Arc::new(OnceLock::new()),
+            ranks: Ranks::one(),
         })
     }
 
@@ -152,6 +176,9 @@ impl SkyBasis for HarmonicBasis {
     }
 
     fn write(&self, exact: &ExactTori, out: &mut FrameWriter<'_>) -> Result<(), AccumulationError> {
+        if self.ranks.are_many() {
+            return Err(AccumulationError::Shared);
+        }
         exact.write(&self.grids, out)
     }
 

@@ -3,6 +3,8 @@
 //! For a block of alphas: the sky turned into the orbit's plane (products with d), its products with the
 //! patterns at all nodes, transforms from mu to gamma; there the weights multiply, pointwise; and back.
 
+use std::ops::Range;
+
 use faer::{Accum, MatMut, MatRef, Par};
 use num_complex::{Complex32, Complex64};
 use rayon::prelude::*;
@@ -11,6 +13,8 @@ use super::grid::{Grids, NODE_GROUP, NODES};
 use super::lines::multiply_line;
 use super::tori::{NodeSums, Tori};
 use super::workspace::{ALPHAS, NodeRange, Workspace};
+use crate::accumulation::fixed_point::parts::sum_of_parts;
+use crate::ranks::Ranks;
 use crate::response::harmonic::filter::FilteredPatterns;
 use crate::response::harmonic::rotation::{RotationTable, orders};
 use crate::response::harmonic::{PatternGeometry, PatternTable, degrees};
@@ -25,6 +29,15 @@ pub(super) struct Operator {
     pub(super) patterns: FilteredPatterns,
     /// One over the transform of the data's kernel at the orders 0 ..= l_max.
     correction: Vec<f64>,
+}
+
+/// The tori of all ranks, of which each holds a part.
+pub(super) struct SharedTori<'a> {
+    pub(super) ranks: &'a Ranks,
+    /// What this one holds.
+    pub(super) tori: &'a Tori,
+    /// The range of nodes that hold data, of any rank.
+    pub(super) reached: Range<usize>,
 }
 
 /// A right-hand side: of the data, or of the noise-only companion.
@@ -82,27 +95,27 @@ impl Operator {
 
     /// Operations of the products with patterns and rotations in one application.
     pub(super) fn matrix_product_flops(&self, tori: &Tori) -> f64 {
-        let reach = self.reach(tori);
-        let used = tori.alphas(self.grids.points, |node| &node.weights);
-        let alphas = used.iter().filter(|used| **used).count().next_multiple_of(ALPHAS);
+        let reach = self.reach(tori.reached(&Ranks::one()));
+        let used = tori.alphas(&self.grids, self.grids.points, |node| &node.weights);
+        let blocks = used.chunks(ALPHAS).filter(|block| block.contains(&true)).count();
         let patterns: usize = (0..=self.l_max).map(|mu| 2 * reach.count * degrees(self.l_max, mu)).sum();
         let rotations: usize = (0..=self.l_max).map(|l| orders(l) * (l + 1)).sum();
         // Forth and back, real and imaginary parts, multiplications and additions.
-        (2 * 2 * 2 * alphas * (patterns + rotations)) as f64
+        (2 * 2 * 2 * ALPHAS * blocks * (patterns + rotations)) as f64
     }
 
-    fn reach(&self, tori: &Tori) -> NodeRange {
-        let reached = tori.reached();
+    fn reach(&self, reached: Range<usize>) -> NodeRange {
         let first = reached.start / NODE_GROUP * NODE_GROUP;
         NodeRange { first, count: (reached.end - first).next_multiple_of(NODE_GROUP) }
     }
 
     /// BtN^-1B of the coefficients `sky`, the gradient in terms of real and imaginary parts for m >= 0.
-    pub(super) fn apply(&self, tori: &Tori, sky: &Alm) -> Alm {
-        let reach = self.reach(tori);
+    pub(super) fn apply(&self, shared: &SharedTori<'_>, sky: &Alm) -> Alm {
+        let tori = shared.tori;
+        let reach = self.reach(shared.reached.clone());
         let circle = Circle { points: self.grids.points };
-        let used = tori.alphas(circle.points, |node| &node.weights);
-        self.over_blocks(&used, circle.points, reach, |work, alphas| {
+        let used = tori.alphas(&self.grids, circle.points, |node| &node.weights);
+        self.over_blocks(shared.ranks, &used, reach, |work, alphas| {
             self.turn(sky, circle, alphas, &mut work.turned);
             self.multiply_patterns(work, reach);
             for (place, &alpha) in alphas.iter().enumerate() {
@@ -113,11 +126,12 @@ impl Operator {
     }
 
     /// BtN^-1 times the data, or times the companion's noise.
-    pub(super) fn project(&self, tori: &Tori, of: RightHandSide) -> Alm {
-        let reach = self.reach(tori);
+    pub(super) fn project(&self, shared: &SharedTori<'_>, of: RightHandSide) -> Alm {
+        let tori = shared.tori;
+        let reach = self.reach(shared.reached.clone());
         let circle = Circle { points: self.grids.data_points() };
-        let used = tori.alphas(circle.points, |node| &node.right);
-        self.over_blocks(&used, circle.points, reach, |work, alphas| {
+        let used = tori.alphas(&self.grids, circle.points, |node| &node.right);
+        self.over_blocks(shared.ranks, &used, reach, |work, alphas| {
             work.products.fill(0.0);
             for (place, &alpha) in alphas.iter().enumerate() {
                 for group in (0..reach.count).step_by(NODE_GROUP) {
@@ -139,23 +153,29 @@ impl Operator {
         })
     }
 
-    /// Sums `block` over blocks of the alphas in use; the order of the sum does not depend on threads.
+    /// Sums `block` over blocks of alphas: of each fixed range of them those in use. The sum has the same bits in any order,
+    /// so that it does not depend on who computes which block.
     fn over_blocks(
         &self,
+        ranks: &Ranks,
         used: &[bool],
-        points: usize,
         reach: NodeRange,
-        block: impl Fn(&mut Workspace, &[usize]) -> Vec<Complex64> + Sync,
+        block: impl Fn(&mut Workspace, &[usize]) -> Vec<f64> + Sync,
     ) -> Alm {
-        let alphas: Vec<usize> = (0..points).filter(|&alpha| used[alpha]).collect();
-        let blocks: Vec<&[usize]> = alphas.chunks(ALPHAS).collect();
-        let parts: Vec<Vec<Complex64>> = blocks
-            .into_par_iter()
+        let points = used.len();
+        let of_range = |first: usize| -> Vec<usize> {
+            (first..points.min(first + ALPHAS)).filter(|&alpha| used[alpha]).collect()
+        };
+        let blocks: Vec<Vec<usize>> =
+            (0..points).step_by(ALPHAS).map(of_range).filter(|alphas| !alphas.is_empty()).collect();
+        let parts: Vec<Vec<f64>> = blocks
+            .par_iter()
             .map_init(|| Workspace::new(self.l_max, points, reach), |work, alphas| block(work, alphas))
             .collect();
         let mut sum = Alm::zeros(self.l_max);
-        for part in parts {
-            sum.values_mut().iter_mut().zip(part).for_each(|(sum, term)| *sum += term);
+        let sums = sum_of_parts(ranks, &parts, 2 * sum.values().len(), points.div_ceil(ALPHAS));
+        for (value, sums) in sum.values_mut().iter_mut().zip(sums.as_chunks::<2>().0) {
+            *value = Complex64::new(sums[0], sums[1]);
         }
         sum
     }
@@ -232,7 +252,8 @@ impl Operator {
         let row = NODES * self.grids.weight_stride();
         let rows = |node: usize| {
             let weights = &tori.nodes.get(node)?.as_ref()?.weights;
-            Some(&weights[alpha * row..(alpha + 1) * row])
+            let from = self.grids.row(alpha) * row;
+            Some(&weights[from..from + row])
         };
         work.ring.iter_mut().for_each(|line| line.fill(Complex32::ZERO));
         // Nodes come in groups, and leave in groups that lag behind by as many as weights reach.
@@ -271,7 +292,7 @@ impl Operator {
             line.fill(Complex32::ZERO);
             return;
         };
-        let rows = &node.right[(alpha * 4 + 2 * of as usize) * stride..];
+        let rows = &node.right[(self.grids.row(alpha) * 4 + 2 * of as usize) * stride..];
         let (re, im) = rows[..2 * stride].split_at(stride);
         for ((out, re), im) in line.iter_mut().zip(re).zip(im) {
             *out = Complex32::new(*re, *im);
@@ -286,7 +307,7 @@ impl Operator {
         circle: Circle,
         alphas: &[usize],
         factor: Option<&[f64]>,
-    ) -> Vec<Complex64> {
+    ) -> Vec<f64> {
         let len = 2 * ALPHAS * 2 * reach.count;
         for (mu, products) in work.products.chunks_exact(len).enumerate() {
             let (start, rows) = (self.turned_start(mu), degrees(self.l_max, mu));
@@ -310,7 +331,7 @@ impl Operator {
         circle: Circle,
         alphas: &[usize],
         factor: Option<&[f64]>,
-    ) -> Vec<Complex64> {
+    ) -> Vec<f64> {
         let starts: Vec<usize> = (0..=self.l_max).map(|mu| self.turned_start(mu)).collect();
         let count = alphas.len();
         let turns = self.turns(circle, alphas);
@@ -347,6 +368,6 @@ impl Operator {
                 *sum.get_mut(l, m) = total * factor.map_or(1.0, |factor| factor[m]);
             }
         }
-        sum.values().to_vec()
+        sum.values().iter().flat_map(|value| [value.re, value.im]).collect()
     }
 }

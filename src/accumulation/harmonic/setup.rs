@@ -2,6 +2,7 @@
 
 use super::grid::Grids;
 use super::operator::Operator;
+use super::workspace::ALPHAS;
 use crate::accumulation::AccumulationError;
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::response::harmonic::{GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry, degrees};
@@ -123,6 +124,25 @@ pub fn memory(l_max: usize, u_max: f64, threads: usize) -> HarmonicMemory {
         sums: grids.nodes.count as u64 * grids.node_bytes(),
         tables: Operator::table_bytes(l_max, &grids),
         workspace: threads as u64 * Operator::workspace_bytes(l_max, &grids),
+    }
+}
+
+/// What ranks that share the sums of maps up to `l_max` divide and exchange.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SharedSize {
+    /// Blocks of alphas, each of which one rank holds.
+    pub blocks: usize,
+    /// Bytes that each rank gives to one product with BtN^-1B, and gets.
+    pub product_bytes: u64,
+}
+
+/// What ranks that share the sums of maps up to `l_max` divide and exchange.
+#[must_use]
+pub fn shared_size(l_max: usize) -> SharedSize {
+    SharedSize {
+        blocks: Grids::new(l_max, 1.0).points.div_ceil(ALPHAS),
+        // Real and imaginary parts of (l_max + 1) (l_max + 2) / 2 coefficients, in 64 bits each.
+        product_bytes: 8 * ((l_max + 1) * (l_max + 2)) as u64,
     }
 }
 

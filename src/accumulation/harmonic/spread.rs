@@ -4,10 +4,12 @@ use pulp::{Arch, Simd, WithSimd};
 
 use super::exact::{BIAS, ExactNode, Quanta, TERM_MAX, biases};
 use super::grid::{Grids, NODES};
+use super::workspace::ALPHAS;
 use crate::accumulation::engine::Accepted;
 use crate::accumulation::fixed_point::Direction;
 use crate::accumulation::fixed_point::rows::{IntegerRow, Integers};
-use crate::response::harmonic::kernel::LANES;
+use crate::ranks::RankShare;
+use crate::response::harmonic::kernel::{Kernel, LANES};
 
 /// A visibility's place among the sums, on a torus at a baseline length.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -102,6 +104,15 @@ impl Located {
         }
     }
 
+    /// Whether it adds to sums that this process holds.
+    pub(super) fn reaches(&self, grids: &Grids) -> bool {
+        let holds = |first: u32, kernel: &Kernel, points: usize| {
+            (0..kernel.width()).any(|k| grids.holds((first as usize + k) % points))
+        };
+        holds(self.weight_first[0], &grids.weight_alpha, grids.points)
+            || holds(self.data_first[0], &grids.data, grids.data_points())
+    }
+
     /// Weights of one of its nodes with itself and with those above; the first node is 0.
     fn diagonals(&self, at: usize) -> [f32; NODES] {
         let mut diagonals = [0.0; NODES];
@@ -128,6 +139,7 @@ pub(super) fn spread(
         |first, group| {
             let rows = Rows {
                 rows: &mut node.weights,
+                share: grids.share,
                 stride: grids.weight_stride(),
                 first: first.weight_first,
                 alphas: grids.weight_alpha.width(),
@@ -149,6 +161,7 @@ pub(super) fn spread(
         |first, group| {
             let rows = Rows {
                 rows: &mut node.right,
+                share: grids.share,
                 stride: grids.data_stride(),
                 first: first.data_first,
                 alphas: grids.data.width(),
@@ -185,6 +198,8 @@ const GROUP: usize = 8;
 /// By alpha `[K][gamma]`, and the first point in alpha and gamma to add to.
 struct Rows<'a, const K: usize> {
     rows: &'a mut [IntegerRow],
+    /// The blocks of alphas that are held; to others nothing is added.
+    share: RankShare,
     stride: usize,
     first: [u32; 2],
     /// Alphas that are reached.
@@ -272,7 +287,12 @@ impl<const K: usize> WithSimd for Spreading<'_, K> {
         let bounds = bounds(terms);
         let shift = rows.shifts.iter().fold(0, |most, shift| *shift.max(&most));
         for (lane, bound) in bounds.iter().enumerate().take(rows.alphas) {
-            let Some(row) = rows.rows.get_mut(alpha) else { return };
+            let here = alpha;
+            alpha = if alpha + 1 == points { 0 } else { alpha + 1 };
+            if !rows.share.holds(here / ALPHAS) {
+                continue;
+            }
+            let Some(row) = rows.rows.get_mut(here) else { return };
             row.make_room(u64::from(*bound) << shift, rows.direction, K * rows.stride);
             for k in 0..rows.used {
                 let multiples = multiples(simd, terms, lane, k);
@@ -287,7 +307,6 @@ impl<const K: usize> WithSimd for Spreading<'_, K> {
                     Integers::None => {}
                 }
             }
-            alpha = if alpha + 1 == points { 0 } else { alpha + 1 };
         }
     }
 }

@@ -1,13 +1,15 @@
 //! Normal equations over harmonic coefficients.
 
+use std::ops::Range;
 use std::sync::{Arc, OnceLock};
 
 use super::HarmonicSetup;
 use super::blocks::OrderBlocks;
 use super::grid::Grids;
-use super::operator::{Operator, RightHandSide};
+use super::operator::{Operator, RightHandSide, SharedTori};
 use super::tori::Tori;
 use crate::accumulation::{Accuracy, NormalSums, SumCounts};
+use crate::ranks::Ranks;
 use crate::sky::harmonics::Alm;
 
 /// Interpolation between nodes and kernels of the weights err by up to 1e-3 of an eigenvalue, and by some 1e-6 of W_max where
@@ -24,7 +26,12 @@ pub struct HarmonicSums {
     pub(super) setup: HarmonicSetup,
     pub(super) grids: Arc<Grids>,
     pub(super) tables: Arc<OnceLock<Operator>>,
+    /// What this process holds of the sums.
     pub(super) tori: Tori,
+    /// Those that hold the rest. Whatever needs all of the sums is asked of all of them at once.
+    pub(super) ranks: Ranks,
+    /// The range of nodes that hold data, of any rank.
+    pub(super) reached: OnceLock<Range<usize>>,
     pub(super) counts: SumCounts,
     pub(super) right: OnceLock<Vec<f64>>,
     pub(super) noise: OnceLock<Vec<f64>>,
@@ -41,7 +48,12 @@ impl HarmonicSums {
         self.tables.get_or_init(|| self.setup.operator(&self.grids))
     }
 
-    /// Floating-point operations of the matrix products in one [`NormalSums::apply`].
+    fn shared(&self) -> SharedTori<'_> {
+        let reached = self.reached.get_or_init(|| self.tori.reached(&self.ranks)).clone();
+        SharedTori { ranks: &self.ranks, tori: &self.tori, reached }
+    }
+
+    /// Floating-point operations of this process's matrix products in one [`NormalSums::apply`].
     #[must_use]
     pub fn matrix_product_flops(&self) -> f64 {
         self.operator().matrix_product_flops(&self.tori)
@@ -51,7 +63,7 @@ impl HarmonicSums {
     /// and phases evenly.
     #[must_use]
     pub fn order_blocks(&self) -> OrderBlocks {
-        OrderBlocks::new(&self.operator().patterns, &self.grids, &self.tori, &self.setup)
+        OrderBlocks::new(&self.operator().patterns, &self.grids, &self.tori, &self.setup, &self.ranks)
     }
 }
 
@@ -62,17 +74,19 @@ impl NormalSums for HarmonicSums {
 
     fn apply(&self, x: &[f64], y: &mut [f64]) {
         let sky = coefficients(x, self.setup.l_max);
-        y.copy_from_slice(&unknowns_of_gradient(&self.operator().apply(&self.tori, &sky)));
+        y.copy_from_slice(&unknowns_of_gradient(&self.operator().apply(&self.shared(), &sky)));
     }
 
     fn right_hand_side(&self) -> &[f64] {
-        self.right
-            .get_or_init(|| unknowns_of_gradient(&self.operator().project(&self.tori, RightHandSide::Data)))
+        self.right.get_or_init(|| {
+            unknowns_of_gradient(&self.operator().project(&self.shared(), RightHandSide::Data))
+        })
     }
 
     fn noise_right_hand_side(&self) -> &[f64] {
-        self.noise
-            .get_or_init(|| unknowns_of_gradient(&self.operator().project(&self.tori, RightHandSide::Noise)))
+        self.noise.get_or_init(|| {
+            unknowns_of_gradient(&self.operator().project(&self.shared(), RightHandSide::Noise))
+        })
     }
 
     fn counts(&self) -> SumCounts {

@@ -5,6 +5,7 @@ use crate::accumulation::noise::companion_noise;
 use crate::accumulation::{NormalEngine, NormalSums};
 use crate::array::{Array, ArrayConfig};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
+use crate::ranks::on_threads;
 use crate::response::harmonic::{
     GeometryLimits, GeometryRefusal, HarmonicModel, ModelSettings, NominalOrbit, PairState, PatternGeometry,
 };
@@ -479,4 +480,46 @@ fn sums_are_within_their_resolution_of_plain_ones() {
 struct Cell {
     sum: f64,
     error_max: f64,
+}
+
+/// All that a solver asks of sums, in bits.
+fn answers(sums: &HarmonicSums) -> Vec<u64> {
+    let mut product = vec![0.0; sums.unknowns()];
+    sums.apply(&vector(3), &mut product);
+    let blocks = sums.order_blocks();
+    let diagonal = (0..=L_MAX).map(|l| blocks.diagonal(l));
+    let right = [sums.right_hand_side(), sums.noise_right_hand_side()].concat();
+    product.into_iter().chain(right).chain(diagonal).map(f64::to_bits).collect()
+}
+
+/// Weights that differ from zero, of all nodes.
+fn weights(sums: &HarmonicSums) -> usize {
+    sums.tori.nodes.iter().flatten().flat_map(|node| &node.weights).filter(|w| **w != 0.0).count()
+}
+
+#[test]
+fn ranks_hold_parts_and_answer_as_one() {
+    let blocks = blocks(0, 12);
+    // Few data, so that some blocks of alphas and nodes are empty; and none.
+    for blocks in [&blocks[..], &blocks[..1], &[]] {
+        let alone = engine(blocks).into_sums();
+        let (expected, weight_count) = (answers(&alone), weights(&alone));
+        // 112 alphas in seven blocks, and 56 of data in four.
+        for count in [1, 2, 3, 4, 9] {
+            let found = on_threads(count, |ranks| {
+                let mut engine = HarmonicEngine::new(setup()).unwrap().among(ranks);
+                for block in blocks {
+                    assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
+                }
+                // A snapshot on the way asks the same.
+                assert!(answers(&engine.sums()) == expected);
+                let refused = engine.checkpoint(&mut Vec::new());
+                assert_eq!(refused.is_err(), count > 1);
+                let sums = engine.into_sums();
+                (answers(&sums) == expected, weights(&sums), sums.counts() == alone.counts())
+            });
+            assert!(found.iter().all(|(is_equal, _, counts)| *is_equal && *counts), "{count} ranks");
+            assert_eq!(found.iter().map(|(_, weights, _)| weights).sum::<usize>(), weight_count);
+        }
+    }
 }
