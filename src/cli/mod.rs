@@ -38,6 +38,8 @@ mod shell;
 mod simulate;
 mod sky;
 mod study;
+#[cfg(feature = "serve")]
+mod top;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -68,6 +70,8 @@ enum Command {
     Run(run::RunArgs),
     Simulate(simulate::SimulateArgs),
     Replay(replay::ReplayArgs),
+    #[cfg(feature = "serve")]
+    Top(top::TopArgs),
     Inspect(inspect::InspectArgs),
     Corrupt(corrupt::CorruptArgs),
     Export(export::ExportArgs),
@@ -117,6 +121,8 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Run(args) => run::execute(&args),
         Command::Simulate(args) => simulate::execute(&args),
         Command::Replay(args) => replay::execute(&args),
+        #[cfg(feature = "serve")]
+        Command::Top(args) => top::execute(&args),
         Command::Inspect(args) => inspect::execute(&args),
         Command::Corrupt(args) => corrupt::execute(&args),
         Command::Export(args) => export::execute(&args),

@@ -16,9 +16,12 @@
 //! publisher. Nothing in the chain waits for it: a browser that is late sees the newest state and misses what was between.
 //! All memory is bounded: maps held, connections, what one request may hold. No request can name a file.
 //!
+//! [`Client`] and [`Screen`] show the same in a terminal (`lunarray top`).
+//!
 //! One thread with an event loop serves all connections, a second one draws pictures. May use every folder before it.
 
 mod address;
+mod client;
 mod collector;
 mod connection;
 mod console;
@@ -26,10 +29,13 @@ mod error;
 mod event_log;
 mod pulse;
 mod routes;
+mod screen;
 mod server;
 mod shelf;
 mod status;
 
 pub use address::ServeAddress;
+pub use client::{Client, ClientError};
 pub use error::ServeError;
+pub use screen::Screen;
 pub use server::{Server, Subject};

@@ -11,6 +11,7 @@ mod service;
 mod serving;
 mod soak;
 mod stations;
+mod terminal;
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};

@@ -137,7 +137,7 @@ impl Reply {
 }
 
 /// A whole run of the small pipeline that goes on serving.
-fn finished(place: &Place, out: &str) -> Served {
+pub(super) fn finished(place: &Place, out: &str) -> Served {
     let out = place.path(out);
     let fixed = ["run", place.pipeline(), "--out", &out, "--serve-after"];
     let served = Served::start(&[&fixed[..], &SNAPSHOTS].concat());

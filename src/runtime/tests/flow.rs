@@ -1,11 +1,11 @@
 //! Order, back pressure, counting, and graphs that cannot run.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
 use super::parts::{Count, Each, Into, Keep, PATIENCE, TestError};
-use crate::runtime::{Cancel, Graph, Outlet, RuntimeError, Stage};
+use crate::runtime::{Cancel, Flow, Graph, Outlet, RuntimeError, Source, Stage};
 
 /// Gives each number twice, and -1 at the end.
 fn twice() -> impl Stage<In = u64, Out = i64, Error = TestError> {
@@ -182,4 +182,44 @@ fn graphs_that_cannot_run_are_refused() {
     let link = other.source("count", 1, Count::to(1));
     graph.sink("end", link, ignore());
     assert!(matches!(run(graph), RuntimeError::ForeignLink { stage } if stage == "end"));
+}
+
+#[test]
+fn a_stage_rests_after_the_last_item_that_waits() {
+    /// Gives three numbers, then nothing until the stage has shown that it rests after the third.
+    struct Pausing(mpsc::Receiver<u64>, bool);
+    impl Source for Pausing {
+        type Out = u64;
+        type Error = TestError;
+        fn next(&mut self, out: &mut Outlet<u64>) -> Result<Flow, TestError> {
+            if !std::mem::replace(&mut self.1, true) {
+                (1..=3).for_each(|n| out.push(n));
+                return Ok(Flow::Continue);
+            }
+            while self.0.recv_timeout(PATIENCE).map_err(|_| TestError(0))? < 3 {}
+            Ok(Flow::Done)
+        }
+    }
+    struct Shown(mpsc::Sender<u64>, u64);
+    impl Stage for Shown {
+        type In = u64;
+        type Out = u64;
+        type Error = TestError;
+        fn step(&mut self, n: u64, out: &mut Outlet<u64>) -> Result<(), TestError> {
+            self.1 = n;
+            out.push(n);
+            Ok(())
+        }
+        fn rest(&mut self) {
+            let _ = self.0.send(self.1);
+        }
+    }
+    let (show, shown) = mpsc::channel();
+    let mut graph = Graph::new();
+    let numbers = graph.source("pausing", 8, Pausing(shown, false));
+    let numbers = graph.stage("shown", 8, numbers, Shown(show, 0));
+    let (sink, kept) = Keep::new();
+    graph.sink("keep", numbers, sink);
+    graph.run(&Cancel::new(), PATIENCE).unwrap();
+    assert_eq!(kept.lock().unwrap().items, [1, 2, 3]);
 }
