@@ -17,6 +17,7 @@ mod orbits;
 mod outputs;
 mod paper;
 mod products;
+mod ranks;
 mod reflection;
 mod run;
 mod start_up;

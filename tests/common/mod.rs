@@ -19,6 +19,11 @@ pub fn python() -> Option<PathBuf> {
     find("LUNARRAY_PYTHON", "")
 }
 
+/// A program with MPI, from `LUNARRAY_MPI`; `None`, said aloud, when it is not set.
+pub fn mpi_program() -> Option<PathBuf> {
+    find("LUNARRAY_MPI", "")
+}
+
 fn find(variable: &str, file: &str) -> Option<PathBuf> {
     let Some(base) = std::env::var_os(variable) else {
         eprintln!("skipped: {variable} is not set");

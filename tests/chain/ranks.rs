@@ -1,0 +1,238 @@
+//! Ranks of an MPI job that share the sums of a map. `LUNARRAY_MPI` names a program built with `--features mpi`.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use crate::common::mpi_program;
+use crate::common::workplace::{Workplace, fail, files, succeed};
+
+/// Sums over 56 alphas in four blocks, and of data over 28 in two; snapshots on the way; and a channel at 30 MHz, which has no
+/// baseline that is short enough.
+const SHARED: &str = r#"
+name = "shared"
+seed = 7
+[sky]
+nside = 4
+[spacecraft]
+channels_hz = [3.0e6, 10.0e6, 30.0e6]
+every_nth_window = 400
+every_nth_integration = 4
+baseline_wavelengths_max = 8.0
+[map]
+nside = 4
+engine = "harmonic"
+l_max = 6
+baseline_bp_max = 1.5
+epsilon = 1e-3
+residual_max = 1e-2
+snapshot_every_s = 2.0e7
+[products]
+pictures = false
+[runtime]
+threads = 1
+"#;
+
+/// How soon a job has to end once one of its ranks has.
+const SOON: Duration = Duration::from_secs(10);
+
+/// A command as a job of so many ranks.
+fn job(program: &Path, ranks: usize, words: &[&str]) -> Command {
+    let mut command = Command::new("mpirun");
+    command
+        .args(["-n", &ranks.to_string()])
+        .arg(program)
+        .args(words)
+        // Of OpenMPI: gates have few cores, and may run as root.
+        .env("OMPI_ALLOW_RUN_AS_ROOT", "1")
+        .env("OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "1")
+        .env("OMPI_MCA_rmaps_base_oversubscribe", "1")
+        .env("OMPI_MCA_btl", "self,vader")
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped());
+    command
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+fn succeeded(output: Output) -> Output {
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    output
+}
+
+/// What a folder of products holds: its files, and what the summary says but for times.
+fn products(out: &str) -> (std::collections::BTreeMap<PathBuf, Vec<u8>>, [Value; 4]) {
+    let summary = std::fs::read(Path::new(out).join("summary.json")).unwrap();
+    let summary: Value = serde_json::from_slice(&summary).unwrap();
+    let said = ["channels", "ledger", "reception", "completeness"].map(|key| summary[key].clone());
+    (files(out.as_ref()), said)
+}
+
+fn assert_equal(found: &str, expected: &str) {
+    let ((found_files, found_said), (files, said)) = (products(found), products(expected));
+    assert!(found_files.keys().eq(files.keys()), "{found}: {:?}", found_files.keys());
+    for (path, bytes) in &files {
+        assert!(found_files[path] == *bytes, "{found}: {} differs", path.display());
+    }
+    assert_eq!(found_said, said, "{found}");
+}
+
+#[test]
+fn ranks_leave_the_bytes_of_one_process() {
+    let Some(program) = mpi_program() else { return };
+    let place = Workplace::new(SHARED);
+    let downlink = place.simulate("x.ccsds", &[]);
+    let replay = |out: &str, more: &[&str]| -> Vec<String> {
+        let words = ["replay", &downlink, "--map", &place.pipeline, "--out", out];
+        words.iter().chain(more).map(|word| (*word).to_owned()).collect()
+    };
+    let of_ranks = |ranks: usize, words: &[&str]| {
+        let output = succeeded(job(&program, ranks, words).output().unwrap());
+        // The first rank alone talks.
+        assert_eq!(text(&output.stdout).matches("Products are in").count(), 1);
+    };
+    // By the program without MPI.
+    let alone = place.path("alone");
+    succeed(&borrowed(&replay(&alone, &[])));
+    let (files, said) = products(&alone);
+    let maps = |name: &str| files.keys().filter(|path| path.file_name().unwrap() == name).count();
+    assert_eq!(maps("map.fits"), 2);
+    assert!(said[0][0]["snapshots"].as_array().unwrap().len() > 1);
+    // Without mpirun.
+    let one = place.path("one");
+    succeeded(Command::new(&program).args(replay(&one, &["--mpi"])).output().unwrap());
+    assert_equal(&one, &alone);
+    // Seven ranks are more than there are blocks, so that some hold nothing.
+    for ranks in [1, 2, 3, 4, 7] {
+        let out = place.path(&format!("of-{ranks}"));
+        of_ranks(ranks, &borrowed(&replay(&out, &["--mpi"])));
+        assert_equal(&out, &alone);
+    }
+    // The whole chain, whose downlink the first rank writes.
+    let run = |out: &str| ["run", &place.pipeline, "--out", out].map(str::to_owned);
+    let (whole, shared) = (place.path("whole"), place.path("shared"));
+    succeed(&borrowed(&run(&whole)));
+    of_ranks(2, &[&borrowed(&run(&shared))[..], &["--mpi"]].concat());
+    assert_equal(&shared, &whole);
+}
+
+fn borrowed(words: &[String]) -> Vec<&str> {
+    words.iter().map(String::as_str).collect()
+}
+
+#[test]
+fn what_ranks_cannot_share_is_refused_by_name() {
+    let place = Workplace::new(SHARED);
+    let out = place.path("out");
+    let replay = ["replay", "x.ccsds", "--out", &out, "--mpi"];
+    for other in [["--state", "s"], ["--groups", "2"], ["--speed", "2"]] {
+        let said = fail(&[&replay[..], &other].concat());
+        assert!(said.contains("--mpi") && said.contains(other[0]), "{said}");
+    }
+    // The program that tests come with knows no MPI.
+    let said = fail(&["run", &place.pipeline, "--out", &out, "--mpi"]);
+    assert!(said.contains("--features mpi") && said.contains("docs/cluster.md"), "{said}");
+    let Some(program) = mpi_program() else { return };
+    let overrides = [
+        ("map.engine=\"pixel\"", "expected \"harmonic\""),
+        ("map.refine={passes_max=2}", "map.refine.passes_max"),
+        ("downlink.link={duplicate=0.1}", "replay --mpi"),
+    ];
+    for (set, expected) in overrides {
+        // Without the keys that have no effect with the other engine, or none with refinement.
+        let usual = ["map.snapshot_every_s=0", "map.l_max=0", "map.residual_max=1e-4", set];
+        let sets = usual.into_iter().flat_map(|set| ["--set", set]);
+        let words: Vec<&str> =
+            ["run", &place.pipeline, "--out", &out, "--mpi"].into_iter().chain(sets).collect();
+        let output = job(&program, 2, &words).output().unwrap();
+        let said = text(&output.stderr);
+        assert!(!output.status.success() && said.contains(expected), "{said}");
+    }
+}
+
+#[test]
+fn ranks_that_hold_different_data_make_no_map() {
+    let Some(program) = mpi_program() else { return };
+    let place = Workplace::new(SHARED);
+    let whole = place.simulate("whole.ccsds", &[]);
+    let bytes = std::fs::read(&whole).unwrap();
+    let part = place.file("part.ccsds", &bytes[..bytes.len() / 2]);
+    let out = place.path("out");
+    // Each rank by a shell that gives the second one another file, as a folder that is not shared would.
+    let script = format!(
+        "if [ \"${{OMPI_COMM_WORLD_RANK:-$PMI_RANK}}\" = 1 ]; then file={part}; else file={whole}; fi\n\
+         exec {} replay \"$file\" --map {} --out {out} --mpi",
+        program.display(),
+        place.pipeline
+    );
+    let output = job(Path::new("sh"), 2, &["-c", &script]).output().unwrap();
+    assert!(!output.status.success());
+    assert!(text(&output.stderr).contains("sums of different data"), "{}", text(&output.stderr));
+}
+
+/// The processes of a program that descend from this one.
+fn ranks_of(child: &Child, program: &Path) -> Vec<i32> {
+    let children = |of: &str| {
+        std::fs::read_to_string(format!("/proc/{of}/task/{of}/children"))
+            .unwrap_or_default()
+            .split_whitespace()
+            .map(str::to_owned)
+            .collect::<Vec<_>>()
+    };
+    let mut open = children(&child.id().to_string());
+    let mut found = Vec::new();
+    while let Some(next) = open.pop() {
+        if std::fs::read_link(format!("/proc/{next}/exe")).is_ok_and(|exe| exe == program) {
+            found.push(next.parse().unwrap());
+        }
+        open.extend(children(&next));
+    }
+    found.sort_unstable();
+    found
+}
+
+#[test]
+fn a_job_ends_soon_after_one_of_its_ranks() {
+    let Some(program) = mpi_program() else { return };
+    let program = program.canonicalize().unwrap();
+    let place = Workplace::new(SHARED);
+    // Every window and integration, and all degrees: longer than any gate.
+    let long =
+        ["spacecraft.every_nth_window=1", "spacecraft.every_nth_integration=1", "map.snapshot_every_s=0"];
+    // A rank that is killed, and one that a signal tells to end.
+    for (signal, rank) in [("KILL", 1), ("INT", 2), ("INT", 0), ("TERM", 1)] {
+        let out = place.path(&format!("{signal}-{rank}"));
+        let sets = long.iter().flat_map(|set| ["--set", set]);
+        let words: Vec<&str> =
+            ["run", &place.pipeline, "--out", &out, "--mpi"].into_iter().chain(sets).collect();
+        let mut command = job(&program, 3, &words);
+        let mut running = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        let downlink = Path::new(&out).join("downlink.ccsds");
+        let since = Instant::now();
+        // Its ranks are at work once there is something on the way down.
+        while !std::fs::metadata(&downlink).is_ok_and(|file| file.len() > 0) {
+            assert!(running.try_wait().unwrap().is_none(), "it ended before it began");
+            assert!(since.elapsed() < Duration::from_secs(120), "it does not begin");
+            std::thread::sleep(Duration::from_millis(100));
+        }
+        let ranks = ranks_of(&running, &program);
+        assert_eq!(ranks.len(), 3);
+        let told = Command::new("kill").args([&format!("-{signal}"), &ranks[rank].to_string()]).status();
+        assert!(told.unwrap().success());
+        let since = Instant::now();
+        let status = loop {
+            if let Some(status) = running.try_wait().unwrap() {
+                break status;
+            }
+            assert!(since.elapsed() < SOON, "{signal} {rank}: the job goes on");
+            std::thread::sleep(Duration::from_millis(50));
+        };
+        assert!(!status.success(), "{signal} {rank}");
+        assert!(!Path::new(&out).join("summary.json").exists());
+    }
+}
