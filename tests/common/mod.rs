@@ -19,8 +19,12 @@ pub fn python() -> Option<PathBuf> {
     find("LUNARRAY_PYTHON", "")
 }
 
-/// A program with MPI, from `LUNARRAY_MPI`; `None`, said aloud, when it is not set.
+/// A program with MPI, from `LUNARRAY_MPI`; `None`, said aloud, when it is not set: only `.ci/run mpi` builds it.
 pub fn mpi_program() -> Option<PathBuf> {
+    if std::env::var_os("LUNARRAY_MPI").is_none() {
+        eprintln!("without MPI: LUNARRAY_MPI is not set");
+        return None;
+    }
     find("LUNARRAY_MPI", "")
 }
 
