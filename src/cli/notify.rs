@@ -17,6 +17,8 @@ const POLL: Duration = Duration::from_millis(100);
 /// Least time between two texts of how it goes.
 const STATUS_EVERY: Duration = Duration::from_secs(2);
 
+const STOPPING: &str = "STOPPING=1\nSTATUS=saving what was received";
+
 /// Tells until dropped.
 pub(super) struct Notifier {
     stop: Sender<()>,
@@ -34,7 +36,7 @@ impl Notifier {
             let (mut alive, mut shown, mut is_ending) = (Instant::now(), Instant::now(), false);
             while matches!(stopped.recv_timeout(POLL), Err(RecvTimeoutError::Timeout)) {
                 if !is_ending && cancel.is_cancelled() {
-                    supervisor.tell("STOPPING=1\nSTATUS=saving what was received");
+                    supervisor.tell(STOPPING);
                     is_ending = true;
                 }
                 if supervisor.alive_every.is_some_and(|every| alive.elapsed() >= every) {
@@ -45,6 +47,10 @@ impl Notifier {
                     supervisor.tell(&format!("STATUS={}", status_of(&watched)));
                     shown = Instant::now();
                 }
+            }
+            // It may have ended between two looks.
+            if !is_ending {
+                supervisor.tell(STOPPING);
             }
         });
         Some(Self { stop, thread: Some(thread) })
