@@ -14,42 +14,71 @@
 //! ```
 //!
 //! which is followed upwards from `I_0` and `I_1` for |mu| < x, and solved as a boundary-value problem beyond.
+//! Pairs are the lanes of vectors: for all of them the rings, and so the orders, are the same.
 
 use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
 
-use num_complex::Complex64;
-
 use crate::response::harmonic::quadrature::{GaussLegendre, Rules};
 use crate::response::harmonic::trigonometry::sin_cos;
+
+/// Pairs that are computed together.
+pub(super) const LANES: usize = 8;
+
+/// One number for each pair.
+pub(super) type Lanes = [f64; LANES];
+
+/// Type of patterns. Sums over the rings keep 1e-6 of a row's rms, of the 1e-4 that interpolation may cost.
+pub(super) type Value = f32;
+
+/// Values of all pairs at one order.
+pub(super) const VALUES: usize = 4 * LANES;
+
+/// Real and imaginary part of `I_mu`, then of `I_{-mu}`, for each pair.
+pub(super) type Coefficients = [[Value; LANES]; 4];
+
+/// A ring as pairs see it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Arcs {
+    /// `2 pi u sin theta`.
+    pub(super) x: Lanes,
+    /// The arc that both satellites of a pair see, rad.
+    pub(super) low: Lanes,
+    pub(super) high: Lanes,
+}
 
 /// Quadrature rules for `I_0` and `I_1`, and buffers for one ring.
 #[derive(Clone, Debug)]
 pub(super) struct ArcSolver {
     rules: Arc<Rules>,
-    ratio: Vec<f64>,
-    values: Vec<Complex64>,
+    steps: Vec<Step>,
 }
 
-/// `I_0` and `I_1` by a rule whose number of points is a multiple of the lanes.
+/// What elimination leaves of one order: real and imaginary part of the right-hand side of `I_n`, then of `(-1)^n I_{-n}`, and
+/// their ratio to the next order's.
+#[derive(Clone, Copy, Debug)]
+struct Step {
+    values: [Lanes; 4],
+    ratio: Lanes,
+}
+
+const NO_STEP: Step = Step { values: [[0.0; LANES]; 4], ratio: [0.0; LANES] };
+
+/// `Int exp(-i x sin psi) dpsi` from `from` over `length`, and that with another factor `exp(-i psi)`: real and imaginary parts.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn integrate_start(x: f64, [low, high]: [f64; 2], abscissae: &[f64], weights: &[f64]) -> [Complex64; 2] {
-    const LANES: usize = 8;
+fn integrate(x: &Lanes, from: &Lanes, length: &Lanes, abscissae: &[f64], weights: &[f64]) -> [Lanes; 4] {
     let mut sums = [[0.0; LANES]; 4];
-    let length = high - low;
-    for (t, w) in abscissae.chunks_exact(LANES).zip(weights.chunks_exact(LANES)) {
+    for (t, w) in abscissae.iter().zip(weights) {
         for k in 0..LANES {
-            let (sin, cos) = sin_cos(low + length * t[k]);
-            let (fringe_sin, fringe_cos) = sin_cos(x * sin);
-            // exp(-i x sin psi), and that times exp(-i psi).
-            sums[0][k] += w[k] * fringe_cos;
-            sums[1][k] -= w[k] * fringe_sin;
-            sums[2][k] += w[k] * (fringe_cos * cos - fringe_sin * sin);
-            sums[3][k] -= w[k] * (fringe_sin * cos + fringe_cos * sin);
+            let (sin, cos) = sin_cos(from[k] + length[k] * t);
+            let (fringe_sin, fringe_cos) = sin_cos(x[k] * sin);
+            sums[0][k] += w * fringe_cos;
+            sums[1][k] -= w * fringe_sin;
+            sums[2][k] += w * (fringe_cos * cos - fringe_sin * sin);
+            sums[3][k] -= w * (fringe_sin * cos + fringe_cos * sin);
         }
     }
-    let [a, b, c, d] = sums.map(|lanes| length * lanes.iter().sum::<f64>());
-    [Complex64::new(a, b), Complex64::new(c, d)]
+    sums.map(|sum| std::array::from_fn(|k| length[k] * sum[k]))
 }
 
 /// From here on Hankel's series gives Bessel functions to rounding.
@@ -70,7 +99,7 @@ fn bessel(x: f64) -> [f64; 2] {
             let odd = (2 * k + 1) as f64;
             term *= (4.0 * order * order - odd * odd) / (8.0 * (k + 1) as f64 * x);
         }
-        let (sin, cos) = (x - (0.5 * order + 0.25) * PI).sin_cos();
+        let (sin, cos) = sin_cos(x - (0.5 * order + 0.25) * PI);
         (2.0 / (PI * x)).sqrt() * (p * cos - q * sin)
     })
 }
@@ -86,118 +115,190 @@ impl ArcSolver {
     /// A solver for 0 <= x <= `x_max`.
     pub(super) fn new(x_max: f64) -> Self {
         let points = GaussLegendre::points_for(MORE_POINTS * PI * x_max);
-        Self { rules: Arc::new(Rules::up_to(points)), ratio: Vec::new(), values: Vec::new() }
+        Self { rules: Arc::new(Rules::up_to(points)), steps: Vec::new() }
     }
 
-    /// Writes `I_mu`, mu = -order_max ..= order_max, for `arc = [low, high]`; `out` has room for these `2 order_max + 1`.
-    pub(super) fn solve(&mut self, x: f64, arc: [f64; 2], out: &mut [Complex64]) {
-        let order_max = out.len() / 2;
-        let start = self.start(x, arc);
-        let edges = arc.map(|psi| Complex64::cis(-x * psi.sin()));
-        let twice = Complex64::new(0.0, 2.0);
-        let below = if x >= 1.0 { twice * (edges[1] - edges[0]) / x - start[1] } else { Complex64::ZERO };
-        self.branch(x, start, edges.map(|e| twice * e), arc.map(|psi| Complex64::cis(-psi)), order_max);
-        out[order_max..].copy_from_slice(&self.values[..=order_max]);
-        // J_n = (-1)^n I_{-n} obeys the same recurrence with the right-hand side of -n times -(-1)^n.
-        let steps = arc.map(|psi| -Complex64::cis(psi));
-        self.branch(x, [start[0], -below], edges.map(|e| -twice * e), steps, order_max);
-        for n in 1..=order_max {
-            out[order_max - n] = if n % 2 == 0 { self.values[n] } else { -self.values[n] };
+    /// Writes the coefficients of mu = 0, 1, .. as far as `out` goes.
+    pub(super) fn solve(&mut self, arcs: &Arcs, out: &mut [Coefficients]) {
+        let start = self.start(arcs);
+        let order_max = out.len().saturating_sub(1);
+        // Where the orders that are asked for stay below x, what is beyond does not matter.
+        let beyond = arcs.x.iter().filter(|x| **x < (order_max + 1) as f64);
+        let far = beyond.map(|x| (x + 10.0 * x.cbrt()) as usize + FAR_MARGIN).max();
+        let far = far.map_or(order_max, |far| far.max(order_max + FAR_MARGIN));
+        if self.steps.len() <= far {
+            self.steps.resize(far + 1, NO_STEP);
         }
+        recurrences(arcs, &start, &mut self.steps[..=far], out);
     }
 
-    /// `I_0` and `I_1` by quadrature.
-    fn start(&self, x: f64, [low, high]: [f64; 2]) -> [Complex64; 2] {
-        let integrate = |arc: [f64; 2]| {
-            let points = GaussLegendre::points_for(MORE_POINTS * 0.5 * (arc[1] - arc[0]) * x);
-            let rule = self.rules.of(points);
-            integrate_start(x, arc, &rule.abscissae, &rule.weights)
-        };
-        let hidden = [high, low + TAU];
-        if x < BESSEL_X_MIN || hidden[1] - hidden[0] > high - low {
-            return integrate([low, high]);
-        }
-        // All of the ring, less what is hidden.
-        let [zero, one] = bessel(x);
-        let rest = if hidden[1] > hidden[0] { integrate(hidden) } else { [Complex64::ZERO; 2] };
-        [TAU * zero - rest[0], -TAU * one - rest[1]]
-    }
-
-    /// Solves `x K_{n+1} + 2 n K_n + x K_{n-1} = b_high s_high^n - b_low s_low^n` for n = 0 ..= `order_max`, given `K_0` and
-    /// `K_1` (the latter used only if x >= 1).
-    fn branch(
-        &mut self,
-        x: f64,
-        start: [Complex64; 2],
-        [mut low, mut high]: [Complex64; 2],
-        [low_step, high_step]: [Complex64; 2],
-        order_max: usize,
-    ) {
-        let turning = x.floor() as usize;
-        let known = turning.min(order_max);
-        let far = order_max.max((x + 10.0 * x.cbrt()) as usize) + FAR_MARGIN;
-        self.values.resize((far + 2).max(self.values.len()), Complex64::ZERO);
-        self.ratio.resize((far + 2).max(self.ratio.len()), 0.0);
-        let (values, ratio) = (&mut self.values, &mut self.ratio);
-        let mut advance = || {
-            (low, high) = (low * low_step, high * high_step);
-            high - low
-        };
-        values[0] = start[0];
-        values[1] = start[1];
-        if known >= 1 {
-            let inverse = 1.0 / x;
-            for n in 1..known {
-                values[n + 1] = (advance() - 2.0 * n as f64 * values[n]) * inverse - values[n - 1];
+    /// `I_0` and `I_1` by quadrature over the shorter of the arcs.
+    fn start(&self, arcs: &Arcs) -> [Lanes; 4] {
+        let (mut from, mut length) = (arcs.low, [0.0; LANES]);
+        let mut whole = [[0.0; LANES]; 4];
+        let mut sign = [1.0; LANES];
+        let mut points = 0;
+        for k in 0..LANES {
+            let (x, seen) = (arcs.x[k], arcs.high[k] - arcs.low[k]);
+            length[k] = seen;
+            if x >= BESSEL_X_MIN && TAU - seen < seen {
+                // All of the ring, less what is hidden.
+                let [zero, one] = bessel(x);
+                // Int exp(-i (x sin psi + psi)) dpsi is 2 pi J_{-1}(x).
+                (whole[0][k], whole[2][k]) = (TAU * zero, -TAU * one);
+                (from[k], length[k], sign[k]) = (arcs.high[k], (TAU - seen).max(0.0), -1.0);
             }
-            if turning >= order_max {
-                return;
+            points = points.max(GaussLegendre::points_for(MORE_POINTS * 0.5 * length[k] * x));
+        }
+        let rule = self.rules.of(points);
+        let part = integrate(&arcs.x, &from, &length, &rule.abscissae, &rule.weights);
+        std::array::from_fn(|n| std::array::from_fn(|k| whole[n][k] + sign[k] * part[n][k]))
+    }
+}
+
+/// Solves `x K_{n+1} + 2 n K_n + x K_{n-1} = b_n(high) - b_n(low)` for `K_n = I_n` and `K_n = (-1)^n I_{-n}`, which obeys the same
+/// recurrence with another right-hand side: upwards while n < x, and beyond by elimination up to the last of the steps and
+/// back.
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+fn recurrences(arcs: &Arcs, start: &[Lanes; 4], steps: &mut [Step], out: &mut [Coefficients]) {
+    const ZERO: Lanes = [0.0; LANES];
+    let x = arcs.x;
+    let (mut inverse, mut known) = (ZERO, ZERO);
+    // The boundary terms at the ends and what multiplies them from order to order; values of this order and the one before.
+    let [mut high, mut low] = [[ZERO; 4]; 2];
+    let [mut high_step, mut low_step] = [[ZERO; 2]; 2];
+    let mut now = [start[0], start[1], start[0], start[1]];
+    let mut before = [ZERO; 4];
+    let mut right = [ZERO; 4];
+    for k in 0..LANES {
+        known[k] = x[k].floor();
+        inverse[k] = if x[k] >= 1.0 { 1.0 / x[k] } else { 0.0 };
+        let (sin, cos) = sin_cos(arcs.high[k]);
+        (high_step[0][k], high_step[1][k]) = (cos, -sin);
+        let (fringe_sin, fringe_cos) = sin_cos(x[k] * sin);
+        // 2 i exp(-i x sin psi), and minus that.
+        (high[0][k], high[1][k]) = (2.0 * fringe_sin, 2.0 * fringe_cos);
+        (high[2][k], high[3][k]) = (-2.0 * fringe_sin, -2.0 * fringe_cos);
+        let (sin, cos) = sin_cos(arcs.low[k]);
+        (low_step[0][k], low_step[1][k]) = (cos, -sin);
+        let (fringe_sin, fringe_cos) = sin_cos(x[k] * sin);
+        (low[0][k], low[1][k]) = (2.0 * fringe_sin, 2.0 * fringe_cos);
+        (low[2][k], low[3][k]) = (-2.0 * fringe_sin, -2.0 * fringe_cos);
+        for n in 0..4 {
+            right[n][k] = high[n][k] - low[n][k];
+        }
+        // I_{-1} from the recurrence at 0, and (-1)^1 I_1.
+        before[0][k] = right[0][k] * inverse[k] - start[2][k];
+        before[1][k] = right[1][k] * inverse[k] - start[3][k];
+        before[2][k] = -start[2][k];
+        before[3][k] = -start[3][k];
+    }
+    let mut ratio = ZERO;
+    steps[0] = Step { values: now, ratio };
+    for (n, step) in steps.iter_mut().enumerate().skip(1) {
+        let (order, below) = (n as f64, 2.0 * (n - 1) as f64);
+        for k in 0..LANES {
+            let pivot = 1.0 / (2.0 * order - x[k] * ratio[k]);
+            let is_known = order <= known[k];
+            ratio[k] = if is_known { 0.0 } else { x[k] * pivot };
+            let (hc, hs) = (high_step[0][k], high_step[1][k]);
+            let (lc, ls) = (low_step[0][k], low_step[1][k]);
+            // exp(-i psi) for the first, -exp(i psi) for the second.
+            let h = [
+                high[0][k] * hc - high[1][k] * hs,
+                high[0][k] * hs + high[1][k] * hc,
+                -(high[2][k] * hc + high[3][k] * hs),
+                high[2][k] * hs - high[3][k] * hc,
+            ];
+            let l = [
+                low[0][k] * lc - low[1][k] * ls,
+                low[0][k] * ls + low[1][k] * lc,
+                -(low[2][k] * lc + low[3][k] * ls),
+                low[2][k] * ls - low[3][k] * lc,
+            ];
+            for part in 0..4 {
+                (high[part][k], low[part][k]) = (h[part], l[part]);
+                let next_right = h[part] - l[part];
+                let upwards = (right[part][k] - below * now[part][k]) * inverse[k] - before[part][k];
+                let eliminated = (next_right - x[k] * now[part][k]) * pivot;
+                before[part][k] = now[part][k];
+                now[part][k] = if is_known { upwards } else { eliminated };
+                right[part][k] = next_right;
             }
-            // The right-hand side at n = `known` belongs to the row that the boundary value replaces.
-            advance();
         }
-        let mut above = 0.0;
-        let mut carried = values[known];
-        for n in known + 1..=far {
-            let pivot = 1.0 / (2.0 * n as f64 - x * above);
-            carried = (advance() - x * carried) * pivot;
-            above = x * pivot;
-            ratio[n] = above;
-            values[n] = carried;
+        *step = Step { values: now, ratio };
+    }
+    // Beyond the last step, by parts: the boundary term over the slope of its phase. The error decays on the way down.
+    let scale = 0.5 / steps.len() as f64;
+    let mut next = [ZERO; 4];
+    for k in 0..LANES {
+        let (hc, hs) = (high_step[0][k], high_step[1][k]);
+        let (lc, ls) = (low_step[0][k], low_step[1][k]);
+        next[0][k] = scale * (high[0][k] * hc - high[1][k] * hs - low[0][k] * lc + low[1][k] * ls);
+        next[1][k] = scale * (high[0][k] * hs + high[1][k] * hc - low[0][k] * ls - low[1][k] * lc);
+        next[2][k] = scale * (-high[2][k] * hc - high[3][k] * hs + low[2][k] * lc + low[3][k] * ls);
+        next[3][k] = scale * (high[2][k] * hs - high[3][k] * hc - low[2][k] * ls + low[3][k] * lc);
+    }
+    for (n, step) in steps.iter().enumerate().rev() {
+        for (next, values) in next.iter_mut().zip(step.values) {
+            for ((next, value), ratio) in next.iter_mut().zip(values).zip(step.ratio) {
+                *next = value - ratio * *next;
+            }
         }
-        // By parts: the boundary term over the slope of its phase; the error decays on the way down.
-        let mut next = advance() / (2.0 * (far + 1) as f64);
-        for n in (known + 1..=far).rev() {
-            next = values[n] - ratio[n] * next;
-            values[n] = next;
+        if let Some(out) = out.get_mut(n) {
+            // (-1)^n I_{-n} is what was solved for.
+            let sign = if n % 2 == 0 { 1.0 } else { -1.0 };
+            for k in 0..LANES {
+                out[0][k] = next[0][k] as Value;
+                out[1][k] = next[1][k] as Value;
+                out[2][k] = (sign * next[2][k]) as Value;
+                out[3][k] = (sign * next[3][k]) as Value;
+            }
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use num_complex::Complex64;
+
     use super::*;
 
     #[test]
     fn coefficients_are_the_integrals() {
         let rule = GaussLegendre::new(400);
-        let order_max = 30;
-        let mut solver = ArcSolver::new(150.0);
-        let mut out = vec![Complex64::ZERO; 2 * order_max + 1];
-        for x in [0.0, 1e-9, 0.3, 1.0, 2.5, 17.3, 30.0, 31.7, 140.0] {
-            for arc in [[-PI, PI], [-2.1, 2.1], [-2.12, 2.07], [-0.4, 0.3], [1e-3, 2.0]] {
-                solver.solve(x, arc, &mut out);
-                for (place, found) in out.iter().enumerate() {
-                    let mu = place as f64 - order_max as f64;
-                    let value = |t: f64| {
-                        let psi = arc[0] + (arc[1] - arc[0]) * t;
-                        Complex64::cis(-x * psi.sin() - mu * psi)
-                    };
-                    let sum: Complex64 =
-                        rule.abscissae.iter().zip(&rule.weights).map(|(t, w)| w * value(*t)).sum();
-                    let expected = (arc[1] - arc[0]) * sum;
-                    // Roundings of numbers of order one, which the recurrence multiplies by up to some thousand about |mu| = x.
-                    assert!((found - expected).norm() < 1e-11, "{x} {arc:?} {mu}: {found} {expected}");
+        let xs = [0.0, 1e-9, 0.3, 1.0, 2.5, 17.3, 30.0, 31.7, 140.0];
+        let arcs = [[-PI, PI], [-2.1, 2.1], [-2.12, 2.07], [-0.4, 0.3], [1e-3, 2.0]];
+        let cases: Vec<(f64, [f64; 2])> = xs.iter().flat_map(|x| arcs.map(|arc| (*x, arc))).collect();
+        // Lanes are cases that lie far apart, so that they need different numbers of points and steps.
+        for first in 0..cases.len() {
+            let lanes: [_; LANES] = std::array::from_fn(|k| cases[(first + 7 * k) % cases.len()]);
+            let arcs =
+                Arcs { x: lanes.map(|c| c.0), low: lanes.map(|c| c.1[0]), high: lanes.map(|c| c.1[1]) };
+            for orders in [1, 4, 31] {
+                let mut out = vec![[[0.0; LANES]; 4]; orders];
+                ArcSolver::new(150.0).solve(&arcs, &mut out);
+                for (mu, found) in out.iter().enumerate() {
+                    for (k, (x, [low, high])) in lanes.iter().enumerate() {
+                        for (sign, parts) in
+                            [(1.0, [found[0][k], found[1][k]]), (-1.0, [found[2][k], found[3][k]])]
+                        {
+                            let value = |t: f64| {
+                                let psi = low + (high - low) * t;
+                                Complex64::cis(-x * psi.sin() - sign * mu as f64 * psi)
+                            };
+                            let sum: Complex64 =
+                                rule.abscissae.iter().zip(&rule.weights).map(|(t, w)| w * value(*t)).sum();
+                            let expected = (high - low) * sum;
+                            let found = Complex64::new(f64::from(parts[0]), f64::from(parts[1]));
+                            // Rounded to the type of patterns in the end.
+                            let error = (found - expected).norm();
+                            assert!(
+                                error < 1e-11 + f64::from(Value::EPSILON) * expected.norm(),
+                                "{lanes:?} {mu}: {error:e}"
+                            );
+                        }
+                    }
                 }
             }
         }

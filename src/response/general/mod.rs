@@ -11,6 +11,7 @@
 mod arc;
 mod operator;
 mod plan;
+mod rings;
 mod turns;
 mod view;
 

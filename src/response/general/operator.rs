@@ -7,17 +7,23 @@ use faer::{Accum, MatMut, MatRef, Par};
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::arc::ArcSolver;
-use super::plan::{GROUP_NODES, Pass, RowNode, RowPlan, class_bytes, classes_max};
+use super::arc::{ArcSolver, Arcs, Coefficients, LANES, Lanes, VALUES, Value};
+use super::plan::{GROUP_NODES, Pass, RowNode, RowPlan, altitude_bytes, classes_max};
+use super::rings::{RingClass, padded};
 use super::turns::{QuarterTurns, place};
 use super::{PairAt, RowsError, RowsSetup};
 use crate::response::harmonic::degrees;
-use crate::response::harmonic::legendre::Legendre;
-use crate::response::harmonic::pattern::{PatternGeometry, RingPoint, ring_points};
+use crate::response::harmonic::trigonometry::sin_cos;
 use crate::sky::harmonics::Alm;
 
 /// Rows of one altitude class that a task computes together.
 const BATCH: usize = 16;
+
+/// Rings whose arcs are held until they are summed up: for [`LANES`] pairs they fit a core's own cache.
+const RINGS: usize = 32;
+
+/// Rows that are interpolated by one product of matrices.
+const ROWS: usize = 64;
 
 /// Groups whose gradients are held until they are added.
 const GROUPS_AT_ONCE: usize = 32;
@@ -140,21 +146,23 @@ impl GeneralRows {
         (joined(plan, skies.len(), seen), out)
     }
 
-    /// Orders of an amplitude: mu = -l_max ..= l_max.
+    /// Orders of an amplitude, mu = -l_max ..= l_max, and what fills the last vector.
     fn orders(&self) -> usize {
-        2 * self.setup.l_max + 1
+        (2 * self.setup.l_max + 1).next_multiple_of(LANES)
     }
 
-    /// Room for the amplitudes g of the passes' nodes: `[node][sky][order]`.
-    fn no_amplitudes(&self, passes: &[Pass], skies: usize) -> Vec<Complex64> {
-        vec![Complex64::ZERO; nodes_of(passes).len() * skies * self.orders()]
+    /// Room for the amplitudes g of the passes' nodes: `[node][sky][real or imaginary part][order]`.
+    fn no_amplitudes(&self, passes: &[Pass], skies: usize) -> Vec<f64> {
+        vec![0.0; nodes_of(passes).len() * skies * 2 * self.orders()]
     }
 
     /// Nodes of passes, in batches of one class: places among the passes' nodes.
     fn batches(plan: &RowPlan, passes: &[Pass]) -> Vec<Vec<usize>> {
         let nodes = &plan.nodes[nodes_of(passes)];
         let mut order: Vec<usize> = (0..nodes.len()).collect();
-        order.sort_by_key(|&k| nodes[k].class);
+        // Pairs of one batch should need about as many quadrature points.
+        let length = |k: usize| nodes[k].view.baseline_m;
+        order.sort_by(|&a, &b| nodes[a].class.cmp(&nodes[b].class).then(length(a).total_cmp(&length(b))));
         order
             .chunk_by(|&a, &b| nodes[a].class == nodes[b].class)
             .flat_map(|same| same.chunks(BATCH).map(<[usize]>::to_vec))
@@ -178,26 +186,22 @@ impl GeneralRows {
     }
 
     /// Writes the amplitudes of a batch.
-    fn amplitudes(&self, batch: &Batch, skies: &[Alm], out: &mut [Complex64]) {
+    fn amplitudes(&self, batch: &Batch, skies: &[Alm], out: &mut [f64]) {
         let (orders, l_max) = (self.orders(), self.setup.l_max);
         let turned = self.turned(&batch.nodes, skies);
-        for mu in 0..=l_max {
-            let count = degrees(l_max, mu);
-            for (n, &node) in batch.places.iter().enumerate() {
-                let pattern = batch.patterns[mu].node(n);
+        let lanes = lanes_of(&batch.nodes);
+        for (mu, [re, im]) in turned.iter().enumerate() {
+            for (group, places) in batch.places.chunks(LANES).enumerate() {
+                let pattern = batch.patterns[mu].of(group);
                 for sky in 0..skies.len() {
-                    let start = (n * skies.len() + sky) * count;
-                    let [re, im] = turned[mu].each_ref().map(|part| &part[start..start + count]);
-                    let (mut plus, mut minus) = (Complex64::ZERO, Complex64::ZERO);
-                    for k in 0..count {
-                        let t = Complex64::new(re[k], im[k]);
-                        plus += t * Complex64::new(pattern[0][k], pattern[1][k]);
-                        minus += t.conj() * Complex64::new(pattern[2][k], pattern[3][k]);
-                    }
-                    let place = (node * skies.len() + sky) * orders + l_max;
-                    out[place + mu] = plus;
-                    if mu > 0 {
-                        out[place - mu] = minus;
+                    let first = sky * lanes + group * LANES;
+                    let sums = products(&re[first..], &im[first..], skies.len() * lanes, pattern);
+                    for (lane, node) in places.iter().enumerate() {
+                        let place = (node * skies.len() + sky) * 2 * orders + l_max;
+                        (out[place + mu], out[place + orders + mu]) = (sums[0][lane], sums[1][lane]);
+                        if mu > 0 {
+                            (out[place - mu], out[place + orders - mu]) = (sums[2][lane], sums[3][lane]);
+                        }
                     }
                 }
             }
@@ -205,67 +209,74 @@ impl GeneralRows {
     }
 
     /// The transpose of [`Self::amplitudes`], added to `out`.
-    fn gradients(&self, batch: &Batch, amplitudes: &[Complex64], out: &mut [Alm]) {
+    fn gradients(&self, batch: &Batch, amplitudes: &[f64], out: &mut [Alm]) {
         let (orders, l_max, skies) = (self.orders(), self.setup.l_max, out.len());
-        let mut turned: Vec<[Vec<f64>; 2]> = Vec::with_capacity(l_max + 1);
-        for mu in 0..=l_max {
-            let count = degrees(l_max, mu);
-            let mut parts = [0, 1].map(|_| vec![0.0; batch.nodes.len() * skies * count]);
-            for (n, &node) in batch.places.iter().enumerate() {
-                let pattern = batch.patterns[mu].node(n);
-                for sky in 0..skies {
-                    let place = (node * skies + sky) * orders + l_max;
-                    let plus = amplitudes[place + mu];
-                    let minus = if mu > 0 { amplitudes[place - mu] } else { Complex64::ZERO };
-                    let start = (n * skies + sky) * count;
-                    for k in 0..count {
-                        let t = Complex64::new(pattern[0][k], -pattern[1][k]) * plus
-                            + Complex64::new(pattern[2][k], pattern[3][k]) * minus.conj();
-                        parts[0][start + k] = t.re;
-                        parts[1][start + k] = t.im;
+        let lanes = lanes_of(&batch.nodes);
+        let turned: Vec<[Vec<f64>; 2]> = (0..=l_max)
+            .map(|mu| {
+                let [mut re, mut im] = [0, 1].map(|_| vec![0.0; degrees(l_max, mu) * skies * lanes]);
+                for (group, places) in batch.places.chunks(LANES).enumerate() {
+                    let pattern = batch.patterns[mu].of(group);
+                    for sky in 0..skies {
+                        let mut values = [[0.0; LANES]; 4];
+                        for (lane, node) in places.iter().enumerate() {
+                            let place = (node * skies + sky) * 2 * orders + l_max;
+                            (values[0][lane], values[1][lane]) =
+                                (amplitudes[place + mu], amplitudes[place + orders + mu]);
+                            if mu > 0 {
+                                (values[2][lane], values[3][lane]) =
+                                    (amplitudes[place - mu], amplitudes[place + orders - mu]);
+                            }
+                        }
+                        let first = sky * lanes + group * LANES;
+                        products_back(&values, pattern, &mut re[first..], &mut im[first..], skies * lanes);
                     }
                 }
-            }
-            turned.push(parts);
-        }
+                [re, im]
+            })
+            .collect();
         self.turn_back(&batch.nodes, &turned, out);
     }
 
-    /// Skies in the frames of nodes, by mu: real and imaginary parts of `t_{l mu}`, `[node][sky][l = mu, mu + 2, ..]`.
+    /// Skies in the frames of nodes, by mu: real and imaginary parts of `t_{l mu}`, `[l = mu, mu + 2, ..][sky][lane]`.
     fn turned(&self, nodes: &[RowNode], skies: &[Alm]) -> Vec<[Vec<f64>; 2]> {
         let l_max = self.setup.l_max;
-        let columns = nodes.len() * skies.len();
+        let lanes = lanes_of(nodes);
+        let columns = lanes * skies.len();
         let phases = Phases::new(nodes, l_max);
         let mut out: Vec<[Vec<f64>; 2]> =
             (0..=l_max).map(|mu| [0, 1].map(|_| vec![0.0; columns * degrees(l_max, mu)])).collect();
+        let mut buffers = [0, 1].map(|_| [0, 1].map(|_| vec![0.0; columns * (l_max + 1)]));
         for l in 0..=l_max {
-            let mut sky = [0, 1].map(|_| vec![0.0; columns * (l + 1)]);
+            let [mut sky, half] =
+                buffers.each_mut().map(|both| both.each_mut().map(|x| &mut x[..columns * (l + 1)]));
             for m in 0..=l {
-                for (column, (node, alm)) in columns_of(nodes.len(), skies).enumerate() {
-                    let z = skies[alm].get(l, m).conj() * phases.get(0, node, m).conj();
-                    let at = column * (l + 1) + place(l, m);
-                    (sky[0][at], sky[1][at]) = (z.re, z.im);
+                for (k, alm) in skies.iter().enumerate() {
+                    let at = place(l, m) * columns + k * lanes;
+                    let [re, im] = sky.each_mut().map(|part| &mut part[at..at + lanes]);
+                    let z = alm.get(l, m).conj();
+                    re.fill(z.re);
+                    im.fill(z.im);
+                    turn(re, im, phases.get(0, m), -1.0);
                 }
             }
-            let mut half = [0, 1].map(|_| vec![0.0; columns * (l + 1)]);
-            let [re, im] = half.each_mut().map(Vec::as_mut_slice);
-            self.turns.turn(l, &[0, 1], sky.each_ref().map(Vec::as_slice), [re, im]);
+            let [re, im] = half;
+            self.turns.turn(l, &[0, 1], [&*sky[0], &*sky[1]], [&mut *re, &mut *im]);
             for k in 0..=l {
-                for (column, (node, _)) in columns_of(nodes.len(), skies).enumerate() {
-                    let at = column * (l + 1) + place(l, k);
-                    let z = Complex64::new(half[0][at], half[1][at]) * phases.get(1, node, k).conj();
-                    (half[0][at], half[1][at]) = (z.re, z.im);
+                let at = place(l, k) * columns;
+                for (re, im) in rows_at(re, im, at..at + columns, lanes) {
+                    turn(re, im, phases.get(1, k), -1.0);
                 }
             }
-            let [re, im] = sky.each_mut().map(Vec::as_mut_slice);
-            self.turns.turn(l, &[l % 2], half.each_ref().map(Vec::as_slice), [re, im]);
+            let [to_re, to_im] = sky;
+            self.turns.turn(l, &[l % 2], [&*re, &*im], [&mut *to_re, &mut *to_im]);
             for mu in (l % 2..=l).step_by(2) {
-                let count = degrees(l_max, mu);
-                for (column, (node, _)) in columns_of(nodes.len(), skies).enumerate() {
-                    let from = column * (l + 1) + place(l, mu);
-                    let t = Complex64::new(sky[0][from], sky[1][from]) * phases.get(2, node, mu).conj();
-                    let to = column * count + (l - mu) / 2;
-                    (out[mu][0][to], out[mu][1][to]) = (t.re, t.im);
+                let (from, to) = (place(l, mu) * columns, (l - mu) / 2 * columns);
+                let [re, im] = &mut out[mu];
+                re[to..to + columns].copy_from_slice(&to_re[from..from + columns]);
+                im[to..to + columns].copy_from_slice(&to_im[from..from + columns]);
+                for (re, im) in rows_at(re, im, to..to + columns, lanes) {
+                    turn(re, im, phases.get(2, mu), -1.0);
                 }
             }
         }
@@ -275,39 +286,38 @@ impl GeneralRows {
     /// The transpose of [`Self::turned`], added to `out`.
     fn turn_back(&self, nodes: &[RowNode], turned: &[[Vec<f64>; 2]], out: &mut [Alm]) {
         let l_max = self.setup.l_max;
-        let columns = nodes.len() * out.len();
+        let lanes = lanes_of(nodes);
+        let columns = lanes * out.len();
         let phases = Phases::new(nodes, l_max);
-        let skies = out.len();
+        let mut buffers = [0, 1].map(|_| [0, 1].map(|_| vec![0.0; columns * (l_max + 1)]));
         for l in 0..=l_max {
-            let mut sky = [0, 1].map(|_| vec![0.0; columns * (l + 1)]);
+            let [sky, half] =
+                buffers.each_mut().map(|both| both.each_mut().map(|x| &mut x[..columns * (l + 1)]));
+            let [sky_re, sky_im] = sky;
             for mu in (l % 2..=l).step_by(2) {
-                let count = degrees(l_max, mu);
-                for column in 0..columns {
-                    let from = column * count + (l - mu) / 2;
-                    let t = Complex64::new(turned[mu][0][from], turned[mu][1][from])
-                        * phases.get(2, column / skies, mu);
-                    let to = column * (l + 1) + place(l, mu);
-                    (sky[0][to], sky[1][to]) = (t.re, t.im);
+                let (from, to) = ((l - mu) / 2 * columns, place(l, mu) * columns);
+                sky_re[to..to + columns].copy_from_slice(&turned[mu][0][from..from + columns]);
+                sky_im[to..to + columns].copy_from_slice(&turned[mu][1][from..from + columns]);
+                for (re, im) in rows_at(sky_re, sky_im, to..to + columns, lanes) {
+                    turn(re, im, phases.get(2, mu), 1.0);
                 }
             }
-            let mut half = [0, 1].map(|_| vec![0.0; columns * (l + 1)]);
-            let [re, im] = half.each_mut().map(Vec::as_mut_slice);
-            self.turns.turn_back(l, &[l % 2], sky.each_ref().map(Vec::as_slice), [re, im]);
+            let [re, im] = half;
+            self.turns.turn_back(l, &[l % 2], [&*sky_re, &*sky_im], [&mut *re, &mut *im]);
             for k in 0..=l {
-                for column in 0..columns {
-                    let at = column * (l + 1) + place(l, k);
-                    let z = Complex64::new(half[0][at], half[1][at]) * phases.get(1, column / skies, k);
-                    (half[0][at], half[1][at]) = (z.re, z.im);
+                let at = place(l, k) * columns;
+                for (re, im) in rows_at(re, im, at..at + columns, lanes) {
+                    turn(re, im, phases.get(1, k), 1.0);
                 }
             }
-            let [re, im] = sky.each_mut().map(Vec::as_mut_slice);
-            self.turns.turn_back(l, &[0, 1], half.each_ref().map(Vec::as_slice), [re, im]);
+            self.turns.turn_back(l, &[0, 1], [&*re, &*im], [&mut *sky_re, &mut *sky_im]);
             for m in 0..=l {
-                for column in 0..columns {
-                    let at = column * (l + 1) + place(l, m);
+                for (k, out) in out.iter_mut().enumerate() {
+                    let at = place(l, m) * columns + k * lanes;
+                    let [re, im] = [&mut sky_re[at..at + lanes], &mut sky_im[at..at + lanes]];
+                    turn(re, im, phases.get(0, m), 1.0);
                     // z = conj(T) conj(phase): the gradient is conj(z' phase).
-                    let z = Complex64::new(sky[0][at], sky[1][at]) * phases.get(0, column / skies, m);
-                    *out[column % skies].get_mut(l, m) += z.conj();
+                    *out.get_mut(l, m) += Complex64::new(re.iter().sum(), -im.iter().sum::<f64>());
                 }
             }
         }
@@ -316,39 +326,40 @@ impl GeneralRows {
     /// Patterns of nodes of one class, by mu.
     fn patterns(&self, class: &RingClass, nodes: &[RowNode], solver: &mut ArcSolver) -> Vec<NodePatterns> {
         let l_max = self.setup.l_max;
-        let values = 4 * nodes.len();
-        // By mu, over the rings: for each node real and imaginary part of I_mu, then of I_{-mu}.
-        let mut arcs: Vec<Vec<f64>> =
-            class.reached.iter().map(|reached| vec![0.0; values * reached]).collect();
-        let mut orders = vec![Complex64::ZERO; self.orders() * nodes.len()];
-        for (k, (ring, &reach)) in class.rings.iter().zip(&class.reach).enumerate() {
-            let stride = 2 * reach + 1;
-            for (node, orders) in nodes.iter().zip(orders.chunks_exact_mut(stride)) {
-                let u = node.view.baseline_m / self.setup.wavelength_m;
-                solver.solve(TAU * u * ring.sin_theta, node.view.arc(ring.sin_theta), orders);
-            }
-            for (mu, arcs) in arcs.iter_mut().enumerate().take(reach + 1) {
-                let values = arcs[values * k..values * (k + 1)].chunks_exact_mut(4);
-                for (four, orders) in values.zip(orders.chunks_exact(stride)) {
-                    let [plus, minus] = [orders[reach + mu], orders[reach - mu]];
-                    four.copy_from_slice(&[plus.re, plus.im, minus.re, minus.im]);
+        let groups = nodes.len().div_ceil(LANES);
+        let mut out: Vec<NodePatterns> =
+            (0..=l_max).map(|mu| NodePatterns::zeros(degrees(l_max, mu), groups)).collect();
+        let mut arcs: Vec<Coefficients> = Vec::new();
+        for first in (0..class.rings.len()).step_by(RINGS) {
+            let last = (first + RINGS).min(class.rings.len());
+            // The first ring of them reaches the greatest order. Rings an odd number apart do not share the cache's sets.
+            let orders = class.reach[first] + 1;
+            let stride = orders | 1;
+            arcs.resize(stride * (last - first), [[0.0; LANES]; 4]);
+            for (group, nodes) in nodes.chunks(LANES).enumerate() {
+                for (ring, arcs) in (first..last).zip(arcs.chunks_exact_mut(stride)) {
+                    solver.solve(
+                        &self.arcs(nodes, class.rings[ring].sin_theta),
+                        &mut arcs[..=class.reach[ring]],
+                    );
+                }
+                for (mu, out) in out.iter_mut().enumerate().take(orders) {
+                    class.sum_up(mu, first..last, &arcs[mu..], stride, out.of_mut(group));
                 }
             }
         }
-        let product = |(mu, arcs): (usize, Vec<f64>)| {
-            let (count, reached) = (degrees(l_max, mu), class.reached[mu]);
-            let mut coefficients = vec![0.0; values * count];
-            faer::linalg::matmul::matmul(
-                MatMut::from_column_major_slice_mut(&mut coefficients, count, values),
-                Accum::Replace,
-                MatRef::from_row_major_slice(&class.legendre[mu], count, reached),
-                MatRef::from_row_major_slice(&arcs, reached, values),
-                1.0,
-                Par::Seq,
-            );
-            NodePatterns { count, coefficients }
-        };
-        arcs.into_iter().enumerate().map(product).collect()
+        out
+    }
+
+    /// A ring as up to [`LANES`] nodes see it; the last of them fills what is left.
+    fn arcs(&self, nodes: &[RowNode], sin_theta: f64) -> Arcs {
+        let mut arcs = Arcs { x: [0.0; LANES], low: [0.0; LANES], high: [0.0; LANES] };
+        for k in 0..LANES {
+            let Some(node) = nodes.get(k).or(nodes.last()) else { break };
+            arcs.x[k] = TAU * node.view.baseline_m / self.setup.wavelength_m * sin_theta;
+            [arcs.low[k], arcs.high[k]] = node.view.arc(sin_theta);
+        }
+        arcs
     }
 
     /// Values at all rows of passes, one vector a sky.
@@ -356,31 +367,39 @@ impl GeneralRows {
         &self,
         plan: &RowPlan,
         passes: &[Pass],
-        amplitudes: &[Complex64],
+        amplitudes: &[f64],
         skies: usize,
     ) -> Vec<Vec<Complex64>> {
         let first = nodes_of(passes).start;
-        let orders = self.orders();
+        let width = 2 * self.orders();
         let mut out = vec![Vec::with_capacity(rows_of(passes).len()); skies];
-        let (mut shares, mut sums) = (Vec::new(), vec![Complex64::ZERO; orders]);
+        let (mut shares, mut sums) = (Vec::new(), vec![0.0; ROWS * skies * width]);
         for pass in passes {
-            for (row, own) in
-                pass.rows.clone().zip(pass.nodes.clone().chain(std::iter::repeat(pass.nodes.start)))
-            {
-                if !pass.tau.is_empty() {
-                    plan.shares(pass, row, &mut shares);
+            let amplitudes = &amplitudes[(pass.nodes.start - first) * skies * width..];
+            let amplitudes = &amplitudes[..pass.nodes.len() * skies * width];
+            if pass.tau.is_empty() {
+                for (row, node) in pass.rows.clone().zip(amplitudes.chunks_exact(skies * width)) {
+                    for (out, g) in out.iter_mut().zip(node.chunks_exact(width)) {
+                        out.push(self.at_phase(g, plan.gamma_rad[row]));
+                    }
                 }
-                for (sky, out) in out.iter_mut().enumerate() {
-                    let node = |k: usize| &amplitudes[((k - first) * skies + sky) * orders..][..orders];
-                    if pass.tau.is_empty() {
-                        out.push(self.at_phase(node(own), plan.gamma_rad[row]));
-                        continue;
+                continue;
+            }
+            for rows in blocks(&pass.rows) {
+                plan.shares(pass, rows.clone(), &mut shares);
+                let sums = &mut sums[..rows.len() * skies * width];
+                faer::linalg::matmul::matmul(
+                    MatMut::from_row_major_slice_mut(sums, rows.len(), skies * width),
+                    Accum::Replace,
+                    MatRef::from_row_major_slice(&shares, rows.len(), pass.nodes.len()),
+                    MatRef::from_row_major_slice(amplitudes, pass.nodes.len(), skies * width),
+                    1.0,
+                    Par::Seq,
+                );
+                for (row, sums) in rows.zip(sums.chunks_exact(skies * width)) {
+                    for (out, g) in out.iter_mut().zip(sums.chunks_exact(width)) {
+                        out.push(self.at_phase(g, plan.gamma_rad[row]));
                     }
-                    sums.fill(Complex64::ZERO);
-                    for (k, share) in pass.nodes.clone().zip(&shares) {
-                        sums.iter_mut().zip(node(k)).for_each(|(sum, g)| *sum += share * g);
-                    }
-                    out.push(self.at_phase(&sums, plan.gamma_rad[row]));
                 }
             }
         }
@@ -388,45 +407,144 @@ impl GeneralRows {
     }
 
     /// `sum_mu exp(-i mu gamma) g_mu`.
-    fn at_phase(&self, amplitudes: &[Complex64], gamma_rad: f64) -> Complex64 {
-        let turn = Complex64::cis(-gamma_rad);
-        // Horner's rule from the greatest order down, then back by the lowest one's phase.
-        let sum = amplitudes.iter().rev().fold(Complex64::ZERO, |sum, g| sum * turn + g);
-        sum * Complex64::cis(self.setup.l_max as f64 * gamma_rad)
+    fn at_phase(&self, amplitudes: &[f64], gamma_rad: f64) -> Complex64 {
+        let (re, im) = amplitudes.split_at(amplitudes.len() / 2);
+        phase_sum(re, im, gamma_rad) * Complex64::cis(self.setup.l_max as f64 * gamma_rad)
     }
 
-    /// The transpose of [`Self::interpolate`], for several vectors over the rows of the passes: `[node][sky][order]`.
-    fn spread(&self, plan: &RowPlan, passes: &[Pass], values: &[&[Complex64]]) -> Vec<Complex64> {
+    /// The transpose of [`Self::interpolate`], for several vectors over the rows of the passes.
+    fn spread(&self, plan: &RowPlan, passes: &[Pass], values: &[&[Complex64]]) -> Vec<f64> {
         let (first, first_row) = (nodes_of(passes).start, rows_of(passes).start);
-        let (orders, skies) = (self.orders(), values.len());
+        let (width, skies) = (2 * self.orders(), values.len());
         let mut out = self.no_amplitudes(passes, skies);
-        let mut shares = Vec::new();
+        let (mut shares, mut terms) = (Vec::new(), vec![0.0; ROWS * skies * width]);
+        let write = |row: usize, to: &mut [f64]| {
+            for (values, to) in values.iter().zip(to.chunks_exact_mut(width)) {
+                let gamma_rad = plan.gamma_rad[row];
+                let lowest = values[row - first_row] * Complex64::cis(-(self.setup.l_max as f64) * gamma_rad);
+                let (re, im) = to.split_at_mut(width / 2);
+                phase_terms(lowest, gamma_rad, re, im);
+            }
+        };
         for pass in passes {
-            for (row, own) in
-                pass.rows.clone().zip(pass.nodes.clone().chain(std::iter::repeat(pass.nodes.start)))
-            {
-                let nodes = if pass.tau.is_empty() { own..own + 1 } else { pass.nodes.clone() };
-                if pass.tau.is_empty() {
-                    shares.clear();
-                    shares.push(1.0);
-                } else {
-                    plan.shares(pass, row, &mut shares);
-                }
-                let turn = Complex64::cis(plan.gamma_rad[row]);
-                let lowest = Complex64::cis(-(self.setup.l_max as f64) * plan.gamma_rad[row]);
-                for (sky, values) in values.iter().enumerate() {
-                    for (k, share) in nodes.clone().zip(&shares) {
-                        let place = ((k - first) * skies + sky) * orders;
-                        let mut term = *share * values[row - first_row] * lowest;
-                        for g in &mut out[place..place + orders] {
-                            *g += term;
-                            term *= turn;
-                        }
-                    }
-                }
+            let out = &mut out[(pass.nodes.start - first) * skies * width..];
+            let out = &mut out[..pass.nodes.len() * skies * width];
+            if pass.tau.is_empty() {
+                pass.rows
+                    .clone()
+                    .zip(out.chunks_exact_mut(skies * width))
+                    .for_each(|(row, to)| write(row, to));
+                continue;
+            }
+            for rows in blocks(&pass.rows) {
+                plan.shares(pass, rows.clone(), &mut shares);
+                let terms = &mut terms[..rows.len() * skies * width];
+                rows.clone().zip(terms.chunks_exact_mut(skies * width)).for_each(|(row, to)| write(row, to));
+                faer::linalg::matmul::matmul(
+                    MatMut::from_row_major_slice_mut(out, pass.nodes.len(), skies * width),
+                    Accum::Add,
+                    MatRef::from_row_major_slice(&shares, rows.len(), pass.nodes.len()).transpose(),
+                    MatRef::from_row_major_slice(terms, rows.len(), skies * width),
+                    1.0,
+                    Par::Seq,
+                );
             }
         }
         out
+    }
+}
+
+/// Consecutive rows, in blocks.
+fn blocks(rows: &Range<usize>) -> impl Iterator<Item = Range<usize>> + use<> {
+    let end = rows.end;
+    rows.clone().step_by(ROWS).map(move |start| start..(start + ROWS).min(end))
+}
+
+/// Nodes of a batch, and what fills the last vector.
+fn lanes_of(nodes: &[RowNode]) -> usize {
+    nodes.len().next_multiple_of(LANES)
+}
+
+/// A range of two lists, in chunks of the lanes.
+fn rows_at<'a>(
+    re: &'a mut [f64],
+    im: &'a mut [f64],
+    range: Range<usize>,
+    lanes: usize,
+) -> impl Iterator<Item = (&'a mut [f64], &'a mut [f64])> {
+    re[range.clone()].chunks_exact_mut(lanes).zip(im[range].chunks_exact_mut(lanes))
+}
+
+/// Turns numbers by phases, or back.
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+fn turn(re: &mut [f64], im: &mut [f64], [cos, sin]: [&[f64]; 2], sign: f64) {
+    for (((re, im), cos), sin) in re.iter_mut().zip(im).zip(cos).zip(sin) {
+        let sin = sign * sin;
+        (*re, *im) = (*re * cos - *im * sin, *re * sin + *im * cos);
+    }
+}
+
+/// Sums over l of turned skies with patterns: for mu, and of the conjugate skies for -mu. Values of one l are `stride` apart.
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+fn products(re: &[f64], im: &[f64], stride: usize, pattern: &[Value]) -> [Lanes; 4] {
+    let mut sums = [[0.0; LANES]; 4];
+    for ((re, im), pattern) in re.chunks(stride).zip(im.chunks(stride)).zip(pattern.chunks_exact(VALUES)) {
+        let (re, im) = (&re[..LANES], &im[..LANES]);
+        for k in 0..LANES {
+            let [a, b, c, d] = [0, 1, 2, 3].map(|part| f64::from(pattern[part * LANES + k]));
+            sums[0][k] += re[k] * a - im[k] * b;
+            sums[1][k] += re[k] * b + im[k] * a;
+            sums[2][k] += re[k] * c + im[k] * d;
+            sums[3][k] += re[k] * d - im[k] * c;
+        }
+    }
+    sums
+}
+
+/// The transpose of [`products`].
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+fn products_back(values: &[Lanes; 4], pattern: &[Value], re: &mut [f64], im: &mut [f64], stride: usize) {
+    let parts = re.chunks_mut(stride).zip(im.chunks_mut(stride));
+    for ((re, im), pattern) in parts.zip(pattern.chunks_exact(VALUES)) {
+        let (re, im) = (&mut re[..LANES], &mut im[..LANES]);
+        for k in 0..LANES {
+            let [a, b, c, d] = [0, 1, 2, 3].map(|part| f64::from(pattern[part * LANES + k]));
+            let [plus_re, plus_im, minus_re, minus_im] = [0, 1, 2, 3].map(|part| values[part][k]);
+            re[k] = a * plus_re + b * plus_im + c * minus_re + d * minus_im;
+            im[k] = a * plus_im - b * plus_re + d * minus_re - c * minus_im;
+        }
+    }
+}
+
+/// `sum_n exp(-i n angle) g_n`, n from 0; the length is a multiple of the lanes.
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+fn phase_sum(re: &[f64], im: &[f64], angle_rad: f64) -> Complex64 {
+    // Horner's rule, each lane on its own from the last of its orders down.
+    let (sin, cos) = (-(LANES as f64) * angle_rad).sin_cos();
+    let mut sums = [[0.0; LANES]; 2];
+    for (re, im) in re.rchunks_exact(LANES).zip(im.rchunks_exact(LANES)) {
+        for k in 0..LANES {
+            let [a, b] = [sums[0][k], sums[1][k]];
+            sums[0][k] = a * cos - b * sin + re[k];
+            sums[1][k] = a * sin + b * cos + im[k];
+        }
+    }
+    (0..LANES).map(|k| Complex64::new(sums[0][k], sums[1][k]) * Complex64::cis(-(k as f64) * angle_rad)).sum()
+}
+
+/// `exp(i n angle) first`, n from 0; the length is a multiple of the lanes.
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+fn phase_terms(first: Complex64, angle_rad: f64, re: &mut [f64], im: &mut [f64]) {
+    let (sin, cos) = (LANES as f64 * angle_rad).sin_cos();
+    let start: [Complex64; LANES] = std::array::from_fn(|k| first * Complex64::cis(k as f64 * angle_rad));
+    let mut term = [start.map(|z| z.re), start.map(|z| z.im)];
+    for (re, im) in re.chunks_exact_mut(LANES).zip(im.chunks_exact_mut(LANES)) {
+        for k in 0..LANES {
+            let [a, b] = [term[0][k], term[1][k]];
+            (re[k], im[k]) = (a, b);
+            term[0][k] = a * cos - b * sin;
+            term[1][k] = a * sin + b * cos;
+        }
     }
 }
 
@@ -466,12 +584,10 @@ struct Tables {
 
 impl Tables {
     fn new(setup: &RowsSetup, plan: &RowPlan) -> Self {
-        let mut is_used = vec![false; plan.class_radius_m.len()];
+        let mut is_used = vec![false; plan.classes.len()];
         plan.nodes.iter().for_each(|node| is_used[node.class as usize] = true);
-        let radii_m = plan.class_radius_m.par_iter().zip(is_used);
-        let classes = radii_m
-            .map(|(&radius_m, used)| used.then(|| RingClass::new(setup, radius_m, plan.u_max)))
-            .collect();
+        let classes = plan.classes.par_iter().zip(is_used);
+        let classes = classes.map(|(class, used)| used.then(|| RingClass::new(setup, class))).collect();
         Self { classes, solver: ArcSolver::new(TAU * plan.u_max) }
     }
 }
@@ -485,95 +601,68 @@ struct Batch {
     patterns: Vec<NodePatterns>,
 }
 
-/// Columns of a batch: node and sky.
-fn columns_of(nodes: usize, skies: &[Alm]) -> impl Iterator<Item = (usize, usize)> + use<> {
-    let count = skies.len();
-    (0..nodes).flat_map(move |node| (0..count).map(move |sky| (node, sky)))
-}
-
-/// `exp(i k angle)` for the turns of nodes.
+/// Cosines and sines of multiples of the turns of nodes; the last node fills the last vector.
 struct Phases {
     stride: usize,
-    nodes: usize,
-    values: Vec<Complex64>,
+    lanes: usize,
+    cos: Vec<f64>,
+    sin: Vec<f64>,
 }
 
 impl Phases {
     fn new(nodes: &[RowNode], l_max: usize) -> Self {
-        let stride = l_max + 1;
-        let mut values = Vec::with_capacity(3 * nodes.len() * stride);
+        let (stride, lanes) = (l_max + 1, lanes_of(nodes));
+        let [mut cos, mut sin] = [0, 1].map(|_| Vec::with_capacity(3 * lanes * stride));
         for turn in 0..3 {
-            for node in nodes {
-                values.extend((0..stride).map(|k| Complex64::cis(k as f64 * node.turns_rad[turn])));
+            for k in 0..stride {
+                let filled = nodes.iter().chain(nodes.last().into_iter().cycle()).take(lanes);
+                for (s, c) in filled.map(|node| sin_cos(k as f64 * node.turns_rad[turn])) {
+                    cos.push(c);
+                    sin.push(s);
+                }
             }
         }
-        Self { stride, nodes: nodes.len(), values }
+        Self { stride, lanes, cos, sin }
     }
 
-    fn get(&self, turn: usize, node: usize, k: usize) -> Complex64 {
-        self.values[(turn * self.nodes + node) * self.stride + k]
+    /// Of one turn and order: cosines and sines by lane.
+    fn get(&self, turn: usize, k: usize) -> [&[f64]; 2] {
+        let first = (turn * self.stride + k) * self.lanes;
+        [&self.cos[first..first + self.lanes], &self.sin[first..first + self.lanes]]
     }
 }
 
-/// Coefficients of the patterns of a batch at one mu.
+/// Coefficients of the patterns of a batch at one mu: for [`LANES`] nodes at a time rows of l = mu, mu + 2, ..; in a row real and
+/// imaginary parts of `f_{l mu}`, then of `(-1)^mu f_{l,-mu}`, each by lane.
 struct NodePatterns {
     count: usize,
-    coefficients: Vec<f64>,
+    coefficients: Vec<Value>,
 }
 
 impl NodePatterns {
-    /// Of one node over l = mu, mu + 2, ..: real and imaginary parts of `f_{l mu}`, then of `(-1)^mu f_{l,-mu}`.
-    fn node(&self, n: usize) -> [&[f64]; 4] {
-        std::array::from_fn(|part| &self.coefficients[(4 * n + part) * self.count..][..self.count])
+    fn zeros(count: usize, groups: usize) -> Self {
+        Self { count, coefficients: vec![0.0; groups * padded(count) * VALUES] }
+    }
+
+    fn of(&self, group: usize) -> &[Value] {
+        &self.coefficients[group * padded(self.count) * VALUES..][..self.count * VALUES]
+    }
+
+    /// With what fills the last panel.
+    fn of_mut(&mut self, group: usize) -> &mut [Value] {
+        &mut self.coefficients[group * padded(self.count) * VALUES..][..padded(self.count) * VALUES]
     }
 }
 
-/// Memory of rows up to `l_max` and `u_max` wavelengths besides the visibilities', bytes: Legendre functions by class of
-/// altitude, and what each thread works with.
+/// Memory of rows up to `l_max` and `u_max` wavelengths besides the visibilities', bytes: Legendre functions by class, and what each thread works with.
 #[must_use]
 pub fn row_tables_bytes(l_max: usize, u_max: f64, threads: usize) -> u64 {
-    let waves = l_max as f64 + TAU * u_max;
-    // As `ring_points`: half a point a radian over both zones.
-    let rings = 0.6 * waves + 64.0;
     let coefficients = 0.25 * ((l_max + 2) as f64).powi(2);
     let turns = ((l_max + 2) as f64).powi(3) / 3.0;
     let gradients = (2 * GROUPS_AT_ONCE) as f64 * 16.0 * 2.0 * coefficients;
     // Amplitudes of two skies before and after the weights, and the patterns.
-    let group = 1.5 * GROUP_NODES as f64 * (4.0 * 16.0 * (2 * l_max + 1) as f64 + 32.0 * coefficients);
-    let batch = BATCH as f64 * (4.0 * 8.0 * (rings * l_max as f64 + coefficients) + 64.0 * coefficients);
-    let classes = classes_max(l_max, u_max) * class_bytes(l_max, u_max);
+    let group = 1.5 * GROUP_NODES as f64 * (4.0 * 16.0 * (2 * l_max + 1) as f64 + 16.0 * coefficients);
+    let batch = BATCH as f64 * 80.0 * coefficients + (RINGS * LANES * 16 * l_max) as f64;
+    let classes = classes_max(l_max, u_max) * altitude_bytes(l_max, u_max);
     (classes + 8.0 * turns + gradients + threads as f64 * (group + batch)) as u64
-}
-
-/// Quadrature points of one class of altitude, and the Legendre functions there.
-struct RingClass {
-    rings: Vec<RingPoint>,
-    /// By ring: the greatest order that is not negligible there.
-    reach: Vec<usize>,
-    /// By mu: on how many rings, from the first, it is not negligible.
-    reached: Vec<usize>,
-    /// By mu: for l = mu, mu + 2, .. a row over the rings that it reaches, with their weights.
-    legendre: Vec<Vec<f64>>,
-}
-
-impl RingClass {
-    fn new(setup: &RowsSetup, radius_m: f64, u_max: f64) -> Self {
-        let geometry = PatternGeometry {
-            orbit_radius_m: radius_m,
-            moon_radius_m: setup.moon_radius_m,
-            wavelength_m: setup.wavelength_m,
-            response: setup.response,
-        };
-        let l_max = setup.l_max;
-        let (rings, weights) = ring_points(geometry, l_max, u_max, 1);
-        let functions = Legendre::new(l_max, rings.iter().map(|ring| (ring.z, ring.sin_theta)));
-        let reach: Vec<usize> = rings.iter().map(|ring| ring.orders(l_max)).collect();
-        let reached: Vec<usize> =
-            (0..=l_max).map(|mu| reach.partition_point(|orders| *orders >= mu)).collect();
-        let legendre = (0..=l_max)
-            .into_par_iter()
-            .map(|mu| functions.even_rows::<f64>(mu, &weights[..reached[mu]]))
-            .collect();
-        Self { rings, reach, reached, legendre }
-    }
 }

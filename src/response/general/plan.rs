@@ -43,8 +43,17 @@ pub(super) struct RowNode {
     /// Angles whose multiples turn a sky into P: about z, then between the quarter turns, then about the new z.
     pub(super) turns_rad: [f64; 3],
     pub(super) view: PairView,
-    /// Class of altitude.
+    /// Its class.
     pub(super) class: u32,
+}
+
+/// Nodes that share quadrature points.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct NodeClass {
+    /// Radius in the middle, m.
+    pub(super) radius_m: f64,
+    /// Longest baseline, wavelengths: shorter ones need fewer points.
+    pub(super) u_max: f64,
 }
 
 /// Consecutive visibilities of a pair, and the nodes of their rows.
@@ -68,8 +77,7 @@ pub struct RowPlan {
     pub(super) gamma_rad: Vec<f64>,
     /// By row: its time within the pass, -1 to 1.
     pub(super) tau: Vec<f64>,
-    /// Radius of each class, m.
-    pub(super) class_radius_m: Vec<f64>,
+    pub(super) classes: Vec<NodeClass>,
     /// Longest baseline, wavelengths.
     pub(super) u_max: f64,
 }
@@ -91,14 +99,14 @@ impl RowPlan {
         let radii = views.iter().map(|view| view.radius_m);
         let (low, high) = radii.fold((f64::INFINITY, 0.0_f64), |(a, b), r| (a.min(r), b.max(r)));
         let u_max = views.iter().map(|view| view.baseline_m / setup.wavelength_m).fold(0.0, f64::max);
-        let classes = Classes::new(low, high, classes_max(setup.l_max, u_max));
+        let classes = Classes::new([low, high], u_max, classes_max(setup.l_max, u_max));
         let mut plan = Self {
             nodes: Vec::new(),
             passes: Vec::new(),
             groups: Vec::new(),
             gamma_rad: vec![0.0; pairs.len()],
             tau: vec![0.0; pairs.len()],
-            class_radius_m: classes.radii_m(),
+            classes: classes.all(),
             u_max,
         };
         let mut first = 0;
@@ -139,54 +147,67 @@ impl RowPlan {
         }
     }
 
-    /// The share of each node of its pass in a row.
-    pub(super) fn shares(&self, pass: &Pass, row: usize, shares: &mut Vec<f64>) {
+    /// The share of each node of a pass in each of these rows, row after row.
+    pub(super) fn shares(&self, pass: &Pass, rows: Range<usize>, shares: &mut Vec<f64>) {
         shares.clear();
-        let tau = self.tau[row];
-        if let Some(at) = pass.tau.iter().position(|node| *node == tau) {
-            shares.extend((0..pass.tau.len()).map(|k| f64::from(u8::from(k == at))));
-            return;
+        for row in rows {
+            let tau = self.tau[row];
+            let first = shares.len();
+            if let Some(at) = pass.tau.iter().position(|node| *node == tau) {
+                shares.extend((0..pass.tau.len()).map(|k| f64::from(u8::from(k == at))));
+                continue;
+            }
+            shares.extend(pass.tau.iter().zip(&pass.weights).map(|(node, weight)| weight / (tau - node)));
+            let sum: f64 = shares[first..].iter().sum();
+            shares[first..].iter_mut().for_each(|share| *share /= sum);
         }
-        shares.extend(pass.tau.iter().zip(&pass.weights).map(|(node, weight)| weight / (tau - node)));
-        let sum: f64 = shares.iter().sum();
-        shares.iter_mut().for_each(|share| *share /= sum);
     }
 }
 
-/// Bytes of one class's tables: Legendre functions of even l + mu at its quadrature points.
-pub(super) fn class_bytes(l_max: usize, u_max: f64) -> f64 {
+/// Longest baselines of classes, in units of the longest.
+const LENGTHS: [f64; 3] = [1.0, 0.5, 0.25];
+
+/// Bytes of the tables of one altitude: Legendre functions of even l + mu at the quadrature points of its classes.
+pub(super) fn altitude_bytes(l_max: usize, u_max: f64) -> f64 {
     // As `ring_points`: half a point a radian over both zones, and some.
-    let rings = 0.6 * (l_max as f64 + TAU * u_max) + 64.0;
-    8.0 * rings * 0.25 * ((l_max + 2) as f64).powi(2)
+    let rings: f64 = LENGTHS.iter().map(|length| 0.6 * (l_max as f64 + TAU * u_max * length) + 64.0).sum();
+    4.0 * rings * 0.25 * ((l_max + 2) as f64).powi(2)
 }
 
 /// Most classes of altitude.
 pub(super) fn classes_max(l_max: usize, u_max: f64) -> f64 {
-    (CLASSES_BYTES / class_bytes(l_max, u_max)).clamp(CLASSES[0], CLASSES[1])
+    (CLASSES_BYTES / altitude_bytes(l_max, u_max)).clamp(CLASSES[0], CLASSES[1])
 }
 
-/// Classes of altitude.
+/// Classes by altitude and length of the baseline.
 struct Classes {
     first_m: f64,
     step_m: f64,
     count: usize,
+    u_max: f64,
 }
 
 impl Classes {
-    fn new(low_m: f64, high_m: f64, classes_max: f64) -> Self {
+    fn new([low_m, high_m]: [f64; 2], u_max: f64, classes_max: f64) -> Self {
         let range_m = (high_m - low_m).max(0.0);
         let step_m = (range_m / classes_max).max(CLASS_M_MIN);
         let count = (range_m / step_m).ceil().max(1.0) as usize;
-        Self { first_m: low_m + 0.5 * (range_m - step_m * (count - 1) as f64), step_m, count }
+        Self { first_m: low_m + 0.5 * (range_m - step_m * (count - 1) as f64), step_m, count, u_max }
     }
 
-    fn of(&self, radius_m: f64) -> u32 {
-        let class = ((radius_m - self.first_m) / self.step_m).round();
-        class.clamp(0.0, (self.count - 1) as f64) as u32
+    fn of(&self, radius_m: f64, u: f64) -> u32 {
+        let altitude = ((radius_m - self.first_m) / self.step_m).round();
+        let altitude = altitude.clamp(0.0, (self.count - 1) as f64) as usize;
+        let length = LENGTHS.iter().rposition(|length| u <= length * self.u_max).unwrap_or(0);
+        (length * self.count + altitude) as u32
     }
 
-    fn radii_m(&self) -> Vec<f64> {
-        (0..self.count).map(|k| self.first_m + self.step_m * k as f64).collect()
+    fn all(&self) -> Vec<NodeClass> {
+        let radius_m = |k: usize| self.first_m + self.step_m * k as f64;
+        let class = |length: f64| {
+            (0..self.count).map(move |k| NodeClass { radius_m: radius_m(k), u_max: length * self.u_max })
+        };
+        LENGTHS.into_iter().flat_map(class).collect()
     }
 }
 
@@ -237,11 +258,15 @@ impl PassBuilder<'_> {
         // Pitch lowers the limb ahead and raises it behind; in between it does less.
         let limb = half_range(&|view| view.limb_rad() + pitch(view))
             .max(half_range(&|view| view.limb_rad() - pitch(view)));
-        let wavelengths = |view: &PairView| view.baseline_m / self.setup.wavelength_m;
+        let wavelengths = |view: &PairView| self.wavelengths(view);
         let slope = views.iter().map(|view| wavelengths(view) * view.limb_rad().sin()).fold(0.0, f64::max);
         let l_max = self.setup.l_max as f64;
         let h = l_max * tilt + (l_max + TAU * slope) * limb + TAU * half_range(&wavelengths);
         (h + 3.0 * h.cbrt() + 5.0).ceil() as usize
+    }
+
+    fn wavelengths(&self, view: &PairView) -> f64 {
+        view.baseline_m / self.setup.wavelength_m
     }
 
     /// The axes of P at a row, and the angle to the pair's own.
@@ -256,7 +281,7 @@ impl PassBuilder<'_> {
         RowNode {
             turns_rad: [alpha + FRAC_PI_2, beta + PI, gamma + FRAC_PI_2],
             view: self.views[row],
-            class: self.classes.of(self.views[row].radius_m),
+            class: self.classes.of(self.views[row].radius_m, self.wavelengths(&self.views[row])),
         }
     }
 

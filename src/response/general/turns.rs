@@ -8,7 +8,7 @@
 //! Re b_k = sum_{m = l+k mod 2} F_{m k} Re z_m,   Im b_k = sum_{m != l+k mod 2} F_{m k} Im z_m,   F = 2 d (d for m = 0)
 //! ```
 //!
-//! Vectors of degree l hold the even orders first, then the odd ones.
+//! Vectors of degree l hold the even orders first, then the odd ones. Matrices of them are row-major: orders by vectors.
 
 use faer::{Accum, MatMut, MatRef, Par};
 use rayon::prelude::*;
@@ -61,13 +61,13 @@ impl QuarterTurns {
         Self { degrees }
     }
 
-    /// Turns `columns` vectors of degree l by a quarter: `[re, im]` of each, column after column. Writes orders of the
-    /// parities in `parities` and leaves others as they are.
+    /// Turns vectors of degree l by a quarter, given by real and imaginary parts. Writes orders of the parities in `parities` and
+    /// leaves others as they are.
     pub(super) fn turn(&self, l: usize, parities: &[usize], from: [&[f64]; 2], to: [&mut [f64]; 2]) {
         let columns = from[0].len() / (l + 1);
         for (part, (from, to)) in from.into_iter().zip(to).enumerate() {
-            let from = MatRef::from_column_major_slice(from, l + 1, columns);
-            let mut to = MatMut::from_column_major_slice_mut(to, l + 1, columns);
+            let from = MatRef::from_row_major_slice(from, l + 1, columns);
+            let mut to = MatMut::from_row_major_slice_mut(to, l + 1, columns);
             for &k in parities {
                 let m = (l + k + part) % 2;
                 let (rows, inner) = (count(l, k), count(l, m));
@@ -91,8 +91,8 @@ impl QuarterTurns {
         let columns = from[0].len() / (l + 1);
         for (part, (from, to)) in from.into_iter().zip(to).enumerate() {
             to.fill(0.0);
-            let from = MatRef::from_column_major_slice(from, l + 1, columns);
-            let mut to = MatMut::from_column_major_slice_mut(to, l + 1, columns);
+            let from = MatRef::from_row_major_slice(from, l + 1, columns);
+            let mut to = MatMut::from_row_major_slice_mut(to, l + 1, columns);
             for &k in parities {
                 let m = (l + k + part) % 2;
                 let (rows, inner) = (count(l, k), count(l, m));
