@@ -18,15 +18,15 @@ pub(super) const CHOLESKY_MULTIPLY_ADDS_PER_S: f64 = 0.5 * RANK_K_MULTIPLY_ADDS_
 pub(super) const HARMONIC_VISIBILITIES_PER_S: f64 = 4e5;
 
 /// Time of a row at true positions on one core, s, in units of `l_max (l_max + 2 pi u)`, for both products of two skies (bench
-/// `general`, which has one sky: 16 ms at l = 191 and u = 125).
-pub(super) const ROW_S: f64 = 1.2e-7;
+/// `general`, which has one sky: 7 ms at l = 191 and u = 125).
+pub(super) const ROW_S: f64 = 5e-8;
 
 /// Visibilities between which one row is computed, the others being interpolated (bench `general`: 45; less where integrations
 /// are left out).
 pub(super) const VISIBILITIES_PER_ROW: f64 = 25.0;
 
 /// Time of the interpolation of a visibility, s (bench `general`).
-pub(super) const INTERPOLATION_S: f64 = 2e-5;
+pub(super) const INTERPOLATION_S: f64 = 1e-5;
 
 /// Multiply-adds of Fourier transforms of lines of 300 to 900 points in a second (bench `harmonic`: products with
 /// BtN^-1B, which are four transforms a line).
