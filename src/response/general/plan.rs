@@ -8,8 +8,8 @@
 //! ```
 //!
 //! where g depends on P, on the baseline's length and on the radii: slowly along an orbit, and smoothly however its plane,
-//! altitude, pitch and yaw change. So g is computed at a few of the times of a pass of one pair, near Chebyshev's points, and
-//! interpolated to the others by the polynomial through them. Their number follows from how far the pattern's phases can
+//! altitude, pitch and yaw change. So g is computed at Chebyshev's points of a pass of one pair, where positions follow from
+//! those of the visibilities, and interpolated by the polynomial through them. Their number follows from how far the pattern's phases can
 //! move; where it would not be less than that of the visibilities, each is computed for itself.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
@@ -19,10 +19,15 @@ use rayon::prelude::*;
 
 use super::view::{Axes, PairView, euler, transported};
 use super::{PairAt, RowsError, RowsSetup};
-use crate::units::vector::{dot, norm, sub};
+use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
 
 /// A gap in a pair's data that ends a pass, s: polynomials do not reach across what the array did not observe.
 const GAP_S: f64 = 900.0;
+
+/// Times from whose positions those of a node follow, and their greatest distance, s: 0.09 rad of a low orbit, so that positions err
+/// by 0.1 mm.
+const POSITIONS: usize = 8;
+const POSITION_STEP_S_MAX: f64 = 120.0;
 
 /// Most rows from which others are interpolated together: more are longer to interpolate from, not more exact.
 const NODES_MAX: usize = 40;
@@ -224,19 +229,19 @@ impl PassBuilder<'_> {
     /// Plans these rows, as one pass or divided in two.
     fn split(&self, rows: Range<usize>, plan: &mut RowPlan) {
         let count = rows.len();
-        let needed = self.nodes_needed(&rows);
-        // The polynomial through the points of equally spaced data that are nearest to Chebyshev's is as good as theirs if
-        // they are fewer than about twice the root of the data's number (Boyd & Xu 2009, Appl. Math. Comput. 210, 158).
-        let is_dense = needed as f64 <= 2.0 * (count as f64).sqrt() && needed <= NODES_MAX;
-        if self.direct || (!is_dense && count <= 16) {
+        if self.direct {
             return self.each(rows, plan);
         }
-        if !is_dense {
+        let needed = self.nodes_needed(&rows);
+        if needed >= count {
+            self.each(rows, plan);
+        } else if needed > NODES_MAX {
             let middle = rows.start + count / 2;
             self.split(rows.start..middle, plan);
-            return self.split(middle..rows.end, plan);
+            self.split(middle..rows.end, plan);
+        } else if !self.interpolated(rows.clone(), needed, plan) {
+            self.each(rows, plan);
         }
-        self.interpolated(rows, needed, plan);
     }
 
     /// Nodes that interpolate `exp(i h tau)` to far below 1e-4, h being what the pattern's phases move by.
@@ -269,64 +274,59 @@ impl PassBuilder<'_> {
         view.baseline_m / self.setup.wavelength_m
     }
 
-    /// The axes of P at a row, and the angle to the pair's own.
-    fn place(&self, reference: &Axes, row: usize) -> (Axes, f64) {
-        let axes = self.views[row].axes;
+    /// The axes of P at a view, and the angle to the pair's own.
+    fn place(reference: &Axes, view: &PairView) -> (Axes, f64) {
+        let axes = view.axes;
         let followed = transported(reference, axes[2]);
         (followed, dot(axes[0], followed[1]).atan2(dot(axes[0], followed[0])))
     }
 
-    fn node(&self, axes: &Axes, row: usize) -> RowNode {
+    fn node(&self, axes: &Axes, view: PairView) -> RowNode {
         let [alpha, beta, gamma] = euler(axes);
         RowNode {
             turns_rad: [alpha + FRAC_PI_2, beta + PI, gamma + FRAC_PI_2],
-            view: self.views[row],
-            class: self.classes.of(self.views[row].radius_m, self.wavelengths(&self.views[row])),
+            view,
+            class: self.classes.of(view.radius_m, self.wavelengths(&view)),
         }
     }
 
     /// A node for each row.
     fn each(&self, rows: Range<usize>, plan: &mut RowPlan) {
         let first = plan.nodes.len();
-        plan.nodes.extend(rows.clone().map(|row| self.node(&self.views[row].axes, row)));
+        plan.nodes.extend(rows.clone().map(|row| self.node(&self.views[row].axes, self.views[row])));
         let nodes = first..plan.nodes.len();
         plan.passes.push(Pass { rows, nodes, tau: Vec::new(), weights: Vec::new() });
     }
 
-    /// `count` nodes for all rows.
-    fn interpolated(&self, rows: Range<usize>, count: usize, plan: &mut RowPlan) {
+    /// `count` nodes for all rows, at Chebyshev's points. Returns whether the positions allow it.
+    fn interpolated(&self, rows: Range<usize>, count: usize, plan: &mut RowPlan) -> bool {
         let times = &self.pairs[rows.clone()];
-        let (from, to) = (times[0].time_s, times[times.len() - 1].time_s);
-        let tau = |row: usize| 2.0 * (self.pairs[row].time_s - from) / (to - from) - 1.0;
+        let (from_s, to_s) = (times[0].time_s, times[times.len() - 1].time_s);
         // Rows of equal times have equal positions.
-        let distinct: Vec<usize> =
-            rows.clone().filter(|&row| row == rows.start || tau(row) > tau(row - 1)).collect();
-        if distinct.len() <= count {
-            return self.each(rows, plan);
+        let is_new =
+            |row: &usize| *row == rows.start || self.pairs[*row].time_s > self.pairs[*row - 1].time_s;
+        let distinct: Vec<&PairAt> = rows.clone().filter(is_new).map(|row| &self.pairs[row]).collect();
+        let is_close = |two: &[&PairAt]| two[1].time_s - two[0].time_s <= POSITION_STEP_S_MAX;
+        if distinct.len() < count.max(POSITIONS) || !distinct.windows(2).all(is_close) {
+            return false;
         }
         let reference = self.views[rows.start + rows.len() / 2].axes;
+        let tau: Vec<f64> = (0..count).map(|k| -(PI * k as f64 / (count - 1) as f64).cos()).collect();
+        let nodes: Option<Vec<RowNode>> = tau
+            .iter()
+            .map(|tau| {
+                let [r_i_m, r_j_m] = positions(&distinct, from_s + 0.5 * (tau + 1.0) * (to_s - from_s));
+                let view = PairView::of(r_i_m, r_j_m, self.setup.moon_radius_m).ok()?;
+                Some(self.node(&Self::place(&reference, &view).0, view))
+            })
+            .collect();
+        let Some(nodes) = nodes else { return false };
         for row in rows.clone() {
-            (plan.gamma_rad[row], plan.tau[row]) = (self.place(&reference, row).1, tau(row));
+            plan.gamma_rad[row] = Self::place(&reference, &self.views[row]).1;
+            plan.tau[row] = 2.0 * (self.pairs[row].time_s - from_s) / (to_s - from_s) - 1.0;
         }
         let first = plan.nodes.len();
-        let mut chosen: Vec<usize> = Vec::with_capacity(count);
-        for k in 0..count {
-            let wanted = -(PI * k as f64 / (count - 1) as f64).cos();
-            let after = distinct.partition_point(|&row| tau(row) < wanted);
-            let nearest = match after {
-                0 => 0,
-                after if after == distinct.len() => after - 1,
-                after if wanted - tau(distinct[after - 1]) < tau(distinct[after]) - wanted => after - 1,
-                after => after,
-            };
-            let least = chosen.last().map_or(0, |last| last + 1);
-            chosen.push(nearest.max(least).min(distinct.len() - count + k));
-        }
-        for &place in &chosen {
-            let row = distinct[place];
-            plan.nodes.push(self.node(&self.place(&reference, row).0, row));
-        }
-        let tau: Vec<f64> = chosen.iter().map(|&place| tau(distinct[place])).collect();
+        plan.nodes.extend(nodes);
         let weights = tau
             .iter()
             .enumerate()
@@ -336,5 +336,21 @@ impl PassBuilder<'_> {
             })
             .collect();
         plan.passes.push(Pass { rows, nodes: first..plan.nodes.len(), tau, weights });
+        true
     }
+}
+
+/// Positions at a time, by the polynomial through those of the nearest times.
+fn positions(known: &[&PairAt], time_s: f64) -> [Vec3; 2] {
+    let after = known.partition_point(|at| at.time_s < time_s);
+    let first = after.saturating_sub(POSITIONS / 2).min(known.len().saturating_sub(POSITIONS));
+    let near = &known[first..(first + POSITIONS).min(known.len())];
+    let mut out = [[0.0; 3]; 2];
+    for (k, at) in near.iter().enumerate() {
+        let others = near.iter().enumerate().filter(|(other, _)| *other != k);
+        let share: f64 =
+            others.map(|(_, other)| (time_s - other.time_s) / (at.time_s - other.time_s)).product();
+        out = [add(out[0], scale(share, at.r_i_m)), add(out[1], scale(share, at.r_j_m))];
+    }
+    out
 }
