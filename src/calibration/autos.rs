@@ -6,7 +6,7 @@ use std::collections::btree_map::Entry;
 use bincode::{Decode, Encode};
 
 use crate::frames::{AutoPower, Instrument, PlacedVisibilities};
-use crate::units::{ChannelId, Pair};
+use crate::units::{ChannelId, MissionTime, Pair};
 
 /// Capacity of a table: 130 MB of memory and 60 MB of a checkpoint, more than two hours of every second of 30
 /// channels.
@@ -72,6 +72,20 @@ impl AutoTable {
         for (key, power) in other.powers {
             self.powers.entry(key).or_insert(power);
         }
+    }
+
+    /// Those of a daughter in one channel between two times, both included: middle of the integration, s, and power, K sr.
+    pub fn between(
+        &self,
+        channel: ChannelId,
+        daughter: u8,
+        [from, to]: [MissionTime; 2],
+    ) -> impl Iterator<Item = (f64, f64)> + '_ {
+        let key = |time: MissionTime| (channel, daughter, time.0.saturating_mul(2));
+        let known = self.powers.range(key(from)..=key(to.max(from)));
+        known.map(|((.., half_ticks), [power_k_sr, _])| {
+            (*half_ticks as f64 / HALF_TICKS_A_SECOND, *power_k_sr)
+        })
     }
 
     /// All of them, by channel, daughter and time.

@@ -4,7 +4,8 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use super::archive::{Archive, RecordDraft};
-use super::{Collector, Delivery, GroundConfig, GroundError, GroundOutcome};
+use super::lookout::{Occasion, Spotter};
+use super::{Collector, DeliveredPacket, Delivery, GroundConfig, GroundError, GroundOutcome};
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::{Calibrator, MissingPackets};
 use crate::downlink::{CucTime, Kind};
@@ -34,6 +35,8 @@ pub struct Ground {
     pub(super) linger: Duration,
     /// Steps so far.
     pub(super) steps: u64,
+    /// For those who look on.
+    pub(super) spotter: Spotter,
 }
 
 impl Ground {
@@ -47,6 +50,7 @@ impl Ground {
             collector: Collector::new(config.wait_bytes),
             calibrator: config.calibrator(&outcome.ledger)?,
             accumulator: config.accumulator(&outcome.ledger),
+            spotter: Spotter::of(&outcome.lookout),
             outcome,
             archive: None,
             cancel: Cancel::new(),
@@ -115,8 +119,23 @@ impl Ground {
             let bad = packets.iter().map(|packet| u64::from(packet.reading.visibilities_bad_value)).sum();
             self.calibrator.count_bad(block.start, bad);
         }
+        let autos = self.spotter.expect_powers(frame.as_ref());
+        let used = self.use_frame(&packets, frame, out);
+        if let Some((span, autos)) = autos.zip(self.calibrator.autos()) {
+            self.spotter.see_powers(span, autos);
+        }
+        used
+    }
+
+    fn use_frame(
+        &mut self,
+        packets: &[DeliveredPacket],
+        frame: Option<GroundFrame>,
+        out: &mut Outlet<Snapshot>,
+    ) -> Result<(), GroundError> {
         let Some(archive) = &mut self.archive else {
             if let Some(placed) = placed(&mut self.calibrator, frame)? {
+                self.spotter.see(&placed);
                 self.accumulator.accept(placed, out)?;
             }
             return Ok(());
@@ -124,9 +143,10 @@ impl Ground {
         let mut draft = RecordDraft::of(frame.as_ref());
         if let Some(placed) = placed(&mut self.calibrator, frame)? {
             draft.offer(&placed);
+            self.spotter.see(&placed);
             draft.used_s = self.accumulator.accept(placed, out)?;
         }
-        let posted = archive.record(&packets, draft, self.calibrator.ephemeris());
+        let posted = archive.record(packets, draft, self.calibrator.ephemeris());
         self.outcome.ledger.post_report(&posted);
         Ok(())
     }
@@ -146,8 +166,10 @@ impl Ground {
         Ok(())
     }
 
-    /// Shows the counters of the reception.
-    fn show(&self) {
+    /// Shows the counters of the reception, and what else visitors see.
+    fn show(&self, occasion: Occasion) {
+        // First, so that nobody sees counters that are newer.
+        self.spotter.show(occasion, &self.collector, self.calibrator.ephemeris());
         fill(&self.outcome.reception, self.collector.counters());
     }
 
@@ -201,14 +223,14 @@ impl Stage for Ground {
         self.advance(out)?;
         self.steps += 1;
         if self.steps.is_power_of_two() || self.steps.is_multiple_of(STEPS_SHOWN) {
-            self.show();
+            self.show(Occasion::Work);
         }
         Ok(())
     }
 
     /// Who watches a link that falls silent sees all that came.
     fn rest(&mut self) {
-        self.show();
+        self.show(Occasion::Rest);
     }
 
     fn finish(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
@@ -221,7 +243,7 @@ impl Stage for Ground {
         if let Some(archive) = &self.archive {
             self.outcome.ledger.post_report(&archive.take_posts());
         }
-        self.show();
+        self.show(Occasion::Rest);
         fill(&self.outcome.autos, self.calibrator.auto_powers());
         Ok(self.accumulator.finish(out)?)
     }

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use serde::Serialize;
 
-use super::GroundError;
+use super::{GroundError, Lookout};
 
 use crate::calibration::Completeness;
 use crate::downlink::ReceptionCounters;
@@ -25,6 +25,8 @@ pub struct GroundOutcome {
     pub autos: Arc<Mutex<Vec<AutoPower>>>,
     /// How its checkpoints went, at any time.
     pub saving: SharedSaving,
+    /// Where visitors see it at work.
+    pub lookout: Lookout,
 }
 
 /// How the checkpoints of a session went.

@@ -8,14 +8,18 @@ use std::time::Instant;
 use axum::body::Bytes;
 
 use super::event_log::EventLog;
+use super::geometry::Geometry;
 use super::pulse::Pulse;
 use super::shelf::Shelf;
 use super::status::{ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, stages_of};
-use crate::ground::SavingReport;
+use super::subject::Subject;
+use crate::array::Array;
+use crate::ground::{GroundOutcome, PassLine, PowerWaterfall, SavingReport, UvwDensity};
 use crate::pipeline::Watched;
 use crate::products::{MapViewer, PublishedMap};
 use crate::runtime::{Metrics, StageProgress};
 use crate::solve::Solving;
+use crate::units::ChannelId;
 
 /// Most senders in a status; it goes out twice a second.
 const SENDERS_SHOWN: usize = 20;
@@ -68,6 +72,8 @@ pub(super) struct Console {
     pub(super) config: Bytes,
     /// Folder of the state, if there is one.
     pub(super) state: Option<PathBuf>,
+    /// Says where the Earth is.
+    model: Option<Array>,
     pub(super) started: Instant,
     pub(super) shelf: Arc<Shelf>,
     pub(super) log: Arc<EventLog>,
@@ -78,12 +84,14 @@ pub(super) struct Console {
 }
 
 impl Console {
-    pub(super) fn new(name: String, segment: &'static str, config: Bytes, state: Option<PathBuf>) -> Self {
+    pub(super) fn new(subject: Subject) -> Self {
+        let Subject { name, segment, config, state, model } = subject;
         Self {
             name,
             segment,
-            config,
+            config: config.into(),
             state,
+            model,
             started: Instant::now(),
             shelf: Arc::default(),
             log: Arc::default(),
@@ -107,6 +115,9 @@ impl Console {
         let viewer =
             Onlooker { shelf: Arc::clone(&self.shelf), log: Arc::clone(&self.log), started: self.started };
         watched.maps.join(Box::new(viewer));
+        if let Some(ground) = &watched.ground {
+            ground.lookout.open();
+        }
         if self.watched.set(watched.clone()).is_ok() {
             self.note(false, "the run begins");
         }
@@ -147,13 +158,41 @@ impl Console {
         self.watched.get().map(|watched| Metrics::snapshot(&watched.metrics)).unwrap_or_default()
     }
 
+    fn ground(&self) -> Option<&GroundOutcome> {
+        self.watched.get().and_then(|watched| watched.ground.as_ref())
+    }
+
+    /// Packets over the mission's time; `None` before the instrument is known.
+    pub(super) fn passes(&self) -> Option<Arc<PassLine>> {
+        self.ground().and_then(|ground| ground.lookout.passes())
+    }
+
+    /// Where everything is; `None` before there are data with positions.
+    pub(super) fn geometry(&self) -> Option<Geometry> {
+        let now = self.ground()?.lookout.array()?;
+        Some(Geometry::of(&now, self.model.as_ref()))
+    }
+
+    /// Baselines of a channel; `None` if it has none.
+    pub(super) fn uvw(&self, channel: ChannelId) -> Option<UvwDensity> {
+        self.ground()?.lookout.density(channel)
+    }
+
+    /// Powers of the daughters in a channel; `None` if none came.
+    pub(super) fn powers(&self, channel: ChannelId) -> Option<PowerWaterfall> {
+        self.ground()?.lookout.powers(channel)
+    }
+
     /// Looks at the run, notes what has changed, and keeps the status.
     pub(super) fn look(&self) -> Status {
         let phase = self.phase();
         let progress = self.progress();
         let ending = self.ending.lock().unwrap_or_else(PoisonError::into_inner).clone();
         let watched = self.watched.get();
-        let ground = watched.and_then(|watched| watched.ground.as_ref());
+        let ground = self.ground();
+        if let Some(ground) = ground {
+            ground.lookout.refresh();
+        }
         let now = Instant::now();
         let mut memory = self.memory();
         let rates = memory.pulse.look(&progress, now);
@@ -169,7 +208,7 @@ impl Console {
         });
         let solving = watched.and_then(|watched| watched.solving.now());
         let saving = ground.and_then(|ground| ground.saving.report());
-        let read = |ground: &crate::ground::GroundOutcome| {
+        let read = |ground: &GroundOutcome| {
             let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
             if let Some(listening) = &listening {
                 listening.report.complete(&mut reception);

@@ -8,6 +8,10 @@
 //! | `/api/config` | the configuration |
 //! | `/api/figures/CHANNEL` | quality of a channel's maps, and spectra of the last |
 //! | `/api/maps/CHANNEL/N.f32`, `.fits`, `.png` | a map; N is a number, `latest`, `noise` or `input` |
+//! | `/api/passes` | packets received and missing over the mission's time |
+//! | `/api/geometry` | where the satellites, the Moon and the Earth are |
+//! | `/api/uvw/CHANNEL` | how the baselines fill the planes of u, v, w |
+//! | `/api/powers/CHANNEL` | powers of the daughters over the mission's time |
 //! | `/api/gaps` | missing packets, if there is a state |
 //! | `/metrics` | for Prometheus |
 //! | `/healthz`, `/readyz` | for a supervisor |
@@ -27,15 +31,18 @@ mod connection;
 mod console;
 mod error;
 mod event_log;
+mod geometry;
 mod pulse;
 mod routes;
 mod screen;
 mod server;
 mod shelf;
 mod status;
+mod subject;
 
 pub use address::ServeAddress;
 pub use client::{Client, ClientError};
 pub use error::ServeError;
 pub use screen::Screen;
-pub use server::{Server, Subject};
+pub use server::Server;
+pub use subject::Subject;

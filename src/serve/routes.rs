@@ -58,6 +58,9 @@ pub(super) fn router(desk: Desk) -> Router {
         .route("/page.css", get(|| asset("text/css; charset=utf-8", include_str!("page/page.css"))))
         .route("/page.js", get(|| asset("text/javascript; charset=utf-8", include_str!("page/page.js"))))
         .route("/sky.js", get(|| asset("text/javascript; charset=utf-8", include_str!("page/sky.js"))))
+        .route("/array.js", get(|| asset("text/javascript; charset=utf-8", include_str!("page/array.js"))))
+        .route("/passes.js", get(|| asset("text/javascript; charset=utf-8", include_str!("page/passes.js"))))
+        .route("/tools.js", get(|| asset("text/javascript; charset=utf-8", include_str!("page/tools.js"))))
         .route("/page.json", get(page_constants))
         .route("/favicon.svg", get(|| asset("image/svg+xml", include_str!("page/favicon.svg"))))
         .route("/events", get(events))
@@ -65,6 +68,10 @@ pub(super) fn router(desk: Desk) -> Router {
         .route("/api/config", get(config))
         .route("/api/figures/{channel}", get(figures))
         .route("/api/maps/{channel}/{file}", get(map))
+        .route("/api/passes", get(passes))
+        .route("/api/geometry", get(geometry))
+        .route("/api/uvw/{channel}", get(uvw))
+        .route("/api/powers/{channel}", get(powers))
         .route("/api/gaps", get(gaps))
         .route("/metrics", get(metrics))
         .route("/healthz", get(healthz))
@@ -202,6 +209,10 @@ fn no_map() -> Response {
     )
 }
 
+fn no_channel() -> Response {
+    refusal(StatusCode::NOT_FOUND, "no such channel; expected the number of one, from 0")
+}
+
 async fn figures(State(desk): State<Desk>, Path(channel): Path<String>) -> Response {
     let Some(channel) = channel_of(&channel) else { return no_map() };
     let shelf = Arc::clone(&desk.console.shelf);
@@ -231,6 +242,26 @@ async fn map(State(desk): State<Desk>, Path((channel, file)): Path<(String, Stri
         Ok(Err(error)) => refusal(StatusCode::INTERNAL_SERVER_ERROR, &error),
         Err(refusal) => refusal,
     }
+}
+
+/// `null` before anything is known.
+async fn passes(State(desk): State<Desk>) -> Response {
+    json(&desk.console.passes().as_deref())
+}
+
+/// `null` before anything is known.
+async fn geometry(State(desk): State<Desk>) -> Response {
+    json(&desk.console.geometry())
+}
+
+/// `null` before anything is known.
+async fn uvw(State(desk): State<Desk>, Path(channel): Path<String>) -> Response {
+    channel_of(&channel).map_or_else(no_channel, |channel| json(&desk.console.uvw(channel)))
+}
+
+/// `null` before anything is known.
+async fn powers(State(desk): State<Desk>, Path(channel): Path<String>) -> Response {
+    channel_of(&channel).map_or_else(no_channel, |channel| json(&desk.console.powers(channel)))
 }
 
 async fn gaps(State(desk): State<Desk>) -> Response {

@@ -1,7 +1,6 @@
 //! The server and its thread.
 
 use std::net::{SocketAddr, TcpListener};
-use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -15,36 +14,14 @@ use super::connection::accept;
 use super::console::{Console, Ending};
 use super::error::ServeError;
 use super::routes::{Desk, router};
-use crate::pipeline::{Config, Watched};
+use super::subject::Subject;
+use crate::pipeline::Watched;
 
 /// Interval between two looks at the run.
 const TICK: Duration = Duration::from_millis(500);
 
 /// Time for the last status to reach those who are connected.
 const LAST_WORDS: Duration = Duration::from_millis(150);
-
-/// What the server tells about.
-#[derive(Clone, Debug)]
-pub struct Subject {
-    /// Name of the pipeline.
-    pub name: String,
-    /// Which part of the chain runs: `whole`, `ground` or `space`.
-    pub segment: &'static str,
-    /// The configuration in JSON.
-    pub config: Vec<u8>,
-    /// Folder of the state, if there is one.
-    pub state: Option<PathBuf>,
-}
-
-impl Subject {
-    /// A run of this configuration, which is shown as it is.
-    #[must_use]
-    pub fn new(config: &Config, segment: &'static str, state: Option<&Path>) -> Self {
-        // A configuration that was read can be written.
-        let text = serde_json::to_vec(config).unwrap_or_default();
-        Self { name: config.name.clone(), segment, config: text, state: state.map(Path::to_owned) }
-    }
-}
 
 /// A server at work; it ends when dropped.
 #[derive(Debug)]
@@ -66,8 +43,7 @@ impl Server {
         let listener = address.bind(allow_remote)?;
         listener.set_nonblocking(true).map_err(start)?;
         let own = listener.local_addr().map_err(start)?;
-        let Subject { name, segment, config, state } = subject;
-        let console = Arc::new(Console::new(name, segment, config.into(), state));
+        let console = Arc::new(Console::new(subject));
         let (news, reader) = watch::channel(Arc::<str>::default());
         let (stop, stopped) = watch::channel(false);
         let slow = Arc::new(Semaphore::new(1));

@@ -97,6 +97,18 @@ impl<T: Copy + Ord> IntervalSet<T> {
         self.ends.iter().map(|(start, end)| *start..*end)
     }
 
+    /// The lowest interval.
+    #[must_use]
+    pub fn lowest(&self) -> Option<Range<T>> {
+        self.ends.first_key_value().map(|(start, end)| *start..*end)
+    }
+
+    /// The highest interval.
+    #[must_use]
+    pub fn highest(&self) -> Option<Range<T>> {
+        self.ends.last_key_value().map(|(start, end)| *start..*end)
+    }
+
     /// Removes all intervals that overlap or touch `interval`; returns their union with it.
     fn take_merged(&mut self, Range { mut start, mut end }: Range<T>) -> Range<T> {
         if start >= end {

@@ -6,6 +6,7 @@ mod common;
 mod events;
 mod pace;
 mod page;
+mod panels;
 mod senders;
 mod service;
 mod serving;

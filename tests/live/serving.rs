@@ -215,12 +215,23 @@ fn every_route_answers_and_nothing_else_does() {
         ("/", 200, "text/html; charset=utf-8", "<title>lunarray"),
         ("/page.js", 200, "text/javascript; charset=utf-8", "EventSource"),
         ("/sky.js", 200, "text/javascript; charset=utf-8", "webgl2"),
+        ("/array.js", 200, "text/javascript; charset=utf-8", "drawOrbit"),
+        ("/passes.js", 200, "text/javascript; charset=utf-8", "class Passes"),
+        ("/tools.js", 200, "text/javascript; charset=utf-8", "copyText"),
         ("/page.css", 200, "text/css; charset=utf-8", "--panel"),
         ("/page.json", 200, "application/json", "cividis"),
         ("/favicon.svg", 200, "image/svg+xml", "<svg"),
         ("/metrics", 200, "application/openmetrics-text; version=1.0.0; charset=utf-8", "# EOF"),
         ("/healthz", 200, "text/plain; charset=utf-8", "ended"),
         ("/readyz", 503, "text/plain; charset=utf-8", "ended"),
+        ("/api/passes", 200, "application/json", "\"kind\":\"visibilities\""),
+        ("/api/geometry", 200, "application/json", "\"earth_hat\":["),
+        ("/api/uvw/0", 200, "application/json", "\"extent_wavelengths\""),
+        ("/api/uvw/00", 404, "text/plain; charset=utf-8", "no such channel"),
+        // No auto-correlations are sent.
+        ("/api/powers/0", 200, "application/json", "null"),
+        ("/api/powers/+1", 404, "text/plain; charset=utf-8", "no such channel"),
+        ("/api/uvw/../../etc/passwd", 404, "text/plain; charset=utf-8", "no such"),
         ("/api/gaps", 404, "text/plain; charset=utf-8", "--state"),
         ("/nothing", 404, "text/plain; charset=utf-8", "no such page"),
         ("/api/maps/0/9999.f32", 404, "text/plain; charset=utf-8", "no such map"),
@@ -245,7 +256,7 @@ fn every_route_answers_and_nothing_else_does() {
         assert_eq!(reply.header("x-content-type-options"), "nosniff", "{path}");
     }
     // The page asks nobody else for anything.
-    for path in ["/", "/page.js", "/sky.js", "/page.css"] {
+    for path in ["/", "/page.js", "/sky.js", "/array.js", "/passes.js", "/tools.js", "/page.css"] {
         let text = served.get(path).text();
         assert!(
             !text.contains("http://") && !text.contains("https://") && !text.contains("src=\"//"),
@@ -431,6 +442,9 @@ fn maps_are_the_same_however_many_look_on() {
                     "/api/status",
                     "/metrics",
                     "/api/maps/1/latest.png",
+                    "/api/passes",
+                    "/api/geometry",
+                    "/api/uvw/0",
                 ];
                 if visitor % 2 == 0 {
                     // Asks for all it can and reads nothing.
@@ -438,7 +452,7 @@ fn maps_are_the_same_however_many_look_on() {
                     stream.set_write_timeout(Some(Duration::from_millis(100))).unwrap();
                     let request = format!(
                         "GET {} HTTP/1.1\r\nHost: {}\r\n\r\n",
-                        wanted[visitor / 2 % 5],
+                        wanted[visitor / 2 % 8],
                         served.address
                     );
                     while !over.load(Ordering::Relaxed) {
@@ -447,7 +461,7 @@ fn maps_are_the_same_however_many_look_on() {
                     }
                 } else {
                     while !over.load(Ordering::Relaxed) {
-                        let path = wanted[1 + visitor / 2 % 4];
+                        let path = wanted[1 + visitor / 2 % 7];
                         let reply = served.get(path);
                         assert!([200, 404].contains(&reply.status), "{path}: {}", reply.status);
                     }

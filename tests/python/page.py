@@ -7,11 +7,13 @@ pictures of the page go to PICTURES. Directions are healpy's: its pixel centres,
 """
 
 import json
+import re
 import subprocess
 import sys
 import threading
 import time
 import urllib.request
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import healpy
@@ -250,6 +252,134 @@ class Page:
             raise AssertionError(f"interface {last[0]}\npage {last[1]}") from error
 
 
+class Panels:
+    """Time line, orbit and baselines of the page."""
+
+    LEFT, RIGHT, TOP, BARS = 72, 10, 6, 84  # Of the time line, CSS pixels.
+    NAMES = {"visibilities": "visibilities", "ephemeris": "positions", "housekeeping": "reports", "instrument": "description"}
+
+    def __init__(self, page, served):
+        self.page, self.served, self.js = page, served, page.browser.js
+
+    def colour(self, name):
+        text = self.js("return getComputedStyle(document.documentElement).getPropertyValue(arguments[0]).trim()", name)
+        return [int(text[k : k + 2], 16) for k in (1, 3, 5)]
+
+    def pixels(self, canvas, places):
+        """Colours of a canvas at places in CSS pixels; zero where nothing is drawn."""
+        script = """
+            const canvas = document.getElementById(arguments[0]), ratio = canvas.width / canvas.getBoundingClientRect().width;
+            const { width, height } = canvas, data = canvas.getContext("2d").getImageData(0, 0, width, height).data;
+            return arguments[1].map(([x, y]) => { const at = 4 * (Math.floor(y * ratio) * width + Math.floor(x * ratio)); return [...data.slice(at, at + 3)]; });"""
+        return self.js(script, canvas, [[float(x), float(y)] for x, y in places])
+
+    def assert_passes(self):
+        """The sums of the time line are the counts of the status, and its bars stand where there are packets."""
+
+        def as_told():
+            status, text = self.served.status(), self.page.text("#passestext")
+            expected = []
+            for kind, name in self.NAMES.items():
+                counts = status["reception"][kind]
+                lost = f", {counts['missing']:,} missing" if counts["missing"] else ""
+                expected.append(f"{name} {counts['packets']:,} received{lost}")
+            last[:] = [text, "whole mission: " + " · ".join(expected)]
+            return last[0] == last[1]
+
+        last = []
+        try:
+            wait_until("the time line", as_told)
+        except AssertionError as error:
+            raise AssertionError(f"page {last[0]}, expected {last[1]}") from error
+        line = self.served.json("/api/passes")
+        received, missing = (
+            np.array(next(kind[key] for kind in line["kinds"] if kind["kind"] == "visibilities")) for key in ("received", "missing")
+        )
+        width = self.page.box("#passes")[2] - self.LEFT - self.RIGHT
+        middle = self.LEFT + (np.arange(len(received)) + 0.5) / len(received) * width
+        # A bar covers whole pixels: its neighbours' middles may be in it.
+        alone = (received + missing == 0) & (np.roll(received + missing, 1) == 0) & (np.roll(received + missing, -1) == 0)
+        full = received > 0
+        lost = (missing > 0) & (received == 0)
+        base = self.TOP + self.BARS - 1
+        for what, where, colour in [("received", full, "--cool"), ("missing", lost, "--bad"), ("nothing", alone[1:-1], None)]:
+            expected = [0, 0, 0] if colour is None else self.colour(colour)
+            places = middle[1:-1] if colour is None else middle
+            found = self.pixels("passes", [(x, base) for x in places[where]])
+            # Lines of the axis stand there, too, with soft edges.
+            line_colour = np.array(self.colour("--line"))
+            found = [seen for seen in found if colour is not None or np.abs(seen - line_colour).max() > 16]
+            assert all(seen == expected for seen in found), (what, found, expected)
+        assert full.sum() > 1, received
+        return line
+
+    def assert_orbit(self):
+        """The Moon in the middle, its far side dark, the daughters at their places: seen from above the orbit, the Earth to the right."""
+        geometry = self.served.json("/api/geometry")
+        normal, earth = np.array(geometry["normal_hat"]), np.array(geometry["earth_hat"])
+        right = earth - (earth @ normal) * normal
+        right /= np.linalg.norm(right)
+        axes = np.array([right, np.cross(normal, right)])
+        width, height = self.page.box("#orbit")[2:]
+        reach = max(np.linalg.norm(geometry["orbit_m"] + geometry["track_m"], axis=1))
+        height -= 44  # For the ruler.
+        per_m = 0.44 * min(width, height) / reach
+
+        def put(place_m):
+            x, y = per_m * (axes @ place_m)
+            return width / 2 + x, height / 2 - y
+
+        satellites = np.array([satellite["position_m"] for satellite in geometry["satellites"]])
+        radius_m = geometry["moon_radius_m"]
+        # The nearest of all is drawn above the others; all have one colour.
+        assert self.pixels("orbit", [put(place) for place in satellites]) == [self.colour("--cool")] * len(satellites)
+        sides = self.pixels("orbit", [put(0.9 * radius_m * right), put(-0.9 * radius_m * right)])
+        assert sides == [self.colour("--moon"), self.colour("--far")], sides
+        hidden = sum(satellite["earth_is_hidden"] for satellite in geometry["satellites"])
+        assert f"day {geometry['time_s'] / 86400:.2f}" in self.page.text("#orbittext")
+        of = f"all {hidden}" if hidden == len(satellites) else f"{hidden} of {len(satellites)}"
+        assert f"Earth hidden from {of};" in self.page.text("#orbittext"), self.page.text("#orbittext")
+
+    def assert_uvw(self, channel, palette):
+        """Each cell has the colour of its count, at both signs."""
+        density = self.served.json(f"/api/uvw/{channel}")
+        wait_until("baselines", lambda: f"{density['visibilities']:,} visibilities" in self.page.text("#uvwtext"))
+        cells = density["cells"]
+        planes = np.array(density["planes"]).reshape(3, cells, cells)
+        planes = planes + planes[:, ::-1, ::-1]
+        width, height = self.page.box("#uvw")[2:]
+        side = min((width - 16) / 3, height - 18)
+        left = (width - 3 * side - 16) / 2
+        place = (np.arange(cells) + 0.5) / cells * side
+        places, expected = [], []
+        for n, row, column in np.ndindex(planes.shape):
+            if 0 < min(row, column) and max(row, column) < cells - 1 and (planes[n, row, column] > 0 or (row + column) % 7 == 0):
+                places.append((left + n * (side + 8) + place[column], place[cells - 1 - row]))
+                expected.append(planes[n, row, column])
+        expected, found = np.array(expected), np.array(self.pixels("uvw", places))
+        index = np.round(255 * (0.25 + 0.75 * np.log(np.maximum(expected, 1)) / np.log(planes.max()))).astype(int)
+        colours = np.where((expected > 0)[:, None], palette[index], self.colour("--field"))
+        wrong = np.abs(colours - found).max(axis=1) > 0
+        assert (expected > 0).sum() > 50 and not wrong.any(), (wrong.sum(), len(wrong), colours[wrong][:5], found[wrong][:5])
+
+
+def without_some(downlink, path):
+    """Writes a downlink of packets but for some of visibilities; returns the ranges of their counts, the latest first."""
+    data, at, count, packets = downlink.read_bytes(), 0, 0, []
+    while at < len(data):
+        end = at + 7 + int.from_bytes(data[at + 4 : at + 6], "big")
+        is_visibilities = int.from_bytes(data[at : at + 2], "big") & 0x7FF == 0x103
+        packets.append((count if is_visibilities else None, data[at:end]))
+        count += is_visibilities
+        at = end
+    # Among the first, as the replay ends after some steps.
+    lost = [(8, 10), (2, 2)]
+    assert count > 40, count
+    kept = [packet for n, packet in packets if n is None or not any(first <= n <= last for first, last in lost)]
+    path.write_bytes(b"".join(kept))
+    return lost
+
+
 def read(path):
     """A map's pixels, as 32-bit numbers."""
     return healpy.read_map(path, dtype=np.float32).astype(float)
@@ -316,12 +446,22 @@ def shows_a_run(page, served, out, pictures):
     px, py = page.on_canvas(x[k], y[k], page.size())
     browser.move(left + px, top + py)
     page.wait_for_text("#cursor", f"pixel {pixels[k]}")
-    said = page.text("#cursor").split()
+    said = re.sub(r" \(.*\)", "", page.text("#cursor")).split()
     assert abs(float(said[0]) / final[pixels[k]] - 1) < 1e-3, said
     lon, lat = healpy.Rotator(coord=["E", "G"])(*healpy.pix2ang(4, int(pixels[k]), lonlat=True), lonlat=True)
     across = (float(said[4].rstrip("°")) - lon + 180) % 360 - 180
     # The mouse is on whole points, of which some 3 make a degree.
     assert abs(across) < 2 and abs(float(said[6].rstrip("°")) - lat) < 1, (said, lon, lat)
+
+    noise_k = status["channels"][0]["noise_rms_k"]
+    assert abs(float(page.text("#cursor").split("whole map ")[1].split()[0]) / noise_k - 1) < 1e-3, page.text("#cursor")
+
+    # Time line, orbit, baselines.
+    panels = Panels(page, served)
+    panels.assert_passes()
+    panels.assert_orbit()
+    panels.assert_uvw(0, inferno)
+    shows_parts_of_the_mission(page, served)
 
     # Slider, by mouse and by keys; difference; blink; channels.
     left, top, width, height = page.box("#slider")
@@ -347,14 +487,53 @@ def shows_a_run(page, served, out, pictures):
     other = read(out / "10.000MHz/map.fits")
     page.assert_sky("second channel", other, Colours.robust(inferno, other))
     browser.press("1")
+    # It may have played to the end before anybody looks.
+    note = "window.played = []; new MutationObserver(([r]) => played.push(r.target.getAttribute('aria-pressed'))).observe(document.getElementById('play'), { attributes: true, attributeFilter: ['aria-pressed'] })"
+    browser.js(note)
     browser.press(" ")
-    assert browser.js("return document.getElementById('play').getAttribute('aria-pressed')") == "true"
+    wait_until("playing", lambda: len(browser.js("return played")) > 0)
     wait_until("the last map played", lambda: browser.js("return document.getElementById('play').getAttribute('aria-pressed')") == "false")
     page.wait_for_text("#which", "final map")
     browser.press("?")
     assert browser.js("return document.getElementById('keys').open")
     browser.press("Escape")
     wait_until("the keys closed", lambda: not browser.js("return document.getElementById('keys').open"))
+
+
+def shows_parts_of_the_mission(page, served):
+    """The keys choose bins of the time line, one after the other; their texts tell of all packets."""
+    browser, line = page.browser, served.json("/api/passes")
+    received = next(kind["received"] for kind in line["kinds"] if kind["kind"] == "visibilities")
+    browser.js("document.getElementById('passes').focus()")
+    browser.press("\ue011")  # Home.
+    assert f"visibilities {received[0]:,} received" in page.text("#passestext"), page.text("#passestext")
+    browser.press("Shift", "ArrowRight")
+    assert f"visibilities {sum(received[:2]):,} received" in page.text("#passestext"), page.text("#passestext")
+    browser.press("\ue010")  # End.
+    assert f"visibilities {received[-1]:,} received" in page.text("#passestext"), page.text("#passestext")
+    assert "final map" in page.text("#which"), "the sky has its keys for itself"
+    # As a date: 1958 and TAI, less the 37 s by which UTC is behind.
+    browser.js("const s = document.getElementById('clock'); s.value = 'utc'; s.dispatchEvent(new Event('change'))")
+    begin = datetime(1958, 1, 1) + timedelta(seconds=line["epoch_tai_s"] + line["start_s"] + (len(received) - 1) * line["bin_s"] - 37)
+    assert page.text("#passestext").startswith(f"{begin:%Y-%m-%d %H:%M} UTC to "), page.text("#passestext")
+    browser.js("const s = document.getElementById('clock'); s.value = 'days'; s.dispatchEvent(new Event('change'))")
+    browser.press("Escape")
+    assert page.text("#passestext").startswith("whole mission: ")
+    browser.js("document.activeElement.blur()")
+
+
+def copies_what_is_missing(page, lost):
+    """The ranges are listed, and copied as they are requested."""
+    browser = page.browser
+    permissions = {"permissions": ["clipboardReadWrite", "clipboardSanitizedWrite"]}
+    browser.post("goog/cdp/execute", cmd="Browser.grantPermissions", params=permissions)
+    expected = "\n".join(f"0x103 {first} {last}" for first, last in lost)
+    rows = "return [...document.querySelectorAll('#ranges tr')].slice(1).map((r) => [...r.cells].slice(0, 3).map((c) => c.textContent).join(' ')).join('\\n')"
+    assert browser.js(rows) == expected, browser.js(rows)
+    browser.click("#copypasses")
+    page.wait_for_text("#copypasses", "copied")
+    copied = browser.js("return navigator.clipboard.readText()")
+    assert copied == expected, copied
 
 
 def fits_a_phone(page, pictures):
@@ -365,10 +544,16 @@ def fits_a_phone(page, pictures):
     wide = page.browser.js("return [document.documentElement.scrollWidth, innerWidth]")
     assert wide[0] <= wide[1], f"the page is {wide[0]} points wide on a phone of {wide[1]}"
     page.browser.screenshot(pictures / "page-phone.png")
+    for name in ["passes", "orbit", "uvw"]:
+        drawn = "const c = document.getElementById(arguments[0]); return c.width > 300 && c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some(Boolean)"
+        wait_until(f"{name} on a phone", lambda name=name: page.browser.js(drawn, name))
+    page.browser.js("document.querySelector('.passes').scrollIntoView()")
+    page.browser.screenshot(pictures / "page-phone-passes.png")
+    page.browser.js("scrollTo(0, 0)")
     page.browser.post("goog/cdp/execute", cmd="Emulation.clearDeviceMetricsOverride", params={})
 
 
-def follows_a_replay(page, replay, out, pictures):
+def follows_a_replay(page, replay, out, lost, pictures):
     """Another run has taken the place; the page, which was not loaded again, shows it step by step."""
     page.wait_for_text("#link", "live")
     page.wait_for_text("#name", "ground")
@@ -377,11 +562,13 @@ def follows_a_replay(page, replay, out, pictures):
     def packets():
         return replay.status()["reception"]["visibilities"]["packets"]
 
+    panels = Panels(page, replay)
     for _ in range(3):
         before = packets()
         print(file=replay.process.stdin, flush=True)
         wait_until("a step", lambda: packets() > before)
         page.assert_counts(replay.status)
+    panels.assert_passes()
     replay.process.stdin.close()
     replay.wait_for_phase("ended")
     page.wait_for_text("#phase", "ended")
@@ -391,6 +578,10 @@ def follows_a_replay(page, replay, out, pictures):
     final = read(out / "3.000MHz/map.fits")
     page.assert_sky("map of the replay", final, Colours.robust(page.palettes["inferno"], final))
     page.wait_for_text("#log", "the run is complete")
+    panels.assert_passes()
+    panels.assert_orbit()
+    panels.assert_uvw(0, page.palettes["inferno"])
+    copies_what_is_missing(page, lost)
     page.browser.screenshot(pictures / "page-replay.png")
 
 
@@ -420,9 +611,10 @@ def main():
         served.end()
         page.wait_for_text("#link", "not connected")
         page.listen()
-        replay = [lunarray, "replay", downlink, "--map", pipeline, "--out", str(folder / "replay")]
+        lost = without_some(Path(downlink), folder / "cut.packets")
+        replay = [lunarray, "replay", str(folder / "cut.packets"), "--map", pipeline, "--out", str(folder / "replay")]
         with Served(*replay, "--step", "pass", "--serve-after", port=served.port) as replay:
-            follows_a_replay(page, replay, folder / "replay", pictures)
+            follows_a_replay(page, replay, folder / "replay", lost, pictures)
             without_webgl(replay, folder / "replay", page.palettes)
         page.listen()
         # What the browser says itself of the cut.

@@ -85,6 +85,22 @@ impl ReceivedSet {
         self.packets.is_empty()
     }
 
+    /// Packets of consecutive counts made at one time, in the order of these times.
+    pub fn intervals(&self) -> impl Iterator<Item = (CucTime, Range<u64>)> + '_ {
+        self.packets.iter().map(|Range { start: (made, first), end: (_, end) }| (made, first..end))
+    }
+
+    /// First and last time at which a packet was made; `None` of an empty set.
+    #[must_use]
+    pub fn span(&self) -> Option<[CucTime; 2]> {
+        let made = |range: Range<(CucTime, u64)>| range.start.0;
+        self.packets
+            .lowest()
+            .map(made)
+            .zip(self.packets.highest().map(made))
+            .map(|(first, last)| [first, last])
+    }
+
     /// The eras, by time: where counts decrease with time, a new one begins.
     #[must_use]
     pub fn eras(&self) -> Vec<Era> {

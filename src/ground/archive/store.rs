@@ -14,6 +14,7 @@ use crate::array::Ephemeris;
 use crate::calibration::{AutoTable, Calibrator};
 use crate::downlink::{DownlinkError, Kind};
 use crate::frames::{EphemerisSegment, VisibilityReason};
+use crate::ground::lookout::Spotter;
 use crate::ground::{
     Collector, CollectorState, DeliveredPacket, Ground, GroundConfig, GroundError, GroundOutcome,
     SharedSaving,
@@ -227,6 +228,7 @@ impl Opened {
         let archive =
             Archive { folder, settings, journal, notes, posts, interval, wait, since_attempt, saving };
         let (cancel, linger, steps) = (Cancel::new(), Duration::ZERO, 0);
+        let spotter = Spotter::of(&outcome.lookout);
         Ok(Ground {
             collector,
             calibrator,
@@ -236,6 +238,7 @@ impl Opened {
             cancel,
             linger,
             steps,
+            spotter,
         })
     }
 }

@@ -1,22 +1,18 @@
 // The page: events in, panels out. Everything comes from this server; nothing is sent to it.
 import { Sky, isSeen } from "/sky.js";
+import { Passes } from "/passes.js";
+import { drawOrbit, drawPowers, drawUvw, tellOrbit } from "/array.js";
+import { $, copyText, css, make, nice, number, short, stored, ticks } from "/tools.js";
 
-const $ = (id) => document.getElementById(id);
 const HELD_BYTES = 96e6, SAMPLE = 65536;
 const BLINK_MS = 700, PLAY_MS = 450;
 const state = {
   status: null, channel: 0, number: null, follows: true, figures: new Map(), curve: "growth",
   maps: new Map(), blink: false, blinkOn: false, playing: false, gapsAt: 0, gapsSeen: 0,
+  arrayAt: 0, arrayKnown: null, fetching: false, geometry: null, density: null, powers: null,
 };
-let sky;
+let sky, passes;
 
-const number = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
-const short = (v) => {
-  if (v === null || v === undefined || !Number.isFinite(v)) return "–";
-  const a = Math.abs(v);
-  if (a !== 0 && (a >= 1e5 || a < 1e-2)) return v.toExponential(2).replace("e+", "e");
-  return String(Number(v.toPrecision(a >= 1000 ? 5 : 4)));
-};
 const prefixed = (v) => {
   for (const [size, name] of [[1e9, " G"], [1e6, " M"], [1e3, " k"]]) if (v >= size) return (v / size).toPrecision(3) + name;
   return v === 0 ? "0 " : v >= 100 ? v.toFixed(0) + " " : v.toPrecision(3) + " ";
@@ -32,16 +28,6 @@ const clock = (s) => {
   return (h ? `${h}:` : "") + `${String(m).padStart(h ? 2 : 1, "0")}:${String(r).padStart(2, "0")}`;
 };
 const days = (s) => `${(s / 86400).toFixed(1)} d`;
-const make = (tag, attributes = {}, ...children) => {
-  const node = document.createElement(tag);
-  for (const [key, value] of Object.entries(attributes)) key === "class" ? (node.className = value) : node.setAttribute(key, value);
-  node.append(...children);
-  return node;
-};
-const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-const stored = (key, value) => {
-  try { if (value !== undefined) localStorage.setItem(`lunarray.${key}`, value); return localStorage.getItem(`lunarray.${key}`); } catch { return null; }
-};
 const channelNow = () => state.status?.channels.find((c) => c.channel === state.channel);
 
 // ---- Maps ----
@@ -305,8 +291,6 @@ function drawCurve() {
   const [left, right, top, bottom] = [52, 10, 24, 30], [w, h] = [box.width - left - right, box.height - top - bottom];
   const px = (x) => left + (x - x0) / (x1 - x0) * w, py = (y) => top + h - (t(y) - y0) / (y1 - y0) * h;
   c.strokeStyle = css("--line"); c.lineWidth = 1;
-  const nice = (span, wanted) => { const raw = span / wanted, p = 10 ** Math.floor(Math.log10(raw)); return p * ([1, 2, 5, 10].find((m) => m * p >= raw) ?? 10); };
-  const ticks = (from, to, step) => { const found = []; for (let v = Math.ceil(from / step - 1e-9) * step; v <= to + 1e-9 * step; v += step) found.push(Math.abs(v) < 1e-12 * step ? 0 : v); return found; };
   c.textAlign = "right"; c.textBaseline = "middle";
   for (const v of ticks(y0, y1, plot.log ? Math.max(1, Math.ceil((y1 - y0) / 5)) : nice(y1 - y0, 4))) {
     const y = top + h - (v - y0) / (y1 - y0) * h;
@@ -348,8 +332,41 @@ async function fetchGaps() {
   $("gaps").replaceChildren(head, ...rows.map((gap) => make("tr", {}, make("td", {}, `0x${gap.apid.toString(16)}`), make("td", {}, String(gap.from)), make("td", {}, String(gap.to)), make("td", {}, (gap.integration_s / 3600).toFixed(3)), make("td", {}, (100 * gap.gain).toFixed(4)))));
   $("gaps").hidden = rows.length === 0;
   $("gapsnote").textContent = (gaps.length ? `${gaps.length} gaps, most valuable first, as of the last checkpoint` : "No packets are missing between those received, as of the last checkpoint.") + (restarts?.length ? `; ${restarts.length} restarts of the counts` : "");
-  $("copy").onclick = () => navigator.clipboard?.writeText(gaps.map((gap) => `0x${gap.apid.toString(16)} ${gap.from} ${gap.to}`).join("\n"));
+  $("copy").onclick = () => copyText(gaps.map((gap) => `0x${gap.apid.toString(16)} ${gap.from} ${gap.to}`).join("\n"));
 }
+
+// ---- Passes, orbit, baselines ----
+const LOOK_MS = 1500;
+async function fetchOf(path) {
+  const answer = await fetch(path);
+  return answer.ok ? answer.json() : null;
+}
+
+/** Fetches what the ground has received since, not more often than it is worth, and one answer after the other. */
+async function fetchArray(status) {
+  const known = `${status.phase}/${status.reception.bytes}/${state.channel}`;
+  if (document.hidden || state.fetching || known === state.arrayKnown || Date.now() - state.arrayAt < LOOK_MS) return;
+  state.fetching = true;
+  try {
+    const paths = ["/api/passes", "/api/geometry", `/api/uvw/${state.channel}`, `/api/powers/${state.channel}`];
+    const [line, geometry, density, powers] = await Promise.all(paths.map(fetchOf));
+    Object.assign(state, { geometry, density, powers, arrayKnown: known });
+    passes.show(line);
+    drawArray();
+  } catch { /* Cut; the next status asks again. */ }
+  state.arrayAt = Date.now(); state.fetching = false;
+}
+
+function drawArray() {
+  $("noorbit").hidden = !!state.geometry; $("nouvw").hidden = !!state.density;
+  drawOrbit($("orbit"), state.geometry, $("orbitview").value); tellOrbit(state.geometry);
+  $("powersbox").hidden = !state.powers;
+  if (!sky) return;
+  const colours = sky.palettes[$("palette").value];
+  drawUvw($("uvw"), state.density, colours); drawPowers($("powers"), state.powers, colours);
+}
+
+function redraw() { draw(); drawCurve(); passes.draw(); drawArray(); }
 
 // ---- Status ----
 function update(status) {
@@ -368,7 +385,8 @@ function update(status) {
   if (status.has_state && saved !== state.gapsSeen && Date.now() - state.gapsAt > 5000) {
     state.gapsAt = Date.now(); state.gapsSeen = saved; fetchGaps();
   }
-  const sections = document.querySelectorAll(".sky, .quality");
+  if (status.reception) fetchArray(status);
+  const sections = document.querySelectorAll(".sky, .quality, .passes, .orbit, .uvw");
   for (const section of sections) section.hidden = status.segment === "space";
   const channel = channelNow() ?? status.channels[0];
   if (!channel) return;
@@ -394,7 +412,7 @@ function listen() {
     const status = JSON.parse(event.data);
     // Another run has taken the place: nothing that is held is of it.
     if (state.status && status.elapsed_s < state.status.elapsed_s - 1) {
-      state.maps.clear(); state.figures.clear(); state.number = null; state.news = null; $("log").replaceChildren();
+      state.maps.clear(); state.figures.clear(); state.number = null; state.news = null; state.arrayKnown = null; $("log").replaceChildren();
     }
     update(status);
   });
@@ -406,6 +424,13 @@ function listen() {
     log.prepend(item);
     while (log.children.length > 256) log.lastChild.remove();
   });
+}
+
+/** There is no standard deviation of each pixel; the noise-only map of the newest snapshot has one of all pixels. */
+function noiseOfMap() {
+  const channel = channelNow(), isMap = $("show").value === "map" && !state.blink;
+  if (!isMap || !channel || channel.is_noiseless || state.number !== channel.held.at(-1)) return "";
+  return ` (noise rms of the whole map ${short(channel.noise_rms_k)} K)`;
 }
 
 // ---- Controls ----
@@ -420,7 +445,7 @@ function play(on) { state.playing = on; press($("play"), on); $("play").textCont
 function blink(on) { state.blink = on; state.blinkOn = false; press($("blink"), on); showSky(); }
 function step(by) { const held = channelNow()?.held; if (held) chooseNumber(held, Math.min(held.length - 1, Math.max(0, held.indexOf(state.number) + by))); }
 function cycle(select) { const options = [...select.options].filter((o) => !o.disabled); select.value = options[(options.findIndex((o) => o.value === select.value) + 1) % options.length].value; select.dispatchEvent(new Event("change")); }
-function theme(name) { document.documentElement.dataset.theme = name; stored("theme", name); draw(); drawCurve(); }
+function theme(name) { document.documentElement.dataset.theme = name; stored("theme", name); redraw(); }
 
 function controls() {
   setInterval(() => { if (state.playing) { const held = channelNow()?.held ?? [], at = held.indexOf(state.number); if (at < 0 || at >= held.length - 1) play(false); else chooseNumber(held, at + 1); } }, PLAY_MS);
@@ -428,7 +453,7 @@ function controls() {
   $("play").addEventListener("click", () => play(!state.playing));
   $("blink").addEventListener("click", () => blink(!state.blink));
   $("slider").addEventListener("input", () => { play(false); chooseNumber(channelNow()?.held ?? [], Number($("slider").value)); });
-  for (const id of ["show", "scale", "palette", "smooth", "marks", "from", "to"]) $(id).addEventListener("change", () => { if (["scale", "palette"].includes(id)) stored(id, $(id).value); showSky(); });
+  for (const id of ["show", "scale", "palette", "smooth", "marks", "from", "to"]) $(id).addEventListener("change", () => { if (["scale", "palette"].includes(id)) stored(id, $(id).value); if (id === "palette") drawArray(); showSky(); });
   $("fixed").addEventListener("change", () => { for (const id of ["from", "to"]) $(id).disabled = !$("fixed").checked; showSky(); });
   for (const id of ["projection", "frame"]) $(id).addEventListener("change", () => setView({ [id]: $(id).value }));
   for (const tab of $("curves").children) tab.addEventListener("click", () => { state.curve = tab.dataset.curve; for (const other of $("curves").children) other.setAttribute("aria-selected", String(other === tab)); drawCurve(); });
@@ -445,10 +470,10 @@ function controls() {
       return;
     }
     const at = sky.probe(event.clientX, event.clientY), axes = { galactic: ["l", "b"], ecliptic: ["λ", "β"], equatorial: ["α", "δ"] }[sky.view.frame];
-    $("cursor").textContent = at ? `${isSeen(at.value) ? `${short(at.value)} K` : "not measured"} · ${axes[0]} ${at.lon.toFixed(1)}° ${axes[1]} ${at.lat.toFixed(1)}° · pixel ${at.pixel}` : "";
+    $("cursor").textContent = at ? `${isSeen(at.value) ? `${short(at.value)} K` : "not measured"}${noiseOfMap()} · ${axes[0]} ${at.lon.toFixed(1)}° ${axes[1]} ${at.lat.toFixed(1)}° · pixel ${at.pixel}` : "";
   });
   stage.addEventListener("pointerleave", () => { $("cursor").textContent = ""; });
-  addEventListener("resize", () => { draw(); drawCurve(); });
+  addEventListener("resize", redraw);
   addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
     if (event.target.matches("input[type=number], select") || (event.target.matches("button, input[type=checkbox]") && event.key === " ")) return;
@@ -473,6 +498,9 @@ async function begin() {
   sky = new Sky($("gl"), $("over"), constants);
   for (const id of ["scale", "palette"]) { const value = stored(id); if (value && [...$(id).options].some((o) => o.value === value)) $(id).value = value; }
   for (const id of ["projection", "frame"]) { const value = stored(id); if (value && [...$(id).options].some((o) => o.value === value)) $(id).value = sky.view[id] = value; }
+  passes = new Passes($("passes"));
+  $("orbitview").value = stored("orbit") ?? "plane";
+  $("orbitview").addEventListener("change", () => { stored("orbit", $("orbitview").value); drawArray(); });
   controls();
   drawCurve();
   listen();

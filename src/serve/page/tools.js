@@ -1,0 +1,57 @@
+// What all parts of the page use.
+
+export const $ = (id) => document.getElementById(id);
+
+export const number = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
+export const short = (v) => {
+  if (v === null || v === undefined || !Number.isFinite(v)) return "–";
+  const a = Math.abs(v);
+  if (a !== 0 && (a >= 1e5 || a < 1e-2)) return v.toExponential(2).replace("e+", "e");
+  return String(Number(v.toPrecision(a >= 1000 ? 5 : 4)));
+};
+
+export const make = (tag, attributes = {}, ...children) => {
+  const node = document.createElement(tag);
+  for (const [key, value] of Object.entries(attributes)) key === "class" ? (node.className = value) : node.setAttribute(key, value);
+  node.append(...children);
+  return node;
+};
+export const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+export const stored = (key, value) => {
+  try { if (value !== undefined) localStorage.setItem(`lunarray.${key}`, value); return localStorage.getItem(`lunarray.${key}`); } catch { return null; }
+};
+
+/** A step of 1, 2 or 5 times a power of ten that divides a span into about so many. */
+export const nice = (span, wanted) => { const raw = span / wanted, p = 10 ** Math.floor(Math.log10(raw)); return p * ([1, 2, 5, 10].find((m) => m * p >= raw) ?? 10); };
+export const ticks = (from, to, step) => { const found = []; for (let v = Math.ceil(from / step - 1e-9) * step; v <= to + 1e-9 * step; v += step) found.push(Math.abs(v) < 1e-12 * step ? 0 : v); return found; };
+
+/** Prepares a canvas for drawing in CSS pixels; undefined while it is not shown. */
+export function brush(canvas) {
+  const box = canvas.getBoundingClientRect(), ratio = Math.min(devicePixelRatio || 1, 2);
+  if (!box.width) return undefined;
+  canvas.width = Math.round(box.width * ratio); canvas.height = Math.round(box.height * ratio);
+  const c = canvas.getContext("2d");
+  c.scale(ratio, ratio);
+  c.font = "11px system-ui, sans-serif";
+  return { c, width: box.width, height: box.height, ratio };
+}
+
+/** Copies a text, also where the page is not trusted with the clipboard: on another machine's address without encryption. */
+export async function copyText(text) {
+  if (navigator.clipboard) { try { await navigator.clipboard.writeText(text); return true; } catch { /* The old way. */ } }
+  const area = make("textarea", { readonly: "" });
+  area.value = text;
+  document.body.append(area);
+  area.select();
+  const done = document.execCommand("copy");
+  area.remove();
+  return done;
+}
+
+// A mission's epoch counts TAI seconds since 1958; UTC is 37 s behind since 2017, and no further leap second is announced.
+const TO_1970_S = 4383 * 86400, TAI_AHEAD_S = 37;
+/** Date and time, UTC, of a mission time. */
+export const utc = (epochTaiS, timeS) => {
+  const date = new Date((epochTaiS + timeS - TO_1970_S - TAI_AHEAD_S) * 1000);
+  return Number.isNaN(date.getTime()) ? "–" : date.toISOString().slice(0, 16).replace("T", " ");
+};

@@ -1,0 +1,34 @@
+//! What the server tells about.
+
+use std::path::{Path, PathBuf};
+
+use crate::array::{Array, ArrayConfig};
+use crate::pipeline::Config;
+
+/// What the server tells about.
+#[derive(Clone, Debug)]
+pub struct Subject {
+    /// Name of the pipeline.
+    pub name: String,
+    /// Which part of the chain runs: `whole`, `ground` or `space`.
+    pub segment: &'static str,
+    /// The configuration in JSON.
+    pub config: Vec<u8>,
+    /// Folder of the state, if there is one.
+    pub state: Option<PathBuf>,
+    /// Says where the Earth is.
+    pub model: Option<Array>,
+}
+
+impl Subject {
+    /// A run of this configuration, which is shown as it is.
+    #[must_use]
+    pub fn new(config: &Config, segment: &'static str, state: Option<&Path>) -> Self {
+        // A configuration that was read can be written.
+        let text = serde_json::to_vec(config).unwrap_or_default();
+        // Nothing but the Earth is asked of it; the orbits come down.
+        let earth_longitude_deg = config.array.earth_longitude_deg;
+        let model = Array::new(&ArrayConfig { earth_longitude_deg, ..ArrayConfig::default() }).ok();
+        Self { name: config.name.clone(), segment, config: text, state: state.map(Path::to_owned), model }
+    }
+}
