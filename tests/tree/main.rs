@@ -8,6 +8,7 @@
 //! that a re-export neither hides an import nor makes one. Code under `#[cfg(test)]` is free.
 #![allow(clippy::unwrap_used, clippy::panic)] // A test fails by panicking.
 
+mod book;
 mod rules;
 mod source;
 
