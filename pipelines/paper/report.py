@@ -316,6 +316,28 @@ def traces(name="fig15-traces"):
     return text
 
 
+def with_all_windows(thinned):
+    """Where the traces cross if the noise falls as the data grow: Tr Sigma_n over the factor, Tr Sigma_s as it is."""
+    study = load("fig15-pixels/study.json")
+    if study is None:
+        return ""
+    points = []
+    for case in study["cases"]:
+        channel = case["figures"]["channels"][0]
+        found = channel["diagnostics"]["traces"]
+        mean_square = channel["power"]["input_k2"][0] / (4 * math.pi)
+        ratio = found["sigma_n_k2"]["value"] / thinned / (mean_square * found["sigma_s"]["value"])
+        points.append((math.log(channel["diagnostics"]["epsilon"]), math.log(ratio)))
+    for (x0, y0), (x1, y1) in zip(points, points[1:]):
+        if y0 >= 0 > y1:
+            where = math.exp(x0 + (x1 - x0) * y0 / (y0 - y1))
+            return (
+                f"\nFrom every {thinned}th window. With all of them Tr Sigma_n is {thinned} times smaller and Tr Sigma_s the same, so that "
+                f"they cross at {where:.1e}: the crossing is a property of the amount of data as much as of the array.\n"
+            )
+    return ""
+
+
 def correlation(name, key, ls, head, said):
     study = load(f"{name}/study.json")
     if study is None:
@@ -366,6 +388,22 @@ def sensitivity(name="fig19-sensitivity", nside=16):
     return table(head, rows) + (
         "\nThe paper: flat above 5 MHz, improving quickly below, as absorption suppresses the sky there.\n"
     )
+
+
+def flatness():
+    """How the sensitivity of a pixel changes from 5 to 10 MHz in both studies, and which channels the larger one lacks."""
+    rise, missing_mhz = {}, []
+    for name in ("fig19-sensitivity", "fig19-nside64"):
+        study = load(f"{name}/study.json")
+        if study is None:
+            return ""
+        channels = [case["figures"]["channels"][0] for case in study["cases"]]
+        of = {round(channel["frequency_hz"] / 1e6): channel["noise_rms_k"] * channel["frequency_hz"] ** 2 for channel in channels}
+        rise[name] = of[10] / of[5]
+        missing_mhz = [str(mhz) for mhz in (2, 3, 5, 10, 20, 30) if mhz not in of]
+    text = (f"\nFrom 5 to 10 MHz sensitivity rises by {rise['fig19-nside64']:.2f}, at nside 16 by {rise['fig19-sensitivity']:.2f}: the larger the "
+            "map, the flatter.\n")
+    return text + (f"Not made here yet: {' and '.join(missing_mhz)} MHz.\n" if missing_mhz else "")
 
 
 def pair_sensitivity():
@@ -442,20 +480,21 @@ def main():
          f"`{patch_command('10', 0)}` and so on", patches()),
         ("Fig. 15: traces against epsilon", "`lunarray study pipelines/paper/fig15-traces.toml`",
          traces() + "\n![rho, SNR, power and traces against epsilon](paper-fig15.png)\n" + basis()
-         + "\n### In pixels, nside 16\n\n`lunarray study pipelines/paper/fig15-pixels.toml`\n\n" + traces("fig15-pixels")),
+         + "\n### In pixels, nside 16\n\n`lunarray study pipelines/paper/fig15-pixels.toml`\n\n" + traces("fig15-pixels") + with_all_windows(40)),
         ("Fig. 16: rows at centres and averaged, rho_l without noise",
          "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("rho", "no noise", "The paper: rows at centres are well below 1 from b_p on; averaged rows are not, and "
                    "b < 2 b_p and b < 4 b_p are alike.")),
         ("Fig. 17: the same, SNR_l with thermal noise", "`lunarray study pipelines/paper/fig16-17-rows.toml`",
-         rows_of_b("snr", "thermal noise", "")),
+         rows_of_b("snr", "thermal noise", "Rows at centres are not made smaller by the pixel, so that they take long baselines for better measured "
+                   "than they are: less noise, and so a greater SNR_l, of maps that Fig. 16 shows to be wrong.")),
         ("Fig. 18: rho_l without noise for epsilon from 1e-9 to 1", "`lunarray study pipelines/paper/fig18-epsilon.toml`",
          correlation("fig18-epsilon", "rho", (8, 16, 32, 64, 96, 128), "epsilon",
                      "The paper: rho_l does not depend on epsilon below 1e-2.")),
         ("Fig. 19: sensitivity against frequency", "`lunarray study pipelines/paper/fig19-sensitivity.toml`",
          sensitivity() + pair_sensitivity()
          + "\n### At nside 64\n\n`lunarray study pipelines/paper/fig19-nside64.toml`, from every 40th window\n\n"
-         + sensitivity("fig19-nside64", 64)),
+         + sensitivity("fig19-nside64", 64) + flatness()),
         ("Fig. 20 and the appendix: N_b and Sigma_b", f"`{FIGURE.format('sub-pixel')}`", figure("sub-pixel", sub_pixel)),
     ]
     print("# The paper, figure by figure\n")
