@@ -277,6 +277,12 @@ impl Collector {
         Kind::ALL.into_iter().map(|kind| (kind, &self.received[kind.index()]))
     }
 
+    /// Packets received so far, of all kinds, but for those that came again.
+    #[must_use]
+    pub fn packets(&self) -> u64 {
+        self.packets
+    }
+
     /// Packets held.
     #[must_use]
     pub fn held(&self) -> &HoldBuffer {

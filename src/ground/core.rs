@@ -5,9 +5,11 @@ use std::time::Duration;
 
 use super::archive::{Archive, RecordDraft};
 use super::lookout::{Occasion, Spotter};
+use super::promises::SenderPromises;
 use super::{Collector, DeliveredPacket, Delivery, GroundConfig, GroundError, GroundOutcome};
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::{Calibrator, MissingPackets};
+use crate::downlink::transport::socket::HeldAnswers;
 use crate::downlink::{CucTime, Kind};
 use crate::frames::{GroundFrame, Instrument, PlacedFrame};
 use crate::ranks::Ranks;
@@ -35,6 +37,8 @@ pub struct Ground {
     pub(super) linger: Duration,
     /// Steps so far.
     pub(super) steps: u64,
+    /// To senders that wait for a checkpoint.
+    pub(super) promises: SenderPromises,
     /// For those who look on.
     pub(super) spotter: Spotter,
 }
@@ -56,6 +60,7 @@ impl Ground {
             cancel: Cancel::new(),
             linger: Duration::ZERO,
             steps: 0,
+            promises: SenderPromises::default(),
         })
     }
 
@@ -72,6 +77,13 @@ impl Ground {
     #[must_use]
     pub fn among(self, ranks: &Ranks) -> Self {
         Self { accumulator: self.accumulator.among(ranks), ..self }
+    }
+
+    /// Tells senders that wait for it, through `answers`, what its checkpoints hold. To be of use, it needs an archive, and has to take
+    /// the stream of the source that shares `answers`, from its beginning.
+    #[must_use]
+    pub fn answering(self, answers: &HeldAnswers) -> Self {
+        Self { promises: self.promises.answering(answers), ..self }
     }
 
     /// Those that hold parts of the sums.
@@ -191,7 +203,9 @@ impl Ground {
     /// Writes a checkpoint, if there is an archive.
     pub(super) fn checkpoint(&mut self) -> Result<(), GroundError> {
         let Some(archive) = &mut self.archive else { return Ok(()) };
-        archive.checkpoint(&self.collector, &self.calibrator, &mut self.accumulator)
+        let written = archive.checkpoint(&self.collector, &self.calibrator, &mut self.accumulator);
+        self.promises.keep(self.collector.packets(), written.is_ok());
+        written
     }
 
     /// Writes the last checkpoint of a session. Maps are made even if it fails for good; the outcome says so.
@@ -221,6 +235,11 @@ impl Stage for Ground {
     fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         self.collector.push(&bytes);
         self.advance(out)?;
+        self.promises.bytes = self.collector.bytes();
+        if self.promises.are_due(self.collector.packets()) {
+            // If it fails, it is tried again while anyone waits.
+            let _ = self.checkpoint();
+        }
         self.steps += 1;
         if self.steps.is_power_of_two() || self.steps.is_multiple_of(STEPS_SHOWN) {
             self.show(Occasion::Work);

@@ -16,6 +16,7 @@ mod lookout;
 mod outcome;
 mod pass_line;
 mod power_waterfall;
+mod promises;
 mod reception;
 mod uvw_density;
 

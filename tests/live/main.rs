@@ -1,9 +1,12 @@
 //! A listening ground, a sending spacecraft, and paced replays: the same bits as through a file.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // Also in the helpers.
 
+mod broker;
 #[path = "../common/mod.rs"]
 mod common;
+mod durable;
 mod events;
+mod log;
 mod pace;
 mod page;
 mod panels;
@@ -24,6 +27,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use common::downlink::{mission, packets_of, pass_ends, transmit};
+use common::schema::check_summary;
 use common::workplace::{SMALL, Workplace, fail, succeed};
 use lunarray::downlink::transport::socket::{ListenConfig, SocketSource, Until};
 use lunarray::downlink::{
@@ -58,7 +62,9 @@ impl Place {
     fn replay(&self, name: &str, file: &str, more: &[&str]) -> Value {
         let out = self.path(name);
         let fixed = ["replay", file, "--map", self.pipeline(), "--out", &out, "--json"];
-        serde_json::from_str(&succeed(&[&fixed, more].concat())).unwrap()
+        let summary = serde_json::from_str(&succeed(&[&fixed, more].concat())).unwrap();
+        check_summary(&summary);
+        summary
     }
 
     /// Starts a listening ground.
@@ -158,7 +164,9 @@ impl Ground {
         let status = self.child.wait().unwrap();
         self.reader.join().unwrap();
         let said = self.said.lock().unwrap().clone();
-        (status, serde_json::from_str(&text).unwrap_or_else(|_| panic!("{text}{said}")), said)
+        let summary = serde_json::from_str(&text).unwrap_or_else(|_| panic!("{text}{said}"));
+        check_summary(&summary);
+        (status, summary, said)
     }
 
     fn end_without_summary(mut self) -> (ExitStatus, String) {

@@ -166,6 +166,11 @@ fn what_is_served_is_what_is_on_disk() {
         stages.as_array().unwrap().iter().map(of).collect()
     };
     assert_eq!(counts(&status["stages"]), counts(&summary["report"]["stages"]));
+    let elapsed_s = status["elapsed_s"].as_f64().unwrap();
+    for stage in status["stages"].as_array().unwrap() {
+        let done = stage["units_per_s"].as_f64().unwrap() * elapsed_s;
+        assert!((done - stage["units"].as_f64().unwrap()).abs() < 1e-6 * done.max(1.0), "{stage}");
+    }
     assert_eq!(served.json("/api/config")["map"]["nside"], 4);
     for (number, channel) in summary["channels"].as_array().unwrap().iter().enumerate() {
         let seen = &status["channels"][number];

@@ -23,6 +23,8 @@ fn a_terminal_shows_what_the_interface_says() {
     let served = finished(&place, "out");
     let status = served.json("/api/status");
     let text = succeed(&["top", &served.address, "--once"]);
+    // What has ended stands still: clock, rates.
+    std::thread::sleep(Duration::from_millis(1100));
     assert_eq!(text, succeed(&["top", &format!("http://{}/", served.address), "--once"]));
     assert!(!text.contains('\u{1b}'), "{text}");
     let row = |name: &str| {

@@ -5,7 +5,6 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, RecvTimeoutError};
 
-use super::socket::Teller;
 use crate::downlink::error::DownlinkError;
 use crate::downlink::receive::{Event, Intake};
 use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
@@ -32,7 +31,7 @@ pub struct Steps {
     /// One step per message. The stream ends when the channel is disconnected.
     pub go: Receiver<()>,
     /// Called whenever the stream waits for a step.
-    pub tell: Teller,
+    pub tell: Box<dyn Fn(&str) + Send + Sync>,
 }
 
 /// What the stream waits for.

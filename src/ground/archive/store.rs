@@ -15,6 +15,7 @@ use crate::calibration::{AutoTable, Calibrator};
 use crate::downlink::{DownlinkError, Kind};
 use crate::frames::{EphemerisSegment, VisibilityReason};
 use crate::ground::lookout::Spotter;
+use crate::ground::promises::SenderPromises;
 use crate::ground::{
     Collector, CollectorState, DeliveredPacket, Ground, GroundConfig, GroundError, GroundOutcome,
     SharedSaving,
@@ -228,6 +229,7 @@ impl Opened {
         let archive =
             Archive { folder, settings, journal, notes, posts, interval, wait, since_attempt, saving };
         let (cancel, linger, steps) = (Cancel::new(), Duration::ZERO, 0);
+        let promises = SenderPromises::since(collector.packets());
         let spotter = Spotter::of(&outcome.lookout);
         Ok(Ground {
             collector,
@@ -238,6 +240,7 @@ impl Opened {
             cancel,
             linger,
             steps,
+            promises,
             spotter,
         })
     }

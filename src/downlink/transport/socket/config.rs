@@ -23,6 +23,8 @@ pub struct ListenConfig {
     pub memory_bytes_max: u64,
     /// Maximum backlog of packets of all connections together, bytes.
     pub backlog_bytes_max: u64,
+    /// Minimum time between two checkpoints that are written because senders wait for one, s.
+    pub held_every_s: f64,
 }
 
 impl Default for ListenConfig {
@@ -35,6 +37,7 @@ impl Default for ListenConfig {
             garbage_bytes_max: 4 << 20,
             memory_bytes_max: 32 << 20,
             backlog_bytes_max: 8 << 20,
+            held_every_s: 10.0,
         }
     }
 }
@@ -46,8 +49,11 @@ impl ListenConfig {
         let mut checks = Checks::of("downlink.listen");
         let Self { connections_max: connections, bytes_per_s_max: rate, .. } = *self;
         checks.require("connections_max", connections, (1..=1024).contains(&connections), "1 to 1024");
-        for (key, value) in [("first_packet_s_max", self.first_packet_s_max), ("idle_s_max", self.idle_s_max)]
-        {
+        for (key, value) in [
+            ("first_packet_s_max", self.first_packet_s_max),
+            ("idle_s_max", self.idle_s_max),
+            ("held_every_s", self.held_every_s),
+        ] {
             checks.require(key, value, (0.0..=1e9).contains(&value), "0 s to 1e9 s");
         }
         let good = rate == 0.0 || (1e3..=1e12).contains(&rate);
@@ -79,9 +85,10 @@ mod tests {
             garbage_bytes_max: 0,
             memory_bytes_max: 0,
             backlog_bytes_max: u64::MAX,
+            held_every_s: -1.0,
         };
-        assert_eq!(bad.problems().len(), 7);
+        assert_eq!(bad.problems().len(), 8);
         let open = ListenConfig { first_packet_s_max: 0.0, idle_s_max: 0.0, bytes_per_s_max: 0.0, ..bad };
-        assert_eq!(open.problems().len(), 4);
+        assert_eq!(open.problems().len(), 5);
     }
 }

@@ -11,8 +11,9 @@ use tokio::sync::Notify;
 use tokio::task::spawn_blocking;
 use tokio::time::{Instant, sleep_until, timeout};
 
-use super::listener::{BUSY, CLOSED, First, ListenContext, PacketBatch, first};
-use super::report::{ConnectionEnd, SenderReport};
+use super::held::WaitingSender;
+use super::listener::{First, ListenContext, PacketBatch, first};
+use super::report::{BUSY, CLOSED, ConnectionEnd, ListenEvent, SenderReport};
 use super::sender_intake::{SenderIntake, Signs};
 use crate::downlink::receive::ReceptionCounters;
 
@@ -32,6 +33,10 @@ struct ConnectionState {
     intake: SenderIntake,
     chunk: Vec<u8>,
     packets: Vec<u8>,
+    /// Bytes of all senders up to the last packet passed on.
+    mark: u64,
+    /// When the last bytes arrived.
+    arrived: Instant,
 }
 
 /// A connection's place.
@@ -58,6 +63,8 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
     let mut bytes = 0;
     let (state, mut ended) = exchange(&mut stream, &seat, &mut bytes).await;
     let (mut packets, mut refused, mut format) = (0, 0, None);
+    // Bytes of the downlink, and where its last packet is, for a sender that asks until it is held.
+    let (mut sent, mut mark) = (bytes, None);
     let mut counters = ReceptionCounters::default();
     let finished = state.map(|mut state| {
         spawn_blocking(move || {
@@ -71,25 +78,33 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
         if let (ConnectionEnd::Whole, Err(refused)) = (ended, finished) {
             ended = refused;
         }
-        if !hand_on(std::mem::take(&mut state.packets), &seat).await {
+        if !hand_on(&mut state, &seat).await {
             ended = ConnectionEnd::Stopped;
         }
         (packets, refused) = state.intake.packets();
         format = state.intake.format();
+        sent = bytes - state.intake.opening_bytes();
+        mark = state.intake.asks_held().then_some(state.mark);
         counters = state.intake.stream();
         status.done.fetch_add(u64::from(state.intake.is_alive()), Ordering::Relaxed);
     }
     let answer = match ended {
-        ConnectionEnd::Whole => format!("taken {bytes} bytes\n"),
+        ConnectionEnd::Whole => format!("taken {sent} bytes\n"),
         ConnectionEnd::GaveWay => format!("{BUSY}closed after {bytes} bytes: {ended}\n"),
         other => format!("{CLOSED}after {bytes} bytes: {other}\n"),
     };
     // A sender need not read the answer.
     let _ = timeout(ANSWER, stream.write_all(answer.as_bytes())).await;
-    shared.notes.say(&format!("{peer}: {bytes} bytes, {packets} packets; {ended}"));
     let report = SenderReport { peer: peer.to_string(), format, bytes, packets, ended };
+    shared.notes.say(ListenEvent::Sender(&report));
     shared.listening.write().close(report, refused, &counters);
     status.open.fetch_sub(1, Ordering::Relaxed);
+    drop(seat);
+    if let (ConnectionEnd::Whole, Some(mark), Some(held)) = (ended, mark, &shared.held)
+        && let Ok(stream) = stream.into_std()
+    {
+        held.add(WaitingSender { stream, bytes: sent, mark }, shared.config.connections_max);
+    }
 }
 
 /// Reads until either side ends the connection. Returns no state if the receiver failed.
@@ -104,8 +119,14 @@ async fn exchange(
         true => ((rate / READS_PER_S) as usize).clamp(READ_BYTES_MIN, READ_BYTES),
         false => READ_BYTES,
     };
-    let intake = SenderIntake::new(shared.mission.clone());
-    let mut state = ConnectionState { intake, chunk: vec![0; read_bytes], packets: Vec::new() };
+    let intake = SenderIntake::new(shared.mission.clone(), shared.held.is_some());
+    let mut state = ConnectionState {
+        intake,
+        chunk: vec![0; read_bytes],
+        packets: Vec::new(),
+        mark: 0,
+        arrived: Instant::now(),
+    };
     // Time spent waiting for the sender only.
     let mut silence = Duration::ZERO;
     let mut due = Instant::now();
@@ -114,6 +135,7 @@ async fn exchange(
             Ok(read) => read,
             Err(ended) => return (Some(state), ended),
         };
+        state.arrived = Instant::now();
         *bytes += read as u64;
         shared.listening.status.bytes.fetch_add(read as u64, Ordering::Relaxed);
         // On another thread: work for this connection must not delay the others.
@@ -131,8 +153,7 @@ async fn exchange(
         if is_new {
             shared.seats.note_new(seat.number, Instant::now());
         }
-        let packets = std::mem::take(&mut state.packets);
-        if !hand_on(packets, seat).await {
+        if !hand_on(&mut state, seat).await {
             return (Some(state), ConnectionEnd::Stopped);
         }
         if let Err(ended) = found.and(within_limits(&state.intake, shared)) {
@@ -182,8 +203,9 @@ fn within_limits(intake: &SenderIntake, shared: &ListenContext) -> Result<(), Co
     Ok(())
 }
 
-/// Passes packets to the ground once there is room. Returns whether the ground still accepts any.
-async fn hand_on(bytes: Vec<u8>, seat: &SeatTaken<'_>) -> bool {
+/// Passes the packets found to the ground once there is room. Returns whether the ground still accepts any.
+async fn hand_on(state: &mut ConnectionState, seat: &SeatTaken<'_>) -> bool {
+    let bytes = std::mem::take(&mut state.packets);
     if bytes.is_empty() {
         return true;
     }
@@ -204,5 +226,7 @@ async fn hand_on(bytes: Vec<u8>, seat: &SeatTaken<'_>) -> bool {
         let mut report = shared.listening.write();
         report.backlog_bytes_max = report.backlog_bytes_max.max(backlog);
     }
-    shared.batches.send(PacketBatch { bytes, room }).is_ok()
+    let passed = shared.pass(PacketBatch { bytes, room, arrived: state.arrived.into_std() });
+    state.mark = passed.unwrap_or(state.mark);
+    passed.is_some()
 }

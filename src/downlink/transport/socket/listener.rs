@@ -15,7 +15,8 @@ use tokio::time::{Instant, sleep, timeout};
 
 use super::config::ListenConfig;
 use super::connection::serve;
-use super::report::Listening;
+use super::held::HeldAnswers;
+use super::report::{BUSY, ListenEvent, ListenNote, Listening};
 use super::seats::{Room, Seats};
 use super::sender_intake::Mission;
 
@@ -25,14 +26,8 @@ const TICK: Duration = Duration::from_millis(50);
 /// Number of notes allowed at once; after that one per second.
 const NOTES_AT_ONCE: f64 = 20.0;
 
-/// Begins an answer after which a sender may try again.
-pub(super) const BUSY: &str = "busy: ";
-
-/// Begins an answer after which it is of no use to try again.
-pub(super) const CLOSED: &str = "closed ";
-
 /// Receives notes about connections.
-pub type Teller = Box<dyn Fn(&str) + Send + Sync>;
+pub type Teller = Box<dyn Fn(&ListenNote<'_>) + Send + Sync>;
 
 /// When listening ends, apart from the end of the run.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -47,6 +42,8 @@ pub struct Until {
 pub(super) struct PacketBatch {
     pub(super) bytes: Vec<u8>,
     pub(super) room: OwnedSemaphorePermit,
+    /// When their last bytes were read.
+    pub(super) arrived: std::time::Instant,
 }
 
 /// What all connections share.
@@ -58,6 +55,10 @@ pub(super) struct ListenContext {
     pub(super) seats: Seats,
     pub(super) room: Arc<Semaphore>,
     pub(super) batches: Sender<PacketBatch>,
+    /// Bytes in all batches so far; locked while one is sent, so that batches are counted in their order.
+    pub(super) passed: Mutex<u64>,
+    /// Who is told what checkpoints hold; `None` if there are none.
+    pub(super) held: Option<HeldAnswers>,
     /// True once reading must stop.
     pub(super) stop: Arc<watch::Sender<bool>>,
     pub(super) notes: Notes,
@@ -69,6 +70,13 @@ impl ListenContext {
     /// Size of the backlog, bytes.
     pub(super) fn room_bytes(config: &ListenConfig) -> usize {
         (config.backlog_bytes_max as usize).min(Semaphore::MAX_PERMITS)
+    }
+
+    /// Passes a batch on; returns the bytes in all batches up to its end, or `None` if nobody takes it.
+    pub(super) fn pass(&self, batch: PacketBatch) -> Option<u64> {
+        let mut passed = self.passed.lock().unwrap_or_else(PoisonError::into_inner);
+        *passed += batch.bytes.len() as u64;
+        self.batches.send(batch).ok().map(|()| *passed)
     }
 
     pub(super) fn note_sign(&self) {
@@ -100,7 +108,7 @@ impl ListenContext {
         // A sender need not read the answer.
         let _ =
             stream.try_write(format!("{BUSY}there are downlink.listen.connections_max others\n").as_bytes());
-        self.notes.say(&format!("{peer}: refused; there are downlink.listen.connections_max others"));
+        self.notes.say(ListenEvent::SenderRefused { peer: peer.to_string() });
     }
 }
 
@@ -135,7 +143,7 @@ pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
             First::B(Ok(Ok(accepted))) => newcomer = Some(accepted),
             // Too many open files, or the peer is gone already: others may connect.
             First::B(Ok(Err(error))) => {
-                shared.notes.say(&format!("cannot accept a connection: {error}"));
+                shared.notes.say(ListenEvent::AcceptFailed { reason: error.to_string() });
                 sleep(TICK).await;
             }
         }
@@ -173,7 +181,7 @@ impl Notes {
         Self { tell, budget: Mutex::new((NOTES_AT_ONCE, Instant::now(), 0)) }
     }
 
-    pub(super) fn say(&self, note: &str) {
+    pub(super) fn say(&self, what: ListenEvent<'_>) {
         let mut budget = self.budget.lock().unwrap_or_else(PoisonError::into_inner);
         let (left, since, unsaid) = &mut *budget;
         *left = (*left + since.elapsed().as_secs_f64()).min(NOTES_AT_ONCE);
@@ -183,9 +191,6 @@ impl Notes {
             return;
         }
         *left -= 1.0;
-        match std::mem::take(unsaid) {
-            0 => (self.tell)(note),
-            unsaid => (self.tell)(&format!("{note} ({unsaid} notes before it are only in the summary)")),
-        }
+        (self.tell)(&ListenNote { what, untold: std::mem::take(unsaid) });
     }
 }

@@ -21,12 +21,17 @@
 //! continue. Once a sender has closed its side and all its packets are passed on, the ground answers with a line of
 //! text, `taken N bytes`, and closes.
 //!
+//! A sender that begins with the line `answer held` is also told `held N bytes`, once a checkpoint on disk has all of it
+//! ([`HeldAnswers`]). The source asks the ground for a checkpoint with an empty piece of the stream. The connection's place is
+//! free while it waits; the last checkpoint of the run, which comes after the listener has ended, answers too.
+//!
 //! Packets carry no signature: whoever can connect can add to the maps. Therefore addresses other than those of this
 //! machine require an explicit option.
 
 mod config;
 mod connection;
 mod error;
+mod held;
 mod listener;
 mod report;
 mod seats;
@@ -37,8 +42,9 @@ mod url;
 
 pub use config::ListenConfig;
 pub use error::SocketError;
+pub use held::HeldAnswers;
 pub use listener::{Teller, Until};
-pub use report::{ConnectionEnd, ListenReport, ListenStatus, Listening, SenderReport};
+pub use report::{ConnectionEnd, ListenNote, ListenReport, ListenStatus, Listening, SenderReport};
 pub use sender_intake::InstrumentCheck;
 pub use sink::{SendOptions, SocketSink};
 pub use source::SocketSource;

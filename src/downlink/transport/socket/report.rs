@@ -11,6 +11,12 @@ use crate::downlink::receive::Listing;
 use crate::downlink::receive::ReceptionCounters;
 use crate::downlink::wire::Format;
 
+/// Begins an answer after which a sender may try again.
+pub(super) const BUSY: &str = "busy: ";
+
+/// Begins an answer after which it is of no use to try again.
+pub(super) const CLOSED: &str = "closed ";
+
 /// How a connection ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -36,6 +42,8 @@ pub enum ConnectionEnd {
     UnfitInstrument,
     /// The ground knows no instrument, and this one came without visibilities and their positions.
     Unconfirmed,
+    /// It asked to be told what checkpoints hold, and the ground has no state.
+    NoState,
     /// All places were taken, and it was the least useful.
     GaveWay,
     /// Its receiver failed: a bug in the program.
@@ -57,6 +65,9 @@ impl fmt::Display for ConnectionEnd {
             Self::Unconfirmed => {
                 "no visibilities with positions confirmed its instrument, and the ground knows none"
             }
+            Self::NoState => {
+                "it asks for `held`, and the ground has no checkpoints; expected a ground with --state"
+            }
             Self::GaveWay => "it gave way to another; all downlink.listen.connections_max were taken",
             Self::Failed => "its receiver failed, which is a bug in the program",
         })
@@ -76,6 +87,59 @@ pub struct SenderReport {
     pub packets: u64,
     /// How it ended.
     pub ended: ConnectionEnd,
+}
+
+/// Something that happened to a connection, told when it happens. As a value it has the field `event`.
+#[derive(Debug, Serialize)]
+pub struct ListenNote<'a> {
+    /// What it was.
+    #[serde(flatten)]
+    pub(super) what: ListenEvent<'a>,
+    /// Notes before it that were not told, as there were too many.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub(super) untold: u64,
+}
+
+#[derive(Debug, Serialize)]
+#[serde(tag = "event", rename_all = "kebab-case")]
+pub(super) enum ListenEvent<'a> {
+    /// It ended.
+    Sender(&'a SenderReport),
+    /// It found no place.
+    SenderRefused { peer: String },
+    /// It could not be accepted.
+    AcceptFailed { reason: String },
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
+fn is_zero(count: &u64) -> bool {
+    *count == 0
+}
+
+impl ListenNote<'_> {
+    /// Whether it is the regular end of a connection.
+    #[must_use]
+    pub fn is_regular(&self) -> bool {
+        matches!(self.what, ListenEvent::Sender(SenderReport { ended: ConnectionEnd::Whole, .. }))
+    }
+}
+
+impl fmt::Display for ListenNote<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.what {
+            ListenEvent::Sender(SenderReport { peer, bytes, packets, ended, .. }) => {
+                write!(f, "{peer}: {bytes} bytes, {packets} packets; {ended}")
+            }
+            ListenEvent::SenderRefused { peer } => {
+                write!(f, "{peer}: refused; there are downlink.listen.connections_max others")
+            }
+            ListenEvent::AcceptFailed { reason } => write!(f, "cannot accept a connection: {reason}"),
+        }?;
+        match self.untold {
+            0 => Ok(()),
+            untold => write!(f, " ({untold} notes before it are only in the summary)"),
+        }
+    }
 }
 
 /// All connections of a run.

@@ -7,7 +7,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use super::error::SocketError;
-use super::listener::{BUSY, CLOSED};
+use super::held::ASKS_HELD;
+use super::report::{BUSY, CLOSED};
 use super::url::TcpUrl;
 use crate::downlink::error::DownlinkError;
 use crate::runtime::{Cancel, Sink, Units};
@@ -39,6 +40,8 @@ pub struct SendOptions {
     pub connect_s: f64,
     /// Maximum rate, bytes/s; 0 for as fast as the receiver reads.
     pub bytes_per_s: f64,
+    /// Whether to wait until a checkpoint of the receiver holds everything.
+    pub held: bool,
 }
 
 /// Sends a byte stream to a listening ground. Connects with the first bytes, and blocks while the receiver does not
@@ -125,7 +128,10 @@ impl SocketSink {
         let mut stream = match self.stream.take() {
             Some(stream) => stream,
             None => {
-                let stream = self.connect()?;
+                let mut stream = self.connect()?;
+                if self.options.held {
+                    self.send(&mut stream, ASKS_HELD)?;
+                }
                 (self.since, self.bytes) = (Instant::now(), 0);
                 stream
             }
@@ -142,9 +148,25 @@ impl SocketSink {
     fn end(&mut self) -> Result<String, SocketError> {
         let Some(mut stream) = self.stream.take() else { return Ok(String::new()) };
         let answer = self.answer(&mut stream)?;
+        if answer.starts_with(CLOSED) || answer == self.expected() {
+            return Ok(answer);
+        }
         match answer.starts_with(BUSY) {
             true => Err(self.closed()(answer)),
+            // It has ended, or is one that does not know the question.
+            false if self.options.held => {
+                Err(self.closed()(format!("no checkpoint is known to hold them; it answered {answer:?}")))
+            }
             false => Ok(answer),
+        }
+    }
+
+    /// The answer after which the sender has no more to do.
+    fn expected(&self) -> String {
+        let bytes = self.bytes;
+        match self.options.held {
+            true => format!("taken {bytes} bytes\nheld {bytes} bytes"),
+            false => format!("taken {bytes} bytes"),
         }
     }
 
@@ -216,7 +238,7 @@ impl SocketSink {
                     piece = &piece[bytes..];
                     taken = Instant::now();
                 }
-                Err(error) if may_go_on(&error) => self.require_patience(taken)?,
+                Err(error) if may_go_on(&error) => self.require_patience(taken, "read the rest")?,
                 Err(error) => return Err(self.refused(stream, &error)),
             }
         }
@@ -231,10 +253,10 @@ impl SocketSink {
         self.closed()(reason)
     }
 
-    /// After cancellation, limits the wait for a stalled receiver.
-    fn require_patience(&self, taken: Instant) -> Result<(), SocketError> {
-        match self.cancel.is_cancelled() && taken.elapsed() > GRACE {
-            true => Err(self.closed()("the run was ended early, and the receiver does not read the rest")),
+    /// After cancellation, limits the wait for a stalled receiver, which does not do `what`.
+    fn require_patience(&self, since: Instant, what: &str) -> Result<(), SocketError> {
+        match self.cancel.is_cancelled() && since.elapsed() > GRACE {
+            true => Err(self.closed()(format!("the run was ended early, and the receiver does not {what}"))),
             false => Ok(()),
         }
     }
@@ -268,7 +290,7 @@ impl SocketSink {
                     return Err(self.closed()("its answer is not a line of text"));
                 }
                 Ok(bytes) => said.extend_from_slice(&piece[..bytes]),
-                Err(error) if may_go_on(&error) => self.require_patience(since)?,
+                Err(error) if may_go_on(&error) => self.require_patience(since, "answer")?,
                 Err(error) if said.is_empty() => return Err(self.closed()(error)),
                 // What it said before the connection broke says more.
                 Err(_) => return Err(self.closed()(String::from_utf8_lossy(&said).trim().to_owned())),
@@ -305,7 +327,7 @@ impl Sink for SocketSink {
             Ok(answer) => answer,
             Err(failure) => self.retry(failure, Self::end)?,
         };
-        if answer == format!("taken {} bytes", self.bytes) {
+        if answer == self.expected() {
             self.confirmed.store(self.bytes, Ordering::Relaxed);
         } else if !answer.is_empty() {
             return Err(self.closed()(answer).into());

@@ -11,6 +11,7 @@ use tokio::sync::{Semaphore, watch};
 
 use super::config::ListenConfig;
 use super::error::SocketError;
+use super::held::HeldAnswers;
 use super::listener::{ListenContext, Notes, PacketBatch, Teller, Until, listen};
 use super::report::Listening;
 use super::seats::Seats;
@@ -32,6 +33,7 @@ pub struct SocketSource {
     waiting: Option<(std::net::TcpListener, Mission, Teller)>,
     running: Option<(Receiver<PacketBatch>, JoinHandle<()>)>,
     room: Arc<Semaphore>,
+    held: Option<HeldAnswers>,
     stop: Arc<watch::Sender<bool>>,
     listening: Listening,
     bytes: u64,
@@ -61,6 +63,7 @@ impl SocketSource {
             waiting: Some((listener, Mission::default(), Box::new(|_| {}))),
             running: None,
             room: Arc::new(Semaphore::new(ListenContext::room_bytes(config))),
+            held: None,
             stop: Arc::new(watch::Sender::new(false)),
             listening,
             bytes: 0,
@@ -82,6 +85,14 @@ impl SocketSource {
         if let Some((listener, mission, tell)) = self.waiting.take() {
             self.waiting = Some((listener, mission.accepting(fits), tell));
         }
+        self
+    }
+
+    /// Answers senders that ask what checkpoints hold, through `answers`; the ground that writes them has to share it. Without it they
+    /// are refused.
+    #[must_use]
+    pub fn answering(mut self, answers: &HeldAnswers) -> Self {
+        self.held = Some(answers.clone());
         self
     }
 
@@ -131,6 +142,8 @@ impl SocketSource {
             seats: Seats::default(),
             room: Arc::clone(&self.room),
             batches,
+            passed: Mutex::new(0),
+            held: self.held.clone(),
             stop: Arc::clone(&self.stop),
             notes: Notes::new(tell),
             sign: Mutex::new(tokio::time::Instant::now()),
@@ -143,7 +156,7 @@ impl SocketSource {
 
     fn give(&mut self, batch: PacketBatch, out: &mut Outlet<Vec<u8>>) {
         self.bytes += batch.bytes.len() as u64;
-        out.push(batch.bytes);
+        out.push_since(batch.bytes, batch.arrived);
         drop(batch.room);
     }
 
@@ -170,6 +183,10 @@ impl Source for SocketSource {
                 self.join()?;
                 return Ok(Flow::Done);
             }
+        }
+        if self.held.as_ref().is_some_and(|held| held.ask(self.bytes)) {
+            // Nothing for the ground to take, but an occasion for a checkpoint.
+            out.push(Vec::new());
         }
         Ok(Flow::Continue)
     }

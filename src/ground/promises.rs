@@ -1,0 +1,51 @@
+//! What senders are told of checkpoints.
+
+use crate::downlink::transport::socket::HeldAnswers;
+
+/// Tells senders what is in a checkpoint.
+#[derive(Debug, Default)]
+pub(super) struct SenderPromises {
+    /// Those who wait; `None` if nobody may.
+    answers: Option<HeldAnswers>,
+    /// Bytes of the stream of which every packet has been applied, or is held.
+    pub(super) bytes: u64,
+    /// Packets that the newest checkpoint has.
+    packets: u64,
+}
+
+impl SenderPromises {
+    /// Of a ground whose newest checkpoint has this number of packets.
+    pub(super) fn since(packets: u64) -> Self {
+        Self { packets, ..Self::default() }
+    }
+
+    /// From now on tells these.
+    pub(super) fn answering(self, answers: &HeldAnswers) -> Self {
+        Self { answers: Some(answers.clone()), ..self }
+    }
+
+    /// Whether a checkpoint has to be written because senders wait for it. If the newest one has all `packets` already, they are
+    /// told.
+    pub(super) fn are_due(&self, packets: u64) -> bool {
+        let Some(answers) = self.answers.as_ref().filter(|answers| answers.begin(self.bytes)) else {
+            return false;
+        };
+        let is_new = packets > self.packets;
+        if !is_new {
+            answers.hold(self.bytes);
+        }
+        is_new
+    }
+
+    /// A checkpoint of so many packets was written, or was not.
+    pub(super) fn keep(&mut self, packets: u64, is_written: bool) {
+        if is_written {
+            self.packets = packets;
+        }
+        match &self.answers {
+            Some(answers) if is_written => answers.hold(self.bytes),
+            Some(answers) => answers.fail(),
+            None => {}
+        }
+    }
+}
