@@ -43,7 +43,7 @@ pub enum AccumulationError {
     /// The sums of an instrument take more memory than there is.
     #[error(
         "the sums of the downlink's {channels} channels take at least {:.1} GB: expected at most {:.1} GB; lower \
-         map.nside, map some channels at a time (replay --groups auto), or state another limit, as in --memory-max {}GB",
+         map.nside, map some channels at a time (--groups auto), or state another limit, as in --memory-max {}GB",
         *needed_bytes as f64 / 1e9, *limit_bytes as f64 / 1e9, needed_bytes.div_ceil(1_000_000_000)
     )]
     Memory {

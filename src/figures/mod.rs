@@ -3,6 +3,7 @@
 //! Each is a picture, a table and a few numbers, computed from a [`Plan`]; the figures of the paper are among them. Maps and
 //! their spectra are [`crate::products`], series of them studies ([`crate::pipeline::Study`]). May use every folder before it.
 
+mod baselines;
 mod coverage;
 mod error;
 mod exposure;
@@ -31,6 +32,7 @@ use crate::pipeline::Plan;
 pub fn make_figure(request: &FigureRequest, plan: &Plan, folder: &Path) -> Result<MadeFigure, FigureError> {
     let made = match request.name.as_str() {
         "spacing" => spacing::make(plan)?,
+        "baselines" => baselines::make(plan)?,
         "pair-time" => pair_time::make(plan)?,
         "uvw" => uvw::make(plan)?,
         "coverage" => coverage::make(plan, folder)?,

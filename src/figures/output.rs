@@ -51,7 +51,8 @@ impl FigureParts {
             write_atomically(&path, &bytes).map_err(|source| ProductsError::Write { path, source })?;
         }
         self.picture.write(&path("png"))?;
-        let files = ["png", "csv", "json"].map(path).into_iter().chain(self.more).collect();
+        self.picture.write(&path("svg"))?;
+        let files = ["png", "svg", "csv", "json"].map(path).into_iter().chain(self.more).collect();
         Ok(MadeFigure { figure: name.to_owned(), numbers: self.numbers, files })
     }
 }

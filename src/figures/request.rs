@@ -3,7 +3,8 @@
 use crate::units::Pair;
 
 /// The figures by name.
-pub const FIGURES: [&str; 7] = ["spacing", "pair-time", "uvw", "coverage", "rows", "waterfall", "sub-pixel"];
+pub const FIGURES: [&str; 8] =
+    ["spacing", "baselines", "pair-time", "uvw", "coverage", "rows", "waterfall", "sub-pixel"];
 
 /// Which figure to make, and of what.
 #[derive(Clone, Debug, PartialEq)]

@@ -290,7 +290,9 @@ impl SpacecraftConfig {
     /// Checks what is simulated and how, with delays and sub-bands.
     fn check_fidelity(&self, checks: &mut Checks) {
         let samples = self.fidelity == Fidelity::Samples;
-        let direct = self.model != ModelChoice::Harmonic && !self.smear_integrations && !self.smear_bandwidth;
+        let direct = matches!(self.model, ModelChoice::Auto | ModelChoice::Direct)
+            && !self.smear_integrations
+            && !self.smear_bandwidth;
         checks.require(
             "fidelity",
             "\"samples\"",
@@ -301,8 +303,8 @@ impl SpacecraftConfig {
         checks.require(
             "smear_integrations",
             true,
-            !(self.smear_integrations && self.model == ModelChoice::Direct),
-            "spacecraft.model = \"harmonic\" or \"auto\" with it, as direct sums are of instants",
+            !self.smear_integrations || matches!(self.model, ModelChoice::Auto | ModelChoice::Harmonic),
+            "spacecraft.model = \"harmonic\" or \"auto\" with it, as all others are of instants",
         );
         let good = match self.delay_centre_deg[..] {
             [] => true,

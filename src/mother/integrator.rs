@@ -33,13 +33,22 @@ const QUEUED_WINDOWS_MAX: usize = 64;
 /// have enough visibilities for an efficient batch; this depends on the windows alone.
 pub struct Integrator {
     array: Arc<Array>,
-    models: Vec<Box<dyn VisibilityModel>>,
+    models: Vec<ChannelModel>,
     instrument: Instrument,
     schedules: Vec<Schedule>,
     options: MeasurementOptions,
     queued: Vec<QueuedWindow>,
     sampled: u64,
     errors: Option<Arc<InstrumentErrors>>,
+}
+
+/// The model of a channel.
+pub struct ChannelModel {
+    /// Its preferred number of visibilities a call.
+    pub batch: usize,
+    /// The model; `None` for a channel that is simulated elsewhere. Batches are those of all channels, so that visibilities have
+    /// the same bits whichever others are simulated with them.
+    pub model: Option<Box<dyn VisibilityModel>>,
 }
 
 /// How a prediction becomes a measurement.
@@ -58,8 +67,14 @@ pub struct MeasurementOptions {
 /// A window whose visibilities have not been predicted yet.
 struct QueuedWindow {
     window: ObservingWindow,
-    /// By channel, the pairs that have integrations.
-    channels: Vec<Vec<Scheduled>>,
+    channels: Vec<QueuedChannel>,
+}
+
+/// A channel of a queued window.
+struct QueuedChannel {
+    visibilities: usize,
+    /// The pairs that have integrations; none of a channel that is simulated elsewhere.
+    pairs: Vec<Scheduled>,
 }
 
 /// The integrations of a pair in a window.
@@ -124,7 +139,7 @@ impl Integrator {
     #[must_use]
     pub fn new(
         array: Arc<Array>,
-        models: Vec<Box<dyn VisibilityModel>>,
+        models: Vec<ChannelModel>,
         instrument: Instrument,
         schedules: Vec<Schedule>,
         options: MeasurementOptions,
@@ -141,25 +156,31 @@ impl Integrator {
     /// The integrations of every channel and pair in a window.
     fn schedule(&self, window: ObservingWindow) -> QueuedWindow {
         let pairs = all_pairs(self.array.satellites());
-        let channel = |schedule: &Schedule| {
+        let channel = |(schedule, model): (&Schedule, &ChannelModel)| {
             let scheduled = |&pair: &Pair| Scheduled {
                 pair,
                 integrations: schedule.integrations(&self.array, window, pair),
             };
+            if model.model.is_none() {
+                let count = |pair: &Pair| schedule.integrations(&self.array, window, *pair).len();
+                return QueuedChannel { visibilities: pairs.par_iter().map(count).sum(), pairs: Vec::new() };
+            }
             let all: Vec<Scheduled> = pairs.par_iter().map(scheduled).collect();
-            all.into_iter().filter(|pair| !pair.integrations.is_empty()).collect()
+            let pairs: Vec<Scheduled> =
+                all.into_iter().filter(|pair| !pair.integrations.is_empty()).collect();
+            QueuedChannel { visibilities: pairs.iter().map(|pair| pair.integrations.len()).sum(), pairs }
         };
-        QueuedWindow { window, channels: self.schedules.iter().map(channel).collect() }
+        QueuedWindow { window, channels: self.schedules.iter().zip(&self.models).map(channel).collect() }
     }
 
     /// Whether the queue is large enough to be predicted.
     fn batch_is_full(&self) -> bool {
         let counts: Vec<usize> = (0..self.schedules.len())
-            .map(|channel| self.queued.iter().map(|queued| queued.visibilities(channel)).sum())
+            .map(|channel| self.queued.iter().map(|queued| queued.channels[channel].visibilities).sum())
             .collect();
         self.queued.len() >= QUEUED_WINDOWS_MAX
             || counts.iter().sum::<usize>() >= QUEUED_VISIBILITIES_MAX
-            || counts.iter().zip(&self.models).all(|(&count, model)| count >= model.batch())
+            || counts.iter().zip(&self.models).all(|(&count, model)| count >= model.batch)
             // Nothing to predict: the windows only need to be reported.
             || counts.iter().all(|&count| count == 0)
     }
@@ -175,36 +196,24 @@ impl Integrator {
         };
         // By channel, then by window.
         let mut blocks: Vec<std::vec::IntoIter<Vec<VisibilityBlock>>> = Vec::new();
-        let mut powers: Vec<Vec<SkyPowers>> = Vec::new();
+        let mut powers: Vec<(ChannelId, Vec<SkyPowers>)> = Vec::new();
         for channel in 0..self.schedules.len() {
-            let sky = SkyPowers::predict(self.models[channel].as_mut(), &self.array, &windows)?;
+            let Some(model) = &mut self.models[channel].model else { continue };
+            let sky = SkyPowers::predict(model.as_mut(), &self.array, &windows)?;
             blocks.push(self.channel_blocks(&queued, channel, &sky, (&shadows, &passes))?.into_iter());
-            powers.push(sky);
+            powers.push((ChannelId(channel as u16), sky));
             if out.is_closed() {
                 return Ok(());
             }
         }
         for (k, window) in windows.into_iter().enumerate() {
-            out.push(GroundFrame::Instrument(self.instrument.clone()));
-            for mut segment in segments_for(&self.array, window.start, window.end, EPHEMERIS_STEP_S) {
-                if let Some(pass) = passes.get(k) {
-                    pass.mislead(&mut segment, &self.array);
-                }
-                out.push(GroundFrame::Ephemeris(segment));
-            }
+            describe(&self.array, &self.instrument, window, passes.get(k), out);
             let visibilities = blocks.iter_mut().flat_map(|windows| windows.next().unwrap_or_default());
-            let autos = powers.iter().zip(0..).flat_map(|(powers, channel)| {
-                let (channel, shadow, pass) = (ChannelId(channel), shadows.get(k), passes.get(k));
-                self.autos(WindowChannel { window, channel, powers: &powers[k], shadow, pass })
+            let autos = powers.iter().flat_map(|(channel, powers)| {
+                let (shadow, pass) = (shadows.get(k), passes.get(k));
+                self.autos(WindowChannel { window, channel: *channel, powers: &powers[k], shadow, pass })
             });
-            let mut sampled = 0;
-            for block in visibilities.chain(autos) {
-                sampled += block.len() as u64;
-                out.push(GroundFrame::Visibilities(block));
-            }
-            self.sampled += sampled;
-            let (time, sampled) = (window.end, self.sampled);
-            out.push(GroundFrame::Housekeeping(Housekeeping { time, sampled, dropped: 0 }));
+            self.sampled += send_window(visibilities.chain(autos), window, self.sampled, out);
             if out.is_closed() {
                 return Ok(());
             }
@@ -236,14 +245,16 @@ impl Integrator {
                 let (window, shadow, pass) = (queued.window, shadows.get(k), passes.get(k));
                 let channel_id = ChannelId(channel as u16);
                 let context = WindowChannel { window, channel: channel_id, powers, shadow, pass };
-                queued.channels[channel].iter().map(move |pair| (context, pair))
+                queued.channels[channel].pairs.iter().map(move |pair| (context, pair))
             })
             .collect();
         let positions: Vec<Vec<PairPosition>> =
             scheduled.par_iter().map(|(context, pair)| self.positions(context.window, pair)).collect();
         let positions = positions.concat();
         let mut predictions = vec![Complex64::ZERO; positions.len()];
-        self.models[channel].predict(&positions, &mut predictions)?;
+        if let Some(model) = &mut self.models[channel].model {
+            model.predict(&positions, &mut predictions)?;
+        }
         let mut rest = &predictions[..];
         let mut parts = Vec::with_capacity(scheduled.len());
         for (_, pair) in &scheduled {
@@ -257,7 +268,7 @@ impl Integrator {
         let blocks: Vec<VisibilityBlock> = scheduled.par_iter().zip(&parts).map(measure).collect();
         let mut blocks = blocks.into_iter();
         let of_window =
-            |queued: &QueuedWindow| blocks.by_ref().take(queued.channels[channel].len()).collect();
+            |queued: &QueuedWindow| blocks.by_ref().take(queued.channels[channel].pairs.len()).collect();
         Ok(queued.iter().map(of_window).collect())
     }
 
@@ -270,6 +281,7 @@ impl Integrator {
             let time_s = from.seconds() + 0.5 * dt_s;
             let smeared = self.options.smear_integrations;
             PairPosition {
+                at: Some((scheduled.pair, time_s)),
                 r_i_m: self.array.position_m(i.into(), time_s),
                 r_j_m: self.array.position_m(j.into(), time_s),
                 span_rad: if smeared { TAU * dt_s / self.array.orbital_period_s() } else { 0.0 },
@@ -401,11 +413,38 @@ fn mean_square(samples: f64, stream: &mut impl rand::Rng) -> f64 {
     Gamma::new(samples, samples.recip()).map_or(1.0, |gamma| gamma.sample(stream))
 }
 
-impl QueuedWindow {
-    /// Integrations of one channel.
-    fn visibilities(&self, channel: usize) -> usize {
-        self.channels[channel].iter().map(|pair| pair.integrations.len()).sum()
+/// Begins a window: what the spacecraft says of the instrument, and where its daughters are.
+pub(super) fn describe(
+    array: &Array,
+    instrument: &Instrument,
+    window: ObservingWindow,
+    pass: Option<&PassErrors>,
+    out: &mut Outlet<GroundFrame>,
+) {
+    out.push(GroundFrame::Instrument(instrument.clone()));
+    for mut segment in segments_for(array, window.start, window.end, EPHEMERIS_STEP_S) {
+        if let Some(pass) = pass {
+            pass.mislead(&mut segment, array);
+        }
+        out.push(GroundFrame::Ephemeris(segment));
     }
+}
+
+/// Sends the visibilities of a window and closes it; returns their number. `sampled` is that of all windows before.
+pub(super) fn send_window(
+    blocks: impl Iterator<Item = VisibilityBlock>,
+    window: ObservingWindow,
+    sampled: u64,
+    out: &mut Outlet<GroundFrame>,
+) -> u64 {
+    let mut count = 0;
+    for block in blocks {
+        count += block.len() as u64;
+        out.push(GroundFrame::Visibilities(block));
+    }
+    let (time, sampled) = (window.end, sampled + count);
+    out.push(GroundFrame::Housekeeping(Housekeeping { time, sampled, dropped: 0 }));
+    count
 }
 
 impl Stage for Integrator {

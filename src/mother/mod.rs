@@ -3,7 +3,8 @@
 //!
 //! The space segment has two fidelities with the same output frames. [`Integrator`] simulates integrated visibilities:
 //! the prediction of a model plus thermal noise. [`correlator`] computes them from the samples of [`crate::daughters`].
-//! [`Ninth`] adds the spectra of a ninth daughter, [`Store`] buffers the frames until a pass.
+//! Where memory has no room for the models of all channels, integrators of groups of them leave their visibilities on disk
+//! ([`SpoolWriter`]), and a [`Merger`] makes the frames. [`Ninth`] adds the spectra of a ninth daughter, [`Store`] buffers the frames until a pass.
 //!
 //! May use [`crate::frames`], [`crate::array`], [`crate::response`], [`crate::daughters`] and [`crate::runtime`].
 //! Only the frames in [`crate::frames`] leave this folder, and only bytes in [`crate::downlink`] reach the ground. The
@@ -12,10 +13,12 @@
 mod config;
 pub mod correlator;
 mod integrator;
+mod merger;
 mod ninth;
 mod observer;
 mod powers;
 mod schedule;
+mod spool;
 mod store;
 mod troubles;
 
@@ -23,8 +26,10 @@ pub use config::{
     Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, IntegrationTooShort, SpacecraftConfig, StoreDrop,
     VISIBILITY_BYTES,
 };
-pub use integrator::{Integrator, MeasurementOptions, NoiseModel};
+pub use integrator::{ChannelModel, Integrator, MeasurementOptions, NoiseModel};
+pub use merger::Merger;
 pub use ninth::{NINTH_BAND_HZ, Ninth, NinthConfig, NinthSetup, NinthSky};
 pub use observer::Observer;
 pub use schedule::{Integration, Schedule};
+pub use spool::{SpoolError, SpoolReader, SpoolWriter};
 pub use store::{PacedLink, Store};

@@ -17,7 +17,7 @@ const KEPT_MIN: f64 = 0.1;
 const RUN: usize = 9;
 
 /// What a map keeps of each degree of the sky, and the Gaussian beam that keeps as much.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
 pub struct EffectiveBeam {
     /// `w_l = C_l^X / C_l^in` of the map and the input, from l = 0; with the Gaussian beam of post-processing, which the
     /// comparison's input has too. NaN (null) where the input has no power.

@@ -291,23 +291,21 @@ impl ChannelFolder {
         let how = provenance.caption(solution);
         let subtitle = format!("{} visibilities, {}; {how}", solution.visibilities, shown.resolution());
         let panel = self.panel(map, &format!("Map at {mhz} MHz"), scale);
-        let path = self.file("map.png");
         let picture = draw_map(&panel, &subtitle, &view(self.config.frame))?;
-        picture.write(&path)?;
+        self.write_picture("map", &picture)?;
         picture.write(&self.file(LATEST_PICTURE))?;
         if let Some(input) = self.input(shown.processing).cloned() {
             let panel = self.panel(input.map.values(), &format!("Input at {mhz} MHz"), scale);
-            let path = self.file("input.png");
-            draw_map(&panel, &shown.resolution(), &view(self.config.frame))?.write(&path)?;
+            let picture = draw_map(&panel, &shown.resolution(), &view(self.config.frame))?;
+            self.write_picture("input", &picture)?;
         }
         if let Some(comparison) = comparison {
-            let path = self.file("error.png");
             let title = format!("Relative error at {mhz} MHz");
-            draw_relative_error(&title, &subtitle, comparison, self.config.frame)?.write(&path)?;
-            let path = self.file("spectra.png");
+            let picture = draw_relative_error(&title, &subtitle, comparison, self.config.frame)?;
+            self.write_picture("error", &picture)?;
             let noise = if solution.instrument.noiseless { "without" } else { "with" };
             let title = format!("{mhz} MHz, {}, {noise} thermal noise", shown.resolution());
-            draw_comparison(&title, comparison)?.write(&path)?;
+            self.write_picture("spectra", &draw_comparison(&title, comparison)?)?;
         }
         self.draw_sheet(shown, &caption(solution), scale)
     }
@@ -330,8 +328,18 @@ impl ChannelFolder {
             ..Sheet::default()
         };
         let picture = draw_sheet(&panels, &sheet)?;
-        let path = self.file("sharpening.png");
-        Ok(picture.write(&path)?)
+        self.write_picture("sharpening", &picture)
+    }
+
+    /// Writes a final picture, as SVG, too, if that is wanted.
+    fn write_picture(&mut self, name: &str, picture: &Picture) -> Result<(), ProductsError> {
+        let path = self.file(&format!("{name}.png"));
+        picture.write(&path)?;
+        if self.config.svg {
+            let path = self.file(&format!("{name}.svg"));
+            picture.write(&path)?;
+        }
+        Ok(())
     }
 }
 

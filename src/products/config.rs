@@ -13,6 +13,8 @@ use crate::units::{Checks, InvalidValue};
 pub struct ProductsConfig {
     /// Whether pictures are drawn.
     pub pictures: bool,
+    /// Whether final pictures are written as SVG, too.
+    pub svg: bool,
     /// Whether every snapshot is written as a FITS map, too.
     pub snapshot_maps: bool,
     /// Celestial frame of pictures; maps are on ecliptic axes in any case.
@@ -24,13 +26,19 @@ pub struct ProductsConfig {
 
 impl Default for ProductsConfig {
     fn default() -> Self {
-        Self { pictures: true, snapshot_maps: false, frame: Frame::Galactic, smooth_fwhm_deg: 0.0 }
+        Self {
+            pictures: true,
+            svg: false,
+            snapshot_maps: false,
+            frame: Frame::Galactic,
+            smooth_fwhm_deg: 0.0,
+        }
     }
 }
 
 /// What is done with maps before they are compared and drawn: pixels are split, and smoothed to a Gaussian beam (the paper,
 /// Sect. 4: nside 64 to 256, FWHM 1 deg).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct PostProcessing {
     /// Pixels along a side into which one is split.
     pub split: usize,

@@ -19,6 +19,12 @@ pub enum ProductsError {
         /// The system's reason.
         source: std::io::Error,
     },
+    /// A folder that holds files already.
+    #[error("{}: there are files in it; expected a new or empty folder", path.display())]
+    NotEmpty {
+        /// The folder.
+        path: PathBuf,
+    },
     /// The summary of a run that cannot be read.
     #[error("cannot read {}: {source}; expected the folder of a finished run", path.display())]
     Read {

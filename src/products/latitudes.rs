@@ -8,7 +8,7 @@ use crate::sky::{Comparison, is_unseen};
 const EDGES_DEG: [f64; 7] = [0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0];
 
 /// Relative error of a map, (map - truth) / truth, in both bands at a distance from the ecliptic.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, bincode::Encode, bincode::Decode)]
 pub struct LatitudeError {
     /// Least distance from the ecliptic, degrees.
     pub from_deg: f64,

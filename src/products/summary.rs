@@ -10,7 +10,7 @@ use super::latitudes::LatitudeError;
 use crate::solve::{Diagnostics, Refinement};
 
 /// One snapshot.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
 pub struct SnapshotSummary {
     /// Number, from 1.
     pub number: u32,
@@ -27,7 +27,7 @@ pub struct SnapshotSummary {
 }
 
 /// Angular power spectra of what is compared, from l = 0.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
 pub struct PowerSpectra {
     /// C_l of the map, K^2.
     pub map_k2: Vec<f64>,
@@ -40,7 +40,7 @@ pub struct PowerSpectra {
 }
 
 /// One channel: its maps and their quality.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
 pub struct ChannelSummary {
     /// Frequency, Hz.
     pub frequency_hz: f64,

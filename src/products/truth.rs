@@ -1,5 +1,7 @@
 //! The true sky of a simulation, which the ground segment does not know.
 
+use std::collections::BTreeMap;
+
 use super::config::PostProcessing;
 use crate::sky::{Frame, InputSky, MapError, SkyMap};
 use crate::units::ChannelId;
@@ -8,7 +10,7 @@ use crate::units::ChannelId;
 ///
 /// Spectra are of the sky at its own resolution, pictures and relative errors of the sky in pixels of the maps.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Truth(Vec<ChannelTruth>);
+pub struct Truth(BTreeMap<ChannelId, ChannelTruth>);
 
 /// The true sky of a channel.
 #[derive(Clone, Debug, PartialEq)]
@@ -43,13 +45,26 @@ impl Truth {
     /// # Errors
     /// A sky that cannot be turned, resampled or smoothed.
     pub fn new(skies: &[SkyMap], shape: MapShape) -> Result<Self, MapError> {
-        skies.iter().map(|sky| ChannelTruth::new(sky, shape)).collect::<Result<_, _>>().map(Self)
+        let channels = (0..).map(ChannelId).zip(skies);
+        channels
+            .map(|(channel, sky)| Ok((channel, ChannelTruth::new(sky, shape)?)))
+            .collect::<Result<_, _>>()
+            .map(Self)
+    }
+
+    /// With that of one more channel.
+    ///
+    /// # Errors
+    /// As [`Truth::new`].
+    pub fn with(mut self, channel: ChannelId, sky: &SkyMap, shape: MapShape) -> Result<Self, MapError> {
+        self.0.insert(channel, ChannelTruth::new(sky, shape)?);
+        Ok(self)
     }
 
     /// The true sky of one channel, if known.
     #[must_use]
     pub(super) fn channel(&self, channel: ChannelId) -> Option<&ChannelTruth> {
-        self.0.get(usize::from(channel.0))
+        self.0.get(&channel)
     }
 }
 

@@ -38,6 +38,23 @@ pub struct SkyConfig {
     pub l_max: usize,
     /// Components of the generated sky.
     pub generated: GeneratedSky,
+    /// What is added to a map file.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub added: Option<AddedSky>,
+}
+
+/// `sky.added`: what is added to a map file, with the numbers of `[sky.generated]` and at `sky.nside` or the map's own
+/// if that is finer.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AddedSky {
+    /// Fluctuations on small scales.
+    pub small_scales: bool,
+    /// Point sources by their counts.
+    pub sources: bool,
+    /// Point sources of a table (CSV).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub catalogue: Option<PathBuf>,
 }
 
 impl Default for SkyConfig {
@@ -49,6 +66,7 @@ impl Default for SkyConfig {
             nside: 64,
             l_max: 0,
             generated: GeneratedSky::default(),
+            added: None,
         }
     }
 }
@@ -104,6 +122,9 @@ impl SkyConfig {
                 "no such key without sky.file: a generated sky is made for the channel's frequency";
             checks.require(key, index, self.file.is_some(), expected);
         }
+        let expected = "no such key without sky.file: a generated sky has its own parts, in sky.generated";
+        let good = self.file.is_some() || self.added.is_none();
+        checks.require("added", "(set)", good, expected);
         let mut found = checks.finish();
         found.extend(self.generated.problems());
         found

@@ -26,7 +26,7 @@ mod rotation;
 pub mod spectra;
 
 pub use compare::{Comparison, ErrorSummary, InputSky, compare, compare_with};
-pub use config::{GENERATED_NSIDE_MAX, MapFrequency, SkyConfig};
+pub use config::{AddedSky, GENERATED_NSIDE_MAX, MapFrequency, SkyConfig};
 pub use cutout::{Cutout, PlaneProjection};
 pub use error::MapError;
 pub use frame::{Frame, Rotation, rotate};

@@ -14,7 +14,7 @@ pub struct StoppingRule {
 }
 
 /// How an iteration ended.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, bincode::Encode, bincode::Decode)]
 pub struct Convergence {
     /// Products with BtN^-1B.
     pub iterations: usize,

@@ -9,7 +9,8 @@
 //!
 //! with B the rows of the true positions and Bc those of the nearest circle, converges in a few products with the former. M
 //! is solved by inner conjugate gradients, so that the outer ones are flexible (Notay 2000, SIAM J. Sci. Comput. 22, 1444).
-//! R is that of the circle's greatest eigenvalue. The map and the noise-only map share passes over the visibilities.
+//! R is that of the circle's greatest eigenvalue. The map and the noise-only map share passes over the visibilities. An earlier
+//! solution, of less data or of an iteration that was interrupted, costs one pass as a beginning and saves those that led to it.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -30,9 +31,9 @@ use crate::sky::harmonics::{Alm, synthesis};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::constants::DAY_S;
 
-/// Residual of the inner iterations: well below the third to tenth that one outer step leaves. Products in f32 reach 1e-5 only after
-/// hundreds of iterations at full size.
-const INNER_RESIDUAL: f64 = 1e-3;
+/// Residual of the inner iterations: well below the third to tenth that one outer step leaves. More exact ones save no outer step, and
+/// cost more than a pass over the visibilities.
+const INNER_RESIDUAL: f64 = 1e-2;
 
 /// When a refinement stops.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -44,7 +45,7 @@ pub struct RefineRule {
 }
 
 /// How a map was refined, and what remains of the data.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct Refinement {
     /// How the iteration for the map ended; its iterations are products with the true matrix.
     pub convergence: Convergence,
@@ -59,7 +60,7 @@ pub struct Refinement {
 }
 
 /// `|V - B x|^2 w / 2`, the mean over visibilities: 1 for noise alone that the map does not fit.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct ChiSquares {
     /// Of all.
     pub all: f64,
@@ -99,6 +100,14 @@ impl From<AccumulationError> for SolveError {
     }
 }
 
+/// Where an iteration begins, and who is told of its steps.
+pub struct RefineSteps<'a> {
+    /// Earlier solutions: of the map, without its prior, and of the noise-only map.
+    pub start: Option<[Vec<f64>; 2]>,
+    /// Gets both after each pass.
+    pub passed: &'a mut dyn FnMut([&[f64]; 2]),
+}
+
 /// Solves for the map and the noise-only map with the rows of the true positions.
 ///
 /// # Errors
@@ -108,6 +117,7 @@ pub fn solve_refined(
     request: HarmonicRequest,
     rule: RefineRule,
     prior_k: Option<&[f64]>,
+    steps: RefineSteps<'_>,
     watch: NamedWatch<'_>,
 ) -> Result<(HarmonicSolution, Refinement), SolveError> {
     check_request(&sums.circle, request.epsilon)?;
@@ -129,7 +139,7 @@ pub fn solve_refined(
         sums.data.noise.iter().zip(&sums.data.weight).map(|(noise, weight)| noise * weight.sqrt()).collect();
     let right = problem.adjoint(&[&weighted, &noise]);
     drop((weighted, noise));
-    let [map, noise] = problem.solve(right, data, rule, watch);
+    let [map, noise] = problem.solve(right, data, rule, steps, watch);
     if map.was_left() {
         return Err(SolveError::Interrupted);
     }
@@ -203,7 +213,8 @@ impl Column {
     /// Whether nothing was done about it, although there was something to do.
     fn was_left(&self) -> bool {
         // The circle's solution, too, may have been interrupted, so that its energy says nothing.
-        self.residuals.is_empty() && !self.is_stuck && self.residual.iter().any(|r| *r != 0.0)
+        let is_new = self.x.iter().all(|x| *x == 0.0);
+        is_new && self.residuals.is_empty() && !self.is_stuck && self.residual.iter().any(|r| *r != 0.0)
     }
 
     fn convergence(&self) -> Convergence {
@@ -239,6 +250,7 @@ impl Refining<'_> {
         right: Vec<Vec<f64>>,
         data: Vec<Complex64>,
         rule: RefineRule,
+        steps: RefineSteps<'_>,
         watch: NamedWatch<'_>,
     ) -> [Column; 2] {
         let task = watch.start("refined map", rule.residual_max);
@@ -272,6 +284,19 @@ impl Refining<'_> {
                 is_stuck: false,
             }
         });
+        if let Some(start) = steps.start.filter(|start| start.iter().all(|x| x.len() == columns[0].x.len())) {
+            let skies = start.each_ref().map(|x| coefficients(x, self.l_max()));
+            let (seen, products) = self.sums.rows.normal(&self.sums.plan, &skies, &self.sums.data.weight);
+            let products = products.iter().map(unknowns_of_gradient);
+            for (((column, x), mut product), seen) in columns.iter_mut().zip(start).zip(products).zip(seen) {
+                product.iter_mut().zip(&x).for_each(|(y, x)| *y += self.regularisation * x);
+                subtract(&mut column.residual, 1.0, &product);
+                column.data.iter_mut().zip(&seen).for_each(|(left, seen)| *left -= seen);
+                column.x = x;
+                column.direction = precondition(&column.residual);
+                column.energy = dot(&column.residual, &column.direction);
+            }
+        }
         while columns.iter().any(Column::is_open)
             && task.report(columns[0].residuals.len(), columns[0].relative())
         {
@@ -301,6 +326,7 @@ impl Refining<'_> {
                 column.direction.iter_mut().zip(&z).for_each(|(d, z)| *d = z + turn * *d);
                 column.residuals.push(column.relative());
             }
+            (steps.passed)([&columns[0].x, &columns[1].x]);
         }
         columns
     }

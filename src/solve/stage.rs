@@ -1,10 +1,12 @@
 //! The ground stage that turns sums into maps.
 
 use std::collections::HashMap;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use super::harmonic::{HarmonicRequest, solve_harmonics};
-use super::refined::{RefineRule, Refinement, solve_refined};
+use super::passes::PassFile;
+use super::refined::{RefineRule, RefineSteps, Refinement, solve_refined};
 use super::tikhonov::solve_pixels_watched;
 use super::{Diagnostics, SolveError, SolveWatch, StoppingRule};
 use crate::accumulation::{Snapshot, SnapshotSums, SumCounts};
@@ -57,6 +59,9 @@ pub struct SolverSetup {
     pub rule: StoppingRule,
     /// When the refinement of a harmonic map stops.
     pub refine: RefineRule,
+    /// Folder in which the passes of a refinement leave their solution, so that one that was interrupted can go on; `None` for
+    /// nowhere.
+    pub passes: Option<PathBuf>,
     /// Random probes for the traces of a final map, where its matrix is too large to be held; 0 for no traces.
     pub trace_probes: usize,
     /// Receives progress, and may interrupt.
@@ -145,10 +150,29 @@ impl Stage for Solver {
                 let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes: 0 };
                 let sums = archive.into_sums()?;
                 let rule = self.setup.refine;
-                let (solved, found) = match solve_refined(&sums, request, rule, prior.as_deref(), watch) {
-                    Err(SolveError::Interrupted) => return Ok(()),
-                    solved => solved?,
+                let of = [which.as_slice(), &data, &[epsilon.to_bits().cast_signed()]].concat();
+                let file = self.setup.passes.as_ref().map(|folder| PassFile::new(folder, channel, &of));
+                let begun = file.as_ref().and_then(PassFile::read);
+                // What was interrupted is nearer than the map before.
+                let start = begun.or_else(|| self.last.remove(&channel));
+                let mut passed = |x: [&[f64]; 2]| {
+                    if let Some(file) = &file {
+                        file.write(x);
+                    }
                 };
+                let steps = RefineSteps { start, passed: &mut passed };
+                let (solved, found) =
+                    match solve_refined(&sums, request, rule, prior.as_deref(), steps, watch) {
+                        Err(SolveError::Interrupted) => return Ok(()),
+                        solved => solved?,
+                    };
+                // Whoever makes it again wants it from its beginning, unless it was interrupted.
+                if let Some(file) = file.filter(|_| watch.goes_on()) {
+                    file.remove();
+                }
+                if !is_final {
+                    self.last.insert(channel, solved.unknowns);
+                }
                 refinement = Some(found);
                 (solved.map_k, solved.noise_k, solved.diagnostics)
             }

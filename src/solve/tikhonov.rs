@@ -12,7 +12,7 @@ use super::watch::{NamedWatch, SolveWatch};
 use crate::accumulation::{NormalSums, PixelSums};
 
 /// Diagnostics of a solution. Eigenvalues and traces are those of pixels, also for a map of harmonics.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct Diagnostics {
     /// epsilon of `R = epsilon W_max I`.
     pub epsilon: f64,

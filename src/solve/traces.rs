@@ -30,7 +30,7 @@ const CLOSED: f64 = 1e-3;
 const OPEN_MAX: f64 = 0.5;
 
 /// A value with its error.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, bincode::Encode, bincode::Decode)]
 pub struct Estimate {
     /// Value.
     pub value: f64,
@@ -48,7 +48,7 @@ impl std::ops::Div<f64> for Estimate {
 }
 
 /// Traces of the thermal covariance and of the imperfection (the paper, Sect. 4).
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, bincode::Encode, bincode::Decode)]
 pub struct Traces {
     /// `sum W / (W + eps)^2`, K^2.
     pub sigma_n_k2: Estimate,
@@ -59,7 +59,7 @@ pub struct Traces {
 }
 
 /// An epsilon for which the engine's sums determine no traces.
-#[derive(Clone, Copy, Debug, Error, PartialEq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, Error, PartialEq, serde::Serialize, bincode::Encode, bincode::Decode)]
 #[error(
     "no traces at epsilon = {epsilon:e}: eigenvalues that decide them are known to {accuracy:e} of W_max only; expected a \
      larger epsilon, or map.engine = \"pixel\", which keeps more digits"

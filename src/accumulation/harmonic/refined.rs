@@ -172,7 +172,7 @@ fn noises(setup: &RefinedSetup, held: &[HeldVisibility]) -> Vec<Complex64> {
 }
 
 /// How far the positions are from the circle on which the preconditioner places them.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct Departures {
     /// Inclination of the circle, degrees.
     pub circle_inclination_deg: f64,

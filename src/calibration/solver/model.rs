@@ -94,8 +94,10 @@ impl KnownSignal {
             .iter()
             .zip(&placed.r_j_m)
             .map(|(&r_i_m, &r_j_m)| match self.moves {
-                true => PairPosition { r_i_m: flown(r_i_m, i), r_j_m: flown(r_j_m, j), span_rad: 0.0 },
-                false => PairPosition { r_i_m, r_j_m, span_rad: 0.0 },
+                true => {
+                    PairPosition { r_i_m: flown(r_i_m, i), r_j_m: flown(r_j_m, j), span_rad: 0.0, at: None }
+                }
+                false => PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: None },
             })
             .collect();
         let frequency_hz = self.frequencies_hz[channel];

@@ -1,6 +1,8 @@
-//! A raster page with antialiased lines and fills.
+//! A page: values in colour as pixels, and above them lines, fills and text, which are kept as such until all is drawn.
 
 use std::ops::Range;
+
+use super::text::{self, Align, Style};
 
 /// Red, green, blue, 0-255.
 pub(super) type Colour = [u8; 3];
@@ -54,24 +56,72 @@ impl Stroke {
     }
 }
 
+/// What is drawn above the pixels.
+#[derive(Clone, Debug)]
+pub(super) enum Shape {
+    /// A filled rectangle, as far as it is within the clip.
+    Fill { rect: Rect, colour: Colour, alpha: f32, clip: Rect },
+    /// A line through points.
+    Line { points: Vec<(f64, f64)>, stroke: Stroke, clip: Rect },
+    /// A line of text.
+    Text { text: String, anchor: (f64, f64), align: Align, style: Style },
+}
+
 /// The page.
 pub(super) struct Canvas {
     width: usize,
     height: usize,
     pixels: Vec<[f32; 3]>,
     clip: Rect,
+    shapes: Vec<Shape>,
 }
 
 impl Canvas {
     pub fn new(width: usize, height: usize) -> Self {
         let clip = Rect { x: 0.0, y: 0.0, width: width as f64, height: height as f64 };
-        Self { width, height, pixels: vec![[255.0; 3]; width * height], clip }
+        Self { width, height, pixels: vec![[255.0; 3]; width * height], clip, shapes: Vec::new() }
     }
 
     /// Limits strokes and fills to a rectangle; `None` for the whole page.
     pub fn set_clip(&mut self, clip: Option<Rect>) {
         let page = Rect { x: 0.0, y: 0.0, width: self.width as f64, height: self.height as f64 };
         self.clip = clip.unwrap_or(page);
+    }
+
+    /// Fills a rectangle.
+    pub fn fill(&mut self, rect: Rect, colour: Colour, alpha: f32) {
+        self.shapes.push(Shape::Fill { rect, colour, alpha, clip: self.clip });
+    }
+
+    /// Draws a line through points; a point that is not finite interrupts it.
+    pub fn polyline(&mut self, points: &[(f64, f64)], stroke: Stroke) {
+        self.shapes.push(Shape::Line { points: points.to_vec(), stroke, clip: self.clip });
+    }
+
+    /// Draws a line of text ([`text::draw`]).
+    pub fn text(&mut self, text: &str, anchor: (f64, f64), align: Align, style: Style) {
+        self.shapes.push(Shape::Text { text: text.to_owned(), anchor, align, style });
+    }
+
+    /// What is drawn above the pixels; from here on it is part of them.
+    pub fn flatten(&mut self) -> Vec<Shape> {
+        let shapes = std::mem::take(&mut self.shapes);
+        for shape in &shapes {
+            match shape {
+                Shape::Fill { rect, colour, alpha, clip } => {
+                    self.clip = *clip;
+                    self.paint_fill(*rect, *colour, *alpha);
+                }
+                Shape::Line { points, stroke, clip } => {
+                    self.clip = *clip;
+                    self.paint_line(points, *stroke);
+                }
+                Shape::Text { text, anchor, align, style } => {
+                    text::paint(self, text, *anchor, *align, *style);
+                }
+            }
+        }
+        shapes
     }
 
     /// Columns of pixels from `low` to `high`, within the page and the clip.
@@ -95,8 +145,8 @@ impl Canvas {
         }
     }
 
-    /// Fills a rectangle; edge pixels by the fraction covered.
-    pub fn fill(&mut self, rect: Rect, colour: Colour, alpha: f32) {
+    /// Edge pixels by the fraction covered.
+    fn paint_fill(&mut self, rect: Rect, colour: Colour, alpha: f32) {
         for y in self.rows(rect.y, rect.bottom()) {
             let covered_y = overlap(y, rect.y, rect.bottom());
             for x in self.columns(rect.x, rect.right()) {
@@ -112,8 +162,7 @@ impl Canvas {
         self.polyline(&[(x, y), (right, y), (right, bottom), (x, bottom), (x, y)], stroke);
     }
 
-    /// Draws a line through points; a point that is not finite interrupts it.
-    pub fn polyline(&mut self, points: &[(f64, f64)], stroke: Stroke) {
+    fn paint_line(&mut self, points: &[(f64, f64)], stroke: Stroke) {
         let pieces = pieces(points, stroke.dash);
         let reach = 0.5 * stroke.width + 1.0;
         let bounds = |a: usize, b: usize| {
@@ -144,9 +193,9 @@ impl Canvas {
         }
     }
 
-    /// The page as bytes, three per pixel.
-    pub fn into_rgb(self) -> Vec<u8> {
-        self.pixels.into_iter().flat_map(|pixel| pixel.map(|v| v.round().clamp(0.0, 255.0) as u8)).collect()
+    /// The pixels as bytes, three each; without what [`Canvas::flatten`] has not drawn yet.
+    pub fn rgb(&self) -> Vec<u8> {
+        self.pixels.iter().flat_map(|pixel| pixel.map(|v| v.round().clamp(0.0, 255.0) as u8)).collect()
     }
 }
 

@@ -48,6 +48,12 @@ pub enum PictureError {
         /// The encoder's reason.
         source: png::EncodingError,
     },
+    /// The PNG encoder failed on a tile.
+    #[error("cannot encode a tile")]
+    EncodeTile {
+        /// The encoder's reason.
+        source: png::EncodingError,
+    },
     /// The file could not be written.
     #[error("{path}: cannot write the picture; check that the folder exists and is writable")]
     Write {

@@ -1,4 +1,4 @@
-//! Pictures: sky maps in Mollweide projection, curves, values over two axes, PNG files.
+//! Pictures: sky maps in Mollweide projection, curves, values over two axes; PNG and SVG files.
 //!
 //! Everything is drawn here, antialiased, with an embedded font. The result does not depend on the machine's fonts or
 //! libraries, so equal data give equal bytes. May use [`crate::sky`] and [`crate::files`].
@@ -14,7 +14,9 @@ mod projection;
 mod raster;
 mod scale;
 mod sheet;
+mod svg;
 mod text;
+mod tile;
 
 pub use curves::{Axis, Curve, Plot, draw_plots};
 pub use error::PictureError;
@@ -24,6 +26,7 @@ pub use png_file::Picture;
 pub use raster::{Raster, draw_rasters};
 pub use scale::{ColourScale, Palette, Scaling};
 pub use sheet::{Bars, MapPanel, Sheet, draw_map, draw_sheet};
+pub use tile::tile_png;
 
 #[cfg(test)]
 mod tests;

@@ -1,9 +1,10 @@
-//! Finished pictures, and writing them as PNG files.
+//! Finished pictures, and writing them as PNG or SVG files.
 
 use std::path::Path;
 
-use super::canvas::Canvas;
+use super::canvas::{Canvas, Shape};
 use super::error::PictureError;
+use super::svg::svg_of;
 use crate::files::write_atomically;
 
 /// Maximum side of a picture, pixels.
@@ -12,19 +13,24 @@ const SIDE_MAX: usize = 16_384;
 const PIXELS_MAX: usize = 1 << 27;
 
 /// A finished picture and its text chunks.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug)]
 pub struct Picture {
     width: usize,
     height: usize,
     rgb: Vec<u8>,
+    /// Without lines, fills and texts.
+    below: Vec<u8>,
+    shapes: Vec<Shape>,
     texts: Vec<(String, String)>,
 }
 
 impl Picture {
-    pub(super) fn from_canvas(canvas: Canvas, width: usize, height: usize, title: &str) -> Self {
+    pub(super) fn from_canvas(mut canvas: Canvas, width: usize, height: usize, title: &str) -> Self {
         let software = concat!("lunarray ", env!("CARGO_PKG_VERSION")).to_owned();
         let texts = vec![("Software".to_owned(), software), ("Title".to_owned(), title.to_owned())];
-        Self { width, height, rgb: canvas.into_rgb(), texts }
+        let below = canvas.rgb();
+        let shapes = canvas.flatten();
+        Self { width, height, rgb: canvas.rgb(), below, shapes, texts }
     }
 
     /// Checks the size of a page.
@@ -68,6 +74,10 @@ impl Picture {
     /// # Errors
     /// What the encoder says.
     pub fn to_png(&self) -> Result<Vec<u8>, png::EncodingError> {
+        self.encoded(&self.rgb)
+    }
+
+    fn encoded(&self, rgb: &[u8]) -> Result<Vec<u8>, png::EncodingError> {
         let mut bytes = Vec::new();
         let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
         encoder.set_color(png::ColorType::Rgb);
@@ -77,18 +87,30 @@ impl Picture {
             encoder.add_itxt_chunk(keyword.clone(), text.clone())?;
         }
         let mut writer = encoder.write_header()?;
-        writer.write_image_data(&self.rgb)?;
+        writer.write_image_data(rgb)?;
         writer.finish()?;
         Ok(bytes)
     }
 
-    /// Writes the picture atomically.
+    /// The picture as an SVG file in memory: lines and texts as such, values in colour as an image within.
+    ///
+    /// # Errors
+    /// What the encoder of the image says.
+    pub fn to_svg(&self) -> Result<String, png::EncodingError> {
+        let is_blank = self.below.iter().all(|&value| value == 255);
+        let image = if is_blank { None } else { Some(self.encoded(&self.below)?) };
+        let title = self.texts.iter().find(|(keyword, _)| keyword == "Title").map_or("", |(_, title)| title);
+        Ok(svg_of(self.width, self.height, title, image.as_deref(), &self.shapes))
+    }
+
+    /// Writes the picture atomically: as SVG to a name that ends so, else as PNG.
     ///
     /// # Errors
     /// [`PictureError::Write`] with the system's reason, [`PictureError::Encode`].
     pub fn write(&self, path: &Path) -> Result<(), PictureError> {
-        let bytes =
-            self.to_png().map_err(|source| PictureError::Encode { path: path.to_path_buf(), source })?;
+        let is_svg = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("svg"));
+        let bytes = if is_svg { self.to_svg().map(String::into_bytes) } else { self.to_png() };
+        let bytes = bytes.map_err(|source| PictureError::Encode { path: path.to_path_buf(), source })?;
         write_atomically(path, &bytes)
             .map_err(|source| PictureError::Write { path: path.to_path_buf(), source })
     }

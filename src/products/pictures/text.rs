@@ -60,11 +60,11 @@ impl Style {
 }
 
 /// Size of a subscript and its drop below the line, relative to the size of the text.
-const SUBSCRIPT_SIZE: f64 = 0.72;
-const SUBSCRIPT_DROP: f64 = 0.16;
+pub(super) const SUBSCRIPT_SIZE: f64 = 0.72;
+pub(super) const SUBSCRIPT_DROP: f64 = 0.16;
 
 /// The runs of a text; `_{...}` marks subscripts.
-fn runs(text: &str) -> Vec<(&str, bool)> {
+pub(super) fn runs(text: &str) -> Vec<(&str, bool)> {
     let mut runs = Vec::new();
     let mut rest = text;
     while let Some((before, after)) = rest.split_once("_{") {
@@ -97,13 +97,23 @@ pub(super) fn length(text: &str, style: Style) -> f64 {
 
 /// Draws a line of text; `anchor` is at mid-height of its capitals, `_{...}` marks subscripts.
 pub(super) fn draw(canvas: &mut Canvas, text: &str, anchor: (f64, f64), align: Align, style: Style) {
+    canvas.text(text, anchor, align, style);
+}
+
+/// Height of capitals, half of it, for a size of 1: those of Roboto are 0.711 em high, and an em is 0.853 of ascent plus descent.
+pub(super) const HALF_CAPITAL: f64 = 0.5 * 0.711 * EM;
+
+/// An em, for a size of 1.
+pub(super) const EM: f64 = 0.853;
+
+/// Paints it onto the pixels.
+pub(super) fn paint(canvas: &mut Canvas, text: &str, anchor: (f64, f64), align: Align, style: Style) {
     let back = match align {
         Align::Start => 0.0,
         Align::Middle => 0.5 * length(text, style),
         Align::End => length(text, style),
     };
-    // Capitals of Roboto are 0.711 em high and an em is 0.853 of ascent plus descent.
-    let half_capital = 0.5 * 0.711 * 0.853 * style.size;
+    let half_capital = HALF_CAPITAL * style.size;
     let mut along = 0.0;
     for (run, subscript) in runs(text) {
         let (style, drop) = lowered(style, subscript);

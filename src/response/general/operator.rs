@@ -48,7 +48,7 @@ impl GeneralRows {
         &self.setup
     }
 
-    /// Plans the rows of visibilities, which are sorted by pair and time.
+    /// Plans the rows of visibilities: few of them where consecutive ones are of one pair and in the order of time.
     ///
     /// # Errors
     /// The first visibility whose positions have no row.

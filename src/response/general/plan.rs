@@ -88,7 +88,8 @@ pub struct RowPlan {
 }
 
 impl RowPlan {
-    /// Plans rows for visibilities sorted by pair and time. `direct` computes each row for itself.
+    /// Plans rows for visibilities; consecutive ones of a pair in the order of time share rows. `direct` computes each row for
+    /// itself.
     ///
     /// # Errors
     /// The first visibility whose positions have no row.
@@ -117,7 +118,8 @@ impl RowPlan {
         let mut first = 0;
         while first < pairs.len() {
             let together = |k: &usize| {
-                pairs[*k].pair == pairs[first].pair && pairs[*k].time_s - pairs[*k - 1].time_s <= GAP_S
+                let step_s = pairs[*k].time_s - pairs[*k - 1].time_s;
+                pairs[*k].pair == pairs[first].pair && (0.0..=GAP_S).contains(&step_s)
             };
             let end = (first + 1..pairs.len()).take_while(together).last().map_or(first + 1, |k| k + 1);
             let pass = PassBuilder { setup, pairs, views: &views, classes: &classes, direct };

@@ -159,6 +159,7 @@ mod tests {
             r_i_m: array.position_m(i, t_s),
             r_j_m: array.position_m(j, t_s),
             span_rad: 0.0,
+            at: None,
         };
         let pairs =
             [(0, 1, 100.0), (0, 4, 900.0), (0, 5, 4000.0), (2, 6, 7000.0), (0, 7, 2000.0)].map(position);

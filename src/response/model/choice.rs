@@ -5,6 +5,9 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use super::{general, harmonic};
+use crate::response::general::row_tables_bytes;
+
 /// The model asked for in the configuration.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -14,8 +17,10 @@ pub enum ModelChoice {
     Auto,
     /// Sums over the sky's pixels.
     Direct,
-    /// Spherical harmonics.
+    /// Spherical harmonics; satellites follow each other on one circle.
     Harmonic,
+    /// Spherical harmonics for satellites anywhere.
+    General,
 }
 
 /// Kind of a visibility model.
@@ -24,8 +29,22 @@ pub enum ModelChoice {
 pub enum ModelKind {
     /// Sums over the sky's pixels.
     Direct,
-    /// Spherical harmonics.
+    /// Spherical harmonics on a circle.
     Harmonic,
+    /// Spherical harmonics anywhere.
+    General,
+}
+
+impl ModelKind {
+    /// Preferred number of visibilities a call ([`VisibilityModel::batch`](super::VisibilityModel::batch)).
+    #[must_use]
+    pub fn batch(self) -> usize {
+        match self {
+            Self::Direct => 1,
+            Self::Harmonic => harmonic::BATCH,
+            Self::General => general::BATCH,
+        }
+    }
 }
 
 impl fmt::Display for ModelKind {
@@ -33,6 +52,7 @@ impl fmt::Display for ModelKind {
         f.write_str(match self {
             Self::Direct => "direct",
             Self::Harmonic => "harmonic",
+            Self::General => "general",
         })
     }
 }
@@ -50,6 +70,8 @@ pub struct Load {
     pub l_max: usize,
     /// Whether visibilities are averages over their integrations.
     pub smeared: bool,
+    /// Whether satellites follow each other on one circle, as the harmonic model has them.
+    pub circle: bool,
 }
 
 /// The chosen model, the reason, and the cost of each.
@@ -59,7 +81,7 @@ pub struct ModelPlan {
     pub kind: ModelKind,
     /// Reason for the choice.
     pub why: &'static str,
-    /// Band limit of the harmonic model.
+    /// Band limit of the harmonic and of the general model.
     pub l_max: usize,
     /// Longest baseline of the harmonic model, wavelengths.
     pub baseline_wavelengths_max: f64,
@@ -69,6 +91,8 @@ pub struct ModelPlan {
     pub set_up_fringes: f64,
     /// Cost of one visibility of the harmonic model, in such fringes.
     pub visibility_fringes: f64,
+    /// Cost of one visibility of the general model, in such fringes.
+    pub general_fringes: f64,
     /// Memory of the chosen model, bytes.
     pub bytes: f64,
 }
@@ -77,6 +101,8 @@ pub struct ModelPlan {
 const L_MAX: usize = 1024;
 /// Direct sums up to this cost are preferred: about a minute on two cores, and they have no band limit.
 const DIRECT_FRINGES_ALLOWED: f64 = 1.2e11;
+/// Memory of a batch of the general model, bytes a position: the position, its view, its row's place.
+const POSITION_BYTES: f64 = 600.0;
 /// Most memory of a harmonic model that was not asked for, bytes.
 const BYTES_ALLOWED: f64 = 8e9;
 
@@ -108,9 +134,24 @@ impl ModelPlan {
         let harmonic_fringes = set_up_fringes + visibility_fringes * load.visibilities;
         // Patterns of both signs of mu; d+ and d-; rotated skies.
         let harmonic_bytes = 2.2 * l * l * nodes + 4.0 / 3.0 * l * l * l + 600.0 * l * l;
+        // A row for every 45 visibilities, and their interpolation (bench `general`).
+        let general_fringes = 7e3 + 0.7 * l * (l + TAU * u_max);
         let (kind, why) = match choice {
             ModelChoice::Direct => (ModelKind::Direct, "as configured"),
             ModelChoice::Harmonic => (ModelKind::Harmonic, "as configured"),
+            ModelChoice::General => (ModelKind::General, "as configured"),
+            ModelChoice::Auto if !load.circle => {
+                if direct_fringes <= DIRECT_FRINGES_ALLOWED {
+                    (ModelKind::Direct, "takes a minute at most")
+                } else if general_fringes < pixels {
+                    (ModelKind::General, "no common circle; cheaper than direct sums")
+                } else {
+                    (
+                        ModelKind::Direct,
+                        "harmonics on a circle need a common one; cheaper than at true positions",
+                    )
+                }
+            }
             ModelChoice::Auto if load.smeared => (ModelKind::Harmonic, "averages over integrations"),
             ModelChoice::Auto if direct_fringes <= DIRECT_FRINGES_ALLOWED => {
                 (ModelKind::Direct, "takes a minute at most")
@@ -124,6 +165,10 @@ impl ModelPlan {
         let bytes = match kind {
             ModelKind::Direct => 28.0 * pixels,
             ModelKind::Harmonic => harmonic_bytes,
+            ModelKind::General => {
+                let threads = rayon::current_num_threads();
+                row_tables_bytes(l_max, u_max, threads) as f64 + POSITION_BYTES * general::BATCH as f64
+            }
         };
         Self {
             kind,
@@ -133,6 +178,7 @@ impl ModelPlan {
             direct_fringes,
             set_up_fringes,
             visibility_fringes,
+            general_fringes,
             bytes,
         }
     }
@@ -157,7 +203,7 @@ mod tests {
     use super::*;
 
     fn load(visibilities: f64, sky_nside: usize, u: f64) -> Load {
-        Load { visibilities, sky_nside, baseline_wavelengths_max: u, l_max: 0, smeared: false }
+        Load { visibilities, sky_nside, baseline_wavelengths_max: u, l_max: 0, smeared: false, circle: true }
     }
 
     #[test]
@@ -177,10 +223,22 @@ mod tests {
     }
 
     #[test]
+    fn without_a_circle_large_jobs_take_rows_at_true_positions() {
+        let plan = |load| ModelPlan::new(ModelChoice::Auto, Load { circle: false, ..load }).kind;
+        assert_eq!(plan(load(5e4, 64, 31.3)), ModelKind::Direct);
+        assert_eq!(plan(Load { l_max: 288, ..load(2.6e7, 256, 125.2) }), ModelKind::General);
+        // Few degrees cost little, and so do few pixels.
+        assert_eq!(plan(Load { l_max: 20, ..load(2.6e7, 64, 3.0) }), ModelKind::General);
+        assert_eq!(plan(load(2.6e7, 16, 125.2)), ModelKind::Direct);
+    }
+
+    #[test]
     fn what_is_asked_for_is_taken() {
-        for (choice, kind) in
-            [(ModelChoice::Direct, ModelKind::Direct), (ModelChoice::Harmonic, ModelKind::Harmonic)]
-        {
+        for (choice, kind) in [
+            (ModelChoice::Direct, ModelKind::Direct),
+            (ModelChoice::Harmonic, ModelKind::Harmonic),
+            (ModelChoice::General, ModelKind::General),
+        ] {
             let plan = ModelPlan::new(choice, Load { l_max: 200, ..load(10.0, 512, 10.0) });
             assert_eq!((plan.kind, plan.l_max), (kind, 200));
         }

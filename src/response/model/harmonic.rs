@@ -15,7 +15,7 @@ use crate::sky::harmonics::Alm;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 /// Visibilities of a batch: some twenty windows of the fiducial array at 10 MHz. Twice as many are no faster.
-const BATCH: usize = 100_000;
+pub(super) const BATCH: usize = 100_000;
 
 /// Greatest degree of the sky for auto-correlation powers: the coefficients of the visibility mask fall as l^-1.5, so
 /// that the rest contributes 1e-4.

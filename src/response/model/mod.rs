@@ -1,18 +1,21 @@
 //! Noise-free visibilities and auto-correlation powers of a given sky.
 //!
 //! [`VisibilityModel`] is the interface, for one sky at one frequency. [`DirectSum`] sums over the sky's pixels,
-//! [`HarmonicSum`] uses spherical harmonics, [`Reflected`] adds the image of the sky in the Moon, [`BandAverage`] averages either over a channel, and [`ModelPlan`] chooses
-//! between the two by cost. Equal arguments give equal results, whatever the threads.
+//! [`HarmonicSum`] uses spherical harmonics on a common circle, [`GeneralSum`] anywhere; [`Reflected`] adds the image of the sky in
+//! the Moon, [`BandAverage`] averages over a channel, and [`ModelPlan`] chooses by cost. Equal arguments give equal results, whatever
+//! the threads.
 
 mod band_average;
 mod choice;
 mod direct;
+mod general;
 mod harmonic;
 mod reflection;
 
 pub use band_average::BandAverage;
 pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
 pub use direct::DirectSum;
+pub use general::GeneralSum;
 pub use harmonic::{HarmonicSum, HarmonicSumSetup};
 pub use reflection::Reflected;
 
@@ -22,6 +25,7 @@ use thiserror::Error;
 use super::harmonic::{GeometryRefusal, HarmonicError};
 use super::pixel::Comb;
 use crate::array::scaled_baseline;
+use crate::units::Pair;
 use crate::units::vector::Vec3;
 
 /// Positions of the two daughters of a pair.
@@ -33,6 +37,8 @@ pub struct PairPosition {
     pub r_j_m: Vec3,
     /// Orbital phase swept during the integration, rad; 0 for an instant.
     pub span_rad: f64,
+    /// Pair and mission time, s, of positions along an orbit; consecutive ones of a pair may be interpolated from each other.
+    pub at: Option<(Pair, f64)>,
 }
 
 /// Position of one daughter, for its auto-correlation power.
@@ -75,9 +81,9 @@ pub enum ModelError {
         /// Frequency, Hz.
         frequency_hz: f64,
     },
-    /// A direct sum was asked for an average over integrations.
+    /// A model of instants was asked for an average over integrations.
     #[error(
-        "visibility model at {frequency_hz} Hz: direct sums hold for instants only; set spacecraft.model = \"harmonic\" \
+        "visibility model at {frequency_hz} Hz: all but harmonics hold for instants only; set spacecraft.model = \"harmonic\" \
          or spacecraft.smear_integrations = false"
     )]
     Smearing {
@@ -132,6 +138,6 @@ impl PairPosition {
     #[must_use]
     pub fn scaled(&self, factor: f64) -> Self {
         let (r_i_m, r_j_m) = scaled_baseline(self.r_i_m, self.r_j_m, factor);
-        Self { r_i_m, r_j_m, span_rad: self.span_rad }
+        Self { r_i_m, r_j_m, ..*self }
     }
 }

@@ -87,7 +87,7 @@ mod tests {
         let mut reflected = Reflected::new(model(moon_m), model(array.orbit_radius_m()), 0.07);
         for (i, j) in [(0, 1), (0, 2), (1, 3)] {
             let (r_i_m, r_j_m) = (array.position_m(i, 9e5), array.position_m(j, 9e5));
-            let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0 };
+            let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: None };
             let (mut found, mut power) = ([Complex64::ZERO], [0.0]);
             reflected.predict(&[position], &mut found).unwrap();
             let daughter = DaughterPosition { r_m: r_i_m, normal_hat: array.orbit_normal_hat(9e5) };

@@ -183,6 +183,14 @@ pub enum FitsProblem {
         /// Its value.
         value: f64,
     },
+    /// An image of incomplete rows.
+    #[error("an image of {found} pixels; expected a multiple of its width, {expected}")]
+    ImageSize {
+        /// Number of values.
+        found: u64,
+        /// Values of a row.
+        expected: u64,
+    },
     /// The map itself is invalid.
     #[error(transparent)]
     Map(#[from] MapError),

@@ -10,6 +10,7 @@ mod card;
 mod error;
 mod frequency;
 mod header;
+mod image;
 mod read;
 mod table;
 mod write;
@@ -19,6 +20,7 @@ pub use card::{Card, CardValue};
 pub use error::{FitsError, FitsProblem};
 pub use frequency::read_sky;
 pub use header::Header;
+pub use image::image_bytes;
 pub use read::{
     MapFile, ReadOptions, read_map, read_map_file, read_map_from, read_unit, read_whole_map,
     read_whole_map_file,

@@ -16,12 +16,14 @@
 //! | 3 | 6.08e6 | 3.67e6 | 5.81e6 | 9.40e6 | 6.84e6 | 4.67e6 | 3.95e6 |
 //! | 10 | 3.77e5 | 2.26e5 | 3.20e5 | 7.51e5 | 3.07e5 | 2.40e5 | 5.09e5 |
 
+mod added;
 mod config;
 mod features;
 mod fluctuations;
 mod galaxy;
 mod sources;
 
+pub use added::AddedSkyError;
 pub use config::{GeneratedSky, GeneratedSkyError};
 pub use sources::{CatalogueSource, catalogue};
 

@@ -15,7 +15,7 @@ use super::GeneratedSky;
 /// [`COUNTS_HZ`] (Franzen et al. 2019).
 const COUNTS: [f64; 6] = [3.52, 0.307, -0.388, -0.0404, 0.0351, 0.006_00];
 /// Frequency of the counts, Hz.
-const COUNTS_HZ: f64 = 154e6;
+pub(super) const COUNTS_HZ: f64 = 154e6;
 /// One jansky, W m^-2 Hz^-1.
 const JANSKY: f64 = 1e-26;
 /// Intervals of the tabulated integral of the counts, uniform in log S.

@@ -1,0 +1,345 @@
+//! Maps as HiPS (Hierarchical Progressive Surveys, IVOA Recommendation 1.0), which Aladin reads.
+//!
+//! The sky is divided into the HEALPix pixels of an order, each a tile of `width` by `width` HEALPix pixels of a higher order, in
+//! `NorderK/DirD/NpixN.fits` and `.png`. A tile's first row from the top begins at the southern corner: rows go to the north-east
+//! (x of the NESTED scheme), columns to the north-west (y). `Norder3/Allsky` has all tiles of order 3, 27 in a row.
+//!
+//! Tiles of the highest order take the value of the map at the centre of each of their pixels, without interpolation; those of
+//! lower orders are means of four pixels below.
+
+use std::fmt::Write;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::error::ProductsError;
+use super::pictures::{ColourScale, Palette, Scaling, tile_png};
+use crate::files::write_atomically;
+use crate::sky::fits::{Card, image_bytes};
+use crate::sky::healpix::{face_direction, nested_to_face, pixel_of};
+use crate::sky::{Frame, Rotation, SkyMap, is_unseen, rotate};
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+
+/// The order that every HiPS has, whose tiles are the first to be shown.
+const ORDER_MIN: u8 = 3;
+/// Widths of tiles: 512 is usual, and 64 is that of published maps of nside 512 (WMAP). Clients keep hundreds of tiles, and
+/// smaller ones save little: coarser maps have several pixels of a tile in one of theirs.
+const WIDTHS: [usize; 2] = [64, 512];
+/// Width of a tile in the picture of the whole sky.
+const PREVIEW_WIDTH: usize = 64;
+/// Tiles of order 3, and how many of them stand in a row of the picture of the whole sky.
+const PREVIEW_TILES: usize = 768;
+const PREVIEW_COLUMNS: usize = 27;
+
+/// How a map is written as HiPS.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Hips {
+    /// Frame of the tiles.
+    pub frame: Frame,
+    /// Scale of the colours.
+    pub scaling: Scaling,
+    /// Title, one line.
+    pub title: String,
+    /// Identifier in the Virtual Observatory, such as `ivo://AUTHORITY/P/NAME`.
+    pub id: String,
+    /// When the map was made, as `YYYY-mm-ddTHH:MMZ`.
+    pub date: String,
+    /// Frequency of the map, Hz.
+    pub frequency_hz: Option<f64>,
+}
+
+/// What was written.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct HipsReport {
+    /// Highest order of tiles.
+    pub order: u8,
+    /// Pixels along a side of a tile.
+    pub tile_width: usize,
+    /// Frame of the tiles.
+    pub frame: Frame,
+    /// Number of tiles of all orders, each as FITS and PNG.
+    pub tiles: usize,
+}
+
+/// Values of a tile, K, row by row from the top; NaN where there is none.
+type Tile = Vec<f32>;
+
+/// A HiPS that is being written.
+struct Tiles<'a> {
+    map: &'a SkyMap,
+    /// From the tiles' frame to the map's.
+    rotation: Rotation,
+    same_frame: bool,
+    scale: ColourScale,
+    order: u8,
+    width: usize,
+    folder: &'a Path,
+}
+
+/// What a tile and those in it leave to the orders above.
+struct Written {
+    tile: Tile,
+    /// Tiles of order 3 with their numbers, reduced.
+    previews: Vec<(usize, Tile)>,
+    count: usize,
+}
+
+impl Hips {
+    /// Writes a map in K into a new or empty folder. The file `properties`, without which nobody reads a HiPS, comes last.
+    ///
+    /// # Errors
+    /// A folder that is not empty, or in which files cannot be written; values beyond single precision.
+    pub fn write(&self, map: &SkyMap, folder: &Path) -> Result<HipsReport, ProductsError> {
+        let failed = |path: &Path| {
+            let path = path.to_owned();
+            move |source| ProductsError::Write { path, source }
+        };
+        fs::create_dir_all(folder).map_err(failed(folder))?;
+        if fs::read_dir(folder).map_err(failed(folder))?.next().is_some() {
+            return Err(ProductsError::NotEmpty { path: folder.to_owned() });
+        }
+        let depth = map.nside().trailing_zeros() as u8;
+        let width = (map.nside() >> ORDER_MIN).clamp(WIDTHS[0], WIDTHS[1]);
+        let order = depth.saturating_sub(width.trailing_zeros() as u8).max(ORDER_MIN);
+        let tiles = Tiles {
+            map,
+            rotation: self.frame.to_frame(map.frame()),
+            same_frame: self.frame == map.frame(),
+            scale: ColourScale::robust(map.values(), self.scaling, Palette::default()),
+            order,
+            width,
+            folder,
+        };
+        let faces: Vec<Written> =
+            (0..12).into_par_iter().map(|face| tiles.write(0, face)).collect::<Result<_, _>>()?;
+        let mut previews = Vec::new();
+        let mut count = 0;
+        for face in faces {
+            previews.extend(face.previews);
+            count += face.count;
+        }
+        tiles.write_preview(&previews)?;
+        let properties = folder.join("properties");
+        write_atomically(&properties, self.properties(&tiles).as_bytes()).map_err(failed(&properties))?;
+        Ok(HipsReport { order, tile_width: width, frame: self.frame, tiles: count })
+    }
+
+    /// The file `properties`: a key and its value a line.
+    fn properties(&self, tiles: &Tiles<'_>) -> String {
+        let seen = || tiles.map.values().iter().copied().filter(|value| !is_unseen(*value));
+        let (low, high) = (seen().fold(f64::INFINITY, f64::min), seen().fold(f64::NEG_INFINITY, f64::max));
+        let pixel_deg = (4.0 * std::f64::consts::PI / 12.0).sqrt().to_degrees()
+            / (f64::from(1_u32 << tiles.order) * tiles.width as f64);
+        let one_line = |text: &str| text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+        let mut lines: Vec<(&str, String)> = vec![
+            ("creator_did", one_line(&self.id)),
+            ("obs_title", one_line(&self.title)),
+            ("dataproduct_type", "image".into()),
+            ("hips_version", "1.4".into()),
+            ("hips_builder", concat!("lunarray ", env!("CARGO_PKG_VERSION")).into()),
+            ("hips_release_date", self.date.clone()),
+            ("hips_status", "public master clonableOnce".into()),
+            (
+                "hips_frame",
+                match self.frame {
+                    Frame::Ecliptic => "ecliptic",
+                    Frame::Galactic => "galactic",
+                    Frame::Equatorial => "equatorial",
+                }
+                .into(),
+            ),
+            ("hips_order_min", "0".into()),
+            ("hips_order", tiles.order.to_string()),
+            ("hips_tile_width", tiles.width.to_string()),
+            ("hips_tile_format", "png fits".into()),
+            ("hips_pixel_bitpix", "-32".into()),
+            ("hips_pixel_scale", format!("{pixel_deg:.6}")),
+            ("hips_pixel_cut", format!("{:e} {:e}", tiles.scale.low(), tiles.scale.high())),
+            ("hips_data_range", format!("{low:e} {high:e}")),
+            ("hips_sampling", "nearest".into()),
+            ("hips_hierarchy", "mean".into()),
+            ("hips_initial_fov", "180".into()),
+            ("moc_sky_fraction", "1".into()),
+            ("data_pixel_bitpix", "-32".into()),
+            ("data_ucd", "phot.antennaTemp".into()),
+            ("obs_regime", "Radio".into()),
+        ];
+        if let Some(wavelength_m) = self.frequency_hz.map(|hz| SPEED_OF_LIGHT_M_S / hz) {
+            lines.push(("em_min", format!("{wavelength_m:e}")));
+            lines.push(("em_max", format!("{wavelength_m:e}")));
+        }
+        lines.iter().fold(String::new(), |mut text, (key, value)| {
+            // A string takes everything that is written to it.
+            let _ = writeln!(text, "{key:<20} = {value}");
+            text
+        })
+    }
+}
+
+impl Tiles<'_> {
+    /// Writes a tile and all that are in it.
+    fn write(&self, order: u8, number: usize) -> Result<Written, ProductsError> {
+        let (mut previews, mut count) = (Vec::new(), 1);
+        let tile = if order == self.order {
+            self.sampled(number)
+        } else {
+            let mut inside = Vec::with_capacity(4);
+            for child in 4 * number..4 * number + 4 {
+                let written = self.write(order + 1, child)?;
+                previews.extend(written.previews);
+                count += written.count;
+                inside.push(written.tile);
+            }
+            self.merged(&inside)
+        };
+        if order == ORDER_MIN {
+            let mut small = tile.clone();
+            let mut width = self.width;
+            while width > PREVIEW_WIDTH {
+                small = halved(&small, width);
+                width /= 2;
+            }
+            previews.push((number, small));
+        }
+        let folder = self.folder.join(format!("Norder{order}/Dir{}", number / 10_000 * 10_000));
+        let cards = [
+            Card::text("BUNIT", "K", "temperature"),
+            Card::integer("ORDER", order.into(), "HEALPix order of the tile"),
+            Card::integer("NPIX", number as i64, "NESTED number of the tile"),
+        ];
+        self.write_both(&folder, &format!("Npix{number}"), self.width, &tile, &cards)?;
+        Ok(Written { tile, previews, count })
+    }
+
+    /// The map's values at the centres of a tile's pixels.
+    fn sampled(&self, number: usize) -> Tile {
+        let tiles = 1_usize << self.order;
+        let (face, x0, y0) = nested_to_face(tiles, number);
+        let side = (tiles * self.width) as f64;
+        let place = |first: usize, k: usize| ((first * self.width + k) as f64 + 0.5) / side;
+        let mut tile = Vec::with_capacity(self.width * self.width);
+        for row in 0..self.width {
+            for column in 0..self.width {
+                let direction = face_direction(face, place(x0, row), place(y0, column));
+                let direction = if self.same_frame { direction } else { rotate(&self.rotation, direction) };
+                let value = self.map.values()[pixel_of(self.map.nside(), direction)];
+                tile.push(if is_unseen(value) { f32::NAN } else { value as f32 });
+            }
+        }
+        tile
+    }
+
+    /// The tile that holds four.
+    fn merged(&self, inside: &[Tile]) -> Tile {
+        let half = self.width / 2;
+        let mut tile = vec![f32::NAN; self.width * self.width];
+        for (child, values) in inside.iter().enumerate() {
+            // The lower bit is of x, the upper one of y.
+            let (down, right) = (child % 2 * half, child / 2 * half);
+            for (row, values) in halved(values, self.width).chunks_exact(half).enumerate() {
+                let start = (down + row) * self.width + right;
+                tile[start..start + half].copy_from_slice(values);
+            }
+        }
+        tile
+    }
+
+    /// All tiles of order 3 in one picture.
+    fn write_preview(&self, previews: &[(usize, Tile)]) -> Result<(), ProductsError> {
+        let width = self.width.min(PREVIEW_WIDTH);
+        let columns = PREVIEW_COLUMNS * width;
+        let mut all = vec![f32::NAN; columns * width * PREVIEW_TILES.div_ceil(PREVIEW_COLUMNS)];
+        for (number, tile) in previews {
+            let (down, right) = (number / PREVIEW_COLUMNS * width, number % PREVIEW_COLUMNS * width);
+            for (row, values) in tile.chunks_exact(width).enumerate() {
+                let start = (down + row) * columns + right;
+                all[start..start + width].copy_from_slice(values);
+            }
+        }
+        let cards = [Card::text("BUNIT", "K", "temperature")];
+        self.write_both(&self.folder.join(format!("Norder{ORDER_MIN}")), "Allsky", columns, &all, &cards)
+    }
+
+    /// An image as FITS and as PNG. Thousands of them are not synchronised one by one: `properties` tells that all are there.
+    fn write_both(
+        &self,
+        folder: &Path,
+        name: &str,
+        width: usize,
+        values: &[f32],
+        cards: &[Card],
+    ) -> Result<(), ProductsError> {
+        let files: [(PathBuf, Vec<u8>); 2] = [
+            (folder.join(format!("{name}.fits")), image_bytes(width, values, cards)?),
+            (folder.join(format!("{name}.png")), tile_png(&self.scale, width, values)?),
+        ];
+        let written =
+            fs::create_dir_all(folder).map_err(|source| (folder.to_owned(), source)).and_then(|()| {
+                files
+                    .into_iter()
+                    .try_for_each(|(path, bytes)| fs::write(&path, bytes).map_err(|source| (path, source)))
+            });
+        written.map_err(|(path, source)| ProductsError::Write { path, source })
+    }
+}
+
+/// Means of four pixels each, of those that have a value.
+fn halved(values: &[f32], width: usize) -> Tile {
+    let half = width / 2;
+    let mean = |row: usize, column: usize| {
+        let four = [0, 1, width, width + 1].map(|step| values[2 * row * width + 2 * column + step]);
+        let (sum, count) = four
+            .iter()
+            .filter(|value| !value.is_nan())
+            .fold((0.0_f64, 0.0), |(sum, count), &value| (sum + f64::from(value), count + 1.0));
+        // NaN of none.
+        (sum / count) as f32
+    };
+    (0..half * half).map(|k| mean(k / half, k % half)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::units::constants::HEALPIX_UNSEEN;
+
+    #[test]
+    fn means_leave_out_what_has_no_value() {
+        let nan = f32::NAN;
+        let values = [1.0, 2.0, nan, nan, 3.0, 6.0, nan, nan, nan, 5.0, 0.0, 0.0, 7.0, nan, 1.0, 1.0];
+        let found = halved(&values, 4);
+        assert_eq!((found[0], found[2], found[3]), (3.0, 6.0, 0.5));
+        assert!(found[1].is_nan());
+    }
+
+    #[test]
+    fn a_hips_is_whole_or_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut map = SkyMap::constant(2, Frame::Galactic, 5.0).unwrap();
+        map.values_mut()[7] = HEALPIX_UNSEEN;
+        let hips = Hips {
+            frame: Frame::Galactic,
+            scaling: Scaling::Linear,
+            title: "two\nlines".into(),
+            id: "ivo://UNK.AUTH/P/test".into(),
+            date: "2026-01-01T00:00Z".into(),
+            frequency_hz: Some(3e6),
+        };
+        let out = folder.path().join("new");
+        let report = hips.write(&map, &out).unwrap();
+        assert_eq!((report.order, report.tile_width), (3, 64));
+        // Orders 0 to 3.
+        assert_eq!(report.tiles, 12 * (1 + 4 + 16 + 64));
+        let properties = fs::read_to_string(out.join("properties")).unwrap();
+        assert!(properties.contains("obs_title            = two lines\n"), "{properties}");
+        // Of 3 MHz, m.
+        assert!(properties.contains("em_min               = 9.993"), "{properties}");
+        let again = hips.write(&map, &out).unwrap_err().to_string();
+        assert!(again.contains("expected a new or empty folder"), "{again}");
+        // With one pixel for four at each order, the mean of what is seen is that of all.
+        let preview = fs::read(out.join("Norder0/Dir0/Npix0.fits")).unwrap();
+        assert_eq!(preview.len(), 2880 * (1 + (4 * 64 * 64_usize).div_ceil(2880)));
+    }
+}
