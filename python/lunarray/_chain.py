@@ -97,8 +97,9 @@ def replay(
 ) -> Replay:
     """Runs the ground segment on downlink files; iterate over what it returns to get its maps. As ``lunarray replay``.
 
-    ``map`` is a map file (a pipeline file is one), ``every`` the mission time between two snapshots, s (none if not given), ``state`` a
-    folder that keeps everything received, ``out`` a folder for products (none are kept if not given). ``truth`` is the true sky:
+    ``map`` is a map file (a pipeline file is one). Without one the settings of the maps are those of the state, if it has any; of the
+    run that made the downlink, if its ``pipeline.toml`` lies beside the first file or it was the quicklook; then the defaults.
+    ``every`` is the mission time between two snapshots, s (none if not given), ``state`` a folder that keeps everything received, ``out`` a folder for products (none are kept if not given). ``truth`` is the true sky:
     a file or pixels, or ``[(sky, frame), ..]`` by channel; then maps have ``rho_l``. The next map is made while one is looked at, and
     no more than that.
     """
@@ -109,7 +110,9 @@ def replay(
         folder = tempfile.TemporaryDirectory(prefix="lunarray-", ignore_cleanup_errors=True)
         out = folder.name
         more = {"products__pictures": False}
-    settings = overrides(None, **more, map__snapshot_every_s=None if every is None else float(every)) + overrides(set)
+    if every is not None or map is None:
+        more["map__snapshot_every_s"] = float(every or 0)
+    settings = overrides(None, **more) + overrides(set)
     if truth is not None and not isinstance(truth, list):
         truth = (truth,)
     return Replay(_native.NativeReplay(files, out, map, settings, state), truth, folder)

@@ -92,6 +92,16 @@ class Downlink:
 
         return write_uvh5(self, path, channel, phase_centre)
 
+    def write_parquet(self, path: str | PathLike[str], channel: int = 0) -> int:
+        """Writes the visibilities of a channel as Parquet, flagged ones too; returns their number.
+
+        The columns are those of ``lunarray export visibilities``, numbers as they are in the downlink; their units and the
+        description of the instrument are in the file's metadata. Needs pyarrow (``pip install lunarray[parquet]``).
+        """
+        from ._parquet import write_parquet
+
+        return write_parquet(self, path, channel)
+
     def inspect(self) -> dict[str, Any]:
         """What the file holds, and its defects: what ``lunarray inspect --json`` prints."""
         return json.loads(_native.inspect(self.path))

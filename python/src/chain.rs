@@ -25,17 +25,20 @@ const POLL: Duration = Duration::from_millis(50);
 /// Visibilities between two checkpoints of a state, as in `lunarray replay`.
 pub(crate) const CHECKPOINT_EVERY: u64 = 1_000_000;
 
-/// Settings of a ground: those of a file, or the defaults, or those of a state if there is one.
+/// Settings of a ground: those of a file; or those of a state if there is one, and of the run that made the first of these
+/// downlinks if it is known; or the defaults.
 pub(crate) fn ground_config(
     file: Option<PathBuf>,
     overrides: Vec<String>,
     state: Option<&Path>,
+    files: &[PathBuf],
 ) -> Result<Config, Failure> {
     let source = ConfigSource { file, overrides, seed: None };
     let source = match state {
         Some(folder) => source.of_state(folder)?,
         None => source,
     };
+    let (source, _) = source.of_downlink(files);
     Ok(source.load_ground()?)
 }
 
@@ -121,7 +124,7 @@ pub(crate) fn solve_state(
     let cancel = Cancel::new();
     let watch = SolveWatch::new(cancel.clone());
     let found = wait(py, &cancel, move || {
-        let config = ground_config(map, overrides, Some(&folder))?;
+        let config = ground_config(map, overrides, Some(&folder), &[])?;
         use_threads(&config.runtime)?;
         let mut found = Vec::new();
         pipeline::solve_state(&folder, &config, &epsilons, &watch, &mut |solution| {
@@ -157,7 +160,7 @@ impl NativeReplay {
     ) -> PyResult<Self> {
         // A state that is to be made takes the settings given; one that is there may be used without naming them again.
         let known = state.as_deref().filter(|folder| Ground::settings_in(folder).is_ok());
-        let config = ground_config(map, overrides, known).map_err(exception)?;
+        let config = ground_config(map, overrides, known, &files).map_err(exception)?;
         let (sender, receiver) = sync_channel(1);
         let cancel = Cancel::new();
         let ended = cancel.clone();

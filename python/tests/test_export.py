@@ -176,3 +176,112 @@ def test_the_packet_definition_in_xtce_describes_every_packet(small):
     counted = {entry["kind"]: entry["packets"] for entry in lunarray.inspect(small.downlink)["packets"]}
     names = {257: "instrument", 258: "ephemeris", 259: "visibilities", 261: "housekeeping"}
     assert {names[apid]: number for apid, number in kinds.items()} == {k: n for k, n in counted.items() if n}
+
+
+def test_parquet_has_the_same_visibilities(small, tmp_path):
+    import json
+
+    import pyarrow as pa
+    import pyarrow.parquet as parquet
+
+    downlink = lunarray.open(small.downlink)
+    expected = downlink.visibilities(1)
+    assert downlink.write_parquet(tmp_path / "v.parquet", 1) == len(expected) > 1000
+    found = parquet.read_table(tmp_path / "v.parquet")
+    assert export("visibilities", small.downlink, "--channel", 1, "--out", tmp_path / "v.csv").returncode == 0
+    with open(tmp_path / "v.csv") as file:
+        names = set(next(csv.reader(file)))
+    # Times are whole numbers of nanoseconds instead of doubles, and UTC is there, too.
+    assert set(found.column_names) == names - {"tai_s"} | {"tai", "utc"}
+
+    def column(name):
+        return found[name].to_numpy()
+
+    for name in ("time_s", "dt_s", "i", "j", "weight", "flag", "tai", "utc"):
+        np.testing.assert_array_equal(column(name), expected[name], err_msg=name)
+    for names, values in [("uvw", "uvw_m"), (("x_i", "y_i", "z_i"), "r_i_m"), (("x_j", "y_j", "z_j"), "r_j_m")]:
+        for axis, name in enumerate(names):
+            np.testing.assert_array_equal(column(f"{name}_m"), expected[values][:, axis], err_msg=name)
+    for unit in ("k_sr", "jy"):
+        np.testing.assert_array_equal(column(f"re_{unit}") + 1j * column(f"im_{unit}"), expected[f"value_{unit}"])
+    # Precision is that of the arrays.
+    assert (found.schema.field("re_k_sr").type, found.schema.field("re_jy").type) == (pa.float32(), pa.float64())
+    assert found.schema.field("utc").type == pa.timestamp("ns")
+    assert all(field.metadata[b"unit"] for field in found.schema)
+    about = found.schema.metadata
+    assert float(about[b"lunarray.frequency_hz"]) == 3e6
+    assert json.loads(about[b"lunarray.instrument"]) == downlink.instrument
+    wrong = export("visibilities", small.downlink, "--out", tmp_path / "w.parquet")
+    assert wrong.returncode == 1 and "write_parquet(..) of the Python package" in wrong.stderr
+
+
+def nested_in_rows(count):
+    """NESTED numbers of the pixels of a HiPS tile of ``count`` levels, row by row from the top, as the standard divides tiles:
+    the first of four is above left, the second below it, the third to its right, the fourth below right."""
+    if count == 0:
+        return np.zeros((1, 1), int)
+    inner, each = nested_in_rows(count - 1), 4 ** (count - 1)
+    return np.block([[inner, inner + 2 * each], [inner + each, inner + 3 * each]])
+
+
+@pytest.mark.parametrize("frame", ["ecliptic", "galactic"])
+def test_hips_tiles_have_the_values_of_the_map(tmp_path, frame):
+    """At every pixel of tiles, with healpy's directions and frames; and the tiles above, the preview and the PNG follow."""
+    from astropy.io import fits
+    from PIL import Image
+
+    rng = np.random.default_rng(8)
+    pixels = np.exp(rng.standard_normal(12 * 16**2)).astype(np.float32)
+    pixels[100] = healpy.UNSEEN
+    healpy.write_map(tmp_path / "map.fits", pixels, coord="E", column_units="K", extra_header=[("FREQ", 3e6)])
+    told = export("hips", tmp_path / "map.fits", "--hips-frame", frame, "--out", tmp_path / "hips")
+    assert told.returncode == 0, told.stderr
+    lines = (tmp_path / "hips/properties").read_text().splitlines()
+    properties = {key.strip(): value.strip() for key, value in (line.split("=", 1) for line in lines)}
+    # What the standard requires.
+    required = {"creator_did", "obs_title", "dataproduct_type", "hips_version", "hips_release_date", "hips_status"}
+    required |= {"hips_frame", "hips_order", "hips_tile_format"}
+    assert required <= set(properties)
+    assert (properties["hips_frame"], properties["hips_order"], properties["hips_tile_width"]) == (frame, "3", "64")
+    low, high = map(float, properties["hips_pixel_cut"].split())
+    assert pixels[pixels > 0].min() < low < high < pixels.max()
+
+    def tile(order, number, kind="fits"):
+        return tmp_path / f"hips/Norder{order}/Dir0/Npix{number}.{kind}"
+
+    inside = nested_in_rows(6)
+    turn = healpy.Rotator(coord=[frame[0].upper(), "E"])
+    values = np.where(pixels == healpy.UNSEEN, np.nan, pixels)
+    preview = fits.getdata(tmp_path / "hips/Norder3/Allsky.fits")[::-1]
+    finest = np.empty(12 * 512**2, np.float32)
+    wrong = 0
+    for number in range(768):
+        data, header = fits.getdata(tile(3, number), header=True)
+        assert (header["BITPIX"], header["ORDER"], header["NPIX"]) == (-32, 3, number)
+        # FITS stores rows from the bottom up.
+        data = data[::-1]
+        directions = turn(np.array(healpy.pix2vec(512, number * 64**2 + inside.ravel(), nest=True)))
+        expected = values[healpy.vec2pix(16, *directions)].reshape(64, 64)
+        wrong += (~((data == expected) | (np.isnan(data) & np.isnan(expected)))).sum()
+        row, column = divmod(number, 27)
+        np.testing.assert_array_equal(preview[64 * row : 64 * row + 64, 64 * column : 64 * column + 64], data)
+        finest[number * 64**2 + inside.ravel()] = data.ravel()
+    # Centres of tiles' pixels on edges of the map's, where rounding decides; none if both are of one grid.
+    assert wrong <= (0 if frame == "ecliptic" else 12 * 512**2 * 1e-6), wrong
+    assert len(list((tmp_path / "hips").rglob("Npix*.fits"))) == 768 + 192 + 48 + 12
+
+    # Above: means of the pixels below that have a value.
+    above = np.nanmean(finest.astype(float).reshape(-1, 4), axis=1)
+    found = np.empty(12 * 256**2)
+    for number in range(192):
+        found[number * 64**2 + inside.ravel()] = fits.getdata(tile(2, number))[::-1].ravel()
+    np.testing.assert_allclose(found, above, rtol=1e-6)
+
+    picture = np.array(Image.open(tile(3, 5, "png")))
+    data = fits.getdata(tile(3, 5))[::-1]
+    assert picture.shape == (64, 64, 4) and (picture[..., 3] == 255 * ~np.isnan(data)).all()
+    # Brighter is lighter.
+    bright = data > np.nanmedian(data)
+    assert picture[bright][:, :3].mean() > picture[~bright & ~np.isnan(data)][:, :3].mean() + 20
+    again = export("hips", tmp_path / "map.fits", "--out", tmp_path / "hips")
+    assert again.returncode == 1 and "expected a new or empty folder" in again.stderr

@@ -1,20 +1,144 @@
-"""The tutorial's code runs."""
+"""The tutorials' code runs, and so do the notebooks."""
 
+import contextlib
+import json
+import os
 import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from itertools import groupby
+from pathlib import Path
 
+import pytest
 from conftest import REPOSITORY
 
+#: For machines without it.
+CURL = """command -v curl > /dev/null || curl() {
+    python -c 'import sys, urllib.request as u; print(u.urlopen(sys.argv[-1]).read().decode())' "$@"
+}
+"""
 
-def test_the_tutorial_runs(tmp_path, monkeypatch, capsys):
+
+def blocks(page):
+    """The blocks of code that a page shows to be run, with their languages and the numbers of their first lines."""
+    text = (REPOSITORY / "docs" / page).read_text()
+    found = re.finditer(r"^```(python|sh)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    return [(match[1], match[2], text[: match.start(2)].count("\n")) for match in found]
+
+
+def run_python(page, block, line, names):
+    # Lines are those of the page, in a traceback too.
+    exec(compile("\n" * line + block, f"docs/{page}", "exec"), names)
+
+
+def run_shell(script):
+    """What a shell prints that runs a script, whose ports are free ones; fails with it."""
+    with socket.socket() as one, socket.socket() as other:
+        for port, free in (("4711", one), ("8080", other)):
+            free.bind(("127.0.0.1", 0))
+            script = script.replace(port, str(free.getsockname()[1]))
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    # A file, and no pipe: what is left in the background would hold a pipe open.
+    with tempfile.TemporaryFile("w+") as said:
+        shell = subprocess.Popen(
+            ["bash", "-euo", "pipefail", "-c", CURL + script],
+            env={**os.environ, "PATH": path},
+            stdout=said,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        try:
+            code = shell.wait(timeout=300)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(shell.pid, signal.SIGKILL)
+        said.seek(0)
+        text = said.read()
+    assert code == 0, text
+    return text
+
+
+def run_page(page):
+    """Runs all blocks of a page in order; returns what its shells print."""
+    names, said = {}, ""
+    for kind, group in groupby(blocks(page), lambda block: block[0]):
+        if kind == "sh":
+            said += run_shell("".join(block for _, block, _ in group))
+        else:
+            for _, block, line in group:
+                run_python(page, block, line, names)
+    return said
+
+
+def test_the_page_of_the_package_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    text = (REPOSITORY / "docs/python.md").read_text()
-    blocks = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    assert len(blocks) > 7
+    python = [(block, line) for kind, block, line in blocks("python.md") if kind == "python"]
+    assert len(python) > 7
     names = {}
-    for block in blocks:
-        # Lines are those of the page, in a traceback too.
-        line = text[: text.index(block)].count("\n")
-        exec(compile("\n" * line + block, "docs/python.md", "exec"), names)
+    for block, line in python:
+        run_python("python.md", block, line, names)
     said = capsys.readouterr().out
     assert "map.nside = 7: expected a power of two" in said and "final map at 3 MHz" in said
     assert (tmp_path / "map.png").stat().st_size > 10_000 and (tmp_path / "channel1.uvh5").exists()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_tutorial_for_cosmologists_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    said = run_page("tutorials/cosmologist.md")
+    assert "mine.toml: no problems" in said and "rho_l (noise power subtracted)" in said
+    printed = capsys.readouterr().out
+    assert "l = 12: rho 0." in printed and "epsilon 0.01: noise" in printed and "visibilities" in printed
+    for name in ("made.png", "spectra.csv", "alm.fits", "hips/properties", "mine.uvh5"):
+        assert (tmp_path / name).stat().st_size > 100
+
+
+def test_the_tutorial_for_ground_engineers_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = run_page("tutorials/ground-engineer.md")
+    assert "A checkpoint of tcp://127.0.0.1" in said and "No packets are missing between those received." in said
+    assert 'lunarray_run_phase{phase="running"} 1' in said and "lunarray_state_unsaved 0" in said
+    # After being killed and told everything again: every visibility once.
+    summary = json.loads((tmp_path / "maps/summary.json").read_text())
+    ledger = summary["ledger"]
+    assert ledger["sampled"] == ledger["accumulated"] + sum(ledger["flagged"].values()) and ledger["lost"] == []
+    assert summary["completeness"]["complete"]
+
+
+def test_the_tutorial_for_array_designers_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = run_page("tutorials/array-designer.md")
+    assert "six.toml: no problems" in said and "daughter 6" in said and "daughter 7" not in said
+    assert {"spacing.png", "coverage.csv", "pair-time.json"} <= {path.name for path in (tmp_path / "figures").iterdir()}
+    # Three inclinations by two epsilons, and a head.
+    assert len((tmp_path / "inclinations/study.csv").read_text().splitlines()) == 7
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["own-sky", "own-array"])
+def test_notebooks_run(name, tmp_path, monkeypatch, capsys):
+    """Their code cells in order, as a kernel would; their outputs are kept in the files."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    path = REPOSITORY / f"docs/notebooks/{name}.ipynb"
+    notebook = json.loads(path.read_text())
+    assert notebook["nbformat"] == 4 and len(notebook["cells"]) > 8
+    names, counts = {}, []
+    for number, cell in enumerate(notebook["cells"]):
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), f"{path.name}, cell {number}", "exec"), names)
+            counts.append(cell["execution_count"])
+            assert not any(output["output_type"] == "error" for output in cell["outputs"])
+    # They were kept as they were run, once and in order.
+    assert counts == list(range(1, len(counts) + 1))
+    # What is kept is what it prints now; numbers to the digits that are printed.
+    kept = [
+        "".join(output["text"])
+        for cell in notebook["cells"]
+        for output in cell.get("outputs", [])
+        if output["output_type"] == "stream"
+    ]
+    assert capsys.readouterr().out == "".join(kept)

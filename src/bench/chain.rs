@@ -55,7 +55,7 @@ pub struct QueueDepths {
 pub(super) fn run(plan: &Plan, skies: &[SkyMap]) -> Result<ChainRun, PipelineError> {
     let capacity = plan.config.runtime.queue_capacity;
     let (sampler, link, correlator) =
-        sample_stages(plan, models::build(plan, skies)?, &SampleCounts::default());
+        sample_stages(plan, models::build_all(plan, skies)?, &SampleCounts::default());
     let mut graph = Graph::new();
     let samples = graph.source("sample", capacity, sampler);
     let samples = graph.stage("link", capacity, samples, link);

@@ -223,7 +223,8 @@ fn never<T>(result: Result<T, Infallible>) -> T {
 }
 
 fn material(plan: &Plan, skies: &[SkyMap]) -> Result<Material, PipelineError> {
-    let (sampler, _, correlator) = sample_stages(plan, models::build(plan, skies)?, &SampleCounts::default());
+    let (sampler, _, correlator) =
+        sample_stages(plan, models::build_all(plan, skies)?, &SampleCounts::default());
     let samples = source(sampler)?;
     let visibilities = never(stage(correlator, samples.clone()));
     let packets = stage(Transmitter::new(&plan.config.downlink)?, visibilities.clone())?;
@@ -258,7 +259,7 @@ fn time_stage(
     name: &str,
 ) -> Result<Spent, PipelineError> {
     let (sampler, link, correlator) =
-        sample_stages(plan, models::build(plan, skies)?, &SampleCounts::default());
+        sample_stages(plan, models::build_all(plan, skies)?, &SampleCounts::default());
     // Input is copied before the clock starts, and output is dropped after it stops.
     Ok(match name {
         "sample" => {

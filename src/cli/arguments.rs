@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::output::print_notes;
 use crate::ground::GroundError;
-use crate::pipeline::{Config, ConfigError, ConfigSource, MemoryLimit};
+use crate::pipeline::{Config, ConfigError, ConfigSource, GroupSize, MemoryLimit};
 use crate::sky::Frame;
 use crate::sky::fits::ReadOptions;
 use crate::units::Dimension;
@@ -61,7 +61,8 @@ impl MapFileArgs {
     }
 }
 
-fn frame(text: &str) -> Result<Frame, String> {
+/// A frame by its name or letter.
+pub(super) fn frame(text: &str) -> Result<Frame, String> {
     Frame::from_coordsys(text).ok_or_else(|| "expected ecliptic, galactic or equatorial".to_owned())
 }
 
@@ -127,6 +128,15 @@ impl ChannelList {
     /// As an override of a setting.
     pub(super) fn setting(&self) -> String {
         format!("map.channels={:?}", self.0)
+    }
+}
+
+/// A number of channels that are taken at a time, or `auto`.
+pub(super) fn group_size(text: &str) -> Result<GroupSize, String> {
+    match (text.trim(), text.trim().parse()) {
+        ("auto", _) => Ok(GroupSize::Automatic),
+        (_, Ok(channels)) if channels > 0 => Ok(GroupSize::Channels(channels)),
+        _ => Err("expected auto, or a number of channels above 0".into()),
     }
 }
 

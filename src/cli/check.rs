@@ -1,10 +1,11 @@
 //! `lunarray check`: validate a pipeline and estimate its cost.
 
 use clap::Args;
+use serde::Serialize;
 
-use super::arguments::PipelineArgs;
+use super::arguments::{PipelineArgs, group_size};
 use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
-use crate::pipeline::{ConfigError, Plan, Segment};
+use crate::pipeline::{ConfigError, Cost, GroupSize, Plan, RunGroups, Segment};
 
 /// Check a pipeline and estimate its cost, without running it.
 ///
@@ -21,9 +22,21 @@ pub(super) struct CheckArgs {
     /// needed, each with the memory of --memory-max or of this machine. Fails if not even one rank fits a node.
     #[arg(long, value_name = "NUMBER", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     ranks: u16,
+    /// As a run in groups of channels (run --groups): prints the groups, and fails only if a channel alone needs too much memory.
+    #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, conflicts_with = "ranks")]
+    groups: Option<GroupSize>,
     /// Print one JSON object instead of a table.
     #[arg(long)]
     json: bool,
+}
+
+/// What is printed as JSON.
+#[derive(Serialize)]
+struct Checked<'a> {
+    #[serde(flatten)]
+    cost: &'a Cost,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    groups: Option<&'a RunGroups>,
 }
 
 pub(super) fn execute(args: &CheckArgs) -> CommandResult {
@@ -38,10 +51,19 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let ranks = usize::from(args.ranks);
     plan.config.require_shareable(ranks)?;
     let cost = plan.cost_among(ranks).on_nodes(args.pipeline.memory_limit());
+    let limit = args.pipeline.memory_limit();
+    let groups = args.groups.map(|size| plan.run_groups(size, limit)).transpose();
+    let found = groups.as_ref().ok().and_then(Option::as_ref);
     if args.json {
-        print_json_line(&cost)?;
+        print_json_line(&Checked { cost: &cost, groups: found })?;
     } else {
         print_text(&format!("{}: no problems\n\n{cost}", source.origin()))?;
+        if let Some(groups) = found {
+            print_text(&format!("{groups}\nMemory above is that of all channels at once."))?;
+        }
+    }
+    if groups?.is_some() {
+        return Ok(Completion::Done);
     }
     cost.require_memory(Segment::Whole, args.pipeline.memory_limit())?;
     Ok(Completion::Done)

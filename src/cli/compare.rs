@@ -39,7 +39,7 @@ pub(super) struct CompareArgs {
     /// Maximum degree; 3 nside - 1 if not given.
     #[arg(long)]
     l_max: Option<usize>,
-    /// Picture of the curves (PNG); MAP-spectra.png, or compare.png of runs, if not given; none with --json. The picture
+    /// Picture of the curves (PNG, or SVG if its name ends so); MAP-spectra.png, or compare.png of runs, if not given; none with --json. The picture
     /// of the relative error goes beside it, with -error before the extension.
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
@@ -131,7 +131,10 @@ fn draw(
     let name = |path: &Path| path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
     let title = format!("{} against {}", name(map), name(truth));
     let plot = args.plot.clone().unwrap_or_else(|| beside(map, "-spectra"));
-    let error = beside(&plot, "-error");
+    let error = match plot.extension() {
+        Some(extension) => beside(&plot, "-error").with_extension(extension),
+        None => beside(&plot, "-error"),
+    };
     draw_comparison(&title, comparison)?.write(&plot)?;
     draw_relative_error(&title, "", comparison, Frame::Galactic)?.write(&error)?;
     Ok(vec![plot, error])

@@ -42,7 +42,7 @@ pub(super) struct CutoutArgs {
     /// Subtract the map smoothed to this FWHM, degrees.
     #[arg(long, value_name = "DEG")]
     subtract_fwhm: Option<f64>,
-    /// Picture (PNG); the table goes beside it with the extension .csv.
+    /// Picture (PNG, or SVG if its name ends so); the table goes beside it with the extension .csv.
     #[arg(short, long, value_name = "FILE.png")]
     out: PathBuf,
     /// Print one JSON object: mean and rms of each piece, and their correlation with the first.

@@ -338,6 +338,12 @@ fn progress(
         }
         told.saving = saving;
     }
+    lines.write(counts_of(watched, &stages, untold.load(Ordering::Relaxed)))
+}
+
+/// What a line of progress tells.
+fn counts_of(watched: &Watched, stages: &[StageProgress], untold: u64) -> Entry<'static> {
+    let ground = watched.ground.as_ref();
     let reception = ground.map(|ground| {
         let counters = ground.reception.lock();
         Box::new(counters.unwrap_or_else(std::sync::PoisonError::into_inner).clone())
@@ -348,12 +354,26 @@ fn progress(
         residual: solving.residual,
         target: solving.target,
     });
-    lines.write(Entry::Progress {
+    Entry::Progress {
         stages: stages.iter().map(StageCount::from).collect(),
         ledger: ground.map(|ground| ground.ledger.report()),
         reception,
         senders: watched.listening.as_ref().map(|listening| listening.status.open()),
         solving,
-        untold: untold.load(Ordering::Relaxed),
-    })
+        untold,
+    }
+}
+
+/// A line of progress for the log.
+#[derive(Serialize)]
+pub(super) struct ProgressLine {
+    elapsed_s: f64,
+    #[serde(flatten)]
+    entry: Entry<'static>,
+}
+
+/// The progress of a run that has lasted so long.
+pub(super) fn progress_of(watched: &Watched, elapsed: Duration) -> ProgressLine {
+    let entry = counts_of(watched, &watched.metrics.snapshot(), 0);
+    ProgressLine { elapsed_s: elapsed.as_secs_f64(), entry }
 }

@@ -20,10 +20,17 @@ pub(super) struct ExplainArgs {
     /// Print one JSON object per line: key, default (as TOML), about.
     #[arg(long)]
     json: bool,
+    /// Print all keys as a page of Markdown, a table a section: docs/keys.md is one.
+    #[arg(long, conflicts_with_all = ["json", "keys"])]
+    markdown: bool,
 }
 
 pub(super) fn explain(args: &ExplainArgs) -> CommandResult {
     let all = key_descriptions();
+    if args.markdown {
+        print_text(page_of(&all).trim_end())?;
+        return Ok(Completion::Done);
+    }
     let mut shown: Vec<&KeyDescription> = Vec::new();
     if args.keys.is_empty() {
         shown.extend(
@@ -59,6 +66,37 @@ fn is_section(all: &[KeyDescription], key: &str) -> bool {
     all.iter().any(|described| described.key.starts_with(&inside))
 }
 
+/// All keys as a page of Markdown.
+fn page_of(all: &[KeyDescription]) -> String {
+    let mut page = "# All keys\n\nEvery key of a pipeline file with its default, as `lunarray explain` has them: a file names only those \
+                    that it changes. This page is written by `lunarray explain --markdown`.\n"
+        .to_owned();
+    let table = "\n| key | default | |\n|---|---|---|\n";
+    page.push_str(table);
+    let mut section = String::new();
+    for KeyDescription { key, default, about } in all {
+        let about = in_a_cell(about);
+        if is_section(all, key) {
+            page.push_str(&format!("\n## {key}\n"));
+            if !about.is_empty() {
+                page.push_str(&format!("\n{about}\n"));
+            }
+            page.push_str(table);
+            section = format!("{key}.");
+        } else {
+            let name = key.strip_prefix(&section).unwrap_or(key);
+            let default = default.as_ref().map_or_else(|| "none".to_owned(), |text| format!("`{text}`"));
+            page.push_str(&format!("| `{name}` | {default} | {about} |\n"));
+        }
+    }
+    page
+}
+
+/// A text with what would end a cell, or begin a tag, escaped.
+fn in_a_cell(text: &str) -> String {
+    text.replace('|', "\\|").replace('<', "&lt;")
+}
+
 /// The key itself; else the keys of the section; else those whose names contain it.
 fn matches_of<'a>(all: &'a [KeyDescription], wanted: &str) -> Vec<&'a KeyDescription> {
     let inside = format!("{wanted}.");
@@ -69,10 +107,14 @@ fn matches_of<'a>(all: &'a [KeyDescription], wanted: &str) -> Vec<&'a KeyDescrip
     all.iter().filter(|described| described.key.contains(wanted)).collect()
 }
 
-/// Print a pipeline file that comes with the program, to start from.
+/// The JSON schema of `summary.json`; every summary that a test reads is held to it.
+const SUMMARY_SCHEMA: &str = include_str!("../../docs/summary.schema.json");
+
+/// Print a pipeline file that comes with the program, to start from, or the schema of what it writes.
 ///
 /// The reference has every key with its default, unit and meaning; a pipeline file needs only the keys that it changes. The
-/// quicklook is what `lunarray run` runs without a file.
+/// quicklook is what `lunarray run` runs without a file. The schema of summary.json (JSON Schema 2020-12) names all its
+/// fields.
 ///
 /// Example: lunarray config --print quicklook > my.toml
 #[derive(Debug, Args)]
@@ -80,6 +122,9 @@ pub(super) struct ConfigArgs {
     /// The file to print.
     #[arg(long, value_enum, default_value = "reference")]
     print: Printed,
+    /// Print a JSON schema instead.
+    #[arg(long, value_enum, conflicts_with = "print")]
+    schema: Option<Schema>,
     /// Print all its settings as one JSON object.
     #[arg(long)]
     json: bool,
@@ -93,7 +138,17 @@ enum Printed {
     Reference,
 }
 
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Schema {
+    /// Of summary.json, and of what run and replay print with --json.
+    Summary,
+}
+
 pub(super) fn config(args: &ConfigArgs) -> CommandResult {
+    if let Some(Schema::Summary) = args.schema {
+        print_text(SUMMARY_SCHEMA.trim_end())?;
+        return Ok(Completion::Done);
+    }
     let text = match args.print {
         Printed::Quicklook => QUICKLOOK,
         Printed::Reference => REFERENCE,

@@ -1,21 +1,25 @@
 //! `lunarray export`: results in formats that other software reads.
 
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
-use clap::{Args, Subcommand};
+use clap::{Args, Subcommand, ValueEnum};
 
-use super::arguments::MapFileArgs;
+use super::arguments::{MapFileArgs, frame};
+use super::log::utc_text;
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::files::write_atomically;
-use crate::products::{RunFigures, VisibilityTable, spectra_csv};
+use crate::products::pictures::Scaling;
+use crate::products::{Hips, HipsReport, RunFigures, VisibilityTable, spectra_csv};
 use crate::runtime::Cancel;
-use crate::sky::fits::{Card, read_whole_map, write_alm};
+use crate::sky::Frame;
+use crate::sky::fits::{Card, read_map_file, read_whole_map, write_alm};
 use crate::sky::harmonics::AnalysisOptions;
 use crate::units::ChannelId;
 
-/// Export visibilities, spectra or harmonic coefficients for other software.
+/// Export visibilities, spectra, harmonic coefficients or tiles for other software.
 ///
-/// Visibilities as UVH5 are written by the Python package: lunarray.open(FILE).write_uvh5(..).
+/// Visibilities as UVH5 and Parquet are written by the Python package: lunarray.open(FILE).write_uvh5(..), .write_parquet(..).
 ///
 /// Example: lunarray export visibilities out/quicklook/downlink.ccsds --channel 1 --out visibilities.csv
 #[derive(Debug, Args)]
@@ -32,6 +36,7 @@ enum What {
     Spectra(SpectraArgs),
     /// Harmonic coefficients of a map as FITS, which healpy's read_alm reads.
     Alm(AlmArgs),
+    Hips(HipsArgs),
 }
 
 #[derive(Debug, Args)]
@@ -69,6 +74,48 @@ struct AlmArgs {
     to: Destination,
 }
 
+/// A map as HiPS, a folder of tiles, which Aladin and Aladin Lite show.
+///
+/// Tiles are FITS (K, single precision) and PNG, of orders 0 to 3, or higher for maps beyond nside 4096, with `properties` and
+/// Norder3/Allsky. Pixels of tiles take the value of the map's pixel at their centre, without interpolation. They are at least
+/// as fine as those of the map, and no coarser than nside 512.
+///
+/// Aladin opens the folder as a file; Aladin Lite reads it from a web server.
+///
+/// Example: lunarray export hips out/quicklook/3.000MHz/map.fits --out hips
+#[derive(Debug, Args)]
+struct HipsArgs {
+    /// HEALPix map, K (FITS).
+    #[arg(value_name = "MAP.fits")]
+    map: PathBuf,
+    #[command(flatten)]
+    maps: MapFileArgs,
+    /// Frame of the tiles: galactic or equatorial; ecliptic, which Aladin Lite does not know, keeps the pixels of an ecliptic map.
+    #[arg(long, value_name = "FRAME", default_value = "galactic", value_parser = frame)]
+    hips_frame: Frame,
+    /// Colours of the PNG tiles: log or linear, over 99 % of the map's values.
+    #[arg(long, value_enum, default_value_t = Colours::Log, value_name = "log|linear", hide_possible_values = true)]
+    colours: Colours,
+    /// Title; the file's name and frequency if not given.
+    #[arg(long)]
+    title: Option<String>,
+    /// Identifier in the Virtual Observatory, for tiles that are to be published.
+    #[arg(long, value_name = "ivo://AUTHORITY/NAME", default_value = "ivo://UNK.AUTH/P/lunarray")]
+    id: String,
+    /// New or empty folder.
+    #[arg(short, long, value_name = "DIR")]
+    out: PathBuf,
+    /// Print one JSON object instead of text: folder, order, tile_width, frame, tiles.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Colours {
+    Log,
+    Linear,
+}
+
 #[derive(Debug, Args)]
 struct Destination {
     /// File to be written.
@@ -81,6 +128,7 @@ struct Destination {
 
 pub(super) fn execute(args: &ExportArgs) -> CommandResult {
     let (to, rows, of) = match &args.what {
+        What::Hips(args) => return hips(args),
         What::Visibilities(args) => (&args.to, visibilities(args)?, "visibilities"),
         What::Spectra(args) => (&args.to, spectra(args)?, "degrees"),
         What::Alm(args) => (&args.to, alm(args)?, "coefficients"),
@@ -94,6 +142,17 @@ pub(super) fn execute(args: &ExportArgs) -> CommandResult {
 }
 
 fn visibilities(args: &VisibilityArgs) -> Result<usize, CommandError> {
+    // A name that promises another format is a mistake that shows only where the file is read.
+    for other in ["parquet", "uvh5"] {
+        if args.to.out.extension().is_some_and(|extension| extension.eq_ignore_ascii_case(other)) {
+            return Err(format!(
+                "--out {}: this command writes CSV; expected lunarray.open({:?}).write_{other}(..) of the Python package",
+                args.to.out.display(),
+                args.file.display().to_string()
+            )
+            .into());
+        }
+    }
     let table = VisibilityTable::read(&args.file, &Cancel::new())?;
     let channels = table.instrument().channels.len();
     if usize::from(args.channel) >= channels {
@@ -132,6 +191,47 @@ fn alm(args: &AlmArgs) -> Result<usize, CommandError> {
     );
     write_alm(&args.to.out, &alm, &[frame])?;
     Ok(alm.values().len())
+}
+
+fn hips(args: &HipsArgs) -> CommandResult {
+    let file = read_map_file(&args.map, &args.maps.options())?;
+    let frequency_hz = file.header.real("FREQ").filter(|hz| *hz > 0.0);
+    let name = args.map.display();
+    let title = args.title.clone().unwrap_or_else(|| match frequency_hz {
+        Some(hz) => format!("{name}, {} MHz", hz / 1e6),
+        None => name.to_string(),
+    });
+    let hips = Hips {
+        frame: args.hips_frame,
+        scaling: match args.colours {
+            Colours::Log => Scaling::Log,
+            Colours::Linear => Scaling::Linear,
+        },
+        title,
+        id: args.id.clone(),
+        date: written_at(&args.map),
+        frequency_hz,
+    };
+    let report = hips.write(&file.map, &args.out)?;
+    if args.json {
+        let mut object = serde_json::to_value(&report)?;
+        object["folder"] = serde_json::json!(args.out);
+        print_json_line(&object)?;
+    } else {
+        let HipsReport { order, tile_width, tiles, .. } = report;
+        print_text(&format!(
+            "{tiles} tiles up to order {order} of {tile_width} by {tile_width} pixels are in {}",
+            args.out.display()
+        ))?;
+    }
+    Ok(Completion::Done)
+}
+
+/// When a file was written, UTC to the minute: an export of the same file is the same at any time.
+fn written_at(path: &Path) -> String {
+    let modified = std::fs::metadata(path).and_then(|found| found.modified());
+    let text = utc_text(modified.unwrap_or(SystemTime::UNIX_EPOCH));
+    format!("{}Z", text.get(..16).unwrap_or(&text))
 }
 
 fn write(path: &Path, bytes: &[u8]) -> Result<(), CommandError> {

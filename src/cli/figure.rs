@@ -14,6 +14,7 @@ use crate::units::Pair;
 ///
 /// Leaves a picture (PNG), a table (CSV) and numbers (JSON) of each:
 /// spacing: the ratio q0 of the formation's steps against R and R_2;
+/// baselines: lengths, parts across the track and upwards, altitudes, over the mission;
 /// pair-time: time of pairs and visibilities by baseline length;
 /// uvw: where baselines lie on ecliptic axes;
 /// coverage: time of pairs, visibilities, shortest projected baseline and uv coverage by direction, also as FITS maps;

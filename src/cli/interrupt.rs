@@ -1,7 +1,7 @@
 //! Ctrl-C and other signals: the first asks a run to end in order, the second ends the process.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
@@ -25,6 +25,7 @@ pub(super) struct Interrupt {
     cancel: Cancel,
     /// The last signal; 0 if there was none.
     signal: Arc<AtomicUsize>,
+    armed: AtomicBool,
 }
 
 impl Interrupt {
@@ -48,8 +49,12 @@ impl Interrupt {
         Ok(())
     }
 
-    /// As [`Interrupt::arm`]; if that fails, says so: signals then end the process as they do by default.
+    /// As [`Interrupt::arm`], once for all runs of a command: armed twice, it would take the first signal for the second. If that fails,
+    /// says so: signals then end the process as they do by default.
     pub(super) fn arm_or_note(&self) {
+        if self.armed.swap(true, Ordering::Relaxed) {
+            return;
+        }
         if let Err(error) = self.arm() {
             print_notes([format!(
                 "signals cannot be handled ({error}); any of them will end the process at once"

@@ -2,8 +2,11 @@
 
 use std::time::Duration;
 
+use serde_json::{Value, json};
+
 use super::interrupt::Interrupt;
-use super::output::{CommandResult, Completion, is_broken_pipe, print_error, say};
+use super::log::{self, Level};
+use super::output::{CommandResult, Completion, is_broken_pipe, print_error};
 use crate::pipeline::MemoryLimit;
 use crate::ranks::{RankJob, Ranks, RanksError};
 
@@ -52,7 +55,10 @@ impl Job {
     ) -> Option<Completion> {
         let error =
             ended.as_ref().err().filter(|_| self.ranks.are_many() && interrupt.cancel().is_cancelled())?;
-        say(format_args!("error: {error}"));
+        match log::is_json() {
+            true => log::log_json(Level::Error, "error", &Value::Null, Some(&error.to_string())),
+            false => log::print_line(format_args!("error: {error}")),
+        }
         Some(interrupt.completion(true))
     }
 
@@ -71,7 +77,8 @@ impl Job {
                 FAILED
             }
         };
-        say(format_args!("rank {} ends the job", self.ranks.share().rank));
+        let rank = self.ranks.share().rank;
+        log::say("job-ended", &json!({ "rank": rank }), format_args!("rank {rank} ends the job"));
         job.abort(code)
     }
 }

@@ -20,6 +20,7 @@ mod inspect;
 mod interrupt;
 mod job;
 mod lines;
+mod log;
 mod merge;
 #[cfg(unix)]
 mod notify;
@@ -45,7 +46,9 @@ use std::ffi::OsString;
 use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser, Subcommand};
+use serde_json::Value;
 
+use log::{Level, LogFormat};
 use output::{Completion, is_broken_pipe, print_error};
 
 /// Simulate a lunar-orbit radio interferometer, and map the sky from its downlink.
@@ -61,6 +64,17 @@ use output::{Completion, is_broken_pipe, print_error};
 #[derive(Debug, Parser)]
 #[command(name = "lunarray", version, propagate_version = true, max_term_width = 100)]
 struct Cli {
+    /// Form of what is said on standard error: text for people, or one JSON object a line with time (UTC), level, event, message and
+    /// fields for programs.
+    #[arg(
+        long,
+        global = true,
+        value_enum,
+        value_name = "text|json",
+        default_value_t,
+        hide_possible_values = true
+    )]
+    log: LogFormat,
     #[command(subcommand)]
     command: Command,
 }
@@ -94,6 +108,12 @@ enum Command {
     Man(shell::ManArgs),
 }
 
+/// Whether words that are no command line ask for messages as JSON.
+fn asks_for_json(words: &[OsString]) -> bool {
+    let is_option = |pair: &[OsString]| pair[0] == "--log" && pair[1] == "json";
+    words.windows(2).any(is_option) || words.iter().any(|word| word == "--log=json")
+}
+
 /// Exit code of a failure.
 const FAILED: u8 = 1;
 
@@ -109,11 +129,19 @@ pub fn main() -> ExitCode {
 
 /// As [`main`], for a command line of which the first word is the program's name; returns the exit code.
 pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
-    let command = match Cli::try_parse_from(words) {
-        Ok(cli) => cli.command,
+    let words: Vec<OsString> = words.into_iter().collect();
+    log::use_format(LogFormat::Text);
+    let command = match Cli::try_parse_from(&words) {
+        Ok(Cli { log, command }) => {
+            log::use_format(log);
+            command
+        }
         Err(error) => {
             // Help and version are such errors too. Nobody may be there to read it.
-            let _ = error.print();
+            match error.use_stderr() && asks_for_json(&words) {
+                true => log::log_json(Level::Error, "usage", &Value::Null, Some(&error.to_string())),
+                false => drop(error.print()),
+            }
             return u8::try_from(error.exit_code()).unwrap_or(FAILED);
         }
     };

@@ -2,6 +2,9 @@
 
 use std::io::Write;
 
+use serde_json::{Value, json};
+
+use super::log::{self, Level};
 use crate::pipeline::{Config, RunSummary};
 use crate::units::printable;
 
@@ -32,12 +35,6 @@ impl Completion {
 /// Whether the reader of our output has closed it, as `head` does: not a failure.
 pub(super) fn is_broken_pipe(error: &(dyn std::error::Error + 'static)) -> bool {
     error.downcast_ref::<std::io::Error>().is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
-}
-
-/// Prints a line to standard error. If that is not possible, there is nobody to tell.
-pub(super) fn say(line: impl std::fmt::Display) {
-    // In one piece, so that lines of several threads stay apart.
-    let _ = std::io::stderr().lock().write_all(format!("{line}\n").as_bytes());
 }
 
 /// Prints one JSON object on a line of its own.
@@ -77,7 +74,7 @@ pub(super) fn printable_text(text: &str) -> String {
 /// Prints notes to standard error.
 pub(super) fn print_notes<T: std::fmt::Display>(notes: impl IntoIterator<Item = T>) {
     for note in notes {
-        say(format_args!("note: {}", printable_text(&note.to_string())));
+        log::note("note", &Value::Null, note);
     }
 }
 
@@ -89,22 +86,29 @@ pub(super) fn print_config_notes(config: &Config) {
 /// Says on standard error that more may be missing than the ledger tells, unless it is known to be complete.
 pub(super) fn print_incompleteness(summary: &RunSummary) {
     if !summary.completeness.complete {
-        print_notes([format!("the ledger is {}", summary.completeness)]);
+        let fields = serde_json::to_value(&summary.completeness).unwrap_or_default();
+        log::note("incomplete", &fields, format_args!("the ledger is {}", summary.completeness));
     }
 }
 
 /// Prints an error and its causes; causes that the message already quotes are left out.
 pub(super) fn print_error(error: &(dyn std::error::Error + 'static)) {
-    let mut said = error.to_string();
-    say(format_args!("error: {}", printable_text(&said)));
-    let mut cause = error.source();
+    let message = error.to_string();
+    let (mut said, mut causes, mut cause) = (message.clone(), Vec::new(), error.source());
     while let Some(error) = cause {
         let text = error.to_string();
         if !said.contains(&text) {
-            say(format_args!("  because: {}", printable_text(&text)));
+            causes.push(text.clone());
         }
         said = text;
         cause = error.source();
+    }
+    if log::is_json() {
+        return log::log_json(Level::Error, "error", &json!({ "causes": causes }), Some(&message));
+    }
+    log::print_line(format_args!("error: {}", printable_text(&message)));
+    for cause in causes {
+        log::print_line(format_args!("  because: {}", printable_text(&cause)));
     }
 }
 

@@ -1,4 +1,4 @@
-//! Progress of long runs: a bar on a terminal, plain lines otherwise.
+//! Progress of long runs: a bar on a terminal, plain lines otherwise, or lines for programs (`--log json`).
 
 use std::io::IsTerminal;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
@@ -6,10 +6,13 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::{Value, json};
 
-use super::output::say;
+use super::events::progress_of;
+use super::log::{Level, is_json, print_line, say, say_entry};
+use crate::accumulation::ChannelGroup;
 use crate::downlink::transport::socket::ListenStatus;
-use crate::pipeline::Watched;
+use crate::pipeline::{ChannelCost, GroupStep, Plan, RunGroups, Watched};
 use crate::runtime::Cancel;
 use crate::solve::Solving;
 
@@ -41,7 +44,7 @@ impl Progress {
             loop {
                 let is_over = !matches!(stopped.recv_timeout(POLL), Err(RecvTimeoutError::Timeout));
                 if !is_told && cancel.is_cancelled() {
-                    say(INTERRUPTED);
+                    say("interrupted", &Value::Null, INTERRUPTED);
                     is_told = true;
                 }
                 if is_over {
@@ -70,6 +73,79 @@ impl Drop for Progress {
     }
 }
 
+/// Parts of a job of known weights, which take time in proportion.
+pub(super) struct Parts {
+    weights: Vec<f64>,
+    /// When the first part began that this job makes, and its number.
+    begun: Option<(Instant, usize)>,
+}
+
+impl Parts {
+    pub(super) fn new(weights: impl Iterator<Item = f64>) -> Self {
+        Self { weights: weights.collect(), begun: None }
+    }
+
+    /// Begins a part: the time left for it and all later ones, s, at the pace so far; `None` before there is one.
+    pub(super) fn begin(&mut self, number: usize) -> Option<f64> {
+        let (since, first) = *self.begun.get_or_insert((Instant::now(), number));
+        let sum = |parts: Option<&[f64]>| parts.unwrap_or_default().iter().sum::<f64>();
+        let (done, left) = (sum(self.weights.get(first..number)), sum(self.weights.get(number..)));
+        (done > 0.0).then(|| since.elapsed().as_secs_f64() / done * left)
+    }
+}
+
+/// How much time is left, in words that end a line.
+pub(super) fn time_left(left_s: Option<f64>) -> String {
+    match left_s {
+        Some(left_s) if left_s >= 90.0 => format!("; about {:.0} min left", left_s / 60.0),
+        Some(left_s) => format!("; about {left_s:.0} s left"),
+        None => String::new(),
+    }
+}
+
+/// Says which group of a run begins, and the time left for all.
+pub(super) struct GroupSteps {
+    groups: RunGroups,
+    parts: Parts,
+}
+
+impl GroupSteps {
+    pub(super) fn new(plan: &Plan, groups: &RunGroups) -> Self {
+        let costs = plan.cost().channels;
+        let seconds = |group: &ChannelGroup, of: fn(&ChannelCost) -> f64| -> f64 {
+            group.iter().filter_map(|channel| costs.get(usize::from(channel.0))).map(of).sum()
+        };
+        let simulated = groups.simulated.iter().map(|group| seconds(group, ChannelCost::simulation_s));
+        let mapped = groups.mapped.iter().map(|group| seconds(group, |cost| cost.mapping_s));
+        // The downlink takes next to no time.
+        Self { groups: groups.clone(), parts: Parts::new(simulated.chain([0.0]).chain(mapped)) }
+    }
+
+    pub(super) fn begin(&mut self, group: GroupStep) {
+        let RunGroups { simulated, mapped } = &self.groups;
+        let (what, number, of) = match group {
+            GroupStep::Simulated(number) => ("simulated", number, simulated),
+            GroupStep::Merged => ("merged", simulated.len(), simulated),
+            GroupStep::Mapped(number) => ("mapped", number, mapped),
+        };
+        let place = if group == GroupStep::Mapped(number) { simulated.len() + 1 + number } else { number };
+        let left_s = self.parts.begin(place);
+        let channels: Vec<String> = of.get(number).into_iter().flatten().map(ToString::to_string).collect();
+        let (left, listed) = (time_left(left_s), channels.join(", "));
+        let text = match group {
+            GroupStep::Simulated(_) => {
+                format!("group {} of {}: simulating channels {listed}{left}", number + 1, of.len())
+            }
+            GroupStep::Merged => format!("the downlink of all channels{left}"),
+            GroupStep::Mapped(_) => {
+                format!("group {} of {}: mapping channels {listed}{left}", number + 1, of.len())
+            }
+        };
+        let fields = json!({ "what": what, "number": number + 1, "of": of.len(), "channels": channels, "left_s": left_s });
+        say("group", &fields, text);
+    }
+}
+
 struct ProgressView {
     bar: Option<ProgressBar>,
     total: u64,
@@ -82,7 +158,7 @@ struct ProgressView {
 
 impl ProgressView {
     fn new(total: u64) -> Self {
-        let bar = std::io::stderr().is_terminal().then(|| {
+        let bar = (std::io::stderr().is_terminal() && !is_json()).then(|| {
             let template = if total > 0 {
                 "{elapsed_precise} [{bar:40}] {pos}/{len} windows, {eta} left  {msg}"
             } else {
@@ -126,6 +202,10 @@ impl ProgressView {
     }
 
     fn show(&mut self, watched: &Watched, stage: &str) {
+        if is_json() {
+            let entry = progress_of(watched, self.since.elapsed());
+            return say_entry(Level::Info, &entry, None);
+        }
         let stages = watched.metrics.snapshot();
         let done = stages.iter().find(|s| s.name == stage).map_or(0, |s| s.items_in.saturating_sub(1));
         let mut message: Vec<String> = stages
@@ -157,7 +237,7 @@ impl ProgressView {
                 let elapsed_s = self.since.elapsed().as_secs();
                 let of =
                     if self.total > 0 { format!(" {done}/{} windows,", self.total) } else { String::new() };
-                say(format_args!("{elapsed_s:>5} s:{of} {message}"));
+                print_line(format_args!("{elapsed_s:>5} s:{of} {message}"));
             }
         }
     }

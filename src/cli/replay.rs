@@ -2,26 +2,31 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use clap::{ArgGroup, Args};
 use crossbeam_channel::{Receiver, bounded};
+use serde_json::{Value, json};
 
-use super::arguments::{ChannelList, channel_list, not_negative_s, size_bytes};
+use super::arguments::{ChannelList, channel_list, group_size, not_negative_s, size_bytes};
 use super::events::{Events, EventsArgs};
 use super::interrupt::Interrupt;
 use super::job::Job;
 use super::lines::next_line;
+use super::log::{Level, is_json, note, say, say_entry};
 use super::output::{
-    CommandError, CommandResult, print_incompleteness, print_json_line, print_notes, print_text, say,
+    CommandError, CommandResult, print_incompleteness, print_json_line, print_notes, print_text,
 };
-use super::progress::Progress;
+use super::progress::{Parts, Progress, time_left};
 use super::serving::{Page, ServeArgs};
-use crate::downlink::transport::socket::{SocketError, SocketSource, TcpUrl, Until};
+use crate::downlink::transport::socket::{HeldAnswers, ListenNote, SocketError, SocketSource, TcpUrl, Until};
 use crate::downlink::{FileSource, Pace, Paced, Steps};
-use crate::ground::{Ground, GroundConfig, WAIT_BYTES};
+use crate::frames::Instrument;
+use crate::ground::{Collector, Ground, GroundConfig, WAIT_BYTES};
 use crate::pipeline::{
-    Config, ConfigSource, GroundSource, GroupSize, MemoryLimit, PipelineError, READ, RunSummary,
-    channel_groups, replay, replay_in_groups, use_threads,
+    Config, ConfigSource, GroundSource, GroupSize, MemoryAdvice, MemoryLimit, PipelineError, READ,
+    RunSummary, channel_groups, replay, replay_in_groups, use_threads,
 };
 
 /// Capacity of the hold buffer when listening without a state, bytes.
@@ -42,7 +47,9 @@ pub(super) struct ReplayArgs {
     /// Downlink files in the order of time.
     #[arg(required_unless_present_any = ["state", "listen"], value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// Map file (TOML): settings of the ground segment; the defaults of pipelines/reference.toml if not given.
+    /// Map file (TOML): settings of the ground segment. If not given, those of the state, if it has any; of the run that made
+    /// the downlink, if its pipeline.toml lies beside the first FILE or it was the quicklook; then the defaults of
+    /// `lunarray config`.
     #[arg(long, value_name = "MAP.toml")]
     map: Option<PathBuf>,
     /// Gains that `lunarray calibrate` found: as calibration.hook = "antenna-gains" with calibration.gains_file.
@@ -94,7 +101,7 @@ pub(super) struct ReplayArgs {
     #[arg(long, value_name = "LIST", value_parser = channel_list)]
     channels: Option<ChannelList>,
     /// Map the channels in groups and read the files once a group: as many channels at a time as memory allows (auto), or this
-    /// many. Maps and ledger are those of all channels at once.
+    /// many. Maps and ledger are those of all channels at once. When interrupted, repeat the command to go on with the next group.
     #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, conflicts_with_all = ["live", "pace", "state"])]
     #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]
     groups: Option<GroupSize>,
@@ -146,14 +153,6 @@ fn step(text: &str) -> Result<StepLength, String> {
     }
 }
 
-fn group_size(text: &str) -> Result<GroupSize, String> {
-    match (text.trim(), text.trim().parse()) {
-        ("auto", _) => Ok(GroupSize::Automatic),
-        (_, Ok(channels)) if channels > 0 => Ok(GroupSize::Channels(channels)),
-        _ => Err("expected auto, or a number of channels above 0".into()),
-    }
-}
-
 pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
     let job = Job::join(args.mpi)?;
     let result = work(args, &job);
@@ -170,7 +169,8 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
         overrides.push("calibration.hook=antenna-gains".to_owned());
         overrides.push(format!("calibration.gains_file={:?}", path.display().to_string()));
     }
-    let config = ConfigSource { file: args.map.clone(), overrides, seed: None }.load_ground()?;
+    let source = ConfigSource { file: args.map.clone(), overrides, seed: None };
+    let config = args.with_known_settings(source, job).load_ground()?;
     use_threads(&config.runtime)?;
     if let Some(size) = args.groups {
         return in_groups(args, &config, size);
@@ -202,7 +202,9 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     let summary = ended.inspect_err(|error| {
         let told = matches!(error.downcast_ref::<PipelineError>(), Some(PipelineError::Unsaved { .. }));
         // Another failure must not hide that nothing was saved.
-        print_notes(saving.report().filter(|saving| saving.unsaved.is_some() && !told));
+        if let Some(saving) = saving.report().filter(|saving| saving.unsaved.is_some() && !told) {
+            note("checkpoint", &serde_json::to_value(&saving).unwrap_or_default(), saving);
+        }
     })?;
     let completion = match args.follow || args.listen.is_some() {
         true => {
@@ -221,6 +223,18 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
 }
 
 impl ReplayArgs {
+    /// Without a map file: with the settings that belong to the state and the downlink.
+    fn with_known_settings(&self, source: ConfigSource, job: &Job) -> ConfigSource {
+        // A state that cannot be read is told when it is opened.
+        let of_state = self.state.as_deref().and_then(|folder| source.clone().of_state(folder).ok());
+        let (source, from) = of_state.unwrap_or(source).of_downlink(&self.files);
+        if let Some(from) = from.filter(|_| job.is_first()) {
+            let fields = json!({ "from": from });
+            say("settings", &fields, format_args!("settings of the maps: those of {from}"));
+        }
+        source
+    }
+
     /// Prints the summary, unless standard output holds events.
     fn print(&self, summary: &RunSummary) -> Result<(), CommandError> {
         match self.json {
@@ -232,18 +246,28 @@ impl ReplayArgs {
 
     /// With the limit of memory that was given, or the machine's.
     fn limited(&self, config: GroundConfig) -> GroundConfig {
-        let limit = self.memory_max.or_else(|| MemoryLimit::of_machine().map(|limit| limit.bytes));
-        GroundConfig { memory_max_bytes: limit, ..config }
+        GroundConfig { memory_max_bytes: self.limit().map(|limit| limit.bytes), ..config }
+    }
+
+    fn limit(&self) -> Option<MemoryLimit> {
+        self.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine)
+    }
+}
+
+/// Says so if the sums of an instrument will outgrow memory.
+fn advise(config: &Config, instrument: &Instrument, limit: Option<MemoryLimit>) {
+    if let Some(advice) = limit.and_then(|limit| MemoryAdvice::of(config, instrument, limit)) {
+        print_notes([advice]);
     }
 }
 
 /// Maps the channels of files in groups.
 fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResult {
-    let limit = args.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine);
-    let groups = channel_groups(&args.files, config, size, limit)?;
+    let groups = channel_groups(&args.files, config, size, args.limit())?;
     let interrupt = Interrupt::default();
     let cancel = interrupt.cancel();
     let events = args.events.start(config, "ground")?;
+    let mut parts = Parts::new(groups.iter().map(|group| group.len() as f64));
     let mut progress = None;
     let ended = replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |number, watched| {
         if number == 0 {
@@ -253,7 +277,11 @@ fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResu
         progress = None;
         let channels: Vec<String> =
             groups[number..].iter().take(1).flatten().map(|c| c.to_string()).collect();
-        say(format_args!("group {} of {}: channels {}", number + 1, groups.len(), channels.join(", ")));
+        let (of, listed) = (groups.len(), channels.join(", "));
+        let left_s = parts.begin(number);
+        let fields = json!({ "number": number + 1, "of": of, "channels": channels, "left_s": left_s });
+        let left = time_left(left_s);
+        say("group", &fields, format_args!("group {} of {of}: channels {listed}{left}", number + 1));
         events.watch(&watched);
         progress = Some(Progress::watch(watched, READ, 0, cancel));
     });
@@ -277,21 +305,36 @@ struct Session<'a> {
 }
 
 impl Session<'_> {
-    fn hear_senders(&self, url: &TcpUrl, ground: Ground) -> Result<RunSummary, CommandError> {
+    fn hear_senders(&self, url: &TcpUrl, mut ground: Ground) -> Result<RunSummary, CommandError> {
         let Self { args, config, .. } = self;
         let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
         let settings = args.limited(config.ground(0));
+        let (advised, own_config, limit) = (AtomicBool::new(false), (*config).clone(), args.limit());
         let until = Until { idle_s: args.idle_s, connections: args.connections };
-        let source = SocketSource::bind(&addresses, &config.downlink.listen, until)
+        let listen = &config.downlink.listen;
+        let mut source = SocketSource::bind(&addresses, listen, until)
             .map_err(|error| match error {
                 SocketError::Listen { source, .. } => SocketError::Listen { url: url.clone(), source },
                 other => other,
             })?
             .knowing(ground.instrument().cloned())
-            .accepting(Arc::new(move |instrument| settings.fits(instrument).is_ok()))
-            .telling(Box::new(|note| print_notes([note])));
+            .accepting(Arc::new(move |instrument| {
+                let fits = settings.fits(instrument).is_ok();
+                if fits && !advised.swap(true, Ordering::Relaxed) {
+                    advise(&own_config, instrument, limit);
+                }
+                fits
+            }))
+            .telling(Box::new(print_listen_note));
+        if args.state.is_some() {
+            let answers = HeldAnswers::new(Duration::from_secs_f64(listen.held_every_s));
+            (source, ground) = (source.answering(&answers), ground.answering(&answers));
+        }
         let address = source.url();
-        Ok(self.watched(source, ground, &|| say(format_args!("listening on {address}")))?)
+        let fields = json!({ "url": address.to_string() });
+        Ok(self.watched(source, ground, &|| {
+            say("listening", &fields, format_args!("listening on {address}"));
+        })?)
     }
 
     fn read_files(&self, ground: Ground) -> Result<RunSummary, CommandError> {
@@ -300,9 +343,15 @@ impl Session<'_> {
             true => FileSource::follow(&args.files, args.idle_s)?,
             false => FileSource::open(&args.files)?,
         };
+        // A pipe can be read only once.
+        if let Some(first) = args.files.first().filter(|path| path.is_file())
+            && let Ok(Some(instrument)) = Collector::instrument_of(first)
+        {
+            advise(self.config, &instrument, args.limit());
+        }
         let pace = match (args.step, args.speed) {
             (Some(StepLength(every_s)), _) => {
-                let tell = Box::new(|note: &str| say(note));
+                let tell = Box::new(|note: &str| say("step", &Value::Null, note));
                 Pace::Steps(Steps { every_s, go: lines_of_input(), tell })
             }
             (None, Speed(Some(times))) => Pace::Speed(times),
@@ -336,6 +385,18 @@ impl Session<'_> {
                 progress = Some(Progress::watch(watched, READ, 0, cancel));
             }
         })
+    }
+}
+
+/// Prints what happened to a connection.
+fn print_listen_note(told: &ListenNote<'_>) {
+    match is_json() {
+        true => say_entry(
+            if told.is_regular() { Level::Info } else { Level::Warn },
+            told,
+            Some(&told.to_string()),
+        ),
+        false => print_notes([told]),
     }
 }
 

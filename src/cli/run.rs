@@ -1,19 +1,23 @@
 //! `lunarray run`: run the whole chain in one process.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::arguments::PipelineArgs;
+use super::arguments::{PipelineArgs, group_size};
 use super::events::EventsArgs;
 use super::interrupt::Interrupt;
 use super::job::Job;
 use super::output::{
-    CommandResult, print_config_notes, print_incompleteness, print_json_line, print_notes, print_text,
+    CommandError, CommandResult, print_config_notes, print_incompleteness, print_json_line, print_notes,
+    print_text,
 };
-use super::progress::Progress;
+use super::progress::{GroupSteps, Progress};
 use super::serving::ServeArgs;
-use crate::pipeline::{INTEGRATE, Plan, Segment, run_among, sky_notes, use_threads};
+use crate::pipeline::{
+    GroupSize, GroupStep, INTEGRATE, MERGE, Plan, READ, RunSummary, Segment, run_among, run_in_groups,
+    sky_notes, use_threads,
+};
 
 /// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
 ///
@@ -33,6 +37,11 @@ pub(super) struct RunArgs {
     /// Print the summary as one JSON object instead of tables.
     #[arg(long)]
     json: bool,
+    /// Simulate and map the channels in groups: as many at a time as memory allows (auto), or this many. Products are those of all
+    /// channels at once. When interrupted, repeat the command to go on with the next group.
+    #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, conflicts_with_all = ["mpi", "events"])]
+    #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]
+    groups: Option<GroupSize>,
     /// Share the sums of each map of the harmonic engine with the other ranks of an MPI job: mpirun -n 4 lunarray run --mpi. The
     /// first rank writes the products, which are those of one process. Needs a program built with --features mpi.
     #[arg(long, conflicts_with = "events")]
@@ -60,9 +69,12 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
         print_notes(sky_notes(&plan)?);
     }
     use_threads(&plan.config.runtime)?;
+    let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
+    if let Some(size) = args.groups {
+        return in_groups(args, &plan, size, &out);
+    }
     let cost = plan.cost_among(job.ranks().share().count);
     cost.require_memory(Segment::Whole, job.memory_limit(args.pipeline.memory_limit()))?;
-    let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
     let interrupt = Interrupt::default();
     let page = args.serve.start(&plan.config, "whole", None)?;
     let events = args.events.start(&plan.config, "whole")?;
@@ -86,12 +98,48 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     if !job.is_first() {
         return Ok(interrupt.completion(summary.cancelled));
     }
-    let printed = match args.json {
-        _ if args.events.take_stdout() => Ok(()),
-        true => print_json_line(&summary),
-        false => print_text(&format!("{summary}\nProducts are in {}", out.display())),
+    let printed = match args.events.take_stdout() {
+        true => Ok(()),
+        false => args.print(&summary, &out),
     };
     print_incompleteness(&summary);
     page.stay(&interrupt);
+    interrupt.completion(summary.cancelled).after(printed)
+}
+
+impl RunArgs {
+    fn print(&self, summary: &RunSummary, out: &Path) -> Result<(), CommandError> {
+        match self.json {
+            true => print_json_line(summary),
+            false => print_text(&format!("{summary}\nProducts are in {}", out.display())),
+        }
+    }
+}
+
+/// Simulates and maps the channels in groups.
+fn in_groups(args: &RunArgs, plan: &Plan, size: GroupSize, out: &Path) -> CommandResult {
+    let groups = plan.run_groups(size, args.pipeline.memory_limit())?;
+    let interrupt = Interrupt::default();
+    let mut steps = GroupSteps::new(plan, &groups);
+    let mut progress = None;
+    let windows = plan.windows_watched();
+    let ended = run_in_groups(plan, &groups, out, interrupt.cancel(), &mut |group, watched| {
+        interrupt.arm_or_note();
+        // The bar of the group before ends first.
+        progress = None;
+        steps.begin(group);
+        let (stage, total) = match group {
+            GroupStep::Simulated(_) => (INTEGRATE, windows),
+            GroupStep::Merged => (MERGE, 0),
+            GroupStep::Mapped(_) => (READ, 0),
+        };
+        progress = Some(Progress::watch(watched, stage, total, interrupt.cancel()));
+    });
+    drop(progress);
+    let Some(summary) = ended? else {
+        return Ok(interrupt.completion(true));
+    };
+    let printed = args.print(&summary, out);
+    print_incompleteness(&summary);
     interrupt.completion(summary.cancelled).after(printed)
 }

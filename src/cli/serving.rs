@@ -4,9 +4,11 @@ use std::path::Path;
 use std::time::Duration;
 
 use clap::Args;
+use serde_json::json;
 
 use super::interrupt::Interrupt;
-use super::output::{CommandError, say};
+use super::log::say;
+use super::output::CommandError;
 use crate::pipeline::{Config, Watched};
 use crate::serve::{ServeAddress, ServeError, Server, Subject};
 
@@ -38,7 +40,8 @@ impl ServeArgs {
     ) -> Result<Page, ServeError> {
         let Some(address) = &self.serve else { return Ok(Page { server: None, stays: false }) };
         let server = Server::start(address, self.serve_remote, Subject::new(config, segment, state))?;
-        say(format_args!("serving on {}", server.url()));
+        let url = server.url().to_string();
+        say("serving", &json!({ "url": url }), format_args!("serving on {url}"));
         Ok(Page { server: Some(server), stays: self.serve_after })
     }
 }
@@ -77,7 +80,9 @@ impl Page {
         let Some(server) = self.server.filter(|_| self.stays && !interrupt.cancel().is_cancelled()) else {
             return;
         };
-        say(format_args!("the run is over; serving on {} until Ctrl-C", server.url()));
+        let url = server.url().to_string();
+        let message = format_args!("the run is over; serving on {url} until Ctrl-C");
+        say("serving-on", &json!({ "url": url }), message);
         while !interrupt.cancel().is_cancelled() {
             std::thread::sleep(POLL);
         }

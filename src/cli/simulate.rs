@@ -1,18 +1,21 @@
 //! `lunarray simulate`: run the space segment alone.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
 use clap::Args;
 
-use super::arguments::{PipelineArgs, not_negative_s};
+use super::arguments::{PipelineArgs, group_size, not_negative_s};
 use super::events::EventsArgs;
 use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_config_notes, print_json_line, print_notes, print_text};
-use super::progress::Progress;
+use super::progress::{GroupSteps, Progress};
 use super::serving::ServeArgs;
 use crate::downlink::transport::socket::{SendOptions, SocketSink, TcpUrl};
-use crate::pipeline::{Destination, INTEGRATE, Plan, Segment, simulate, sky_notes, use_threads};
+use crate::pipeline::{
+    Destination, GroupSize, GroupStep, INTEGRATE, MERGE, Plan, RunGroups, Segment, simulate,
+    simulate_in_groups, sky_notes, use_threads,
+};
 
 /// Simulate the space segment, and write its downlink to a file or send it to a listening ground segment.
 ///
@@ -29,6 +32,11 @@ pub(super) struct SimulateArgs {
     /// Downlink file to write.
     #[arg(short, long, value_name = "FILE", required_unless_present = "send")]
     out: Option<PathBuf>,
+    /// Simulate the channels in groups, to files beside the downlink of which it is then made: as many at a time as memory allows
+    /// (auto), or this many. The downlink has the same bytes. When interrupted, repeat the command to go on with the next group.
+    #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, requires = "out", conflicts_with_all = ["send", "events"])]
+    #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]
+    groups: Option<GroupSize>,
     /// Send the downlink to this address, where `lunarray replay --listen` listens, as it is made. A slow receiver slows
     /// the simulation.
     #[arg(long, value_name = "tcp://HOST:PORT")]
@@ -39,6 +47,10 @@ pub(super) struct SimulateArgs {
     /// Maximum rate, bytes/s; 0 for no limit.
     #[arg(long, value_name = "NUMBER", default_value_t = 0.0, requires = "send", value_parser = rate)]
     bytes_per_s: f64,
+    /// Wait until a checkpoint on the ground's disk holds the whole downlink, and send it again, from its beginning, to a ground that
+    /// was ended before and is back within --connect-s. Needs a ground with --state; what is sent again is at most 16 MiB.
+    #[arg(long, requires = "send")]
+    held: bool,
     /// Print stages and throughput as one JSON object instead of a table.
     #[arg(long)]
     json: bool,
@@ -61,11 +73,14 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let plan = Plan::new(config)?;
     print_notes(sky_notes(&plan)?);
     use_threads(&plan.config.runtime)?;
+    if let (Some(size), Some(out)) = (args.groups, &args.out) {
+        return in_groups(args, &plan, size, out);
+    }
     plan.cost().require_memory(Segment::Space, args.pipeline.memory_limit())?;
     let interrupt = Interrupt::default();
     let page = args.serve.start(&plan.config, "space", None)?;
     let cancel = interrupt.cancel();
-    let options = SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s };
+    let options = SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s, held: args.held };
     let socket = args.send.as_ref().map(|url| SocketSink::new(url, options, cancel)).transpose()?;
     let confirmed = socket.as_ref().map(SocketSink::confirmed);
     let events = args.events.start(&plan.config, "space")?;
@@ -94,6 +109,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     if let (Some(url), Some(confirmed)) = (&args.send, confirmed) {
         places.push(match confirmed.load(Ordering::Relaxed) {
             0 => format!("Sent the downlink to {url}, which confirmed no bytes"),
+            bytes if args.held => format!("A checkpoint of {url} holds all {bytes} bytes"),
             bytes => format!("{url} confirmed all {bytes} bytes"),
         });
     }
@@ -104,4 +120,42 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     };
     page.stay(&interrupt);
     interrupt.completion(report.cancelled).after(printed)
+}
+
+/// Simulates the channels in groups.
+fn in_groups(args: &SimulateArgs, plan: &Plan, size: GroupSize, out: &Path) -> CommandResult {
+    let simulated = plan.simulation_groups(size, args.pipeline.memory_limit())?;
+    let groups = RunGroups { simulated, mapped: Vec::new() };
+    let interrupt = Interrupt::default();
+    let mut steps = GroupSteps::new(plan, &groups);
+    let mut progress = None;
+    let windows = plan.windows_watched();
+    let count = groups.simulated.len();
+    let ended =
+        simulate_in_groups(plan, &groups.simulated, out, interrupt.cancel(), &mut |number, watched| {
+            interrupt.arm_or_note();
+            // The bar of the group before ends first.
+            progress = None;
+            let (group, stage, total) = match number < count {
+                true => (GroupStep::Simulated(number), INTEGRATE, windows),
+                false => (GroupStep::Merged, MERGE, 0),
+            };
+            steps.begin(group);
+            progress = Some(Progress::watch(watched, stage, total, interrupt.cancel()));
+        });
+    drop(progress);
+    let reports = ended?;
+    let is_cancelled = reports.last().is_some_and(|report| report.cancelled);
+    let place = match is_cancelled {
+        true => "No downlink yet: repeat the command to go on".to_owned(),
+        false => format!("Wrote the downlink to {}", out.display()),
+    };
+    let printed = match args.json {
+        true => print_json_line(&reports),
+        false => {
+            let each: Vec<String> = reports.iter().map(ToString::to_string).collect();
+            print_text(&format!("{}\n{place}", each.join("\n\n")))
+        }
+    };
+    interrupt.completion(is_cancelled).after(printed)
 }

@@ -3,10 +3,12 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use serde_json::json;
 
 use super::arguments::size_bytes;
 use super::interrupt::Interrupt;
-use super::output::{CommandResult, print_json_line, print_notes, print_text, say};
+use super::log::say;
+use super::output::{CommandResult, print_json_line, print_notes, print_text};
 use super::progress::Progress;
 use crate::pipeline::{
     INTEGRATE, MemoryLimit, READ, Segment, Study, StudyPhase, StudySummary, run_study, use_threads,
@@ -17,7 +19,8 @@ use crate::pipeline::{
 /// A study names a pipeline file and axes: a key with values, or named cases of several settings. Cases that differ only
 /// in the ground segment share one simulation, and those that differ only in epsilon or prior share their sums. Leaves the
 /// products of every case, tables (study.csv, spectra.csv, study.json) and overlaid curves (study.png): rho_l, SNR_l, C_l,
-/// and, with map.trace_probes, the traces of thermal noise and imperfection against epsilon, with their crossing. Cases
+/// and, with map.trace_probes, the traces of thermal noise and imperfection against epsilon, with their crossing. With
+/// `realisations = N` each case is made for N realisations of noise and random errors, for maps of sigma and covariances of C_l. Cases
 /// that are finished are not made again: to resume after an interruption, repeat the command.
 ///
 /// Example: lunarray study pipelines/paper/fig15-traces.toml --out out/fig15
@@ -62,7 +65,9 @@ pub(super) fn execute(args: &StudyArgs) -> CommandResult {
         drop(progress.take());
         let case = &study.cases[number];
         let what = if phase == StudyPhase::Simulate { "simulating for" } else { "mapping" };
-        say(format_args!("case {} of {}: {what} {}", number + 1, study.cases.len(), case.label()));
+        let (of, label) = (study.cases.len(), case.label());
+        let fields = json!({ "number": number + 1, "of": of, "what": what, "label": label });
+        say("case", &fields, format_args!("case {} of {of}: {what} {label}", number + 1));
         let (stage, total) = match phase {
             StudyPhase::Simulate => (INTEGRATE, case.plan.windows_watched()),
             StudyPhase::Map => (READ, 0),
@@ -105,6 +110,16 @@ fn table(summary: &StudySummary) -> String {
                 channel.noise_rms_k
             ));
         }
+    }
+    for spread in &summary.spreads {
+        let case = if spread.case.is_empty() { String::new() } else { format!("{}, ", spread.case) };
+        lines.push(format!(
+            "{case}{:.3} MHz: {} realisations; noise of a pixel {:.3e} K rms, which scatters by {:.1} % over the sphere",
+            spread.frequency_hz / 1e6,
+            spread.count,
+            spread.sigma_rms_k,
+            100.0 * spread.sigma_scatter
+        ));
     }
     for crossing in &summary.crossings {
         let of =

@@ -260,6 +260,7 @@ impl PairGrid {
             r_i_m: place(self.pair.i, t_s),
             r_j_m: place(self.pair.j, t_s),
             span_rad: 0.0,
+            at: None,
         };
         let positions: Vec<PairPosition> = self.instants_s(request.epochs).map(position).collect();
         let half = 0.5 * request.channel.width_hz / request.channel.frequency_hz;

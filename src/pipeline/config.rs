@@ -118,7 +118,7 @@ impl Config {
         }
         let Self { spacecraft, map, .. } = self;
         let visibilities = spacecraft.fidelity == Fidelity::Visibilities;
-        let direct = spacecraft.model != ModelChoice::Harmonic;
+        let anywhere = spacecraft.model != ModelChoice::Harmonic;
         let isotropic = spacecraft.antenna == Antenna::Isotropic;
         for (key, value, good, expected) in [
             (
@@ -128,7 +128,7 @@ impl Config {
                 "\"pixel\", or map.refine,",
             ),
             ("spacecraft.fidelity", "\"samples\"", visibilities, "\"visibilities\""),
-            ("spacecraft.model", "\"harmonic\"", direct, "\"auto\" or \"direct\""),
+            ("spacecraft.model", "\"harmonic\"", anywhere, "\"auto\", \"general\" or \"direct\""),
             ("spacecraft.smear_integrations", "true", !spacecraft.smear_integrations, "false"),
             ("spacecraft.antenna", "\"dipole-normal\"", isotropic, "\"isotropic\""),
             ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
@@ -179,6 +179,9 @@ impl Config {
         let (mut sky, mut array) = (sky.clone(), array.clone());
         array.oem = array.oem.iter().map(|path| contents(path)).collect();
         sky.file = sky.file.map(|files| files.map(|path| contents(path)));
+        if let Some(added) = &mut sky.added {
+            added.catalogue = added.catalogue.as_deref().map(contents);
+        }
         // Data of an ideal instrument are those of before there were errors, byte for byte.
         match instrument.is_on() {
             true => hash(&(name, seed, sky, &array, daughters, spacecraft, instrument)),

@@ -11,7 +11,8 @@ use super::problems::{Problem, Problems};
 use crate::units::shortened;
 
 /// Keys that have no default because they may be absent.
-const OPTIONAL_KEYS: [&str; 4] = ["sky.file", "sky.frame", "calibration.gains_file", "map.prior_frame"];
+const OPTIONAL_KEYS: [&str; 5] =
+    ["sky.file", "sky.frame", "sky.added", "calibration.gains_file", "map.prior_frame"];
 
 /// Most characters of a key, an override or the parser's message that are shown.
 pub(super) const SHOWN_MAX: usize = 160;

@@ -43,10 +43,14 @@ pub struct ChannelCost {
     pub simulation_direct_s: f64,
     /// Estimated time of the simulation through harmonics, s: set-up and visibilities.
     pub simulation_harmonic_s: [f64; 2],
+    /// Estimated time of the simulation with rows of any positions, s.
+    pub simulation_general_s: f64,
     /// Multiply-adds of the normal equations.
     pub accumulation_multiply_adds: f64,
     /// Multiply-adds of one solution.
     pub solution_multiply_adds: f64,
+    /// Estimated time of the sums and of all solutions, s.
+    pub mapping_s: f64,
 }
 
 /// The cost of a whole pipeline.
@@ -105,10 +109,12 @@ pub enum Segment {
 
 impl ChannelCost {
     /// Estimated time of the simulation as it will be done, s.
-    fn simulation_s(&self) -> f64 {
+    #[must_use]
+    pub fn simulation_s(&self) -> f64 {
         match self.simulation.kind {
             ModelKind::Direct => self.simulation_direct_s,
             ModelKind::Harmonic => self.simulation_harmonic_s.iter().sum(),
+            ModelKind::General => self.simulation_general_s,
         }
     }
 }
@@ -134,6 +140,8 @@ impl Plan {
             if is_mapped { cost() } else { EngineCost::default() }
         };
         let engines: Vec<EngineCost> = frequencies.iter().zip(&expected).enumerate().map(engine).collect();
+        let sent: f64 = expected.iter().map(|e| e.sent).sum();
+        let solutions = self.solutions(sent);
         let channels: Vec<ChannelCost> = frequencies
             .iter()
             .zip(&expected)
@@ -150,23 +158,21 @@ impl Plan {
                     simulation.set_up_fringes / fringes_per_s,
                     simulation.visibility_fringes * expected.sent / fringes_per_s,
                 ],
+                simulation_general_s: simulation.general_fringes * expected.sent / fringes_per_s,
                 accumulation_multiply_adds: expected.mapped * engine.visibility_multiply_adds,
                 solution_multiply_adds: engine.solution_multiply_adds,
+                mapping_s: engine.visibility_s * expected.mapped
+                    + solutions as f64 * engine.solution_s
+                    + engine.probes_s,
             })
             .collect();
-        let sent: f64 = expected.iter().map(|e| e.sent).sum();
-        let solutions = self.solutions(sent);
         let simulation_memory_bytes = self.simulation_bytes(sent, &nsides)
             + channels.iter().map(|channel| channel.simulation.bytes).sum::<f64>();
         let memory_bytes = memory_bytes(simulation_memory_bytes, &engines, solutions);
-        let solving_s = solutions as f64 * engines.iter().map(|engine| engine.solution_s).sum::<f64>()
-            + engines.iter().map(|engine| engine.probes_s).sum::<f64>();
         let sampling_s = self.sampling_s();
         let simulating_s: f64 =
             sampling_s.unwrap_or_else(|| channels.iter().map(ChannelCost::simulation_s).sum());
-        let accumulating_s: f64 =
-            engines.iter().zip(&expected).map(|(engine, e)| engine.visibility_s * e.mapped).sum();
-        let predicted_s = simulating_s + accumulating_s + solving_s;
+        let predicted_s = simulating_s + channels.iter().map(|channel| channel.mapping_s).sum::<f64>();
         Cost {
             channels,
             windows: self.windows.len(),
@@ -234,6 +240,16 @@ impl Plan {
         let steps = (self.config.spacecraft.duration_s / every_s).ceil();
         let observed = (self.observing_s() / every_s).ceil() + self.windows.len() as f64;
         steps.min(observed).min(sent.ceil()).max(1.0) as u64
+    }
+
+    /// Memory that a simulation of any channels takes, and that of each channel's sky and model, bytes.
+    pub(super) fn simulation_bytes_by_channel(&self) -> (f64, Vec<f64>) {
+        let nsides = self.sky_nsides();
+        let sky = |nside: &usize| 8.0 * pixel_count(*nside) as f64;
+        let turned = 3.0 * nsides.iter().map(sky).fold(0.0, f64::max);
+        let models = self.model_plans(&nsides);
+        let each = nsides.iter().zip(&models).map(|(nside, model)| sky(nside) + model.bytes).collect();
+        (turned + QUEUED_VISIBILITIES_MAX * QUEUED_VISIBILITY_BYTES + BASE_BYTES, each)
     }
 
     /// Memory of the space segment besides its models, bytes.
@@ -319,9 +335,10 @@ impl fmt::Display for Cost {
             writeln!(
                 f,
                 "{:>8.3} MHz simulated by {kind} ({why}): estimated {:.1} s by direct sums; harmonics to l = {l_max} \
-                 {set_up_s:.1} s to set up and {visibilities_s:.1} s for visibilities",
+                 {set_up_s:.1} s to set up and {visibilities_s:.1} s for visibilities, or {:.1} s by rows of any positions",
                 channel.frequency_hz / 1e6,
-                channel.simulation_direct_s
+                channel.simulation_direct_s,
+                channel.simulation_general_s
             )?;
         }
         writeln!(f)?;

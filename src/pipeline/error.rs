@@ -26,6 +26,9 @@ pub enum PipelineError {
     /// The generated sky.
     #[error(transparent)]
     GeneratedSky(#[from] crate::sky::generated::GeneratedSkyError),
+    /// What is added to a map of the sky.
+    #[error(transparent)]
+    AddedSky(#[from] crate::sky::generated::AddedSkyError),
     /// The harmonic coefficients of the simulated sky cannot be computed.
     #[error("the harmonic coefficients of the simulated sky: {0}")]
     Coefficients(#[from] crate::sky::harmonics::HarmonicsError),
@@ -138,10 +141,27 @@ pub enum PipelineError {
         /// Visibilities now.
         now: u64,
     },
+    /// What cannot be done group by group.
+    #[error("--groups: found {found}, expected {expected}")]
+    NotInGroups {
+        /// What was set.
+        found: &'static str,
+        /// What can be.
+        expected: &'static str,
+    },
+    /// Visibilities that were put aside are gone.
+    #[error("{}: gone while the others were simulated; expected it to stay: repeat the command", path.display())]
+    SpoolGone {
+        /// The file.
+        path: std::path::PathBuf,
+    },
+    /// Visibilities cannot be put aside, or read back.
+    #[error(transparent)]
+    Spool(#[from] crate::mother::SpoolError),
     /// More memory needed than there is.
     #[error(
         "an estimated {} of memory are needed, and {} are available ({}): expected at most that; lower map.nside, \
-         map.l_max or the number of channels, map some of them at a time (replay --groups auto), or state another limit, as in --memory-max {}GB",
+         map.l_max or the number of channels, take some of them at a time (--groups auto), or state another limit, as in --memory-max {}GB",
         gigabytes(*needed_bytes), gigabytes(limit.bytes as f64), limit.source, (needed_bytes / 1e9).ceil()
     )]
     Memory {

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::plan::Plan;
 use super::problems::Problems;
+use crate::sky::AddedSky;
 use crate::sky::fits::{ReadOptions, read_sky, read_whole_map};
 
 impl Plan {
@@ -21,6 +22,9 @@ impl Plan {
         let options = ReadOptions { frame_if_missing: self.config.map.prior_frame, ..ReadOptions::default() };
         let priors = priors.map(|path| read_whole_map(path, &options));
         for problem in skies.chain(priors).filter_map(Result::err) {
+            found.push(|| problem);
+        }
+        if let Some(Err(problem)) = sky.added.as_ref().map(AddedSky::check) {
             found.push(|| problem);
         }
         if let Err(problem) = self.config.calibration.build(Path::new("")) {

@@ -38,6 +38,7 @@ impl Config {
             prior_maps: prior_maps(self)?,
             rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
             refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
+            passes: None,
             trace_probes: map.trace_probes,
             watch,
         })
@@ -79,7 +80,8 @@ pub(super) fn add(
     let Mapping { out, truth, watch, viewers } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let ranks = ground.ranks().clone();
-    let setup = config.solver(watch.among(&ranks))?;
+    let passes = config.map.refine.is_on().then(|| out.to_owned());
+    let setup = SolverSetup { passes, ..config.solver(watch.among(&ranks))? };
     if !ranks.is_first() {
         let sums = graph.stage(GROUND, 1, bytes, ground);
         let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));

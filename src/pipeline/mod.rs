@@ -9,6 +9,7 @@ pub(crate) mod config;
 mod config_reader;
 mod config_source;
 mod cost;
+mod downlink_settings;
 mod engine_cost;
 pub(crate) mod error;
 mod file_problems;
@@ -21,10 +22,12 @@ pub(crate) mod plan;
 mod problems;
 mod quantities;
 mod rates;
+mod realisations;
 mod reference;
 mod run;
 mod sample_summary;
 pub(crate) mod sampling;
+mod simulation_groups;
 pub(crate) mod space_segment;
 mod state;
 mod study;
@@ -36,10 +39,14 @@ pub use config_reader::ReadProblem;
 pub use config_source::{ConfigError, ConfigSource, QUICKLOOK};
 pub use cost::{ChannelCost, Cost, RankCost, Segment};
 pub use error::PipelineError;
-pub use groups::{GroupSize, GroupWatcher, channel_groups, replay_in_groups};
+pub use groups::{
+    GroupSize, GroupStep, GroupStepWatcher, GroupWatcher, MemoryAdvice, RunGroups, channel_groups,
+    replay_in_groups, run_in_groups,
+};
 pub use memory::{MemoryLimit, MemorySource};
 pub use plan::{Expected, Plan};
 pub use problems::{Problem, Problems};
+pub use realisations::{PowerSpread, RealisationSpread};
 pub use reference::{KeyDescription, REFERENCE, key_descriptions};
 pub use run::{
     Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, run_among, simulate,
@@ -47,6 +54,7 @@ pub use run::{
 };
 pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
 pub use sampling::sample_stages;
+pub use simulation_groups::{MERGE, simulate_in_groups};
 pub use space_segment::{INTEGRATE, sky_notes};
 pub use state::solve_state;
 pub use study::{

@@ -3,19 +3,24 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use rayon::prelude::*;
+
 use super::error::PipelineError;
 use super::plan::{Expected, Plan};
 use crate::array::Array;
-use crate::mother::{Fidelity, Schedule};
+use crate::frames::ObservingWindow;
+use crate::mother::{ChannelModel, Fidelity, Schedule};
 use crate::response::harmonic::RotationTable;
 use crate::response::model::{
-    BandAverage, DirectSum, HarmonicSum, HarmonicSumSetup, Load, ModelChoice, ModelKind, ModelPlan,
-    Reflected, VisibilityModel,
+    BandAverage, DirectSum, GeneralSum, HarmonicSum, HarmonicSumSetup, Load, ModelChoice, ModelKind,
+    ModelPlan, Reflected, VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
 use crate::sky::{Frame, SkyConfig, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
+use crate::units::vector::{Vec3, norm, sub};
+use crate::units::{Pair, all_pairs};
 
 impl Plan {
     /// The choice of model for each channel, with skies of these nsides, channel by channel.
@@ -27,8 +32,12 @@ impl Plan {
     /// As [`Self::model_plans`], for the visibilities of [`Self::visibilities`].
     pub(super) fn model_plans_for(&self, expected: &[Expected], nsides: &[usize]) -> Vec<ModelPlan> {
         let spacecraft = &self.config.spacecraft;
+        let apart_m = match self.array.formation() {
+            Some(_) => 0.0,
+            None => farthest_apart_m(&self.array, &self.windows),
+        };
         let plan = |((schedule, expected), &sky_nside): ((&Schedule, &Expected), &usize)| {
-            let longest = longest_baseline_wavelengths(&self.array, schedule);
+            let longest = longest_baseline_wavelengths(&self.array, apart_m, schedule);
             let (frequencies, stretch) = match spacecraft.smear_bandwidth {
                 true => {
                     let width_hz = spacecraft.channel_width_hz;
@@ -44,16 +53,12 @@ impl Plan {
                 baseline_wavelengths_max: longest * stretch,
                 l_max: self.config.sky.l_max,
                 smeared: spacecraft.smear_integrations,
+                circle: self.array.formation().is_some(),
             };
             if spacecraft.fidelity == Fidelity::Samples {
-                // The sampler needs auto-correlations and pairs stretched over the channel; the harmonic model is made for
-                // neither.
+                // The sampler needs auto-correlations and pairs stretched over the channel; the others are made for neither.
                 let direct = ModelPlan::new(ModelChoice::Direct, load);
                 return ModelPlan { why: "samples take direct sums", ..direct };
-            }
-            if self.array.formation().is_none() {
-                let direct = ModelPlan::new(ModelChoice::Direct, load);
-                return ModelPlan { why: "harmonics need a common circle", ..direct };
             }
             ModelPlan::new(spacecraft.model, load)
         };
@@ -70,19 +75,19 @@ impl Plan {
         let nside = |channel: usize| {
             let path = sky.file.as_ref().and_then(|files| files.get(channel));
             let map = path.and_then(|path| read_whole_map(&path, &options).ok());
-            map.map_or(sky.nside, |map| map.nside())
+            let least = if sky.added.is_some() { sky.nside } else { 1 };
+            map.map_or(sky.nside, |map| map.nside().max(least))
         };
         (0..self.schedules.len()).map(nside).collect()
     }
 }
 
 /// The longest baseline of a schedule, wavelengths. The limit holds at the start of an integration; until its middle a
-/// baseline moves by less than the rule allows.
-fn longest_baseline_wavelengths(array: &Array, schedule: &Schedule) -> f64 {
+/// baseline moves by less than the rule allows. Without a formation satellites are `apart_m` apart at most.
+fn longest_baseline_wavelengths(array: &Array, apart_m: f64, schedule: &Schedule) -> f64 {
     let Some(formation) = array.formation() else {
-        // No two satellites are further apart than on opposite sides; what counts is in the schedule.
         let limit = schedule.baseline_wavelengths_max;
-        let most = 2.0 * array.farthest_m() * schedule.frequency_hz / SPEED_OF_LIGHT_M_S;
+        let most = apart_m * schedule.frequency_hz / SPEED_OF_LIGHT_M_S;
         return if limit > 0.0 { most.min(limit + schedule.rule.motion_wavelengths_max) } else { most };
     };
     // Arcs are greatest at the start of a period.
@@ -97,41 +102,95 @@ fn longest_baseline_wavelengths(array: &Array, schedule: &Schedule) -> f64 {
     }
 }
 
-/// The model of each channel.
+/// Windows in which distances are looked at, at most, and instants of each.
+const WINDOWS_MAX: usize = 500;
+const INSTANTS: usize = 5;
+
+/// About the greatest distance of two satellites while they observe, m: a tenth more than at some instants, and at most that of
+/// opposite sides.
+fn farthest_apart_m(array: &Array, windows: &[ObservingWindow]) -> f64 {
+    let step = windows.len().div_ceil(WINDOWS_MAX).max(1);
+    let chosen: Vec<&ObservingWindow> = windows.iter().step_by(step).collect();
+    let pairs = all_pairs(array.satellites());
+    let in_window = |window: &&ObservingWindow| {
+        let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
+        let at = |k: usize| start_s + (end_s - start_s) * k as f64 / (INSTANTS - 1) as f64;
+        let distance = |t_s: f64| {
+            let places: Vec<Vec3> = (0..array.satellites()).map(|n| array.position_m(n, t_s)).collect();
+            let apart = |pair: &Pair| norm(sub(places[usize::from(pair.i)], places[usize::from(pair.j)]));
+            pairs.iter().map(apart).fold(0.0, f64::max)
+        };
+        (0..INSTANTS).map(at).map(distance).fold(0.0, f64::max)
+    };
+    let found = chosen.par_iter().map(in_window).reduce(|| 0.0, f64::max);
+    (1.1 * found).min(2.0 * array.farthest_m())
+}
+
+/// The model of each channel that has a sky.
 ///
 /// # Errors
 /// A sky whose coefficients cannot be computed; an invalid model.
-pub(crate) fn build(plan: &Plan, skies: &[SkyMap]) -> Result<Vec<Box<dyn VisibilityModel>>, PipelineError> {
-    let nsides: Vec<usize> = skies.iter().map(SkyMap::nside).collect();
-    let array = &plan.array;
-    let mut rotations: HashMap<usize, Arc<RotationTable<f32>>> = HashMap::new();
-    let mut models: Vec<Box<dyn VisibilityModel>> = Vec::new();
-    for ((model, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {
-        let (frequency_hz, response) = (schedule.frequency_hz, plan.instrument.response);
-        if model.kind == ModelKind::Direct {
-            let direct = |moon_m| -> Result<Box<dyn VisibilityModel>, PipelineError> {
-                Ok(Box::new(DirectSum::new(sky, frequency_hz, moon_m, response)))
-            };
-            models.push(averaged(plan, reflected(plan, direct)?, frequency_hz));
-            continue;
-        }
-        let alm = coefficients(sky, model.l_max)?;
-        let setup = |moon_radius_m| HarmonicSumSetup {
-            frequency_hz,
-            orbit_radius_m: array.orbit_radius_m(),
-            inclination_rad: array.inclination_rad(),
-            moon_radius_m,
-            baseline_wavelengths_max: model.baseline_wavelengths_max,
-            response,
-        };
-        let table = || Arc::new(RotationTable::new(model.l_max, array.inclination_rad()));
-        let rotation = Arc::clone(rotations.entry(model.l_max).or_insert_with(table));
-        let harmonic = |moon_m| -> Result<Box<dyn VisibilityModel>, PipelineError> {
-            Ok(Box::new(HarmonicSum::new(alm.clone(), setup(moon_m), Arc::clone(&rotation))?))
-        };
-        models.push(averaged(plan, reflected(plan, harmonic)?, frequency_hz));
+pub(crate) fn build(plan: &Plan, skies: &[Option<&SkyMap>]) -> Result<Vec<ChannelModel>, PipelineError> {
+    let nside = |(sky, usual): (&Option<&SkyMap>, usize)| sky.map_or(usual, SkyMap::nside);
+    let nsides: Vec<usize> = skies.iter().zip(plan.sky_nsides()).map(nside).collect();
+    let mut rotations = HashMap::new();
+    let mut models = Vec::new();
+    for ((choice, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {
+        let made = sky.map(|sky| channel_model(plan, choice, sky, schedule, &mut rotations));
+        models.push(ChannelModel { batch: choice.kind.batch(), model: made.transpose()? });
     }
     Ok(models)
+}
+
+/// The models of all channels.
+///
+/// # Errors
+/// As [`build`].
+pub(crate) fn build_all(
+    plan: &Plan,
+    skies: &[SkyMap],
+) -> Result<Vec<Box<dyn VisibilityModel>>, PipelineError> {
+    let skies: Vec<Option<&SkyMap>> = skies.iter().map(Some).collect();
+    Ok(build(plan, &skies)?.into_iter().filter_map(|channel| channel.model).collect())
+}
+
+/// The model of a channel; `rotations` holds the tables that channels share.
+fn channel_model(
+    plan: &Plan,
+    choice: &ModelPlan,
+    sky: &SkyMap,
+    schedule: &Schedule,
+    rotations: &mut HashMap<usize, Arc<RotationTable<f32>>>,
+) -> Result<Box<dyn VisibilityModel>, PipelineError> {
+    let array = &plan.array;
+    let (frequency_hz, response) = (schedule.frequency_hz, plan.instrument.response);
+    if choice.kind == ModelKind::Direct {
+        let direct = |moon_m| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+            Ok(Box::new(DirectSum::new(sky, frequency_hz, moon_m, response)))
+        };
+        return Ok(averaged(plan, reflected(plan, direct)?, frequency_hz));
+    }
+    let alm = coefficients(sky, choice.l_max)?;
+    if choice.kind == ModelKind::General {
+        let general = |moon_m| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+            Ok(Box::new(GeneralSum::new(sky, alm.clone(), frequency_hz, moon_m)?))
+        };
+        return Ok(averaged(plan, reflected(plan, general)?, frequency_hz));
+    }
+    let setup = |moon_radius_m| HarmonicSumSetup {
+        frequency_hz,
+        orbit_radius_m: array.orbit_radius_m(),
+        inclination_rad: array.inclination_rad(),
+        moon_radius_m,
+        baseline_wavelengths_max: choice.baseline_wavelengths_max,
+        response,
+    };
+    let table = || Arc::new(RotationTable::new(choice.l_max, array.inclination_rad()));
+    let rotation = Arc::clone(rotations.entry(choice.l_max).or_insert_with(table));
+    let harmonic = |moon_m| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+        Ok(Box::new(HarmonicSum::new(alm.clone(), setup(moon_m), Arc::clone(&rotation))?))
+    };
+    Ok(averaged(plan, reflected(plan, harmonic)?, frequency_hz))
 }
 
 /// The model that `of` makes for a radius of the Moon, m, with the image of the sky if the configuration asks for it.

@@ -33,7 +33,8 @@ pub fn key_descriptions() -> Vec<KeyDescription> {
             found.push(KeyDescription { key: joined(&section, key), default, about: about.to_owned() });
         } else if let Some((key, rest)) = optional.and_then(|rest| rest.split_once(" = ")) {
             let (example, about) = comment_of(rest);
-            let about = format!("{about} (for example {example})");
+            // First, so that lines that go on with the text follow it.
+            let about = format!("for example {example}: {about}");
             found.push(KeyDescription { key: joined(&section, key), default: None, about });
         } else if line.starts_with(' ')
             && !about.is_empty()
@@ -90,7 +91,10 @@ mod tests {
         assert!(of("sky.frequency").about.ends_with("T(nu) = T(FREQ) (nu / FREQ)^index"));
         assert_eq!(of("sky").about, "the simulated sky");
         // Not there by default.
-        assert!(of("sky.file").default.is_none() && of("sky.file").about.contains("map.fits"));
+        assert!(
+            of("sky.file").default.is_none()
+                && of("sky.file").about.starts_with("for example \"map.fits\": ")
+        );
         let bare: Vec<&str> =
             found.iter().filter(|described| described.key.contains(' ')).map(|d| d.key.as_str()).collect();
         assert!(bare.is_empty(), "{bare:?}");

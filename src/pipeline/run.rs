@@ -38,6 +38,14 @@ pub struct Watched {
     pub maps: MapWatch,
 }
 
+impl Watched {
+    /// Handles of a graph without a ground.
+    pub(super) fn of_space(graph: &Graph) -> Self {
+        let (solving, maps) = (SolveWatch::default(), MapWatch::default());
+        Self { metrics: graph.metrics(), solving, listening: None, ground: None, maps }
+    }
+}
+
 /// A source of downlink bytes.
 pub trait GroundSource: Source<Out = Vec<u8>, Error = DownlinkError> {
     /// Its senders, if it listens.
@@ -82,10 +90,10 @@ pub type Watcher<'a> = &'a mut dyn FnMut(Watched);
 pub const READ: &str = "read";
 
 /// Name of the stage that writes the downlink file.
-const RECORD: &str = "record";
+pub(super) const RECORD: &str = "record";
 
 /// Name of the file of settings that `run` leaves among its products.
-const SETTINGS: &str = "pipeline.toml";
+pub(super) const SETTINGS: &str = "pipeline.toml";
 
 /// Name of the downlink file that `run` leaves among its products.
 #[must_use]
@@ -211,9 +219,8 @@ pub(super) fn simulate_sky(
         // The graph says that its end is open.
         (None, None) => drop(bytes),
     }
-    let (solving, maps) = (SolveWatch::default(), MapWatch::default());
-    let watched = Watched { metrics: graph.metrics(), solving, listening: None, ground: None, maps };
-    let report = start(graph, &Ranks::one(), &plan.config.runtime, cancel, (watched, watch))?;
+    let watched = Watched::of_space(&graph);
+    let report = start_alone(graph, &plan.config.runtime, cancel, watched, watch)?;
     close_samples(&counts, plan, &report)?;
     Ok(report)
 }
@@ -317,7 +324,7 @@ fn close_samples(
 }
 
 /// Adds the link's faults, if any are configured; their truth file goes beside the downlink file.
-fn add_link(
+pub(super) fn add_link(
     graph: &mut Graph,
     bytes: Link<Vec<u8>>,
     config: &Config,
@@ -330,7 +337,7 @@ fn add_link(
 }
 
 /// Leaves the true errors of the instrument beside a downlink file, if it has any.
-fn write_instrument_truth(plan: &Plan, file: &Path) -> Result<(), PipelineError> {
+pub(super) fn write_instrument_truth(plan: &Plan, file: &Path) -> Result<(), PipelineError> {
     let Some(text) = plan.instrument_truth() else { return Ok(()) };
     let mut name = file.as_os_str().to_owned();
     name.push(".instrument.csv");
@@ -339,7 +346,7 @@ fn write_instrument_truth(plan: &Plan, file: &Path) -> Result<(), PipelineError>
 }
 
 /// Leaves all settings of a run beside its products, as a pipeline file that repeats it.
-fn write_settings(config: &Config, out: &Path) -> Result<(), PipelineError> {
+pub(super) fn write_settings(config: &Config, out: &Path) -> Result<(), PipelineError> {
     let path = out.join(SETTINGS);
     let settings = toml::to_string_pretty(config)
         .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
@@ -375,6 +382,17 @@ impl Grace {
 /// How long stages of one rank of several have to end after a failure: they may be waiting for the others.
 const SHUTDOWN_OF_RANK: Duration = Duration::from_secs(3);
 
+/// Runs a graph in one process.
+pub(super) fn start_alone(
+    graph: Graph,
+    config: &RuntimeConfig,
+    cancel: &Cancel,
+    watched: Watched,
+    watch: Watcher<'_>,
+) -> Result<Report, PipelineError> {
+    start(graph, &Ranks::one(), config, cancel, (watched, watch))
+}
+
 fn start(
     mut graph: Graph,
     ranks: &Ranks,
@@ -398,6 +416,13 @@ pub(super) struct Ended {
     outcome: SegmentOutcome,
     listening: Option<Listening>,
     samples: Option<SampleSummary>,
+}
+
+impl Ended {
+    /// Auto-correlations that were taken.
+    pub(super) fn powers(&self) -> u64 {
+        self.outcome.ground.autos.lock().unwrap_or_else(PoisonError::into_inner).len() as u64
+    }
 }
 
 /// The summary of a run, which the first rank writes.

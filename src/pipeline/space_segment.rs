@@ -18,6 +18,7 @@ use crate::runtime::{Graph, Link};
 use crate::sky::fits::{read_sky, read_unit};
 use crate::sky::generated::generate;
 use crate::sky::{Frame, SkyMap};
+use crate::units::ChannelId;
 
 /// Name of the stage by whose windows progress is measured.
 pub const INTEGRATE: &str = "integrate";
@@ -27,19 +28,31 @@ pub const INTEGRATE: &str = "integrate";
 /// # Errors
 /// A map that cannot be read, that has pixels that are no temperature of a sky, or that is of another frequency.
 pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
+    (0..).map(ChannelId).take(plan.schedules.len()).map(|channel| sky(plan, channel)).collect()
+}
+
+/// That of one channel.
+///
+/// # Errors
+/// As [`skies`].
+pub(super) fn sky(plan: &Plan, channel: ChannelId) -> Result<SkyMap, PipelineError> {
     let config = &plan.config.sky;
-    let sky = |(channel, &frequency_hz): (usize, &f64)| match config.file.as_ref() {
+    let channel = usize::from(channel.0);
+    let frequency_hz = plan.config.spacecraft.channels_hz[channel];
+    match config.file.as_ref() {
         Some(files) => {
             let path = files.get(channel).unwrap_or_default();
             let may_be_dark = plan.config.spacecraft.receiver_noise_k_sr > 0.0;
-            Ok(read_sky(&path, frequency_hz, config, may_be_dark)?)
+            let map = read_sky(&path, frequency_hz, config, may_be_dark)?;
+            let Some(added) = &config.added else { return Ok(map) };
+            let seed = plan.config.seed;
+            Ok(added.add_to(map, &config.generated, frequency_hz, config.nside, seed)?)
         }
         None => {
             let values = generate(&config.generated, frequency_hz, config.nside, plan.config.seed)?;
             Ok(SkyMap::new(Frame::Ecliptic, values)?)
         }
-    };
-    plan.config.spacecraft.channels_hz.iter().enumerate().map(sky).collect()
+    }
 }
 
 /// What is assumed about the map files of the sky: those without a unit are in K.
@@ -67,14 +80,26 @@ pub fn add(
     skies: &[SkyMap],
     counts: &SampleCounts,
 ) -> Result<Link<Vec<u8>>, PipelineError> {
-    let Plan { config, array, instrument, schedules, windows } = plan;
-    let capacity = config.runtime.queue_capacity;
-    let models = models::build(plan, skies)?;
-    if config.spacecraft.fidelity == Fidelity::Samples {
-        let frames = samples(graph, plan, models, counts);
-        let frames = add_ninth(graph, plan, skies, frames)?;
-        return transmit(graph, plan, frames);
+    if plan.config.spacecraft.fidelity == Fidelity::Samples {
+        let frames = samples(graph, plan, models::build_all(plan, skies)?, counts);
+        return send(graph, plan, frames);
     }
+    let skies: Vec<Option<&SkyMap>> = skies.iter().map(Some).collect();
+    let frames = integrate(graph, plan, &skies)?;
+    send(graph, plan, frames)
+}
+
+/// Adds the integration of the visibilities of the channels that have skies.
+///
+/// # Errors
+/// An invalid model.
+pub(super) fn integrate(
+    graph: &mut Graph,
+    plan: &Plan,
+    skies: &[Option<&SkyMap>],
+) -> Result<Link<GroundFrame>, PipelineError> {
+    let Plan { config, array, instrument, schedules, windows } = plan;
+    let models = models::build(plan, skies)?;
     let noise = NoiseModel {
         seed: config.spacecraft.thermal_noise.then_some(config.seed),
         receiver_noise_k_sr: config.spacecraft.receiver_noise_k_sr,
@@ -90,8 +115,19 @@ pub fn add(
             .with_errors(plan.instrument_errors());
     // A window itself is small; its visibilities are not.
     let windows = graph.source("observe", 1, Observer::new(windows.clone()));
-    let frames = graph.stage(INTEGRATE, capacity, windows, integrator);
-    let frames = add_ninth(graph, plan, skies, frames)?;
+    Ok(graph.stage(INTEGRATE, config.runtime.queue_capacity, windows, integrator))
+}
+
+/// Adds what follows on the frames of all channels, to the bytes of the downlink.
+///
+/// # Errors
+/// A sky that the ninth daughter cannot take; an invalid configuration of the downlink.
+pub(super) fn send(
+    graph: &mut Graph,
+    plan: &Plan,
+    frames: Link<GroundFrame>,
+) -> Result<Link<Vec<u8>>, PipelineError> {
+    let frames = add_ninth(graph, plan, frames)?;
     transmit(graph, plan, frames)
 }
 
@@ -99,7 +135,6 @@ pub fn add(
 fn add_ninth(
     graph: &mut Graph,
     plan: &Plan,
-    skies: &[SkyMap],
     frames: Link<GroundFrame>,
 ) -> Result<Link<GroundFrame>, PipelineError> {
     let Plan { config, array, windows, .. } = plan;
@@ -109,7 +144,7 @@ fn add_ninth(
     let setup = NinthSetup {
         array: Arc::clone(array),
         config: config.spacecraft.ninth.clone(),
-        sky: ninth_sky(plan, skies)?,
+        sky: ninth_sky(plan)?,
         windows: windows.clone(),
         seed: config.spacecraft.thermal_noise.then_some(config.seed),
     };
@@ -122,15 +157,15 @@ fn add_ninth(
 
 /// The sky of the ninth daughter: the generated sky at its own frequencies, or the map file of the highest channel,
 /// continued as a power of frequency.
-fn ninth_sky(plan: &Plan, skies: &[SkyMap]) -> Result<NinthSky, PipelineError> {
+fn ninth_sky(plan: &Plan) -> Result<NinthSky, PipelineError> {
     let Plan { config, array, instrument, .. } = plan;
     let model = |sky: &SkyMap, at_hz| DirectSum::new(sky, at_hz, array.moon_radius_m(), instrument.response);
     let ninth = &config.spacecraft.ninth;
-    let channels = skies.iter().zip(&config.spacecraft.channels_hz);
+    let channels = (0..).map(ChannelId).zip(&config.spacecraft.channels_hz);
     let highest = channels.max_by(|a, b| a.1.total_cmp(b.1));
-    if let (Some(_), Some((sky, &frequency_hz))) = (&config.sky.file, highest) {
+    if let (Some(_), Some((channel, &frequency_hz))) = (&config.sky.file, highest) {
         return Ok(NinthSky::PowerLaw {
-            model: model(sky, frequency_hz),
+            model: model(&sky(plan, channel)?, frequency_hz),
             frequency_hz,
             index: ninth.file_index,
         });

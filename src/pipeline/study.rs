@@ -14,6 +14,7 @@ use super::config::Config;
 use super::config_source::ConfigSource;
 use super::error::PipelineError;
 use super::plan::Plan;
+use super::realisations::{RealisationSpread, csv_of, spreads};
 use super::run::{Destination, Watched, downlink_file, replay_knowing, simulate_sky};
 use super::space_segment;
 use crate::downlink::{FileSource, Recorder};
@@ -78,6 +79,8 @@ struct StudyFile {
     set: Vec<String>,
     #[serde(default)]
     axis: Vec<AxisFile>,
+    /// Realisations of each case: of the noise-only map's noise, and of the instrument's random errors if it has any.
+    realisations: Option<usize>,
 }
 
 /// An axis: a key and its values, or named cases of several settings each.
@@ -101,8 +104,10 @@ struct CaseFile {
 pub struct Study {
     /// Name; results go to `out/NAME` by default.
     pub name: String,
-    /// Its cases, in order.
+    /// Its cases, in order; those that differ in their realisation alone follow each other.
     pub cases: Vec<StudyCase>,
+    /// Realisations of each case; 1 for no such axis.
+    pub realisations: usize,
 }
 
 /// A case of a study.
@@ -166,11 +171,38 @@ impl Study {
                 })
                 .collect();
         }
+        let realisations = file.realisations.unwrap_or(1);
+        if realisations == 0 || combinations.len().saturating_mul(realisations) > CASES_MAX {
+            let found = format!("realisations = {realisations} of {} cases", combinations.len());
+            return Err(wrong(found, "1 or more, at most 1000 cases in all"));
+        }
         let stem =
             path.file_stem().map_or_else(|| "study".into(), |stem| stem.to_string_lossy().into_owned());
         let beside = |pipeline: &PathBuf| path.parent().unwrap_or(Path::new("")).join(pipeline);
         let pipeline = file.pipeline.as_ref().map(beside);
-        let cases = combinations.into_iter().map(|(labels, sets)| {
+        let mut realised = Vec::new();
+        for (labels, sets) in combinations {
+            let overrides = [file.set.as_slice(), &sets, more].concat();
+            let source = ConfigSource { file: pipeline.clone(), overrides, seed: None };
+            // What is wrong is told with the case.
+            let base = source.load().ok();
+            for number in 1..=realisations {
+                let (mut labels, mut sets) = (labels.clone(), sets.clone());
+                if let Some(base) = base.as_ref().filter(|_| realisations > 1) {
+                    labels.push(format!("realisation {number}"));
+                    sets.push(format!(
+                        "map.companion_seed={}",
+                        base.map.companion_seed.wrapping_add(number as u64)
+                    ));
+                    if base.instrument.is_on() {
+                        let realisation = base.instrument.realisation.saturating_add(number as u32);
+                        sets.push(format!("instrument.realisation={realisation}"));
+                    }
+                }
+                realised.push((labels, sets));
+            }
+        }
+        let cases = realised.into_iter().map(|(labels, sets)| {
             let overrides = [file.set.as_slice(), &sets, more].concat();
             let source = ConfigSource { file: pipeline.clone(), overrides: overrides.clone(), seed: None };
             let plan = source.load().map_err(PipelineError::from).and_then(Plan::new);
@@ -184,7 +216,7 @@ impl Study {
             let found = format!("two cases with products in {}", twice.folder());
             return Err(wrong(found, "labels that differ in letters or digits"));
         }
-        Ok(Self { name: file.name.unwrap_or(stem), cases })
+        Ok(Self { name: file.name.unwrap_or(stem), cases, realisations })
     }
 }
 
@@ -241,6 +273,9 @@ pub struct StudySummary {
     pub cases: Vec<CaseSummary>,
     /// Where the traces cross, for cases that differ in map.epsilon alone.
     pub crossings: Vec<Crossing>,
+    /// What realisations scatter by.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub spreads: Vec<RealisationSpread>,
 }
 
 /// A finished case.
@@ -463,7 +498,21 @@ fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary,
         .map(|(_, members)| members.into_iter().map(|k| &cases[k].figures).collect())
         .collect();
     let crossings = crossings(&groups);
-    Ok(StudySummary { name: study.name.clone(), cancelled, cases, crossings })
+    let spreads = if study.realisations > 1 { spreads(&realised(study, &cases), out)? } else { Vec::new() };
+    Ok(StudySummary { name: study.name.clone(), cancelled, cases, crossings, spreads })
+}
+
+/// Cases that differ in their realisation alone, with what they have in common.
+fn realised<'a>(study: &Study, cases: &'a [CaseSummary]) -> Vec<(String, Vec<&'a CaseSummary>)> {
+    let labels = study.cases.chunks(study.realisations);
+    labels
+        .map(|members| {
+            let folders: BTreeSet<String> = members.iter().map(StudyCase::folder).collect();
+            let label = members[0].labels.split_last().map(|(_, common)| common.join(", "));
+            let done = cases.iter().filter(|case| folders.contains(&case.folder));
+            (label.unwrap_or_default(), done.collect())
+        })
+        .collect()
 }
 
 fn write_results(summary: &StudySummary, out: &Path) -> Result<(), PipelineError> {
@@ -474,11 +523,17 @@ fn write_results(summary: &StudySummary, out: &Path) -> Result<(), PipelineError
         ("study.json", json),
         ("study.csv", runs_csv(&runs).into_bytes()),
         ("spectra.csv", spectra_csv(&runs).into_bytes()),
+        ("realisations.csv", csv_of(&summary.spreads).into_bytes()),
     ] {
+        if name == "realisations.csv" && summary.spreads.is_empty() {
+            continue;
+        }
         let path = out.join(name);
         write_atomically(&path, &bytes).map_err(|source| ProductsError::Write { path, source })?;
     }
     let picture = draw_runs(&summary.name, &runs).map_err(ProductsError::from)?;
-    picture.write(&out.join("study.png")).map_err(ProductsError::from)?;
+    for name in ["study.png", "study.svg"] {
+        picture.write(&out.join(name)).map_err(ProductsError::from)?;
+    }
     Ok(())
 }

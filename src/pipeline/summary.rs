@@ -2,8 +2,10 @@
 
 use std::collections::BTreeSet;
 use std::fmt;
+use std::fs;
 use std::path::{Path, PathBuf};
 
+use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
 use serde::{Deserialize, Serialize};
 
 use super::config::Config;
@@ -100,20 +102,16 @@ impl RunSummary {
         }
     }
 
-    /// The summary of this pass and a later one over the same downlink, for other channels.
-    pub(super) fn and(self, later: Self) -> Self {
+    /// The summary of this pass and an earlier one over the same downlink, for other channels.
+    pub(super) fn after(self, earlier: PassRecord) -> Self {
         let elsewhere = VisibilityReason::ChannelNotMapped;
-        let ledger = self.ledger.of_two_passes(&later.ledger, VisibilityReason::is_of_sums, elsewhere);
-        let (mut channels, mut earlier_reports) = (self.channels, self.earlier_reports);
-        channels.extend(later.channels);
-        earlier_reports.push(self.report);
+        let ledger = earlier.ledger.of_two_passes(&self.ledger, VisibilityReason::is_of_sums, elsewhere);
         Self {
-            seed: self.seed.or(later.seed),
-            space_hash: self.space_hash.or(later.space_hash),
-            channels,
+            seed: earlier.seed.or(self.seed),
+            space_hash: earlier.space_hash.or(self.space_hash),
+            channels: [earlier.channels, self.channels].concat(),
             ledger,
-            earlier_reports,
-            ..later
+            ..self
         }
     }
 
@@ -147,6 +145,57 @@ impl RunSummary {
             let _ = file.parent().map(std::fs::remove_dir);
         }
         Ok(path)
+    }
+}
+
+/// What a summary says of a group that is mapped.
+#[derive(bincode::Encode, bincode::Decode)]
+pub(super) struct PassRecord {
+    pub(super) ledger: LedgerReport<VisibilityReason>,
+    pub(super) channels: Vec<ChannelSummary>,
+    pub(super) seed: Option<u64>,
+    pub(super) space_hash: Option<String>,
+}
+
+/// Greatest record that is read: a channel's curves take some 100 kB.
+const RECORD_BYTES_MAX: usize = 1 << 28;
+
+const CODEC: Configuration<LittleEndian, Fixint, Limit<RECORD_BYTES_MAX>> = bincode::config::standard()
+    .with_little_endian()
+    .with_fixed_int_encoding()
+    .with_limit::<RECORD_BYTES_MAX>();
+
+impl PassRecord {
+    pub(super) fn of(summary: &RunSummary) -> Self {
+        Self {
+            ledger: summary.ledger.clone(),
+            channels: summary.channels.clone(),
+            seed: summary.seed,
+            space_hash: summary.space_hash.clone(),
+        }
+    }
+
+    /// The record of a group that is mapped by the same settings; `None` if there is none, or if its products are gone.
+    pub(super) fn read(path: &Path, key: u64, out: &Path) -> Option<Self> {
+        let bytes = fs::read(path).ok().filter(|bytes| bytes.len() <= RECORD_BYTES_MAX)?;
+        let (body, crc) = bytes.split_last_chunk::<8>()?;
+        let (found, body) = body.split_first_chunk::<8>()?;
+        let sum = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, body);
+        if u64::from_le_bytes(*found) != key || u64::from_le_bytes(*crc) != sum {
+            return None;
+        }
+        let (record, _) = bincode::decode_from_slice::<Self, _>(body, CODEC).ok()?;
+        let mut files = record.channels.iter().flat_map(|channel| &channel.files);
+        files.all(|file| out.join(file).is_file()).then_some(record)
+    }
+
+    pub(super) fn write(&self, path: &Path, key: u64) -> Result<(), ProductsError> {
+        let failed = |source| ProductsError::Write { path: path.to_owned(), source };
+        let body = bincode::encode_to_vec(self, CODEC)
+            .map_err(|error| ProductsError::Encode { path: path.to_owned(), reason: error.to_string() })?;
+        let crc = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &body);
+        let bytes = [key.to_le_bytes().as_slice(), &body, &crc.to_le_bytes()].concat();
+        write_atomically(path, &bytes).map_err(failed)
     }
 }
 

@@ -162,7 +162,8 @@ pub struct StageProgress {
     pub queue_capacity: Option<usize>,
     /// Working: one entry for each step.
     pub working: DurationCounts,
-    /// From the source's push of an item to the end of the step on what was made from it.
+    /// From the source's push of an item, or since when the source says that it was there, to the end of the step on what was made
+    /// from it.
     pub since_source: DurationCounts,
     /// Whether the stage is in a step, and not waiting for room.
     pub is_working: bool,

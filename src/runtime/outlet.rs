@@ -47,6 +47,15 @@ impl<T> Outlet<T> {
         }
     }
 
+    /// As [`Outlet::push`] of a source, for an item that was there `since` an instant: from then on its latencies count.
+    pub fn push_since(&mut self, item: T, since: Instant) {
+        self.descend_from(since);
+        self.push(item);
+        if let Target::Queue(queue) = &mut self.0 {
+            queue.born = None;
+        }
+    }
+
     /// As [`Outlet::push`], but gives up waiting for room when `cancel` is triggered; for items that no one needs then.
     pub fn push_unless(&mut self, item: T, cancel: &Cancel) {
         match &mut self.0 {

@@ -36,7 +36,8 @@ pub struct StageReport {
     pub working: TimingSummary,
     /// Waiting for room in the output queue: one entry for each step, and one for `finish`.
     pub waiting_out: TimingSummary,
-    /// From the source's push of an item to the end of the step on what was made from it; one entry for each input.
+    /// From the source's push of an item, or since when the source says that it was there, to the end of the step on what was made
+    /// from it; one entry for each input.
     pub since_source: TimingSummary,
     /// The queue before the stage; `None` for a source.
     pub queue: Option<QueueReport>,

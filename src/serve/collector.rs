@@ -96,7 +96,7 @@ impl Collector for Scrape {
 
 impl Scrape {
     fn run(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
-        let Status { version, name, segment, phase, elapsed_s, .. } = &self.status;
+        let Status { version, name, segment, phase, up_s, .. } = &self.status;
         let build = [
             ("version", (*version).to_owned()),
             ("pipeline", name.clone()),
@@ -108,7 +108,7 @@ impl Scrape {
             [(build, 1.0)],
         )?;
         let uptime = About("uptime", "Time since the server started", Some(Unit::Seconds));
-        gauge(out, uptime, *elapsed_s)?;
+        gauge(out, uptime, *up_s)?;
         let phases = Phase::ALL.map(|p| ([("phase", p.name().to_owned())], f64::from(u8::from(p == *phase))));
         gauges(out, About("run_phase", "1 for the phase in which the run is", None), phases)
     }

@@ -9,7 +9,7 @@ use axum::body::Bytes;
 
 use super::event_log::EventLog;
 use super::geometry::Geometry;
-use super::pulse::Pulse;
+use super::pulse::{Pulse, whole_run};
 use super::shelf::Shelf;
 use super::status::{ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, stages_of};
 use super::subject::Subject;
@@ -46,9 +46,11 @@ impl VisitorCounts {
 
 /// How a run ended.
 #[derive(Clone, Debug)]
-pub(super) struct Ending {
-    pub(super) error: Option<String>,
-    pub(super) cancelled: bool,
+struct Ending {
+    error: Option<String>,
+    cancelled: bool,
+    /// When, since the server's start, s.
+    up_s: f64,
 }
 
 /// What changes from one look to the next.
@@ -102,12 +104,13 @@ impl Console {
         }
     }
 
-    fn elapsed_s(&self) -> f64 {
+    /// Since the server's start, s.
+    fn up_s(&self) -> f64 {
         self.started.elapsed().as_secs_f64()
     }
 
     fn note(&self, is_bad: bool, text: impl Into<String>) {
-        self.log.push(self.elapsed_s(), is_bad, text.into());
+        self.log.push(self.up_s(), is_bad, text.into());
     }
 
     /// The run begins.
@@ -124,7 +127,8 @@ impl Console {
     }
 
     /// The run has ended.
-    pub(super) fn end(&self, ending: Ending) {
+    pub(super) fn end(&self, error: Option<String>, cancelled: bool) {
+        let ending = Ending { error, cancelled, up_s: self.up_s() };
         match &ending {
             Ending { error: Some(error), .. } => self.note(true, format!("the run failed: {error}")),
             Ending { cancelled: true, .. } => self.note(true, "the run was ended early"),
@@ -195,7 +199,12 @@ impl Console {
         }
         let now = Instant::now();
         let mut memory = self.memory();
-        let rates = memory.pulse.look(&progress, now);
+        let up_s = self.up_s();
+        let elapsed_s = ending.as_ref().map_or(up_s, |ending| ending.up_s);
+        let rates = match ending {
+            Some(_) => whole_run(&progress, elapsed_s),
+            None => memory.pulse.look(&progress, now),
+        };
         let listening = watched.and_then(|watched| watched.listening.as_ref()).map(|listening| {
             let mut report = listening.report();
             report.senders.listed.truncate(SENDERS_SHOWN);
@@ -224,7 +233,8 @@ impl Console {
             phase,
             error: ending.as_ref().and_then(|ending| ending.error.clone()),
             cancelled: ending.is_some_and(|ending| ending.cancelled),
-            elapsed_s: self.elapsed_s(),
+            up_s,
+            elapsed_s,
             stages: stages_of(&progress, &rates),
             solving: solving.map(|solving| memory.solver(solving, now)),
             ledger: ground.map(|ground| ground.ledger.report().into()),

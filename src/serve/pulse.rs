@@ -1,4 +1,4 @@
-//! Rates of stages over the last seconds.
+//! Rates of stages over the last seconds, and of a run that has ended over all of it.
 
 use std::collections::VecDeque;
 use std::time::Instant;
@@ -19,8 +19,8 @@ struct Look {
     stages: Vec<(u64, f64)>,
 }
 
-/// What a stage did over the last seconds.
-#[derive(Clone, Copy, Debug, Default)]
+/// What a stage did over the last seconds, or in the whole run.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct StageRate {
     /// Share of the time in which it worked, 0 to 1.
     pub(super) busy: f64,
@@ -53,4 +53,14 @@ impl Pulse {
         }
         rates
     }
+}
+
+/// Rates over a whole run, which took so long.
+pub(super) fn whole_run(stages: &[StageProgress], elapsed_s: f64) -> Vec<StageRate> {
+    let seconds = elapsed_s.max(1e-3);
+    let rate = |stage: &StageProgress| StageRate {
+        busy: (stage.working.total_s / seconds).clamp(0.0, 1.0),
+        units_per_s: stage.units.count as f64 / seconds,
+    };
+    stages.iter().map(rate).collect()
 }

@@ -11,7 +11,7 @@ use tokio::time::{MissedTickBehavior, interval, sleep};
 
 use super::address::ServeAddress;
 use super::connection::accept;
-use super::console::{Console, Ending};
+use super::console::Console;
 use super::error::ServeError;
 use super::routes::{Desk, router};
 use super::subject::Subject;
@@ -74,7 +74,7 @@ impl Server {
     pub fn conclude(&self, error: Option<String>, cancelled: bool) {
         // What happened before the end stands before it in the log.
         tell(&self.console, &self.news);
-        self.console.end(Ending { error, cancelled });
+        self.console.end(error, cancelled);
         tell(&self.console, &self.news);
     }
 }

@@ -58,9 +58,9 @@ pub(super) struct StageStatus {
     pub(super) items_out: u64,
     pub(super) units: u64,
     pub(super) unit: &'static str,
-    /// Units per second, over the last seconds.
+    /// Units per second, over the last seconds; after the run over all of it.
     units_per_s: f64,
-    /// Share of the last seconds in which it worked.
+    /// Share of that time in which it worked.
     pub(super) busy: f64,
     pub(super) ended: bool,
     pub(super) queue: Option<QueueStatus>,
@@ -155,6 +155,8 @@ pub(super) struct Status {
     /// Whether it was told to end early.
     pub(super) cancelled: bool,
     /// Since the server's start, s.
+    pub(super) up_s: f64,
+    /// Since the server's start, to the end of the run if it has ended, s.
     pub(super) elapsed_s: f64,
     pub(super) stages: Vec<StageStatus>,
     pub(super) solving: Option<SolverStatus>,

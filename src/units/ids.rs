@@ -10,7 +10,18 @@ pub const MAX_SATELLITES: usize = 64;
 
 /// Index of a frequency channel in the instrument description.
 #[derive(
-    Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, bincode::Encode, bincode::Decode,
+    Clone,
+    Copy,
+    Debug,
+    Default,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Hash,
+    serde::Serialize,
+    bincode::Encode,
+    bincode::Decode,
 )]
 pub struct ChannelId(pub u16);
 

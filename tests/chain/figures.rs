@@ -64,6 +64,41 @@ fn q0_is_that_of_the_reference() {
     assert!(met >= 6, "{met}");
 }
 
+/// Lengths and altitudes over a mission, against the equations of the orbits.
+#[test]
+fn baselines_are_those_of_the_orbits() {
+    let place = Workplace::new(SMALL);
+    let (eccentricity, ratio) = (0.01, 0.02);
+    let sets = [
+        format!("array.eccentricity={eccentricity}"),
+        format!("array.cross_track_ratio={ratio}"),
+        "array.periapsis_rate_deg_per_day=1.15".to_owned(),
+        "spacecraft.every_nth_window=11".to_owned(),
+    ];
+    let sets: Vec<&str> = sets.iter().flat_map(|set| ["--set", set.as_str()]).collect();
+    let (numbers, out) = figure(&place, "baselines", &[&[place.pipeline.as_str()], sets.as_slice()].concat());
+    let number = |key: &str, k: usize| numbers[key][k].as_f64().unwrap();
+    // a (1 - e) to a (1 + e); instants meet the apsides within 5 deg in 470 windows, and so to 0.4 % of 20 km.
+    let axis_m = 2_037.1e3;
+    for (k, sign) in [(0, -1.0), (1, 1.0)] {
+        let expected_m = 300e3 + sign * eccentricity * axis_m;
+        assert!((number("altitude_m", k) - expected_m).abs() < 100.0, "{numbers}");
+    }
+    // 100 m to 100 km apart in phase, which an ellipse changes by at most (1 + e) / (1 - e), to first order in e 2 %.
+    let (shortest_m, longest_m) = (number("length_m", 0), number("length_m", 1));
+    assert!((98.0..=104.0).contains(&shortest_m) && (98e3..=102e3).contains(&longest_m), "{numbers}");
+    // Planes that are inclined to each other by the ratio of their distance: the distance across the track is that of 100 km at most,
+    // 2 % more at the apoapsis.
+    let across_m = numbers["across_m_max"].as_f64().unwrap();
+    assert!((0.95 * ratio * 100e3..=1.03 * ratio * 100e3).contains(&across_m), "{numbers}");
+    // Radii differ by a e sin(anomaly) of the phase between the two, so by e 100 km at most.
+    let radial_m = numbers["radial_m_max"].as_f64().unwrap();
+    assert!((0.9 * eccentricity * 100e3..=1.05 * eccentricity * 100e3).contains(&radial_m), "{numbers}");
+    let table = lines(&format!("{out}/baselines.csv"));
+    assert_eq!(table.len(), 28 * numbers["windows"].as_u64().unwrap() as usize);
+    assert!(table.iter().all(|row| row[3] <= row[4] && row[5] <= row[4]), "{:?}", table[0]);
+}
+
 #[test]
 fn pair_time_gives_the_independent_counts() {
     let place = Workplace::new(SMALL);

@@ -1,5 +1,10 @@
 //! Channels that are mapped group by group, or some of them alone.
 
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use lunarray::pipeline::{ConfigSource, GroupSize, GroupStep, Plan, RunSummary, run_in_groups};
+use lunarray::runtime::Cancel;
 use serde_json::Value;
 
 use crate::common::workplace::{SMALL, Workplace, fail, files, json, lunarray, succeed};
@@ -86,4 +91,148 @@ fn groups_that_cannot_be_made_say_why() {
     let output = lunarray(&["replay", &downlink, "--out", &out, "--groups", "0"]);
     assert!(String::from_utf8(output.stderr).unwrap().contains("expected auto, or a number"));
     succeed(&["replay", &downlink, "--map", &place.pipeline, "--out", &out, "--groups", "2"]);
+}
+
+#[test]
+fn a_run_in_groups_leaves_the_bytes_of_one_of_all_channels() {
+    // Harmonics, whose batches are counted over all channels; faults on the link.
+    let more = ["--set", "spacecraft.model=harmonic", "--set", "downlink.link={duplicate=0.1,pass_cut=0.3}"];
+    let place = place();
+    let run = |name: &str, groups: &[&str]| {
+        let out = place.path(name);
+        let summary = json(&[&["run", &place.pipeline, "--out", &out], &more[..], groups].concat());
+        (files(out.as_ref()), summary)
+    };
+    let (all, whole) = run("all", &[]);
+    assert!(all.keys().any(|path| path.ends_with("downlink.ccsds")));
+    for size in ["1", "2", "auto"] {
+        let (found, summary) = run(&format!("by-{size}"), &["--groups", size]);
+        assert!(found.keys().eq(all.keys()), "{size}: {:?}", found.keys());
+        assert!(found == all, "{size}");
+        for key in ["ledger", "reception", "completeness", "seed", "space_hash", "ground_hash", "channels"] {
+            assert_eq!(summary[key], whole[key], "{size} {key}");
+        }
+        let (one, grouped) = (place.path("one.ccsds"), place.path(&format!("{size}.ccsds")));
+        succeed(&[&["simulate", &place.pipeline, "--out", &one], &more[..]].concat());
+        succeed(&[&["simulate", &place.pipeline, "--out", &grouped, "--groups", size], &more[..]].concat());
+        assert!(std::fs::read(one).unwrap() == std::fs::read(grouped).unwrap(), "{size}");
+    }
+    let checked = json(&["check", &place.pipeline, "--groups", "2"]);
+    assert_eq!(checked["groups"], serde_json::json!({"simulated": [[0, 1], [2]], "mapped": [[0, 1], [2]]}));
+    let samples = fail(&["run", &place.pipeline, "--groups", "1", "--set", "spacecraft.fidelity=samples"]);
+    assert!(samples.contains("--groups: found spacecraft.fidelity"), "{samples}");
+}
+
+#[test]
+fn a_ground_is_told_when_its_sums_will_outgrow_memory() {
+    let place = place();
+    let downlink = place.simulate("x.ccsds", &[]);
+    let out = place.path("out");
+    let harmonic = ["--set", "map.engine=harmonic", "--map", &place.pipeline, "--out", &out];
+    let said = |args: &[&str]| {
+        let output = lunarray(&[&["replay", &downlink], &harmonic[..], args].concat());
+        assert!(output.status.success());
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let small = said(&["--memory-max", "60MB"]);
+    assert!(
+        small.contains("the sums of 3 channels at map.nside = ") && small.contains("--groups auto"),
+        "{small}"
+    );
+    assert!(!said(&["--memory-max", "200GB"]).contains("the sums of"));
+}
+
+/// All files but `summary.json`, which has times.
+fn products_of(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = files(folder);
+    found.remove(Path::new(".lock"));
+    // Nothing stays that is of use to a later call alone.
+    let hidden = found.keys().find(|path| path.file_name().unwrap().to_string_lossy().starts_with('.'));
+    assert_eq!(hidden, None);
+    found
+}
+
+#[test]
+fn a_run_in_groups_goes_on_where_it_was_cancelled() {
+    let overrides = [
+        "spacecraft.channels_hz=[1e6, 2e6, 3e6]",
+        "spacecraft.duration_s=30000",
+        "spacecraft.auto_powers=true",
+        "spacecraft.ninth.on=true",
+        "instrument.phase_deg.pass_rms=5",
+        "sky.nside=8",
+        "map.nside=4",
+        "map.snapshot_every_s=0",
+        "products.pictures=false",
+        "runtime.threads=0",
+    ];
+    let overrides = overrides.map(str::to_owned).to_vec();
+    let config = ConfigSource { overrides, ..ConfigSource::default() }.load().unwrap();
+    let plan = Plan::new(config).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let whole = folder.path().join("whole");
+    let summary = lunarray::pipeline::run(&plan, &whole, &Cancel::default(), &mut |_| {}).unwrap();
+    let expected = products_of(&whole);
+    assert!(expected.len() > 6, "{:?}", expected.keys());
+    let groups = plan.run_groups(GroupSize::Channels(1), None).unwrap();
+    let steps = [
+        GroupStep::Simulated(0),
+        GroupStep::Simulated(1),
+        GroupStep::Simulated(2),
+        GroupStep::Merged,
+        GroupStep::Mapped(0),
+        GroupStep::Mapped(1),
+        GroupStep::Mapped(2),
+    ];
+    for (place, at) in steps.into_iter().enumerate() {
+        let out = folder.path().join(format!("cancelled-{place}"));
+        let cancel = Cancel::default();
+        let cut = run_in_groups(&plan, &groups, &out, &cancel, &mut |step, _| {
+            if step == at {
+                cancel.cancel();
+            }
+        });
+        let cut = cut.unwrap();
+        assert_eq!(cut.is_none(), place < 4, "{at:?}");
+        assert!(cut.is_none_or(|cut| cut.cancelled));
+        let mut seen = Vec::new();
+        let again = run_in_groups(&plan, &groups, &out, &Cancel::default(), &mut |step, _| seen.push(step));
+        let again = again.unwrap().unwrap();
+        // What was done before is not done again.
+        assert_eq!(seen, steps[place..], "{at:?}");
+        assert!(products_of(&out) == expected, "{at:?}");
+        assert_eq!(again.ledger, summary.ledger);
+        assert_eq!(again.reception, summary.reception);
+        assert_eq!(again.completeness, summary.completeness);
+        let of = |summary: &RunSummary| serde_json::to_value(&summary.channels).unwrap();
+        assert_eq!(of(&again), of(&summary));
+    }
+}
+
+#[test]
+fn other_settings_begin_anew() {
+    let sets = |epsilon: &str| {
+        let sets = [epsilon, "spacecraft.duration_s=30000", "sky.nside=8", "map.nside=4"];
+        let more = ["spacecraft.channels_hz=[1e6, 2e6]", "map.snapshot_every_s=0", "products.pictures=false"];
+        let overrides = [&sets[..], &more].concat().into_iter().map(str::to_owned).collect();
+        Plan::new(ConfigSource { overrides, ..ConfigSource::default() }.load().unwrap()).unwrap()
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let (first, second) = (sets("map.epsilon=1e-3"), sets("map.epsilon=1e-4"));
+    let groups = first.run_groups(GroupSize::Channels(1), None).unwrap();
+    let cancel = Cancel::default();
+    run_in_groups(&first, &groups, folder.path(), &cancel, &mut |step, _| {
+        if step == GroupStep::Mapped(1) {
+            cancel.cancel();
+        }
+    })
+    .unwrap();
+    let mut seen = Vec::new();
+    run_in_groups(&second, &groups, folder.path(), &Cancel::default(), &mut |step, _| seen.push(step))
+        .unwrap();
+    // The downlink is the same; no map is.
+    assert_eq!(seen, [GroupStep::Mapped(0), GroupStep::Mapped(1)]);
+    let expected = tempfile::tempdir().unwrap();
+    lunarray::pipeline::run(&second, expected.path(), &Cancel::default(), &mut |_| {}).unwrap();
+    assert!(products_of(folder.path()) == products_of(expected.path()));
 }

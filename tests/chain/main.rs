@@ -20,5 +20,6 @@ mod products;
 mod ranks;
 mod reflection;
 mod run;
+mod schema;
 mod start_up;
 mod study;

@@ -45,6 +45,9 @@ fn the_published_sky_comes_back_as_in_the_paper() {
             "--set",
             "spacecraft.thermal_noise=false",
             "--set",
+            // Somewhat beyond what a map of nside 32 takes, 62.6.
+            "spacecraft.baseline_wavelengths_max=70",
+            "--set",
             "map.nside=32",
             "--json",
         ]);

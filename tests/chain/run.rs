@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use common::process::{wait_until, written};
-use common::workplace::{Workplace, fail, files, succeed};
+use common::workplace::{Workplace, fail, files, lunarray, succeed};
 use serde_json::Value;
 
 /// A small mission: real geometry, small maps, at most a few minutes of work.
@@ -279,4 +279,89 @@ fn the_sky_command_writes_the_sky_of_a_run() {
     };
     assert!(found.contains_key(Path::new("3.000MHz/input.fits")));
     assert_eq!(read(&sky), read(&place.path("out/3.000MHz/input.fits")));
+}
+
+#[test]
+fn a_replay_that_is_told_nothing_gives_the_maps_of_the_run() {
+    // Settings that are not the defaults, in a folder that `run` leaves.
+    let place = Workplace::new(SMALL);
+    let out = place.path("ran");
+    let set = ["--set", "map.epsilon=[1e-3,1e-5]", "--set", "map.nside=4"];
+    succeed(&[&["run", &place.pipeline, "--out", &out], &set[..]].concat());
+    let downlink = format!("{out}/downlink.ccsds");
+    let replay = |name: &str, file: &str, more: &[&str]| {
+        let out = place.path(name);
+        let done = lunarray(&[&["replay", file, "--out", &out], more].concat());
+        let said = String::from_utf8(done.stderr).unwrap();
+        assert!(done.status.success(), "{said}");
+        (files_of_maps(Path::new(&out)), said)
+    };
+    let (maps, said) = replay("told-nothing", &downlink, &[]);
+    assert_same(&maps, &files_of_maps(Path::new(&out)));
+    assert!(said.contains(&format!("settings of the maps: those of {out}/pipeline.toml")), "{said}");
+    // What is said on the command line counts more; and so does a map file, of which the rest are defaults.
+    let first = |maps: &BTreeMap<PathBuf, Vec<u8>>| maps.values().next().unwrap().clone();
+    let epsilon = ["--set", "map.epsilon=1e-4"];
+    let (other, _) = replay("set", &downlink, &epsilon);
+    assert!(first(&other) != first(&maps));
+    let of_file = [&["--map", &place.pipeline], &epsilon[..]].concat();
+    let (plain, said) = replay("file", &downlink, &of_file);
+    assert!(first(&plain) != first(&other) && !said.contains("settings of the maps"), "{said}");
+    let (same, _) = replay("file-and-set", &downlink, &[&of_file[..], &set[2..]].concat());
+    assert!(first(&same) == first(&other), "nothing else differs");
+
+    // The pipeline of another space segment says nothing about this one.
+    let elsewhere = place.path("elsewhere");
+    std::fs::create_dir(&elsewhere).unwrap();
+    let copied = format!("{elsewhere}/copy.ccsds");
+    std::fs::copy(&downlink, &copied).unwrap();
+    let changed = std::fs::read_to_string(format!("{out}/pipeline.toml")).unwrap();
+    std::fs::write(format!("{elsewhere}/pipeline.toml"), changed.replacen("seed = 7", "seed = 8", 1))
+        .unwrap();
+    let (defaults, said) = replay("defaults", &copied, &[]);
+    assert!(!said.contains("settings of the maps"), "{said}");
+    // nside 16 by default.
+    assert!(first(&defaults).len() > first(&maps).len());
+
+    // A state keeps to its settings, whatever lies beside later files.
+    let state = place.path("state");
+    replay("begun", &copied, &["--set", "map.nside=2", "--state", &state]);
+    let (maps, _) = replay("again", &downlink, &["--state", &state]);
+    let nside = |bytes: &[u8]| String::from_utf8_lossy(bytes).contains("NSIDE   =                    2");
+    assert!(nside(&first(&maps)));
+}
+
+#[test]
+fn the_quicklook_is_known_wherever_its_downlink_lies() {
+    let place = Workplace::new(SMALL);
+    let file = place.path("alone.ccsds");
+    // The space segment of the quicklook; its packets in other pieces, which is no matter of the hash.
+    succeed(&["simulate", "--out", &file, "--set", "downlink.packet_bytes_max=60000"]);
+    let out = place.path("out");
+    let done = lunarray(&[
+        "replay",
+        &file,
+        "--out",
+        &out,
+        "--set",
+        "map.nside=4",
+        "--set",
+        "products.pictures=false",
+    ]);
+    let said = String::from_utf8(done.stderr).unwrap();
+    assert!(
+        done.status.success() && said.contains("settings of the maps: those of embedded quicklook"),
+        "{said}"
+    );
+    let summary: Value =
+        serde_json::from_slice(&std::fs::read(format!("{out}/summary.json")).unwrap()).unwrap();
+    // As in the paper, by channel.
+    let epsilons: Vec<f64> = summary["channels"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|channel| channel["diagnostics"]["epsilon"].as_f64().unwrap())
+        .collect();
+    assert_eq!(epsilons, [1e-4, 1e-6, 1e-4]);
+    assert_eq!(summary["channels"][0]["snapshots"].as_array().unwrap().len(), 6);
 }

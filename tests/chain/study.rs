@@ -1,10 +1,12 @@
 //! Studies: one simulation, many solutions.
 
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 
 use lunarray::pipeline::Study;
 use serde_json::Value;
 
+use super::common::process::{signal, start};
 use super::common::workplace::{SMALL, Workplace, fail, json, succeed};
 
 /// Two epsilons and two limits of the baselines, each in cases of its own.
@@ -74,7 +76,7 @@ fn a_study_gives_the_maps_of_separate_runs() {
         .filter(|name| !name.starts_with("case-"))
         .collect();
     left.sort_unstable();
-    assert_eq!(left, ["spectra.csv", "study.csv", "study.json", "study.png"]);
+    assert_eq!(left, ["spectra.csv", "study.csv", "study.json", "study.png", "study.svg"]);
     let table = String::from_utf8(bytes(format!("{out}/study.csv"))).unwrap();
     assert_eq!(table.lines().count(), 1 + 4 * 2);
     assert!(table.contains("\"b < 2 b_p, epsilon = 0.01\",10000000,4,"), "{table}");
@@ -152,4 +154,73 @@ fn studies_of_the_paper_are_good() {
         count += 1;
     }
     assert!(count >= 1);
+}
+
+#[test]
+fn realisations_scatter_by_the_noise_that_the_matrix_tells() {
+    let place = Workplace::new(SMALL);
+    let study = r#"
+name = "many"
+pipeline = "pipeline.toml"
+set = ["map.trace_probes=1", "products.pictures=false", "spacecraft.channels_hz=[3e6]", "map.snapshot_every_s=0"]
+realisations = 60
+"#;
+    let (study, out) = (place.file("many.toml", study.as_bytes()), place.path("many"));
+    let summary = json(&["study", &study, "--out", &out]);
+    assert_eq!(summary["cases"].as_array().unwrap().len(), 60);
+    let spread = &summary["spreads"][0];
+    assert_eq!(spread["count"], 60);
+    // N_pix times the mean variance of a pixel is the trace of Sigma_n, which comes from eigenvalues. The sum of N_pix variances of 60
+    // realisations scatters by sqrt(2 / 60 / modes), and a few modes hold most of it: at most 18 % if it is one.
+    let figures = &summary["cases"][0]["figures"]["channels"][0];
+    let pixels = 12.0 * figures["nside"].as_f64().unwrap().powi(2);
+    let trace_k2 = figures["diagnostics"]["traces"]["sigma_n_k2"]["value"].as_f64().unwrap();
+    let found_k2 = pixels * spread["sigma_rms_k"].as_f64().unwrap().powi(2);
+    assert!((found_k2 / trace_k2 - 1.0).abs() < 0.36, "{found_k2:e} {trace_k2:e}");
+    // The same by degrees: sum of (2 l + 1) C_l is 4 pi times the mean variance, up to the pixels' own aliasing.
+    let power = spread["noise"]["mean_k2"].as_array().unwrap();
+    let variance: f64 =
+        power.iter().enumerate().map(|(l, c)| (2 * l + 1) as f64 * c.as_f64().unwrap()).sum::<f64>()
+            / (4.0 * std::f64::consts::PI);
+    assert!((variance * pixels / found_k2 - 1.0).abs() < 0.2, "{variance:e} {found_k2:e}");
+    let files: Vec<&str> =
+        spread["files"].as_array().unwrap().iter().map(|file| file.as_str().unwrap()).collect();
+    assert_eq!(
+        files,
+        ["sigma-1-3.000MHz.fits", "covariance-noise-1-3.000MHz.csv", "covariance-map-1-3.000MHz.csv"]
+    );
+    let covariance = String::from_utf8(bytes(format!("{out}/{}", files[1]))).unwrap();
+    let rows: Vec<Vec<f64>> =
+        covariance.lines().map(|line| line.split(',').map(|x| x.parse().unwrap()).collect()).collect();
+    assert!(rows.len() == power.len() && rows.iter().all(|row| row.len() == rows.len()));
+    for (a, row) in rows.iter().enumerate() {
+        let deviation = spread["noise"]["deviation_k2"][a].as_f64().unwrap();
+        assert!((row[a].sqrt() - deviation).abs() <= 1e-12 * deviation);
+        // Symmetric, and no correlation beyond one.
+        assert!(
+            row.iter().enumerate().all(|(b, c)| *c == rows[b][a] && c * c <= 1.0001 * row[a] * rows[b][b])
+        );
+    }
+    assert!(bytes(format!("{out}/realisations.csv")).starts_with(b"case,frequency_hz,realisations,l,"));
+}
+
+#[test]
+fn the_first_signal_ends_a_study_in_order() {
+    let place = Workplace::new(SMALL);
+    let values: Vec<String> = (0..60).map(|k| format!("{}e-5", 1 + k)).collect();
+    let study = format!(
+        "name = \"many\"\npipeline = \"pipeline.toml\"\n[[axis]]\nkey = \"map.epsilon\"\nvalues = [{}]\n",
+        values.join(", ")
+    );
+    let (study, out) = (place.file("many.toml", study.as_bytes()), place.path("many"));
+    let mut child = start(&["study", &study, "--out", &out]);
+    // The third run of this command: the simulation, and a case before.
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    while !lines.next().unwrap().unwrap().contains("case 2 of 60: mapping") {}
+    signal(&child, "INT");
+    let rest: Vec<String> = lines.map(|line| line.unwrap()).collect();
+    assert_eq!(child.wait().unwrap().code(), Some(130), "{rest:?}");
+    assert!(rest.iter().any(|line| line.contains("repeat the command to go on")), "{rest:?}");
+    let summary: Value = serde_json::from_slice(&bytes(format!("{out}/study.json"))).unwrap();
+    assert!(summary["cancelled"] == true && !summary["cases"].as_array().unwrap().is_empty());
 }

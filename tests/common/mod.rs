@@ -3,6 +3,7 @@
 
 pub mod downlink;
 pub mod process;
+pub mod schema;
 pub mod workplace;
 
 use std::path::PathBuf;

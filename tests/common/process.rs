@@ -1,6 +1,6 @@
 //! Commands that run while the test does something to them.
 
-use std::io::Read;
+use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -12,6 +12,20 @@ const PATIENCE: Duration = Duration::from_secs(300);
 pub fn start(args: &[&str]) -> Child {
     let mut command = Command::new(assert_cmd::cargo::cargo_bin("lunarray"));
     command.args(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+}
+
+/// The address on which a ground says that it listens; what it says later is read and dropped.
+pub fn listening(child: &mut Child) -> String {
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    let url = loop {
+        // It fails here if the ground ends before it listens.
+        let line = lines.next().unwrap().unwrap();
+        if let Some(url) = line.strip_prefix("listening on ") {
+            break url.to_owned();
+        }
+    };
+    std::thread::spawn(move || lines.for_each(drop));
+    url
 }
 
 /// Sends a signal such as `INT`.

@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 use assert_cmd::Command;
 use serde_json::Value;
 
+use super::schema::check_summary;
+
 /// Real geometry, two channels, few visibilities.
 pub const SMALL: &str = r#"
 name = "small"
@@ -78,8 +80,13 @@ pub fn fail(args: &[&str]) -> String {
     String::from_utf8(output.stderr).unwrap()
 }
 
+/// What a command prints with --json. The summary of a run is held to its schema.
 pub fn json(args: &[&str]) -> Value {
-    serde_json::from_str(&succeed(&[args, &["--json"]].concat())).unwrap()
+    let found = serde_json::from_str(&succeed(&[args, &["--json"]].concat())).unwrap();
+    if ["run", "replay"].contains(&args[0]) {
+        check_summary(&found);
+    }
+    found
 }
 
 /// All files below a folder but the summary, which holds times, by their paths in it.

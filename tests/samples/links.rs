@@ -8,6 +8,7 @@ use lunarray::daughters::{DropPolicy, SampleLink};
 use lunarray::runtime::{Outlet, Stage};
 use serde_json::Value;
 
+use crate::common::schema::check_summary;
 use crate::craft::{Spacecraft, blocks, constant, frequencies};
 
 const PIPELINE: &str = r#"
@@ -53,7 +54,9 @@ fn lunarray(folder: &Path, command: &str, sets: &[&str]) -> String {
 fn samples(folder: &Path, sets: &[&str]) -> Value {
     lunarray(folder, "run", sets);
     let text = std::fs::read_to_string(folder.join("summary.json")).unwrap();
-    serde_json::from_str::<Value>(&text).unwrap()["samples"].take()
+    let mut summary: Value = serde_json::from_str(&text).unwrap();
+    check_summary(&summary);
+    summary["samples"].take()
 }
 
 /// Blocks of 1024 samples in a window, and windows times daughters.

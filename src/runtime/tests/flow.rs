@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, mpsc};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::parts::{Count, Each, Into, Keep, PATIENCE, TestError};
 use crate::runtime::{Cancel, Flow, Graph, Outlet, RuntimeError, Source, Stage};
@@ -81,6 +81,44 @@ fn the_report_counts_what_passed() {
     assert!(names.iter().all(|name| table.contains(name)), "{table}");
     let json = serde_json::to_value(&report).unwrap();
     assert_eq!(json["stages"][2]["items_in"], 201);
+}
+
+#[test]
+fn what_was_there_before_the_source_took_it_is_as_old_as_it_is() {
+    /// Gives a number that waited, and one that did not.
+    struct Late(Option<Instant>);
+    impl Source for Late {
+        type Out = u64;
+        type Error = TestError;
+        fn next(&mut self, out: &mut Outlet<u64>) -> Result<Flow, TestError> {
+            if let Some(since) = self.0.take() {
+                out.push_since(1, since);
+                return Ok(Flow::Continue);
+            }
+            out.push(2);
+            Ok(Flow::Done)
+        }
+    }
+    let waited = Duration::from_secs(1);
+    let since = Instant::now();
+    std::thread::sleep(waited);
+    let mut graph = Graph::new();
+    let numbers = graph.source("late", 2, Late(Some(since)));
+    let passed = Each::new(|n: u64, out: &mut Outlet<u64>| {
+        out.push(n);
+        Ok(())
+    });
+    let numbers = graph.stage("pass", 2, numbers, passed);
+    let (sink, kept) = Keep::new();
+    graph.sink("keep", numbers, sink);
+    let report = graph.run(&Cancel::new(), PATIENCE).unwrap();
+    assert_eq!(kept.lock().unwrap().items, [1, 2]);
+    for stage in &report.stages[1..] {
+        let found = stage.since_source;
+        assert!(found.max_s >= waited.as_secs_f64(), "{found:?}");
+        // The other one is new: together they are not twice as old.
+        assert!(found.count == 2 && found.total_s < 2.0 * found.max_s, "{found:?}");
+    }
 }
 
 /// An item that knows how many of its kind there are.

@@ -411,7 +411,7 @@ function listen() {
   source.addEventListener("status", (event) => {
     const status = JSON.parse(event.data);
     // Another run has taken the place: nothing that is held is of it.
-    if (state.status && status.elapsed_s < state.status.elapsed_s - 1) {
+    if (state.status && status.up_s < state.status.up_s - 1) {
       state.maps.clear(); state.figures.clear(); state.number = null; state.news = null; state.arrayKnown = null; $("log").replaceChildren();
     }
     update(status);

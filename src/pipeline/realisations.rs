@@ -1,0 +1,198 @@
+//! What maps scatter by over realisations of noise and of the instrument's errors: pixels, power, and the covariance of C_l.
+
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use super::error::PipelineError;
+use super::study::CaseSummary;
+use crate::files::write_atomically;
+use crate::products::{ChannelFigures, ProductsError};
+use crate::sky::SkyMap;
+use crate::sky::fits::{ReadOptions, WriteOptions, read_whole_map, write_map};
+use crate::sky::harmonics::AnalysisOptions;
+use crate::sky::spectra::auto_cl;
+
+/// Realisations of one channel of one case.
+#[derive(Clone, Debug, Serialize)]
+pub struct RealisationSpread {
+    /// What tells the case from the others; empty if it is the only one.
+    pub case: String,
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Number of realisations.
+    pub count: usize,
+    /// Root mean square over the sphere of the standard deviation of a pixel of the noise-only map, K.
+    pub sigma_rms_k: f64,
+    /// Scatter of that standard deviation over the sphere, relative to its mean.
+    pub sigma_scatter: f64,
+    /// Angular power of the noise-only maps.
+    pub noise: PowerSpread,
+    /// Angular power of the maps, if they were compared with their input.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub map: Option<PowerSpread>,
+    /// Its files, in the study's folder.
+    pub files: Vec<PathBuf>,
+}
+
+/// Angular power over realisations, l = 0, 1, ...
+#[derive(Clone, Debug, Serialize)]
+pub struct PowerSpread {
+    /// Mean of C_l, K^2.
+    pub mean_k2: Vec<f64>,
+    /// Standard deviation of C_l, K^2.
+    pub deviation_k2: Vec<f64>,
+    /// Covariance of C_l and C_l', K^4; in files of its own.
+    #[serde(skip)]
+    covariance_k4: Vec<Vec<f64>>,
+}
+
+impl PowerSpread {
+    /// Of at least two spectra of one length.
+    fn of(spectra: &[Vec<f64>]) -> Self {
+        let (count, degrees) = (spectra.len() as f64, spectra.first().map_or(0, Vec::len));
+        let mean = |l: usize| spectra.iter().map(|c| c[l]).sum::<f64>() / count;
+        let mean_k2: Vec<f64> = (0..degrees).map(mean).collect();
+        let covariance = |a: usize, b: usize| {
+            let products = spectra.iter().map(|c| (c[a] - mean_k2[a]) * (c[b] - mean_k2[b]));
+            products.sum::<f64>() / (count - 1.0)
+        };
+        let row = |a: usize| (0..degrees).map(|b| covariance(a, b)).collect();
+        let covariance_k4: Vec<Vec<f64>> = (0..degrees).map(row).collect();
+        let deviation_k2 = (0..degrees).map(|l| covariance_k4[l][l].sqrt()).collect();
+        Self { mean_k2, deviation_k2, covariance_k4 }
+    }
+
+    fn csv(&self) -> String {
+        let line = |row: &Vec<f64>| row.iter().map(|x| format!("{x:e}")).collect::<Vec<_>>().join(",") + "\n";
+        self.covariance_k4.iter().map(line).collect()
+    }
+}
+
+/// Spreads of the cases of a study that differ in their realisation alone, `groups` with their labels; leaves for each channel maps of
+/// sigma and tables of covariances in `out`. Groups of fewer than two are left out.
+///
+/// # Errors
+/// Maps that cannot be read; files that cannot be written.
+pub(super) fn spreads(
+    groups: &[(String, Vec<&CaseSummary>)],
+    out: &Path,
+) -> Result<Vec<RealisationSpread>, PipelineError> {
+    let mut found = Vec::new();
+    for (case, members) in groups.iter().filter(|(_, members)| members.len() > 1) {
+        for place in 0..members[0].figures.channels.len() {
+            let of_channel: Vec<(&Path, &ChannelFigures)> = members
+                .iter()
+                .filter_map(|member| Some((Path::new(&member.folder), member.figures.channels.get(place)?)))
+                .collect();
+            if of_channel.len() == members.len() {
+                let number = found.len() + 1;
+                found.push(channel_spread(case, number, &of_channel, out)?);
+            }
+        }
+    }
+    Ok(found)
+}
+
+fn channel_spread(
+    case: &str,
+    number: usize,
+    members: &[(&Path, &ChannelFigures)],
+    out: &Path,
+) -> Result<RealisationSpread, PipelineError> {
+    let (_, first) = members[0];
+    let mhz = format!("{:.3}MHz", first.frequency_hz / 1e6);
+    let mut squares: Vec<f64> = Vec::new();
+    let mut noise_k2 = Vec::new();
+    let mut frame = None;
+    for (folder, _) in members {
+        let path = out.join(folder).join(&mhz).join("noise.fits");
+        let noise = read_whole_map(&path, &ReadOptions::default())?;
+        squares.resize(noise.values().len(), 0.0);
+        squares.iter_mut().zip(noise.values()).for_each(|(sum, value)| *sum += value * value);
+        let l_max = 3 * noise.nside() - 1;
+        noise_k2.push(auto_cl(&noise.harmonics(l_max, &AnalysisOptions::default())?));
+        frame = Some(noise.frame());
+    }
+    let count = members.len();
+    let sigma: Vec<f64> = squares.iter().map(|sum| (sum / count as f64).sqrt()).collect();
+    let pixels = sigma.len() as f64;
+    let mean_square = sigma.iter().map(|s| s * s).sum::<f64>() / pixels;
+    let mean = sigma.iter().sum::<f64>() / pixels;
+    let noise = PowerSpread::of(&noise_k2);
+    let map_k2: Option<Vec<Vec<f64>>> = members
+        .iter()
+        .map(|(_, figures)| Some(figures.power.as_ref()?.map_k2.iter().map(|c| c.unwrap_or(0.0)).collect()))
+        .collect();
+    let map = map_k2.map(|spectra| PowerSpread::of(&spectra));
+    let mut files = Vec::new();
+    if let Some(frame) = frame {
+        let name = PathBuf::from(format!("sigma-{number}-{mhz}.fits"));
+        write_map(&out.join(&name), &SkyMap::new(frame, sigma)?, &WriteOptions::default())?;
+        files.push(name);
+    }
+    for (what, spread) in [("noise", Some(&noise)), ("map", map.as_ref())] {
+        let Some(spread) = spread else { continue };
+        let name = PathBuf::from(format!("covariance-{what}-{number}-{mhz}.csv"));
+        write(&out.join(&name), spread.csv().as_bytes())?;
+        files.push(name);
+    }
+    Ok(RealisationSpread {
+        case: case.to_owned(),
+        frequency_hz: first.frequency_hz,
+        count,
+        sigma_rms_k: mean_square.sqrt(),
+        sigma_scatter: (mean_square - mean * mean).max(0.0).sqrt() / mean,
+        noise,
+        map,
+        files,
+    })
+}
+
+fn write(path: &Path, bytes: &[u8]) -> Result<(), PipelineError> {
+    let failed = |source| ProductsError::Write { path: path.to_owned(), source };
+    Ok(write_atomically(path, bytes).map_err(failed)?)
+}
+
+/// Means and deviations as a table (CSV).
+pub(super) fn csv_of(spreads: &[RealisationSpread]) -> String {
+    let mut out =
+        "case,frequency_hz,realisations,l,noise_mean_k2,noise_deviation_k2,map_mean_k2,map_deviation_k2\n"
+            .to_owned();
+    for spread in spreads {
+        let case = spread.case.replace('"', "\"\"");
+        for (l, (mean, deviation)) in spread.noise.mean_k2.iter().zip(&spread.noise.deviation_k2).enumerate()
+        {
+            let of_map = |of: fn(&PowerSpread) -> &[f64]| {
+                let value = spread.map.as_ref().and_then(|map| of(map).get(l));
+                value.map_or_else(String::new, |value| format!("{value:e}"))
+            };
+            // Writing to a string cannot fail.
+            let _ = writeln!(
+                out,
+                "\"{case}\",{},{},{l},{mean:e},{deviation:e},{},{}",
+                spread.frequency_hz,
+                spread.count,
+                of_map(|map| &map.mean_k2),
+                of_map(|map| &map.deviation_k2)
+            );
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn means_deviations_and_covariances_are_those_of_the_textbook() {
+        let spread = PowerSpread::of(&[vec![1.0, 4.0], vec![3.0, 0.0], vec![5.0, 2.0]]);
+        assert_eq!(spread.mean_k2, [3.0, 2.0]);
+        // Sums of squares 8 and 8, of products -4, over n - 1 = 2.
+        assert_eq!(spread.covariance_k4, [[4.0, -2.0], [-2.0, 4.0]]);
+        assert_eq!(spread.deviation_k2, [2.0, 2.0]);
+        assert_eq!(spread.csv(), "4e0,-2e0\n-2e0,4e0\n");
+    }
+}

@@ -1,0 +1,144 @@
+//! Simulation of more channels than memory has room for at a time: group by group to files beside the downlink, which is then made
+//! of them. It has the same bytes as one of all channels at once.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use super::error::PipelineError;
+use super::groups::{GroupSize, GroupWatcher, partition};
+use super::memory::MemoryLimit;
+use super::plan::Plan;
+use super::run::{self, Watched};
+use super::space_segment;
+use crate::accumulation::ChannelGroup;
+use crate::downlink::Recorder;
+use crate::mother::{Fidelity, Merger, SpoolReader, SpoolWriter};
+use crate::products::ProductsError;
+use crate::runtime::{Cancel, Graph, Report};
+use crate::sky::SkyMap;
+use crate::units::ChannelId;
+
+/// Name of the stage that puts visibilities aside.
+const SPOOL: &str = "spool";
+/// Name of the source that makes frames of what groups have left; it takes window by window.
+pub const MERGE: &str = "merge";
+
+impl Plan {
+    /// Groups of the channels for a simulation, in their order.
+    ///
+    /// # Errors
+    /// Samples, which are simulated for all channels together; a channel for which alone there is too little memory.
+    pub fn simulation_groups(
+        &self,
+        size: GroupSize,
+        limit: Option<MemoryLimit>,
+    ) -> Result<Vec<ChannelGroup>, PipelineError> {
+        if self.config.spacecraft.fidelity == Fidelity::Samples {
+            return Err(PipelineError::NotInGroups {
+                found: "spacecraft.fidelity = \"samples\"",
+                expected: "\"visibilities\": samples hold all channels together",
+            });
+        }
+        let (shared, each) = self.simulation_bytes_by_channel();
+        let needed = |group: &[ChannelId]| {
+            shared + group.iter().filter_map(|channel| each.get(usize::from(channel.0))).sum::<f64>()
+        };
+        let channels = (0..).map(ChannelId).take(each.len());
+        partition(channels, size, limit, needed)
+    }
+
+    /// What decides whether visibilities that were put aside are those of this plan.
+    fn spool_key(&self) -> u64 {
+        let text = format!("{} {:016x}", env!("CARGO_PKG_VERSION"), self.config.space_hash());
+        crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, text.as_bytes())
+    }
+}
+
+/// Where the visibilities of a group are put aside.
+fn spool_path(file: &Path, group: &ChannelGroup) -> PathBuf {
+    let end = |channel: Option<&ChannelId>| channel.map_or(0, |channel| channel.0);
+    let mut name = file.as_os_str().to_owned();
+    name.push(format!(".channels-{}-{}.spool", end(group.first()), end(group.last())));
+    name.into()
+}
+
+/// As [`simulate`](super::simulate) to a file, group by group. Groups that an earlier call, which was cancelled, has put aside are
+/// taken as they are; what was put aside is removed once the downlink is whole.
+///
+/// `watch` gets the number of the group that is about to be simulated, and their number itself when the downlink is made of them.
+/// The reports are of each that ran, and last of the downlink; the last one says whether all were cancelled.
+///
+/// # Errors
+/// The first failure of any stage; another process that simulates to the same file.
+pub fn simulate_in_groups(
+    plan: &Plan,
+    groups: &[ChannelGroup],
+    file: &Path,
+    cancel: &Cancel,
+    watch: GroupWatcher<'_>,
+) -> Result<Vec<Report>, PipelineError> {
+    let key = plan.spool_key();
+    run::write_instrument_truth(plan, file)?;
+    // What cannot be written shows before anything is computed.
+    let recorder = Recorder::create(file)?;
+    let mut reports = Vec::new();
+    for (number, group) in groups.iter().enumerate() {
+        let path = spool_path(file, group);
+        if SpoolReader::open(&path, key)?.is_some() {
+            continue;
+        }
+        let writer = SpoolWriter::create(&path, key, plan.windows.len())?;
+        let mut graph = Graph::new();
+        let skies: Vec<Option<SkyMap>> = (0..plan.schedules.len())
+            .map(|channel| ChannelId(channel as u16))
+            .map(|channel| group.contains(&channel).then(|| space_segment::sky(plan, channel)).transpose())
+            .collect::<Result<_, _>>()?;
+        let present: Vec<Option<&SkyMap>> = skies.iter().map(Option::as_ref).collect();
+        let frames = space_segment::integrate(&mut graph, plan, &present)?;
+        drop(skies);
+        graph.sink(SPOOL, frames, writer);
+        let watched = Watched::of_space(&graph);
+        let report =
+            run::start_alone(graph, &plan.config.runtime, cancel, watched, &mut |w| watch(number, w))?;
+        let is_cut = report.cancelled;
+        reports.push(report);
+        if is_cut {
+            return Ok(reports);
+        }
+    }
+    let open = |group: &ChannelGroup| {
+        let path = spool_path(file, group);
+        // It was there, or has just been written.
+        SpoolReader::open(&path, key)?.ok_or(PipelineError::SpoolGone { path })
+    };
+    let spools = groups.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+    let mut graph = Graph::new();
+    let merger = Merger::new(
+        Arc::clone(&plan.array),
+        plan.instrument.clone(),
+        plan.windows.clone(),
+        spools,
+        plan.instrument_errors(),
+    );
+    let frames = graph.source(MERGE, plan.config.runtime.queue_capacity, merger);
+    let bytes = space_segment::send(&mut graph, plan, frames)?;
+    let bytes = run::add_link(&mut graph, bytes, &plan.config, file)?;
+    graph.sink(run::RECORD, bytes, recorder);
+    let watched = Watched::of_space(&graph);
+    let report =
+        run::start_alone(graph, &plan.config.runtime, cancel, watched, &mut |w| watch(groups.len(), w))?;
+    if !report.cancelled {
+        remove_spools(groups, file)?;
+    }
+    reports.push(report);
+    Ok(reports)
+}
+
+fn remove_spools(groups: &[ChannelGroup], file: &Path) -> Result<(), PipelineError> {
+    for group in groups {
+        let path = spool_path(file, group);
+        fs::remove_file(&path).map_err(|source| ProductsError::Write { path, source })?;
+    }
+    Ok(())
+}
