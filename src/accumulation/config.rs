@@ -171,7 +171,7 @@ impl MapConfig {
             let l_max = self.l_max as f64;
             checks.number("l_max", l_max, self.l_max < 3 * self.nside, "0, or 1 to 3 nside - 1");
             let degree = self.degree() as f64;
-            checks.number("l_max", degree, self.degree() <= L_MAX, "at most 383; 0 stands for 2.5 nside");
+            checks.number("l_max", degree, self.degree() <= L_MAX, "at most 1024; 0 stands for 2.5 nside");
         }
         self.check_effects(&mut checks);
         let residual = self.residual_max;

@@ -20,7 +20,9 @@ use super::output::{
 };
 use super::progress::{Parts, Progress, time_left};
 use super::serving::{Page, ServeArgs};
-use crate::downlink::transport::socket::{HeldAnswers, ListenNote, SocketError, SocketSource, TcpUrl, Until};
+use crate::downlink::transport::socket::{
+    HeldAnswers, ListenNote, SocketError, SocketSource, Stations, TcpUrl, Until,
+};
 use crate::downlink::{FileSource, Pace, Paced, Steps};
 use crate::frames::Instrument;
 use crate::ground::{Collector, Ground, GroundConfig, WAIT_BYTES};
@@ -79,6 +81,10 @@ pub(super) struct ReplayArgs {
     /// Allow an address that other machines can reach. Anyone who connects can add data to the maps.
     #[arg(long, requires = "listen")]
     allow_remote: bool,
+    /// Take packets only from the stations in this file, which has a line NAME TOKEN for each. Their connections begin with the line
+    /// `token TOKEN`, and are reported by name. Nobody else may be able to read the file. Tokens are sent as they are: use a tunnel.
+    #[arg(long, value_name = "FILE", requires = "listen")]
+    stations: Option<PathBuf>,
     /// End after this number of connections that delivered packets have closed; 0 for never.
     #[arg(long, value_name = "NUMBER", default_value_t = 0, requires = "listen")]
     connections: u64,
@@ -326,6 +332,9 @@ impl Session<'_> {
                 fits
             }))
             .telling(Box::new(print_listen_note));
+        if let Some(path) = &args.stations {
+            source = source.of_stations(Stations::read(path)?);
+        }
         if args.state.is_some() {
             let answers = HeldAnswers::new(Duration::from_secs_f64(listen.held_every_s));
             (source, ground) = (source.answering(&answers), ground.answering(&answers));

@@ -11,7 +11,7 @@ use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_config_notes, print_json_line, print_notes, print_text};
 use super::progress::{GroupSteps, Progress};
 use super::serving::ServeArgs;
-use crate::downlink::transport::socket::{SendOptions, SocketSink, TcpUrl};
+use crate::downlink::transport::socket::{SendOptions, SocketSink, Stations, TcpUrl};
 use crate::pipeline::{
     Destination, GroupSize, GroupStep, INTEGRATE, MERGE, Plan, RunGroups, Segment, simulate,
     simulate_in_groups, sky_notes, use_threads,
@@ -51,6 +51,9 @@ pub(super) struct SimulateArgs {
     /// was ended before and is back within --connect-s. Needs a ground with --state; what is sent again is at most 16 MiB.
     #[arg(long, requires = "send")]
     held: bool,
+    /// File with the line NAME TOKEN of the station that sends, for a ground with --stations. Nobody else may be able to read it.
+    #[arg(long, value_name = "FILE", requires = "send")]
+    token: Option<PathBuf>,
     /// Print stages and throughput as one JSON object instead of a table.
     #[arg(long)]
     json: bool,
@@ -80,7 +83,9 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let interrupt = Interrupt::default();
     let page = args.serve.start(&plan.config, "space", None)?;
     let cancel = interrupt.cancel();
-    let options = SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s, held: args.held };
+    let token = args.token.as_ref().map(|path| Stations::read(path)?.only_token(path)).transpose()?;
+    let options =
+        SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s, held: args.held, token };
     let socket = args.send.as_ref().map(|url| SocketSink::new(url, options, cancel)).transpose()?;
     let confirmed = socket.as_ref().map(SocketSink::confirmed);
     let events = args.events.start(&plan.config, "space")?;

@@ -8,6 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use super::collector::Collector;
 use super::pass_line::PassLine;
 use super::power_waterfall::PowerWaterfall;
+use super::sky_hits::SkyHits;
 use super::uvw_density::UvwDensity;
 use crate::array::{Ephemeris, SatelliteState};
 use crate::calibration::AutoTable;
@@ -79,6 +80,8 @@ struct Shared {
     /// By channel; the ground waits for a copy of one at most, some microseconds.
     densities: Mutex<BTreeMap<ChannelId, UvwDensity>>,
     /// Likewise.
+    hits: Mutex<BTreeMap<ChannelId, SkyHits>>,
+    /// Likewise.
     powers: Mutex<BTreeMap<ChannelId, PowerWaterfall>>,
 }
 
@@ -116,6 +119,12 @@ impl Lookout {
         self.densities().get(&channel).cloned()
     }
 
+    /// Where the pairs of a channel stood, of this session.
+    #[must_use]
+    pub fn hits(&self, channel: ChannelId) -> Option<SkyHits> {
+        self.all_hits().get(&channel).cloned()
+    }
+
     /// The daughters' powers in a channel, of this session.
     #[must_use]
     pub fn powers(&self, channel: ChannelId) -> Option<PowerWaterfall> {
@@ -124,6 +133,10 @@ impl Lookout {
 
     fn all_powers(&self) -> MutexGuard<'_, BTreeMap<ChannelId, PowerWaterfall>> {
         self.0.powers.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn all_hits(&self) -> MutexGuard<'_, BTreeMap<ChannelId, SkyHits>> {
+        self.0.hits.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn densities(&self) -> MutexGuard<'_, BTreeMap<ChannelId, UvwDensity>> {
@@ -202,6 +215,8 @@ impl Spotter {
         if densities.len() < CHANNELS_MAX || densities.contains_key(&placed.channel) {
             let density = densities.entry(placed.channel);
             density.or_insert_with(|| UvwDensity::new(placed.frequency_hz)).add(placed);
+            let mut hits = self.lookout.all_hits();
+            hits.entry(placed.channel).or_insert_with(|| SkyHits::new(placed.frequency_hz)).add(placed);
         }
     }
 

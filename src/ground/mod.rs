@@ -18,6 +18,7 @@ mod pass_line;
 mod power_waterfall;
 mod promises;
 mod reception;
+mod sky_hits;
 mod uvw_density;
 
 pub use self::core::Ground;
@@ -30,4 +31,5 @@ pub use outcome::{GroundOutcome, SavingReport, SharedSaving};
 pub use pass_line::{KindLine, MissingRange, PassLine};
 pub use power_waterfall::PowerWaterfall;
 pub use reception::Reception;
+pub use sky_hits::{HitsMap, SkyHits};
 pub use uvw_density::UvwDensity;

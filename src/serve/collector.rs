@@ -241,7 +241,12 @@ impl Scrape {
             let name = serde_json::to_value(end).ok()?.as_str()?.to_owned();
             Some(([("end", name)], count))
         });
-        counters(out, About("senders_ended", "Connections of senders by how they ended", None), ended)
+        counters(out, About("senders_ended", "Connections of senders by how they ended", None), ended)?;
+        let stations = || report.stations.iter().map(|(name, counts)| ([("station", name.clone())], counts));
+        let about = About("station_read", "Read from a station known by its token", Some(Unit::Bytes));
+        counters(out, about, stations().map(|(label, counts)| (label, counts.bytes)))?;
+        let about = About("station_connections", "Connections of a station that have ended", None);
+        counters(out, about, stations().map(|(label, counts)| (label, counts.connections)))
     }
 
     fn maps(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {

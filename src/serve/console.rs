@@ -14,7 +14,7 @@ use super::shelf::Shelf;
 use super::status::{ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, stages_of};
 use super::subject::Subject;
 use crate::array::Array;
-use crate::ground::{GroundOutcome, PassLine, PowerWaterfall, SavingReport, UvwDensity};
+use crate::ground::{GroundOutcome, HitsMap, PassLine, PowerWaterfall, SavingReport, UvwDensity};
 use crate::pipeline::Watched;
 use crate::products::{MapViewer, PublishedMap};
 use crate::runtime::{Metrics, StageProgress};
@@ -180,6 +180,12 @@ impl Console {
     /// Baselines of a channel; `None` if it has none.
     pub(super) fn uvw(&self, channel: ChannelId) -> Option<UvwDensity> {
         self.ground()?.lookout.density(channel)
+    }
+
+    /// Visibilities of a channel by direction; `None` if it has none. Takes a while.
+    pub(super) fn hits(&self, channel: ChannelId) -> Option<HitsMap> {
+        let lookout = &self.ground()?.lookout;
+        Some(lookout.hits(channel)?.map(lookout.array()?.moon_radius_m))
     }
 
     /// Powers of the daughters in a channel; `None` if none came.

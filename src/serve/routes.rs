@@ -71,6 +71,7 @@ pub(super) fn router(desk: Desk) -> Router {
         .route("/api/passes", get(passes))
         .route("/api/geometry", get(geometry))
         .route("/api/uvw/{channel}", get(uvw))
+        .route("/api/hits/{channel}", get(hits))
         .route("/api/powers/{channel}", get(powers))
         .route("/api/gaps", get(gaps))
         .route("/metrics", get(metrics))
@@ -257,6 +258,16 @@ async fn geometry(State(desk): State<Desk>) -> Response {
 /// `null` before anything is known.
 async fn uvw(State(desk): State<Desk>, Path(channel): Path<String>) -> Response {
     channel_of(&channel).map_or_else(no_channel, |channel| json(&desk.console.uvw(channel)))
+}
+
+/// `null` before anything is known.
+async fn hits(State(desk): State<Desk>, Path(channel): Path<String>) -> Response {
+    let Some(channel) = channel_of(&channel) else { return no_channel() };
+    let console = Arc::clone(&desk.console);
+    match slowly(&desk, move || console.hits(channel)).await {
+        Ok(hits) => json(&hits),
+        Err(refusal) => refusal,
+    }
 }
 
 /// `null` before anything is known.

@@ -16,6 +16,8 @@ mod serving;
 mod soak;
 mod stations;
 mod terminal;
+#[cfg(unix)]
+mod tokens;
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -74,6 +76,15 @@ impl Place {
             if more.contains(&"--listen") { &[] } else { ["--listen", "tcp://127.0.0.1:0"].as_slice() };
         let fixed = ["replay", "--map", self.pipeline(), "--out", &out, "--json"];
         Ground::start(&[&fixed, listen, more].concat())
+    }
+
+    /// A file that nobody else can read.
+    #[cfg(unix)]
+    fn secret(&self, name: &str, text: &str) -> String {
+        use std::os::unix::fs::PermissionsExt;
+        let path = self.workplace.file(name, text.as_bytes());
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600)).unwrap();
+        path
     }
 
     fn maps(&self, name: &str) -> Vec<Vec<u8>> {

@@ -232,6 +232,13 @@ fn the_planes_of_u_v_w_hold_every_eighth_baseline() {
             (&8.into(), &0.into(), &64.into())
         );
         assert_eq!(density["frequency_hz"], frequency_hz);
+        let hits = served.json(&format!("/api/hits/{channel}"));
+        assert_eq!((&hits["visibilities"], &hits["nside"]), (&good.len().into(), &16.into()));
+        // The poles of the orbit are never hidden, what lies in it is for a third of the time.
+        let by_direction = numbers(&hits["hits"]);
+        let [least, most] = [by_direction.iter().min().unwrap(), by_direction.iter().max().unwrap()];
+        assert_eq!((by_direction.len(), *most), (3072, 8 * good.len().div_ceil(8) as u64));
+        assert!(0 < *least && least < most, "{least} {most}");
         let counted: Vec<&[f64; 3]> = good.iter().step_by(8).collect();
         let longest = counted.iter().flat_map(|b| b.iter()).fold(0.0, |m: f64, x| m.max(x.abs()));
         let extent = density["extent_wavelengths"].as_f64().unwrap();
@@ -261,7 +268,7 @@ fn nothing_is_told_of_what_is_not_known() {
     // A space segment alone has no ground.
     let served = Served::start(&["simulate", place.pipeline(), "--out", &out, "--serve-after"]);
     served.wait_for_phase("ended");
-    for path in ["/api/passes", "/api/geometry", "/api/uvw/0"] {
+    for path in ["/api/passes", "/api/geometry", "/api/uvw/0", "/api/hits/0"] {
         assert!(served.json(path).is_null(), "{path}");
     }
     assert!(served.end().success());

@@ -90,12 +90,12 @@ fn dashboard_and_alerts_name_metrics_that_exist() {
     // A ground that listens and keeps a state has all but the solver's, which are there while it iterates.
     let file = place.downlink("packets");
     let (out, state) = (place.path("out"), place.path("state"));
+    let stations = place.secret("stations", "urumqi 0123456789abcdef");
     let listen = ["replay", "--listen", "tcp://127.0.0.1:0", "--connections", "1", "--map", place.pipeline()];
-    let served = Served::start(&[&listen[..], &["--out", &out, "--state", &state, "--serve-after"]].concat());
-    assert!(
-        finish(TcpStream::connect(served.listening()).unwrap(), &std::fs::read(file).unwrap())
-            .starts_with("taken ")
-    );
+    let more = ["--out", &out, "--state", &state, "--stations", &stations, "--serve-after"];
+    let served = Served::start(&[&listen[..], &more].concat());
+    let sent = [b"token 0123456789abcdef\n", std::fs::read(file).unwrap().as_slice()].concat();
+    assert!(finish(TcpStream::connect(served.listening()).unwrap(), &sent).starts_with("taken "));
     served.wait_for_phase("ended");
     let text = served.get("/metrics").text();
     let mut known = metrics_in(&text);

@@ -439,6 +439,17 @@ def shows_a_run(page, served, out, pictures):
     page.assert_sky("with marks", final, Colours.robust(inferno, final), is_marked=True)
     browser.click("#marks")
 
+    # Visibilities by direction, from the counts that the server tells.
+    hits = np.array(served.json("/api/hits/0")["hits"], dtype=float)
+    assert healpy.npix2nside(len(hits)) == 16 and hits.max() > hits.min() > 0
+    show = "const s = document.getElementById('show'); s.value = arguments[0]; s.dispatchEvent(new Event('change'))"
+    browser.js(show, "hits")
+    page.wait_for_text("#high", "visibilities")
+    low, high = (np.sort(hits)[round(q * (len(hits) - 1))] for q in (0.005, 0.995))
+    page.assert_sky("visibilities by direction", hits, Colours(palettes["viridis"], "linear", low, high))
+    browser.js(show, "map")
+    page.wait_for_text("#high", "K, log")
+
     # Value and coordinates under the cursor.
     pixels, x, y = centres(healpy.npix2nside(len(final)), **page.view)
     left, top, *_ = page.box("#gl")

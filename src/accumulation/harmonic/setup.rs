@@ -29,10 +29,10 @@ pub struct HarmonicSetup {
     pub weight_max: f64,
 }
 
-/// Greatest degree that is accepted: its sums would take 25 GB at 125 wavelengths.
-pub const L_MAX: usize = 383;
+/// Greatest degree that is accepted. Sums up to it take 0.5 GB a wavelength: beyond short baselines they are for many ranks.
+pub const L_MAX: usize = 1024;
 /// Longest baseline that is accepted, wavelengths.
-const U_MAX: f64 = 1000.0;
+const U_MAX: f64 = 10_000.0;
 
 /// Nominal inclinations are multiples of this, so that they do not depend on which data arrives first.
 pub(super) const INCLINATION_STEP_DEG: f64 = 0.05;
@@ -66,7 +66,7 @@ impl HarmonicSetup {
         let orbit = &self.orbit;
         let u_max = self.baseline_m_max / self.wavelength_m();
         for (name, value, good, expected) in [
-            ("l_max", self.l_max as f64, (1..=L_MAX).contains(&self.l_max), "1 to 383"),
+            ("l_max", self.l_max as f64, (1..=L_MAX).contains(&self.l_max), "1 to 1024"),
             ("frequency_hz", self.frequency_hz, self.frequency_hz > 0.0, "a positive number"),
             ("moon_radius_m", self.moon_radius_m, self.moon_radius_m > 0.0, "a positive number"),
             ("orbit radius_m", orbit.radius_m, orbit.radius_m > self.moon_radius_m, "more than the Moon's"),
@@ -80,7 +80,7 @@ impl HarmonicSetup {
                 "baseline_m_max",
                 self.baseline_m_max,
                 self.baseline_m_max > 0.0 && self.baseline_m_max < orbit.radius_m && u_max <= U_MAX,
-                "above 0, at most 1000 wavelengths and less than the orbit's radius",
+                "above 0, at most 1e4 wavelengths and less than the orbit's radius",
             ),
         ] {
             if !(good && value.is_finite()) {

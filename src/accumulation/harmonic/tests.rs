@@ -10,6 +10,7 @@ use crate::response::harmonic::{
     GeometryLimits, GeometryRefusal, HarmonicModel, ModelSettings, NominalOrbit, PairState, PatternGeometry,
 };
 use crate::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
+use crate::units::vector::{norm, sub};
 use crate::units::{Pair, all_pairs};
 
 const L_MAX: usize = 20;
@@ -44,7 +45,7 @@ fn blocks(from: usize, count: usize) -> Vec<PlacedVisibilities> {
             for n in 0..5 {
                 let time_s = start_s + 600.0 * f64::from(n);
                 let [r_i_m, r_j_m] = [pair.i, pair.j].map(|n| array.position_m(usize::from(n), time_s));
-                let length = crate::units::vector::norm(crate::units::vector::sub(r_i_m, r_j_m));
+                let length = norm(sub(r_i_m, r_j_m));
                 if length < 1_400.0 {
                     placed.time_s.push(time_s);
                     placed.r_i_m.push(r_i_m);
@@ -72,8 +73,12 @@ fn engine(blocks: &[PlacedVisibilities]) -> HarmonicEngine {
 
 /// A vector of unknowns without pattern.
 fn vector(seed: u64) -> Vec<f64> {
+    vector_to(L_MAX, seed)
+}
+
+fn vector_to(l_max: usize, seed: u64) -> Vec<f64> {
     let mut word = seed;
-    (0..(L_MAX + 1).pow(2))
+    (0..(l_max + 1).pow(2))
         .map(|_| {
             word = word.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
             (word >> 33) as f64 / (1_u64 << 31) as f64 - 0.5
@@ -87,7 +92,10 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 
 /// Visibilities of a sky by the forward operator, which is tested against sums over directions.
 fn forward(unknowns: &[f64], blocks: &[PlacedVisibilities]) -> Vec<Complex64> {
-    let setup = setup();
+    forward_of(&setup(), unknowns, blocks)
+}
+
+fn forward_of(setup: &HarmonicSetup, unknowns: &[f64], blocks: &[PlacedVisibilities]) -> Vec<Complex64> {
     let wavelength_m = SPEED_OF_LIGHT_M_S / FREQUENCY_HZ;
     let geometry = PatternGeometry {
         orbit_radius_m: setup.orbit.radius_m,
@@ -97,7 +105,7 @@ fn forward(unknowns: &[f64], blocks: &[PlacedVisibilities]) -> Vec<Complex64> {
     };
     let settings =
         ModelSettings::new(geometry, setup.orbit.inclination_rad, setup.baseline_m_max / wavelength_m);
-    let mut model = HarmonicModel::new(coefficients(unknowns, L_MAX), settings).unwrap();
+    let mut model = HarmonicModel::new(coefficients(unknowns, setup.l_max), settings).unwrap();
     let states: Vec<PairState> = blocks
         .iter()
         .flat_map(|block| block.r_i_m.iter().zip(&block.r_j_m))
@@ -142,6 +150,44 @@ fn the_operator_is_the_sum_over_rows() {
             (dot(&z, &y) - form(&vz, &vx)) / scale
         );
     }
+}
+
+/// The same at a degree of maps of nside 256, from short baselines of a few minutes: few nodes and alphas hold data, and take
+/// memory.
+#[test]
+fn the_operator_is_the_sum_over_rows_at_high_degrees() {
+    let mut blocks = blocks(3, 1);
+    let is_short =
+        |block: &PlacedVisibilities| norm(sub(block.r_i_m[0], block.r_j_m[0])) < 300.0 && block.len() == 5;
+    blocks.retain(is_short);
+    assert!(!blocks.is_empty());
+    let setup = HarmonicSetup { l_max: 640, baseline_m_max: 400.0, ..setup() };
+    let mut engine = HarmonicEngine::new(setup).unwrap();
+    for block in &blocks {
+        assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
+    }
+    let sums = engine.into_sums();
+    // Random coefficients that fall as those of the sky: the highest degrees count, and do not drown the rest.
+    let falling = |seed| {
+        let mut alm = coefficients(&vector_to(640, seed), 640);
+        for m in 0..=640 {
+            for l in m..=640 {
+                *alm.get_mut(l, m) *= 1.0 / (1.0 + l as f64);
+            }
+        }
+        unknowns(&alm)
+    };
+    let (x, z) = (falling(1), falling(2));
+    let (vx, vz) = (forward_of(&setup, &x, &blocks), forward_of(&setup, &z, &blocks));
+    let weights: Vec<f64> = blocks.iter().flat_map(|block| block.weight.clone()).collect();
+    let form = |a: &[Complex64], b: &[Complex64]| -> f64 {
+        a.iter().zip(b).zip(&weights).map(|((a, b), w)| w * (a.conj() * b).re).sum()
+    };
+    let mut y = vec![0.0; x.len()];
+    sums.apply(&x, &mut y);
+    let scale = (form(&vx, &vx) * form(&vz, &vz)).sqrt();
+    let errors = [dot(&x, &y) / form(&vx, &vx) - 1.0, (dot(&z, &y) - form(&vz, &vx)) / scale];
+    assert!(errors.iter().all(|error| error.abs() < INTERPOLATION), "{errors:?}");
 }
 
 #[test]

@@ -32,6 +32,11 @@ const channelNow = () => state.status?.channels.find((c) => c.channel === state.
 
 // ---- Maps ----
 async function fetchMap(name) {
+  // It grows with the data, and stands for all of them.
+  if (name === "hits") {
+    const found = await (await fetch(`/api/hits/${state.channel}`)).json();
+    return found && Float32Array.from(found.hits);
+  }
   const key = `${state.channel}/${name}`;
   const held = state.maps.get(key);
   if (held) { state.maps.delete(key); state.maps.set(key, held); return held; }
@@ -58,7 +63,7 @@ async function showSky() {
   if (show === "difference") second = before === undefined ? null : String(before);
   if (show === "input") first = "input";
   if (show === "error") second = "input";
-  if (show === "noise") first = "noise";
+  if (show === "noise" || show === "hits") first = show;
   if (state.blink && state.blinkOn) [first, second] = [channel.has_input ? "input" : String(before ?? state.number), null];
   const [a, b] = await Promise.all([fetchMap(first), second === null ? null : fetchMap(second)]);
   if (turn !== drawing) return;
@@ -71,12 +76,14 @@ async function showSky() {
   if (turn === drawing) draw();
 }
 
+const isShowingHits = () => $("show").value === "hits" && !(state.blink && state.blinkOn);
+const unit = () => isShowingHits() ? "visibilities" : "K";
 const quantile = (sorted, q) => sorted[Math.min(sorted.length - 1, Math.max(0, Math.round(q * (sorted.length - 1))))];
 async function limits(a, b) {
-  const look = sky.look, isDifference = sky.isDifference, isNoise = $("show").value === "noise";
+  const look = sky.look, isDifference = sky.isDifference, isNoise = $("show").value === "noise", isHits = isShowingHits();
   look.smooth = $("smooth").checked; look.marks = $("marks").checked;
-  look.palette = isDifference || isNoise ? "difference" : $("palette").value;
-  look.scale = isDifference || isNoise ? "linear" : $("scale").value;
+  look.palette = isDifference || isNoise ? "difference" : isHits ? "viridis" : $("palette").value;
+  look.scale = isDifference || isNoise || isHits ? "linear" : $("scale").value;
   if ($("fixed").checked) {
     const [low, high] = [Number($("from").value), Number($("to").value)];
     if (low < high && (look.scale !== "log" || low > 0)) { look.low = low; look.high = high; return; }
@@ -109,7 +116,7 @@ function draw() {
   const image = c.createImageData(256, 1);
   for (let k = 0; k < 256; k++) image.data.set([colours[3 * k], colours[3 * k + 1], colours[3 * k + 2], 255], 4 * k);
   c.putImageData(image, 0, 0);
-  $("low").textContent = `${short(look.low)} K`; $("high").textContent = `${short(look.high)} K, ${look.scale}`;
+  $("low").textContent = `${short(look.low)} ${unit()}`; $("high").textContent = `${short(look.high)} ${unit()}, ${look.scale}`;
 }
 
 function chooseNumber(held, place) {
@@ -235,7 +242,8 @@ function showReception(status) {
     return make("tr", {}, make("td", {}, kind), cell(k.packets), cell(k.missing, true), cell(k.damaged, true), cell(k.duplicates));
   }));
   const ends = listening ? Object.entries(listening.report.ended).map(([end, count]) => `${end} ${count}`).join(", ") : "";
-  $("senders").textContent = listening ? `${listening.open} senders connected, ${number.format(listening.report.connections)} accepted, ${number.format(listening.report.refused)} refused; ${prefixed(listening.bytes)}B read, ${prefixed(listening.backlog_bytes)}B wait${ends ? `; ended: ${ends}` : ""}` : `${prefixed(reception.bytes)}B received`;
+  const stations = Object.entries(listening?.report.stations ?? {}).map(([name, counts]) => `${name} ${prefixed(counts.bytes)}B`).join(", ");
+  $("senders").textContent = listening ? `${listening.open} senders connected, ${number.format(listening.report.connections)} accepted, ${number.format(listening.report.refused)} refused; ${prefixed(listening.bytes)}B read, ${prefixed(listening.backlog_bytes)}B wait${ends ? `; ended: ${ends}` : ""}${stations ? `; stations: ${stations}` : ""}` : `${prefixed(reception.bytes)}B received`;
   $("saving").textContent = saving ? (saving.unsaved ? `▲ state not saved, ${saving.failed} attempts failed: ${saving.unsaved}` : `state saved, ${saving.written} checkpoints`) : "";
 }
 
@@ -470,7 +478,7 @@ function controls() {
       return;
     }
     const at = sky.probe(event.clientX, event.clientY), axes = { galactic: ["l", "b"], ecliptic: ["λ", "β"], equatorial: ["α", "δ"] }[sky.view.frame];
-    $("cursor").textContent = at ? `${isSeen(at.value) ? `${short(at.value)} K` : "not measured"}${noiseOfMap()} · ${axes[0]} ${at.lon.toFixed(1)}° ${axes[1]} ${at.lat.toFixed(1)}° · pixel ${at.pixel}` : "";
+    $("cursor").textContent = at ? `${isSeen(at.value) ? `${short(at.value)} ${unit()}` : "not measured"}${noiseOfMap()} · ${axes[0]} ${at.lon.toFixed(1)}° ${axes[1]} ${at.lat.toFixed(1)}° · pixel ${at.pixel}` : "";
   });
   stage.addEventListener("pointerleave", () => { $("cursor").textContent = ""; });
   addEventListener("resize", redraw);

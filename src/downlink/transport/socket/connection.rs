@@ -13,6 +13,7 @@ use tokio::time::{Instant, sleep_until, timeout};
 
 use super::held::WaitingSender;
 use super::listener::{First, ListenContext, PacketBatch, first};
+use super::opening::Opening;
 use super::report::{BUSY, CLOSED, ConnectionEnd, ListenEvent, SenderReport};
 use super::sender_intake::{SenderIntake, Signs};
 use crate::downlink::receive::ReceptionCounters;
@@ -65,7 +66,7 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
     let (mut packets, mut refused, mut format) = (0, 0, None);
     // Bytes of the downlink, and where its last packet is, for a sender that asks until it is held.
     let (mut sent, mut mark) = (bytes, None);
-    let mut counters = ReceptionCounters::default();
+    let (mut counters, mut station) = (ReceptionCounters::default(), None);
     let finished = state.map(|mut state| {
         spawn_blocking(move || {
             let finished = state.intake.finish(&mut state.packets);
@@ -83,8 +84,10 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
         }
         (packets, refused) = state.intake.packets();
         format = state.intake.format();
-        sent = bytes - state.intake.opening_bytes();
-        mark = state.intake.asks_held().then_some(state.mark);
+        let opening = state.intake.opening();
+        sent = bytes - opening.bytes();
+        mark = opening.asks_held().then_some(state.mark);
+        station = opening.station().map(str::to_owned);
         counters = state.intake.stream();
         status.done.fetch_add(u64::from(state.intake.is_alive()), Ordering::Relaxed);
     }
@@ -95,7 +98,7 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
     };
     // A sender need not read the answer.
     let _ = timeout(ANSWER, stream.write_all(answer.as_bytes())).await;
-    let report = SenderReport { peer: peer.to_string(), format, bytes, packets, ended };
+    let report = SenderReport { peer: peer.to_string(), station, format, bytes, packets, ended };
     shared.notes.say(ListenEvent::Sender(&report));
     shared.listening.write().close(report, refused, &counters);
     status.open.fetch_sub(1, Ordering::Relaxed);
@@ -119,7 +122,8 @@ async fn exchange(
         true => ((rate / READS_PER_S) as usize).clamp(READ_BYTES_MIN, READ_BYTES),
         false => READ_BYTES,
     };
-    let intake = SenderIntake::new(shared.mission.clone(), shared.held.is_some());
+    let opening = Opening::new(shared.stations.clone(), shared.held.is_some());
+    let intake = SenderIntake::new(shared.mission.clone(), opening);
     let mut state = ConnectionState {
         intake,
         chunk: vec![0; read_bytes],
@@ -145,6 +149,9 @@ async fn exchange(
         });
         let Ok((back, found)) = found.await else { return (None, ConnectionEnd::Failed) };
         state = back;
+        if let Some(station) = state.intake.opening().station() {
+            shared.listening.write().hear(station, read as u64);
+        }
         let Signs { is_alive, is_new } = found.unwrap_or_default();
         if is_alive {
             silence = Duration::ZERO;

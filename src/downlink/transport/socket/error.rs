@@ -1,6 +1,7 @@
 //! Errors of a socket as a whole. Faults of senders are counted instead.
 
 use std::io;
+use std::path::PathBuf;
 
 use thiserror::Error;
 
@@ -72,6 +73,14 @@ pub enum SocketError {
         bytes: u64,
         /// The receiver's answer, or the system's error.
         reason: String,
+    },
+    /// The file of stations and their tokens.
+    #[error("stations {}: {found}", path.display())]
+    Stations {
+        /// Path.
+        path: PathBuf,
+        /// What is wrong, and what was expected.
+        found: String,
     },
     /// The link has faults, but there is no file beside which to write their truth.
     #[error(

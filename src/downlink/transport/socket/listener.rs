@@ -19,6 +19,7 @@ use super::held::HeldAnswers;
 use super::report::{BUSY, ListenEvent, ListenNote, Listening};
 use super::seats::{Room, Seats};
 use super::sender_intake::Mission;
+use super::stations::Stations;
 
 /// Interval between two checks of the end condition.
 const TICK: Duration = Duration::from_millis(50);
@@ -59,6 +60,8 @@ pub(super) struct ListenContext {
     pub(super) passed: Mutex<u64>,
     /// Who is told what checkpoints hold; `None` if there are none.
     pub(super) held: Option<HeldAnswers>,
+    /// Who may send; `None` for everyone.
+    pub(super) stations: Option<Arc<Stations>>,
     /// True once reading must stop.
     pub(super) stop: Arc<watch::Sender<bool>>,
     pub(super) notes: Notes,

@@ -1,6 +1,6 @@
 //! The downlink over TCP: a ground that listens to several stations at once, and a spacecraft that sends to it.
 //!
-//! A connection carries the bytes of a downlink file, in either format, and nothing else. So any tool that sends a
+//! A connection carries the bytes of a downlink file, in either format, and needs nothing else. So any tool that sends a
 //! file over TCP can be a station. The ground works in three places:
 //!
 //! | task | where | on |
@@ -26,26 +26,32 @@
 //! free while it waits; the last checkpoint of the run, which comes after the listener has ended, answers too.
 //!
 //! Packets carry no signature: whoever can connect can add to the maps. Therefore addresses other than those of this
-//! machine require an explicit option.
+//! machine require an explicit option. With [`Stations`] a connection has to begin with the line `token TOKEN` of one of them, and
+//! is reported by its name.
 
 mod config;
 mod connection;
 mod error;
 mod held;
 mod listener;
+mod opening;
 mod report;
 mod seats;
 mod sender_intake;
 mod sink;
 mod source;
+mod stations;
 mod url;
 
 pub use config::ListenConfig;
 pub use error::SocketError;
 pub use held::HeldAnswers;
 pub use listener::{Teller, Until};
-pub use report::{ConnectionEnd, ListenNote, ListenReport, ListenStatus, Listening, SenderReport};
+pub use report::{
+    ConnectionEnd, ListenNote, ListenReport, ListenStatus, Listening, SenderReport, StationCounts,
+};
 pub use sender_intake::InstrumentCheck;
 pub use sink::{SendOptions, SocketSink};
 pub use source::SocketSource;
+pub use stations::Stations;
 pub use url::TcpUrl;

@@ -44,6 +44,10 @@ pub enum ConnectionEnd {
     Unconfirmed,
     /// It asked to be told what checkpoints hold, and the ground has no state.
     NoState,
+    /// It did not begin with a token.
+    NoToken,
+    /// It began with a token that no station has.
+    UnknownToken,
     /// All places were taken, and it was the least useful.
     GaveWay,
     /// Its receiver failed: a bug in the program.
@@ -68,6 +72,8 @@ impl fmt::Display for ConnectionEnd {
             Self::NoState => {
                 "it asks for `held`, and the ground has no checkpoints; expected a ground with --state"
             }
+            Self::NoToken => "it did not begin with `token TOKEN`, and the ground has --stations",
+            Self::UnknownToken => "no station has its token",
             Self::GaveWay => "it gave way to another; all downlink.listen.connections_max were taken",
             Self::Failed => "its receiver failed, which is a bug in the program",
         })
@@ -79,6 +85,9 @@ impl fmt::Display for ConnectionEnd {
 pub struct SenderReport {
     /// Its address.
     pub peer: String,
+    /// The station whose token it gave.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub station: Option<String>,
     /// Format of its stream, if it was detected.
     pub format: Option<Format>,
     /// Bytes read.
@@ -127,8 +136,9 @@ impl ListenNote<'_> {
 impl fmt::Display for ListenNote<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.what {
-            ListenEvent::Sender(SenderReport { peer, bytes, packets, ended, .. }) => {
-                write!(f, "{peer}: {bytes} bytes, {packets} packets; {ended}")
+            ListenEvent::Sender(SenderReport { peer, station, bytes, packets, ended, .. }) => {
+                let station = station.iter().map(|name| format!(" ({name})")).collect::<String>();
+                write!(f, "{peer}{station}: {bytes} bytes, {packets} packets; {ended}")
             }
             ListenEvent::SenderRefused { peer } => {
                 write!(f, "{peer}: refused; there are downlink.listen.connections_max others")
@@ -140,6 +150,17 @@ impl fmt::Display for ListenNote<'_> {
             untold => write!(f, " ({untold} notes before it are only in the summary)"),
         }
     }
+}
+
+/// What came from a station.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct StationCounts {
+    /// Its connections that have ended.
+    pub connections: u64,
+    /// Bytes read, also from those that are open.
+    pub bytes: u64,
+    /// Sound packets passed to the ground by those that have ended.
+    pub packets: u64,
 }
 
 /// All connections of a run.
@@ -161,6 +182,9 @@ pub struct ListenReport {
     pub backlog_bytes_max: u64,
     /// Connections by end.
     pub ended: BTreeMap<ConnectionEnd, u64>,
+    /// What came from each station that is known by its token.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub stations: BTreeMap<String, StationCounts>,
     /// The first connections.
     pub senders: Listing<SenderReport>,
     /// Counters of everything in the streams but packets.
@@ -174,10 +198,24 @@ impl ListenReport {
         reception.add_stream(&self.streams);
     }
 
+    /// Counts bytes from a station.
+    pub(super) fn hear(&mut self, station: &str, bytes: u64) {
+        match self.stations.get_mut(station) {
+            Some(counts) => counts.bytes += bytes,
+            None => {
+                self.stations.insert(station.to_owned(), StationCounts { bytes, ..StationCounts::default() });
+            }
+        }
+    }
+
     pub(super) fn close(&mut self, report: SenderReport, refused: u64, stream: &ReceptionCounters) {
         self.bytes += report.bytes;
         self.packets += report.packets;
         self.packets_refused += refused;
+        if let Some(counts) = report.station.as_ref().and_then(|name| self.stations.get_mut(name)) {
+            counts.connections += 1;
+            counts.packets += report.packets;
+        }
         *self.ended.entry(report.ended).or_default() += 1;
         self.senders.push(report);
         self.streams.add_stream(stream);
@@ -195,6 +233,9 @@ impl fmt::Display for ListenReport {
         )?;
         for (ended, count) in &self.ended {
             write!(f, "\n  {count:>6}  {ended}")?;
+        }
+        for (name, StationCounts { connections, bytes, packets }) in &self.stations {
+            write!(f, "\n  {name}: {connections} connections, {bytes} bytes, {packets} packets")?;
         }
         Ok(())
     }

@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::held::ASKS_HELD;
+use super::opening::Opening;
 use super::report::ConnectionEnd;
 use crate::downlink::receive::cadu::FrameCounters;
 use crate::downlink::receive::{Decoder, Event, Intake, Packet, ReceivedSet, ReceptionCounters};
@@ -162,22 +162,9 @@ pub(super) struct Signs {
     pub(super) is_new: bool,
 }
 
-/// What a connection begins with.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Opening {
-    /// This many bytes of [`ASKS_HELD`], and nothing yet that differs from it.
-    Unknown(usize),
-    /// Packets, or whatever else it may be.
-    Packets,
-    /// [`ASKS_HELD`].
-    AsksHeld,
-}
-
 /// The receiver of one connection. It counts everything but packets, which the ground counts.
 pub(super) struct SenderIntake {
     opening: Opening,
-    /// Whether a sender may ask what checkpoints hold.
-    may_ask: bool,
     intake: Intake,
     stream: Decoder,
     judge: Judge,
@@ -196,11 +183,9 @@ pub(super) struct SenderIntake {
 }
 
 impl SenderIntake {
-    /// `may_ask`: whether a sender may ask what checkpoints hold.
-    pub(super) fn new(mission: Mission, may_ask: bool) -> Self {
+    pub(super) fn new(mission: Mission, opening: Opening) -> Self {
         Self {
-            opening: Opening::Unknown(0),
-            may_ask,
+            opening,
             intake: Intake::unfiltered(),
             stream: Decoder::new(),
             judge: Judge::new(mission),
@@ -219,12 +204,10 @@ impl SenderIntake {
     /// Takes the next bytes and appends the packets that they complete and that may be passed on to `out`.
     ///
     /// # Errors
-    /// The instrument is refused, or not confirmed in time, or the sender asks what it may not: from then on no packet is appended.
+    /// The instrument is refused, or not confirmed in time, or the opening is: from then on no packet is appended.
     pub(super) fn take(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<Signs, ConnectionEnd> {
-        let bytes = self.open(bytes);
-        if self.asks_held() && !self.may_ask {
-            return Err(ConnectionEnd::NoState);
-        }
+        let (before, bytes) = self.opening.take(bytes)?;
+        self.intake.push(&before);
         self.intake.push(bytes);
         self.hand_out(out);
         let is_alive = self.look_for_signs();
@@ -239,12 +222,10 @@ impl SenderIntake {
     /// Ends the stream; appends the remaining packets.
     ///
     /// # Errors
-    /// The instrument is refused, or was not confirmed.
+    /// The instrument is refused, or was not confirmed; or the opening is refused.
     pub(super) fn finish(&mut self, out: &mut Vec<u8>) -> Result<(), ConnectionEnd> {
-        if let Opening::Unknown(seen) = self.opening {
-            self.opening = Opening::Packets;
-            self.intake.push(&ASKS_HELD[..seen]);
-        }
+        let before = self.opening.finish()?;
+        self.intake.push(&before);
         self.intake.finish();
         self.hand_out(out);
         self.end_group();
@@ -259,32 +240,9 @@ impl SenderIntake {
         }
     }
 
-    /// Finds out how the connection begins; returns the rest of the bytes.
-    fn open<'a>(&mut self, bytes: &'a [u8]) -> &'a [u8] {
-        let Opening::Unknown(seen) = self.opening else { return bytes };
-        let expected = &ASKS_HELD[seen..];
-        let same = expected.iter().zip(bytes).take_while(|(a, b)| a == b).count();
-        if same == expected.len() {
-            self.opening = Opening::AsksHeld;
-            return &bytes[same..];
-        }
-        if same == bytes.len() {
-            self.opening = Opening::Unknown(seen + same);
-            return &[];
-        }
-        self.opening = Opening::Packets;
-        self.intake.push(&ASKS_HELD[..seen]);
-        bytes
-    }
-
-    /// Whether the sender asks to be told what checkpoints hold.
-    pub(super) fn asks_held(&self) -> bool {
-        self.opening == Opening::AsksHeld
-    }
-
-    /// Bytes before the packets.
-    pub(super) fn opening_bytes(&self) -> u64 {
-        if self.asks_held() { ASKS_HELD.len() as u64 } else { 0 }
+    /// What came before the packets.
+    pub(super) fn opening(&self) -> &Opening {
+        &self.opening
     }
 
     /// Whether a sound packet or frame has arrived since the last check.
@@ -388,6 +346,7 @@ fn append(packet: &Packet<'_>, out: &mut Vec<u8>) {
 mod tests {
     use proptest::prelude::*;
 
+    use super::super::held::ASKS_HELD;
     use super::*;
     use crate::downlink::{DownlinkConfig, Transmission};
     use crate::frames::{AntennaResponse, Channel, EphemerisSegment, Housekeeping};
@@ -405,6 +364,11 @@ mod tests {
             spectrometer: None,
             noiseless: false,
         }
+    }
+
+    /// Anyone may send, and ask.
+    fn anyone() -> Opening {
+        Opening::new(None, true)
     }
 
     /// A ground whose instrument is known.
@@ -464,7 +428,7 @@ mod tests {
         let plain = sent("ours", Format::Packets);
         for format in [Format::Packets, Format::Cadu] {
             for piece in [1, 100, 1 << 16] {
-                let mut sender = SenderIntake::new(ours(), true);
+                let mut sender = SenderIntake::new(ours(), anyone());
                 let (pieces, foreign) = through(&mut sender, &sent("ours", format), piece);
                 assert!(!foreign && pieces.concat() == plain);
                 // The description, the positions and the counts: for any pieces, no payload is divided.
@@ -479,12 +443,12 @@ mod tests {
     fn another_instrument_is_refused_from_its_description_on() {
         for format in [Format::Packets, Format::Cadu] {
             let mission = ours();
-            let mut sender = SenderIntake::new(mission.clone(), true);
+            let mut sender = SenderIntake::new(mission.clone(), anyone());
             let (pieces, foreign) = through(&mut sender, &sent("theirs", format), 1000);
             assert!(foreign && pieces.concat().is_empty());
             assert!(sender.packets().0 == 0 && sender.packets().1 > 10);
             // Also from a sender that began with the right one.
-            let mut sender = SenderIntake::new(mission, true);
+            let mut sender = SenderIntake::new(mission, anyone());
             let both = [sent("ours", format), sent("theirs", format)].concat();
             let (pieces, foreign) = through(&mut sender, &both, 1000);
             assert!(foreign && pieces.concat() == sent("ours", Format::Packets));
@@ -512,26 +476,26 @@ mod tests {
             let mission = Mission::default();
             // Descriptions and positions alone do not, however many.
             for name in ["forged", "more", "theirs"] {
-                let mut sender = SenderIntake::new(mission.clone(), true);
+                let mut sender = SenderIntake::new(mission.clone(), anyone());
                 let (pieces, refused) = through(&mut sender, &sent(name, format), 1000);
                 assert!(!refused && pieces.concat().is_empty() && sender.packets().1 > 10);
             }
             let bytes = with_block("ours", start);
-            let mut sender = SenderIntake::new(mission.clone(), true);
+            let mut sender = SenderIntake::new(mission.clone(), anyone());
             let (pieces, refused) = through(&mut sender, &bytes, 1000);
             assert!(!refused);
             match confirms {
                 true => assert!(pieces.concat() == bytes),
                 false => assert!(pieces.concat().is_empty()),
             }
-            let mut sender = SenderIntake::new(mission, true);
+            let mut sender = SenderIntake::new(mission, anyone());
             assert_eq!(through(&mut sender, &with_block("theirs", 5), 1000).1, confirms);
         }
     }
 
     #[test]
     fn what_is_not_confirmed_is_not_kept_for_long() {
-        let mut sender = SenderIntake::new(Mission::default(), true);
+        let mut sender = SenderIntake::new(Mission::default(), anyone());
         let bytes = sent("forged", Format::Packets);
         let mut ends = Vec::new();
         for _ in 0..=UNCONFIRMED_BYTES_MAX / bytes.len() {
@@ -544,12 +508,12 @@ mod tests {
     #[test]
     fn an_instrument_that_does_not_fit_is_refused_and_replayed_packets_are_not_new() {
         let mission = Mission::default().accepting(Arc::new(|found| found.name != "unfit"));
-        let mut sender = SenderIntake::new(mission.clone(), true);
+        let mut sender = SenderIntake::new(mission.clone(), anyone());
         let bytes = with_block("unfit", 5);
         assert_eq!(sender.take(&bytes, &mut Vec::new()), Err(ConnectionEnd::UnfitInstrument));
         let bytes = with_block("ours", 900);
         for is_new in [true, false] {
-            let mut sender = SenderIntake::new(mission.clone(), true);
+            let mut sender = SenderIntake::new(mission.clone(), anyone());
             assert_eq!(sender.take(&bytes, &mut Vec::new()), Ok(Signs { is_alive: true, is_new }));
         }
     }
@@ -559,29 +523,29 @@ mod tests {
         let bytes = sent("ours", Format::Packets);
         let asking = [ASKS_HELD, &bytes].concat();
         for piece in [1, 5, ASKS_HELD.len(), 1000] {
-            let mut sender = SenderIntake::new(ours(), true);
+            let mut sender = SenderIntake::new(ours(), anyone());
             let (pieces, _) = through(&mut sender, &asking, piece);
-            assert!(sender.asks_held() && sender.opening_bytes() == ASKS_HELD.len() as u64);
+            assert!(sender.opening.asks_held() && sender.opening.bytes() == ASKS_HELD.len() as u64);
             // The line is no part of the stream.
             assert!(pieces.concat() == bytes && sender.intake.bytes() == bytes.len() as u64);
             // Whoever begins in another way sends packets, and what is not a packet is counted.
             for start in [&ASKS_HELD[..7], b"answer hold\n", b"\nanswer held\n"] {
-                let mut sender = SenderIntake::new(ours(), true);
+                let mut sender = SenderIntake::new(ours(), anyone());
                 let (pieces, _) = through(&mut sender, &[start, &bytes].concat(), piece);
-                assert!(!sender.asks_held() && pieces.concat() == bytes);
+                assert!(!sender.opening.asks_held() && pieces.concat() == bytes);
                 assert_eq!(sender.stream().bytes_garbage, start.len() as u64);
             }
         }
         // The beginning of the line alone.
-        let mut sender = SenderIntake::new(ours(), true);
+        let mut sender = SenderIntake::new(ours(), anyone());
         through(&mut sender, &ASKS_HELD[..4], 4);
-        assert!(!sender.asks_held() && sender.intake.bytes() == 4);
+        assert!(!sender.opening.asks_held() && sender.intake.bytes() == 4);
     }
 
     #[test]
     fn without_checkpoints_nothing_is_taken_of_a_sender_that_asks_for_them() {
         let asking = [ASKS_HELD, &sent("ours", Format::Packets)].concat();
-        let (mut sender, mut out) = (SenderIntake::new(ours(), false), Vec::new());
+        let (mut sender, mut out) = (SenderIntake::new(ours(), Opening::new(None, false)), Vec::new());
         assert_eq!(sender.take(&asking, &mut out), Err(ConnectionEnd::NoState));
         let _ = sender.finish(&mut out);
         assert!(out.is_empty() && sender.packets() == (0, 0));
@@ -600,7 +564,7 @@ mod tests {
                 bytes[at] ^= octet;
             }
             bytes.truncate(1 + cut.index(bytes.len()));
-            let mut sender = SenderIntake::new(ours(), true);
+            let mut sender = SenderIntake::new(ours(), anyone());
             let (pieces, _) = through(&mut sender, &bytes, piece);
             let counters = sender.stream();
             let others = counters.bytes_garbage + counters.bytes_damaged + counters.bytes_truncated;

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use super::error::SocketError;
 use super::held::ASKS_HELD;
+use super::opening::TOKEN;
 use super::report::{BUSY, CLOSED};
 use super::url::TcpUrl;
 use crate::downlink::error::DownlinkError;
@@ -34,7 +35,7 @@ const PAUSE_MAX: Duration = Duration::from_secs(5);
 const ANSWER_BYTES_MAX: u64 = 1 << 10;
 
 /// Options for sending.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct SendOptions {
     /// Time limit for connecting, and for finding a receiver that is busy free again, s.
     pub connect_s: f64,
@@ -42,6 +43,8 @@ pub struct SendOptions {
     pub bytes_per_s: f64,
     /// Whether to wait until a checkpoint of the receiver holds everything.
     pub held: bool,
+    /// Token of the station, for a receiver that asks for one.
+    pub token: Option<String>,
 }
 
 /// Sends a byte stream to a listening ground. Connects with the first bytes, and blocks while the receiver does not
@@ -129,6 +132,9 @@ impl SocketSink {
             Some(stream) => stream,
             None => {
                 let mut stream = self.connect()?;
+                if let Some(token) = self.options.token.clone() {
+                    self.send(&mut stream, &[TOKEN, token.as_bytes(), b"\n"].concat())?;
+                }
                 if self.options.held {
                     self.send(&mut stream, ASKS_HELD)?;
                 }

@@ -16,6 +16,7 @@ use super::listener::{ListenContext, Notes, PacketBatch, Teller, Until, listen};
 use super::report::Listening;
 use super::seats::Seats;
 use super::sender_intake::{InstrumentCheck, Mission};
+use super::stations::Stations;
 use super::url::TcpUrl;
 use crate::downlink::error::DownlinkError;
 use crate::frames::Instrument;
@@ -34,6 +35,7 @@ pub struct SocketSource {
     running: Option<(Receiver<PacketBatch>, JoinHandle<()>)>,
     room: Arc<Semaphore>,
     held: Option<HeldAnswers>,
+    stations: Option<Arc<Stations>>,
     stop: Arc<watch::Sender<bool>>,
     listening: Listening,
     bytes: u64,
@@ -64,6 +66,7 @@ impl SocketSource {
             running: None,
             room: Arc::new(Semaphore::new(ListenContext::room_bytes(config))),
             held: None,
+            stations: None,
             stop: Arc::new(watch::Sender::new(false)),
             listening,
             bytes: 0,
@@ -93,6 +96,13 @@ impl SocketSource {
     #[must_use]
     pub fn answering(mut self, answers: &HeldAnswers) -> Self {
         self.held = Some(answers.clone());
+        self
+    }
+
+    /// Takes packets of these stations only.
+    #[must_use]
+    pub fn of_stations(mut self, stations: Stations) -> Self {
+        self.stations = Some(Arc::new(stations));
         self
     }
 
@@ -144,6 +154,7 @@ impl SocketSource {
             batches,
             passed: Mutex::new(0),
             held: self.held.clone(),
+            stations: self.stations.clone(),
             stop: Arc::clone(&self.stop),
             notes: Notes::new(tell),
             sign: Mutex::new(tokio::time::Instant::now()),
