@@ -467,6 +467,19 @@ def shows_a_run(page, served, out, pictures):
     noise_k = status["channels"][0]["noise_rms_k"]
     assert abs(float(page.text("#cursor").split("whole map ")[1].split()[0]) / noise_k - 1) < 1e-3, page.text("#cursor")
 
+    # Once the noise-only map is there: its rms about the cursor, here over half of the sky.
+    def says_the_noise():
+        browser.move(left + px + 1, top + py)
+        browser.move(left + px, top + py)
+        return "±" in page.text("#cursor")
+
+    wait_until("noise near by", says_the_noise)
+    noise = read(out / "3.000MHz/noise.fits")
+    near = healpy.query_disc(4, healpy.pix2vec(4, int(pixels[k])), np.arccos(1 - 200 / 192))
+    found = float(re.search(r"± (\S+) K", page.text("#cursor")).group(1))
+    # The page takes the directions in the circle, this the pixels whose centres are in it.
+    assert abs(found / np.sqrt(np.mean(noise[near] ** 2)) - 1) < 0.1, (found, page.text("#cursor"))
+
     # Time line, orbit, baselines.
     panels = Panels(page, served)
     panels.assert_passes()

@@ -1,5 +1,5 @@
 // The page: events in, panels out. Everything comes from this server; nothing is sent to it.
-import { Sky, isSeen } from "/sky.js";
+import { Sky, isSeen, rmsNear } from "/sky.js";
 import { Passes } from "/passes.js";
 import { drawOrbit, drawPowers, drawUvw, tellOrbit } from "/array.js";
 import { $, copyText, css, make, nice, number, short, stored, ticks } from "/tools.js";
@@ -9,7 +9,7 @@ const BLINK_MS = 700, PLAY_MS = 450;
 const state = {
   status: null, channel: 0, number: null, follows: true, figures: new Map(), curve: "growth",
   maps: new Map(), blink: false, blinkOn: false, playing: false, gapsAt: 0, gapsSeen: 0,
-  arrayAt: 0, arrayKnown: null, fetching: false, geometry: null, density: null, powers: null,
+  arrayAt: 0, arrayKnown: null, fetching: false, geometry: null, density: null, powers: null, noise: null,
 };
 let sky, passes;
 
@@ -435,10 +435,20 @@ function listen() {
 }
 
 /** There is no standard deviation of each pixel; the noise-only map of the newest snapshot has one of all pixels. */
-function noiseOfMap() {
+// Pixels of the noise-only map over which its rms is taken about the cursor: known to 7 %.
+const NEAR_PIXELS = 100;
+function noiseOfMap(direction) {
   const channel = channelNow(), isMap = $("show").value === "map" && !state.blink;
   if (!isMap || !channel || channel.is_noiseless || state.number !== channel.held.at(-1)) return "";
-  return ` (noise rms of the whole map ${short(channel.noise_rms_k)} K)`;
+  const whole = `of the whole map ${short(channel.noise_rms_k)} K`, key = `${state.channel}/${state.number}`;
+  if (state.noise?.key !== key) {
+    // At the next move it is there.
+    state.noise = { key, values: null };
+    fetchMap("noise").then((values) => { if (state.noise.key === key) state.noise.values = values; });
+  }
+  if (!state.noise.values) return ` (noise rms ${whole})`;
+  const { rms, radius } = rmsNear(state.noise.values, direction, NEAR_PIXELS);
+  return ` (± ${short(rms)} K, noise rms within ${radius.toPrecision(2)}°; ${whole})`;
 }
 
 // ---- Controls ----
@@ -478,7 +488,7 @@ function controls() {
       return;
     }
     const at = sky.probe(event.clientX, event.clientY), axes = { galactic: ["l", "b"], ecliptic: ["λ", "β"], equatorial: ["α", "δ"] }[sky.view.frame];
-    $("cursor").textContent = at ? `${isSeen(at.value) ? `${short(at.value)} ${unit()}` : "not measured"}${noiseOfMap()} · ${axes[0]} ${at.lon.toFixed(1)}° ${axes[1]} ${at.lat.toFixed(1)}° · pixel ${at.pixel}` : "";
+    $("cursor").textContent = at ? `${isSeen(at.value) ? `${short(at.value)} ${unit()}` : "not measured"}${noiseOfMap(at.direction)} · ${axes[0]} ${at.lon.toFixed(1)}° ${axes[1]} ${at.lat.toFixed(1)}° · pixel ${at.pixel}` : "";
   });
   stage.addEventListener("pointerleave", () => { $("cursor").textContent = ""; });
   addEventListener("resize", redraw);

@@ -119,6 +119,24 @@ export function placeOf(v, { scale, low, high }) {
   }
   return (v - low) / (high - low);
 }
+/** RMS of a map within the circle about a direction that has the area of so many pixels, and its radius in degrees. */
+export function rmsNear(values, direction, pixels) {
+  const nside = Math.round(Math.sqrt(values.length / 12)), height = Math.min(2, 2 * pixels / values.length);
+  const [x, y, z] = direction, side = Math.abs(z) < 0.9 ? [0, 0, 1] : [1, 0, 0];
+  const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+  let e = cross(side, direction);
+  e = e.map((v) => v / Math.hypot(...e));
+  const f = cross(direction, e), count = 4 * pixels;
+  let sum = 0, seen = 0;
+  // A spiral of equal areas.
+  for (let k = 0; k < count; k++) {
+    const c = 1 - height * (k + 0.5) / count, s = Math.sqrt(1 - c * c), turn = 2.399963229728653 * k, [p, q] = [s * Math.cos(turn), s * Math.sin(turn)];
+    const v = values[pixelAt(nside, [c * x + p * e[0] + q * f[0], c * y + p * e[1] + q * f[1], c * z + p * e[2] + q * f[2]])];
+    if (isSeen(v)) { sum += v * v; seen += 1; }
+  }
+  return { rms: Math.sqrt(sum / seen), radius: Math.acos(1 - height) * 180 / Math.PI };
+}
+
 const kneeOf = (low, high) => 0.02 * Math.max(Math.abs(low), Math.abs(high), 1e-300);
 
 export class Sky {
@@ -271,14 +289,14 @@ export class Sky {
     return isSeen(this.b[pixel]) ? x - this.b[pixel] : this.b[pixel];
   }
 
-  /** What is below the mouse: pixel, value, longitude and latitude on the axes shown, degrees. */
+  /** What is below the mouse: pixel, value, longitude and latitude on the axes shown in degrees, direction on those of the map. */
   probe(clientX, clientY) {
     const box = this.canvas.getBoundingClientRect();
     const d = this.screenDirection((clientX - box.left) * this.ratio, (clientY - box.top) * this.ratio);
     if (!d || !this.a) return undefined;
-    const { turned, toMap } = this.turn(), f = apply(turned, d), pixel = pixelAt(this.nside, apply(toMap, d));
+    const { turned, toMap } = this.turn(), f = apply(turned, d), direction = apply(toMap, d), pixel = pixelAt(this.nside, direction);
     const lon = (Math.atan2(f[1], f[0]) * 180 / Math.PI + 360) % 360, lat = Math.asin(Math.max(-1, Math.min(1, f[2]))) * 180 / Math.PI;
-    return { pixel, value: this.value(pixel), lon, lat };
+    return { pixel, value: this.value(pixel), lon, lat, direction };
   }
 
   /** Place on the canvas of a direction on the axes shown; undefined on the far side. */
