@@ -1,29 +1,29 @@
 //! The engine without its basis.
 //!
 //! An [`ExactEngine`] checks and counts visibilities, collects them in batches, and hands each batch to its [`SkyBasis`],
-//! which rounds it to integers and adds them to the exact sums.
+//! which rounds it to integers and adds them to the exact sums, while the next batch is collected.
 
 use std::fmt;
 use std::io::{Read, Write};
-
-use num_complex::Complex64;
-use rayon::prelude::*;
+use std::sync::Arc;
 
 use super::checkpoint::{BasisKind, FrameReader, FrameWriter};
+use super::deferred::Deferred;
 use super::fixed_point::{Direction, Totals, WeightScale};
 use super::noise::companion_noise;
 use super::{AccumulationError, Added, NormalEngine, NormalSums, Refusal, SumCounts};
 use crate::frames::PlacedVisibilities;
 use crate::units::vector::Vec3;
+use num_complex::Complex64;
 
 /// A basis of the sky: how visibilities enter the sums, and how the sums become equations.
-pub trait SkyBasis: Sized + Send + Sync {
+pub trait SkyBasis: Sized + Send + Sync + 'static {
     /// Everything on which the sums depend besides the data; only engines of equal setup can be merged.
     type Setup: Copy + fmt::Debug + PartialEq + Send + Sync;
     /// Where a visibility belongs in the sums.
-    type Place: Copy + Send + Sync;
+    type Place: Copy + Send + Sync + 'static;
     /// The sums as integers.
-    type Exact: Clone + Send + Sync;
+    type Exact: Clone + Send + Sync + 'static;
     /// The sums as numbers, ready to be solved.
     type Equations: NormalSums;
     /// A setup as it stands in a checkpoint.
@@ -118,8 +118,8 @@ pub struct Accepted<P> {
 pub struct ExactEngine<B: SkyBasis> {
     setup: B::Setup,
     scale: WeightScale,
-    pub(super) basis: B,
-    exact: B::Exact,
+    pub(super) basis: Arc<B>,
+    exact: Deferred<B::Exact>,
     /// All that the engine holds, pending visibilities included.
     totals: Totals,
     pending: Vec<Accepted<B::Place>>,
@@ -154,10 +154,10 @@ impl<B: SkyBasis> ExactEngine<B> {
         let scale = WeightScale::new(B::common(&setup).weight_max)?;
         let basis = B::new(&setup, scale)?;
         Ok(Self {
-            exact: exact(&basis)?,
+            exact: Deferred::Here(exact(&basis)?),
             setup,
             scale,
-            basis,
+            basis: Arc::new(basis),
             totals,
             pending: Vec::with_capacity(B::BATCH),
             direction: Direction::In,
@@ -193,7 +193,8 @@ impl<B: SkyBasis> ExactEngine<B> {
         if found_hz != expected_hz {
             return Err(AccumulationError::Frequency { expected_hz, found_hz });
         }
-        let found: Vec<_> = (0..placed.len()).into_par_iter().map(|k| self.accept(placed, k)).collect();
+        // Not in the pool, which sums the batch before: this is the other half of the work.
+        let found: Vec<_> = (0..placed.len()).map(|k| self.accept(placed, k)).collect();
         let scale = self.scale;
         let one = |accepted: &Accepted<B::Place>| Totals::one(scale, accepted.weight);
         if direction == Direction::Out {
@@ -216,7 +217,7 @@ impl<B: SkyBasis> ExactEngine<B> {
                 Err(reason) => added.refuse(reason),
             }
             if self.pending.len() >= B::BATCH {
-                self.flush();
+                self.sum_pending();
             }
         }
         Ok(added)
@@ -229,6 +230,15 @@ impl<B: SkyBasis> ExactEngine<B> {
         if is_full { Err(Refusal::Full) } else { Ok(totals) }
     }
 
+    /// Hands the pending visibilities to the pool.
+    fn sum_pending(&mut self) {
+        if !self.pending.is_empty() {
+            let batch = std::mem::replace(&mut self.pending, Vec::with_capacity(B::BATCH));
+            let (basis, direction) = (Arc::clone(&self.basis), self.direction);
+            self.exact.change(move |exact| basis.sum(exact, &batch, direction));
+        }
+    }
+
     fn combine(&mut self, mut other: Self, direction: Direction) -> Result<(), AccumulationError> {
         if self.setup != other.setup {
             return Err(AccumulationError::Mismatch {
@@ -238,7 +248,7 @@ impl<B: SkyBasis> ExactEngine<B> {
         let totals = self.with(other.totals, direction).map_err(|_| AccumulationError::Range)?;
         self.flush();
         other.flush();
-        self.basis.combine(&mut self.exact, &other.exact, direction);
+        self.basis.combine(self.exact.get(), other.exact.get(), direction);
         self.totals = totals;
         Ok(())
     }
@@ -256,10 +266,8 @@ impl<B: SkyBasis> NormalEngine for ExactEngine<B> {
     }
 
     fn flush(&mut self) {
-        if !self.pending.is_empty() {
-            self.basis.sum(&mut self.exact, &self.pending, self.direction);
-            self.pending.clear();
-        }
+        self.sum_pending();
+        self.exact.get();
     }
 
     fn merge(&mut self, other: Self) -> Result<(), AccumulationError> {
@@ -276,19 +284,20 @@ impl<B: SkyBasis> NormalEngine for ExactEngine<B> {
 
     fn sums(&mut self) -> B::Equations {
         self.flush();
-        self.basis.equations(&self.exact, self.counts())
+        let counts = self.counts();
+        self.basis.equations(self.exact.get(), counts)
     }
 
     fn into_sums(mut self) -> B::Equations {
         self.flush();
         let counts = self.counts();
-        self.basis.finish(self.exact, counts)
+        self.basis.finish(self.exact.here(), counts)
     }
 
     fn checkpoint(&mut self, out: &mut dyn Write) -> Result<(), AccumulationError> {
         self.flush();
         let mut out = FrameWriter::new(out, B::KIND, (B::head(&self.setup), self.totals))?;
-        self.basis.write(&self.exact, &mut out)?;
+        self.basis.write(self.exact.get(), &mut out)?;
         Ok(out.finish()?)
     }
 

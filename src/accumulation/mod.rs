@@ -11,6 +11,7 @@
 
 mod checkpoint;
 mod config;
+mod deferred;
 mod engine;
 mod error;
 mod fixed_point;

@@ -79,12 +79,9 @@ impl HarmonicEngine {
     #[must_use]
     pub fn among(mut self, ranks: &Ranks) -> Self {
         let grids = Grids { share: ranks.share(), ..Grids::clone(&self.basis.grids) };
-        self.basis = HarmonicBasis {
-            grids: Arc::new(grids),
-            tables: Arc::default(),
-            ranks: ranks.clone(),
-            ..self.basis
-        };
+        let HarmonicBasis { setup, quanta, .. } = *self.basis;
+        let (grids, tables, ranks) = (Arc::new(grids), Arc::default(), ranks.clone());
+        self.basis = Arc::new(HarmonicBasis { setup, quanta, grids, tables, ranks });
         self
     }
 }
