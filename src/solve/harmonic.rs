@@ -2,18 +2,21 @@
 
 use super::conjugate_gradients::{Convergence, StoppingRule, System};
 use super::error::SolveError;
-use super::lanczos::{LargestEigenvalue, largest_eigenvalue};
+use super::lanczos::{LargestEigenvalue, largest_eigenvalue_from, normalised, random_vector};
 use super::tikhonov::{Diagnostics, check_request, subtract_prediction};
 use super::traces::traces;
 use super::vectors::add;
 use super::watch::NamedWatch;
 use crate::accumulation::NormalSums;
-use crate::accumulation::harmonic::{HarmonicSums, coefficients, unknowns};
+use crate::accumulation::harmonic::{HarmonicSums, OrderBlocks, coefficients, unknowns};
 use crate::sky::harmonics::{AnalysisOptions, analysis, synthesis};
 use crate::sky::healpix::{nside_of, pixel_area_sr};
 
 /// Relative accuracy of W_max: it only scales R.
 pub(super) const W_MAX_TOLERANCE: f64 = 1e-4;
+
+/// Products with the blocks before the iteration for W_max.
+const LIFTS: usize = 6;
 
 /// Parameters of a harmonic solution.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -59,9 +62,11 @@ pub fn solve_harmonics(
     check_request(sums, request.epsilon)?;
     let l_max = sums.setup().l_max;
     let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
+    let blocks = sums.order_blocks();
     let LargestEigenvalue { value: w_max, iterations, .. } = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
-        largest_eigenvalue(sums, W_MAX_TOLERANCE, &mut |step, change| task.report(step, change))
+        let start = lifted(&blocks, sums.unknowns());
+        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |step, change| task.report(step, change))
     };
     let regularisation = request.epsilon * w_max;
     let mut right = sums.right_hand_side().to_vec();
@@ -69,7 +74,11 @@ pub fn solve_harmonics(
         subtract_prediction(sums, prior, &mut right);
     }
     let right_hand_sides = [right.as_slice(), sums.noise_right_hand_side()];
-    let (solved, convergence) = iterate(sums, regularisation, right_hand_sides, start, request.rule, watch);
+    let factors = blocks.factors(regularisation);
+    // At high degrees they take as much as the factors.
+    drop(blocks);
+    let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
+    let (solved, convergence) = iterate(&system, right_hand_sides, start, request.rule, watch);
     let area_sr = pixel_area_sr(request.nside);
     let map = |x: &[f64]| synthesis(&coefficients(x, l_max), request.nside).map_err(SolveError::from);
     let mut whole = solved[0].clone();
@@ -93,18 +102,26 @@ pub fn solve_harmonics(
     Ok(HarmonicSolution { map_k: map(&whole)?, noise_k: map(&solved[1])?, unknowns: solved, diagnostics })
 }
 
+/// A random vector times the blocks of BtN^-1B that keep m, several times over: a beginning near the vectors with the largest
+/// eigenvalues, at the cost of less than a product.
+fn lifted(blocks: &OrderBlocks, unknowns: usize) -> Vec<f64> {
+    let mut vector = random_vector(unknowns);
+    for _ in 0..LIFTS {
+        blocks.multiply(&mut vector);
+        vector = normalised(vector);
+    }
+    vector
+}
+
 /// Solves for the map and the noise-only map, from an earlier solution of the same size if there is one.
 fn iterate(
-    sums: &HarmonicSums,
-    regularisation: f64,
+    system: &System<'_>,
     right_hand_sides: [&[f64]; 2],
     start: Option<&[Vec<f64>; 2]>,
     rule: StoppingRule,
     watch: NamedWatch<'_>,
 ) -> ([Vec<f64>; 2], [Convergence; 2]) {
-    let factors = sums.order_blocks().factors(regularisation);
-    let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
-    let unknowns = sums.unknowns();
+    let unknowns = system.sums.unknowns();
     let mut solved = [0, 1].map(|which| match start {
         Some(start) if start[which].len() == unknowns => start[which].clone(),
         _ => vec![0.0; unknowns],

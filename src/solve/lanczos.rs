@@ -35,9 +35,23 @@ pub fn largest_eigenvalue(
     tolerance: f64,
     report: &mut dyn FnMut(usize, f64) -> bool,
 ) -> LargestEigenvalue {
-    let order = sums.unknowns();
+    largest_eigenvalue_from(random_vector(sums.unknowns()), sums, tolerance, report)
+}
+
+/// A vector whose direction nothing prefers.
+pub(super) fn random_vector(order: usize) -> Vec<f64> {
     let mut stream = random_stream(0, StreamKind::Probe, [order as u64, 0]);
-    let start: Vec<f64> = (0..order).map(|_| StandardNormal.sample(&mut stream)).collect();
+    (0..order).map(|_| StandardNormal.sample(&mut stream)).collect()
+}
+
+/// As [`largest_eigenvalue`], from a vector that should have parts of all vectors with large eigenvalues.
+pub(super) fn largest_eigenvalue_from(
+    start: Vec<f64>,
+    sums: &dyn NormalSums,
+    tolerance: f64,
+    report: &mut dyn FnMut(usize, f64) -> bool,
+) -> LargestEigenvalue {
+    let order = sums.unknowns();
     let mut krylov = Krylov::new(start);
     let mut found = LargestEigenvalue { value: 0.0, iterations: 0, change: f64::INFINITY };
     let mut calm = 0;
@@ -92,7 +106,7 @@ impl Krylov {
     }
 }
 
-fn normalised(mut vector: Vec<f64>) -> Vec<f64> {
+pub(super) fn normalised(mut vector: Vec<f64>) -> Vec<f64> {
     let norm = norm(&vector);
     vector.iter_mut().for_each(|x| *x /= norm);
     vector

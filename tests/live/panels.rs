@@ -234,11 +234,12 @@ fn the_planes_of_u_v_w_hold_every_eighth_baseline() {
         assert_eq!(density["frequency_hz"], frequency_hz);
         let hits = served.json(&format!("/api/hits/{channel}"));
         assert_eq!((&hits["visibilities"], &hits["nside"]), (&good.len().into(), &16.into()));
-        // The poles of the orbit are never hidden, what lies in it is for a third of the time.
+        // The poles of the ecliptic are hidden at most by the blur, what lies in the orbit's plane for a third of the time.
         let by_direction = numbers(&hits["hits"]);
         let [least, most] = [by_direction.iter().min().unwrap(), by_direction.iter().max().unwrap()];
-        assert_eq!((by_direction.len(), *most), (3072, 8 * good.len().div_ceil(8) as u64));
-        assert!(0 < *least && least < most, "{least} {most}");
+        let counted = 8 * good.len().div_ceil(8) as u64;
+        assert!(by_direction.len() == 3072 && (counted - counted / 50..=counted).contains(most), "{most}");
+        assert!(counted / 3 < *least && *least < counted * 9 / 10, "{least} of {counted}");
         let counted: Vec<&[f64; 3]> = good.iter().step_by(8).collect();
         let longest = counted.iter().flat_map(|b| b.iter()).fold(0.0, |m: f64, x| m.max(x.abs()));
         let extent = density["extent_wavelengths"].as_f64().unwrap();

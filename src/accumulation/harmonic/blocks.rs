@@ -65,6 +65,20 @@ impl OrderBlocks {
         self.blocks[0][l % 2][(l / 2, l / 2)]
     }
 
+    /// Multiplies a vector of unknowns by the blocks, in place.
+    pub fn multiply(&self, unknowns: &mut [f64]) {
+        let mut rest = unknowns;
+        for (m, blocks) in self.blocks.iter().enumerate() {
+            let parts = parts_of(m);
+            let (of_m, others) = rest.split_at_mut(parts * (self.l_max + 1 - m));
+            rest = others;
+            for (parity, block) in blocks.iter().enumerate() {
+                let product = block * part_of(of_m, parity, parts, block.nrows());
+                put_part(of_m, parity, parts, &product);
+            }
+        }
+    }
+
     /// Factors of the blocks plus `regularisation` I; a block without a factor leaves its unknowns unchanged.
     #[must_use]
     pub fn factors(&self, regularisation: f64) -> OrderFactors {
@@ -85,20 +99,34 @@ impl OrderFactors {
     pub fn solve(&self, unknowns: &mut [f64]) {
         let mut rest = unknowns;
         for (m, factors) in self.factors.iter().enumerate() {
-            let parts = if m == 0 { 1 } else { 2 };
+            let parts = parts_of(m);
             let (of_m, others) = rest.split_at_mut(parts * (self.l_max + 1 - m));
             rest = others;
             for (parity, factor) in factors.iter().enumerate() {
                 let Some(factor) = factor else { continue };
-                let count = size(self.l_max, m, parity);
-                let mut right = Mat::from_fn(count, parts, |k, part| of_m[(2 * k + parity) * parts + part]);
+                let mut right = part_of(of_m, parity, parts, size(self.l_max, m, parity));
                 factor.solve_in_place(&mut right);
-                for k in 0..count {
-                    for part in 0..parts {
-                        of_m[(2 * k + parity) * parts + part] = right[(k, part)];
-                    }
-                }
+                put_part(of_m, parity, parts, &right);
             }
+        }
+    }
+}
+
+/// Numbers of a coefficient of order m.
+fn parts_of(m: usize) -> usize {
+    if m == 0 { 1 } else { 2 }
+}
+
+/// Of the unknowns of an order those of every second degree: a row for each of `count` degrees.
+fn part_of(of_m: &[f64], parity: usize, parts: usize, count: usize) -> Mat<f64> {
+    Mat::from_fn(count, parts, |k, part| of_m[(2 * k + parity) * parts + part])
+}
+
+/// Puts them back.
+fn put_part(of_m: &mut [f64], parity: usize, parts: usize, values: &Mat<f64>) {
+    for k in 0..values.nrows() {
+        for part in 0..parts {
+            of_m[(2 * k + parity) * parts + part] = values[(k, part)];
         }
     }
 }
