@@ -5,6 +5,7 @@ use thiserror::Error;
 
 use super::correlator::{Division, SUB_BANDS_MAX, dump_samples, shortest_integration_s};
 use super::ninth::NinthConfig;
+use super::receiver::{ReceiverNoise, is_none, is_zero};
 use super::schedule::Schedule;
 use crate::array::{Array, IntegrationRule};
 use crate::frames::{AntennaResponse, Channel};
@@ -63,9 +64,19 @@ pub struct SpacecraftConfig {
     /// Whether thermal noise is added. Weights describe the noise in either case.
     pub thermal_noise: bool,
     /// Receiver noise T_rec / zeta, referred to the sky, K sr.
-    pub receiver_noise_k_sr: f64,
+    pub receiver_noise_k_sr: ReceiverNoise,
+    /// Frequency at which the receiver's 1/f noise equals its other noise, Hz: `receiver_noise_k_sr` is multiplied by
+    /// `1 + knee / frequency`; 0 for none.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub receiver_knee_hz: f64,
+    /// Radio interference of the spacecraft itself, added to the receiver noise of every daughter, K sr.
+    #[serde(skip_serializing_if = "is_none")]
+    pub interference_floor_k_sr: PerChannel<f64>,
     /// Share of the power of the sky that the Moon reflects, xi_R; 0 for none. The paper has 0.07.
     pub moon_reflection: f64,
+    /// Brightness temperature of the Moon's disc, equal over it, K; 0 for none. Physically some 250.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub moon_temperature_k: f64,
     /// Antenna response of the daughters.
     pub antenna: Antenna,
     /// Sub-bands into which each channel of samples is divided before correlation: a power of two, 1 for none.
@@ -152,8 +163,11 @@ impl Default for SpacecraftConfig {
             smear_integrations: false,
             smear_bandwidth: false,
             thermal_noise: true,
-            receiver_noise_k_sr: 0.0,
+            receiver_noise_k_sr: ReceiverNoise::default(),
+            receiver_knee_hz: 0.0,
+            interference_floor_k_sr: PerChannel::All(0.0),
             moon_reflection: 0.0,
+            moon_temperature_k: 0.0,
             antenna: Antenna::default(),
             sub_bands: 1,
             delay_centre_deg: Vec::new(),
@@ -378,10 +392,11 @@ impl SpacecraftConfig {
         checks.number("auto_integration_s", autos, good, "0.001 s to 1000 s, or 0 for none");
         let wait = self.wait_blocks;
         checks.number("wait_blocks", wait as f64, (1..=1024).contains(&wait), "1 to 1024 blocks");
-        let noise = self.receiver_noise_k_sr;
-        checks.number("receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
+        self.check_receiver(checks);
         let share = self.moon_reflection;
         checks.number("moon_reflection", share, (0.0..=1.0).contains(&share), "0 to 1");
+        let moon_k = self.moon_temperature_k;
+        checks.number("moon_temperature_k", moon_k, (0.0..=1e4).contains(&moon_k), "0 K to 1e4 K");
         checks.number(
             "every_nth_window",
             self.every_nth_window as f64,
