@@ -74,6 +74,9 @@ pub struct SpacecraftConfig {
     pub interference_floor_k_sr: PerChannel<f64>,
     /// Share of the power of the sky that the Moon reflects, xi_R; 0 for none. The paper has 0.07.
     pub moon_reflection: f64,
+    /// The form of the Moon that reflects.
+    #[serde(skip_serializing_if = "MoonMirror::is_flat")]
+    pub moon_mirror: MoonMirror,
     /// Brightness temperature of the Moon's disc, equal over it, K; 0 for none. Physically some 250.
     #[serde(skip_serializing_if = "is_zero")]
     pub moon_temperature_k: f64,
@@ -124,6 +127,24 @@ pub enum StoreDrop {
     LowestValue,
 }
 
+/// The form of the Moon that reflects the sky.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MoonMirror {
+    /// The horizontal plane below each pair.
+    #[default]
+    Flat,
+    /// A sphere; direct sums only.
+    Sphere,
+}
+
+impl MoonMirror {
+    #[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
+    fn is_flat(&self) -> bool {
+        *self == Self::Flat
+    }
+}
+
 /// Antenna response by name.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -167,6 +188,7 @@ impl Default for SpacecraftConfig {
             receiver_knee_hz: 0.0,
             interference_floor_k_sr: PerChannel::All(0.0),
             moon_reflection: 0.0,
+            moon_mirror: MoonMirror::default(),
             moon_temperature_k: 0.0,
             antenna: Antenna::default(),
             sub_bands: 1,
@@ -395,6 +417,9 @@ impl SpacecraftConfig {
         self.check_receiver(checks);
         let share = self.moon_reflection;
         checks.number("moon_reflection", share, (0.0..=1.0).contains(&share), "0 to 1");
+        let direct = self.moon_mirror == MoonMirror::Flat || self.model == ModelChoice::Direct;
+        let expected = "spacecraft.model = \"direct\" with it, as harmonics are of a flat mirror";
+        checks.require("moon_mirror", "\"sphere\"", direct, expected);
         let moon_k = self.moon_temperature_k;
         checks.number("moon_temperature_k", moon_k, (0.0..=1e4).contains(&moon_k), "0 K to 1e4 K");
         checks.number(

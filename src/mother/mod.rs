@@ -24,7 +24,7 @@ mod store;
 mod troubles;
 
 pub use config::{
-    Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, IntegrationTooShort, SpacecraftConfig, StoreDrop,
+    Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, IntegrationTooShort, MoonMirror, SpacecraftConfig, StoreDrop,
     VISIBILITY_BYTES,
 };
 pub use integrator::{ChannelModel, Integrator, MeasurementOptions, NoiseModel};

@@ -156,7 +156,10 @@ mod tests {
         let text = toml::to_string(&usual).unwrap();
         assert!(text.contains("receiver_noise_k_sr = 0.0\n"), "{text}");
         assert!(
-            !text.contains("knee") && !text.contains("floor") && !text.contains("moon_temperature"),
+            !text.contains("knee")
+                && !text.contains("floor")
+                && !text.contains("moon_temperature")
+                && !text.contains("mirror"),
             "{text}"
         );
     }

@@ -11,11 +11,11 @@ use super::error::PipelineError;
 use super::plan::{Expected, Plan};
 use crate::array::Array;
 use crate::frames::ObservingWindow;
-use crate::mother::{ChannelModel, Fidelity, Schedule};
+use crate::mother::{ChannelModel, Fidelity, MoonMirror, Schedule};
 use crate::response::harmonic::RotationTable;
 use crate::response::model::{
     BandAverage, DirectSum, Emitting, GeneralSum, HarmonicSum, HarmonicSumSetup, Load, ModelChoice,
-    ModelKind, ModelPlan, Reflected, VisibilityModel,
+    ModelKind, ModelPlan, Reflected, SphereMirrored, VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
@@ -171,7 +171,7 @@ fn channel_model(
             let sky = less(sky, less_k)?;
             Ok(Box::new(DirectSum::new(&sky, frequency_hz, moon_m, response)))
         };
-        return Ok(averaged(plan, with_moon(plan, direct, frequency_hz)?, frequency_hz));
+        return Ok(averaged(plan, with_moon(plan, direct, sky, frequency_hz)?, frequency_hz));
     }
     let alm = coefficients(sky, choice.l_max)?;
     if choice.kind == ModelKind::General {
@@ -179,7 +179,7 @@ fn channel_model(
             let (sky, alm) = (less(sky, less_k)?, less_alm(&alm, less_k));
             Ok(Box::new(GeneralSum::new(&sky, alm, frequency_hz, moon_m)?))
         };
-        return Ok(averaged(plan, with_moon(plan, general, frequency_hz)?, frequency_hz));
+        return Ok(averaged(plan, with_moon(plan, general, sky, frequency_hz)?, frequency_hz));
     }
     let setup = |moon_radius_m| HarmonicSumSetup {
         frequency_hz,
@@ -194,7 +194,7 @@ fn channel_model(
     let harmonic = |moon_m, less_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
         Ok(Box::new(HarmonicSum::new(less_alm(&alm, less_k), setup(moon_m), Arc::clone(&rotation))?))
     };
-    Ok(averaged(plan, with_moon(plan, harmonic, frequency_hz)?, frequency_hz))
+    Ok(averaged(plan, with_moon(plan, harmonic, sky, frequency_hz)?, frequency_hz))
 }
 
 /// The sky less a temperature in all directions.
@@ -213,11 +213,12 @@ fn less_alm(alm: &Alm, less_k: f64) -> Alm {
     alm
 }
 
-/// The model that `of` makes for a radius of the Moon, m, and of the sky less a temperature, K; with the Moon's emission and the
-/// image of the sky if the configuration asks for them.
+/// The model that `of` makes for a radius of the Moon, m, and of the sky's `map` less a temperature, K; with the Moon's emission and
+/// the image of the sky if the configuration asks for them.
 fn with_moon(
     plan: &Plan,
     of: impl Fn(f64, f64) -> Result<Box<dyn VisibilityModel>, PipelineError>,
+    map: &SkyMap,
     frequency_hz: f64,
 ) -> Result<Box<dyn VisibilityModel>, PipelineError> {
     let moon_k = plan.config.spacecraft.moon_temperature_k;
@@ -228,6 +229,11 @@ fn with_moon(
     let share = plan.config.spacecraft.moon_reflection;
     if share == 0.0 {
         return Ok(sky);
+    }
+    if plan.config.spacecraft.moon_mirror == MoonMirror::Sphere {
+        let mirror = (plan.array.moon_radius_m(), share);
+        let response = plan.instrument.response;
+        return Ok(Box::new(SphereMirrored::new(sky, map.clone(), frequency_hz, response, mirror)));
     }
     // A Moon that all but touches the orbit hides what is below the horizontal: to 5e-5 rad.
     let above = of(plan.array.orbit_radius_m() * (1.0 - 1e-9), 0.0)?;

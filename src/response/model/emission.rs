@@ -121,8 +121,8 @@ mod tests {
 
     const MOON_K: f64 = 250.0;
     const FREQUENCY_HZ: f64 = 1e6;
-    /// Of the directions of the sums in these tests.
-    const NSIDE: usize = 256;
+    /// Of the directions of the sums in these tests, which alias beyond some 60 wavelengths.
+    const NSIDE: usize = 128;
 
     #[test]
     fn uniform_skies_are_those_of_sums() {
@@ -152,7 +152,7 @@ mod tests {
     }
 
     fn positions(array: &Array) -> Vec<PairPosition> {
-        let pairs = [(0, 1, 9e5), (2, 0, 9.03e5), (1, 3, 9e5), (0, 7, 2e3)];
+        let pairs = [(0, 1, 9e5), (2, 0, 9.03e5), (1, 3, 9e5), (0, 4, 2e3)];
         let at = |(i, j, t_s): (usize, usize, f64)| PairPosition {
             r_i_m: array.position_m(i, t_s),
             r_j_m: array.position_m(j, t_s),
@@ -162,7 +162,7 @@ mod tests {
         pairs.map(at).to_vec()
     }
 
-    /// The sum over directions that the Moon hides from either daughter, K sr, and the number of directions of the limb.
+    /// The sum over directions that the Moon hides from either daughter, K sr.
     fn disc(array: &Array, pair: &PairPosition, frequency_hz: f64, normal_hat: Option<Vec3>) -> Complex64 {
         let hides = |n: Vec3, r_m: Vec3| {
             // The ray from the daughter comes closer to the centre than the surface is.
@@ -205,7 +205,7 @@ mod tests {
             orbit_radius_m: array.orbit_radius_m(),
             inclination_rad: array.inclination_rad(),
             moon_radius_m: array.moon_radius_m(),
-            baseline_wavelengths_max: 400.0,
+            baseline_wavelengths_max: 60.0,
             response,
         };
         let rotation = Arc::new(RotationTable::new(0, array.inclination_rad()));
@@ -243,7 +243,6 @@ mod tests {
             for (k, position) in positions.iter().enumerate() {
                 let expected = disc(&array, position, FREQUENCY_HZ, dipole([9e5, 9.03e5, 9e5, 2e3][k]));
                 let off = (found[k] - expected).norm();
-                println!("{name} {k}: {} {expected}", found[k]);
                 assert!(off < limb_k_sr(), "{name} {k}: {} {expected}", found[k]);
             }
             let r_m = positions[0].r_i_m;
@@ -255,7 +254,6 @@ mod tests {
             let across = PI * (2.0 / 3.0 - cos + cos.powi(3) / 3.0);
             let less_sr = if response == isotropic { 0.0 } else { across };
             let expected = MOON_K * (TAU * (1.0 - cos) - less_sr);
-            println!("{name}: {} {expected}", power[0]);
             // General powers are summed at nside 64.
             assert!((power[0] - expected).abs() < 4.0 * limb_k_sr(), "{name}: {} {expected}", power[0]);
         }
