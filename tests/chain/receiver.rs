@@ -35,9 +35,14 @@ const WIDTH_HZ: f64 = 8e3;
 
 /// The blocks of a simulation of a sky of 0 K at this nside.
 fn simulate(nside: usize, set: &[&str]) -> Vec<VisibilityBlock> {
+    simulate_sky(nside, 0.0, set)
+}
+
+/// Of a sky with the same temperature everywhere.
+fn simulate_sky(nside: usize, sky_k: f64, set: &[&str]) -> Vec<VisibilityBlock> {
     let place = Workplace::new(DARK);
     let sky = place.path("dark.fits");
-    let map = SkyMap::new(Frame::Ecliptic, vec![0.0; 12 * nside * nside]).unwrap();
+    let map = SkyMap::new(Frame::Ecliptic, vec![sky_k; 12 * nside * nside]).unwrap();
     write_map(Path::new(&sky), &map, &WriteOptions::default()).unwrap();
     let file = format!("sky.file={sky:?}");
     let set: Vec<&str> = [&[file.as_str()], set].concat().iter().flat_map(|set| ["--set", *set]).collect();
@@ -185,4 +190,25 @@ fn the_moon_shines_for_pairs_and_powers_with_every_model() {
         let of_powers = if model == "harmonic" { 0.05 } else { 5.0 * pixels_k_sr };
         assert!(worst_power < of_powers, "{model}: {worst_power}");
     }
+}
+
+#[test]
+fn a_round_moon_reflects_into_its_disc() {
+    let array = Array::new(&ArrayConfig::default()).unwrap();
+    let disc_sr = TAU * (1.0 - (1.0 - (array.moon_radius_m() / array.orbit_radius_m()).powi(2)).sqrt());
+    let set = ["spacecraft.moon_reflection=0.07", "spacecraft.moon_mirror=sphere", "spacecraft.model=direct"];
+    let set =
+        [&set[..], &["spacecraft.every_nth_window=3000", "spacecraft.every_nth_integration=200"]].concat();
+    // In a sky of 100 K everywhere the mirror shows 7 K; pixels of the limb as above.
+    let expected_k_sr = 100.0 * (4.0 * PI - disc_sr) + 7.0 * disc_sr;
+    let tolerance_k_sr = 5.0 * 100.0 * 4.0 * PI / (12.0 * 64.0 * 64.0) * (167.0_f64 / 12.0).sqrt();
+    let mut counted = 0;
+    for block in simulate_sky(64, 100.0, &set).iter().filter(|block| block.pair.i == block.pair.j) {
+        for value in &block.value_k_sr {
+            counted += 1;
+            let off = f64::from(value.re) - expected_k_sr;
+            assert!(off.abs() < tolerance_k_sr, "{} {expected_k_sr}", value.re);
+        }
+    }
+    assert!(counted > 50, "{counted}");
 }
