@@ -5,7 +5,7 @@ use thiserror::Error;
 
 use super::correlator::{Division, SUB_BANDS_MAX, dump_samples, shortest_integration_s};
 use super::ninth::NinthConfig;
-use super::receiver::{ReceiverNoise, is_none, is_zero};
+use super::receiver::{ReceiverNoise, check_channels, is_none, is_zero};
 use super::schedule::Schedule;
 use crate::array::{Array, IntegrationRule};
 use crate::frames::{AntennaResponse, Channel};
@@ -363,6 +363,26 @@ impl SpacecraftConfig {
         checks.require("delay_centre_deg", centre, whole, format!("[] {expected}"));
         let noisy = self.thermal_noise || !samples;
         checks.require("thermal_noise", false, noisy, "true with fidelity = \"samples\": samples are noise");
+    }
+
+    /// What a daughter's receiver adds to the power of the sky in each channel, K sr: `T_rec / zeta (1 + knee / nu)`, and the
+    /// floor of interference. 0 for what a configuration with [`Self::problems`] lacks.
+    #[must_use]
+    pub fn receiver_k_sr(&self) -> Vec<f64> {
+        let of_channel = |(channel, &frequency_hz): (usize, &f64)| {
+            let receiver = self.receiver_noise_k_sr.at(channel, frequency_hz).unwrap_or(0.0);
+            let floor = self.interference_floor_k_sr.get(channel).unwrap_or(0.0);
+            receiver * (1.0 + self.receiver_knee_hz / frequency_hz) + floor
+        };
+        self.channels_hz.iter().enumerate().map(of_channel).collect()
+    }
+
+    fn check_receiver(&self, checks: &mut Checks) {
+        self.receiver_noise_k_sr.check(&self.channels_hz, checks);
+        let knee = self.receiver_knee_hz;
+        checks.number("receiver_knee_hz", knee, knee >= 0.0, "Hz, or 0 for no 1/f noise");
+        let floor = &self.interference_floor_k_sr;
+        check_channels("interference_floor_k_sr", floor, self.channels_hz.len(), checks);
     }
 
     /// The rule of the adaptive integration.

@@ -2,7 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::config::SpacecraftConfig;
 use crate::units::{Checks, PerChannel};
 
 /// Most points of a table of receiver noise.
@@ -46,7 +45,7 @@ impl ReceiverNoise {
         }
     }
 
-    fn check(&self, channels_hz: &[f64], checks: &mut Checks) {
+    pub(super) fn check(&self, channels_hz: &[f64], checks: &mut Checks) {
         let key = "receiver_noise_k_sr";
         let points = match self {
             Self::Channels(values) => {
@@ -79,32 +78,10 @@ impl ReceiverNoise {
 }
 
 /// Requires one value, or one for each channel, none negative, K sr.
-fn check_channels(key: &str, values: &PerChannel<f64>, channels: usize, checks: &mut Checks) {
+pub(super) fn check_channels(key: &str, values: &PerChannel<f64>, channels: usize, checks: &mut Checks) {
     let expected = format!("one value, or one for each of the {channels} channels");
     checks.require(key, format!("({} values)", values.values().len()), values.fits(channels), expected);
     checks.numbers(key, values.values(), |k_sr| k_sr >= 0.0, "K sr, not negative");
-}
-
-impl SpacecraftConfig {
-    /// What a daughter's receiver adds to the power of the sky in each channel, K sr: `T_rec / zeta (1 + knee / nu)`, and the
-    /// floor of interference. 0 for what a configuration with [`Self::problems`] lacks.
-    #[must_use]
-    pub fn receiver_k_sr(&self) -> Vec<f64> {
-        let of_channel = |(channel, &frequency_hz): (usize, &f64)| {
-            let receiver = self.receiver_noise_k_sr.at(channel, frequency_hz).unwrap_or(0.0);
-            let floor = self.interference_floor_k_sr.get(channel).unwrap_or(0.0);
-            receiver * (1.0 + self.receiver_knee_hz / frequency_hz) + floor
-        };
-        self.channels_hz.iter().enumerate().map(of_channel).collect()
-    }
-
-    pub(super) fn check_receiver(&self, checks: &mut Checks) {
-        self.receiver_noise_k_sr.check(&self.channels_hz, checks);
-        let knee = self.receiver_knee_hz;
-        checks.number("receiver_knee_hz", knee, knee >= 0.0, "Hz, or 0 for no 1/f noise");
-        let floor = &self.interference_floor_k_sr;
-        check_channels("interference_floor_k_sr", floor, self.channels_hz.len(), checks);
-    }
 }
 
 /// Whether a number is 0: keys that came later are left out of hashes while they change nothing.
@@ -121,6 +98,7 @@ pub(super) fn is_none(values: &PerChannel<f64>) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mother::SpacecraftConfig;
 
     fn told(lines: &str) -> Vec<String> {
         let config: SpacecraftConfig = toml::from_str(lines).unwrap();
