@@ -97,7 +97,6 @@ pub(super) fn is_none(values: &PerChannel<f64>) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use crate::mother::SpacecraftConfig;
 
     fn told(lines: &str) -> Vec<String> {
