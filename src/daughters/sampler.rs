@@ -30,8 +30,8 @@ pub struct Scene {
     pub models: Vec<Box<dyn VisibilityModel>>,
     /// Channels.
     pub channels: Vec<Channel>,
-    /// Receiver noise T_rec / zeta of each daughter, K sr.
-    pub receiver_noise_k_sr: f64,
+    /// Receiver noise of each channel, equal at all daughters, K sr.
+    pub receiver_noise_k_sr: Vec<f64>,
     /// Seed of all random numbers.
     pub seed: u64,
 }
@@ -250,7 +250,7 @@ impl ChannelWork<'_> {
         let request = CovarianceRequest {
             array: &sampler.scene.array,
             channel: sampler.scene.channels[usize::from(self.id.0)],
-            receiver_noise_k_sr: sampler.scene.receiver_noise_k_sr,
+            receiver_noise_k_sr: sampler.scene.receiver_noise_k_sr[usize::from(self.id.0)],
             epochs,
             tables: &sampler.tables,
         };

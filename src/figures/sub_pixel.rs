@@ -216,9 +216,10 @@ fn noise_k_sr(plan: &Plan, sample: &Sample, sky: &SkyMap) -> Result<Vec<f64>, Fi
     let values: Vec<f32> = sky.values().iter().map(|&value| value as f32).collect();
     let powers = sky_powers(&singles, &directions, &values, pixel_area_sr(sky.nside()))?;
     let spacecraft = &plan.config.spacecraft;
-    let sigma = |(power, dt_s): (f64, &f64)| {
-        (power + spacecraft.receiver_noise_k_sr) / (2.0 * spacecraft.channel_width_hz * dt_s).sqrt()
-    };
+    // As the baselines, of the first channel.
+    let receiver = spacecraft.receiver_k_sr().first().copied().unwrap_or(0.0);
+    let sigma =
+        |(power, dt_s): (f64, &f64)| (power + receiver) / (2.0 * spacecraft.channel_width_hz * dt_s).sqrt();
     Ok(powers.into_iter().zip(&sample.dt_s).map(sigma).collect())
 }
 

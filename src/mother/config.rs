@@ -5,6 +5,7 @@ use thiserror::Error;
 
 use super::correlator::{Division, SUB_BANDS_MAX, dump_samples, shortest_integration_s};
 use super::ninth::NinthConfig;
+use super::receiver::{ReceiverNoise, check_channels, is_none, is_zero};
 use super::schedule::Schedule;
 use crate::array::{Array, IntegrationRule};
 use crate::frames::{AntennaResponse, Channel};
@@ -63,9 +64,22 @@ pub struct SpacecraftConfig {
     /// Whether thermal noise is added. Weights describe the noise in either case.
     pub thermal_noise: bool,
     /// Receiver noise T_rec / zeta, referred to the sky, K sr.
-    pub receiver_noise_k_sr: f64,
+    pub receiver_noise_k_sr: ReceiverNoise,
+    /// Frequency at which the receiver's 1/f noise equals its other noise, Hz: `receiver_noise_k_sr` is multiplied by
+    /// `1 + knee / frequency`; 0 for none.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub receiver_knee_hz: f64,
+    /// Radio interference of the spacecraft itself, added to the receiver noise of every daughter, K sr.
+    #[serde(skip_serializing_if = "is_none")]
+    pub interference_floor_k_sr: PerChannel<f64>,
     /// Share of the power of the sky that the Moon reflects, xi_R; 0 for none. The paper has 0.07.
     pub moon_reflection: f64,
+    /// The form of the Moon that reflects.
+    #[serde(skip_serializing_if = "MoonMirror::is_flat")]
+    pub moon_mirror: MoonMirror,
+    /// Brightness temperature of the Moon's disc, equal over it, K; 0 for none. Physically some 250.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub moon_temperature_k: f64,
     /// Antenna response of the daughters.
     pub antenna: Antenna,
     /// Sub-bands into which each channel of samples is divided before correlation: a power of two, 1 for none.
@@ -113,6 +127,24 @@ pub enum StoreDrop {
     LowestValue,
 }
 
+/// The form of the Moon that reflects the sky.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MoonMirror {
+    /// The horizontal plane below each pair.
+    #[default]
+    Flat,
+    /// A sphere; direct sums only.
+    Sphere,
+}
+
+impl MoonMirror {
+    #[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
+    fn is_flat(&self) -> bool {
+        *self == Self::Flat
+    }
+}
+
 /// Antenna response by name.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -152,8 +184,12 @@ impl Default for SpacecraftConfig {
             smear_integrations: false,
             smear_bandwidth: false,
             thermal_noise: true,
-            receiver_noise_k_sr: 0.0,
+            receiver_noise_k_sr: ReceiverNoise::default(),
+            receiver_knee_hz: 0.0,
+            interference_floor_k_sr: PerChannel::All(0.0),
             moon_reflection: 0.0,
+            moon_mirror: MoonMirror::default(),
+            moon_temperature_k: 0.0,
             antenna: Antenna::default(),
             sub_bands: 1,
             delay_centre_deg: Vec::new(),
@@ -329,6 +365,26 @@ impl SpacecraftConfig {
         checks.require("thermal_noise", false, noisy, "true with fidelity = \"samples\": samples are noise");
     }
 
+    /// What a daughter's receiver adds to the power of the sky in each channel, K sr: `T_rec / zeta (1 + knee / nu)`, and the
+    /// floor of interference. 0 for what a configuration with [`Self::problems`] lacks.
+    #[must_use]
+    pub fn receiver_k_sr(&self) -> Vec<f64> {
+        let of_channel = |(channel, &frequency_hz): (usize, &f64)| {
+            let receiver = self.receiver_noise_k_sr.at(channel, frequency_hz).unwrap_or(0.0);
+            let floor = self.interference_floor_k_sr.get(channel).unwrap_or(0.0);
+            receiver * (1.0 + self.receiver_knee_hz / frequency_hz) + floor
+        };
+        self.channels_hz.iter().enumerate().map(of_channel).collect()
+    }
+
+    fn check_receiver(&self, checks: &mut Checks) {
+        self.receiver_noise_k_sr.check(&self.channels_hz, checks);
+        let knee = self.receiver_knee_hz;
+        checks.number("receiver_knee_hz", knee, knee >= 0.0, "Hz, or 0 for no 1/f noise");
+        let floor = &self.interference_floor_k_sr;
+        check_channels("interference_floor_k_sr", floor, self.channels_hz.len(), checks);
+    }
+
     /// The rule of the adaptive integration.
     #[must_use]
     pub fn rule(&self) -> IntegrationRule {
@@ -378,10 +434,14 @@ impl SpacecraftConfig {
         checks.number("auto_integration_s", autos, good, "0.001 s to 1000 s, or 0 for none");
         let wait = self.wait_blocks;
         checks.number("wait_blocks", wait as f64, (1..=1024).contains(&wait), "1 to 1024 blocks");
-        let noise = self.receiver_noise_k_sr;
-        checks.number("receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
+        self.check_receiver(checks);
         let share = self.moon_reflection;
         checks.number("moon_reflection", share, (0.0..=1.0).contains(&share), "0 to 1");
+        let direct = self.moon_mirror == MoonMirror::Flat || self.model == ModelChoice::Direct;
+        let expected = "spacecraft.model = \"direct\" with it, as harmonics are of a flat mirror";
+        checks.require("moon_mirror", "\"sphere\"", direct, expected);
+        let moon_k = self.moon_temperature_k;
+        checks.number("moon_temperature_k", moon_k, (0.0..=1e4).contains(&moon_k), "0 K to 1e4 K");
         checks.number(
             "every_nth_window",
             self.every_nth_window as f64,

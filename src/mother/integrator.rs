@@ -52,7 +52,7 @@ pub struct ChannelModel {
 }
 
 /// How a prediction becomes a measurement.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct MeasurementOptions {
     /// Thermal noise.
     pub noise: NoiseModel,
@@ -107,12 +107,12 @@ impl WindowChannel<'_> {
 }
 
 /// Thermal noise of integrated visibilities.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct NoiseModel {
     /// Seed of the noise; `None` adds none (weights are those of the noise anyway).
     pub seed: Option<u64>,
-    /// Receiver noise T_rec / zeta, K sr.
-    pub receiver_noise_k_sr: f64,
+    /// Receiver noise of each channel, T_rec / zeta with all that is added to it, K sr.
+    pub receiver_noise_k_sr: Vec<f64>,
 }
 
 impl NoiseModel {
@@ -120,9 +120,14 @@ impl NoiseModel {
     /// `sqrt(P_i P_j / (2 dnu dt))` with `P = T_rec / zeta + Int T S A dn` (the paper, Eq. 12, with each daughter's own
     /// system temperature).
     #[must_use]
-    pub fn sigma_k_sr(&self, powers_k_sr: [f64; 2], width_hz: f64, dt_s: f64) -> f64 {
-        let [p_i, p_j] = powers_k_sr.map(|power| self.receiver_noise_k_sr + power);
+    pub fn sigma_k_sr(&self, channel: ChannelId, powers_k_sr: [f64; 2], width_hz: f64, dt_s: f64) -> f64 {
+        let receiver = self.receiver_k_sr(channel);
+        let [p_i, p_j] = powers_k_sr.map(|power| receiver + power);
         (p_i * p_j / (2.0 * width_hz * dt_s)).sqrt()
+    }
+
+    fn receiver_k_sr(&self, channel: ChannelId) -> f64 {
+        self.receiver_noise_k_sr.get(usize::from(channel.0)).copied().unwrap_or(0.0)
     }
 
     /// Random stream of the noise of a pair, or of an auto-correlation, in a channel and window.
@@ -298,7 +303,7 @@ impl Integrator {
         predictions: &[Complex64],
     ) -> VisibilityBlock {
         let WindowChannel { window, channel, powers, .. } = context;
-        let (pair, noise_model) = (scheduled.pair, self.options.noise);
+        let (pair, noise_model) = (scheduled.pair, &self.options.noise);
         let width_hz = self.instrument.channels[usize::from(channel.0)].width_hz;
         let mut noise = noise_model.stream(window, channel, pair);
         let mut troubles = self.troubles(context, pair);
@@ -318,7 +323,7 @@ impl Integrator {
                 // A dead receiver delivers noise of the same power.
                 value = if troubles.is_dead() { Complex64::ZERO } else { value * gain };
             }
-            let sigma = noise_model.sigma_k_sr(own, width_hz, dt_s) * gain.norm();
+            let sigma = noise_model.sigma_k_sr(channel, own, width_hz, dt_s) * gain.norm();
             if let Some(stream) = &mut noise {
                 let draw: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(stream));
                 value.re += sigma * draw[0];
@@ -363,7 +368,7 @@ impl Integrator {
         if step == 0 {
             return Vec::new();
         }
-        let noise_model = self.options.noise;
+        let noise_model = &self.options.noise;
         let width_hz = self.instrument.channels[usize::from(channel.0)].width_hz;
         let length = (window.end.0 - window.start.0).clamp(0, i64::from(u32::MAX)) as u32;
         let block = |n: u8| {
@@ -378,7 +383,7 @@ impl Integrator {
                 let from = window.start.plus_ticks(offset.into());
                 let middle_s = from.seconds() + 0.5 * dt_s;
                 let mut expected_k_sr =
-                    noise_model.receiver_noise_k_sr + powers.at(&self.array, n.into(), middle_s);
+                    noise_model.receiver_k_sr(channel) + powers.at(&self.array, n.into(), middle_s);
                 let mut flags = context.flags(pair, from, duration);
                 if let Some(troubles) = &troubles {
                     expected_k_sr += troubles.signals(middle_s).power_k_sr;

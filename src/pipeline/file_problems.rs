@@ -13,10 +13,10 @@ impl Plan {
     pub fn file_problems(&self) -> Problems {
         let mut found = Problems::default();
         let (sky, spacecraft) = (&self.config.sky, &self.config.spacecraft);
-        let channels = spacecraft.channels_hz.iter().enumerate();
-        let skies = channels.filter_map(|(k, hz)| Some((sky.file.as_ref()?.get(k)?, hz)));
-        let skies = skies.map(|(path, &frequency_hz)| {
-            read_sky(&path, frequency_hz, sky, spacecraft.receiver_noise_k_sr > 0.0)
+        let channels = spacecraft.channels_hz.iter().zip(spacecraft.receiver_k_sr()).enumerate();
+        let skies = channels.filter_map(|(k, channel)| Some((sky.file.as_ref()?.get(k)?, channel)));
+        let skies = skies.map(|(path, (&frequency_hz, receiver_k_sr))| {
+            read_sky(&path, frequency_hz, sky, receiver_k_sr > 0.0)
         });
         let priors = self.config.map.prior_files.iter();
         let options = ReadOptions { frame_if_missing: self.config.map.prior_frame, ..ReadOptions::default() };

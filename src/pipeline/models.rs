@@ -1,6 +1,8 @@
 //! The visibility model of each channel.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
+use std::f64::consts::PI;
 use std::sync::Arc;
 
 use rayon::prelude::*;
@@ -9,15 +11,15 @@ use super::error::PipelineError;
 use super::plan::{Expected, Plan};
 use crate::array::Array;
 use crate::frames::ObservingWindow;
-use crate::mother::{ChannelModel, Fidelity, Schedule};
+use crate::mother::{ChannelModel, Fidelity, MoonMirror, Schedule};
 use crate::response::harmonic::RotationTable;
 use crate::response::model::{
-    BandAverage, DirectSum, GeneralSum, HarmonicSum, HarmonicSumSetup, Load, ModelChoice, ModelKind,
-    ModelPlan, Reflected, VisibilityModel,
+    BandAverage, DirectSum, Emitting, GeneralSum, HarmonicSum, HarmonicSumSetup, Load, ModelChoice,
+    ModelKind, ModelPlan, Reflected, SphereMirrored, VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
-use crate::sky::{Frame, SkyConfig, SkyMap};
+use crate::sky::{Frame, MapError, SkyConfig, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, norm, sub};
 use crate::units::{Pair, all_pairs};
@@ -165,17 +167,19 @@ fn channel_model(
     let array = &plan.array;
     let (frequency_hz, response) = (schedule.frequency_hz, plan.instrument.response);
     if choice.kind == ModelKind::Direct {
-        let direct = |moon_m| -> Result<Box<dyn VisibilityModel>, PipelineError> {
-            Ok(Box::new(DirectSum::new(sky, frequency_hz, moon_m, response)))
+        let direct = |moon_m, less_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+            let sky = less(sky, less_k)?;
+            Ok(Box::new(DirectSum::new(&sky, frequency_hz, moon_m, response)))
         };
-        return Ok(averaged(plan, reflected(plan, direct)?, frequency_hz));
+        return Ok(averaged(plan, with_moon(plan, direct, sky, frequency_hz)?, frequency_hz));
     }
     let alm = coefficients(sky, choice.l_max)?;
     if choice.kind == ModelKind::General {
-        let general = |moon_m| -> Result<Box<dyn VisibilityModel>, PipelineError> {
-            Ok(Box::new(GeneralSum::new(sky, alm.clone(), frequency_hz, moon_m)?))
+        let general = |moon_m, less_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+            let (sky, alm) = (less(sky, less_k)?, less_alm(&alm, less_k));
+            Ok(Box::new(GeneralSum::new(&sky, alm, frequency_hz, moon_m)?))
         };
-        return Ok(averaged(plan, reflected(plan, general)?, frequency_hz));
+        return Ok(averaged(plan, with_moon(plan, general, sky, frequency_hz)?, frequency_hz));
     }
     let setup = |moon_radius_m| HarmonicSumSetup {
         frequency_hz,
@@ -187,24 +191,52 @@ fn channel_model(
     };
     let table = || Arc::new(RotationTable::new(choice.l_max, array.inclination_rad()));
     let rotation = Arc::clone(rotations.entry(choice.l_max).or_insert_with(table));
-    let harmonic = |moon_m| -> Result<Box<dyn VisibilityModel>, PipelineError> {
-        Ok(Box::new(HarmonicSum::new(alm.clone(), setup(moon_m), Arc::clone(&rotation))?))
+    let harmonic = |moon_m, less_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+        Ok(Box::new(HarmonicSum::new(less_alm(&alm, less_k), setup(moon_m), Arc::clone(&rotation))?))
     };
-    Ok(averaged(plan, reflected(plan, harmonic)?, frequency_hz))
+    Ok(averaged(plan, with_moon(plan, harmonic, sky, frequency_hz)?, frequency_hz))
 }
 
-/// The model that `of` makes for a radius of the Moon, m, with the image of the sky if the configuration asks for it.
-fn reflected(
+/// The sky less a temperature in all directions.
+fn less(sky: &SkyMap, less_k: f64) -> Result<Cow<'_, SkyMap>, MapError> {
+    if less_k == 0.0 {
+        return Ok(Cow::Borrowed(sky));
+    }
+    let values_k = sky.values().iter().map(|value| value - less_k).collect();
+    Ok(Cow::Owned(SkyMap::new(sky.frame(), values_k)?))
+}
+
+/// As [`less`], of its coefficients: 1 K in all directions is sqrt(4 pi) of l = 0.
+fn less_alm(alm: &Alm, less_k: f64) -> Alm {
+    let mut alm = alm.clone();
+    alm.get_mut(0, 0).re -= less_k * (4.0 * PI).sqrt();
+    alm
+}
+
+/// The model that `of` makes for a radius of the Moon, m, and of the sky's `map` less a temperature, K; with the Moon's emission and
+/// the image of the sky if the configuration asks for them.
+fn with_moon(
     plan: &Plan,
-    of: impl Fn(f64) -> Result<Box<dyn VisibilityModel>, PipelineError>,
+    of: impl Fn(f64, f64) -> Result<Box<dyn VisibilityModel>, PipelineError>,
+    map: &SkyMap,
+    frequency_hz: f64,
 ) -> Result<Box<dyn VisibilityModel>, PipelineError> {
-    let sky = of(plan.array.moon_radius_m())?;
+    let moon_k = plan.config.spacecraft.moon_temperature_k;
+    let mut sky = of(plan.array.moon_radius_m(), moon_k)?;
+    if moon_k > 0.0 {
+        sky = Box::new(Emitting::new(sky, frequency_hz, plan.instrument.response, moon_k));
+    }
     let share = plan.config.spacecraft.moon_reflection;
     if share == 0.0 {
         return Ok(sky);
     }
+    if plan.config.spacecraft.moon_mirror == MoonMirror::Sphere {
+        let mirror = (plan.array.moon_radius_m(), share);
+        let response = plan.instrument.response;
+        return Ok(Box::new(SphereMirrored::new(sky, map.clone(), frequency_hz, response, mirror)));
+    }
     // A Moon that all but touches the orbit hides what is below the horizontal: to 5e-5 rad.
-    let above = of(plan.array.orbit_radius_m() * (1.0 - 1e-9))?;
+    let above = of(plan.array.orbit_radius_m() * (1.0 - 1e-9), 0.0)?;
     Ok(Box::new(Reflected::new(sky, above, share)))
 }
 

@@ -23,7 +23,7 @@ pub fn sample_stages(
         array: Arc::clone(array),
         models,
         channels: config.spacecraft.channels(),
-        receiver_noise_k_sr: config.spacecraft.receiver_noise_k_sr,
+        receiver_noise_k_sr: config.spacecraft.receiver_k_sr(),
         seed: config.seed,
     };
     let daughters = &config.daughters;

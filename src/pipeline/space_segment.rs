@@ -42,7 +42,7 @@ pub(super) fn sky(plan: &Plan, channel: ChannelId) -> Result<SkyMap, PipelineErr
     match config.file.as_ref() {
         Some(files) => {
             let path = files.get(channel).unwrap_or_default();
-            let may_be_dark = plan.config.spacecraft.receiver_noise_k_sr > 0.0;
+            let may_be_dark = plan.config.spacecraft.receiver_k_sr()[channel] > 0.0;
             let map = read_sky(&path, frequency_hz, config, may_be_dark)?;
             let Some(added) = &config.added else { return Ok(map) };
             let seed = plan.config.seed;
@@ -102,7 +102,7 @@ pub(super) fn integrate(
     let models = models::build(plan, skies)?;
     let noise = NoiseModel {
         seed: config.spacecraft.thermal_noise.then_some(config.seed),
-        receiver_noise_k_sr: config.spacecraft.receiver_noise_k_sr,
+        receiver_noise_k_sr: config.spacecraft.receiver_k_sr(),
     };
     let options = MeasurementOptions {
         noise,

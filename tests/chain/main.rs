@@ -18,6 +18,7 @@ mod outputs;
 mod paper;
 mod products;
 mod ranks;
+mod receiver;
 mod reflection;
 mod run;
 mod schema;

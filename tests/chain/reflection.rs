@@ -4,7 +4,7 @@ use std::path::Path;
 
 use lunarray::sky::fits::{ReadOptions, read_whole_map};
 
-use super::common::workplace::{SMALL, Workplace, json, succeed};
+use super::common::workplace::{SMALL, Workplace, fail, json, succeed};
 
 fn map(out: &str) -> Vec<f64> {
     let path = format!("{out}/10.000MHz/map.fits");
@@ -52,5 +52,34 @@ fn what_the_moon_reflects_is_added_and_mostly_taken_back() {
         // and the limb (1.522 of the sphere's halves are seen) is not.
         assert!(added > 1.02 * none && added < 1.08 * none, "{model}: {added} {none}");
         assert!((corrected / none - 1.0).abs() < 0.04 && corrected < none, "{model}: {corrected} {none}");
+    }
+}
+
+#[test]
+fn a_round_moon_shows_the_sky_smaller() {
+    let place = Workplace::new(SMALL);
+    let mean = |name: &str, sets: &[&str]| {
+        let out = place.path(name);
+        let quiet = ["spacecraft.thermal_noise=false", "spacecraft.model=direct", "sky.nside=32"];
+        let sets: Vec<&str> = sets.iter().chain(&quiet).flat_map(|set| ["--set", *set]).collect();
+        let run = json(&[&["run", &place.pipeline, "--out", &out], &sets[..]].concat());
+        run["channels"][0]["mean_k"].as_f64().unwrap()
+    };
+    let (reflects, sphere) = ("spacecraft.moon_reflection=0.07", "spacecraft.moon_mirror=sphere");
+    let none = mean("none", &[]);
+    let flat = mean("flat", &[reflects]);
+    let round = mean("round", &[reflects, sphere]);
+    // The image fills the Moon's disc, 3.0 sr, instead of 2 pi below the horizontal: baselines of a wavelength and more have less of
+    // it. Its power is held to the disc's in `receiver`.
+    assert!(round != none && (round - none).abs() < 0.5 * (flat - none), "{none} {round} {flat}");
+    // Without reflection there is nothing to mirror.
+    assert!((mean("dark", &[sphere]) - none).abs() < 1e-9 * none);
+    for model in ["auto", "harmonic", "general"] {
+        let model = format!("spacecraft.model={model}");
+        let refused = fail(&["check", &place.pipeline, "--set", &model, "--set", sphere]);
+        assert!(
+            refused.contains("spacecraft.moon_mirror = \"sphere\": expected spacecraft.model = \"direct\""),
+            "{refused}"
+        );
     }
 }

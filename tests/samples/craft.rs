@@ -113,7 +113,7 @@ impl Spacecraft {
             array: Arc::clone(&self.array),
             models: self.frequencies_hz.iter().map(|&frequency_hz| (self.sky)(frequency_hz)).collect(),
             channels: self.channels(),
-            receiver_noise_k_sr: self.receiver_noise_k_sr,
+            receiver_noise_k_sr: vec![self.receiver_noise_k_sr; self.frequencies_hz.len()],
             seed,
         };
         let counts = Arc::default();

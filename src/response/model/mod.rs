@@ -2,21 +2,25 @@
 //!
 //! [`VisibilityModel`] is the interface, for one sky at one frequency. [`DirectSum`] sums over the sky's pixels,
 //! [`HarmonicSum`] uses spherical harmonics on a common circle, [`GeneralSum`] anywhere; [`Reflected`] adds the image of the sky in
-//! the Moon, [`BandAverage`] averages over a channel, and [`ModelPlan`] chooses by cost. Equal arguments give equal results, whatever
-//! the threads.
+//! a flat Moon, [`SphereMirrored`] in a round one, [`Emitting`] the Moon's own emission, [`BandAverage`] averages over a channel, and
+//! [`ModelPlan`] chooses by cost. Equal arguments give equal results, whatever the threads.
 
 mod band_average;
 mod choice;
 mod direct;
+mod emission;
 mod general;
 mod harmonic;
+mod mirror;
 mod reflection;
 
 pub use band_average::BandAverage;
 pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
 pub use direct::DirectSum;
+pub use emission::Emitting;
 pub use general::GeneralSum;
 pub use harmonic::{HarmonicSum, HarmonicSumSetup};
+pub use mirror::SphereMirrored;
 pub use reflection::Reflected;
 
 use num_complex::Complex64;
