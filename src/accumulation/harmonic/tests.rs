@@ -152,14 +152,14 @@ fn the_operator_is_the_sum_over_rows() {
     }
 }
 
-/// The same at a degree of maps of nside 256, from short baselines of a few minutes: few nodes and alphas hold data, and take
-/// memory.
+/// The same at a degree of maps of nside 256, from the shortest baseline over a few minutes: few nodes and alphas hold data, and
+/// take memory.
 #[test]
 fn the_operator_is_the_sum_over_rows_at_high_degrees() {
-    let mut blocks = blocks(0, 1);
-    blocks.retain(|block| norm(sub(block.r_i_m[0], block.r_j_m[0])) < 300.0);
-    assert!(!blocks.is_empty());
-    let setup = HarmonicSetup { l_max: 640, baseline_m_max: 400.0, ..setup() };
+    let length_m = |block: &PlacedVisibilities| norm(sub(block.r_i_m[0], block.r_j_m[0]));
+    let shortest = blocks(0, 8).into_iter().min_by(|a, b| length_m(a).total_cmp(&length_m(b)));
+    let blocks = [shortest.unwrap()];
+    let setup = HarmonicSetup { l_max: 640, ..setup() };
     let mut engine = HarmonicEngine::new(setup).unwrap();
     for block in &blocks {
         assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
@@ -185,7 +185,8 @@ fn the_operator_is_the_sum_over_rows_at_high_degrees() {
     sums.apply(&x, &mut y);
     let scale = (form(&vx, &vx) * form(&vz, &vz)).sqrt();
     let errors = [dot(&x, &y) / form(&vx, &vx) - 1.0, (dot(&z, &y) - form(&vz, &vx)) / scale];
-    assert!(errors.iter().all(|error| error.abs() < INTERPOLATION), "{errors:?}");
+    // Five rows do not average: ripples of the weights' kernels, 1e-3 in alpha and 3e-4 in gamma, and interpolation, twice 1.2e-4.
+    assert!(errors.iter().all(|error| error.abs() < 1.6e-3), "{errors:?}");
 }
 
 #[test]

@@ -85,7 +85,8 @@ impl Opening {
     /// # Errors
     /// As [`Opening::take`]. A connection without a byte needs no token.
     pub(super) fn finish(&mut self) -> Result<Vec<u8>, ConnectionEnd> {
-        if !self.is_over && !(self.line.is_empty() && self.bytes == 0) {
+        let is_empty = self.line.is_empty() && self.bytes == 0;
+        if !self.is_over && !is_empty {
             self.end()?;
         }
         Ok(std::mem::take(&mut self.line))
