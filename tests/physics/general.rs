@@ -188,7 +188,9 @@ fn off_a_circle_rows_are_direct_sums() {
         assert!(error < 1e-2, "{} {}: {error:e}", shape.altitude_m, shape.cross);
         let half = found.len() / 2;
         let conjugate: Vec<Complex64> = found[half..].iter().map(Complex64::conj).collect();
-        assert!(difference(&found[..half], &conjugate) < 1e-12);
+        // Patterns are rounded to f32, and the two pitches differ in sign.
+        let error = difference(&found[..half], &conjugate);
+        assert!(error < 1e-6, "{error:e}");
     }
 }
 

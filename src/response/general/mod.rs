@@ -1,17 +1,19 @@
 //! Rows of B over spherical harmonics for satellites at any positions.
 //!
 //! Nothing is assumed of orbits: a pair's two positions give its own frame, what the Moon hides from either, and so its
-//! pattern, by the quadrature of [`mod@crate::response::harmonic`]; the sky is turned into that frame. On a common circle the
+//! pattern (see `cap.rs`); the sky is turned into that frame. On a common circle the
 //! two agree. Along a pass the rows of a pair change slowly, so that few are computed and the others interpolated
 //! (see `plan.rs`): [`GeneralRows::plan`], [`GeneralRows::forward`], [`GeneralRows::adjoint`]. [`GeneralRows::plan_direct`]
 //! computes each row, the reference for the other.
 //!
 //! Results do not depend on the number of threads.
 
-mod arc;
+mod bessel;
+mod border;
+mod cap;
+mod lanes;
 mod operator;
 mod plan;
-mod rings;
 mod turns;
 mod view;
 

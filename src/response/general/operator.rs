@@ -1,26 +1,22 @@
 //! Products with B and its transpose.
 
-use std::f64::consts::TAU;
 use std::ops::Range;
 
 use faer::{Accum, MatMut, MatRef, Par};
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::arc::{ArcSolver, Arcs, Coefficients, LANES, Lanes, VALUES, Value};
-use super::plan::{GROUP_NODES, Pass, RowNode, RowPlan, altitude_bytes, classes_max};
-use super::rings::{RingClass, padded};
+use super::cap::{CapBuffers, CapClass, NodePatterns, Patterns, batch_bytes};
+use super::lanes::{LANES, Lanes, VALUES, Value};
+use super::plan::{GROUP_NODES, Pass, RowNode, RowPlan, tables_bytes};
 use super::turns::{QuarterTurns, place};
 use super::{PairAt, RowsError, RowsSetup};
 use crate::response::harmonic::degrees;
 use crate::response::harmonic::trigonometry::sin_cos;
 use crate::sky::harmonics::Alm;
 
-/// Rows of one altitude class that a task computes together.
-const BATCH: usize = 16;
-
-/// Rings whose arcs are held until they are summed up: for [`LANES`] pairs they fit a core's own cache.
-const RINGS: usize = 32;
+/// Rows of one class that a task computes together.
+const BATCH: usize = 32;
 
 /// Rows that are interpolated by one product of matrices.
 const ROWS: usize = 64;
@@ -33,13 +29,15 @@ const GROUPS_AT_ONCE: usize = 32;
 pub struct GeneralRows {
     setup: RowsSetup,
     turns: QuarterTurns,
+    patterns: Patterns,
 }
 
 impl GeneralRows {
     /// Rows for a setup.
     #[must_use]
     pub fn new(setup: RowsSetup) -> Self {
-        Self { turns: QuarterTurns::new(setup.l_max), setup }
+        let turns = QuarterTurns::new(setup.l_max);
+        Self { patterns: Patterns::new(setup, &turns), turns, setup }
     }
 
     /// Setup.
@@ -71,9 +69,9 @@ impl GeneralRows {
         let values = plan.groups.par_iter().map(|group| {
             let passes = &plan.passes[group.clone()];
             let mut amplitudes = self.no_amplitudes(passes, skies.len());
-            let mut solver = tables.solver.clone();
+            let mut buffers = CapBuffers::default();
             for places in Self::batches(plan, passes) {
-                let Some(batch) = self.batch(plan, passes, &tables, &mut solver, places) else { continue };
+                let Some(batch) = self.batch(plan, passes, &tables, &mut buffers, places) else { continue };
                 self.amplitudes(&batch, skies, &mut amplitudes);
             }
             self.interpolate(plan, passes, &amplitudes, skies.len())
@@ -95,9 +93,9 @@ impl GeneralRows {
                 let values: Vec<&[Complex64]> = values.iter().map(|values| &values[rows.clone()]).collect();
                 let amplitudes = self.spread(plan, passes, &values);
                 let mut gradients = vec![Alm::zeros(self.setup.l_max); values.len()];
-                let mut solver = tables.solver.clone();
+                let mut buffers = CapBuffers::default();
                 for places in Self::batches(plan, passes) {
-                    let Some(batch) = self.batch(plan, passes, &tables, &mut solver, places) else {
+                    let Some(batch) = self.batch(plan, passes, &tables, &mut buffers, places) else {
                         continue;
                     };
                     self.gradients(&batch, &amplitudes, &mut gradients);
@@ -121,10 +119,10 @@ impl GeneralRows {
             let parts = groups.par_iter().map(|group| {
                 let passes = &plan.passes[group.clone()];
                 let mut amplitudes = self.no_amplitudes(passes, skies.len());
-                let mut solver = tables.solver.clone();
+                let mut buffers = CapBuffers::default();
                 let batches: Vec<Batch> = Self::batches(plan, passes)
                     .into_iter()
-                    .filter_map(|places| self.batch(plan, passes, &tables, &mut solver, places))
+                    .filter_map(|places| self.batch(plan, passes, &tables, &mut buffers, places))
                     .collect();
                 batches.iter().for_each(|batch| self.amplitudes(batch, skies, &mut amplitudes));
                 let seen = self.interpolate(plan, passes, &amplitudes, skies.len());
@@ -175,13 +173,13 @@ impl GeneralRows {
         plan: &RowPlan,
         passes: &[Pass],
         tables: &Tables,
-        solver: &mut ArcSolver,
+        buffers: &mut CapBuffers,
         places: Vec<usize>,
     ) -> Option<Batch> {
         let first = nodes_of(passes).start;
         let nodes: Vec<RowNode> = places.iter().map(|&k| plan.nodes[first + k]).collect();
         let class = tables.classes[nodes.first()?.class as usize].as_ref()?;
-        let patterns = self.patterns(class, &nodes, solver);
+        let patterns = self.patterns.of(class, &nodes, buffers);
         Some(Batch { places, nodes, patterns })
     }
 
@@ -321,45 +319,6 @@ impl GeneralRows {
                 }
             }
         }
-    }
-
-    /// Patterns of nodes of one class, by mu.
-    fn patterns(&self, class: &RingClass, nodes: &[RowNode], solver: &mut ArcSolver) -> Vec<NodePatterns> {
-        let l_max = self.setup.l_max;
-        let groups = nodes.len().div_ceil(LANES);
-        let mut out: Vec<NodePatterns> =
-            (0..=l_max).map(|mu| NodePatterns::zeros(degrees(l_max, mu), groups)).collect();
-        let mut arcs: Vec<Coefficients> = Vec::new();
-        for first in (0..class.rings.len()).step_by(RINGS) {
-            let last = (first + RINGS).min(class.rings.len());
-            // The first ring of them reaches the greatest order. Rings an odd number apart do not share the cache's sets.
-            let orders = class.reach[first] + 1;
-            let stride = orders | 1;
-            arcs.resize(stride * (last - first), [[0.0; LANES]; 4]);
-            for (group, nodes) in nodes.chunks(LANES).enumerate() {
-                for (ring, arcs) in (first..last).zip(arcs.chunks_exact_mut(stride)) {
-                    solver.solve(
-                        &self.arcs(nodes, class.rings[ring].sin_theta),
-                        &mut arcs[..=class.reach[ring]],
-                    );
-                }
-                for (mu, out) in out.iter_mut().enumerate().take(orders) {
-                    class.sum_up(mu, first..last, &arcs[mu..], stride, out.of_mut(group));
-                }
-            }
-        }
-        out
-    }
-
-    /// A ring as up to [`LANES`] nodes see it; the last of them fills what is left.
-    fn arcs(&self, nodes: &[RowNode], sin_theta: f64) -> Arcs {
-        let mut arcs = Arcs { x: [0.0; LANES], low: [0.0; LANES], high: [0.0; LANES] };
-        for k in 0..LANES {
-            let Some(node) = nodes.get(k).or(nodes.last()) else { break };
-            arcs.x[k] = TAU * node.view.baseline_m / self.setup.wavelength_m * sin_theta;
-            [arcs.low[k], arcs.high[k]] = node.view.arc(sin_theta);
-        }
-        arcs
     }
 
     /// Values at all rows of passes, one vector a sky.
@@ -578,8 +537,7 @@ fn add_to(sums: &mut [Alm], part: &[Alm]) {
 /// What the rows of a plan share.
 struct Tables {
     /// The classes that nodes are of, by number.
-    classes: Vec<Option<RingClass>>,
-    solver: ArcSolver,
+    classes: Vec<Option<CapClass>>,
 }
 
 impl Tables {
@@ -587,8 +545,8 @@ impl Tables {
         let mut is_used = vec![false; plan.classes.len()];
         plan.nodes.iter().for_each(|node| is_used[node.class as usize] = true);
         let classes = plan.classes.par_iter().zip(is_used);
-        let classes = classes.map(|(class, used)| used.then(|| RingClass::new(setup, class))).collect();
-        Self { classes, solver: ArcSolver::new(TAU * plan.u_max) }
+        let classes = classes.map(|(class, used)| used.then(|| CapClass::new(setup, class))).collect();
+        Self { classes }
     }
 }
 
@@ -632,28 +590,6 @@ impl Phases {
     }
 }
 
-/// Coefficients of the patterns of a batch at one mu: for [`LANES`] nodes at a time rows of l = mu, mu + 2, ..; in a row real and
-/// imaginary parts of `f_{l mu}`, then of `(-1)^mu f_{l,-mu}`, each by lane.
-struct NodePatterns {
-    count: usize,
-    coefficients: Vec<Value>,
-}
-
-impl NodePatterns {
-    fn zeros(count: usize, groups: usize) -> Self {
-        Self { count, coefficients: vec![0.0; groups * padded(count) * VALUES] }
-    }
-
-    fn of(&self, group: usize) -> &[Value] {
-        &self.coefficients[group * padded(self.count) * VALUES..][..self.count * VALUES]
-    }
-
-    /// With what fills the last panel.
-    fn of_mut(&mut self, group: usize) -> &mut [Value] {
-        &mut self.coefficients[group * padded(self.count) * VALUES..][..padded(self.count) * VALUES]
-    }
-}
-
 /// Memory of rows up to `l_max` and `u_max` wavelengths besides the visibilities', bytes: Legendre functions by class, and what each thread works with.
 #[must_use]
 pub fn row_tables_bytes(l_max: usize, u_max: f64, threads: usize) -> u64 {
@@ -662,7 +598,7 @@ pub fn row_tables_bytes(l_max: usize, u_max: f64, threads: usize) -> u64 {
     let gradients = (2 * GROUPS_AT_ONCE) as f64 * 16.0 * 2.0 * coefficients;
     // Amplitudes of two skies before and after the weights, and the patterns.
     let group = 1.5 * GROUP_NODES as f64 * (4.0 * 16.0 * (2 * l_max + 1) as f64 + 16.0 * coefficients);
-    let batch = BATCH as f64 * 80.0 * coefficients + (RINGS * LANES * 16 * l_max) as f64;
-    let classes = classes_max(l_max, u_max) * altitude_bytes(l_max, u_max);
-    (classes + 8.0 * turns + gradients + threads as f64 * (group + batch)) as u64
+    let batch = BATCH as f64 * 80.0 * coefficients + batch_bytes(l_max, u_max, BATCH);
+    let classes = tables_bytes(l_max, u_max);
+    (classes + 10.0 * turns + gradients + threads as f64 * (group + batch)) as u64
 }

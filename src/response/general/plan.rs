@@ -17,6 +17,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
+use super::cap::rings_for;
 use super::view::{Axes, PairView, euler, transported};
 use super::{PairAt, RowsError, RowsSetup};
 use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
@@ -32,12 +33,13 @@ const POSITION_STEP_S_MAX: f64 = 120.0;
 /// Most rows from which others are interpolated together: more are longer to interpolate from, not more exact.
 const NODES_MAX: usize = 40;
 
-/// Classes of altitude that share quadrature points, and the least width of one, m. Within a class the points follow the
-/// Moon's limb as seen from its middle; that its edge lies elsewhere costs up to 1e-4 of a visibility with few classes and few
-/// points, so that there are as many as have room.
-const CLASSES: [f64; 2] = [24.0, 400.0];
-const CLASSES_BYTES: f64 = 3e8;
-const CLASS_M_MIN: f64 = 100.0;
+/// Width of a class of limbs that share quadrature points, in units of a harmonic's wave length over 2 pi: what lies between
+/// a class's limb and a pair's takes a series of as many terms more. With little memory classes are wider.
+const CLASS_WIDTH: f64 = 0.5;
+const CLASSES_BYTES: f64 = 8e8;
+
+/// Most classes of limbs.
+const CLASSES_MAX: f64 = 64.0;
 
 /// Rows that a task computes together, and whose patterns a product with `Bt W B` holds: 0.3 MB each at l = 191.
 pub(super) const GROUP_NODES: usize = 256;
@@ -55,8 +57,10 @@ pub(super) struct RowNode {
 /// Nodes that share quadrature points.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct NodeClass {
-    /// Radius in the middle, m.
-    pub(super) radius_m: f64,
+    /// Angle between nadir and limb in the middle, rad.
+    pub(super) limb_rad: f64,
+    /// How far limbs lie from there at most, rad.
+    pub(super) width_rad: f64,
     /// Longest baseline, wavelengths: shorter ones need fewer points.
     pub(super) u_max: f64,
 }
@@ -83,8 +87,6 @@ pub struct RowPlan {
     /// By row: its time within the pass, -1 to 1.
     pub(super) tau: Vec<f64>,
     pub(super) classes: Vec<NodeClass>,
-    /// Longest baseline, wavelengths.
-    pub(super) u_max: f64,
 }
 
 impl RowPlan {
@@ -102,10 +104,8 @@ impl RowPlan {
                     .map_err(|refusal| RowsError { index, refusal })
             })
             .collect::<Result<_, _>>()?;
-        let radii = views.iter().map(|view| view.radius_m);
-        let (low, high) = radii.fold((f64::INFINITY, 0.0_f64), |(a, b), r| (a.min(r), b.max(r)));
         let u_max = views.iter().map(|view| view.baseline_m / setup.wavelength_m).fold(0.0, f64::max);
-        let classes = Classes::new([low, high], u_max, classes_max(setup.l_max, u_max));
+        let classes = Classes::new(setup.l_max, &views, u_max);
         let mut plan = Self {
             nodes: Vec::new(),
             passes: Vec::new(),
@@ -113,7 +113,6 @@ impl RowPlan {
             gamma_rad: vec![0.0; pairs.len()],
             tau: vec![0.0; pairs.len()],
             classes: classes.all(),
-            u_max,
         };
         let mut first = 0;
         while first < pairs.len() {
@@ -171,48 +170,64 @@ impl RowPlan {
     }
 }
 
-/// Longest baselines of classes, in units of the longest.
-const LENGTHS: [f64; 3] = [1.0, 0.5, 0.25];
+/// Longest baselines of classes, in units of the longest: shorter ones need fewer points.
+const LENGTHS: [f64; 5] = [1.0, 0.75, 0.5, 0.3, 0.15];
 
-/// Bytes of the tables of one altitude: Legendre functions of even l + mu at the quadrature points of its classes.
-pub(super) fn altitude_bytes(l_max: usize, u_max: f64) -> f64 {
-    // As `ring_points`: half a point a radian over both zones, and some.
-    let rings: f64 = LENGTHS.iter().map(|length| 0.6 * (l_max as f64 + TAU * u_max * length) + 64.0).sum();
-    4.0 * rings * 0.25 * ((l_max + 2) as f64).powi(2)
+/// Bytes of the tables of one limb, from [`LENGTHS`]: Legendre functions at the quadrature points, of which some three quarters are
+/// not negligible.
+fn limb_bytes(l_max: usize, u_max: f64, cap_rad: f64) -> f64 {
+    let rings = |length: &f64| rings_for(l_max, cap_rad, u_max * length) as f64;
+    let rings: f64 = LENGTHS.iter().map(rings).sum();
+    4.0 * 0.75 * rings * 0.5 * ((l_max + 2) as f64).powi(2)
 }
 
-/// Most classes of altitude.
-pub(super) fn classes_max(l_max: usize, u_max: f64) -> f64 {
-    (CLASSES_BYTES / altitude_bytes(l_max, u_max)).clamp(CLASSES[0], CLASSES[1])
+/// Bytes of all tables at most: those of two limbs as wide as they may be, a hemisphere, or what classes may take.
+pub(super) fn tables_bytes(l_max: usize, u_max: f64) -> f64 {
+    CLASSES_BYTES.max(2.0 * limb_bytes(l_max, u_max, FRAC_PI_2))
 }
 
-/// Classes by altitude and length of the baseline.
+/// Classes by limb and length of the baseline.
 struct Classes {
-    first_m: f64,
-    step_m: f64,
+    first_rad: f64,
+    step_rad: f64,
     count: usize,
+    width_rad: f64,
     u_max: f64,
 }
 
 impl Classes {
-    fn new([low_m, high_m]: [f64; 2], u_max: f64, classes_max: f64) -> Self {
-        let range_m = (high_m - low_m).max(0.0);
-        let step_m = (range_m / classes_max).max(CLASS_M_MIN);
-        let count = (range_m / step_m).ceil().max(1.0) as usize;
-        Self { first_m: low_m + 0.5 * (range_m - step_m * (count - 1) as f64), step_m, count, u_max }
+    fn new(l_max: usize, views: &[PairView], u_max: f64) -> Self {
+        let caps = views.iter().map(PairView::cap_rad);
+        let (low, high) = caps.fold((f64::INFINITY, 0.0_f64), |(a, b), cap| (a.min(cap), b.max(cap)));
+        let range_rad = (high - low).max(0.0);
+        let most = (CLASSES_BYTES / limb_bytes(l_max, u_max, high)).floor().clamp(1.0, CLASSES_MAX);
+        let step_rad = (range_rad / most).max(CLASS_WIDTH / (l_max + 1) as f64);
+        let count = (range_rad / step_rad).ceil().max(1.0) as usize;
+        let apart_rad = views.iter().map(PairView::limbs_apart_rad).fold(0.0, f64::max);
+        Self {
+            first_rad: low + 0.5 * (range_rad - step_rad * (count - 1) as f64),
+            step_rad,
+            count,
+            // Nodes lie between visibilities.
+            width_rad: 0.5 * step_rad + 1.05 * apart_rad,
+            u_max,
+        }
     }
 
-    fn of(&self, radius_m: f64, u: f64) -> u32 {
-        let altitude = ((radius_m - self.first_m) / self.step_m).round();
-        let altitude = altitude.clamp(0.0, (self.count - 1) as f64) as usize;
+    fn of(&self, cap_rad: f64, u: f64) -> u32 {
+        let limb = ((cap_rad - self.first_rad) / self.step_rad).round();
+        let limb = limb.clamp(0.0, (self.count - 1) as f64) as usize;
         let length = LENGTHS.iter().rposition(|length| u <= length * self.u_max).unwrap_or(0);
-        (length * self.count + altitude) as u32
+        (length * self.count + limb) as u32
     }
 
     fn all(&self) -> Vec<NodeClass> {
-        let radius_m = |k: usize| self.first_m + self.step_m * k as f64;
         let class = |length: f64| {
-            (0..self.count).map(move |k| NodeClass { radius_m: radius_m(k), u_max: length * self.u_max })
+            (0..self.count).map(move |k| NodeClass {
+                limb_rad: self.first_rad + self.step_rad * k as f64,
+                width_rad: self.width_rad,
+                u_max: length * self.u_max,
+            })
         };
         LENGTHS.into_iter().flat_map(class).collect()
     }
@@ -288,7 +303,7 @@ impl PassBuilder<'_> {
         RowNode {
             turns_rad: [alpha + FRAC_PI_2, beta + PI, gamma + FRAC_PI_2],
             view,
-            class: self.classes.of(view.radius_m, self.wavelengths(&view)),
+            class: self.classes.of(view.cap_rad(), self.wavelengths(&view)),
         }
     }
 

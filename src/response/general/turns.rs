@@ -22,6 +22,44 @@ pub(super) struct QuarterTurns {
     degrees: Vec<[[Vec<f64>; 2]; 2]>,
 }
 
+/// Quarter turns of functions that are even about the pole's plane, given by real coefficients of m >= 0, to the orders k of
+/// even l + k; even and odd m apart, so that their sum and difference are the orders k and -k. In f32.
+#[derive(Clone, Debug)]
+pub(super) struct Fold {
+    /// By l: for both parities of m a block of rows k and columns m, column-major.
+    degrees: Vec<[Vec<f32>; 2]>,
+}
+
+impl Fold {
+    pub(super) fn new(turns: &QuarterTurns) -> Self {
+        let of = |l: usize| [0, 1].map(|m| turns.degrees[l][l % 2][m].iter().map(|x| *x as f32).collect());
+        Self { degrees: (0..turns.degrees.len()).map(of).collect() }
+    }
+
+    /// Turns vectors of degree l, `[m][column]`, to `[k][column]`: from even m, and from odd m.
+    pub(super) fn turn(&self, l: usize, from: &[f32], columns: usize, to: &mut [Vec<f32>; 2]) {
+        let rows = count(l, l % 2);
+        for (parity, to) in to.iter_mut().enumerate() {
+            to.clear();
+            to.resize(rows * columns, 0.0);
+            let inner = count(l, parity);
+            if inner == 0 {
+                continue;
+            }
+            let from = &from[parity * columns..];
+            let from = &from[..(inner - 1) * 2 * columns + columns];
+            faer::linalg::matmul::matmul(
+                MatMut::from_row_major_slice_mut(to, rows, columns),
+                Accum::Replace,
+                MatRef::from_column_major_slice(&self.degrees[l][parity], rows, inner),
+                MatRef::from_row_major_slice_with_stride(from, inner, columns, 2 * columns),
+                1.0,
+                Par::Seq,
+            );
+        }
+    }
+}
+
 /// Orders 0 ..= l of this parity.
 pub(super) fn count(l: usize, parity: usize) -> usize {
     (l + 2 - parity) / 2
@@ -109,6 +147,16 @@ impl QuarterTurns {
             }
         }
     }
+}
+
+/// A matrix to be written whose rows begin `stride` apart. (faer's own constructor of this kind confuses the strides, in 0.24.4.)
+pub(super) fn rows_apart_mut(
+    slice: &mut [f32],
+    rows: usize,
+    columns: usize,
+    stride: usize,
+) -> MatMut<'_, f32> {
+    MatMut::from_column_major_slice_with_stride_mut(slice, columns, rows, stride).transpose_mut()
 }
 
 /// Place of the first order of this parity.

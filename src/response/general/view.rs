@@ -59,18 +59,20 @@ impl PairView {
         0.5 * (self.cos_limb[0].asin() + self.cos_limb[1].asin())
     }
 
-    /// The arc `[low, high]` of the ring at this sine of colatitude that both see, rad. What is left between the arcs that the
-    /// two do not see, opposite the zenith, is neglected: less than 1e-10 sr for a separation of 1.8e-3 rad.
-    pub(super) fn arc(&self, sin_theta: f64) -> [f64; 2] {
-        use std::f64::consts::PI;
-        let mut arc = [f64::NEG_INFINITY, f64::INFINITY];
-        for (angle, cos_limb) in self.angle_rad.into_iter().zip(self.cos_limb) {
-            if sin_theta > cos_limb {
-                let edge = (-cos_limb / sin_theta).acos();
-                arc = [arc[0].max(angle - edge), arc[1].min(angle + edge)];
-            }
-        }
-        if arc[0].is_infinite() { [-PI, PI] } else { [arc[0], arc[1].max(arc[0])] }
+    /// Angle between the nadir and the limb, rad, of the mean of both.
+    pub(super) fn cap_rad(&self) -> f64 {
+        0.5 * (self.cos_limb[0].acos() + self.cos_limb[1].acos())
+    }
+
+    /// How far either limb lies from [`Self::cap_rad`] as seen from the mean nadir, rad.
+    pub(super) fn limbs_apart_rad(&self) -> f64 {
+        let away = 0.5 * (self.angle_rad[0] - self.angle_rad[1]).abs();
+        away + 0.5 * (self.cos_limb[0].acos() - self.cos_limb[1].acos()).abs()
+    }
+
+    /// Angle of the mean zenith from x towards y, rad: as much as the baseline is out of the horizontal.
+    pub(super) fn pitch_rad(&self) -> f64 {
+        0.5 * (self.angle_rad[0] + self.angle_rad[1])
     }
 }
 

@@ -32,8 +32,18 @@ impl Legendre {
     /// `weight(theta) lambda_{l mu}(theta)` for l = mu, mu + 2, .. <= l_max: one row a degree, over the first
     /// `weights.len()` colatitudes.
     pub(crate) fn even_rows<T: Real>(&self, mu: usize, weights: &[f64]) -> Vec<T> {
+        self.every(2, mu, weights)
+    }
+
+    /// As [`Self::even_rows`], for l = mu, mu + 1, ..
+    pub(crate) fn rows<T: Real>(&self, mu: usize, weights: &[f64]) -> Vec<T> {
+        self.every(1, mu, weights)
+    }
+
+    /// For l = mu, mu + `step`, ..
+    fn every<T: Real>(&self, step: usize, mu: usize, weights: &[f64]) -> Vec<T> {
         let points = weights.len().min(self.z.len());
-        let mut rows = Vec::with_capacity(points * ((self.l_max - mu) / 2 + 1));
+        let mut rows = Vec::with_capacity(points * ((self.l_max - mu) / step + 1));
         let sign = if mu.is_multiple_of(2) { 1.0 } else { -1.0 };
         let mut lanes = ScaledLanes::zeros(points);
         let ln_512 = 512.0 * std::f64::consts::LN_2;
@@ -54,9 +64,9 @@ impl Legendre {
                 } else {
                     ((twice + 1.0) / (twice - 3.0) * square(l - 1) * above).sqrt()
                 };
-                step(forward, behind, &self.z[..points], &mut lanes);
+                advance_all(forward, behind, &self.z[..points], &mut lanes);
             }
-            if (l - mu).is_multiple_of(2) {
+            if (l - mu).is_multiple_of(step) {
                 rows.extend(lanes.value.iter().zip(weights).map(|(v, w)| T::entry(v * w)));
             }
         }
@@ -65,7 +75,7 @@ impl Legendre {
 }
 
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn step(forward: f64, behind: f64, z: &[f64], lanes: &mut ScaledLanes) {
+fn advance_all(forward: f64, behind: f64, z: &[f64], lanes: &mut ScaledLanes) {
     let n = z.len();
     let LaneSlices { current, previous, power, value } = lanes.slices(0..n);
     let (current, previous) = (&mut current[..n], &mut previous[..n]);
