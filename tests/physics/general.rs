@@ -260,7 +260,8 @@ fn the_adjoint_is_the_transpose() {
         let of_sky: f64 =
             alm.values().iter().zip(back[0].values()).map(|(x, g)| x.re * g.re + x.im * g.im).sum();
         let size = rms(&seen[0]) * rms(&values) * values.len() as f64;
-        assert!((of_data - of_sky).abs() < 1e-12 * size, "{of_data} {of_sky}");
+        // Both directions turn and sum in f32, but not in the same order: 6e-8 a rounding, at random over some hundred rows.
+        assert!((of_data - of_sky).abs() < 1e-6 * size, "{of_data} {of_sky} {size}");
         // Both at once are the same operations.
         let weight: Vec<f64> = pairs.iter().map(|_| random.next().abs()).collect();
         let weighted: Vec<Complex64> = seen[0].iter().zip(&weight).map(|(v, w)| v * *w).collect();

@@ -27,7 +27,7 @@ use super::bessel::BesselOrders;
 use super::border::{Border, BorderBuffers};
 use super::lanes::{LANES, VALUES, Value};
 use super::plan::{NodeClass, RowNode};
-use super::turns::{Fold, QuarterTurns, rows_apart_mut};
+use super::turns::{QuarterTurns, rows_apart_mut};
 use crate::frames::AntennaResponse;
 use crate::response::harmonic::degrees;
 use crate::response::harmonic::legendre::Legendre;
@@ -281,19 +281,19 @@ pub(super) struct CapBuffers {
 #[derive(Clone, Debug)]
 pub(super) struct Patterns {
     setup: RowsSetup,
-    fold: Fold,
     /// By mu, for l = mu, mu + 2, ..: what multiplies `j_l`, `j_{l+2}` and `j_{l-2}`.
     whole: Vec<Vec<[f64; 3]>>,
 }
 
 impl Patterns {
-    pub(super) fn new(setup: RowsSetup, turns: &QuarterTurns) -> Self {
-        Self { fold: Fold::new(turns), whole: whole_sky(&setup), setup }
+    pub(super) fn new(setup: RowsSetup) -> Self {
+        Self { whole: whole_sky(&setup), setup }
     }
 
     /// Patterns of pairs of one class, by mu: for [`LANES`] of them at a time rows of l = mu, mu + 2, ..
     pub(super) fn of(
         &self,
+        turns: &QuarterTurns,
         class: &CapClass,
         nodes: &[RowNode],
         buffers: &mut CapBuffers,
@@ -305,10 +305,10 @@ impl Patterns {
         let mut out: Vec<NodePatterns> =
             (0..=l_max).map(|mu| NodePatterns::zeros(degrees(l_max, mu), groups)).collect();
         let unhidden = self.unhidden(nodes, buffers);
-        let turns = mean_turns(nodes, l_max);
+        let pitches = pitch_phases(nodes, l_max);
         for l in 0..=l_max {
             let hidden = &buffers.hidden[l * (l_max + 1) * columns..][..(l + 1) * columns];
-            self.fold.turn(l, hidden, columns, &mut buffers.turned);
+            turns.fold(l, hidden, columns, &mut buffers.turned);
             let [even, odd] = &buffers.turned;
             for (row, mu) in (l % 2..=l).step_by(2).enumerate() {
                 let degree = (l - mu) / 2;
@@ -318,7 +318,7 @@ impl Patterns {
                     let signs = [1.0, if mu % 2 == 0 { 1.0 } else { -1.0 }];
                     assemble(
                         [&even[place..place + COMPLEX], &odd[place..place + COMPLEX]],
-                        [0, 1].map(|part| &turns[part][(group * (l_max + 1) + mu) * LANES..][..LANES]),
+                        [0, 1].map(|part| &pitches[part][(group * (l_max + 1) + mu) * LANES..][..LANES]),
                         &unhidden[group * (l_max + 3)..],
                         l,
                         &of,
@@ -347,7 +347,7 @@ impl Patterns {
 }
 
 /// `exp(-i mu p)` by group, mu and lane: real and imaginary parts.
-fn mean_turns(nodes: &[RowNode], l_max: usize) -> [Vec<Value>; 2] {
+fn pitch_phases(nodes: &[RowNode], l_max: usize) -> [Vec<Value>; 2] {
     let mut out = [0, 1].map(|_| Vec::with_capacity(nodes.len().next_multiple_of(LANES) * (l_max + 1)));
     for nodes in nodes.chunks(LANES) {
         for mu in 0..=l_max {
@@ -530,7 +530,7 @@ mod tests {
             let setup =
                 RowsSetup { l_max: L_MAX, wavelength_m: WAVELENGTH_M, moon_radius_m: MOON_M, response };
             let nodes = views.map(|view| RowNode { turns_rad: [0.0; 3], view, class: 0 });
-            let patterns = Patterns::new(setup, &QuarterTurns::new(L_MAX));
+            let patterns = Patterns::new(setup);
             let middle_rad = views[0].cap_rad();
             let farthest = |view: &PairView| (view.cap_rad() - middle_rad).abs() + view.limbs_apart_rad();
             let class = NodeClass {
@@ -539,7 +539,7 @@ mod tests {
                 u_max: 40.0,
             };
             let class = CapClass::new(&setup, &class);
-            let found = patterns.of(&class, &nodes, &mut CapBuffers::default());
+            let found = patterns.of(&QuarterTurns::new(L_MAX), &class, &nodes, &mut CapBuffers::default());
             for (lane, view) in views.iter().enumerate() {
                 for (mu, expected) in expected(view, response).iter().enumerate() {
                     for (k, expected) in expected.iter().enumerate() {

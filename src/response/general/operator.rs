@@ -37,7 +37,7 @@ impl GeneralRows {
     #[must_use]
     pub fn new(setup: RowsSetup) -> Self {
         let turns = QuarterTurns::new(setup.l_max);
-        Self { patterns: Patterns::new(setup, &turns), turns, setup }
+        Self { patterns: Patterns::new(setup), turns, setup }
     }
 
     /// Setup.
@@ -179,7 +179,7 @@ impl GeneralRows {
         let first = nodes_of(passes).start;
         let nodes: Vec<RowNode> = places.iter().map(|&k| plan.nodes[first + k]).collect();
         let class = tables.classes[nodes.first()?.class as usize].as_ref()?;
-        let patterns = self.patterns.of(class, &nodes, buffers);
+        let patterns = self.patterns.of(&self.turns, class, &nodes, buffers);
         Some(Batch { places, nodes, patterns })
     }
 
@@ -210,7 +210,8 @@ impl GeneralRows {
     fn gradients(&self, batch: &Batch, amplitudes: &[f64], out: &mut [Alm]) {
         let (orders, l_max, skies) = (self.orders(), self.setup.l_max, out.len());
         let lanes = lanes_of(&batch.nodes);
-        let turned: Vec<[Vec<f64>; 2]> = (0..=l_max)
+        let at = |place: usize| amplitudes[place] as Value;
+        let turned: Vec<[Vec<Value>; 2]> = (0..=l_max)
             .map(|mu| {
                 let [mut re, mut im] = [0, 1].map(|_| vec![0.0; degrees(l_max, mu) * skies * lanes]);
                 for (group, places) in batch.places.chunks(LANES).enumerate() {
@@ -219,11 +220,10 @@ impl GeneralRows {
                         let mut values = [[0.0; LANES]; 4];
                         for (lane, node) in places.iter().enumerate() {
                             let place = (node * skies + sky) * 2 * orders + l_max;
-                            (values[0][lane], values[1][lane]) =
-                                (amplitudes[place + mu], amplitudes[place + orders + mu]);
+                            (values[0][lane], values[1][lane]) = (at(place + mu), at(place + orders + mu));
                             if mu > 0 {
                                 (values[2][lane], values[3][lane]) =
-                                    (amplitudes[place - mu], amplitudes[place + orders - mu]);
+                                    (at(place - mu), at(place + orders - mu));
                             }
                         }
                         let first = sky * lanes + group * LANES;
@@ -237,12 +237,12 @@ impl GeneralRows {
     }
 
     /// Skies in the frames of nodes, by mu: real and imaginary parts of `t_{l mu}`, `[l = mu, mu + 2, ..][sky][lane]`.
-    fn turned(&self, nodes: &[RowNode], skies: &[Alm]) -> Vec<[Vec<f64>; 2]> {
+    fn turned(&self, nodes: &[RowNode], skies: &[Alm]) -> Vec<[Vec<Value>; 2]> {
         let l_max = self.setup.l_max;
         let lanes = lanes_of(nodes);
         let columns = lanes * skies.len();
         let phases = Phases::new(nodes, l_max);
-        let mut out: Vec<[Vec<f64>; 2]> =
+        let mut out: Vec<[Vec<Value>; 2]> =
             (0..=l_max).map(|mu| [0, 1].map(|_| vec![0.0; columns * degrees(l_max, mu)])).collect();
         let mut buffers = [0, 1].map(|_| [0, 1].map(|_| vec![0.0; columns * (l_max + 1)]));
         for l in 0..=l_max {
@@ -253,8 +253,8 @@ impl GeneralRows {
                     let at = place(l, m) * columns + k * lanes;
                     let [re, im] = sky.each_mut().map(|part| &mut part[at..at + lanes]);
                     let z = alm.get(l, m).conj();
-                    re.fill(z.re);
-                    im.fill(z.im);
+                    re.fill(z.re as Value);
+                    im.fill(z.im as Value);
                     turn(re, im, phases.get(0, m), -1.0);
                 }
             }
@@ -282,7 +282,7 @@ impl GeneralRows {
     }
 
     /// The transpose of [`Self::turned`], added to `out`.
-    fn turn_back(&self, nodes: &[RowNode], turned: &[[Vec<f64>; 2]], out: &mut [Alm]) {
+    fn turn_back(&self, nodes: &[RowNode], turned: &[[Vec<Value>; 2]], out: &mut [Alm]) {
         let l_max = self.setup.l_max;
         let lanes = lanes_of(nodes);
         let columns = lanes * out.len();
@@ -315,7 +315,8 @@ impl GeneralRows {
                     let [re, im] = [&mut sky_re[at..at + lanes], &mut sky_im[at..at + lanes]];
                     turn(re, im, phases.get(0, m), 1.0);
                     // z = conj(T) conj(phase): the gradient is conj(z' phase).
-                    *out.get_mut(l, m) += Complex64::new(re.iter().sum(), -im.iter().sum::<f64>());
+                    let sum = |part: &[Value]| part.iter().map(|x| f64::from(*x)).sum::<f64>();
+                    *out.get_mut(l, m) += Complex64::new(sum(re), -sum(im));
                 }
             }
         }
@@ -426,17 +427,17 @@ fn lanes_of(nodes: &[RowNode]) -> usize {
 
 /// A range of two lists, in chunks of the lanes.
 fn rows_at<'a>(
-    re: &'a mut [f64],
-    im: &'a mut [f64],
+    re: &'a mut [Value],
+    im: &'a mut [Value],
     range: Range<usize>,
     lanes: usize,
-) -> impl Iterator<Item = (&'a mut [f64], &'a mut [f64])> {
+) -> impl Iterator<Item = (&'a mut [Value], &'a mut [Value])> {
     re[range.clone()].chunks_exact_mut(lanes).zip(im[range].chunks_exact_mut(lanes))
 }
 
 /// Turns numbers by phases, or back.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn turn(re: &mut [f64], im: &mut [f64], [cos, sin]: [&[f64]; 2], sign: f64) {
+fn turn(re: &mut [Value], im: &mut [Value], [cos, sin]: [&[Value]; 2], sign: Value) {
     for (((re, im), cos), sin) in re.iter_mut().zip(im).zip(cos).zip(sin) {
         let sin = sign * sin;
         (*re, *im) = (*re * cos - *im * sin, *re * sin + *im * cos);
@@ -445,16 +446,17 @@ fn turn(re: &mut [f64], im: &mut [f64], [cos, sin]: [&[f64]; 2], sign: f64) {
 
 /// Sums over l of turned skies with patterns: for mu, and of the conjugate skies for -mu. Values of one l are `stride` apart.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn products(re: &[f64], im: &[f64], stride: usize, pattern: &[Value]) -> [Lanes; 4] {
+fn products(re: &[Value], im: &[Value], stride: usize, pattern: &[Value]) -> [Lanes; 4] {
     let mut sums = [[0.0; LANES]; 4];
     for ((re, im), pattern) in re.chunks(stride).zip(im.chunks(stride)).zip(pattern.chunks_exact(VALUES)) {
         let (re, im) = (&re[..LANES], &im[..LANES]);
         for k in 0..LANES {
             let [a, b, c, d] = [0, 1, 2, 3].map(|part| f64::from(pattern[part * LANES + k]));
-            sums[0][k] += re[k] * a - im[k] * b;
-            sums[1][k] += re[k] * b + im[k] * a;
-            sums[2][k] += re[k] * c + im[k] * d;
-            sums[3][k] += re[k] * d - im[k] * c;
+            let (re, im) = (f64::from(re[k]), f64::from(im[k]));
+            sums[0][k] += re * a - im * b;
+            sums[1][k] += re * b + im * a;
+            sums[2][k] += re * c + im * d;
+            sums[3][k] += re * d - im * c;
         }
     }
     sums
@@ -462,12 +464,18 @@ fn products(re: &[f64], im: &[f64], stride: usize, pattern: &[Value]) -> [Lanes;
 
 /// The transpose of [`products`].
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn products_back(values: &[Lanes; 4], pattern: &[Value], re: &mut [f64], im: &mut [f64], stride: usize) {
+fn products_back(
+    values: &[[Value; LANES]; 4],
+    pattern: &[Value],
+    re: &mut [Value],
+    im: &mut [Value],
+    stride: usize,
+) {
     let parts = re.chunks_mut(stride).zip(im.chunks_mut(stride));
     for ((re, im), pattern) in parts.zip(pattern.chunks_exact(VALUES)) {
         let (re, im) = (&mut re[..LANES], &mut im[..LANES]);
         for k in 0..LANES {
-            let [a, b, c, d] = [0, 1, 2, 3].map(|part| f64::from(pattern[part * LANES + k]));
+            let [a, b, c, d] = [0, 1, 2, 3].map(|part| pattern[part * LANES + k]);
             let [plus_re, plus_im, minus_re, minus_im] = [0, 1, 2, 3].map(|part| values[part][k]);
             re[k] = a * plus_re + b * plus_im + c * minus_re + d * minus_im;
             im[k] = a * plus_im - b * plus_re + d * minus_re - c * minus_im;
@@ -563,8 +571,8 @@ struct Batch {
 struct Phases {
     stride: usize,
     lanes: usize,
-    cos: Vec<f64>,
-    sin: Vec<f64>,
+    cos: Vec<Value>,
+    sin: Vec<Value>,
 }
 
 impl Phases {
@@ -575,8 +583,8 @@ impl Phases {
             for k in 0..stride {
                 let filled = nodes.iter().chain(nodes.last().into_iter().cycle()).take(lanes);
                 for (s, c) in filled.map(|node| sin_cos(k as f64 * node.turns_rad[turn])) {
-                    cos.push(c);
-                    sin.push(s);
+                    cos.push(c as Value);
+                    sin.push(s as Value);
                 }
             }
         }
@@ -584,7 +592,7 @@ impl Phases {
     }
 
     /// Of one turn and order: cosines and sines by lane.
-    fn get(&self, turn: usize, k: usize) -> [&[f64]; 2] {
+    fn get(&self, turn: usize, k: usize) -> [&[Value]; 2] {
         let first = (turn * self.stride + k) * self.lanes;
         [&self.cos[first..first + self.lanes], &self.sin[first..first + self.lanes]]
     }
@@ -600,5 +608,5 @@ pub fn row_tables_bytes(l_max: usize, u_max: f64, threads: usize) -> u64 {
     let group = 1.5 * GROUP_NODES as f64 * (4.0 * 16.0 * (2 * l_max + 1) as f64 + 16.0 * coefficients);
     let batch = BATCH as f64 * 80.0 * coefficients + batch_bytes(l_max, u_max, BATCH);
     let classes = tables_bytes(l_max, u_max);
-    (classes + 10.0 * turns + gradients + threads as f64 * (group + batch)) as u64
+    (classes + 4.0 * turns + gradients + threads as f64 * (group + batch)) as u64
 }

@@ -13,51 +13,14 @@
 use faer::{Accum, MatMut, MatRef, Par};
 use rayon::prelude::*;
 
+use super::lanes::Value;
 use crate::sky::harmonics::WignerTable;
 
 /// `F^l_{m k}` for all l.
 #[derive(Clone, Debug)]
 pub(super) struct QuarterTurns {
     /// By l: for parities of k and of m a block of rows k and columns m, column-major.
-    degrees: Vec<[[Vec<f64>; 2]; 2]>,
-}
-
-/// Quarter turns of functions that are even about the pole's plane, given by real coefficients of m >= 0, to the orders k of
-/// even l + k; even and odd m apart, so that their sum and difference are the orders k and -k. In f32.
-#[derive(Clone, Debug)]
-pub(super) struct Fold {
-    /// By l: for both parities of m a block of rows k and columns m, column-major.
-    degrees: Vec<[Vec<f32>; 2]>,
-}
-
-impl Fold {
-    pub(super) fn new(turns: &QuarterTurns) -> Self {
-        let of = |l: usize| [0, 1].map(|m| turns.degrees[l][l % 2][m].iter().map(|x| *x as f32).collect());
-        Self { degrees: (0..turns.degrees.len()).map(of).collect() }
-    }
-
-    /// Turns vectors of degree l, `[m][column]`, to `[k][column]`: from even m, and from odd m.
-    pub(super) fn turn(&self, l: usize, from: &[f32], columns: usize, to: &mut [Vec<f32>; 2]) {
-        let rows = count(l, l % 2);
-        for (parity, to) in to.iter_mut().enumerate() {
-            to.clear();
-            to.resize(rows * columns, 0.0);
-            let inner = count(l, parity);
-            if inner == 0 {
-                continue;
-            }
-            let from = &from[parity * columns..];
-            let from = &from[..(inner - 1) * 2 * columns + columns];
-            faer::linalg::matmul::matmul(
-                MatMut::from_row_major_slice_mut(to, rows, columns),
-                Accum::Replace,
-                MatRef::from_column_major_slice(&self.degrees[l][parity], rows, inner),
-                MatRef::from_row_major_slice_with_stride(from, inner, columns, 2 * columns),
-                1.0,
-                Par::Seq,
-            );
-        }
-    }
+    degrees: Vec<[[Vec<Value>; 2]; 2]>,
 }
 
 /// Orders 0 ..= l of this parity.
@@ -74,7 +37,7 @@ impl QuarterTurns {
     pub(super) fn new(l_max: usize) -> Self {
         let wigner = WignerTable::new(l_max, std::f64::consts::FRAC_PI_2);
         let block = |l: usize, k: usize, m: usize| vec![0.0; count(l, k) * count(l, m)];
-        let mut degrees: Vec<[[Vec<f64>; 2]; 2]> =
+        let mut degrees: Vec<[[Vec<Value>; 2]; 2]> =
             (0..=l_max).map(|l| [0, 1].map(|k| [0, 1].map(|m| block(l, k, m)))).collect();
         let columns: Vec<Vec<Vec<f64>>> = (0..=l_max)
             .into_par_iter()
@@ -92,7 +55,7 @@ impl QuarterTurns {
                 for (m, d) in row.iter().enumerate() {
                     let rows = count(l, k % 2);
                     let factor = if m == 0 { 1.0 } else { 2.0 };
-                    degrees[l][k % 2][m % 2][m / 2 * rows + k / 2] = factor * d;
+                    degrees[l][k % 2][m % 2][m / 2 * rows + k / 2] = (factor * d) as Value;
                 }
             }
         }
@@ -101,7 +64,7 @@ impl QuarterTurns {
 
     /// Turns vectors of degree l by a quarter, given by real and imaginary parts. Writes orders of the parities in `parities` and
     /// leaves others as they are.
-    pub(super) fn turn(&self, l: usize, parities: &[usize], from: [&[f64]; 2], to: [&mut [f64]; 2]) {
+    pub(super) fn turn(&self, l: usize, parities: &[usize], from: [&[Value]; 2], to: [&mut [Value]; 2]) {
         let columns = from[0].len() / (l + 1);
         for (part, (from, to)) in from.into_iter().zip(to).enumerate() {
             let from = MatRef::from_row_major_slice(from, l + 1, columns);
@@ -123,9 +86,31 @@ impl QuarterTurns {
         }
     }
 
+    /// Turns functions that are mirror-symmetric in a plane through the pole, given by real coefficients of degree l, `[m][column]`, to the
+    /// orders k of even l + k about that plane's normal, `[k][column]`: from even m, and from odd m. Their sum is order k, their
+    /// difference `(-1)^k` times order -k.
+    pub(super) fn fold(&self, l: usize, from: &[Value], columns: usize, to: &mut [Vec<Value>; 2]) {
+        let rows = count(l, l % 2);
+        for (parity, to) in to.iter_mut().enumerate() {
+            to.clear();
+            to.resize(rows * columns, 0.0);
+            let inner = count(l, parity);
+            if inner == 0 {
+                continue;
+            }
+            let from = &from[parity * columns..][..(inner - 1) * 2 * columns + columns];
+            multiply(
+                MatMut::from_row_major_slice_mut(to, rows, columns),
+                MatRef::from_column_major_slice(&self.degrees[l][l % 2][parity], rows, inner),
+                MatRef::from_row_major_slice_with_stride(from, inner, columns, 2 * columns),
+                Accum::Replace,
+            );
+        }
+    }
+
     /// The transpose of [`Self::turn`]: from gradients of its output, of which those of `parities` count, to gradients of
     /// its input.
-    pub(super) fn turn_back(&self, l: usize, parities: &[usize], from: [&[f64]; 2], to: [&mut [f64]; 2]) {
+    pub(super) fn turn_back(&self, l: usize, parities: &[usize], from: [&[Value]; 2], to: [&mut [Value]; 2]) {
         let columns = from[0].len() / (l + 1);
         for (part, (from, to)) in from.into_iter().zip(to).enumerate() {
             to.fill(0.0);
@@ -151,11 +136,11 @@ impl QuarterTurns {
 
 /// A matrix to be written whose rows begin `stride` apart. (faer's own constructor of this kind confuses the strides, in 0.24.4.)
 pub(super) fn rows_apart_mut(
-    slice: &mut [f32],
+    slice: &mut [Value],
     rows: usize,
     columns: usize,
     stride: usize,
-) -> MatMut<'_, f32> {
+) -> MatMut<'_, Value> {
     MatMut::from_column_major_slice_with_stride_mut(slice, columns, rows, stride).transpose_mut()
 }
 
@@ -164,6 +149,6 @@ fn first(l: usize, parity: usize) -> usize {
     if parity == 0 { 0 } else { count(l, 0) }
 }
 
-fn multiply(to: MatMut<'_, f64>, a: MatRef<'_, f64>, b: MatRef<'_, f64>, accum: Accum) {
+fn multiply(to: MatMut<'_, Value>, a: MatRef<'_, Value>, b: MatRef<'_, Value>, accum: Accum) {
     faer::linalg::matmul::matmul(to, accum, a, b, 1.0, Par::Seq);
 }
