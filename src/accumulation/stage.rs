@@ -317,6 +317,10 @@ impl Accumulator {
                 }
                 return self.add(&placed);
             }
+            PlacedFrame::Elsewhere(counted) => {
+                self.emit_if_due(counted.first_s, out);
+                self.ledger.left_out(VisibilityReason::ChannelNotMapped, counted.visibilities);
+            }
             PlacedFrame::Housekeeping(_) => {}
         }
         Ok(None)

@@ -40,22 +40,37 @@ impl Ephemeris {
             value_k_sr: Vec::with_capacity(block.len()),
             weight: Vec::with_capacity(block.len()),
         };
-        let mut counts = PlacingCounts::default();
-        let mut from = 0;
-        while from < block.len() {
-            from = self.place_run(block, from, &mut out, &mut counts);
-        }
-        counts.placed = out.len() as u64;
+        let counts = self.runs(block, &mut |range, piece| extend(&mut out, block, range, piece));
         (out, counts)
     }
 
-    /// Places the visibilities from `from` on that share its piece of the ephemeris (or its reason for being skipped);
-    /// returns the index of the first that does not.
-    fn place_run(
+    /// The counts of [`Self::place`] alone, and the mission time of the middle of the first visibility that it places, s.
+    #[must_use]
+    pub fn count(&self, block: &VisibilityBlock) -> (PlacingCounts, Option<f64>) {
+        let mut first = None;
+        let counts = self.runs(block, &mut |range, _| {
+            let _ = first.get_or_insert(range.start);
+        });
+        (counts, first.map(|k| middle_half_ticks(block, k) as f64 / 2e6))
+    }
+
+    /// Hands all runs of good visibilities to `take`, each with the piece of the ephemeris that is valid for all of it.
+    fn runs(&self, block: &VisibilityBlock, take: &mut dyn FnMut(Range<usize>, &Piece<2>)) -> PlacingCounts {
+        let mut counts = PlacingCounts::default();
+        let mut from = 0;
+        while from < block.len() {
+            from = self.run(block, from, take, &mut counts);
+        }
+        counts
+    }
+
+    /// The visibilities from `from` on that share its piece of the ephemeris (or its reason for being skipped); returns the index of
+    /// the first that does not.
+    fn run(
         &self,
         block: &VisibilityBlock,
         from: usize,
-        out: &mut PlacedVisibilities,
+        take: &mut dyn FnMut(Range<usize>, &Piece<2>),
         counts: &mut PlacingCounts,
     ) -> usize {
         if let Some(reason) = block.flags[from].reason() {
@@ -78,7 +93,10 @@ impl Ephemeris {
         };
         let to = from + (from..block.len()).take_while(continues).count();
         match piece {
-            Some(piece) => extend(out, block, from..to, &piece),
+            Some(piece) => {
+                counts.placed += (to - from) as u64;
+                take(from..to, &piece);
+            }
             None => counts.without_ephemeris += (to - from) as u64,
         }
         to
@@ -185,6 +203,10 @@ mod tests {
         ];
         let flagged = flagged.into_iter().collect();
         assert_eq!(counts, PlacingCounts { placed: 70, flagged, without_ephemeris: 27 });
+        // Counting alone says the same.
+        assert_eq!(table.count(&block), (counts, placed.time_s.first().copied()));
+        let nowhere = Ephemeris::default();
+        assert_eq!(nowhere.count(&block), (nowhere.place(&block, 1e7).1, None));
     }
 
     #[test]

@@ -51,6 +51,11 @@ pub trait Calibration: Send {
     /// [`CalibrationError`] if the calibration was not made for this block. Bad data is not an error but counted in the
     /// report.
     fn apply(&mut self, block: &mut PlacedVisibilities) -> Result<CalibrationReport, CalibrationError>;
+
+    /// Whether it leaves every block as it is.
+    fn is_identity(&self) -> bool {
+        false
+    }
 }
 
 /// What became of the visibilities of a block.
@@ -82,5 +87,9 @@ impl Calibration for Identity {
 
     fn apply(&mut self, block: &mut PlacedVisibilities) -> Result<CalibrationReport, CalibrationError> {
         Ok(CalibrationReport { kept: block.len(), unusable_gain: 0 })
+    }
+
+    fn is_identity(&self) -> bool {
+        true
     }
 }

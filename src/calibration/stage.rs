@@ -1,6 +1,6 @@
 //! The stage that places visibilities and calibrates them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use num_complex::Complex64;
 
@@ -9,11 +9,11 @@ use super::blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
 use super::{Calibration, CalibrationError, VanVleck};
 use crate::array::Ephemeris;
 use crate::frames::{
-    AutoPower, Channel, EphemerisSegment, GroundFrame, Instrument, PlacedFrame, PlacedVisibilities,
-    VisibilityBlock, VisibilityReason,
+    AutoPower, Channel, CountedVisibilities, EphemerisSegment, GroundFrame, Instrument, PlacedFrame,
+    PlacedVisibilities, VisibilityBlock, VisibilityReason,
 };
 use crate::runtime::{Ledger, Outlet, Stage, Units};
-use crate::units::{MissionTime, Pair};
+use crate::units::{ChannelId, MissionTime, Pair};
 
 /// Places visibilities by the ephemeris packets alone and passes them through the calibration hook. What cannot be used
 /// is flagged in the ledger with its reason.
@@ -30,6 +30,8 @@ pub struct Calibrator {
     ephemeris: Ephemeris,
     instrument: Option<Instrument>,
     blocks: ReceivedBlocks,
+    /// The channels whose values are needed; `None` for all.
+    group: Option<BTreeSet<ChannelId>>,
 }
 
 impl Calibrator {
@@ -44,7 +46,14 @@ impl Calibrator {
             ephemeris: Ephemeris::default(),
             instrument: None,
             blocks: ReceivedBlocks::default(),
+            group: None,
         }
+    }
+
+    /// Visibilities of other channels are counted and left out, where calibration would not remove any; `None` for no others.
+    #[must_use]
+    pub fn of_group(self, group: Option<BTreeSet<ChannelId>>) -> Self {
+        Self { group, ..self }
     }
 
     /// Corrects the quantiser's effect on correlations first.
@@ -156,9 +165,7 @@ impl Calibrator {
                 self.ephemeris.insert(segment);
                 Ok(None)
             }
-            GroundFrame::Visibilities(block) => {
-                Ok(self.accept_visibilities(block)?.map(PlacedFrame::Visibilities))
-            }
+            GroundFrame::Visibilities(block) => self.accept_visibilities(block),
             GroundFrame::Housekeeping(report) => {
                 self.blocks.report(report);
                 Ok(Some(PlacedFrame::Housekeeping(report)))
@@ -194,7 +201,7 @@ impl Calibrator {
     fn accept_visibilities(
         &mut self,
         block: VisibilityBlock,
-    ) -> Result<Option<PlacedVisibilities>, CalibrationError> {
+    ) -> Result<Option<PlacedFrame>, CalibrationError> {
         let count = block.len() as u64;
         let Some(key) = BlockKey::of(&block) else { return Ok(None) };
         if !self.blocks.insert(key) {
@@ -204,7 +211,11 @@ impl Calibrator {
         }
         self.blocks.count(block.start, count);
         if block.pair.i != block.pair.j {
-            return Ok(self.place(block)?.filter(|placed| !placed.is_empty()));
+            if self.is_elsewhere(&block) {
+                return Ok(self.count_elsewhere(&block).map(PlacedFrame::Elsewhere));
+            }
+            let placed = self.place(block)?.filter(|placed| !placed.is_empty());
+            return Ok(placed.map(PlacedFrame::Visibilities));
         }
         if let Some(placed) = self.calibrate_autos(block)? {
             self.keep_autos(&placed);
@@ -273,6 +284,21 @@ impl Calibrator {
             van_vleck.apply(block, channel.width_hz);
         }
         Some(channel)
+    }
+
+    fn is_elsewhere(&self, block: &VisibilityBlock) -> bool {
+        let is_other = self.group.as_ref().is_some_and(|group| !group.contains(&block.channel));
+        let is_known =
+            || self.instrument.as_ref().and_then(|i| i.channel_of(block.channel, block.pair)).is_some();
+        is_other && self.calibration.is_identity() && is_known()
+    }
+
+    /// Posts what would become of a block of two daughters; `None` if nothing of it would be left.
+    fn count_elsewhere(&self, block: &VisibilityBlock) -> Option<CountedVisibilities> {
+        let (placing, first_s) = self.ephemeris.count(block);
+        self.ledger.left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
+        self.post_flagged(placing.flagged);
+        first_s.map(|first_s| CountedVisibilities { first_s, visibilities: placing.placed })
     }
 
     /// Places and calibrates a block of two daughters; `None` if no instrument is known.

@@ -14,7 +14,7 @@ mod visibility;
 
 pub use ephemeris::EphemerisSegment;
 pub use flags::Flags;
-pub use ground::PlacedFrame;
+pub use ground::{CountedVisibilities, PlacedFrame};
 pub use housekeeping::Housekeeping;
 pub use instrument::{AntennaResponse, Channel, Instrument, Spectrometer};
 pub use reason::{SampleReason, VisibilityReason};

@@ -60,7 +60,8 @@ impl GroundConfig {
         Ok(Calibrator::new(calibration, ledger.clone())
             .with_van_vleck(self.calibration.van_vleck()?)
             .with_autos()
-            .with_segments(SEGMENTS_MAX))
+            .with_segments(SEGMENTS_MAX)
+            .of_group(self.group.clone()))
     }
 
     /// An accumulator without data, posting to `ledger`.
