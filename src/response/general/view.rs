@@ -17,8 +17,6 @@ pub(super) struct PairView {
     pub(super) axes: [Vec3; 3],
     /// Length of the baseline, m.
     pub(super) baseline_m: f64,
-    /// Mean radius, m.
-    pub(super) radius_m: f64,
     /// Angles of i and j in the plane from x towards y, rad.
     pub(super) angle_rad: [f64; 2],
     /// Cosines of the angles between the nadir and the Moon's limb's opposite: `sqrt(1 - (R_moon / r)^2)` of i and j.
@@ -27,7 +25,8 @@ pub(super) struct PairView {
 
 impl PairView {
     /// # Errors
-    /// Positions that are not finite, below the Moon's surface, or without a plane.
+    /// Positions that are not finite, below the Moon's surface, so high that neither satellite's nadir is hidden from the other, or without
+    /// a plane.
     pub(super) fn of(r_i_m: Vec3, r_j_m: Vec3, moon_radius_m: f64) -> Result<Self, GeometryRefusal> {
         let (difference, sum) = (sub(r_i_m, r_j_m), add(r_i_m, r_j_m));
         let baseline_m = norm(difference);
@@ -45,13 +44,22 @@ impl PairView {
             return Err(GeometryRefusal::Degenerate);
         }
         let x = scale(1.0 / across_m, across);
-        Ok(Self {
+        let view = Self {
             axes: [x, y, cross(x, y)],
             baseline_m,
-            radius_m: 0.5 * (radii_m[0] + radii_m[1]),
             angle_rad: [r_i_m, r_j_m].map(|r_m| dot(r_m, y).atan2(dot(r_m, x))),
             cos_limb: radii_m.map(|radius_m| (1.0 - (moon_radius_m / radius_m).powi(2)).sqrt()),
-        })
+        };
+        // Else the Moon hides two regions.
+        if view.cos_limb.iter().any(|cos_limb| 1.01 * view.away_rad() > cos_limb.acos()) {
+            return Err(GeometryRefusal::Altitude);
+        }
+        Ok(view)
+    }
+
+    /// Half the angle between the satellites at the Moon's centre, rad.
+    fn away_rad(&self) -> f64 {
+        0.5 * (self.angle_rad[0] - self.angle_rad[1]).abs()
     }
 
     /// Angle between the horizontal and the limb, rad, of the mean of both.
@@ -66,8 +74,7 @@ impl PairView {
 
     /// How far either limb lies from [`Self::cap_rad`] as seen from the mean nadir, rad.
     pub(super) fn limbs_apart_rad(&self) -> f64 {
-        let away = 0.5 * (self.angle_rad[0] - self.angle_rad[1]).abs();
-        away + 0.5 * (self.cos_limb[0].acos() - self.cos_limb[1].acos()).abs()
+        self.away_rad() + 0.5 * (self.cos_limb[0].acos() - self.cos_limb[1].acos()).abs()
     }
 
     /// Angle of the mean zenith from x towards y, rad: as much as the baseline is out of the horizontal.
@@ -103,4 +110,23 @@ pub(super) fn euler(axes: &Axes) -> [f64; 3] {
         return [0.0, if z[2] > 0.0 { 0.0 } else { std::f64::consts::PI }, gamma];
     }
     [z[1].atan2(z[0]), beta, y[2].atan2(-x[2])]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn satellites_from_which_the_moon_hides_two_regions_are_refused() {
+        const MOON_M: f64 = 1737.1e3;
+        let at = |radius_m: f64, angle: f64| [radius_m * angle.cos(), radius_m * angle.sin(), 0.0];
+        let pair = |radius_m: f64, away: f64| {
+            PairView::of(at(radius_m, away), at(radius_m, -away), MOON_M).map(|view| view.cap_rad())
+        };
+        // From ten radii the cap is asin(0.1) wide.
+        let found = pair(10.0 * MOON_M, 0.09).unwrap();
+        assert!((found - 0.1_f64.asin()).abs() < 1e-12, "{found}");
+        assert_eq!(pair(10.0 * MOON_M, 0.11), Err(GeometryRefusal::Altitude));
+        assert_eq!(pair(0.99 * MOON_M, 1e-3), Err(GeometryRefusal::Altitude));
+    }
 }
