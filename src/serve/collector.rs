@@ -13,6 +13,7 @@ use prometheus_client::registry::{Registry, Unit};
 use super::console::Console;
 use super::status::{Phase, Status};
 use crate::downlink::Kind;
+use crate::downlink::transport::socket::ConnectionEnd;
 use crate::runtime::{DurationCounts, StageProgress};
 use crate::units::Reason;
 
@@ -237,9 +238,10 @@ impl Scrape {
         counter(out, About("senders_read", "Read from senders", Some(Unit::Bytes)), listening.bytes)?;
         let about = "Read from senders and not taken by the ground yet";
         gauge(out, About("senders_backlog", about, Some(Unit::Bytes)), listening.backlog_bytes as f64)?;
-        let ended = report.ended.iter().filter_map(|(end, &count)| {
+        // From zero on: an increase from nothing to one is none for Prometheus.
+        let ended = ConnectionEnd::ALL.iter().filter_map(|end| {
             let name = serde_json::to_value(end).ok()?.as_str()?.to_owned();
-            Some(([("end", name)], count))
+            Some(([("end", name)], report.ended.get(end).copied().unwrap_or(0)))
         });
         counters(out, About("senders_ended", "Connections of senders by how they ended", None), ended)?;
         let stations = || report.stations.iter().map(|(name, counts)| ([("station", name.clone())], counts));

@@ -4,6 +4,7 @@
 mod broker;
 #[path = "../common/mod.rs"]
 mod common;
+mod crowd;
 mod durable;
 mod events;
 mod log;

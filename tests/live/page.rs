@@ -23,20 +23,35 @@ fn has_browser() -> bool {
     missing.is_none()
 }
 
+/// Runs a script of `tests/python` with the command and these arguments, and prints what it says.
+fn drive(python: &Path, script: &str, args: &[&str]) {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python").join(script);
+    let lunarray = assert_cmd::cargo::cargo_bin("lunarray");
+    let output = Process::new(python).arg(script).arg(lunarray).args(args).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{said}{}", String::from_utf8_lossy(&output.stderr));
+    println!("{said}");
+}
+
 #[test]
 fn a_browser_shows_what_the_interface_and_the_files_say() {
     let Some(python) = python().filter(|_| has_browser()) else { return };
     let place = Place::new();
     let file = place.downlink("packets");
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/page.py");
-    let output = Process::new(python)
-        .arg(script)
-        .arg(assert_cmd::cargo::cargo_bin("lunarray"))
-        .args([place.pipeline(), &file, &place.path("")])
-        .arg(pictures())
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&output.stdout);
-    assert!(output.status.success(), "{said}{}", String::from_utf8_lossy(&output.stderr));
-    println!("{said}");
+    let pictures = pictures();
+    drive(&python, "page.py", &[place.pipeline(), &file, &place.path(""), pictures.to_str().unwrap()]);
+}
+
+/// A mission of 1.3 years, of which every tenth window is kept, in half a minute; LUNARRAY_PAGE_S and LUNARRAY_PAGE_WINDOWS say
+/// otherwise, 600 and 2 for a long look.
+#[test]
+fn a_page_that_stays_open_takes_no_more_memory() {
+    let Some(python) = python().filter(|_| has_browser()) else { return };
+    let place = Place::new();
+    let of = |name: &str, default: &str| std::env::var(name).unwrap_or_else(|_| default.to_owned());
+    let windows = format!("spacecraft.every_nth_window={}", of("LUNARRAY_PAGE_WINDOWS", "10"));
+    let thinned = ["--set", &windows, "--set", "spacecraft.every_nth_integration=16"];
+    let file = place.workplace.simulate("year.ccsds", &thinned);
+    let seconds = of("LUNARRAY_PAGE_S", "30");
+    drive(&python, "page_memory.py", &[place.pipeline(), &file, &place.path(""), &seconds]);
 }

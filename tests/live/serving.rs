@@ -41,6 +41,11 @@ impl Served {
         Self { child, address, said }
     }
 
+    /// Its process.
+    pub(super) fn process(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Where it listens for packets.
     pub(super) fn listening(&self) -> String {
         let mut found = None;
@@ -83,7 +88,7 @@ impl Served {
     }
 
     /// The value of a sample.
-    fn metric(&self, name: &str) -> f64 {
+    pub(super) fn metric(&self, name: &str) -> f64 {
         let text = String::from_utf8(self.get("/metrics").body).unwrap();
         let line = text.lines().find(|line| line.split([' ', '{']).next() == Some(name));
         line.unwrap_or_else(|| panic!("no {name} in {text}")).rsplit(' ').next().unwrap().parse().unwrap()

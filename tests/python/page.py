@@ -662,4 +662,5 @@ def without_webgl(served, out, palettes):
         page.assert_sky("without WebGL", final, Colours.robust(palettes["inferno"], final))
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -52,6 +52,12 @@ async function fetchMap(name) {
   return values;
 }
 
+/** Maps that the server has thinned away can no longer be chosen. */
+function forgetMaps(channels) {
+  const held = new Set(channels.flatMap(({ channel, held }) => ["input", ...held].map((name) => `${channel}/${name}`)));
+  for (const key of state.maps.keys()) if (!held.has(key)) state.maps.delete(key);
+}
+
 let drawing = 0;
 async function showSky() {
   const turn = ++drawing, channel = channelNow();
@@ -407,7 +413,7 @@ function update(status) {
     state.number = latest;
     if (changed) showSky();
   }
-  if (state.news !== news) { state.news = news; fetchFigures(channel.channel); showFigures(); drawCurve(); }
+  if (state.news !== news) { state.news = news; forgetMaps(status.channels); fetchFigures(channel.channel); showFigures(); drawCurve(); }
   syncSlider();
 }
 

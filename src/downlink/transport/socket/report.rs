@@ -54,6 +54,27 @@ pub enum ConnectionEnd {
     Failed,
 }
 
+impl ConnectionEnd {
+    /// All of them.
+    pub const ALL: [Self; 15] = [
+        Self::Whole,
+        Self::Broken,
+        Self::Stopped,
+        Self::FirstPacket,
+        Self::Idle,
+        Self::Garbage,
+        Self::Memory,
+        Self::OtherInstrument,
+        Self::UnfitInstrument,
+        Self::Unconfirmed,
+        Self::NoState,
+        Self::NoToken,
+        Self::UnknownToken,
+        Self::GaveWay,
+        Self::Failed,
+    ];
+}
+
 impl fmt::Display for ConnectionEnd {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
