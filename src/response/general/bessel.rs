@@ -133,10 +133,9 @@ fn recurrence(x: &Lanes, shift: f64, start: &[Lanes; 2], values: &mut [Lanes], o
     let [mut before, mut now] = *start;
     values[0] = before;
     values[1] = now;
-    for n in 2..=order_max {
+    for (n, value) in values.iter_mut().enumerate().take(order_max + 1).skip(2) {
         let factor = (2 * (n - 1)) as f64 + shift;
         let order = n as f64;
-        let value = &mut values[n];
         for k in 0..LANES {
             let upwards = factor * inverse[k] * now[k] - before[k];
             let downwards = value[k] * now[k];

@@ -156,9 +156,10 @@ impl CapClass {
         buffers: &mut CapBuffers,
     ) {
         let (terms, height) = (self.border.terms, self.border.terms + self.rings.len());
+        let Some(last) = nodes.last() else { return };
         let mut waves = [[0.0; LANES]; 2];
-        for k in 0..LANES {
-            let Some(node) = nodes.get(k).or(nodes.last()) else { return };
+        let filled = nodes.iter().chain(std::iter::repeat(last)).take(LANES);
+        for (k, node) in filled.enumerate() {
             let wave = TAU * node.view.baseline_m / wavelength_m;
             let (sin, cos) = node.view.pitch_rad().sin_cos();
             (waves[0][k], waves[1][k]) = (wave * cos, wave * sin);
@@ -248,7 +249,7 @@ fn write_ring(
 ) {
     let quarter = 0.25 * ring.sin * ring.sin;
     for m in 0..=ring.reach {
-        let sign = if m % 2 == 0 { 1.0 } else { -1.0 };
+        let sign = if m.is_multiple_of(2) { 1.0 } else { -1.0 };
         let out = &mut out[m * stride..m * stride + COMPLEX];
         let (re, im) = out.split_at_mut(LANES);
         for k in 0..LANES {
@@ -315,7 +316,7 @@ impl Patterns {
                 let of = self.whole[mu][degree];
                 for group in 0..groups {
                     let place = row * columns + group * COMPLEX;
-                    let signs = [1.0, if mu % 2 == 0 { 1.0 } else { -1.0 }];
+                    let signs = [1.0, if mu.is_multiple_of(2) { 1.0 } else { -1.0 }];
                     assemble(
                         [&even[place..place + COMPLEX], &odd[place..place + COMPLEX]],
                         [0, 1].map(|part| &pitches[part][(group * (l_max + 1) + mu) * LANES..][..LANES]),
@@ -396,11 +397,11 @@ fn whole_sky(setup: &RowsSetup) -> Vec<Vec<[f64; 3]>> {
         .map(|mu| {
             let values = functions.even_rows::<f64>(mu, &[4.0 * PI]);
             // With (-1)^((l + mu) / 2), which alternates with l.
-            let first = if mu % 2 == 0 { 1.0 } else { -1.0 };
+            let first = if mu.is_multiple_of(2) { 1.0 } else { -1.0 };
             let value = |degree: usize| {
-                values
-                    .get(degree)
-                    .map_or(0.0, |value| if degree % 2 == 0 { first * value } else { -first * value })
+                values.get(degree).map_or(0.0, |value| {
+                    if degree.is_multiple_of(2) { first * value } else { -first * value }
+                })
             };
             let step = |l: usize| {
                 if l <= mu { 0.0 } else { (((l * l - mu * mu) as f64) / ((4 * l * l - 1) as f64)).sqrt() }
