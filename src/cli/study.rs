@@ -20,8 +20,10 @@ use crate::pipeline::{
 /// in the ground segment share one simulation, and those that differ only in epsilon or prior share their sums. Leaves the
 /// products of every case, tables (study.csv, spectra.csv, study.json) and overlaid curves (study.png): rho_l, SNR_l, C_l,
 /// and, with map.trace_probes, the traces of thermal noise and imperfection against epsilon, with their crossing. With
-/// `realisations = N` each case is made for N realisations of noise and random errors, for maps of sigma and covariances of C_l. Cases
-/// that are finished are not made again: to resume after an interruption, repeat the command.
+/// `realisations = N` each case is made for N realisations of noise and random errors, for maps of sigma and covariances of C_l. With
+/// `calibrated = true` each case is made twice, from the data as sent and with gains that are found from them; cases with errors of the
+/// instrument are compared with the one without. Cases that are finished are not made again: to resume after an interruption, repeat
+/// the command.
 ///
 /// Example: lunarray study pipelines/paper/fig15-traces.toml --out out/fig15
 #[derive(Debug, Args)]
@@ -64,15 +66,19 @@ pub(super) fn execute(args: &StudyArgs) -> CommandResult {
         // The last one ends before the next begins.
         drop(progress.take());
         let case = &study.cases[number];
-        let what = if phase == StudyPhase::Simulate { "simulating for" } else { "mapping" };
+        let what = match phase {
+            StudyPhase::Simulate => "simulating for",
+            StudyPhase::Calibrate => "calibrating",
+            StudyPhase::Map => "mapping",
+        };
         let (of, label) = (study.cases.len(), case.label());
         let fields = json!({ "number": number + 1, "of": of, "what": what, "label": label });
         say("case", &fields, format_args!("case {} of {of}: {what} {label}", number + 1));
         let (stage, total) = match phase {
             StudyPhase::Simulate => (INTEGRATE, case.plan.windows_watched()),
-            StudyPhase::Map => (READ, 0),
+            StudyPhase::Calibrate | StudyPhase::Map => (READ, 0),
         };
-        progress = Some(Progress::watch(watched, stage, total, interrupt.cancel()));
+        progress = watched.map(|watched| Progress::watch(watched, stage, total, interrupt.cancel()));
     })?;
     drop(progress);
     if summary.cancelled {
@@ -87,6 +93,29 @@ pub(super) fn execute(args: &StudyArgs) -> CommandResult {
     } else {
         print_text(&format!("{}\nTables, curves and products are in {}", table(&summary), out.display()))
     })
+}
+
+/// What imperfect instruments leave of the power, a line a case.
+fn told_power_kept(summary: &StudySummary) -> Vec<String> {
+    let channels = summary
+        .cases
+        .iter()
+        .flat_map(|case| case.figures.channels.iter().map(move |channel| (&case.figures.label, channel)));
+    let number = |value: Option<f64>| value.map_or_else(|| "-".to_owned(), |value| format!("{value:.4}"));
+    channels
+        .filter(|(_, channel)| channel.power_kept.is_some())
+        .map(|(label, channel)| {
+            let [ratio, coherent] = channel.power_kept_means();
+            format!(
+                "{label}, {:.3} MHz: C_l {} of the ideal instrument's, coherent with the sky {}, rho_l {} (means, l = 20 to {})",
+                channel.frequency_hz / 1e6,
+                number(ratio),
+                number(coherent),
+                number(channel.rho_mean()),
+                120.min(2 * channel.nside)
+            )
+        })
+        .collect()
 }
 
 fn table(summary: &StudySummary) -> String {
@@ -121,6 +150,7 @@ fn table(summary: &StudySummary) -> String {
             100.0 * spread.sigma_scatter
         ));
     }
+    lines.extend(told_power_kept(summary));
     for crossing in &summary.crossings {
         let of =
             |epsilon: Option<f64>| epsilon.map_or_else(|| "not within".to_owned(), |e| format!("{e:.2e}"));

@@ -465,6 +465,14 @@ fn change_rms(before: &[PassSolution], after: &[PassSolution]) -> f64 {
     if count > 0.0 { (sum / count).sqrt() } else { f64::INFINITY }
 }
 
+/// `config` with the gains of a file.
+pub(super) fn with_gains(config: &Config, gains: PathBuf) -> Config {
+    let mut config = config.clone();
+    config.calibration.hook = CalibrationHook::AntennaGains;
+    config.calibration.gains_file = Some(gains);
+    config
+}
+
 /// Maps of the data with solutions, one a channel.
 fn make_maps(
     config: &Config,
@@ -479,9 +487,7 @@ fn make_maps(
     create(folder)?;
     let path = folder.join("gains.json");
     write_json(&path, &gains)?;
-    let mut config = config.clone();
-    config.calibration.hook = CalibrationHook::AntennaGains;
-    config.calibration.gains_file = Some(path);
+    let mut config = with_gains(config, path);
     config.products.pictures = false;
     config.map.snapshot_every_s = 0.0;
     let ground = Ground::new(&config.ground(WAIT_BYTES))?;

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::calibrate::{CalibrateJob, calibrate, with_gains};
 use super::config::Config;
 use super::config_source::ConfigSource;
 use super::error::PipelineError;
@@ -17,6 +18,7 @@ use super::plan::Plan;
 use super::realisations::{RealisationSpread, csv_of, spreads};
 use super::run::{Destination, Watched, downlink_file, replay_knowing, simulate_sky};
 use super::space_segment;
+use crate::calibration::solver::SolverConfig;
 use crate::downlink::{FileSource, Recorder};
 use crate::files::{FolderLock, write_atomically};
 use crate::ground::{Ground, WAIT_BYTES};
@@ -25,6 +27,7 @@ use crate::products::{
 };
 use crate::runtime::Cancel;
 use crate::sky::SkyMap;
+use crate::sky::fits::{ReadOptions, read_whole_map};
 
 /// Most cases of a study.
 const CASES_MAX: usize = 1000;
@@ -81,6 +84,12 @@ struct StudyFile {
     axis: Vec<AxisFile>,
     /// Realisations of each case: of the noise-only map's noise, and of the instrument's random errors if it has any.
     realisations: Option<usize>,
+    /// Whether each case is made twice: with the data as sent, and with gains that are found from them.
+    #[serde(default)]
+    calibrated: bool,
+    /// Maps of the sky to calibrate with, one a channel; beside the study.
+    #[serde(default)]
+    model: Vec<PathBuf>,
 }
 
 /// An axis: a key and its values, or named cases of several settings each.
@@ -108,6 +117,8 @@ pub struct Study {
     pub cases: Vec<StudyCase>,
     /// Realisations of each case; 1 for no such axis.
     pub realisations: usize,
+    /// Maps of the sky to calibrate with, K; empty if none is calibrated, or if an artificial signal is enough.
+    pub models: Vec<SkyMap>,
 }
 
 /// A case of a study.
@@ -119,6 +130,10 @@ pub struct StudyCase {
     pub overrides: Vec<String>,
     /// Its plan.
     pub plan: Plan,
+    /// Whether gains are found from its data and applied.
+    pub calibrated: bool,
+    /// A number that changes with the maps to calibrate with.
+    models_hash: u64,
 }
 
 impl StudyCase {
@@ -202,13 +217,31 @@ impl Study {
                 realised.push((labels, sets));
             }
         }
-        let cases = realised.into_iter().map(|(labels, sets)| {
-            let overrides = [file.set.as_slice(), &sets, more].concat();
+        let models: Vec<PathBuf> = file.model.iter().map(beside).collect();
+        if !models.is_empty() && !file.calibrated {
+            return Err(wrong("model without calibration".to_owned(), "calibrated = true with a model"));
+        }
+        let (models, models_hash) = read_models(&models)?;
+        let kinds: &[bool] = if file.calibrated { &[false, true] } else { &[false] };
+        // Realisations of a case stay together.
+        let realised = realised.chunks(realisations).flat_map(|of_case| {
+            kinds.iter().flat_map(move |&calibrated| {
+                of_case.iter().map(move |(labels, sets)| {
+                    let mut labels = labels.clone();
+                    if file.calibrated {
+                        labels.insert(0, if calibrated { "calibrated" } else { "as sent" }.to_owned());
+                    }
+                    (labels, sets, calibrated)
+                })
+            })
+        });
+        let cases = realised.map(|(labels, sets, calibrated)| {
+            let overrides = [file.set.as_slice(), sets, more].concat();
             let source = ConfigSource { file: pipeline.clone(), overrides: overrides.clone(), seed: None };
             let plan = source.load().map_err(PipelineError::from).and_then(Plan::new);
             let plan = plan
                 .map_err(|source| StudyError::Case { label: labels.join(", "), source: Box::new(source) })?;
-            Ok(StudyCase { labels, overrides, plan })
+            Ok(StudyCase { labels, overrides, plan, calibrated, models_hash })
         });
         let cases = cases.collect::<Result<Vec<StudyCase>, StudyError>>()?;
         let mut folders = BTreeSet::new();
@@ -216,8 +249,24 @@ impl Study {
             let found = format!("two cases with products in {}", twice.folder());
             return Err(wrong(found, "labels that differ in letters or digits"));
         }
-        Ok(Self { name: file.name.unwrap_or(stem), cases, realisations })
+        Ok(Self { name: file.name.unwrap_or(stem), cases, realisations, models })
     }
+}
+
+/// Maps to calibrate with, and a number that changes with their bytes.
+fn read_models(paths: &[PathBuf]) -> Result<(Vec<SkyMap>, u64), StudyError> {
+    let (mut maps, mut sums) = (Vec::new(), Vec::new());
+    for path in paths {
+        let failed = |reason: String| StudyError::File {
+            path: path.clone(),
+            found: reason,
+            expected: "a map of the sky to calibrate with, HEALPix in K",
+        };
+        maps.push(read_whole_map(path, &ReadOptions::default()).map_err(|error| failed(error.to_string()))?);
+        let bytes = fs::read(path).map_err(|error| failed(error.to_string()))?;
+        sums.extend_from_slice(&crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes).to_le_bytes());
+    }
+    Ok((maps, crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &sums)))
 }
 
 fn read_text(path: &Path) -> Result<String, StudyError> {
@@ -255,12 +304,14 @@ fn steps(axis: &AxisFile) -> Option<Vec<(String, Vec<String>)>> {
 pub enum StudyPhase {
     /// Simulating the downlink that some cases share.
     Simulate,
+    /// Finding the gains of its data.
+    Calibrate,
     /// Mapping a case.
     Map,
 }
 
-/// Follows a study: the number of the case, from 0, what is done for it, and the handles of its graph.
-pub type StudyWatcher<'a> = &'a mut dyn FnMut(usize, StudyPhase, Watched);
+/// Follows a study: the number of the case, from 0, what is done for it, and the handles of its graph if it has one.
+pub type StudyWatcher<'a> = &'a mut dyn FnMut(usize, StudyPhase, Option<Watched>);
 
 /// Results of a study.
 #[derive(Clone, Debug, Serialize)]
@@ -299,10 +350,14 @@ struct CaseMarker {
 }
 
 impl CaseMarker {
-    fn of(config: &Config) -> Self {
+    fn of(case: &StudyCase) -> Self {
+        let config = &case.plan.config;
         let mut value = serde_json::to_value(config).unwrap_or_default();
         if let Some(sections) = value.as_object_mut() {
             sections.remove("runtime");
+            if case.calibrated {
+                sections.insert("calibrated_with".to_owned(), case.models_hash.into());
+            }
         }
         Self { space_hash: config.space_hash(), ground_hash: config.ground_hash(), config: value }
     }
@@ -310,6 +365,13 @@ impl CaseMarker {
 
 /// Name of the file in a case's folder that says that it is finished.
 const MARKER: &str = "case.json";
+
+/// What a case is mapped from: data, gains, and sums that it shares with others.
+struct Given<'a> {
+    files: &'a [PathBuf],
+    gains: Option<&'a Path>,
+    state: Option<&'a PathBuf>,
+}
 
 /// Where a study stands.
 struct Making<'a> {
@@ -368,7 +430,7 @@ fn extension(config: &Config) -> &'static str {
 fn is_done(case: &StudyCase, out: &Path) -> bool {
     let marker = fs::read(out.join(case.folder()).join(MARKER)).ok();
     let found = marker.and_then(|bytes| serde_json::from_slice::<CaseMarker>(&bytes).ok());
-    found.is_some_and(|found| found == CaseMarker::of(&case.plan.config))
+    found.is_some_and(|found| found == CaseMarker::of(case))
 }
 
 /// A number that cases of equal downlinks share.
@@ -378,9 +440,13 @@ fn downlink_key(config: &Config) -> u64 {
 }
 
 /// A number that cases of equal sums of one downlink share.
-fn sums_key(config: &Config) -> u64 {
-    let map = &config.map;
-    let text = serde_json::to_vec(&(map.of_sums(), map.snapshot_every_s, &map.refine, &config.calibration));
+fn sums_key(case: &StudyCase) -> u64 {
+    let config = &case.plan.config;
+    let (map, solver) = (&config.map, case.calibrated.then_some(&config.calibrate));
+    let sums = (map.of_sums(), map.snapshot_every_s, &map.refine, &config.calibration, solver);
+    // Alternation with the map depends on how the map is solved for.
+    let solution = solver.filter(|solver| solver.map_rounds > 0).map(|_| map);
+    let text = serde_json::to_vec(&(sums, solution));
     let text = text.unwrap_or_default();
     crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
 }
@@ -406,7 +472,7 @@ impl Making<'_> {
                 (Destination::from(&file), recorder),
                 self.cancel,
                 &mut |watched| {
-                    watch(group[0], StudyPhase::Simulate, watched);
+                    watch(group[0], StudyPhase::Simulate, Some(watched));
                 },
             )?;
             if report.cancelled {
@@ -418,17 +484,24 @@ impl Making<'_> {
         let mut left = group.to_vec();
         let mut last = None;
         while let Some(&first) = left.first() {
-            let key = sums_key(&cases[first].plan.config);
+            let key = sums_key(&cases[first]);
             let (same, rest): (Vec<usize>, Vec<usize>) =
-                left.iter().partition(|&&k| sums_key(&cases[k].plan.config) == key);
+                left.iter().partition(|&&k| sums_key(&cases[k]) == key);
             let state = self.out.join(format!("state-{key:016x}"));
             // A refined map needs its visibilities, which no state keeps; snapshots need the data to arrive.
             let map = &cases[first].plan.config.map;
             let is_shared = same.len() > 1 && !map.refine.is_on() && map.snapshot_every_s == 0.0;
+            let gains = if cases[first].calibrated {
+                let Some(gains) = self.calibrate(first, file)? else { return Ok(false) };
+                Some(gains)
+            } else {
+                None
+            };
             for (number, &k) in same.iter().enumerate() {
                 // The state has taken the file in once its first case is made.
                 let files = if number == 0 || !is_shared { &[file.to_owned()][..] } else { &[] };
-                if !self.map(k, files, is_shared.then_some(state.as_path()), &skies, &mut last)? {
+                let given = Given { files, gains: gains.as_deref(), state: is_shared.then_some(&state) };
+                if !self.map(k, given, &skies, &mut last)? {
                     return Ok(false);
                 }
             }
@@ -441,17 +514,38 @@ impl Making<'_> {
         Ok(true)
     }
 
+    /// Finds the gains of a downlink with the settings of a case, in a folder within that of its products; `None` if it was
+    /// ended early.
+    fn calibrate(&mut self, number: usize, file: &Path) -> Result<Option<PathBuf>, PipelineError> {
+        let case = &self.study.cases[number];
+        let folder = self.out.join(case.folder());
+        fs::create_dir_all(&folder)
+            .map_err(|source| ProductsError::Write { path: folder.clone(), source })?;
+        let out = folder.join("calibration");
+        (self.watch)(number, StudyPhase::Calibrate, None);
+        let job = CalibrateJob {
+            config: &case.plan.config,
+            files: &[file.to_owned()],
+            models: self.study.models.clone(),
+            out: &out,
+        };
+        let summary = calibrate(job, self.cancel)?;
+        Ok((!summary.cancelled).then(|| out.join("gains.json")))
+    }
+
     /// Maps a case; whether it was finished.
     fn map(
         &mut self,
         number: usize,
-        files: &[PathBuf],
-        state: Option<&Path>,
+        given: Given<'_>,
         skies: &[SkyMap],
         last: &mut Option<LastTruth>,
     ) -> Result<bool, PipelineError> {
-        let config = &self.study.cases[number].plan.config;
-        let folder = self.out.join(self.study.cases[number].folder());
+        let Given { files, gains, state } = given;
+        let case = &self.study.cases[number];
+        let with_gains = gains.map(|gains| with_gains(&case.plan.config, gains.to_owned()));
+        let config = with_gains.as_ref().unwrap_or(&case.plan.config);
+        let folder = self.out.join(case.folder());
         let shape = config.map_shape();
         let truth = match last.take() {
             Some(known) if known.shape == shape => known.truth,
@@ -466,13 +560,13 @@ impl Making<'_> {
         let source = FileSource::open(files)?;
         let watch = &mut self.watch;
         let summary = replay_knowing(truth, source, config, ground, &folder, self.cancel, &mut |watched| {
-            watch(number, StudyPhase::Map, watched);
+            watch(number, StudyPhase::Map, Some(watched));
         })?;
         if summary.cancelled {
             return Ok(false);
         }
         let path = folder.join(MARKER);
-        let text = serde_json::to_vec_pretty(&CaseMarker::of(config)).unwrap_or_default();
+        let text = serde_json::to_vec_pretty(&CaseMarker::of(case)).unwrap_or_default();
         write_atomically(&path, &text).map_err(|source| ProductsError::Write { path, source })?;
         Ok(true)
     }
@@ -481,12 +575,13 @@ impl Making<'_> {
 fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary, PipelineError> {
     let mut cases = Vec::new();
     let mut groups: Vec<(Vec<u8>, Vec<usize>)> = Vec::new();
-    for case in study.cases.iter().filter(|case| is_done(case, out)) {
+    let done: Vec<&StudyCase> = study.cases.iter().filter(|case| is_done(case, out)).collect();
+    for case in &done {
         let mut figures = RunFigures::read(&out.join(case.folder()))?;
         figures.label = case.label();
         let mut config = case.plan.config.clone();
         config.map.epsilon = crate::accumulation::MapConfig::default().epsilon;
-        let key = serde_json::to_vec(&config).unwrap_or_default();
+        let key = serde_json::to_vec(&(config, case.calibrated)).unwrap_or_default();
         match groups.iter_mut().find(|(found, _)| *found == key) {
             Some((_, members)) => members.push(cases.len()),
             None => groups.push((key, vec![cases.len()])),
@@ -498,8 +593,38 @@ fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary,
         .map(|(_, members)| members.into_iter().map(|k| &cases[k].figures).collect())
         .collect();
     let crossings = crossings(&groups);
+    note_power_kept(&done, &mut cases);
     let spreads = if study.realisations > 1 { spreads(&realised(study, &cases), out)? } else { Vec::new() };
     Ok(StudySummary { name: study.name.clone(), cancelled, cases, crossings, spreads })
+}
+
+/// Compares each case of a study of the instrument's errors with the one that has none of them and is not calibrated.
+fn note_power_kept(done: &[&StudyCase], cases: &mut [CaseSummary]) {
+    let ideal_of = |case: &StudyCase| {
+        let mut config = case.plan.config.clone();
+        config.instrument = config.instrument.without_errors();
+        config.calibrate = SolverConfig::default();
+        serde_json::to_value(&config).unwrap_or_default()
+    };
+    let has_errors = |case: &StudyCase| {
+        let instrument = &case.plan.config.instrument;
+        case.calibrated || *instrument != instrument.without_errors()
+    };
+    if !done.iter().any(|case| has_errors(case)) {
+        return;
+    }
+    let ideals: Vec<(serde_json::Value, RunFigures)> = done
+        .iter()
+        .zip(cases.iter())
+        .filter(|(case, _)| !has_errors(case))
+        .map(|(case, summary)| (ideal_of(case), summary.figures.clone()))
+        .collect();
+    for (case, summary) in done.iter().zip(cases) {
+        let key = ideal_of(case);
+        if let Some((_, ideal)) = ideals.iter().find(|(found, _)| *found == key) {
+            summary.figures.against_ideal(ideal);
+        }
+    }
 }
 
 /// Cases that differ in their realisation alone, with what they have in common.

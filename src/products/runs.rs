@@ -53,6 +53,34 @@ pub struct ChannelFigures {
     pub beam: Option<BeamFigures>,
     /// Relative error by distance from the ecliptic.
     pub latitudes: Option<Vec<LatitudeError>>,
+    /// What an imperfect instrument leaves of the power, in a study of its errors.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub power_kept: Option<PowerKept>,
+}
+
+/// Power of a map relative to that of the same map from an instrument without errors, by degree from l = 0.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PowerKept {
+    /// C_l over C_l of the ideal map. Power that errors spread over the map counts.
+    pub cl_ratio: Vec<Option<f64>>,
+    /// Square of the cross power with the input over that of the ideal map: what is still the sky.
+    pub coherent: Vec<Option<f64>>,
+}
+
+impl PowerKept {
+    /// What `map` keeps of `ideal`; `None` if either has no power.
+    fn of(map: &ChannelFigures, ideal: &ChannelFigures) -> Option<Self> {
+        let (map, ideal) = (map.power.as_ref()?, ideal.power.as_ref()?);
+        let ratios = |of: &[Option<f64>], to: &[Option<f64>], power: i32| {
+            let ratio =
+                |(of, to): (&Option<f64>, &Option<f64>)| Some((*of)? / (*to)?).filter(|r| r.is_finite());
+            of.iter().zip(to).map(|pair| ratio(pair).map(|ratio| ratio.powi(power))).collect()
+        };
+        Some(Self {
+            cl_ratio: ratios(&map.map_k2, &ideal.map_k2, 1),
+            coherent: ratios(&map.cross_k2, &ideal.cross_k2, 2),
+        })
+    }
 }
 
 /// Regularisation of a solution, and its traces.
@@ -132,10 +160,36 @@ impl ChannelFigures {
         Some((power / (4.0 * std::f64::consts::PI)).sqrt())
     }
 
-    /// Mean of rho_l over `from <= l <= to`, if all of these are known.
-    fn rho_mean(&self, from: usize, to: usize) -> Option<f64> {
-        let rho: Option<Vec<f64>> = self.rho.as_ref()?.get(from..=to)?.iter().copied().collect();
-        rho.map(|rho| rho.iter().sum::<f64>() / rho.len() as f64)
+    /// Mean of rho_l over 20 <= l <= 120, or to 2 nside if that is less.
+    #[must_use]
+    pub fn rho_mean(&self) -> Option<f64> {
+        self.mean(self.rho.as_ref()?)
+    }
+
+    /// Means of C_l over that of the ideal instrument, and of its coherent part, over the same degrees.
+    #[must_use]
+    pub fn power_kept_means(&self) -> [Option<f64>; 2] {
+        let kept = self.power_kept.as_ref();
+        [kept.and_then(|kept| self.mean(&kept.cl_ratio)), kept.and_then(|kept| self.mean(&kept.coherent))]
+    }
+
+    /// Mean over 20 <= l <= 120, or to 2 nside if that is less, if all of these are known.
+    fn mean(&self, of_degrees: &[Option<f64>]) -> Option<f64> {
+        let values: Option<Vec<f64>> =
+            of_degrees.get(20..=120.min(2 * self.nside))?.iter().copied().collect();
+        values
+            .filter(|values| !values.is_empty())
+            .map(|values| values.iter().sum::<f64>() / values.len() as f64)
+    }
+}
+
+impl RunFigures {
+    /// Notes what each channel's map keeps of the power of that of an instrument without errors.
+    pub fn against_ideal(&mut self, ideal: &Self) {
+        for channel in &mut self.channels {
+            let same = ideal.channels.iter().find(|ideal| ideal.frequency_hz == channel.frequency_hz);
+            channel.power_kept = same.and_then(|ideal| PowerKept::of(channel, ideal));
+        }
     }
 }
 
@@ -209,12 +263,14 @@ fn number(value: Option<f64>) -> String {
 pub fn runs_csv(runs: &[&RunFigures]) -> String {
     let mut text =
         "run,frequency_hz,nside,visibilities,epsilon,w_max,mean_k,input_mean_k,noise_rms_k,tr_sigma_n_k2,\
-                    tr_sigma_n_error_k2,tr_sigma_s,tr_sigma_s_error,rho_mean_20_120,beam_fwhm_deg,noise_rms_jy_beam\n"
+                    tr_sigma_n_error_k2,tr_sigma_s,tr_sigma_s_error,rho_mean_20_120,beam_fwhm_deg,noise_rms_jy_beam,\
+                    cl_ratio_20_120,coherent_power_20_120\n"
             .to_owned();
     for (run, channel) in runs.iter().flat_map(|run| run.channels.iter().map(move |channel| (run, channel))) {
         let DiagnosticFigures { epsilon, w_max, traces } = &channel.diagnostics;
         let [n, s] =
             [|t: &TraceFigures| t.sigma_n_k2, |t: &TraceFigures| t.sigma_s].map(|of| traces.as_ref().map(of));
+        let [cl_ratio, coherent] = channel.power_kept_means();
         let start = [
             field(&run.label),
             format!("{}", channel.frequency_hz),
@@ -231,9 +287,11 @@ pub fn runs_csv(runs: &[&RunFigures]) -> String {
             n.and_then(|n| n.error),
             s.map(|s| s.value),
             s.and_then(|s| s.error),
-            channel.rho_mean(20, 120.min(2 * channel.nside)),
+            channel.rho_mean(),
             channel.beam.as_ref().and_then(|beam| beam.fwhm_deg),
             channel.beam.as_ref().and_then(|beam| beam.noise_rms_jy),
+            cl_ratio,
+            coherent,
         ];
         let fields: Vec<String> = start.into_iter().chain(numbers.map(number)).collect();
         text.push_str(&fields.join(","));
@@ -246,7 +304,7 @@ pub fn runs_csv(runs: &[&RunFigures]) -> String {
 #[must_use]
 pub fn spectra_csv(runs: &[&RunFigures]) -> String {
     let mut text =
-        "run,frequency_hz,l,rho,rho_noise_subtracted,snr,map_k2,input_k2,cross_k2,noise_k2\n".to_owned();
+        "run,frequency_hz,l,rho,rho_noise_subtracted,snr,map_k2,input_k2,cross_k2,noise_k2,cl_ratio,coherent_power\n".to_owned();
     for (run, channel) in runs.iter().flat_map(|run| run.channels.iter().map(move |channel| (run, channel))) {
         let power = channel.power.as_ref();
         let columns = [
@@ -257,6 +315,8 @@ pub fn spectra_csv(runs: &[&RunFigures]) -> String {
             power.map(|power| &power.input_k2),
             power.map(|power| &power.cross_k2),
             power.and_then(|power| power.noise_k2.as_ref()),
+            channel.power_kept.as_ref().map(|kept| &kept.cl_ratio),
+            channel.power_kept.as_ref().map(|kept| &kept.coherent),
         ];
         let degrees = columns.iter().flatten().map(|column| column.len()).max().unwrap_or(0);
         for l in 0..degrees {
@@ -323,6 +383,11 @@ pub fn draw_runs(title: &str, runs: &[&RunFigures]) -> Result<Picture, PictureEr
     }
     let power = Axis { label: "C_{l} (K²)".to_owned(), log: true, limits: None };
     plot("Angular power of the maps", power, powers, Vec::new());
+    let ratio = |label: &str| Axis { label: label.to_owned(), limits: Some((0.0, 1.2)), log: false };
+    let kept = of_degrees(&|c| c.power_kept.as_ref().map(|kept| &kept.cl_ratio));
+    plot("Power against the ideal instrument's", ratio("C_{l} / C_{l} ideal"), kept, vec![0.95, 1.0]);
+    let coherent = of_degrees(&|c| c.power_kept.as_ref().map(|kept| &kept.coherent));
+    plot("Part of it that is still the sky", ratio("coherent power"), coherent, vec![0.95, 1.0]);
     plots.extend(trace_plot(&channels));
     if plots.is_empty() {
         plots.push(Plot { title: "No input to compare with, and no traces".to_owned(), ..Plot::default() });
@@ -401,6 +466,7 @@ mod tests {
             power: Some(power),
             beam: None,
             latitudes: None,
+            power_kept: None,
         };
         RunFigures { label: label.to_owned(), cancelled: false, channels: vec![channel] }
     }

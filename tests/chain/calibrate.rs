@@ -199,6 +199,87 @@ fn map_and_gains_settle_in_turn_from_the_beacon() {
     assert!(rounds.last().unwrap()["chi_square_held_out"].as_f64().unwrap() > 0.0);
 }
 
+/// Errors of the data, with and without calibration.
+const STUDY: &str = r#"
+name = "kept"
+pipeline = "pipeline.toml"
+calibrated = true
+[[axis]]
+cases = [
+    { label = "none", set = [] },
+    { label = "large", set = ["instrument.phase_deg.pass_rms=60.0", "instrument.clock_ns.pass_rms=30.0"] },
+]
+"#;
+
+#[test]
+fn a_study_has_each_case_as_sent_and_calibrated() {
+    let place = Workplace::new(SMALL);
+    // Spectra of summaries are those of maps without noise.
+    let beacon = [&BEACON[..], &["calibrate.mode=beacon", "spacecraft.thermal_noise=false"]].concat();
+    let errors = ["instrument.phase_deg.pass_rms=60.0", "instrument.clock_ns.pass_rms=30.0"];
+    let ideal = command(&place, "run", "ideal", &beacon);
+    let spoilt = command(&place, "run", "spoilt", &[&errors[..], &beacon].concat());
+    let (_, maps) = calibrated(&place, (&spoilt, "solved"), &[], &beacon);
+    let study = place.file("study.toml", STUDY.as_bytes());
+    let out = place.path("study");
+    let mut args = vec!["study", &study, "--out", &out, "--json"];
+    beacon.iter().for_each(|set| args.extend(["--set", set]));
+    let summary: serde_json::Value = serde_json::from_str(&succeed(&args)).unwrap();
+    let labels: Vec<&str> = summary["cases"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|case| case["figures"]["name"].as_str().unwrap())
+        .collect();
+    assert_eq!(labels, ["as sent, none", "calibrated, none", "as sent, large", "calibrated, large"]);
+    // The maps of separate commands.
+    for (case, alone) in [("as-sent-none", &ideal), ("as-sent-large", &spoilt), ("calibrated-large", &maps)] {
+        let [case, alone] = [format!("{out}/case-{case}"), alone.clone()];
+        let values = |folder: &str| {
+            let path = format!("{folder}/{}/map.fits", MHZ[1]);
+            let options = lunarray::sky::fits::ReadOptions::default();
+            lunarray::sky::fits::read_whole_map(Path::new(&path), &options).unwrap().into_values()
+        };
+        assert_eq!(values(&case), values(&alone), "{case}");
+    }
+    let gains = |folder: &str| std::fs::read(format!("{folder}/gains.json")).unwrap();
+    assert!(gains(&format!("{out}/case-calibrated-large/calibration")) == gains(&place.path("solved")));
+    // What is kept, by the spectra of separate commands.
+    let power = |folder: &str, name: &str, l: usize| {
+        let text = std::fs::read_to_string(format!("{folder}/summary.json")).unwrap();
+        let summary: serde_json::Value = serde_json::from_str(&text).unwrap();
+        summary["channels"][1]["power"][name][l].as_f64().unwrap()
+    };
+    let kept = &summary["cases"][2]["figures"]["channels"][1]["power_kept"];
+    for l in 0..=8 {
+        for (name, of, square) in [("cl_ratio", "map_k2", false), ("coherent", "cross_k2", true)] {
+            let ratio = power(&spoilt, of, l) / power(&ideal, of, l);
+            let expected = if square { ratio * ratio } else { ratio };
+            assert!((kept[name][l].as_f64().unwrap() / expected - 1.0).abs() < 1e-12, "{name}, {l}");
+        }
+    }
+    let coherent = |number: usize, l: usize| {
+        summary["cases"][number]["figures"]["channels"][1]["power_kept"]["coherent"][l].as_f64().unwrap()
+    };
+    let mean = |number| (2..=8).map(|l| coherent(number, l)).sum::<f64>() / 7.0;
+    eprintln!("coherent: {:.3} as sent, {:.3} calibrated", mean(2), mean(3));
+    // The bounds of the tests above.
+    assert!(mean(2) < 0.5 && mean(3) > 0.95 && mean(3) < 1.05);
+    assert!(summary["cases"][0]["figures"]["channels"][1]["power_kept"]["coherent"][4].as_f64() == Some(1.0));
+    // Nothing is made again; with a map to calibrate with, only what is calibrated.
+    let made =
+        |case: &str| std::fs::metadata(format!("{out}/case-{case}/case.json")).unwrap().modified().unwrap();
+    let before = ["as-sent-large", "calibrated-large"].map(made);
+    assert_eq!(serde_json::from_str::<serde_json::Value>(&succeed(&args)).unwrap(), summary);
+    assert_eq!(["as-sent-large", "calibrated-large"].map(made), before);
+    // The model is of the sky of both channels: one is missing.
+    let model = format!("model = [\"{ideal}/{}/input.fits\"]\n{STUDY}", MHZ[0]);
+    let study = place.file("modelled.toml", model.as_bytes());
+    args[1] = &study;
+    assert!(fail(&args).contains("one a channel of the downlink"));
+    assert_eq!(made("as-sent-large"), before[0]);
+}
+
 #[test]
 fn what_does_not_fit_is_refused() {
     let place = Workplace::new(SMALL);

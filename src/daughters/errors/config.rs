@@ -187,6 +187,12 @@ impl InstrumentConfig {
             || self.beacon.k_sr > 0.0
     }
 
+    /// The same schedule of the artificial signal, and no errors.
+    #[must_use]
+    pub fn without_errors(&self) -> Self {
+        Self { beacon: self.beacon.clone(), ..Self::default() }
+    }
+
     /// Whether there are bursts of interference.
     #[must_use]
     pub fn has_bursts(&self) -> bool {
