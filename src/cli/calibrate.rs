@@ -7,6 +7,7 @@ use clap::Args;
 use super::arguments::MapFileArgs;
 use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_json_line, print_notes, print_text};
+use super::progress::CalibrateLines;
 use crate::pipeline::{CalibrateJob, CalibrateSummary, ConfigSource, calibrate, use_threads};
 use crate::sky::fits::read_whole_map;
 
@@ -51,7 +52,14 @@ pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
     let models = args.model.iter().map(|path| read_whole_map(path, &options)).collect::<Result<_, _>>()?;
     let interrupt = Interrupt::default();
     interrupt.arm_or_note();
-    let job = CalibrateJob { config: &config, files: &args.files, models, out: &args.out };
+    let mut lines = CalibrateLines::new();
+    let job = CalibrateJob {
+        config: &config,
+        files: &args.files,
+        models,
+        out: &args.out,
+        watch: &mut |at| lines.show(&at),
+    };
     let summary = calibrate(job, interrupt.cancel())?;
     print_notes(&summary.conventions);
     interrupt.completion(summary.cancelled).after(if args.json {

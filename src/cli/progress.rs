@@ -12,7 +12,7 @@ use super::events::progress_of;
 use super::log::{Level, is_json, print_line, say, say_entry};
 use crate::accumulation::ChannelGroup;
 use crate::downlink::transport::socket::ListenStatus;
-use crate::pipeline::{ChannelCost, GroupStep, Plan, RunGroups, Watched};
+use crate::pipeline::{CalibrateProgress, ChannelCost, GroupStep, Plan, RunGroups, Watched};
 use crate::runtime::Cancel;
 use crate::solve::Solving;
 
@@ -70,6 +70,49 @@ impl Drop for Progress {
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
+    }
+}
+
+/// Lines of how far a calibration is.
+pub(super) struct CalibrateLines {
+    last: Instant,
+    /// When the round began, and its number; not while its map is made.
+    round: Option<(Instant, u32)>,
+}
+
+impl CalibrateLines {
+    pub(super) fn new() -> Self {
+        let now = Instant::now();
+        Self { last: now, round: Some((now, 0)) }
+    }
+
+    /// Shows where it is, at most every ten seconds.
+    pub(super) fn show(&mut self, at: &CalibrateProgress) {
+        let of = if at.last_round > 0 {
+            format!(", round {} of {}", at.round, at.last_round)
+        } else {
+            String::new()
+        };
+        let Some(passes) = at.passes else {
+            self.round = None;
+            say("progress", &json!(at), format_args!("  gains{of}: the map to go on with"));
+            return;
+        };
+        let begun = match self.round {
+            Some((begun, round)) if round == at.round => begun,
+            _ => self.round.insert((Instant::now(), at.round)).0,
+        };
+        if self.last.elapsed() < LINE_EVERY || at.read <= 0.0 {
+            return;
+        }
+        self.last = Instant::now();
+        let left_s = begun.elapsed().as_secs_f64() * (1.0 / at.read - 1.0).max(0.0);
+        let part = 100.0 * at.read.min(1.0);
+        say(
+            "progress",
+            &json!(at),
+            format_args!("  gains{of}: {passes} passes, {part:.0} % of the data, about {left_s:.0} s left"),
+        );
     }
 }
 

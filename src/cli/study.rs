@@ -9,9 +9,9 @@ use super::arguments::size_bytes;
 use super::interrupt::Interrupt;
 use super::log::say;
 use super::output::{CommandResult, print_json_line, print_notes, print_text};
-use super::progress::Progress;
+use super::progress::{CalibrateLines, Progress};
 use crate::pipeline::{
-    INTEGRATE, MemoryLimit, READ, Segment, Study, StudyPhase, StudySummary, run_study, use_threads,
+    INTEGRATE, MemoryLimit, READ, Segment, Study, StudyStep, StudySummary, run_study, use_threads,
 };
 
 /// Run a pipeline at every combination of some settings, and show the results side by side.
@@ -61,24 +61,34 @@ pub(super) fn execute(args: &StudyArgs) -> CommandResult {
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&study.name));
     let interrupt = Interrupt::default();
     let mut progress: Option<Progress> = None;
-    let summary = run_study(&study, &out, args.keep, interrupt.cancel(), &mut |number, phase, watched| {
+    let mut gains: Option<(usize, CalibrateLines)> = None;
+    let summary = run_study(&study, &out, args.keep, interrupt.cancel(), &mut |number, step| {
         interrupt.arm_or_note();
+        let case = &study.cases[number];
+        let (of, label) = (study.cases.len(), case.label());
+        let begin = |what: &str| {
+            let fields = json!({ "number": number + 1, "of": of, "what": what, "label": label });
+            say("case", &fields, format_args!("case {} of {of}: {what} {label}", number + 1));
+        };
+        let (watched, what, stage, total) = match step {
+            StudyStep::Calibrate(at) => {
+                drop(progress.take());
+                if gains.as_ref().is_none_or(|(of, _)| *of != number) {
+                    begin("calibrating");
+                    gains = Some((number, CalibrateLines::new()));
+                }
+                gains.iter_mut().for_each(|(_, lines)| lines.show(&at));
+                return;
+            }
+            StudyStep::Simulate(watched) => {
+                (watched, "simulating for", INTEGRATE, case.plan.windows_watched())
+            }
+            StudyStep::Map(watched) => (watched, "mapping", READ, 0),
+        };
         // The last one ends before the next begins.
         drop(progress.take());
-        let case = &study.cases[number];
-        let what = match phase {
-            StudyPhase::Simulate => "simulating for",
-            StudyPhase::Calibrate => "calibrating",
-            StudyPhase::Map => "mapping",
-        };
-        let (of, label) = (study.cases.len(), case.label());
-        let fields = json!({ "number": number + 1, "of": of, "what": what, "label": label });
-        say("case", &fields, format_args!("case {} of {of}: {what} {label}", number + 1));
-        let (stage, total) = match phase {
-            StudyPhase::Simulate => (INTEGRATE, case.plan.windows_watched()),
-            StudyPhase::Calibrate | StudyPhase::Map => (READ, 0),
-        };
-        progress = watched.map(|watched| Progress::watch(watched, stage, total, interrupt.cancel()));
+        begin(what);
+        progress = Some(Progress::watch(watched, stage, total, interrupt.cancel()));
     })?;
     drop(progress);
     if summary.cancelled {

@@ -37,6 +37,24 @@ pub struct CalibrateJob<'a> {
     pub models: Vec<SkyMap>,
     /// Folder for the products.
     pub out: &'a Path,
+    /// Is told after each pass how far it is.
+    pub watch: CalibrateWatcher<'a>,
+}
+
+/// Follows a calibration.
+pub type CalibrateWatcher<'a> = &'a mut dyn FnMut(CalibrateProgress);
+
+/// How far a calibration is.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct CalibrateProgress {
+    /// Number of the round; 0 with the given model.
+    pub round: u32,
+    /// Number of the last one, unless gains settle before.
+    pub last_round: u32,
+    /// Passes solved in it; `None` while its map is made.
+    pub passes: Option<u64>,
+    /// Part of the data that it has read, 0 to 1.
+    pub read: f64,
 }
 
 /// One solution of all passes, and the map that it was made with.
@@ -96,7 +114,7 @@ pub struct CalibrateSummary {
 /// # Errors
 /// Files that cannot be read; maps that do not fit the channels; a failed replay.
 pub fn calibrate(job: CalibrateJob<'_>, cancel: &Cancel) -> Result<CalibrateSummary, PipelineError> {
-    let CalibrateJob { config, files, models, out } = job;
+    let CalibrateJob { config, files, models, out, watch } = job;
     let solver = &config.calibrate;
     check(config, &models)?;
     let _lock = lock_folder(out)?;
@@ -105,22 +123,29 @@ pub fn calibrate(job: CalibrateJob<'_>, cancel: &Cancel) -> Result<CalibrateSumm
         _ => solver.clone(),
     };
     let van_vleck = config.calibration.van_vleck()?;
-    let solve = |solver: &SolverConfig, maps: &[SkyMap]| {
-        Passes { solver, files, maps, van_vleck: van_vleck.as_ref(), cancel }.solve()
+    let bytes = files.iter().map(|file| std::fs::metadata(file).map_or(0, |file| file.len())).sum::<u64>();
+    let last_round = solver.map_rounds;
+    let solve = |round: u32, solver: &SolverConfig, maps: &[SkyMap], watch: CalibrateWatcher<'_>| {
+        let passes = Passes { solver, files, maps, van_vleck: van_vleck.as_ref(), cancel };
+        passes.solve(&mut |passes, read_bytes| {
+            let read = read_bytes as f64 / bytes.max(1) as f64;
+            watch(CalibrateProgress { round, last_round, passes: Some(passes), read });
+        })
     };
     let mut rounds = Vec::new();
-    let mut found = solve(&first, &models)?;
+    let mut found = solve(0, &first, &models, watch)?;
     rounds.push(found.round(0, first.mode, None, Vec::new()));
     for round in 1..=solver.map_rounds {
         if cancel.is_cancelled() {
             break;
         }
+        watch(CalibrateProgress { round, last_round, passes: None, read: 0.0 });
         let maps = make_maps(config, files, &found, &out.join(format!("round-{round}")), cancel)?;
         if cancel.is_cancelled() {
             break;
         }
         let powers = maps.iter().map(power).collect::<Result<_, PipelineError>>()?;
-        let next = solve(solver, &maps)?;
+        let next = solve(round, solver, &maps, watch)?;
         let change = change_rms(&found.solutions, &next.solutions);
         rounds.push(next.round(round, solver.mode, Some(change), powers));
         found = next;
@@ -200,11 +225,13 @@ struct OpenPass {
 }
 
 impl Passes<'_> {
-    fn solve(&self) -> Result<FoundSolutions, PipelineError> {
+    /// Solves all passes; `watch` hears after each their number and the bytes that are read.
+    fn solve(&self, watch: &mut dyn FnMut(u64, u64)) -> Result<FoundSolutions, PipelineError> {
         let mut found = FoundSolutions::default();
         let mut ephemeris = Ephemeris::default();
         let mut signal: Option<KnownSignal> = None;
         let mut open = OpenPass::default();
+        let mut bytes_before = 0;
         for file in self.files {
             let mut reader = DownlinkReader::open(file)?;
             while let Some(frame) = reader.next_frame()? {
@@ -227,6 +254,7 @@ impl Passes<'_> {
                             Some([_, until_s]) if of[0] > until_s + gap_s => {
                                 let pass = std::mem::take(&mut open);
                                 self.close(pass, &ephemeris, &mut signal, &mut found)?;
+                                watch(found.passes, bytes_before + reader.bytes());
                             }
                             Some([from_s, _]) if of[1] < from_s - gap_s => {
                                 found.late += block.len() as u64;
@@ -241,6 +269,7 @@ impl Passes<'_> {
                     _ => {}
                 }
             }
+            bytes_before += reader.bytes();
         }
         self.close(open, &ephemeris, &mut signal, &mut found)?;
         if found.instrument.is_none() {

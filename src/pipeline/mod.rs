@@ -33,7 +33,9 @@ mod state;
 mod study;
 mod summary;
 
-pub use calibrate::{CalibrateJob, CalibrateRound, CalibrateSummary, calibrate};
+pub use calibrate::{
+    CalibrateJob, CalibrateProgress, CalibrateRound, CalibrateSummary, CalibrateWatcher, calibrate,
+};
 pub use config::Config;
 pub use config_reader::ReadProblem;
 pub use config_source::{ConfigError, ConfigSource, QUICKLOOK};
@@ -58,6 +60,6 @@ pub use simulation_groups::{MERGE, simulate_in_groups};
 pub use space_segment::{INTEGRATE, sky_notes};
 pub use state::solve_state;
 pub use study::{
-    CaseSummary, Study, StudyCase, StudyError, StudyPhase, StudySummary, StudyWatcher, run_study,
+    CaseSummary, Study, StudyCase, StudyError, StudyStep, StudySummary, StudyWatcher, run_study,
 };
 pub use summary::{RunScope, RunSummary};

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use super::calibrate::{CalibrateJob, calibrate, with_gains};
+use super::calibrate::{CalibrateJob, CalibrateProgress, calibrate, with_gains};
 use super::config::Config;
 use super::config_source::ConfigSource;
 use super::error::PipelineError;
@@ -299,19 +299,19 @@ fn steps(axis: &AxisFile) -> Option<Vec<(String, Vec<String>)>> {
     (!steps.is_empty()).then_some(steps)
 }
 
-/// What a study is doing.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum StudyPhase {
-    /// Simulating the downlink that some cases share.
-    Simulate,
+/// What a study is doing for a case.
+#[derive(Clone, Debug)]
+pub enum StudyStep {
+    /// Simulating the downlink that it shares with others, with the handles of the graph.
+    Simulate(Watched),
     /// Finding the gains of its data.
-    Calibrate,
-    /// Mapping a case.
-    Map,
+    Calibrate(CalibrateProgress),
+    /// Mapping it, with the handles of the graph.
+    Map(Watched),
 }
 
-/// Follows a study: the number of the case, from 0, what is done for it, and the handles of its graph if it has one.
-pub type StudyWatcher<'a> = &'a mut dyn FnMut(usize, StudyPhase, Option<Watched>);
+/// Follows a study: the number of the case, from 0, and what is done for it.
+pub type StudyWatcher<'a> = &'a mut dyn FnMut(usize, StudyStep);
 
 /// Results of a study.
 #[derive(Clone, Debug, Serialize)]
@@ -472,7 +472,7 @@ impl Making<'_> {
                 (Destination::from(&file), recorder),
                 self.cancel,
                 &mut |watched| {
-                    watch(group[0], StudyPhase::Simulate, Some(watched));
+                    watch(group[0], StudyStep::Simulate(watched));
                 },
             )?;
             if report.cancelled {
@@ -522,12 +522,13 @@ impl Making<'_> {
         fs::create_dir_all(&folder)
             .map_err(|source| ProductsError::Write { path: folder.clone(), source })?;
         let out = folder.join("calibration");
-        (self.watch)(number, StudyPhase::Calibrate, None);
+        let watch = &mut self.watch;
         let job = CalibrateJob {
             config: &case.plan.config,
             files: &[file.to_owned()],
             models: self.study.models.clone(),
             out: &out,
+            watch: &mut |progress| watch(number, StudyStep::Calibrate(progress)),
         };
         let summary = calibrate(job, self.cancel)?;
         Ok((!summary.cancelled).then(|| out.join("gains.json")))
@@ -560,7 +561,7 @@ impl Making<'_> {
         let source = FileSource::open(files)?;
         let watch = &mut self.watch;
         let summary = replay_knowing(truth, source, config, ground, &folder, self.cancel, &mut |watched| {
-            watch(number, StudyPhase::Map, Some(watched));
+            watch(number, StudyStep::Map(watched));
         })?;
         if summary.cancelled {
             return Ok(false);

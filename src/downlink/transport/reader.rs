@@ -64,6 +64,12 @@ impl<R: Read> DownlinkReader<R> {
         self.decoder.counters()
     }
 
+    /// Bytes read so far.
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        self.events.intake().bytes()
+    }
+
     /// The counters of the coded frames, if the file holds any.
     #[must_use]
     pub fn frames(&self) -> Option<FrameCounters> {
