@@ -501,7 +501,31 @@ mod tests {
             lines[1].starts_with("\"b < b_p, \"\"all\"\"\",10000000,8,5,1e-4,2e0,9.5e0,1e1,5e-1,3e0,,5e-1,,")
         );
         let spectra = spectra_csv(&all);
-        assert_eq!(spectra.lines().nth(2).unwrap(), "\"b < b_p, \"\"all\"\"\",10000000,1,,,,,2e0,1e0,");
+        assert_eq!(spectra.lines().nth(2).unwrap(), "\"b < b_p, \"\"all\"\"\",10000000,1,,,,,2e0,1e0,,,");
+        // The header has as many fields as the lines.
+        for text in [&table, &spectra] {
+            let fields = |line: usize| text.lines().nth(line).unwrap().replace(", ", " ").split(',').count();
+            assert_eq!(fields(0), fields(1), "{text}");
+        }
         assert!(draw_runs("runs", &all).is_ok());
+    }
+    #[test]
+    fn power_kept_is_relative_to_the_ideal_map() {
+        let ideal = run("ideal", 1e-4, 1.0, 1.0);
+        let mut spoilt = run("spoilt", 1e-4, 1.0, 1.0);
+        let power = spoilt.channels[0].power.as_mut().unwrap();
+        power.map_k2 = vec![power.map_k2[0].map(|c| 3.0 * c), Some(1.0)];
+        power.cross_k2 = vec![power.cross_k2[0].map(|c| 0.5 * c), Some(0.25)];
+        spoilt.against_ideal(&ideal);
+        let kept = spoilt.channels[0].power_kept.as_ref().unwrap();
+        // Where the ideal map's power is not known, neither is the ratio.
+        assert!((kept.cl_ratio[0].unwrap() - 3.0).abs() < 1e-12 && kept.cl_ratio[1].is_none());
+        assert!((kept.coherent[0].unwrap() - 0.25).abs() < 1e-12 && kept.coherent[1] == Some(0.0625));
+        // Two degrees are no mean over 20 <= l <= 120, and other frequencies are not compared.
+        assert_eq!(spoilt.channels[0].power_kept_means(), [None, None]);
+        let mut other = ideal.clone();
+        other.channels[0].frequency_hz = 2e7;
+        spoilt.against_ideal(&other);
+        assert!(spoilt.channels[0].power_kept.is_none());
     }
 }
