@@ -35,6 +35,21 @@ pub enum ConfigError {
         /// The system's error.
         source: std::io::Error,
     },
+    /// The file is no text.
+    #[error(
+        "{}: not text; expected a pipeline file (TOML). `lunarray inspect` and `replay` read a downlink, and sky.file names a map",
+        path.display()
+    )]
+    NotText {
+        /// Path.
+        path: PathBuf,
+    },
+    /// The file is a study.
+    #[error("{}: a study, with [[axis]]; expected a pipeline file: run it by `lunarray study {}`", path.display(), path.display())]
+    Study {
+        /// Path.
+        path: PathBuf,
+    },
     /// The file is too long for a pipeline file.
     #[error("{}: more than {FILE_BYTES_MAX} bytes; expected a pipeline file, which has some thousand", path.display())]
     TooLong {
@@ -158,6 +173,9 @@ impl ConfigSource {
             Ok(table) => table,
             Err(problems) => return Err(ConfigError::Values { origin, problems }),
         };
+        if let Some(path) = self.file.as_ref().filter(|_| is_study(&table)) {
+            return Err(ConfigError::Study { path: path.clone() });
+        }
         read_units(&mut table);
         let mut lines = Lines::of(text);
         let mut bad_overrides = Vec::new();
@@ -173,6 +191,7 @@ impl ConfigSource {
             }
         }
         read_units(&mut table);
+        channel_lists::of_one(&mut table);
         if let Some(before) = channels_hz {
             notes.extend(channel_lists::follow(&mut table, &before, |key| keys.contains(&key)));
         }
@@ -192,15 +211,24 @@ impl ConfigSource {
     }
 }
 
+/// Whether a table is that of a study, which has axes where a pipeline has sections.
+pub(super) fn is_study(table: &toml::Table) -> bool {
+    table.get("axis").is_some_and(toml::Value::is_array)
+}
+
 fn read(path: &Path) -> Result<String, ConfigError> {
     let failed = |source| ConfigError::Read { path: path.to_owned(), source };
     let file = std::fs::File::open(path).map_err(failed)?;
-    let mut text = String::new();
-    let bytes = file.take(FILE_BYTES_MAX + 1).read_to_string(&mut text).map_err(failed)?;
-    if bytes as u64 > FILE_BYTES_MAX {
-        return Err(ConfigError::TooLong { path: path.to_owned() });
+    let mut bytes = Vec::new();
+    file.take(FILE_BYTES_MAX + 1).read_to_end(&mut bytes).map_err(failed)?;
+    let is_long = bytes.len() as u64 > FILE_BYTES_MAX;
+    // The last character of a part may be cut.
+    let is_text = |error: std::str::Utf8Error| is_long && error.error_len().is_none();
+    match String::from_utf8(bytes) {
+        Err(error) if !is_text(error.utf8_error()) => Err(ConfigError::NotText { path: path.to_owned() }),
+        Ok(text) if !is_long => Ok(text),
+        _ => Err(ConfigError::TooLong { path: path.to_owned() }),
     }
-    Ok(text)
 }
 
 /// Sets `key=value` in a table; a value that is not TOML is a string. Returns the key.
@@ -329,6 +357,19 @@ mod tests {
             let told = load("", &[bad]).unwrap_err().to_string();
             assert!(told.contains("invalid type: string"), "{bad}: {told}");
         }
+    }
+
+    #[test]
+    fn one_frequency_is_one_channel() {
+        for text in ["3MHz", "3e6", "3_000_000", "[3MHz]"] {
+            let config = with(&[&format!("spacecraft.channels_hz={text}")]).unwrap();
+            assert_eq!(config.spacecraft.channels_hz, [3e6], "{text}");
+        }
+        let told = with(&["spacecraft.channels_hz=lots"]).unwrap_err().to_string();
+        assert!(
+            told.contains("spacecraft.channels_hz: invalid type: string \"lots\", expected a list"),
+            "{told}"
+        );
     }
 
     #[test]
