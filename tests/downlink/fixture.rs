@@ -11,11 +11,11 @@ use lunarray::frames::{
 use lunarray::units::{ChannelId, MissionTime, Pair};
 use num_complex::Complex32;
 
-/// What `tests/python/downlink_make.py` wrote, by the same formulas.
+/// What `tests/python/downlink_make.py` wrote, by the same formulas: `0.0 - x` as Python's integers have no negative zero.
 fn sent() -> Vec<GroundFrame> {
     let channel = |frequency_hz, width_hz| Channel { frequency_hz, width_hz };
     let position =
-        |node: u32, satellite: u32| [1e6 + f64::from(1000 * node + satellite), -f64::from(node), 0.5];
+        |node: u32, satellite: u32| [1e6 + f64::from(1000 * node + satellite), 0.0 - f64::from(node), 0.5];
     vec![
         GroundFrame::Instrument(Instrument {
             name: "made elsewhere".to_owned(),
@@ -41,7 +41,7 @@ fn sent() -> Vec<GroundFrame> {
             start: MissionTime(500_000),
             offset_ticks: (0..4).map(|k| 250_000 * k).collect(),
             duration_ticks: (0..4).map(|k| 200_000 + k).collect(),
-            value_k_sr: (0..4_u8).map(|k| Complex32::new(f32::from(k) + 0.25, -f32::from(k))).collect(),
+            value_k_sr: (0..4_u8).map(|k| Complex32::new(f32::from(k) + 0.25, 0.0 - f32::from(k))).collect(),
             weight: vec![1.0, 2.0, 4.0, 8.0],
             flags: vec![Flags::GOOD, Flags::INTERFERENCE, Flags::INCOMPLETE, Flags::GOOD],
         }),
