@@ -144,6 +144,7 @@ fn messages_name_file_finding_and_expectation() {
     assert!(message(&forged(&good, "NSIDE   = 17")).contains("NSIDE is 17"));
     assert!(message(&forged(&good, "NSIDE   = 32")).contains("12288"));
     assert!(message(&forged(&good, "ORDERING= 'SPIRAL'")).contains("SPIRAL"));
+    assert!(message(&forged(&good, "ORDERING= T")).contains("ORDERING is T; expected RING or NESTED"));
     assert!(message(&forged(&good, "COORDSYS= 'X'")).contains("'X'"));
     assert!(message(&forged(&good, "COORDSYS")).contains("COORDSYS is missing"));
     assert!(message(&forged(&good, "NAXIS2")).contains("NAXIS2 is missing"));
