@@ -282,7 +282,10 @@ mod tests {
             ("map.nside", "expected key=value"),
             ("=8", "expected key=value"),
             ("seed.more=1", "--set seed.more: `seed` is not a section"),
-            ("map.nsides=8", "--set map.nsides=8: map.nsides: no such key; [map] has baseline_bp_max, "),
+            (
+                "map.nsides=8",
+                "--set map.nsides=8: map.nsides: no such key; did you mean nside? [map] has baseline_bp_max, ",
+            ),
             ("a.b.c.d.e.f.g.h.i.j=1", "expected key=value"),
         ] {
             let told = with(&["seed=5", bad]).unwrap_err().to_string();
@@ -306,12 +309,12 @@ mod tests {
         let expected = [
             "here: 13 problem(s)",
             "--set runtime.threads: expected key=value",
-            "line 5: map.l_maxx: no such key; [map] has",
+            "line 5: map.l_maxx: no such key; did you mean l_max? [map] has",
             "line 3: map.nside: invalid type: string \"big\", expected a whole number, not negative",
             "--set map.weight_max=lots: map.weight_max: invalid type: string \"lots\", expected a number",
             "line 17: products.pictures: invalid type: integer `1`, expected a boolean",
             "line 7: sat: no such key; a pipeline has",
-            "line 1: sed: no such key",
+            "line 1: sed: no such key; did you mean seed? a pipeline has",
             "line 14: sky.file: expected one value, or a list with one for each channel",
             "--set spacecraft.antenna=\"dish\": spacecraft.antenna: unknown variant `dish`, expected `isotropic`",
             "line 12: spacecraft.ninth: found one value (integer), expected a section",
