@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import operator
 from os import PathLike
 from typing import Any
 
@@ -57,7 +58,11 @@ class Downlink:
         2 k nu^2 / c^2; ``weight`` the inverse variance of the real part, (K sr)^-2; ``flag`` is 0 for a good one. UTC is TAI less
         37 s, as since 2017.
         """
-        return self._native.visibilities(channel).view(VISIBILITY)
+        # The native function counts in 16 bits, and Python would say no more than that another number does not fit.
+        number, count = operator.index(channel), len(self.channels_hz)
+        if not 0 <= number < count:
+            raise _native.LunarrayError(f"channel {number}: expected one of the file's {count} channels, from 0")
+        return self._native.visibilities(number).view(VISIBILITY)
 
     def autos(self) -> NDArray[np.void]:
         """The auto-correlations of all channels, a structured array with the frequency of each; power in K sr."""

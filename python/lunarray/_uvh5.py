@@ -9,6 +9,8 @@ from contextlib import ExitStack
 
 import numpy as np
 
+from ._native import LunarrayError
+
 #: Mean obliquity of the ecliptic at J2000, rad (IAU 1976, which HEALPix uses).
 OBLIQUITY = np.radians(23.4392911)
 
@@ -40,12 +42,13 @@ def to_uvdata(downlink, channel, phase_centre):
     from astropy.utils import iers
     from pyuvdata import Telescope, UVData
 
+    ra_deg, dec_deg = phase_centre
+    if not (-360 <= ra_deg <= 360 and -90 <= dec_deg <= 90):
+        raise LunarrayError(f"phase_centre = {phase_centre}: expected right ascension and declination, degrees")
     rows = downlink.visibilities(channel)
     rows = rows[(rows["flag"] == 0) & np.isfinite(rows["uvw_m"][:, 0])]
     rows = rows[np.argsort(rows["time_s"], kind="stable")]
     if len(rows) == 0:
-        from ._native import LunarrayError
-
         raise LunarrayError(f"{downlink.path}: no good visibility of channel {channel} with positions")
     frequency_hz = downlink.channels_hz[channel]
     frame = axes(phase_centre) @ ECLIPTIC_TO_ICRS

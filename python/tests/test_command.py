@@ -1,5 +1,7 @@
 """The command line that the wheel brings along."""
 
+import importlib.metadata
+import json
 import os
 import signal
 import subprocess
@@ -25,6 +27,15 @@ def test_the_command_is_there_in_both_ways(command):
     assert wrong.returncode == 2 and "unrecognized subcommand 'ran'" in wrong.stderr
     failed = said(*command, "inspect", "nowhere.ccsds")
     assert failed.returncode == 1 and "error: " in failed.stderr and "nowhere.ccsds" in failed.stderr
+
+
+def test_the_wheel_brings_licences_and_a_bill_of_materials():
+    files = {file.name: file for file in importlib.metadata.files("lunarray")}
+    assert "Permission is hereby granted" in files["LICENSE-MIT"].read_text()
+    assert "Apache License" in files["LICENSE-APACHE"].read_text()
+    bill = json.loads(files["lunarray-python.cyclonedx.json"].read_text())
+    named = {part["name"] for part in bill["components"]}
+    assert bill["bomFormat"] == "CycloneDX" and {"lunarray", "pyo3", "bincode", "faer"} <= named
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")

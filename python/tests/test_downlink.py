@@ -144,5 +144,11 @@ def test_files_that_are_none_are_refused(small, tmp_path):
         lunarray.open(empty)
     with pytest.raises(lunarray.Error, match="channel 2: expected one of the file's 2 channels, from 0"):
         lunarray.open(small.downlink).visibilities(2)
+    for beyond in (-1, 65536):
+        with pytest.raises(lunarray.Error, match=f"channel {beyond}: expected one of the file's 2 channels, from 0"):
+            lunarray.open(small.downlink).visibilities(beyond)
+    for nowhere in ((0, 95), (0, float("nan")), (1e3, 0)):
+        with pytest.raises(lunarray.Error, match="expected right ascension and declination"):
+            lunarray.open(small.downlink).write_uvh5(tmp_path / "x.uvh5", phase_centre=nowhere)
     with pytest.raises(lunarray.Error, match="-1e9 to 1e9"):
         lunarray.open(small.downlink).ephemeris(float("nan"))

@@ -4,7 +4,7 @@ use thiserror::Error;
 
 use crate::response::harmonic::GeometryRefusal;
 use crate::response::pixel::ResponseError;
-use crate::units::{ChannelId, InvalidValue};
+use crate::units::{ChannelId, Dimension, InvalidValue};
 
 /// Why visibilities could not be summed.
 #[derive(Debug, Error)]
@@ -30,7 +30,7 @@ pub enum AccumulationError {
     #[error("visibilities of channel {0} are to be removed, but its sums do not hold them")]
     NothingHeld(ChannelId),
     /// Data of another frequency.
-    #[error("a block at {found_hz} Hz for an engine at {expected_hz} Hz")]
+    #[error("a block at {} for an engine at {}", Dimension::Frequency.show(*found_hz), Dimension::Frequency.show(*expected_hz))]
     Frequency {
         /// The engine's, Hz.
         expected_hz: f64,

@@ -337,19 +337,27 @@ impl Accumulator {
         Ok(())
     }
 
-    /// The sums that `placed` belongs to, created with the first data; `None` if its positions determine no orbit.
-    fn sums(&mut self, placed: &PlacedVisibilities) -> Result<Option<&mut ChannelSums>, AccumulationError> {
+    /// The sums that `placed` belongs to, created with the first data; or why its positions determine no orbit.
+    fn sums(
+        &mut self,
+        placed: &PlacedVisibilities,
+    ) -> Result<Result<&mut ChannelSums, VisibilityReason>, AccumulationError> {
         let channel = placed.channel;
         let index = usize::from(channel.0);
         let unknown = || AccumulationError::UnknownChannel(channel);
         let instrument = self.instrument.as_ref().ok_or_else(unknown)?;
         let slot = self.channels.get_mut(index).ok_or_else(unknown)?;
-        if slot.is_none() {
-            let Some(engine) = engine(&self.config, instrument, placed)? else { return Ok(None) };
-            let engine = engine.among(&self.ranks);
-            *slot = Some(ChannelSums { engine, span_s: NO_SPAN_S, snapshots: 0 });
-        }
-        Ok(slot.as_mut())
+        let sums = match slot {
+            Some(sums) => sums,
+            empty => match engine(&self.config, instrument, placed)? {
+                Ok(engine) => {
+                    let engine = engine.among(&self.ranks);
+                    empty.insert(ChannelSums { engine, span_s: NO_SPAN_S, snapshots: 0 })
+                }
+                Err(reason) => return Ok(Err(reason)),
+            },
+        };
+        Ok(Ok(sums))
     }
 
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Option<[f64; 2]>, AccumulationError> {
@@ -364,9 +372,12 @@ impl Accumulator {
             // A channel without usable data has no sums, and no map.
             return Ok(None);
         }
-        let Some(sums) = self.sums(&near)? else {
-            self.ledger.left_out(VisibilityReason::NoDirection, near.len() as u64);
-            return Ok(None);
+        let sums = match self.sums(&near)? {
+            Ok(sums) => sums,
+            Err(reason) => {
+                self.ledger.left_out(reason, near.len() as u64);
+                return Ok(None);
+            }
         };
         let Added { visibilities, refused } = sums.engine.add(&near)?;
         let offered_s = near.time_s.first().zip(near.time_s.last()).map(|(&first, &last)| [first, last]);
@@ -421,12 +432,12 @@ impl Accumulator {
     }
 }
 
-/// An engine for the channel of `placed`, which is its first data; `None` if its positions determine no orbit.
+/// An engine for the channel of `placed`, which is its first data; or why its positions determine no orbit.
 fn engine(
     config: &MapConfig,
     instrument: &Instrument,
     placed: &PlacedVisibilities,
-) -> Result<Option<Engine>, AccumulationError> {
+) -> Result<Result<Engine, VisibilityReason>, AccumulationError> {
     let Some(&Channel { frequency_hz, width_hz }) = instrument.channels.get(usize::from(placed.channel.0))
     else {
         return Err(AccumulationError::UnknownChannel(placed.channel));
@@ -437,7 +448,7 @@ fn engine(
         weight_max => weight_max,
     };
     Ok(match config.engine {
-        EngineKind::Pixel => Some(Engine::Pixel(Box::new(PixelEngine::new(PixelSetup {
+        EngineKind::Pixel => Ok(Engine::Pixel(Box::new(PixelEngine::new(PixelSetup {
             nside: config.nside,
             frequency_hz,
             method: config.rows,
@@ -447,7 +458,7 @@ fn engine(
             weight_max,
         })?))),
         EngineKind::Harmonic if config.refine.is_on() => {
-            Some(Engine::Refined(Box::new(VisibilityArchive::new(RefinedSetup {
+            Ok(Engine::Refined(Box::new(VisibilityArchive::new(RefinedSetup {
                 channel: placed.channel,
                 l_max: config.degree(),
                 frequency_hz,
@@ -461,7 +472,11 @@ fn engine(
             })?)))
         }
         EngineKind::Harmonic => match orbit_of(placed, config.limits) {
-            Some(orbit) => Some(Engine::Harmonic(Box::new(HarmonicEngine::new(HarmonicSetup {
+            // Positions come from outside: what no satellite can have is refused, and later data may have others.
+            Some(orbit) if orbit.radius_m <= moon_radius_m.max(config.baseline_m_max(frequency_hz)) => {
+                Err(VisibilityReason::OffAltitude)
+            }
+            Some(orbit) => Ok(Engine::Harmonic(Box::new(HarmonicEngine::new(HarmonicSetup {
                 l_max: config.degree(),
                 frequency_hz,
                 baseline_m_max: config.baseline_m_max(frequency_hz),
@@ -471,7 +486,7 @@ fn engine(
                 companion_seed: config.companion_seed,
                 weight_max,
             })?))),
-            None => None,
+            None => Err(VisibilityReason::NoDirection),
         },
     })
 }

@@ -195,6 +195,9 @@ pub enum ArrayError {
     },
 }
 
+/// Greatest radius or altitude that is accepted, m: the Moon's sphere of influence has 6.6e7 m.
+const ORBIT_M_MAX: f64 = 1e8;
+
 impl ArrayConfig {
     /// Whether satellites have orbits of their own, in place of a formation on one.
     #[must_use]
@@ -222,14 +225,16 @@ impl ArrayConfig {
         let mut checks = Checks::of("array");
         let count = self.satellites as f64;
         checks.number("satellites", count, (3..=MAX_SATELLITES).contains(&self.satellites), "3 to 64");
+        // As far away the Moon no longer holds them.
+        for (key, value) in [("moon_radius_m", self.moon_radius_m), ("altitude_m", self.altitude_m)] {
+            let inside = value > 0.0 && value <= ORBIT_M_MAX;
+            checks.number(key, value, inside, "above 0 and at most 1e8 m, beyond which the Earth takes over");
+        }
         for (key, value) in [
-            ("moon_radius_m", self.moon_radius_m),
-            ("altitude_m", self.altitude_m),
             ("precession_period_s", self.precession_period_s),
             ("breathing.period_s", breathing.period_s),
             ("breathing.first_spacing_m_min", breathing.first_spacing_m_min),
             ("breathing.second_spacing_m_min", breathing.second_spacing_m_min),
-            ("breathing.span_m_max", breathing.span_m_max),
         ] {
             checks.number(key, value, value > 0.0, POSITIVE);
         }
@@ -267,6 +272,10 @@ impl ArrayConfig {
             |m| m > 0.0 && m <= half_m,
             "m, above 0 and up to half of the orbit",
         );
+        let (span_m, of_breathing) = (breathing.span_m_max, arcs == 0 && !self.has_own_orbits());
+        let expected = "m, above 0 and up to half of the orbit";
+        let inside = span_m > 0.0 && (!of_breathing || span_m <= half_m);
+        checks.number("breathing.span_m_max", span_m, inside, expected);
         let orbits = self.kepler.len();
         let fits = orbits == 0 || orbits == self.satellites;
         checks.require("kepler", format_args!("({orbits} orbits)"), fits, "one for each satellite, or none");

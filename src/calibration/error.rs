@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use crate::units::{InvalidValue, Pair};
+use crate::units::{Dimension, InvalidValue, Pair};
 
 /// Errors of calibration.
 #[derive(Debug, Error)]
@@ -45,8 +45,8 @@ pub enum CalibrationError {
     },
     /// A channel without gains.
     #[error(
-        "no gains within {tolerance_hz} Hz of the channel at {frequency_hz} Hz, the nearest are for \
-         {nearest_hz} Hz; add them to the gains file or leave the channel out"
+        "no gains within {} of the channel at {}, the nearest are for {}; add them to the gains file or leave the channel out",
+        Dimension::Frequency.show(*tolerance_hz), Dimension::Frequency.show(*frequency_hz), Dimension::Frequency.show(*nearest_hz)
     )]
     Channel {
         /// Centre frequency of the channel, Hz.

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use clap::builder::{PathBufValueParser, TypedValueParser};
 
 use super::output::print_notes;
 use crate::ground::GroundError;
@@ -16,7 +17,7 @@ use crate::units::Dimension;
 #[derive(Debug, Args)]
 pub(super) struct PipelineArgs {
     /// Pipeline file (TOML); the embedded quicklook if none is given.
-    #[arg(value_name = "PIPELINE.toml")]
+    #[arg(value_name = "PIPELINE.toml", value_parser = input_path())]
     pipeline: Option<PathBuf>,
     /// Seed of all random numbers of the space segment, in place of the file's.
     #[arg(long)]
@@ -40,7 +41,7 @@ pub(super) struct PipelineArgs {
 #[derive(Debug, Args)]
 pub(super) struct ArrayArgs {
     /// Pipeline file (TOML) that describes the array; the paper's fiducial array if none is given.
-    #[arg(long, value_name = "PIPELINE.toml")]
+    #[arg(long, value_name = "PIPELINE.toml", value_parser = input_path())]
     pipeline: Option<PathBuf>,
     /// Replace one setting, for example --set array.inclination_deg=60; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
@@ -61,6 +62,27 @@ impl MapFileArgs {
     }
 }
 
+/// Standard input and output, as commands of a shell name them.
+const STANDARD: &str = "-";
+
+/// A file to be read; `-` is standard input.
+pub(super) fn input_path() -> impl TypedValueParser<Value = PathBuf> {
+    PathBufValueParser::new().map(|path| if is_standard(&path) { PathBuf::from("/dev/stdin") } else { path })
+}
+
+/// A file or folder to be written, which must have a name.
+pub(super) fn output_path() -> impl TypedValueParser<Value = PathBuf> {
+    PathBufValueParser::new().try_map(|path| match is_standard(&path) {
+        true => Err("expected a name, as this is not written to standard output; ./- is a file of that name"),
+        false => Ok(path),
+    })
+}
+
+/// Whether a path stands for standard input or output.
+pub(super) fn is_standard(path: &Path) -> bool {
+    path.as_os_str() == STANDARD
+}
+
 /// A frame by its name or letter.
 pub(super) fn frame(text: &str) -> Result<Frame, String> {
     Frame::from_coordsys(text).ok_or_else(|| "expected ecliptic, galactic or equatorial".to_owned())
@@ -70,7 +92,7 @@ pub(super) fn frame(text: &str) -> Result<Frame, String> {
 #[derive(Debug, Args)]
 pub(super) struct StateMapArgs {
     /// Map file (TOML) with which the state was made; the settings that the state itself holds if none is given.
-    #[arg(long, value_name = "MAP.toml")]
+    #[arg(long, value_name = "MAP.toml", value_parser = input_path())]
     map: Option<PathBuf>,
     /// Replace one setting, for example --set map.nside=8; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
@@ -182,6 +204,11 @@ pub(super) fn time_s(text: &str) -> Result<f64, String> {
         value if value.abs() <= 1e9 => Ok(value),
         _ => Err("expected at most 1e9 s".to_owned()),
     }
+}
+
+/// A band in Hz, for messages.
+pub(super) fn band_text([low_hz, high_hz]: [f64; 2]) -> String {
+    format!("{} to {}", Dimension::Frequency.show(low_hz), Dimension::Frequency.show(high_hz))
 }
 
 /// Hz from a frequency such as `3MHz` or `3e6`.

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
+use super::arguments::input_path;
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::bench::{BENCH_STAGES, BenchSettings, bench_config};
 use crate::pipeline::{ConfigSource, Plan, use_threads};
@@ -21,7 +22,7 @@ use crate::pipeline::{ConfigSource, Plan, use_threads};
 #[derive(Debug, Args)]
 pub(super) struct BenchArgs {
     /// Pipeline file (TOML); measures its first window, at most spacecraft.window_s_max long.
-    #[arg(value_name = "PIPELINE.toml")]
+    #[arg(value_name = "PIPELINE.toml", value_parser = input_path())]
     pipeline: Option<PathBuf>,
     /// Replace one setting of the pipeline file, for example --set daughters.bits=2; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE", requires = "pipeline")]

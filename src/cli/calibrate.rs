@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::arguments::MapFileArgs;
+use super::arguments::{MapFileArgs, input_path, output_path};
 use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_json_line, print_notes, print_text};
 use super::progress::CalibrateLines;
@@ -23,16 +23,16 @@ use crate::sky::fits::read_whole_map;
 #[derive(Debug, Args)]
 pub(super) struct CalibrateArgs {
     /// Downlink files in the order of time.
-    #[arg(required = true, value_name = "FILE")]
+    #[arg(required = true, value_name = "FILE", value_parser = input_path())]
     files: Vec<PathBuf>,
     /// HEALPix map of the sky in K; one a channel of the downlink, in their order.
     #[arg(long, value_name = "MAP.fits", num_args = 1..)]
     model: Vec<PathBuf>,
     /// Map file (TOML): settings of the ground segment; the defaults of pipelines/reference.toml if not given.
-    #[arg(long, value_name = "MAP.toml")]
+    #[arg(long, value_name = "MAP.toml", value_parser = input_path())]
     map: Option<PathBuf>,
     /// Output folder.
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: PathBuf,
     /// Replace one setting, for example --set calibrate.clock_sigma_ns=50; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]

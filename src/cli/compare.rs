@@ -10,6 +10,7 @@ use crate::products::{RunFigures, draw_comparison, draw_relative_error, draw_run
 use crate::sky::Frame;
 use crate::sky::fits::read_whole_map_file;
 use crate::sky::{Comparison, SkyMap, compare};
+use crate::units::Dimension;
 
 /// Compare a map with the truth, degree by degree; or runs with one another.
 ///
@@ -62,7 +63,8 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     if let (Some(map_hz), Some(truth_hz)) = (map_hz, truth_hz)
         && (map_hz - truth_hz).abs() > 1e-6 * truth_hz
     {
-        print_notes([format!("the map is at {map_hz} Hz, the truth at {truth_hz} Hz (FREQ)")]);
+        let [map, truth] = [map_hz, truth_hz].map(|hz| Dimension::Frequency.show(hz));
+        print_notes([format!("the map is at {map}, the truth at {truth} (FREQ)")]);
     }
     if let Some(l_max) = args.band_limit {
         truth = truth.band_limited(map.nside(), l_max)?;

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
+use super::arguments::{input_path, output_path};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::downlink::link::{LinkConfig, corrupt, truth_path};
 
@@ -18,10 +19,10 @@ use crate::downlink::link::{LinkConfig, corrupt, truth_path};
 #[derive(Debug, Args)]
 pub(super) struct CorruptArgs {
     /// Intact downlink file.
-    #[arg(value_name = "FILE")]
+    #[arg(value_name = "FILE", value_parser = input_path())]
     file: PathBuf,
     /// Damaged file to write.
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE", value_parser = output_path())]
     out: PathBuf,
     /// Seed of all faults.
     #[arg(long, default_value_t = 0)]

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use serde::Serialize;
 
+use super::arguments::output_path;
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::files::write_atomically;
 use crate::products::pictures::{ColourScale, Palette, Patch, Scaling, draw_patches};
@@ -43,7 +44,7 @@ pub(super) struct CutoutArgs {
     #[arg(long, value_name = "DEG")]
     subtract_fwhm: Option<f64>,
     /// Picture (PNG, or SVG if its name ends so); the table goes beside it with the extension .csv.
-    #[arg(short, long, value_name = "FILE.png")]
+    #[arg(short, long, value_name = "FILE.png", value_parser = output_path())]
     out: PathBuf,
     /// Print one JSON object: mean and rms of each piece, and their correlation with the first.
     #[arg(long)]

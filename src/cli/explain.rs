@@ -8,7 +8,8 @@ use crate::units::echo;
 
 /// Explain keys of pipeline files: their defaults, units and meaning.
 ///
-/// Takes whole keys (map.epsilon), sections (map), or a part of a name (epsilon), which finds all keys that contain it.
+/// Takes whole keys (map.epsilon), sections (map), or a part of a name (epsilon), which finds all keys that contain it, or else
+/// all whose explanation does (regularisation).
 /// Without one it lists the sections.
 ///
 /// Example: lunarray explain map.epsilon
@@ -40,7 +41,7 @@ pub(super) fn explain(args: &ExplainArgs) -> CommandResult {
     for key in &args.keys {
         let found = matches_of(&all, key);
         if found.is_empty() {
-            let expected = "expected a key such as map.epsilon, a section such as map, or a part of a name";
+            let expected = "expected a key such as map.epsilon, a section such as map, or a part of a name or of what is said of it";
             return Err(format!("{}: no such key; {expected}", echo(key)).into());
         }
         shown.extend(found);
@@ -97,14 +98,19 @@ fn in_a_cell(text: &str) -> String {
     text.replace('|', "\\|").replace('<', "&lt;")
 }
 
-/// The key itself; else the keys of the section; else those whose names contain it.
+/// The key itself; else the keys of the section; else those whose names contain it; else those whose meaning does.
 fn matches_of<'a>(all: &'a [KeyDescription], wanted: &str) -> Vec<&'a KeyDescription> {
     let inside = format!("{wanted}.");
     let of_section: Vec<_> = all.iter().filter(|d| d.key == wanted || d.key.starts_with(&inside)).collect();
     if !of_section.is_empty() || wanted.is_empty() {
         return of_section;
     }
-    all.iter().filter(|described| described.key.contains(wanted)).collect()
+    let named: Vec<_> = all.iter().filter(|described| described.key.contains(wanted)).collect();
+    if !named.is_empty() {
+        return named;
+    }
+    let word = wanted.to_lowercase();
+    all.iter().filter(|described| described.about.to_lowercase().contains(&word)).collect()
 }
 
 /// The JSON schema of `summary.json`; every summary that a test reads is held to it.

@@ -5,9 +5,11 @@ use std::time::SystemTime;
 
 use clap::{Args, Subcommand, ValueEnum};
 
-use super::arguments::{MapFileArgs, frame};
+use super::arguments::{MapFileArgs, frame, input_path, is_standard, output_path};
 use super::log::utc_text;
-use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
+use super::output::{
+    CommandError, CommandResult, Completion, of_stdout, print_json_line, print_notes, print_text,
+};
 use crate::files::write_atomically;
 use crate::products::pictures::Scaling;
 use crate::products::{Hips, HipsReport, RunFigures, VisibilityTable, spectra_csv};
@@ -42,7 +44,7 @@ enum What {
 #[derive(Debug, Args)]
 struct VisibilityArgs {
     /// Downlink file.
-    #[arg(value_name = "FILE")]
+    #[arg(value_name = "FILE", value_parser = input_path())]
     file: PathBuf,
     /// Channel, from 0.
     #[arg(long, value_name = "NUMBER", default_value_t = 0)]
@@ -103,7 +105,7 @@ struct HipsArgs {
     #[arg(long, value_name = "ivo://AUTHORITY/NAME", default_value = "ivo://UNK.AUTH/P/lunarray")]
     id: String,
     /// New or empty folder.
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: PathBuf,
     /// Print one JSON object instead of text: folder, order, tile_width, frame, tiles.
     #[arg(long)]
@@ -118,22 +120,43 @@ enum Colours {
 
 #[derive(Debug, Args)]
 struct Destination {
-    /// File to be written.
+    /// File to be written; - for a table on standard output.
     #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
-    /// Print one JSON object instead of text: file, rows.
+    /// Print one JSON object instead of text: file, rows. Not with a table on standard output.
     #[arg(long)]
     json: bool,
 }
 
+impl ExportArgs {
+    fn refuse_misuse_of_standard_output(&self) -> Result<(), CommandError> {
+        let (to, is_table) = match &self.what {
+            What::Visibilities(args) => (&args.to, true),
+            What::Spectra(args) => (&args.to, true),
+            What::Alm(args) => (&args.to, false),
+            What::Hips(_) => return Ok(()),
+        };
+        match is_standard(&to.out) {
+            true if !is_table => Err("--out -: a FITS file needs a name; ./- is a file of that name".into()),
+            true if to.json => {
+                Err("--json with --out -: standard output holds the table; expected one of them".into())
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
 pub(super) fn execute(args: &ExportArgs) -> CommandResult {
+    args.refuse_misuse_of_standard_output()?;
     let (to, rows, of) = match &args.what {
         What::Hips(args) => return hips(args),
         What::Visibilities(args) => (&args.to, visibilities(args)?, "visibilities"),
         What::Spectra(args) => (&args.to, spectra(args)?, "degrees"),
         What::Alm(args) => (&args.to, alm(args)?, "coefficients"),
     };
-    if to.json {
+    if is_standard(&to.out) {
+        // What is printed is the table.
+    } else if to.json {
         print_json_line(&serde_json::json!({ "file": to.out, "rows": rows }))?;
     } else {
         print_text(&format!("{rows} {of} are in {}", to.out.display()))?;
@@ -162,7 +185,11 @@ fn visibilities(args: &VisibilityArgs) -> Result<usize, CommandError> {
         )
         .into());
     }
-    let rows = table.write_csv(ChannelId(args.channel), &args.to.out)?;
+    let channel = ChannelId(args.channel);
+    let rows = match is_standard(&args.to.out) {
+        true => table.write_csv_to(channel, &mut std::io::stdout().lock()).map_err(of_stdout)?,
+        false => table.write_csv(channel, &args.to.out)?,
+    };
     if rows == 0 {
         print_notes([format!("{}: no visibility of channel {}", args.file.display(), args.channel)]);
     }
@@ -176,7 +203,10 @@ fn spectra(args: &SpectraArgs) -> Result<usize, CommandError> {
     };
     let runs = args.runs.iter().map(read).collect::<Result<Vec<_>, _>>()?;
     let text = spectra_csv(&runs.iter().collect::<Vec<_>>());
-    write(&args.to.out, text.as_bytes())?;
+    match is_standard(&args.to.out) {
+        true => print_text(text.trim_end())?,
+        false => write(&args.to.out, text.as_bytes())?,
+    }
     Ok(text.lines().count().saturating_sub(1))
 }
 

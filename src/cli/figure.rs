@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::arguments::time_s;
+use super::arguments::{input_path, output_path, time_s};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::figures::{FIGURES, FigureRequest, make_figure};
 use crate::pipeline::{ConfigSource, Plan, use_threads};
@@ -29,13 +29,13 @@ pub(super) struct FigureArgs {
     #[arg(value_name = "NAME", value_parser = FIGURES)]
     name: String,
     /// Pipeline file (TOML); the embedded quicklook if none is given.
-    #[arg(value_name = "PIPELINE.toml")]
+    #[arg(value_name = "PIPELINE.toml", value_parser = input_path())]
     pipeline: Option<PathBuf>,
     /// Replace one setting, for example --set spacecraft.channels_hz=[3e6,10e6]; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
     /// Output folder.
-    #[arg(short, long, value_name = "DIR", default_value = "out/figures")]
+    #[arg(short, long, value_name = "DIR", default_value = "out/figures", value_parser = output_path())]
     out: PathBuf,
     /// Pair of rows and waterfall, such as 1-2; the one closest to 2 b_p if not given.
     #[arg(long)]

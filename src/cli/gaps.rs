@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
+use super::arguments::input_path;
 use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::downlink::Kind;
 use crate::ground::archive::{CoverageSurvey, GapReport, Gaps, RestartReport};
@@ -23,7 +24,7 @@ use crate::products::draw_coverage;
 #[derive(Debug, Args)]
 pub(super) struct GapsArgs {
     /// State folder, checkpoint or downlink file.
-    #[arg(value_name = "STATE|FILE")]
+    #[arg(value_name = "STATE|FILE", value_parser = input_path())]
     path: PathBuf,
     /// Maximum number of gaps shown; --json lists all.
     #[arg(long, default_value_t = 20)]

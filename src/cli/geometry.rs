@@ -3,12 +3,12 @@
 use clap::Args;
 use serde::Serialize;
 
-use super::arguments::{ArrayArgs, frequency_hz, time_s};
+use super::arguments::{ArrayArgs, band_text, frequency_hz, time_s};
 use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
 use crate::array::{Array, integration_time_s};
 use crate::mother::BAND_HZ;
-use crate::units::all_pairs;
 use crate::units::vector::{Vec3, norm, sub};
+use crate::units::{Dimension, all_pairs};
 
 /// Print satellite positions, whether the array observes, and the integration time of each pair.
 ///
@@ -50,9 +50,12 @@ struct PairReport {
 
 pub(super) fn execute(args: &GeometryArgs) -> CommandResult {
     if !(BAND_HZ[0]..=BAND_HZ[1]).contains(&args.freq_hz) {
-        return Err(
-            format!("--freq-hz {}: expected {} Hz to {} Hz", args.freq_hz, BAND_HZ[0], BAND_HZ[1]).into()
-        );
+        return Err(format!(
+            "--freq-hz {}: expected {}",
+            Dimension::Frequency.show(args.freq_hz),
+            band_text(BAND_HZ)
+        )
+        .into());
     }
     let config = args.array.source().load()?;
     print_config_notes(&config);

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
+use super::arguments::input_path;
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::accumulation::harmonic::{GeometryCoverage, GeometrySurvey};
 use crate::downlink::Contents;
@@ -20,7 +21,7 @@ use crate::response::harmonic::GeometryLimits;
 #[derive(Debug, Args)]
 pub(super) struct InspectArgs {
     /// Downlink file.
-    #[arg(value_name = "FILE")]
+    #[arg(value_name = "FILE", value_parser = input_path())]
     file: PathBuf,
     /// Print one JSON object instead of tables.
     #[arg(long)]

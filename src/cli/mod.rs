@@ -59,6 +59,8 @@ use output::{Completion, is_broken_pipe, print_error};
 ///
 /// Start with `lunarray run`: it needs no input file and writes maps to out/quicklook/.
 ///
+/// A file of - is standard input where a pipeline or a downlink is read: cat pass.cadu | lunarray inspect -
+///
 /// Exit codes: 0 done; 1 failed; 2 wrong usage; 130 ended by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP, with what was
 /// received saved if there is a state. 0 also for `replay --listen` and `--follow` that SIGTERM ends.
 #[derive(Debug, Parser)]

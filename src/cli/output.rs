@@ -39,10 +39,7 @@ pub(super) fn is_broken_pipe(error: &(dyn std::error::Error + 'static)) -> bool 
 
 /// Prints one JSON object on a line of its own.
 pub(super) fn print_json_line(value: &impl serde::Serialize) -> Result<(), CommandError> {
-    let mut out = std::io::stdout().lock();
-    out.write_all(json_text(value)?.as_bytes())?;
-    out.write_all(b"\n")?;
-    Ok(())
+    print(&json_text(value)?)
 }
 
 /// A JSON object whose strings hold no character that a terminal would obey. JSON itself allows some of them.
@@ -60,10 +57,22 @@ pub(super) fn json_text(value: &impl serde::Serialize) -> Result<String, serde_j
 
 /// Prints text for people.
 pub(super) fn print_text(text: &str) -> Result<(), CommandError> {
+    print(&printable_text(text))
+}
+
+/// Prints text and a line feed as they are.
+fn print(text: &str) -> Result<(), CommandError> {
     let mut out = std::io::stdout().lock();
-    out.write_all(printable_text(text).as_bytes())?;
-    out.write_all(b"\n")?;
-    Ok(())
+    let printed = out.write_all(text.as_bytes()).and_then(|()| out.write_all(b"\n"));
+    printed.map_err(of_stdout)
+}
+
+/// An error of standard output, which names it unless it is only that nobody reads.
+pub(super) fn of_stdout(error: std::io::Error) -> CommandError {
+    match error.kind() {
+        std::io::ErrorKind::BrokenPipe => error.into(),
+        _ => format!("standard output: cannot write: {error}").into(),
+    }
 }
 
 /// Text for a terminal, with its line breaks: names and replies of others in it are shown, not obeyed.

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::arguments::{ArrayArgs, MapFileArgs, frequency_hz, time_s};
+use super::arguments::{ArrayArgs, MapFileArgs, band_text, frequency_hz, time_s};
 use super::lines::next_line;
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
 use crate::array::Array;
@@ -13,7 +13,7 @@ use crate::mother::BAND_HZ;
 use crate::response::pixel::{PairGeometry, exact};
 use crate::sky::fits::read_whole_map;
 use crate::sky::healpix::pixel_area_sr;
-use crate::units::{Pair, echo};
+use crate::units::{Dimension, Pair, echo};
 
 /// Predict visibilities of a sky map by a direct sum over its pixels.
 ///
@@ -87,8 +87,10 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
             return print_json_line(&answer);
         }
         print_text(&format!(
-            "t = {t_s} s, pair {pair}, {freq_hz} Hz: {:+.9e} {:+.9e} i K sr",
-            answer.re, answer.im
+            "t = {t_s} s, pair {pair}, {}: {:+.9e} {:+.9e} i K sr",
+            Dimension::Frequency.show(freq_hz),
+            answer.re,
+            answer.im
         ))
     };
     if let (Some(t_s), Some(pair), Some(freq_hz)) = (args.at_s, args.pair, args.freq_hz) {
@@ -135,7 +137,8 @@ fn check(array: &Array, query: VisibilityQuery) -> Result<(), String> {
         return Err(format!("pair {pair}: the array has {} satellites", array.satellites()));
     }
     if !(BAND_HZ[0]..=BAND_HZ[1]).contains(&freq_hz) {
-        return Err(format!("freq_hz = {}: expected {} to {}", echo(freq_hz), BAND_HZ[0], BAND_HZ[1]));
+        let found = Dimension::Frequency.show(freq_hz);
+        return Err(format!("freq_hz = {found}: expected {}", band_text(BAND_HZ)));
     }
     Ok(())
 }

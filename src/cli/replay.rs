@@ -9,7 +9,9 @@ use clap::{ArgGroup, Args};
 use crossbeam_channel::{Receiver, bounded};
 use serde_json::{Value, json};
 
-use super::arguments::{ChannelList, channel_list, group_size, not_negative_s, size_bytes};
+use super::arguments::{
+    ChannelList, channel_list, group_size, input_path, not_negative_s, output_path, size_bytes,
+};
 use super::events::{Events, EventsArgs};
 use super::interrupt::Interrupt;
 use super::job::Job;
@@ -47,18 +49,18 @@ const WAIT_BYTES_LIVE: u64 = 1 << 20;
 #[command(group(ArgGroup::new("pace").args(["speed", "step"])))]
 pub(super) struct ReplayArgs {
     /// Downlink files in the order of time.
-    #[arg(required_unless_present_any = ["state", "listen"], value_name = "FILE")]
+    #[arg(required_unless_present_any = ["state", "listen"], value_name = "FILE", value_parser = input_path())]
     files: Vec<PathBuf>,
     /// Map file (TOML): settings of the ground segment. If not given, those of the state, if it has any; of the run that made
     /// the downlink, if its pipeline.toml lies beside the first FILE or it was the quicklook; then the defaults of
     /// `lunarray config`.
-    #[arg(long, value_name = "MAP.toml")]
+    #[arg(long, value_name = "MAP.toml", value_parser = input_path())]
     map: Option<PathBuf>,
     /// Gains that `lunarray calibrate` found: as calibration.hook = "antenna-gains" with calibration.gains_file.
     #[arg(long, value_name = "GAINS.json")]
     calibration: Option<PathBuf>,
     /// Output folder for the products.
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: PathBuf,
     /// State folder that keeps everything received: every packet is applied once, in this session and all later ones,
     /// however often and in whatever order it arrives. To resume after an interruption, repeat the command.

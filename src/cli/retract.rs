@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::arguments::StateMapArgs;
+use super::arguments::{StateMapArgs, input_path};
 use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::use_threads;
@@ -22,7 +22,7 @@ use crate::units::MissionTime;
 #[derive(Debug, Args)]
 pub(super) struct RetractArgs {
     /// Downlink files whose packets are removed.
-    #[arg(required = true, value_name = "FILE")]
+    #[arg(required = true, value_name = "FILE", value_parser = input_path())]
     files: Vec<PathBuf>,
     /// State folder of `lunarray replay --state`.
     #[arg(long, value_name = "DIR")]

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::arguments::{PipelineArgs, group_size};
+use super::arguments::{PipelineArgs, group_size, output_path};
 use super::events::EventsArgs;
 use super::interrupt::Interrupt;
 use super::job::Job;
@@ -32,7 +32,7 @@ pub(super) struct RunArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
     /// Output folder for the products; out/NAME if not given.
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: Option<PathBuf>,
     /// Print the summary as one JSON object instead of tables.
     #[arg(long)]

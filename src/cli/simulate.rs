@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 
 use clap::Args;
 
-use super::arguments::{PipelineArgs, group_size, not_negative_s};
+use super::arguments::{PipelineArgs, group_size, not_negative_s, output_path};
 use super::events::EventsArgs;
 use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_config_notes, print_json_line, print_notes, print_text};
@@ -30,7 +30,7 @@ pub(super) struct SimulateArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
     /// Downlink file to write.
-    #[arg(short, long, value_name = "FILE", required_unless_present = "send")]
+    #[arg(short, long, value_name = "FILE", required_unless_present = "send", value_parser = output_path())]
     out: Option<PathBuf>,
     /// Simulate the channels in groups, to files beside the downlink of which it is then made: as many at a time as memory allows
     /// (auto), or this many. The downlink has the same bytes. When interrupted, repeat the command to go on with the next group.

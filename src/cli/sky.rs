@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::arguments::{MapFileArgs, frequency_hz};
+use super::arguments::{MapFileArgs, band_text, frequency_hz, output_path};
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
 use crate::files::write_atomically;
 use crate::mother::{BAND_HZ, NINTH_BAND_HZ};
@@ -14,6 +14,7 @@ use crate::products::pictures::{ColourScale, MapPanel, Palette, Scaling, View, d
 use crate::sky::fits::{WriteOptions, read_whole_map, write_map};
 use crate::sky::generated::{GeneratedSky, catalogue, generate};
 use crate::sky::{Frame, GENERATED_NSIDE_MAX, SkyMap};
+use crate::units::Dimension;
 
 /// Write the generated sky as a HEALPix FITS map, and a picture of it.
 ///
@@ -37,7 +38,7 @@ pub(super) struct SkyArgs {
     #[arg(long, default_value_t = 64)]
     nside: usize,
     /// Map to write (FITS); its picture goes beside it with the extension .png.
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE", value_parser = output_path())]
     out: PathBuf,
     /// Map (FITS) to resemble, at its own nside.
     #[arg(long, value_name = "MAP.fits", requires = "correlation", conflicts_with_all = ["freq_hz", "sources"])]
@@ -72,7 +73,12 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
     let freq_hz = args.freq_hz.unwrap_or_default();
     let band_hz = [BAND_HZ[0], NINTH_BAND_HZ[1]];
     if !(band_hz[0]..=band_hz[1]).contains(&freq_hz) {
-        return Err(format!("--freq-hz {freq_hz}: expected {} Hz to {} Hz", band_hz[0], band_hz[1]).into());
+        return Err(format!(
+            "--freq-hz {}: expected {}",
+            Dimension::Frequency.show(freq_hz),
+            band_text(band_hz)
+        )
+        .into());
     }
     let source = ConfigSource { file: args.pipeline.clone(), overrides: args.overrides.clone(), seed };
     let Config { seed, sky, .. } = source.load()?;
@@ -83,7 +89,7 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
     }
     let values = generate(&sky.generated, freq_hz, nside, seed)?;
     let map = SkyMap::new(Frame::Ecliptic, values)?;
-    let mut made = Made::write(args, &map, &format!("{freq_hz} Hz"))?;
+    let mut made = Made::write(args, &map, &Dimension::Frequency.show(freq_hz))?;
     if let Some(path) = &args.sources {
         let count = write_sources(path, &sky.generated, freq_hz, seed)?;
         made.lines.push(format!("{}: {count} sources", path.display()));

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde_json::json;
 
-use super::arguments::size_bytes;
+use super::arguments::{output_path, size_bytes};
 use super::interrupt::Interrupt;
 use super::log::say;
 use super::output::{CommandResult, print_json_line, print_notes, print_text};
@@ -32,7 +32,7 @@ pub(super) struct StudyArgs {
     #[arg(value_name = "STUDY.toml")]
     study: PathBuf,
     /// Output folder; out/NAME if not given.
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: Option<PathBuf>,
     /// Replace one setting in all cases, for example --set map.nside=16; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]

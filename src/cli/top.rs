@@ -11,7 +11,7 @@ use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, Ke
 use serde_json::Value;
 
 use super::interrupt::Interrupt;
-use super::output::{CommandResult, Completion, print_text};
+use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::serve::{Client, ClientError, Screen, ServeAddress};
 
 /// Where `--serve 8080` serves.
@@ -40,6 +40,9 @@ pub(super) struct TopArgs {
     /// Print one frame as plain text, and end.
     #[arg(long)]
     once: bool,
+    /// Print the status as one JSON object, as /api/status has it, and end.
+    #[arg(long, conflicts_with = "once")]
+    json: bool,
 }
 
 /// An address as `--serve` takes it, or as it prints it.
@@ -50,6 +53,10 @@ fn address(text: &str) -> Result<ServeAddress, String> {
 
 pub(super) fn execute(args: &TopArgs) -> CommandResult {
     let client = Client::new(args.address.clone());
+    if args.json {
+        print_json_line(&client.json("/api/status")?)?;
+        return Ok(Completion::Done);
+    }
     let first = Look::of(&client, 0)?;
     let mut screen = Screen { address: client.address(), ..Screen::default() };
     first.show(&mut screen);

@@ -49,7 +49,7 @@ pub enum VisibilityReason {
     BaselineBeyondEngine,
     /// The engine refused it: its value or weight cannot be summed.
     ValueNotFinite,
-    /// The engine refused it: its weight, or its value in units of its noise, is out of the range of the sums.
+    /// The engine refused it: its weight (too great, or so small that it vanishes in the sums), or its value in units of its noise, is out of the range of the sums.
     WeightOutOfRange,
     /// The engine refused it: the sums have no room for more weight, or no more visibilities are held for refinement.
     SumsFull,
@@ -118,7 +118,7 @@ impl Reason for VisibilityReason {
                 "refused by the engine: value or weight not finite, or weight not positive"
             }
             Self::WeightOutOfRange => {
-                "refused by the engine: weight above map.weight_max, or value far above its noise"
+                "refused by the engine: weight above map.weight_max or vanishing beside it, or value far above its noise"
             }
             Self::SumsFull => {
                 "refused by the engine: full at this map.weight_max, or map.refine.visibilities_max"

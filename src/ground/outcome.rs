@@ -43,10 +43,14 @@ pub struct SavingReport {
 impl fmt::Display for SavingReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.unsaved {
-            Some(reason) => write!(f, "state not saved, {} attempts failed: {reason}", self.failed),
-            None => write!(f, "state saved; {} attempts failed before", self.failed),
+            Some(reason) => write!(f, "state not saved, {} failed: {reason}", attempts(self.failed)),
+            None => write!(f, "state saved; {} failed before", attempts(self.failed)),
         }
     }
+}
+
+fn attempts(count: u64) -> String {
+    format!("{count} attempt{}", if count == 1 { "" } else { "s" })
 }
 
 /// The report on the checkpoints of a ground at work; clones share it.

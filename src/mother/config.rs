@@ -11,7 +11,7 @@ use crate::array::{Array, IntegrationRule};
 use crate::frames::{AntennaResponse, Channel};
 use crate::response::model::ModelChoice;
 use crate::units::constants::YEAR_S;
-use crate::units::{Checks, InvalidValue, PerChannel};
+use crate::units::{Checks, Dimension, InvalidValue, PerChannel};
 
 /// Most channels: the mission's own number.
 pub const CHANNELS_MAX: usize = 30;
@@ -280,19 +280,19 @@ impl SpacecraftConfig {
         let is_listed = (1..=CHANNELS_MAX).contains(&channels);
         checks.require("channels_hz", count, is_listed, expected);
         let [low_hz, high_hz] = BAND_HZ;
+        let [low, high] = BAND_HZ.map(|hz| Dimension::Frequency.show(hz));
         // Each value and pair of values can be a problem: of a list that is too long only its length is.
         let listed = if is_listed { self.channels_hz.as_slice() } else { &[] };
         for (index, &value) in listed.iter().enumerate() {
             let key = format!("channels_hz[{index}]");
             let inside = (low_hz..=high_hz).contains(&value);
-            checks.number(&key, value, inside, format!("{low_hz} Hz to {high_hz} Hz"));
+            checks.number(&key, value, inside, format!("{low} to {high}"));
             let half_hz = 0.5 * self.channel_width_hz;
             // Sub-bands are channels of the downlink, which lie within the band; others must only stay above zero.
             let inside = value - half_hz >= low_hz && value + half_hz <= high_hz;
             let fits = half_hz < value && (self.sub_bands == 1 || inside);
             let expected = format!(
-                "a channel of channel_width_hz = {} Hz that stays above zero, and with sub-bands within {low_hz} Hz to \
-                 {high_hz} Hz",
+                "a channel of channel_width_hz = {} Hz that stays above zero, and with sub-bands within {low} to {high}",
                 self.channel_width_hz
             );
             checks.number(&key, value, fits, expected);

@@ -18,6 +18,14 @@ pub(super) fn channels_hz(table: &Table) -> Option<Vec<f64>> {
     list.iter().map(|value| number(value).filter(|hz| *hz > 0.0)).collect()
 }
 
+/// Makes a list of a single frequency: one channel.
+pub(super) fn of_one(table: &mut Table) {
+    let found = table.get_mut("spacecraft").and_then(|table| table.get_mut("channels_hz"));
+    if let Some(value) = found.filter(|value| value.is_float() || value.is_integer()) {
+        *value = Value::Array(vec![value.clone()]);
+    }
+}
+
 /// Gives each channel of `table` the values of that of `before` whose frequency is nearest, in all lists for `before` that
 /// `is_set` does not name. Returns what was done, a line a list.
 pub(super) fn follow(table: &mut Table, before: &[f64], is_set: impl Fn(&str) -> bool) -> Vec<String> {

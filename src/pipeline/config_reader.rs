@@ -129,7 +129,7 @@ impl Walk<'_> {
                     self.problems.push(|| ReadProblem::Unknown {
                         place: lines.place(&path),
                         key: shortened(&path.join("."), SHOWN_MAX),
-                        known: keys_of(&path[..path.len() - 1], known),
+                        known: keys_of(&path, known),
                     });
                     None
                 }
@@ -163,14 +163,37 @@ fn alone(path: &[&str], value: Value) -> Table {
     path.fold(innermost, |table, key| Table::from_iter([((*key).to_owned(), Value::Table(table))]))
 }
 
-/// The keys of a section, for a message.
+/// The keys of the section in which `path` is none, for a message; first the one that is spelled most like it.
 fn keys_of(path: &[&str], known: &Table) -> String {
+    let Some((wrong, path)) = path.split_last() else { return String::new() };
     let section = path.join(".");
     let optional = OPTIONAL_KEYS.iter().filter_map(|key| key.rsplit_once('.'));
     let optional = optional.filter(|(of, _)| *of == section).map(|(_, key)| key);
     let keys: Vec<&str> = known.keys().map(String::as_str).chain(optional).collect();
     let section = if path.is_empty() { "a pipeline".to_owned() } else { format!("[{section}]") };
-    format!("{section} has {}", keys.join(", "))
+    let has = format!("{section} has {}", keys.join(", "));
+    // One slip in three letters.
+    let nearest = keys.iter().map(|key| (slips(wrong, key), key)).min();
+    match nearest.filter(|(slips, key)| 3 * slips <= key.len()) {
+        Some((_, key)) => format!("did you mean {key}? {has}"),
+        None => has,
+    }
+}
+
+/// Letters to be changed, added or left out to make one word of another (Levenshtein's distance).
+fn slips(from: &str, to: &str) -> usize {
+    // Nobody means a key by a word of hundreds of letters.
+    let from = from.bytes().take(2 * SHOWN_MAX);
+    let mut row: Vec<usize> = (0..=to.len()).collect();
+    for (k, a) in from.enumerate() {
+        let mut diagonal = std::mem::replace(&mut row[0], k + 1);
+        for (j, b) in to.bytes().enumerate() {
+            let changed = diagonal + usize::from(a != b);
+            diagonal = row[j + 1];
+            row[j + 1] = changed.min(diagonal + 1).min(row[j] + 1);
+        }
+    }
+    row[to.len()]
 }
 
 /// A message of the parser without the language's names of types.

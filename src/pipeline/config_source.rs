@@ -35,6 +35,21 @@ pub enum ConfigError {
         /// The system's error.
         source: std::io::Error,
     },
+    /// The file is no text.
+    #[error(
+        "{}: not text; expected a pipeline file (TOML). `lunarray inspect` and `replay` read a downlink, and sky.file names a map",
+        path.display()
+    )]
+    NotText {
+        /// Path.
+        path: PathBuf,
+    },
+    /// The file is a study.
+    #[error("{}: a study, with [[axis]]; expected a pipeline file: run it by `lunarray study {}`", path.display(), path.display())]
+    Study {
+        /// Path.
+        path: PathBuf,
+    },
     /// The file is too long for a pipeline file.
     #[error("{}: more than {FILE_BYTES_MAX} bytes; expected a pipeline file, which has some thousand", path.display())]
     TooLong {
@@ -158,6 +173,9 @@ impl ConfigSource {
             Ok(table) => table,
             Err(problems) => return Err(ConfigError::Values { origin, problems }),
         };
+        if let Some(path) = self.file.as_ref().filter(|_| is_study(&table)) {
+            return Err(ConfigError::Study { path: path.clone() });
+        }
         read_units(&mut table);
         let mut lines = Lines::of(text);
         let mut bad_overrides = Vec::new();
@@ -173,6 +191,7 @@ impl ConfigSource {
             }
         }
         read_units(&mut table);
+        channel_lists::of_one(&mut table);
         if let Some(before) = channels_hz {
             notes.extend(channel_lists::follow(&mut table, &before, |key| keys.contains(&key)));
         }
@@ -192,15 +211,24 @@ impl ConfigSource {
     }
 }
 
+/// Whether a table is that of a study, which has axes where a pipeline has sections.
+pub(super) fn is_study(table: &toml::Table) -> bool {
+    table.get("axis").is_some_and(toml::Value::is_array)
+}
+
 fn read(path: &Path) -> Result<String, ConfigError> {
     let failed = |source| ConfigError::Read { path: path.to_owned(), source };
     let file = std::fs::File::open(path).map_err(failed)?;
-    let mut text = String::new();
-    let bytes = file.take(FILE_BYTES_MAX + 1).read_to_string(&mut text).map_err(failed)?;
-    if bytes as u64 > FILE_BYTES_MAX {
-        return Err(ConfigError::TooLong { path: path.to_owned() });
+    let mut bytes = Vec::new();
+    file.take(FILE_BYTES_MAX + 1).read_to_end(&mut bytes).map_err(failed)?;
+    let is_long = bytes.len() as u64 > FILE_BYTES_MAX;
+    // The last character of a part may be cut.
+    let is_text = |error: std::str::Utf8Error| is_long && error.error_len().is_none();
+    match String::from_utf8(bytes) {
+        Err(error) if !is_text(error.utf8_error()) => Err(ConfigError::NotText { path: path.to_owned() }),
+        Ok(text) if !is_long => Ok(text),
+        _ => Err(ConfigError::TooLong { path: path.to_owned() }),
     }
-    Ok(text)
 }
 
 /// Sets `key=value` in a table; a value that is not TOML is a string. Returns the key.
@@ -254,7 +282,10 @@ mod tests {
             ("map.nside", "expected key=value"),
             ("=8", "expected key=value"),
             ("seed.more=1", "--set seed.more: `seed` is not a section"),
-            ("map.nsides=8", "--set map.nsides=8: map.nsides: no such key; [map] has baseline_bp_max, "),
+            (
+                "map.nsides=8",
+                "--set map.nsides=8: map.nsides: no such key; did you mean nside? [map] has baseline_bp_max, ",
+            ),
             ("a.b.c.d.e.f.g.h.i.j=1", "expected key=value"),
         ] {
             let told = with(&["seed=5", bad]).unwrap_err().to_string();
@@ -278,12 +309,12 @@ mod tests {
         let expected = [
             "here: 13 problem(s)",
             "--set runtime.threads: expected key=value",
-            "line 5: map.l_maxx: no such key; [map] has",
+            "line 5: map.l_maxx: no such key; did you mean l_max? [map] has",
             "line 3: map.nside: invalid type: string \"big\", expected a whole number, not negative",
             "--set map.weight_max=lots: map.weight_max: invalid type: string \"lots\", expected a number",
             "line 17: products.pictures: invalid type: integer `1`, expected a boolean",
             "line 7: sat: no such key; a pipeline has",
-            "line 1: sed: no such key",
+            "line 1: sed: no such key; did you mean seed? a pipeline has",
             "line 14: sky.file: expected one value, or a list with one for each channel",
             "--set spacecraft.antenna=\"dish\": spacecraft.antenna: unknown variant `dish`, expected `isotropic`",
             "line 12: spacecraft.ninth: found one value (integer), expected a section",
@@ -329,6 +360,19 @@ mod tests {
             let told = load("", &[bad]).unwrap_err().to_string();
             assert!(told.contains("invalid type: string"), "{bad}: {told}");
         }
+    }
+
+    #[test]
+    fn one_frequency_is_one_channel() {
+        for text in ["3MHz", "3e6", "3_000_000", "[3MHz]"] {
+            let config = with(&[&format!("spacecraft.channels_hz={text}")]).unwrap();
+            assert_eq!(config.spacecraft.channels_hz, [3e6], "{text}");
+        }
+        let told = with(&["spacecraft.channels_hz=lots"]).unwrap_err().to_string();
+        assert!(
+            told.contains("spacecraft.channels_hz: invalid type: string \"lots\", expected a list"),
+            "{told}"
+        );
     }
 
     #[test]

@@ -182,5 +182,9 @@ pub enum PipelineError {
 
 /// Bytes as gigabytes.
 fn gigabytes(bytes: f64) -> String {
-    format!("{:.2} GB", bytes / 1e9)
+    match bytes {
+        1e8.. => format!("{:.2} GB", bytes / 1e9),
+        1e5.. => format!("{:.1} MB", bytes / 1e6),
+        _ => format!("{bytes:.0} bytes"),
+    }
 }

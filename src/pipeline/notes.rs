@@ -5,6 +5,7 @@ use std::f64::consts::TAU;
 use super::config::Config;
 use crate::calibration::VanVleck;
 use crate::mother::Fidelity;
+use crate::units::Dimension;
 use crate::units::constants::{MOON_GM_M3_S2, MOON_RADIUS_M};
 
 /// Relative difference of the orbital period from Kepler's that is accepted; the paper's is 2e-4.
@@ -27,10 +28,10 @@ impl Config {
         let is_formation = !array.has_own_orbits();
         (differs && is_formation && array.moon_radius_m == MOON_RADIUS_M).then(|| {
             format!(
-                "array.orbital_period_s = {}, but an orbit {:.0} km above the Moon takes {kepler_s:.2} s; \
+                "array.orbital_period_s = {}, but an orbit {} above the Moon takes {kepler_s:.2} s; \
                  array.precession_period_s does not follow the altitude, either",
                 array.orbital_period_s,
-                array.altitude_m / 1e3
+                Dimension::Length.show(array.altitude_m)
             )
         })
     }
@@ -58,7 +59,11 @@ mod tests {
         assert_eq!(config.notes(), Vec::<String>::new());
         config.array.altitude_m = 50e3;
         // Two pi times the root of 1787.1 km cubed over 4902.8 km^3/s^2.
-        assert!(config.notes()[0].contains("takes 6779"), "{:?}", config.notes());
+        assert!(
+            config.notes()[0].contains("an orbit 50 km above the Moon takes 6779"),
+            "{:?}",
+            config.notes()
+        );
         config.array.orbital_period_s = 6779.0;
         assert_eq!(config.notes(), Vec::<String>::new());
         config.spacecraft.fidelity = Fidelity::Samples;

@@ -12,7 +12,7 @@ use thiserror::Error;
 
 use super::calibrate::{CalibrateJob, CalibrateProgress, calibrate, with_gains};
 use super::config::Config;
-use super::config_source::ConfigSource;
+use super::config_source::{ConfigSource, is_study};
 use super::error::PipelineError;
 use super::plan::Plan;
 use super::realisations::{RealisationSpread, csv_of, spreads};
@@ -161,8 +161,15 @@ impl Study {
     pub fn read(path: &Path, more: &[String]) -> Result<Self, StudyError> {
         let text = read_text(path)?;
         let wrong = |found: String, expected| StudyError::File { path: path.to_owned(), found, expected };
-        let file: StudyFile = toml::from_str(&text).map_err(|error| {
-            wrong(error.to_string(), "name, pipeline, set and [[axis]] with key and values, or with cases")
+        let file: StudyFile = toml::from_str(&text).map_err(|error| match is_pipeline(&text) {
+            true => wrong(
+                "a pipeline".to_owned(),
+                "a study: pipeline = \"FILE\" and [[axis]] with key and values, or with cases; `lunarray run` runs a pipeline",
+            ),
+            false => wrong(
+                error.to_string().trim_end().to_owned(),
+                "name, pipeline, set and [[axis]] with key and values, or with cases",
+            ),
         })?;
         let mut combinations = vec![(Vec::new(), Vec::new())];
         for (number, axis) in file.axis.iter().enumerate() {
@@ -251,6 +258,13 @@ impl Study {
         }
         Ok(Self { name: file.name.unwrap_or(stem), cases, realisations, models })
     }
+}
+
+/// Whether a text has sections of a pipeline, and no axis.
+fn is_pipeline(text: &str) -> bool {
+    const SECTIONS: [&str; 4] = ["array", "map", "sky", "spacecraft"];
+    let table: toml::Table = toml::from_str(text).unwrap_or_default();
+    !is_study(&table) && SECTIONS.iter().any(|section| table.contains_key(*section))
 }
 
 /// Maps to calibrate with, and a number that changes with their bytes.

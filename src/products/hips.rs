@@ -87,7 +87,8 @@ struct Written {
 }
 
 impl Hips {
-    /// Writes a map in K into a new or empty folder. The file `properties`, without which nobody reads a HiPS, comes last.
+    /// Writes a map in K into a new or empty folder. The file `properties`, without which nobody reads a HiPS, comes last; tiles without it
+    /// are those of an export that was broken off, and are replaced.
     ///
     /// # Errors
     /// A folder that is not empty, or in which files cannot be written; values beyond single precision.
@@ -97,8 +98,19 @@ impl Hips {
             move |source| ProductsError::Write { path, source }
         };
         fs::create_dir_all(folder).map_err(failed(folder))?;
-        if fs::read_dir(folder).map_err(failed(folder))?.next().is_some() {
-            return Err(ProductsError::NotEmpty { path: folder.to_owned() });
+        let properties = folder.join("properties");
+        let mut left = Vec::new();
+        for entry in fs::read_dir(folder).map_err(failed(folder))? {
+            let path = entry.map_err(failed(folder))?.path();
+            let is_tiles = path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("Norder"));
+            if !is_tiles || properties.exists() {
+                return Err(ProductsError::NotEmpty { path: folder.to_owned() });
+            }
+            left.push(path);
+        }
+        // Of an export that was broken off: a full disk, a signal.
+        for path in &left {
+            fs::remove_dir_all(path).map_err(failed(path))?;
         }
         let depth = map.nside().trailing_zeros() as u8;
         let width = (map.nside() >> ORDER_MIN).clamp(WIDTHS[0], WIDTHS[1]);
@@ -121,7 +133,6 @@ impl Hips {
             count += face.count;
         }
         tiles.write_preview(&previews)?;
-        let properties = folder.join("properties");
         write_atomically(&properties, self.properties(&tiles).as_bytes()).map_err(failed(&properties))?;
         Ok(HipsReport { order, tile_width: width, frame: self.frame, tiles: count })
     }
@@ -338,6 +349,17 @@ mod tests {
         assert!(properties.contains("em_min               = 9.993"), "{properties}");
         let again = hips.write(&map, &out).unwrap_err().to_string();
         assert!(again.contains("expected a new or empty folder"), "{again}");
+        // One that was broken off has no `properties` and a tile that is not whole. What is not ours stays.
+        let tile = out.join("Norder3/Dir0/Npix5.fits");
+        let whole = fs::read(&tile).unwrap();
+        fs::remove_file(out.join("properties")).unwrap();
+        fs::write(&tile, b"").unwrap();
+        let foreign = out.join("notes.txt");
+        fs::write(&foreign, b"mine").unwrap();
+        assert!(hips.write(&map, &out).is_err() && tile.exists() && foreign.exists());
+        fs::remove_file(&foreign).unwrap();
+        hips.write(&map, &out).unwrap();
+        assert_eq!(fs::read(&tile).unwrap(), whole);
         // With one pixel for four at each order, the mean of what is seen is that of all.
         let preview = fs::read(out.join("Norder0/Dir0/Npix0.fits")).unwrap();
         assert_eq!(preview.len(), 2880 * (1 + (4 * 64 * 64_usize).div_ceil(2880)));

@@ -120,17 +120,26 @@ impl VisibilityTable {
     /// A file that cannot be written.
     pub fn write_csv(&self, channel: ChannelId, path: &Path) -> Result<usize, ProductsError> {
         let failed = |source| ProductsError::Write { path: path.to_owned(), source };
+        let file = AtomicFile::create(path, IfUnfinished::Remove).map_err(failed)?;
+        let mut out = BufWriter::new(file);
+        let rows = self.write_csv_to(channel, &mut out).map_err(failed)?;
+        let file = out.into_inner().map_err(|error| failed(error.into_error()))?;
+        file.finish().map_err(failed)?;
+        Ok(rows)
+    }
+
+    /// As [`Self::write_csv`], to what writes bytes.
+    ///
+    /// # Errors
+    /// Those of `out`.
+    pub fn write_csv_to(&self, channel: ChannelId, out: &mut impl Write) -> io::Result<usize> {
         let frequency_hz =
             self.instrument.channels.get(usize::from(channel.0)).map_or(f64::NAN, |c| c.frequency_hz);
         let rows = self.visibilities(channel);
-        let file = AtomicFile::create(path, IfUnfinished::Remove).map_err(failed)?;
-        let mut out = BufWriter::new(file);
-        writeln!(out, "{CSV_HEADER}").map_err(failed)?;
+        writeln!(out, "{CSV_HEADER}")?;
         for row in &rows {
-            self.write_line(&mut out, row, jansky_per_k_sr(frequency_hz)).map_err(failed)?;
+            self.write_line(out, row, jansky_per_k_sr(frequency_hz))?;
         }
-        let file = out.into_inner().map_err(|error| failed(error.into_error()))?;
-        file.finish().map_err(failed)?;
         Ok(rows.len())
     }
 

@@ -130,6 +130,9 @@ impl Stage for Solver {
             SnapshotSums::Pixel(sums) => {
                 let solved = match solve_pixels_watched(sums, epsilon, prior.as_deref(), probes, watch) {
                     Err(SolveError::Interrupted) => return Ok(()),
+                    // The first data alone, or what a stranger sent, may not determine a map. The next snapshot has more; that the
+                    // last one fails is an error.
+                    Err(SolveError::NotPositive { .. }) if !is_final => return Ok(()),
                     solved => solved?,
                 };
                 (solved.map_k, solved.noise_k, solved.diagnostics)

@@ -15,6 +15,9 @@ pub enum Dimension {
     Angle,
 }
 
+/// Sizes of numbers that are written without a power of ten.
+const PLAIN: std::ops::Range<f64> = 1e-3..1e9;
+
 /// Units of frequency and what they are in Hz; longer names before those that they end with.
 const FREQUENCIES: [(&str, f64); 4] = [("GHz", 1e9), ("MHz", 1e6), ("kHz", 1e3), ("Hz", 1.0)];
 const TIMES: [(&str, f64); 7] = [
@@ -70,6 +73,26 @@ impl Dimension {
         }
     }
 
+    /// A value as people write it: in the largest unit of which it is one or more, with no digit lost.
+    #[must_use]
+    pub fn show(self, value: f64) -> String {
+        let plain = |number: f64, unit: &str| match PLAIN.contains(&number.abs()) || number == 0.0 {
+            true => format!("{number} {unit}"),
+            false => format!("{number:e} {unit}"),
+        };
+        // Units of time are for arguments; a mission is counted in days.
+        let shown = self.units().iter().filter(|(unit, _)| !["yr", "h", "min"].contains(unit));
+        let fitting = shown.filter(|(_, size)| value.abs() >= *size && (value / size) * size == value);
+        let (unit, size) = fitting.max_by(|a, b| a.1.total_cmp(&b.1)).copied().unwrap_or(self.base());
+        plain(value / size, unit)
+    }
+
+    /// The unit in which values are kept.
+    fn base(self) -> (&'static str, f64) {
+        let unit = self.units().iter().find(|(_, size)| *size == 1.0);
+        unit.copied().unwrap_or_default()
+    }
+
     /// The value of a text, in the unit that this dimension is kept in; a number alone is in that unit.
     ///
     /// # Errors
@@ -121,6 +144,31 @@ mod tests {
             (Dimension::Length, "3 feet"),
         ] {
             assert!(dimension.parse(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn values_are_shown_with_their_unit_and_read_again() {
+        for (dimension, value, expected) in [
+            (Dimension::Frequency, 3e6, "3 MHz"),
+            (Dimension::Frequency, 8500.0, "8.5 kHz"),
+            (Dimension::Frequency, 0.1, "0.1 Hz"),
+            (Dimension::Frequency, 0.0, "0 Hz"),
+            (Dimension::Frequency, 1e12, "1000 GHz"),
+            (Dimension::Frequency, f64::NAN, "NaN Hz"),
+            (Dimension::Time, 2_592_000.0, "30 d"),
+            (Dimension::Time, 90.0, "90 s"),
+            (Dimension::Length, 300.0, "300 m"),
+            (Dimension::Length, -300e3, "-300 km"),
+            (Dimension::Length, 1e300, "1e297 km"),
+            (Dimension::Angle, 0.5, "30 arcmin"),
+            (Dimension::Angle, 30.0, "30 deg"),
+        ] {
+            assert_eq!(dimension.show(value), expected);
+        }
+        // No digit is lost: 0.1 MHz and its neighbours.
+        for value in [1e5_f64.next_up(), 1e5, 1e5_f64.next_down(), 2.1e6, 1.0 / 3.0, 1e6 / 3.0] {
+            assert_eq!(Dimension::Frequency.parse(&Dimension::Frequency.show(value)), Ok(value), "{value}");
         }
     }
 

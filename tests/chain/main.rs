@@ -10,6 +10,7 @@ mod coded;
 mod command_line;
 mod ending;
 mod figures;
+mod first_contact;
 mod groups;
 mod harmonic;
 mod instrument;

@@ -27,6 +27,11 @@ fn a_terminal_shows_what_the_interface_says() {
     std::thread::sleep(Duration::from_millis(1100));
     assert_eq!(text, succeed(&["top", &format!("http://{}/", served.address), "--once"]));
     assert!(!text.contains('\u{1b}'), "{text}");
+    // For programs: what the interface says.
+    let mut printed: Value = serde_json::from_str(&succeed(&["top", &served.address, "--json"])).unwrap();
+    for key in ["ledger", "reception", "channels"] {
+        assert_eq!(printed[key].take(), status[key], "{key}");
+    }
     let row = |name: &str| {
         let found = text.lines().find(|line| line.contains(&format!("\u{2502}{name} ")));
         found.unwrap_or_else(|| panic!("no {name} in\n{text}"))

@@ -290,6 +290,8 @@ fn what_is_out_of_range_is_refused_and_counted() {
         for (bad, reason) in [
             (of(4.001, Complex64::ONE), Refusal::OutOfRange),
             (of(1e300, Complex64::ONE), Refusal::OutOfRange),
+            // Nothing of it would be in the matrix, and something in the right-hand side.
+            (of(4.0 * 0.5_f64.powi(43), Complex64::ONE), Refusal::OutOfRange),
             (of(1.0, Complex64::new(0.0, -1.65e4)), Refusal::OutOfRange),
             (of(f64::INFINITY, Complex64::ONE), Refusal::NotFinite),
             (of(-1.0, Complex64::ONE), Refusal::NotFinite),

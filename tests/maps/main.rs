@@ -7,6 +7,7 @@ mod common;
 mod closed_loop;
 mod engines;
 mod exact_sums;
+mod forged;
 mod refined;
 mod tikhonov;
 mod traces;

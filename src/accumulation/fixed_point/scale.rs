@@ -15,6 +15,9 @@ const INTEGRATION_S: f64 = 25.0;
 const HEAD_ROOM: f64 = 1024.0;
 /// Greatest signal-to-noise ratio of one visibility; thermal noise of the sky itself allows 600.
 const SIGNAL_TO_NOISE_MAX: f64 = 16_384.0;
+/// Least weight, as a part of the scale: what the pixel engine's sums hold of a smaller one is rounded to nothing. It is twelve orders of
+/// magnitude below the greatest.
+const WEIGHT_PART_MIN: f64 = 2.273_736_754_432_320_6e-13; // 2^-42
 /// Weights are counted in this part of the scale.
 const WEIGHT_STEPS: f64 = 18_446_744_073_709_551_616.0; // 2^64
 
@@ -64,7 +67,8 @@ impl WeightScale {
             return Err(Refusal::NotFinite);
         }
         let signal = value.re.abs().max(value.im.abs()) * weight.sqrt();
-        if weight > weight_max || signal > SIGNAL_TO_NOISE_MAX {
+        let vanishes = weight < WEIGHT_PART_MIN * self.weight;
+        if weight > weight_max || vanishes || signal > SIGNAL_TO_NOISE_MAX {
             return Err(Refusal::OutOfRange);
         }
         Ok(())
@@ -138,6 +142,18 @@ mod tests {
         }
         for weight_max in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e-70, 1e70] {
             assert!(WeightScale::new(weight_max).is_err());
+        }
+    }
+
+    #[test]
+    fn weights_that_vanish_are_refused() {
+        let scale = WeightScale::new(1.0).unwrap();
+        let check = |weight: f64| scale.check(Complex64::new(1.0, 0.0), weight, 1.0);
+        assert_eq!(check(1.0), Ok(()));
+        assert_eq!(check(0.5_f64.powi(42)), Ok(()));
+        // The least weight that a packet can hold.
+        for weight in [0.5_f64.powi(43), f64::from(f32::from_bits(1))] {
+            assert_eq!(check(weight), Err(Refusal::OutOfRange));
         }
     }
 

@@ -29,8 +29,8 @@ use thiserror::Error;
 use super::harmonic::{GeometryRefusal, HarmonicError};
 use super::pixel::Comb;
 use crate::array::scaled_baseline;
-use crate::units::Pair;
 use crate::units::vector::Vec3;
+use crate::units::{Dimension, Pair};
 
 /// Positions of the two daughters of a pair.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -60,7 +60,8 @@ pub struct DaughterPosition {
 pub enum ModelError {
     /// A pair departs too far from the orbit of the model.
     #[error(
-        "visibility model at {frequency_hz} Hz: {refusal}; set spacecraft.model = \"direct\" for such an array"
+        "visibility model at {}: {refusal}; set spacecraft.model = \"direct\" for such an array",
+        Dimension::Frequency.show(*frequency_hz)
     )]
     Geometry {
         /// Frequency, Hz.
@@ -69,7 +70,7 @@ pub enum ModelError {
         refusal: GeometryRefusal,
     },
     /// The harmonic model failed.
-    #[error("visibility model at {frequency_hz} Hz: {source}")]
+    #[error("visibility model at {}: {source}", Dimension::Frequency.show(*frequency_hz))]
     Harmonic {
         /// Frequency, Hz.
         frequency_hz: f64,
@@ -78,8 +79,9 @@ pub enum ModelError {
     },
     /// Two daughters with dipoles in the same or in opposite directions from the Moon's centre.
     #[error(
-        "visibility model at {frequency_hz} Hz: two daughters in the same or in opposite directions from the Moon's \
-         centre do not define the orbital plane that their dipoles are normal to"
+        "visibility model at {}: two daughters in the same or in opposite directions from the Moon's \
+         centre do not define the orbital plane that their dipoles are normal to",
+        Dimension::Frequency.show(*frequency_hz)
     )]
     NoPlane {
         /// Frequency, Hz.
@@ -87,8 +89,9 @@ pub enum ModelError {
     },
     /// A model of instants was asked for an average over integrations.
     #[error(
-        "visibility model at {frequency_hz} Hz: all but harmonics hold for instants only; set spacecraft.model = \"harmonic\" \
-         or spacecraft.smear_integrations = false"
+        "visibility model at {}: all but harmonics hold for instants only; set spacecraft.model = \"harmonic\" \
+         or spacecraft.smear_integrations = false",
+        Dimension::Frequency.show(*frequency_hz)
     )]
     Smearing {
         /// Frequency, Hz.

@@ -250,7 +250,7 @@ function showReception(status) {
   const ends = listening ? Object.entries(listening.report.ended).map(([end, count]) => `${end} ${count}`).join(", ") : "";
   const stations = Object.entries(listening?.report.stations ?? {}).map(([name, counts]) => `${name} ${prefixed(counts.bytes)}B`).join(", ");
   $("senders").textContent = listening ? `${listening.open} senders connected, ${number.format(listening.report.connections)} accepted, ${number.format(listening.report.refused)} refused; ${prefixed(listening.bytes)}B read, ${prefixed(listening.backlog_bytes)}B wait${ends ? `; ended: ${ends}` : ""}${stations ? `; stations: ${stations}` : ""}` : `${prefixed(reception.bytes)}B received`;
-  $("saving").textContent = saving ? (saving.unsaved ? `▲ state not saved, ${saving.failed} attempts failed: ${saving.unsaved}` : `state saved, ${saving.written} checkpoints`) : "";
+  $("saving").textContent = saving ? (saving.unsaved ? `▲ state not saved, ${saving.failed} attempt${saving.failed === 1 ? "" : "s"} failed: ${saving.unsaved}` : `state saved, ${saving.written} checkpoints`) : "";
 }
 
 function showFigures() {

@@ -5,6 +5,7 @@ use std::path::Path;
 use super::error::{FitsError, FitsProblem};
 use super::read::{MapFile, ReadOptions, read_whole_map_file};
 use crate::sky::{MapError, MapFrequency, SkyConfig, SkyMap};
+use crate::units::Dimension;
 
 /// Relative difference up to which two frequencies are the same: a digit lost in a header.
 const SAME: f64 = 1e-6;
@@ -53,10 +54,11 @@ fn read_at(path: &Path, frequency_hz: f64, config: &SkyConfig) -> Result<SkyMap,
         _ if (map_hz - frequency_hz).abs() <= SAME * frequency_hz => Ok(map),
         MapFrequency::MustMatch => {
             let expected = format!(
-                "{frequency_hz} Hz, the channel's: give a map of that frequency, or have it scaled by \
-                 sky.frequency = {{ spectral_index = -2.5 }}"
+                "{}, the channel's: give a map of that frequency, or have it scaled by \
+                 sky.frequency = {{ spectral_index = -2.5 }}",
+                Dimension::Frequency.show(frequency_hz)
             );
-            Err(refuse(FitsProblem::keyword("FREQ", format!("{map_hz} Hz"), expected)))
+            Err(refuse(FitsProblem::keyword("FREQ", Dimension::Frequency.show(map_hz), expected)))
         }
         MapFrequency::SpectralIndex(index) => {
             let factor = (frequency_hz / map_hz).powf(index);

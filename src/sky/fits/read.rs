@@ -261,10 +261,15 @@ fn nside(header: &Header, cells: u64, explicit: bool) -> Result<usize, FitsProbl
     }
 }
 
+fn is_one_of<const N: usize>(text: &str, names: [&str; N]) -> bool {
+    names.iter().any(|name| text.trim().eq_ignore_ascii_case(name))
+}
+
 fn is_nested(header: &Header) -> Result<bool, FitsProblem> {
-    match header.text("ORDERING").map(str::to_ascii_uppercase).as_deref() {
-        Some("RING") | None => Ok(false),
-        Some("NESTED" | "NEST") => Ok(true),
+    match header.get("ORDERING") {
+        None => Ok(false),
+        Some(CardValue::Text(text)) if is_one_of(text, ["RING"]) => Ok(false),
+        Some(CardValue::Text(text)) if is_one_of(text, ["NEST", "NESTED"]) => Ok(true),
         Some(other) => Err(FitsProblem::keyword("ORDERING", other, "RING or NESTED")),
     }
 }
