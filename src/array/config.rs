@@ -324,7 +324,7 @@ impl ArrayConfig {
             checks.number(key, value, true, FINITE);
         }
         let mut found = checks.finish();
-        found.extend(self.propagate.problems(!self.kepler.is_empty()));
+        found.extend(self.propagate.problems(self.satellites, !self.kepler.is_empty()));
         let of_one =
             |(index, elements): (usize, &KeplerElements)| elements.problems(index, self.moon_radius_m);
         found.extend(self.kepler.iter().take(MAX_SATELLITES).enumerate().flat_map(of_one));

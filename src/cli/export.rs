@@ -119,7 +119,7 @@ struct HipsArgs {
 /// Positions in km and velocities in km/s on the axes of EME2000, centre MOON, times TDB, Hermite's interpolation of degree 7. Read again, positions are
 /// the same to 1 mm. Orbits of tables (`array.oem`, `array.propagate`) are written at their own states, as long as they last.
 ///
-/// Example: lunarray export orbits --set array.propagate.days=366 --out oem-year
+/// Example: lunarray export orbits --set array.propagate.days=475 --out oem
 #[derive(Debug, Args)]
 struct OrbitArgs {
     #[command(flatten)]

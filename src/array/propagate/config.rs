@@ -5,6 +5,9 @@ use serde::{Deserialize, Serialize};
 use super::grgm900c::DEGREE_MAX;
 use crate::units::{Checks, InvalidValue};
 
+/// Days of all satellites, at most: 1.6 GB of states.
+const DAYS_MAX: f64 = 40_000.0;
+
 /// What station keeping restores.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -51,9 +54,12 @@ impl PropagateConfig {
     }
 
     /// Everything that is wrong with the section; empty if it is good.
-    pub(in crate::array) fn problems(&self, from_elements: bool) -> Vec<InvalidValue> {
+    pub(in crate::array) fn problems(&self, satellites: usize, from_elements: bool) -> Vec<InvalidValue> {
         let mut checks = Checks::of("array.propagate");
-        checks.number("days", self.days, (0.0..=3660.0).contains(&self.days), "0 to 3660");
+        let days_max = DAYS_MAX / satellites.max(1) as f64;
+        let expected =
+            format!("0 to {days_max:.0} for {satellites} satellites, whose states take 40 kB a day each");
+        checks.number("days", self.days, (0.0..=days_max).contains(&self.days), expected);
         let degree = self.degree;
         let expected = format!("0, or 2 to {DEGREE_MAX}, as far as the table of the Moon's field goes");
         checks.number("degree", degree as f64, degree != 1 && degree <= DEGREE_MAX, expected);

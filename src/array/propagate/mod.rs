@@ -60,15 +60,15 @@ static LATEST: Mutex<Option<(ArrayConfig, Vec<TableOrbit>)>> = Mutex::new(None);
 
 /// The orbits of all satellites of a configuration without other problems.
 pub(super) fn orbits(config: &ArrayConfig) -> Result<Vec<TableOrbit>, ArrayError> {
-    // Held while another thread propagates the same. A thread that failed leaves what was there before.
-    let mut latest = LATEST.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-    if let Some((known, orbits)) = &*latest
+    // Not held while orbits are propagated, which may wait for other work of this thread.
+    let latest = || LATEST.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    if let Some((known, orbits)) = &*latest()
         && known == config
     {
         return Ok(orbits.clone());
     }
     let orbits = propagated(config)?;
-    *latest = Some((config.clone(), orbits.clone()));
+    *latest() = Some((config.clone(), orbits.clone()));
     Ok(orbits)
 }
 

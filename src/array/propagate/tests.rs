@@ -303,7 +303,7 @@ fn elements_fly_too_and_what_falls_is_told() {
     let kept = PropagateConfig { keep_every_days: 1.0, ..config.propagate.clone() };
     let wrong = ArrayConfig { propagate: kept, ..config };
     assert!(wrong.problems()[0].to_string().contains("array.propagate.keep_every_days = 1"));
-    for (degree, days) in [(1, 1.0), (17, 1.0), (4, -1.0), (4, f64::NAN)] {
+    for (degree, days) in [(1, 1.0), (17, 1.0), (4, -1.0), (4, f64::NAN), (4, 5_001.0), (4, 1e9)] {
         let propagate = PropagateConfig { degree, days, ..PropagateConfig::default() };
         assert_eq!(
             ArrayConfig { propagate, ..ArrayConfig::default() }.problems().len(),
