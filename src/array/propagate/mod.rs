@@ -46,12 +46,12 @@ const RADIUS_M_MAX: f64 = 6.6e7;
 const TELL_EVERY: usize = 4_000;
 
 /// Takes the days that are done, and those that there are.
-pub type Teller = fn(f64, f64);
+pub type PropagationTeller = fn(f64, f64);
 
-static TELLER: OnceLock<Teller> = OnceLock::new();
+static TELLER: OnceLock<PropagationTeller> = OnceLock::new();
 
 /// Has the progress of long propagations told; the first call of a process counts.
-pub fn tell_propagation(teller: Teller) {
+pub fn tell_propagation(teller: PropagationTeller) {
     let _ = TELLER.set(teller);
 }
 
