@@ -25,8 +25,8 @@ S31, S32, S33 = (SIN[k] * NORM[k] for k in ("31", "32", "33"))
 STEP = 60.0
 EVERY = 2
 AXIS, INCLINATION = 2037.1e3, np.radians(30)
-# Arcs behind the first, m: those of the DSL array at its widest; each plane is inclined by 2 % of its arc.
-ARCS = np.array([0, 600.0, 2100.0, 5600.0, 13700.0, 32400.0, 60100.0, 100000.0])
+# Arcs behind the first, m, so that pairs of many lengths are there though nothing breathes; each plane is inclined by 2 % of its arc.
+ARCS = np.array([0, 100.0, 240.0, 480.0, 900.0, 1600.0, 2800.0, 5000.0])
 
 
 def field(r):

@@ -7,6 +7,7 @@ use thiserror::Error;
 
 use super::kepler::KeplerElements;
 use super::oem::seconds;
+use super::propagate::PropagateConfig;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
 
@@ -63,6 +64,9 @@ pub struct ArrayConfig {
     pub oem: Vec<PathBuf>,
     /// Epoch of the mission in the files' time system, such as 2030-01-31T12:00:00; empty for the latest of their first epochs.
     pub oem_epoch: String,
+    /// Orbits by numerical integration, from the state of the formation, or of `kepler`, at the epoch.
+    #[serde(skip_serializing_if = "PropagateConfig::is_default")]
+    pub propagate: PropagateConfig,
     /// The formation's breathing.
     pub breathing: BreathingConfig,
 }
@@ -88,6 +92,7 @@ impl Default for ArrayConfig {
             kepler: Vec::new(),
             oem: Vec::new(),
             oem_epoch: String::new(),
+            propagate: PropagateConfig::default(),
             breathing: BreathingConfig::default(),
         }
     }
@@ -154,6 +159,19 @@ pub enum ArrayError {
         /// What was found there, and what was expected.
         what: String,
     },
+    /// A propagated satellite that does not stay in orbit.
+    #[error(
+        "array.propagate: satellite {satellite} is {:.1} km from the Moon's centre after {day:.2} days; expected orbits above \
+         the surface: a higher one, fewer days, or station keeping of the orbit", radius_m / 1e3
+    )]
+    Strays {
+        /// Which, from 1.
+        satellite: usize,
+        /// When, days after the epoch.
+        day: f64,
+        /// How far from the Moon's centre it is, m.
+        radius_m: f64,
+    },
     /// Satellites that are not apart.
     #[error(
         "array.kepler: satellites {first} and {second} are at one place at the epoch: expected orbits or anomalies that differ"
@@ -202,7 +220,7 @@ impl ArrayConfig {
     /// Whether satellites have orbits of their own, in place of a formation on one.
     #[must_use]
     pub fn has_own_orbits(&self) -> bool {
-        !self.kepler.is_empty() || !self.oem.is_empty()
+        !self.kepler.is_empty() || !self.oem.is_empty() || self.propagate.is_on()
     }
 
     /// Whether all satellites follow each other on one circle.
@@ -259,7 +277,7 @@ impl ArrayConfig {
         checks.number("cross_track_ratio", ratio, ratio.abs() <= 1.0, "-1 to 1");
         let shaped = eccentricity != 0.0 || ratio != 0.0;
         let shape = format_args!("{eccentricity}, array.cross_track_ratio = {ratio}");
-        let one = !(shaped && self.has_own_orbits());
+        let one = !shaped || self.kepler.is_empty() && self.oem.is_empty();
         checks.require("eccentricity", shape, one, "0 and 0 where array.kepler or array.oem is given");
         let arcs = self.arcs_m.len();
         let expected = "an arc for each daughter but the first, or none";
@@ -291,6 +309,13 @@ impl ArrayConfig {
             one,
             "none where array.kepler or array.arcs_m is given",
         );
+        let one = files == 0 || !self.propagate.is_on();
+        checks.require(
+            "oem",
+            format_args!("({files} files)"),
+            one,
+            "none where array.propagate.days is given",
+        );
         let epoch = &self.oem_epoch;
         let good = epoch.is_empty() || seconds(epoch).is_some();
         checks.require(
@@ -308,6 +333,7 @@ impl ArrayConfig {
             checks.number(key, value, true, FINITE);
         }
         let mut found = checks.finish();
+        found.extend(self.propagate.problems(self.satellites, !self.kepler.is_empty()));
         let of_one =
             |(index, elements): (usize, &KeplerElements)| elements.problems(index, self.moon_radius_m);
         found.extend(self.kepler.iter().take(MAX_SATELLITES).enumerate().flat_map(of_one));

@@ -87,13 +87,18 @@ pub(super) struct KeplerOrbit {
 
 impl KeplerOrbit {
     pub(super) fn new(elements: &KeplerElements) -> Self {
+        Self::about(elements, MOON_GM_M3_S2)
+    }
+
+    /// The motion about a mass of this GM, m^3/s^2.
+    pub(super) fn about(elements: &KeplerElements, gm_m3_s2: f64) -> Self {
         let &KeplerElements { semi_major_axis_m: axis_m, eccentricity, .. } = elements;
         let rate = |deg_per_day: f64| deg_per_day.to_radians() / DAY_S;
         Self {
             axes_m: [axis_m, axis_m * (1.0 - eccentricity * eccentricity).sqrt()],
             eccentricity,
             inclination_rad: elements.inclination_deg.to_radians(),
-            anomaly: [elements.mean_anomaly_deg.to_radians(), (MOON_GM_M3_S2 / axis_m.powi(3)).sqrt()],
+            anomaly: [elements.mean_anomaly_deg.to_radians(), (gm_m3_s2 / axis_m.powi(3)).sqrt()],
             periapsis: [elements.periapsis_deg.to_radians(), rate(elements.periapsis_rate_deg_per_day)],
             node: [elements.node_longitude_deg.to_radians(), rate(elements.node_rate_deg_per_day)],
         }

@@ -5,7 +5,8 @@ use std::f64::consts::TAU;
 use super::config::{ArrayConfig, ArrayError, NodeMotion};
 use super::formation::Formation;
 use super::kepler::{KeplerOrbit, eccentric_anomaly};
-use super::oem::{self, TableOrbit};
+use super::oem::{self, Stretch, TableOrbit};
+use super::propagate;
 use super::state::SatelliteState;
 use crate::units::constants::{DAY_S, SIDEREAL_MONTH_S};
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
@@ -119,9 +120,13 @@ impl Array {
         let rate = TAU / config.precession_period_s;
         let kepler: Vec<KeplerOrbit> = config.kepler.iter().map(KeplerOrbit::new).collect();
         require_apart(&kepler)?;
-        let tables = oem::read(&config.oem, config.oem_epoch_s(), config.moon_radius_m)?;
-        let own: Vec<OwnOrbit> =
-            kepler.into_iter().map(OwnOrbit::Kepler).chain(tables.into_iter().map(OwnOrbit::Table)).collect();
+        let own: Vec<OwnOrbit> = if config.propagate.is_on() {
+            propagate::orbits(config)?.into_iter().map(OwnOrbit::Table).collect()
+        } else {
+            let tables = oem::read(&config.oem, config.oem_epoch_s(), config.moon_radius_m)?;
+            let tables = tables.into_iter().map(OwnOrbit::Table);
+            kepler.into_iter().map(OwnOrbit::Kepler).chain(tables).collect()
+        };
         Ok(Self {
             formation: if own.is_empty() { Some(Formation::new(config)?) } else { None },
             shape: Shape::new(config),
@@ -148,6 +153,14 @@ impl Array {
             OwnOrbit::Kepler(_) => None,
         });
         spans.reduce(|[from, to], [start, end]| [from.max(start), to.min(end)])
+    }
+
+    /// The states through which the orbit of satellite `n` (from 0) goes, if it is given by a table.
+    pub(super) fn stretches(&self, n: usize) -> Option<Vec<Stretch>> {
+        match self.own.get(n) {
+            Some(OwnOrbit::Table(orbit)) => Some(orbit.stretches()),
+            _ => None,
+        }
     }
 
     /// Number of daughters.

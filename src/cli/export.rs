@@ -5,11 +5,12 @@ use std::time::SystemTime;
 
 use clap::{Args, Subcommand, ValueEnum};
 
-use super::arguments::{MapFileArgs, frame, input_path, is_standard, output_path};
+use super::arguments::{ArrayArgs, MapFileArgs, frame, input_path, is_standard, output_path, time_s};
 use super::log::utc_text;
 use super::output::{
-    CommandError, CommandResult, Completion, of_stdout, print_json_line, print_notes, print_text,
+    CommandError, CommandResult, Completion, of_stdout, print_config_notes, print_json_line, print_notes, print_text,
 };
+use crate::array::{Array, OemExport};
 use crate::files::write_atomically;
 use crate::products::pictures::Scaling;
 use crate::products::{Hips, HipsReport, RunFigures, VisibilityTable, spectra_csv};
@@ -39,6 +40,7 @@ enum What {
     /// Harmonic coefficients of a map as FITS, which healpy's read_alm reads.
     Alm(AlmArgs),
     Hips(HipsArgs),
+    Orbits(OrbitArgs),
 }
 
 #[derive(Debug, Args)]
@@ -112,6 +114,33 @@ struct HipsArgs {
     json: bool,
 }
 
+/// Orbits of an array as CCSDS OEM files, DIR/sat1.oem, sat2.oem, .., which `array.oem` and other software read.
+///
+/// Positions in km and velocities in km/s on the axes of EME2000, centre MOON, times TDB, Hermite's interpolation of degree 7. Read again, positions are
+/// the same to 1 mm. Orbits of tables (`array.oem`, `array.propagate`) are written at their own states, as long as they last.
+///
+/// Example: lunarray export orbits --set array.propagate.days=475 --out oem
+#[derive(Debug, Args)]
+struct OrbitArgs {
+    #[command(flatten)]
+    array: ArrayArgs,
+    /// How long, with an optional unit s, h or d; the mission's `spacecraft.duration_s` if not given.
+    #[arg(long, value_name = "TIME", value_parser = time_s)]
+    duration: Option<f64>,
+    /// Most time between states, with an optional unit s, h or d.
+    #[arg(long, value_name = "TIME", value_parser = time_s, default_value = "120s")]
+    step: f64,
+    /// First epoch, that of the mission.
+    #[arg(long, default_value = "2030-12-31T00:00:00")]
+    epoch: String,
+    /// Folder for the files.
+    #[arg(short, long, value_name = "DIR")]
+    out: PathBuf,
+    /// Print one JSON object instead of text: folder, files, states.
+    #[arg(long)]
+    json: bool,
+}
+
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Colours {
     Log,
@@ -134,7 +163,7 @@ impl ExportArgs {
             What::Visibilities(args) => (&args.to, true),
             What::Spectra(args) => (&args.to, true),
             What::Alm(args) => (&args.to, false),
-            What::Hips(_) => return Ok(()),
+            What::Hips(_) | What::Orbits(_) => return Ok(()),
         };
         match is_standard(&to.out) {
             true if !is_table => Err("--out -: a FITS file needs a name; ./- is a file of that name".into()),
@@ -150,6 +179,7 @@ pub(super) fn execute(args: &ExportArgs) -> CommandResult {
     args.refuse_misuse_of_standard_output()?;
     let (to, rows, of) = match &args.what {
         What::Hips(args) => return hips(args),
+        What::Orbits(args) => return orbits(args),
         What::Visibilities(args) => (&args.to, visibilities(args)?, "visibilities"),
         What::Spectra(args) => (&args.to, spectra(args)?, "degrees"),
         What::Alm(args) => (&args.to, alm(args)?, "coefficients"),
@@ -253,6 +283,27 @@ fn hips(args: &HipsArgs) -> CommandResult {
             "{tiles} tiles up to order {order} of {tile_width} by {tile_width} pixels are in {}",
             args.out.display()
         ))?;
+    }
+    Ok(Completion::Done)
+}
+
+fn orbits(args: &OrbitArgs) -> CommandResult {
+    let config = args.array.source().load()?;
+    print_config_notes(&config);
+    let until_s = args.duration.unwrap_or(config.spacecraft.duration_s);
+    let export = OemExport::new(&args.epoch, until_s, args.step)?;
+    let array = Array::new(&config.array)?;
+    let mut states = 0;
+    for satellite in 0..array.satellites() {
+        let (text, count) = export.text(&array, satellite);
+        write(&args.out.join(format!("sat{}.oem", satellite + 1)), text.as_bytes())?;
+        states += count;
+    }
+    let files = array.satellites();
+    if args.json {
+        print_json_line(&serde_json::json!({ "folder": args.out, "files": files, "states": states }))?;
+    } else {
+        print_text(&format!("{states} states of {files} satellites are in {}", args.out.display()))?;
     }
     Ok(Completion::Done)
 }

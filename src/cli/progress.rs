@@ -2,6 +2,7 @@
 
 use std::io::IsTerminal;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
+use std::sync::{Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -21,9 +22,25 @@ const POLL: Duration = Duration::from_millis(200);
 /// Interval between lines without a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(10);
 
+/// Interval between lines of the propagation of orbits.
+const PROPAGATION_EVERY: Duration = Duration::from_secs(3);
+
 /// What is said when a run is interrupted.
 const INTERRUPTED: &str =
     "\ninterrupted: finishing with the data so far (interrupt again to stop immediately)";
+
+/// Says how far the propagation of orbits is, every few seconds; `days` of `of_days` are done.
+pub(super) fn say_propagation(days: f64, of_days: f64) {
+    static LAST: Mutex<Option<Instant>> = Mutex::new(None);
+    let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
+    // The first call begins an interval: short ones say nothing.
+    let since = last.get_or_insert_with(Instant::now);
+    if since.elapsed() >= PROPAGATION_EVERY {
+        *since = Instant::now();
+        let fields = json!({ "days": days, "of_days": of_days });
+        say("propagation", &fields, format_args!("orbits propagated: {days:.0} of {of_days:.0} days"));
+    }
+}
 
 /// Shows the progress of a running graph until dropped.
 pub(super) struct Progress {

@@ -104,9 +104,12 @@ impl Config {
         let mut checks = Checks::of("spacecraft");
         let duration_s = self.spacecraft.duration_s;
         let good = from_s <= 0.0 && until_s >= duration_s;
-        let expected = format!(
-            "at most what the files of array.oem hold: from {from_s:.3} s to {until_s:.3} s after the mission's epoch"
-        );
+        let source = match self.array.propagate.is_on() {
+            true => "what array.propagate.days gives",
+            false => "what the files of array.oem hold",
+        };
+        let expected =
+            format!("at most {source}: from {from_s:.3} s to {until_s:.3} s after the mission's epoch");
         checks.number("duration_s", duration_s, good, expected);
         checks.finish()
     }
@@ -134,8 +137,8 @@ impl Config {
             ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
         ] {
             let expected = format!(
-                "{expected} with array.kepler, array.oem, array.eccentricity or array.cross_track_ratio: the other needs a \
-                     common circle"
+                "{expected} with array.kepler, array.oem, array.propagate, array.eccentricity or array.cross_track_ratio: the \
+                     other needs a common circle"
             );
             checks.require(key, value, good, expected);
         }

@@ -214,3 +214,45 @@ fn orbits_from_files_are_flown_and_mapped() {
     let said = fail(&long);
     assert!(said.contains("spacecraft.duration_s = ") && said.contains("array.oem"), "{said}");
 }
+
+/// Positions of all satellites at some times, m, as `geometry` prints them.
+fn places(pipeline: &str, sets: &[&str]) -> Vec<f64> {
+    let times = ["geometry", "--json", "--pipeline", pipeline, "--at", "0", "12345.6", "80000"];
+    let out = succeed(&[&times[..], sets].concat());
+    let line = |line: &str| -> serde_json::Value { serde_json::from_str(line).unwrap() };
+    let numbers = |value: serde_json::Value| -> Vec<f64> {
+        let rows = value["satellites_m"].as_array().unwrap().iter();
+        rows.flat_map(|row| row.as_array().unwrap()).map(|x| x.as_f64().unwrap()).collect()
+    };
+    out.lines().map(line).flat_map(numbers).collect()
+}
+
+/// A day in the Moon's field: looked at, written to files and read again, flown.
+#[test]
+fn propagated_orbits_are_flown_and_exported() {
+    let kepler = TRIPLE.find("kepler").unwrap()..TRIPLE.find("[spacecraft]").unwrap();
+    let mut pipeline = TRIPLE.replace("every_nth_window = 100", "duration_s = 86400.0\nevery_nth_window = 5");
+    pipeline.replace_range(
+        kepler,
+        "arcs_m = [600.0, 1500.0]\n[array.propagate]\ndays = 1.1\nkeep_every_days = 0.5\n",
+    );
+    let place = Workplace::new(&pipeline);
+    succeed(&["check", &place.pipeline]);
+    let figures = place.path("figures");
+    succeed(&["figure", "baselines", &place.pipeline, "--out", &figures]);
+    let folder = place.path("orbits");
+    let made = json(&["export", "orbits", "--pipeline", &place.pipeline, "--out", &folder]);
+    // 1.1 days in steps of 120 s, and twice the state of each correction.
+    assert_eq!((made["files"].as_u64(), made["states"].as_u64()), (Some(3), Some(3 * (793 + 2))), "{made}");
+    let files = format!("array.oem=[\"{folder}/sat1.oem\", \"{folder}/sat2.oem\", \"{folder}/sat3.oem\"]");
+    let plain = ["--set", "array.arcs_m=[]", "--set", "array.propagate.days=0", "--set", &files];
+    let (flown, read) = (places(&place.pipeline, &[]), places(&place.pipeline, &plain));
+    assert_eq!((flown.len(), read.len()), (27, 27));
+    for (flown, read) in flown.iter().zip(&read) {
+        assert!((flown - read).abs() < 1e-3, "{flown} {read}");
+    }
+    let summary = json(&["run", &place.pipeline, "--out", &place.path("out")]);
+    assert!(summary["ledger"]["accumulated"].as_u64().unwrap() > 100, "{}", summary["ledger"]);
+    let said = fail(&["check", &place.pipeline, "--set", "spacecraft.duration_s=1e6"]);
+    assert!(said.contains("spacecraft.duration_s = ") && said.contains("array.propagate.days"), "{said}");
+}

@@ -10,4 +10,5 @@ mod general;
 mod geometry;
 mod oem;
 mod patterns;
+mod propagated;
 mod response;

@@ -272,6 +272,34 @@ fn turned(turns: bool, v: Vec3) -> Vec3 {
     [v[0], cos * v[1] + sin * v[2], cos * v[2] - sin * v[1]]
 }
 
+/// From ecliptic to equatorial axes.
+pub(in crate::array) fn to_equatorial(v: Vec3) -> Vec3 {
+    let (sin, cos) = OBLIQUITY_DEG.to_radians().sin_cos();
+    [v[0], cos * v[1] - sin * v[2], cos * v[2] + sin * v[1]]
+}
+
+/// The epoch, to a microsecond, of seconds from 1970-01-01T00:00:00.
+pub(in crate::array) fn epoch_text(seconds: f64) -> String {
+    let whole = seconds.floor();
+    // To a microsecond, of which there may be a million.
+    let micros = ((seconds - whole) * 1e6).round() as i64;
+    let (whole, micros) = (whole as i64 + micros / 1_000_000, micros % 1_000_000);
+    let (days, clock) = (whole.div_euclid(86_400), whole.rem_euclid(86_400));
+    let mut year = 1970 + days.div_euclid(366);
+    while days_before(year + 1) <= days {
+        year += 1;
+    }
+    let mut day = days - days_before(year);
+    let mut month = 0;
+    let lengths = month_lengths(year);
+    while day >= lengths[month] {
+        day -= lengths[month];
+        month += 1;
+    }
+    let (hour, minute, second) = (clock / 3600, clock / 60 % 60, clock % 60);
+    format!("{year:04}-{:02}-{:02}T{hour:02}:{minute:02}:{second:02}.{micros:06}", month + 1, day + 1)
+}
+
 /// Seconds from 1970-01-01T00:00:00 of an epoch `YYYY-MM-DDThh:mm:ss[.d]` or `YYYY-DDDThh:mm:ss[.d]`.
 pub(in crate::array) fn seconds(epoch: &str) -> Option<f64> {
     let (date, clock) = epoch.trim_end_matches('Z').split_once('T')?;
@@ -282,7 +310,7 @@ pub(in crate::array) fn seconds(epoch: &str) -> Option<f64> {
     let days = match parts.as_slice() {
         [year, month, day] => {
             let (year, month, day) = (digits(year, 4)?, digits(month, 2)?, digits(day, 2)?);
-            let lengths = [31, 28 + i64::from(is_leap(year)), 31, 30, 31, 30, 31, 31, 30, 31, 30, 31];
+            let lengths = month_lengths(year);
             let index = usize::try_from(month - 1).ok().filter(|index| *index < 12)?;
             (1..=lengths[index]).contains(&day).then_some(())?;
             days_before(year) + lengths[..index].iter().sum::<i64>() + day - 1
@@ -302,6 +330,10 @@ pub(in crate::array) fn seconds(epoch: &str) -> Option<f64> {
     let second: f64 = second.parse().ok()?;
     let good = hour < 24 && minute < 60 && second < 61.0;
     good.then(|| days as f64 * DAY_S + (hour * 3600 + minute * 60) as f64 + second)
+}
+
+fn month_lengths(year: i64) -> [i64; 12] {
+    [31, 28 + i64::from(is_leap(year)), 31, 30, 31, 30, 31, 31, 30, 31, 30, 31]
 }
 
 fn is_leap(year: i64) -> bool {
@@ -330,6 +362,16 @@ mod tests {
             ("2030-365T00:00:00", 1_924_905_600.0),
         ] {
             assert_eq!(seconds(epoch), Some(expected), "{epoch}");
+        }
+        for (expected, seconds) in [
+            ("1970-01-01T00:00:00.000000", 0.0),
+            ("1969-12-31T23:59:59.000000", -1.0),
+            ("2000-01-01T12:00:00.000000", 946_728_000.0),
+            ("2024-02-29T23:59:59.500000", 1_709_251_199.5),
+            ("2024-03-01T00:00:00.000000", 1_709_251_199.999_999_8),
+            ("2030-12-31T00:00:00.000000", 1_924_905_600.0),
+        ] {
+            assert_eq!(epoch_text(seconds), expected);
         }
         for bad in [
             "",

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use super::file::{DEGREE_MAX, Fault, OemFile, OemSegment, parse};
+use super::file::{DEGREE_MAX, Fault, OemFile, OemSegment, TableMethod, parse};
 use crate::array::config::ArrayError;
 use crate::array::state::SatelliteState;
 use crate::units::constants::MOON_GM_M3_S2;
@@ -15,6 +15,33 @@ pub(in crate::array) struct TableOrbit {
     file: Arc<OemFile>,
     /// Epoch of the mission in the file's seconds.
     epoch_s: f64,
+}
+
+/// States of one orbit, at rising times, without a jump.
+#[derive(Clone, Debug, Default)]
+pub(in crate::array) struct Stretch {
+    time_s: Vec<f64>,
+    position_m: Vec<Vec3>,
+    velocity_m_s: Vec<Vec3>,
+}
+
+impl Stretch {
+    pub(in crate::array) fn times_s(&self) -> &[f64] {
+        &self.time_s
+    }
+
+    /// Times and states.
+    pub(in crate::array) fn states(&self) -> impl Iterator<Item = (f64, SatelliteState)> + '_ {
+        let states = self.position_m.iter().zip(&self.velocity_m_s);
+        let states = states.map(|(&position_m, &velocity_m_s)| SatelliteState { position_m, velocity_m_s });
+        self.time_s.iter().copied().zip(states)
+    }
+
+    pub(in crate::array) fn push(&mut self, time_s: f64, state: SatelliteState) {
+        self.time_s.push(time_s);
+        self.position_m.push(state.position_m);
+        self.velocity_m_s.push(state.velocity_m_s);
+    }
 }
 
 /// Largest file that is read, bytes: ten years of states each minute.
@@ -132,6 +159,31 @@ impl OemFile {
 }
 
 impl TableOrbit {
+    /// An orbit through states at times after the mission's epoch; each stretch, of four states or more, begins when the one
+    /// before ends.
+    pub(in crate::array) fn of_stretches(stretches: Vec<Stretch>) -> Self {
+        let segment = |Stretch { time_s, position_m, velocity_m_s }| OemSegment {
+            method: TableMethod::Hermite,
+            degree: 7,
+            line: 0,
+            time_s,
+            position_m,
+            velocity_m_s,
+        };
+        let segments = stretches.into_iter().map(segment).collect();
+        Self { file: Arc::new(OemFile { time_system: "TDB".into(), segments }), epoch_s: 0.0 }
+    }
+
+    /// The states of the table, at times since the mission's epoch.
+    pub(in crate::array) fn stretches(&self) -> Vec<Stretch> {
+        let stretch = |segment: &OemSegment| Stretch {
+            time_s: segment.time_s.iter().map(|t_s| t_s - self.epoch_s).collect(),
+            position_m: segment.position_m.clone(),
+            velocity_m_s: segment.velocity_m_s.clone(),
+        };
+        self.file.segments.iter().map(stretch).collect()
+    }
+
     /// First and last time, s since the mission's epoch.
     pub(in crate::array) fn span_s(&self) -> [f64; 2] {
         self.file.span_s().map(|t_s| t_s - self.epoch_s)

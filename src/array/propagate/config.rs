@@ -1,0 +1,73 @@
+//! Configuration of orbits that are propagated.
+
+use serde::{Deserialize, Serialize};
+
+use super::grgm900c::DEGREE_MAX;
+use crate::units::{Checks, InvalidValue};
+
+/// Days of all satellites, at most: 1.6 GB of states.
+const DAYS_MAX: f64 = 40_000.0;
+
+/// What station keeping restores.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Keeping {
+    /// The followers' places behind satellite 1, whose orbit goes on as it is.
+    #[default]
+    Formation,
+    /// Satellite 1's semi-major axis, eccentricity, inclination and argument of the periapsis, too; its node stays.
+    Orbit,
+}
+
+/// Orbits by numerical integration of the forces, from the formation's state at the epoch or from `array.kepler`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PropagateConfig {
+    /// How long, days from the epoch; 0 for orbits that are not propagated.
+    pub days: f64,
+    /// Degree and order of the Moon's field.
+    pub degree: usize,
+    /// Whether the Earth pulls, too.
+    pub earth: bool,
+    /// Days between corrections of the formation; 0 for none.
+    pub keep_every_days: f64,
+    /// What a correction restores.
+    pub keep: Keeping,
+}
+
+impl Default for PropagateConfig {
+    fn default() -> Self {
+        Self { days: 0.0, degree: 12, earth: true, keep_every_days: 0.0, keep: Keeping::Formation }
+    }
+}
+
+impl PropagateConfig {
+    /// Whether orbits are propagated.
+    #[must_use]
+    pub fn is_on(&self) -> bool {
+        self.days != 0.0
+    }
+
+    /// Whether the section is as it is without being mentioned.
+    pub(in crate::array) fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Everything that is wrong with the section; empty if it is good.
+    pub(in crate::array) fn problems(&self, satellites: usize, from_elements: bool) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("array.propagate");
+        let days_max = DAYS_MAX / satellites.max(1) as f64;
+        let expected =
+            format!("0 to {days_max:.0} for {satellites} satellites, whose states take 40 kB a day each");
+        checks.number("days", self.days, (0.0..=days_max).contains(&self.days), expected);
+        let degree = self.degree;
+        let expected = format!("0, or 2 to {DEGREE_MAX}, as far as the table of the Moon's field goes");
+        checks.number("degree", degree as f64, degree != 1 && degree <= DEGREE_MAX, expected);
+        let every = self.keep_every_days;
+        let good = every == 0.0 || (0.25..=3660.0).contains(&every);
+        checks.number("keep_every_days", every, good, "0, or 0.25 to 3660");
+        let expected = "0 with array.kepler: station keeping restores a formation";
+        checks.number("keep_every_days", every, every == 0.0 || !from_elements, expected);
+        checks.finish()
+    }
+}
