@@ -2,7 +2,8 @@
 """Cramer-Rao bounds of the phases of daughters in one pass and channel with a known sky, in numpy and healpy: shares no code with
 lunarray.
 
-    python3 pipelines/calibration/bound.py ULSA_FOLDER          # a table of six cases, deg against daughter 1
+    python3 pipelines/calibration/bound.py ULSA_FOLDER [ARCSEC] # a table of six cases, deg against daughter 1, with drawn
+                                                                # sources of a diameter (15)
     python3 pipelines/calibration/bound.py --points MHZ FOLDER  # writes FOLDER/points.fits, and bounds for that sky alone
 
 The sky is ULSA (Cong et al. 2021; nside 64, on baselines up to 32 wavelengths), the 3,100 brightest sources of the GLEAM counts
@@ -59,7 +60,7 @@ def window(after):
     return t[rises], t[rises + np.argmin(hidden[rises:])]
 
 
-def sources(nu):
+def sources(nu, arcsec=15.0):
     """Directions, K sr, and diameters (rad) with scattering at nu (Hz)."""
     rng = np.random.default_rng(5)
     log_flux = np.linspace(0, 3, 3001)
@@ -71,7 +72,7 @@ def sources(nu):
     z, longitude = rng.uniform(-1, 1, 3100), rng.uniform(0, 2 * np.pi, 3100)
     across = np.sqrt(1 - z * z)
     where = np.stack([across * np.cos(longitude), across * np.sin(longitude), z], 1)
-    jansky, size = drawn * (nu / 154e6) ** -0.8, np.full(3100, 15.0)
+    jansky, size = drawn * (nu / 154e6) ** -0.8, np.full(3100, arcsec)
     turn = hp.Rotator(coord="CE")
     named = np.array([turn(hp.ang2vec(ra, dec, lonlat=True)) for ra, dec, *_ in NAMED])
     table = np.array(NAMED)
@@ -145,5 +146,6 @@ else:
         sky = diffuse(sys.argv[1], nu)
         extended = np.array(hp.pix2vec(64, np.arange(len(sky)))).T, sky * hp.nside2pixarea(64)
         for label, after in [("widest", 0.0), ("narrowest", HALF_BREATH - 0.5 * PERIOD)]:
-            found, length = bounds(nu, after, sources(nu), extended)
+            arcsec = float(sys.argv[2]) if len(sys.argv) > 2 else 15.0
+            found, length = bounds(nu, after, sources(nu, arcsec), extended)
             told(f"{mhz:2d} MHz {label:9s}:", found)
