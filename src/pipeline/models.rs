@@ -14,8 +14,8 @@ use crate::frames::ObservingWindow;
 use crate::mother::{ChannelModel, Fidelity, MoonMirror, Schedule};
 use crate::response::harmonic::RotationTable;
 use crate::response::model::{
-    AntennaPatterns, AntennaSum, BandAverage, DirectSum, Emitting, GeneralSum, HarmonicSum, HarmonicSumSetup, Load, ModelChoice,
-    ModelKind, ModelPlan, Reflected, SphereMirrored, VisibilityModel,
+    AntennaPatterns, AntennaSum, BandAverage, DirectSum, Emitting, GeneralSum, HarmonicSum, HarmonicSumSetup,
+    Load, ModelChoice, ModelKind, ModelPlan, Reflected, SphereMirrored, VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
@@ -138,7 +138,8 @@ pub(crate) fn build(plan: &Plan, skies: &[Option<&SkyMap>]) -> Result<Vec<Channe
     let (mut rotations, antennas) = (HashMap::new(), plan.antenna_errors());
     let mut models = Vec::new();
     for ((choice, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {
-        let made = sky.map(|sky| channel_model((plan, antennas.as_ref()), choice, sky, schedule, &mut rotations));
+        let made =
+            sky.map(|sky| channel_model((plan, antennas.as_ref()), choice, sky, schedule, &mut rotations));
         models.push(ChannelModel { batch: choice.kind.batch(), model: made.transpose()? });
     }
     Ok(models)

@@ -233,7 +233,11 @@ fn tilted_dipoles_see_one_source_by_their_projections() {
         let own = dot(normal, p).powi(2) + dot(normal, q).powi(2);
         let expected = (a[0] * b[0] + a[1] * b[1]) / own;
         // Single precision, and the digits of the table.
-        assert!((after / before - expected).norm() < 2e-6 * (1.0 + expected.abs() / own), "{key:?}: {} {expected}", after / before);
+        assert!(
+            (after / before - expected).norm() < 2e-6 * (1.0 + expected.abs() / own),
+            "{key:?}: {} {expected}",
+            after / before
+        );
         (compared, far) = (compared + 1, far.max((expected - 1.0).abs()));
     }
     assert!(compared > 100 && far > 0.2, "{compared} {far}");

@@ -4,7 +4,9 @@ use std::f64::consts::TAU;
 use std::sync::Arc;
 
 use lunarray::array::{Array, ArrayConfig, IntegrationRule, ObservingWindows};
-use lunarray::daughters::{DaughtersConfig, InstrumentConfig, InstrumentErrors, Sampler, SamplerCounts, Scene};
+use lunarray::daughters::{
+    DaughtersConfig, InstrumentConfig, InstrumentErrors, Sampler, SamplerCounts, Scene,
+};
 use lunarray::frames::{
     AntennaResponse, Channel, GroundFrame, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame,
     VisibilityBlock,

@@ -141,7 +141,10 @@ fn errors_of_the_instrument_turn_samples_as_they_turn_visibilities() {
             assert!(found.len() >= 60, "{}", found.len());
             let (scaled, error) = ratio(&found, wanted);
             // 3e-3: synthesis; phases turn by 1.5 deg in an integration, whose mean loses 1e-4.
-            assert!((scaled - 1.0).norm() < 4.0 * COMMON * error + 3e-3, "{pair} {channel}: {scaled} +- {error}");
+            assert!(
+                (scaled - 1.0).norm() < 4.0 * COMMON * error + 3e-3,
+                "{pair} {channel}: {scaled} +- {error}"
+            );
         }
     }
 }

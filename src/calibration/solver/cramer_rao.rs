@@ -51,13 +51,10 @@ fn direction([longitude_deg, latitude_deg]: [f64; 2]) -> Vec3 {
 }
 
 fn sources(frequency_hz: f64) -> Vec<Source> {
-    let k_sr = |jansky: f64| {
-        1e-26 * jansky * (SPEED_OF_LIGHT_M_S / frequency_hz).powi(2) / (2.0 * BOLTZMANN_J_K)
-    };
+    let k_sr =
+        |jansky: f64| 1e-26 * jansky * (SPEED_OF_LIGHT_M_S / frequency_hz).powi(2) / (2.0 * BOLTZMANN_J_K);
     // Blurred by the Galaxy: 30' (nu / MHz)^-2.2 (Jester & Falcke 2009).
-    let blurred = |arcsec: f64| {
-        (arcsec / 3600.0).hypot(0.5 * (frequency_hz / 1e6).powf(-2.2)).to_radians()
-    };
+    let blurred = |arcsec: f64| (arcsec / 3600.0).hypot(0.5 * (frequency_hz / 1e6).powf(-2.2)).to_radians();
     let drawn = catalogue(&GeneratedSky::default(), frequency_hz, 1).into_iter().take(600);
     let drawn = drawn.map(|source| (direction(source.place_deg), k_sr(source.flux_jy), blurred(15.0)));
     let named = STRONGEST.map(|[longitude, latitude, jansky, index, arcsec]| {
@@ -167,8 +164,9 @@ fn solve(data: &[PairData], frequency_hz: f64, seed: u64) -> Vec<[f64; 2]> {
     let mut stream = random_stream(seed, StreamKind::Probe, [3, 3]);
     let mut normal = || -> f64 { StandardNormal.sample(&mut stream) };
     // 10 % and 60 deg.
-    let gains: [Complex64; DAUGHTERS] =
-        std::array::from_fn(|_| Complex64::from_polar((0.1 * normal()).exp(), 60_f64.to_radians() * normal()));
+    let gains: [Complex64; DAUGHTERS] = std::array::from_fn(|_| {
+        Complex64::from_polar((0.1 * normal()).exp(), 60_f64.to_radians() * normal())
+    });
     let block = |data: &PairData| {
         let gain = gains[usize::from(data.pair.i)] * gains[usize::from(data.pair.j)].conj();
         let mut block = ModelledBlock { pair: data.pair, time_s: data.time_s.clone(), ..Default::default() };
@@ -188,11 +186,8 @@ fn solve(data: &[PairData], frequency_hz: f64, seed: u64) -> Vec<[f64; 2]> {
     let config = SolverConfig { phase_sigma_deg_max: 1e3, ..SolverConfig::default() };
     let span_s = [0.0, f64::INFINITY];
     let normal_hat = vec![[0.0, 0.0, 1.0]; DAUGHTERS];
-    let found = solve_pass(
-        &config,
-        &[frequency_hz],
-        PassData { pass: 0, span_s, blocks: &mut blocks, normal_hat },
-    );
+    let found =
+        solve_pass(&config, &[frequency_hz], PassData { pass: 0, span_s, blocks: &mut blocks, normal_hat });
     assert!(found.converged, "{seed}: {found:?}");
     (1..DAUGHTERS)
         .map(|n| {
@@ -223,7 +218,9 @@ fn phases_of_every_daughter_reach_the_bound_in_one_pass() {
             let of_all: Vec<&[f64; 2]> = found.iter().flatten().collect();
             let inside = of_all.iter().filter(|[error, sigma]| error.abs() < 3.0 * sigma).count();
             let coverage = inside as f64 / of_all.len() as f64;
-            eprintln!("{mhz} MHz, {formation}: bounds {bounds:.2?} deg, ratios {ratios:.3?}, coverage {coverage:.4}");
+            eprintln!(
+                "{mhz} MHz, {formation}: bounds {bounds:.2?} deg, ratios {ratios:.3?}, coverage {coverage:.4}"
+            );
             // 1,000 solutions give a root mean square to 2.2 %.
             assert!(ratios.iter().all(|ratio| *ratio < 1.2), "{mhz} MHz, {formation}: {ratios:?}");
             assert!(coverage >= 0.99, "{mhz} MHz, {formation}: {coverage}");

@@ -91,7 +91,8 @@ impl Series {
             orbit: [0, 1].map(|part| random(terms.orbit_rms, Term::Orbit, part)),
             orbit_rad_per_s: std::f64::consts::TAU / period_s,
             drift: (terms.drift_rms > 0.0).then(|| {
-                let process = Process { rms: terms.drift_rms, time_s: terms.drift_time_s, nodes: NODES_PER_TIME };
+                let process =
+                    Process { rms: terms.drift_rms, time_s: terms.drift_time_s, nodes: NODES_PER_TIME };
                 process.over([from_s, to_s], &|node| draws.normal(Term::Drift, node))
             }),
             walk: None,
@@ -101,13 +102,7 @@ impl Series {
 
     /// Adds a random walk over an interval whose increments have a variance of `per_root_s`^2 each second, and which is
     /// forgotten within `steering_s`.
-    pub(super) fn with_walk(
-        self,
-        per_root_s: f64,
-        steering_s: f64,
-        draws: Draws,
-        span_s: [f64; 2],
-    ) -> Self {
+    pub(super) fn with_walk(self, per_root_s: f64, steering_s: f64, draws: Draws, span_s: [f64; 2]) -> Self {
         // Increments over t of a Gauss-Markov process have 2 rms^2 (1 - exp(-t / time)).
         let process = Process {
             rms: per_root_s * (0.5 * steering_s).sqrt(),
@@ -284,7 +279,8 @@ mod tests {
         // Any interval has the same values.
         let (from_s, whole) = clock(7);
         let span_s = [from_s + 1000.0, from_s + 1100.0];
-        let part = Series::new(&none, draws(0), (7, span_s), 8000.0).with_walk(at_1_s, steering_s, draws(0), span_s);
+        let part =
+            Series::new(&none, draws(0), (7, span_s), 8000.0).with_walk(at_1_s, steering_s, draws(0), span_s);
         for k in 0..100 {
             let t_s = from_s + 1000.0 + f64::from(k);
             assert_eq!(whole.at(t_s), part.at(t_s));

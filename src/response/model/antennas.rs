@@ -49,9 +49,10 @@ impl VisibilityModel for AntennaSum {
     fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
         let at: Option<Vec<_>> = daughters.iter().map(|daughter| daughter.at).collect();
         let Some(at) = at else { return self.sum.predict_powers(daughters, out) };
-        let singles = daughters.iter().zip(at).map(|(daughter, (number, t_s))| {
-            (self.sum.single(daughter), self.patterns.antenna(number, t_s))
-        });
+        let singles = daughters
+            .iter()
+            .zip(at)
+            .map(|(daughter, (number, t_s))| (self.sum.single(daughter), self.patterns.antenna(number, t_s)));
         let singles: Vec<_> = singles.collect();
         let (directions, values, area_sr) = self.sum.sky();
         // As above.
@@ -111,8 +112,7 @@ mod tests {
             for (i, j) in [(0_u8, 1_u8), (2, 5), (1, 7)] {
                 let t_s = 4e5 + f64::from(j);
                 let [r_i_m, r_j_m] = [i, j].map(|n| array.position_m(n.into(), 0.0));
-                let position =
-                    PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: Some((Pair { i, j }, t_s)) };
+                let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: Some((Pair { i, j }, t_s)) };
                 let (mut found, mut ideal) = ([Complex64::ZERO], [Complex64::ZERO]);
                 model.predict(&[position], &mut found).unwrap();
                 plain.predict(&[position], &mut ideal).unwrap();
@@ -154,8 +154,7 @@ mod tests {
         let mut model = AntennaSum::new(plain.clone(), Arc::new(Straight(array.clone())));
         let t_s = 3e6;
         let [r_i_m, r_j_m] = [1, 5].map(|n| array.position_m(n, t_s));
-        let position =
-            PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: Some((Pair { i: 1, j: 5 }, t_s)) };
+        let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: Some((Pair { i: 1, j: 5 }, t_s)) };
         let (mut found, mut expected) = ([Complex64::ZERO], [Complex64::ZERO]);
         model.predict(&[position], &mut found).unwrap();
         plain.predict(&[position], &mut expected).unwrap();

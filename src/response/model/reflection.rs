@@ -94,7 +94,11 @@ mod tests {
             let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: None };
             let (mut found, mut power) = ([Complex64::ZERO], [0.0]);
             reflected.predict(&[position], &mut found).unwrap();
-            let daughter = DaughterPosition { r_m: r_i_m, normal_hat: array.orbit_normal_hat(9e5), ..DaughterPosition::default() };
+            let daughter = DaughterPosition {
+                r_m: r_i_m,
+                normal_hat: array.orbit_normal_hat(9e5),
+                ..DaughterPosition::default()
+            };
             reflected.predict_powers(&[daughter], &mut power).unwrap();
             // Two waves from each direction: one straight, one by the mirror, with the mirrored direction's own fringe.
             let middle = add(r_i_m, r_j_m);

@@ -286,8 +286,9 @@ mod tests {
     fn four_skies_together_have_the_bits_of_each_alone() {
         let n = pixel_directions(16);
         let directions = Directions::from(n.as_slice());
-        let skies: [Vec<f32>; 4] =
-            std::array::from_fn(|m| n.iter().map(|n| 2.0 + (n[m % 3] * (m as f64 + 1.5)).sin() as f32).collect());
+        let skies: [Vec<f32>; 4] = std::array::from_fn(|m| {
+            n.iter().map(|n| 2.0 + (n[m % 3] * (m as f64 + 1.5)).sin() as f32).collect()
+        });
         let pairs: Vec<PairGeometry> = (1..70)
             .map(|k| {
                 let one = single(AntennaResponse::DipoleNormal);
@@ -301,8 +302,7 @@ mod tests {
                 }
             })
             .collect();
-        let together =
-            four_sky_sums(&pairs, &directions, skies.each_ref().map(Vec::as_slice), 0.5).unwrap();
+        let together = four_sky_sums(&pairs, &directions, skies.each_ref().map(Vec::as_slice), 0.5).unwrap();
         for (m, sky) in skies.iter().enumerate() {
             for (k, alone) in sky_sums(&pairs, &directions, sky, 0.5).unwrap().iter().enumerate() {
                 assert_eq!(together[k][m], alone.visibility_k_sr, "sky {m}, pair {k}");
