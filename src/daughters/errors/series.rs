@@ -271,9 +271,12 @@ mod tests {
                 }
             }
             // sigma_y^2 = <(x_2 - 2 x_1 + x_0)^2> / (2 tau^2).
-            let (found, law) = ((sum / count / 2.0).sqrt() / tau_s, at_1_s / tau_s.sqrt());
-            // Four standard deviations of a deviation from `count` values, and nodes of 1 s with straight lines between.
-            let bound = 4.0 / (2.0 * count).sqrt() + 1.0 / tau_s / 20.0;
+            // Straight lines between nodes of 1 s lack 1 / 6 of a second's variance at each of the three instants, with weights
+            // 1, 4 and 1 of 2 tau.
+            let lines = 1.0 - 1.0 / (2.0 * tau_s);
+            let (found, law) = ((sum / count / 2.0).sqrt() / tau_s, at_1_s * (lines / tau_s).sqrt());
+            // Four standard deviations of a deviation from `count` values, and what steering takes.
+            let bound = 4.0 / (2.0 * count).sqrt() + tau_s / steering_s;
             assert!((found / law - 1.0).abs() < bound, "{tau_s} s: {found} for {law}, within {bound}");
         }
         // Any interval has the same values.
