@@ -355,6 +355,18 @@ impl Array {
     }
 }
 
+impl Array {
+    /// Angle of the Earth below the Moon's limb for daughter `n` (from 0), rad: positive when hidden.
+    #[must_use]
+    pub fn earth_below_limb_rad(&self, n: usize, t_s: f64) -> f64 {
+        let position_m = self.position_m(n, t_s);
+        let distance_m = norm(position_m);
+        let from_zenith = (dot(self.earth_hat(t_s), position_m) / distance_m).clamp(-1.0, 1.0).acos();
+        let limb_from_nadir = (self.moon_radius_m / distance_m).min(1.0).asin();
+        from_zenith - (std::f64::consts::PI - limb_from_nadir)
+    }
+}
+
 /// Requires that no two satellites are at one place at the epoch.
 fn require_apart(orbits: &[KeplerOrbit]) -> Result<(), ArrayError> {
     let places: Vec<Vec3> = orbits.iter().map(|orbit| orbit.state(0.0).position_m).collect();

@@ -23,7 +23,8 @@ use crate::units::Dimension;
 /// the same sky at every frequency and nside.
 ///
 /// With --like, writes instead a sky with the mean and the angular power of another map, and a given correlation with it at
-/// every degree: a wrong prior.
+/// every degree: a wrong prior. With --extrapolate-from, writes what a power of frequency makes of the sky at another frequency:
+/// a wrong model, as gas absorbs below 10 MHz.
 ///
 /// Examples: lunarray sky --freq-hz 10e6 --out sky.fits; lunarray sky --like sky.fits --correlation 0.8 --out wrong.fits
 #[derive(Debug, Args)]
@@ -46,6 +47,12 @@ pub(super) struct SkyArgs {
     /// Correlation with that map at every degree from 1 to 2 nside: 0 to 1.
     #[arg(long, requires = "like")]
     correlation: Option<f64>,
+    /// Frequency, Hz or with a unit, whose sky is continued to --freq-hz as a power of frequency.
+    #[arg(long, value_parser = frequency_hz, conflicts_with = "like")]
+    extrapolate_from: Option<f64>,
+    /// Temperature index of that power.
+    #[arg(long, default_value_t = -2.5, allow_negative_numbers = true, requires = "extrapolate_from")]
+    index: f64,
     /// Table of the point sources (CSV): place, flux density at 154 MHz and at the frequency, unabsorbed.
     #[arg(long, value_name = "FILE")]
     sources: Option<PathBuf>,
@@ -87,8 +94,17 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
             format!("--nside {nside}: expected a power of two from 1 to {GENERATED_NSIDE_MAX}").into()
         );
     }
-    let values = generate(&sky.generated, freq_hz, nside, seed)?;
-    let map = SkyMap::new(Frame::Ecliptic, values)?;
+    let made_hz = args.extrapolate_from.unwrap_or(freq_hz);
+    if !(band_hz[0]..=band_hz[1]).contains(&made_hz) || !(-10.0..=10.0).contains(&args.index) {
+        return Err(format!(
+            "--extrapolate-from {made_hz} --index {}: expected {} Hz to {} Hz, and -10 to 10",
+            args.index, band_hz[0], band_hz[1]
+        )
+        .into());
+    }
+    let factor = (freq_hz / made_hz).powf(args.index);
+    let values = generate(&sky.generated, made_hz, nside, seed)?.into_iter().map(|value| factor * value);
+    let map = SkyMap::new(Frame::Ecliptic, values.collect())?;
     let mut made = Made::write(args, &map, &Dimension::Frequency.show(freq_hz))?;
     if let Some(path) = &args.sources {
         let count = write_sources(path, &sky.generated, freq_hz, seed)?;

@@ -25,7 +25,9 @@ mod synthesis;
 mod tile;
 
 pub use config::{DaughtersConfig, Disturbances, DropPolicy, FLOAT_BITS};
-pub use errors::{BeaconSchedule, ErrorTerms, InstrumentConfig, InstrumentErrors, PassErrors, truth_csv};
+pub use errors::{
+    AntennaErrors, BeaconSchedule, ErrorTerms, InstrumentConfig, InstrumentErrors, PassErrors, truth_csv,
+};
 pub use link::{LinkCounts, SampleLink};
 pub use repair::Repairs;
 pub(crate) use sampler::sample_ticks;

@@ -318,7 +318,7 @@ impl Integrator {
             if let Some(troubles) = &troubles {
                 let signals = troubles.signals(middle_s);
                 value += signals.visibility_k_sr;
-                own = own.map(|power| power + signals.power_k_sr);
+                own.iter_mut().zip(signals.powers_k_sr).for_each(|(own, power)| *own += power);
                 gain = troubles.gain(middle_s);
                 // A dead receiver delivers noise of the same power.
                 value = if troubles.is_dead() { Complex64::ZERO } else { value * gain };
@@ -386,7 +386,7 @@ impl Integrator {
                     noise_model.receiver_k_sr(channel) + powers.at(&self.array, n.into(), middle_s);
                 let mut flags = context.flags(pair, from, duration);
                 if let Some(troubles) = &troubles {
-                    expected_k_sr += troubles.signals(middle_s).power_k_sr;
+                    expected_k_sr += troubles.signals(middle_s).powers_k_sr[0];
                     expected_k_sr *= troubles.gain(middle_s).norm();
                     if troubles.beacon_is_on(middle_s) {
                         flags.0 |= Flags::BEACON.0;

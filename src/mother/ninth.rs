@@ -232,7 +232,11 @@ impl Ninth {
             let middle = f64::from(*offset) + 0.5 * f64::from(*duration);
             let t_s = window.start.seconds() + middle / TICKS_PER_SECOND as f64;
             let r_m = self.setup.array.trailing_m(config.arc_m, t_s);
-            DaughterPosition { r_m, normal_hat: self.setup.array.orbit_normal_hat(t_s) }
+            DaughterPosition {
+                r_m,
+                normal_hat: self.setup.array.orbit_normal_hat(t_s),
+                ..DaughterPosition::default()
+            }
         };
         let places: Vec<DaughterPosition> = offsets.iter().zip(&durations).map(place).collect();
         let channels: Vec<_> = self.spectrometer.channels().collect();

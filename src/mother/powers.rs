@@ -33,7 +33,7 @@ impl SkyPowers {
         array: &Array,
         windows: &[ObservingWindow],
     ) -> Result<Vec<Self>, ModelError> {
-        let shared = array.formation().is_some();
+        let shared = array.formation().is_some() && !model.has_own_antennas();
         let tables = if shared { 1 } else { array.satellites() };
         // Arcs are longest at the start of a breathing period.
         let lags_s = (0..array.satellites()).map(|n| lag_s(array, n, 0.0));
@@ -48,6 +48,7 @@ impl SkyPowers {
         let place = |n: usize, t_s: f64| DaughterPosition {
             r_m: if shared { array.trailing_m(0.0, t_s) } else { array.position_m(n, t_s) },
             normal_hat: array.normal_hat(n, t_s),
+            at: Some((n as u8, t_s)),
         };
         let instants = |&(from_s, count): &(f64, usize)| (0..count).map(move |k| from_s + STEP_S * k as f64);
         let places: Vec<DaughterPosition> = spans
@@ -66,7 +67,8 @@ impl SkyPowers {
 
     /// The power of daughter `n` at a time of the window, K sr.
     pub fn at(&self, array: &Array, n: usize, t_s: f64) -> f64 {
-        let x = (t_s - lag_s(array, n, t_s) - self.from_s) / STEP_S;
+        let lag_s = if self.tables.len() == 1 { lag_s(array, n, t_s) } else { 0.0 };
+        let x = (t_s - lag_s - self.from_s) / STEP_S;
         let table = if self.tables.len() == 1 { &self.tables[0] } else { &self.tables[n] };
         // Four nodes of the table, whatever the time.
         let first = (x.floor() - BEYOND).clamp(0.0, table.len().saturating_sub(4) as f64) as usize;

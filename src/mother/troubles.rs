@@ -28,8 +28,8 @@ pub(super) struct PairTroubles<'a> {
 /// Signals besides the sky's.
 #[derive(Clone, Copy)]
 pub(super) struct Signals {
-    /// At a daughter.
-    pub(super) power_k_sr: f64,
+    /// At either daughter.
+    pub(super) powers_k_sr: [f64; 2],
     pub(super) visibility_k_sr: Complex64,
 }
 
@@ -40,13 +40,16 @@ impl PairTroubles<'_> {
         let beacon =
             if self.beacon_is_on(t_s) { self.errors.config().beacon.signal() } else { Default::default() };
         let burst_k_sr = self.errors.burst_k_sr(t_s);
-        if !beacon.is_on() && burst_k_sr == 0.0 {
-            return Signals { power_k_sr: 0.0, visibility_k_sr: Complex64::ZERO };
+        let leaks_k_sr = [pair.i, pair.j].map(|n| self.errors.leak_k_sr(array, n.into(), t_s));
+        if !beacon.is_on() && burst_k_sr == 0.0 && leaks_k_sr == [0.0; 2] {
+            return Signals { powers_k_sr: [0.0; 2], visibility_k_sr: Complex64::ZERO };
         }
         let [r_i_m, r_j_m] = [pair.i, pair.j].map(|n| array.position_m(n.into(), t_s));
-        let burst = plane_wave(burst_k_sr, array.earth_hat(t_s), sub(r_i_m, r_j_m), frequency_hz);
+        let earth_k_sr = burst_k_sr + (leaks_k_sr[0] * leaks_k_sr[1]).sqrt();
+        let earth = plane_wave(earth_k_sr, array.earth_hat(t_s), sub(r_i_m, r_j_m), frequency_hz);
         let beacon_k_sr = beacon.visibility_k_sr(r_i_m, r_j_m, frequency_hz);
-        Signals { power_k_sr: beacon.k_sr + burst_k_sr, visibility_k_sr: beacon_k_sr + burst }
+        let powers_k_sr = leaks_k_sr.map(|leak_k_sr| beacon.k_sr + burst_k_sr + leak_k_sr);
+        Signals { powers_k_sr, visibility_k_sr: beacon_k_sr + earth }
     }
 
     /// The product of the two gains at a time.

@@ -11,7 +11,7 @@ use crate::calibration::solver::SolverConfig;
 use crate::calibration::{CalibrationConfig, VanVleck};
 use crate::daughters::{DaughtersConfig, InstrumentConfig};
 use crate::downlink::DownlinkConfig;
-use crate::mother::{Antenna, Fidelity, SpacecraftConfig};
+use crate::mother::{Antenna, Fidelity, MoonMirror, SpacecraftConfig};
 use crate::products::ProductsConfig;
 use crate::response::model::ModelChoice;
 use crate::runtime::RuntimeConfig;
@@ -71,6 +71,7 @@ impl Config {
         checks.require("calibration.sub_bands", ground, space == ground, expected);
         self.check_quantiser(&mut checks);
         self.check_orbits(&mut checks);
+        self.check_antennas(&mut checks);
         found.extend(checks.finish());
         let array = self.array.problems();
         let spacecraft = self.spacecraft.problems();
@@ -140,6 +141,24 @@ impl Config {
                 "{expected} with array.kepler, array.oem, array.propagate, array.eccentricity or array.cross_track_ratio: the \
                      other needs a common circle"
             );
+            checks.require(key, value, good, expected);
+        }
+    }
+
+    /// Requires what antennas that are not ideal can have.
+    fn check_antennas(&self, checks: &mut Checks) {
+        if !self.instrument.has_own_antennas() {
+            return;
+        }
+        let spacecraft = &self.spacecraft;
+        let direct = spacecraft.fidelity == Fidelity::Samples || spacecraft.model == ModelChoice::Direct;
+        let mirror = spacecraft.moon_reflection == 0.0 || spacecraft.moon_mirror == MoonMirror::Flat;
+        for (key, value, good, expected) in [
+            ("spacecraft.model", "(other)", direct, "\"direct\""),
+            ("spacecraft.moon_temperature_k", "(above 0)", spacecraft.moon_temperature_k == 0.0, "0"),
+            ("spacecraft.moon_mirror", "\"sphere\"", mirror, "\"flat\""),
+        ] {
+            let expected = format!("{expected} with instrument.tilt_along_deg, tilt_radial_deg or pattern");
             checks.require(key, value, good, expected);
         }
     }

@@ -14,8 +14,8 @@ use crate::frames::ObservingWindow;
 use crate::mother::{ChannelModel, Fidelity, MoonMirror, Schedule};
 use crate::response::harmonic::RotationTable;
 use crate::response::model::{
-    BandAverage, DirectSum, Emitting, GeneralSum, HarmonicSum, HarmonicSumSetup, Load, ModelChoice,
-    ModelKind, ModelPlan, Reflected, SphereMirrored, VisibilityModel,
+    AntennaPatterns, AntennaSum, BandAverage, DirectSum, Emitting, GeneralSum, HarmonicSum, HarmonicSumSetup,
+    Load, ModelChoice, ModelKind, ModelPlan, Reflected, SphereMirrored, VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
@@ -135,10 +135,11 @@ fn farthest_apart_m(array: &Array, windows: &[ObservingWindow]) -> f64 {
 pub(crate) fn build(plan: &Plan, skies: &[Option<&SkyMap>]) -> Result<Vec<ChannelModel>, PipelineError> {
     let nside = |(sky, usual): (&Option<&SkyMap>, usize)| sky.map_or(usual, SkyMap::nside);
     let nsides: Vec<usize> = skies.iter().zip(plan.sky_nsides()).map(nside).collect();
-    let mut rotations = HashMap::new();
+    let (mut rotations, antennas) = (HashMap::new(), plan.antenna_errors());
     let mut models = Vec::new();
     for ((choice, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {
-        let made = sky.map(|sky| channel_model(plan, choice, sky, schedule, &mut rotations));
+        let made =
+            sky.map(|sky| channel_model((plan, antennas.as_ref()), choice, sky, schedule, &mut rotations));
         models.push(ChannelModel { batch: choice.kind.batch(), model: made.transpose()? });
     }
     Ok(models)
@@ -156,9 +157,9 @@ pub(crate) fn build_all(
     Ok(build(plan, &skies)?.into_iter().filter_map(|channel| channel.model).collect())
 }
 
-/// The model of a channel; `rotations` holds the tables that channels share.
+/// The model of a channel, with antennas that are not ideal; `rotations` holds the tables that channels share.
 fn channel_model(
-    plan: &Plan,
+    (plan, antennas): (&Plan, Option<&Arc<dyn AntennaPatterns>>),
     choice: &ModelPlan,
     sky: &SkyMap,
     schedule: &Schedule,
@@ -169,7 +170,11 @@ fn channel_model(
     if choice.kind == ModelKind::Direct {
         let direct = |moon_m, less_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
             let sky = less(sky, less_k)?;
-            Ok(Box::new(DirectSum::new(&sky, frequency_hz, moon_m, response)))
+            let sum = DirectSum::new(&sky, frequency_hz, moon_m, response);
+            Ok(match antennas {
+                Some(antennas) => Box::new(AntennaSum::new(sum, Arc::clone(antennas))),
+                None => Box::new(sum),
+            })
         };
         return Ok(averaged(plan, with_moon(plan, direct, sky, frequency_hz)?, frequency_hz));
     }

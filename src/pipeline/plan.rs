@@ -5,9 +5,10 @@ use std::sync::Arc;
 use super::config::Config;
 use super::error::PipelineError;
 use crate::array::Array;
-use crate::daughters::{DaughtersConfig, InstrumentErrors, truth_csv};
-use crate::frames::{Instrument, ObservingWindow};
+use crate::daughters::{AntennaErrors, DaughtersConfig, InstrumentErrors, truth_csv};
+use crate::frames::{AntennaResponse, Instrument, ObservingWindow};
 use crate::mother::{Fidelity, Observer, Schedule, SpacecraftConfig};
+use crate::response::model::AntennaPatterns;
 use crate::units::{ChannelId, MissionTime, all_pairs};
 
 /// A configuration that has been checked, with what follows from it.
@@ -87,6 +88,15 @@ impl Plan {
     pub fn instrument_errors(&self) -> Option<Arc<InstrumentErrors>> {
         let Config { instrument, seed, spacecraft, .. } = &self.config;
         InstrumentErrors::new(instrument, *seed, &self.array, &spacecraft.channels()).map(Arc::new)
+    }
+
+    /// Antennas of the daughters that are not ideal; `None` if all are.
+    #[must_use]
+    pub fn antenna_errors(&self) -> Option<Arc<dyn AntennaPatterns>> {
+        let is_dipole = self.instrument.response == AntennaResponse::DipoleNormal;
+        let errors = self.instrument_errors()?;
+        let found = AntennaErrors::new(&errors, Arc::clone(&self.array), &self.windows, is_dipole)?;
+        Some(Arc::new(found))
     }
 
     /// The true errors of the instrument in every pass as a table (CSV); `None` if it is ideal.

@@ -149,6 +149,145 @@ fn visibilities_weights_and_dead_receivers_follow_the_truth() {
     assert!(dead_seen > 10);
 }
 
+/// The number in a column of a line of the truth.
+fn column(table: &str, name: &str, line: &str) -> f64 {
+    let place = table.lines().next().unwrap().split(',').position(|field| field == name).unwrap();
+    line.split(',').nth(place).unwrap().parse().unwrap()
+}
+
+#[test]
+fn tilted_dipoles_see_one_source_by_their_projections() {
+    let place = Workplace::new(SMALL);
+    // One bright pixel, high above the ecliptic where daughters see it from most of the orbit.
+    let (nside, pixel) = (8, 100);
+    let mut values = vec![0.0; 12 * nside * nside];
+    values[pixel] = 1e6;
+    let map = lunarray::sky::SkyMap::new(lunarray::sky::Frame::Ecliptic, values).unwrap();
+    let path = place.path("source.fits");
+    let options = lunarray::sky::fits::WriteOptions::default();
+    lunarray::sky::fits::write_map(Path::new(&path), &map, &options).unwrap();
+    let n_hat = lunarray::sky::healpix::pixel_directions(nside)[pixel];
+    let file = format!("sky.file={path}");
+    let set = [
+        &file,
+        "spacecraft.thermal_noise=false",
+        "spacecraft.antenna=dipole-normal",
+        "spacecraft.model=direct",
+    ];
+    simulate(&place, "ideal.ccsds", &set);
+    let tilts = [
+        "instrument.tilt_along_deg={constant=[0.0,10.0,-20.0,5.0]}",
+        "instrument.tilt_radial_deg={pass_rms=10.0}",
+        "instrument.pattern={constant=[0.0,0.1,-0.2,0.3]}",
+    ];
+    simulate(&place, "tilted.ccsds", &[&set[..], &tilts].concat());
+    let [ideal, tilted] = ["ideal", "tilted"].map(|name| blocks(&place.path(&format!("{name}.ccsds"))));
+    let table = std::fs::read_to_string(place.path("tilted.ccsds.instrument.csv")).unwrap();
+    let array = lunarray::array::Array::new(&lunarray::array::ArrayConfig {
+        satellites: 4,
+        ..lunarray::array::ArrayConfig::default()
+    })
+    .unwrap();
+    type Vec3 = [f64; 3];
+    let dot = |a: Vec3, b: Vec3| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    // Radians towards the track and away from the Moon, and the distortion, as the truth has them for the pass of a time.
+    let truth = |n: u8, t_s: f64| -> [f64; 3] {
+        let of = |line: &&str| {
+            let daughter = column(&table, "daughter", line) as u8 == n + 1;
+            let near_s = (column(&table, "time_s", line) - t_s).abs();
+            if daughter { (near_s * 1e3) as u64 } else { u64::MAX }
+        };
+        let line = table.lines().skip(1).min_by_key(of).unwrap();
+        let [along, radial] = ["tilt_along_deg", "tilt_radial_deg"].map(|name| column(&table, name, line));
+        [along.to_radians(), radial.to_radians(), column(&table, "pattern", line)]
+    };
+    let (mut compared, mut far) = (0, 0.0_f64);
+    for ((key, ideal), tilted) in ideal.iter().zip(tilted.values()) {
+        let of = |block: &VisibilityBlock| {
+            Complex64::new(block.value_k_sr[0].re.into(), block.value_k_sr[0].im.into())
+        };
+        let (before, after) = (of(ideal), of(tilted));
+        if before.norm() == 0.0 {
+            assert_eq!(after.norm(), 0.0);
+            continue;
+        }
+        let t_s = ideal.middle_s(0);
+        // Across the wave's direction, dipoles lie along two axes p and q; each has its own part on them.
+        let (normal, p) = (array.orbit_normal_hat(t_s), {
+            let helper = if n_hat[2].abs() < 0.9 { [0.0, 0.0, 1.0] } else { [1.0, 0.0, 0.0] };
+            lunarray::units::vector::unit(lunarray::units::vector::cross(n_hat, helper))
+        });
+        let q = lunarray::units::vector::cross(n_hat, p);
+        let voltages = |n: u8| {
+            let [along, radial, distortion] = truth(n, t_s);
+            let r_m = array.position_m(n.into(), t_s);
+            let up = lunarray::units::vector::unit(r_m);
+            let track = lunarray::units::vector::cross(normal, up);
+            let axis: Vec3 =
+                std::array::from_fn(|k| normal[k] + along.tan() * track[k] + radial.tan() * up[k]);
+            let axis = lunarray::units::vector::unit(axis);
+            let factor = 1.0 + distortion * (3.0 * dot(axis, n_hat).powi(2) - 1.0) / 2.0;
+            [factor * dot(axis, p), factor * dot(axis, q)]
+        };
+        let (a, b) = (voltages(key.1), voltages(key.2));
+        let own = dot(normal, p).powi(2) + dot(normal, q).powi(2);
+        let expected = (a[0] * b[0] + a[1] * b[1]) / own;
+        // Single precision, and the digits of the table.
+        assert!(
+            (after / before - expected).norm() < 2e-6 * (1.0 + expected.abs() / own),
+            "{key:?}: {} {expected}",
+            after / before
+        );
+        (compared, far) = (compared + 1, far.max((expected - 1.0).abs()));
+    }
+    assert!(compared > 100 && far > 0.2, "{compared} {far}");
+    // The other models know one antenna.
+    let args = ["simulate", &place.pipeline, "--out", &place.path("x"), "--set", tilts[0]];
+    let said = common::workplace::fail(&args);
+    assert!(said.contains("spacecraft.model = (other): expected \"direct\" with instrument.tilt"), "{said}");
+}
+
+#[test]
+fn a_leak_about_the_limb_is_a_wave_from_the_earth() {
+    let place = Workplace::new(SMALL);
+    let quiet = "spacecraft.thermal_noise=false";
+    simulate(&place, "ideal.ccsds", &[quiet]);
+    simulate(
+        &place,
+        "leak.ccsds",
+        &[quiet, "instrument.leak_k_sr=1e9", "instrument.leak_depth_deg=3.0", "spacecraft.flag_earth=false"],
+    );
+    let [ideal, leak] = ["ideal", "leak"].map(|name| blocks(&place.path(&format!("{name}.ccsds"))));
+    let array = lunarray::array::Array::new(&lunarray::array::ArrayConfig {
+        satellites: 4,
+        ..lunarray::array::ArrayConfig::default()
+    })
+    .unwrap();
+    let (mut strong, mut weak) = (0, 0);
+    for ((key, ideal), leak) in ideal.iter().zip(leak.values()) {
+        let of = |block: &VisibilityBlock| {
+            Complex64::new(block.value_k_sr[0].re.into(), block.value_k_sr[0].im.into())
+        };
+        let (t_s, hz) = (ideal.middle_s(0), [3e6, 5e6][usize::from(key.0)]);
+        let [r_i, r_j] = [key.1, key.2].map(|n| array.position_m(n.into(), t_s));
+        let earth = array.earth_hat(t_s);
+        let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+        // Power at a daughter, by the angle from the nadir and the disc's radius.
+        let power = |r: [f64; 3]| {
+            let distance = dot(r, r).sqrt();
+            let below = (1_737_100.0 / distance).asin() - (-dot(r, earth) / distance).acos();
+            1e9 * (-below.to_degrees().max(0.0) / 3.0).exp()
+        };
+        let turns = hz / 299_792_458.0 * (dot(earth, r_i) - dot(earth, r_j));
+        let amplitude = (power(r_i) * power(r_j)).sqrt();
+        let expected = of(ideal) + Complex64::from_polar(amplitude, -std::f64::consts::TAU * turns);
+        // Single precision.
+        assert!((of(leak) - expected).norm() < 1e-6 * (amplitude + of(ideal).norm()), "{key:?}");
+        (strong, weak) = if amplitude > 1e8 { (strong + 1, weak) } else { (strong, weak + 1) };
+    }
+    assert!(strong > 10 && weak > 10, "{strong} {weak}");
+}
+
 #[test]
 fn studies_of_tolerances_are_good() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("pipelines/calibration");

@@ -150,8 +150,8 @@ fn studies_of_the_repository_are_good() {
         let paths = std::fs::read_dir(folder.join(name)).unwrap().map(|entry| entry.unwrap().path());
         let mut count = 0;
         for path in paths.filter(|path| path.extension().is_some_and(|extension| extension == "toml")) {
-            // The pipeline of the others.
-            if path.ends_with("mission-10mhz.toml") {
+            // Pipelines of their own.
+            if path.ends_with("mission-10mhz.toml") || path.ends_with("wrong-sky.toml") {
                 continue;
             }
             let study = Study::read(&path, &[]).unwrap();

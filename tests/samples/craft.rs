@@ -4,7 +4,9 @@ use std::f64::consts::TAU;
 use std::sync::Arc;
 
 use lunarray::array::{Array, ArrayConfig, IntegrationRule, ObservingWindows};
-use lunarray::daughters::{DaughtersConfig, Sampler, SamplerCounts, Scene};
+use lunarray::daughters::{
+    DaughtersConfig, InstrumentConfig, InstrumentErrors, Sampler, SamplerCounts, Scene,
+};
 use lunarray::frames::{
     AntennaResponse, Channel, GroundFrame, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame,
     VisibilityBlock,
@@ -80,6 +82,7 @@ pub struct Spacecraft {
     pub receiver_noise_k_sr: f64,
     pub rule: IntegrationRule,
     pub daughters: DaughtersConfig,
+    pub instrument: InstrumentConfig,
     pub window: ObservingWindow,
     pub division: Division,
     pub auto_integration_s: f64,
@@ -97,6 +100,7 @@ impl Spacecraft {
             receiver_noise_k_sr: 0.0,
             rule: IntegrationRule::default(),
             daughters: DaughtersConfig { bits: 32, ..DaughtersConfig::default() },
+            instrument: InstrumentConfig::default(),
             window: ObservingWindow { index: 0, start, end },
             division: Division::NONE,
             auto_integration_s: 0.0,
@@ -105,6 +109,11 @@ impl Spacecraft {
 
     pub fn channels(&self) -> Vec<Channel> {
         self.frequencies_hz.iter().map(|&frequency_hz| Channel { frequency_hz, width_hz: WIDTH_HZ }).collect()
+    }
+
+    /// Errors of the instrument, if there are any.
+    pub fn errors(&self, seed: u64) -> Option<InstrumentErrors> {
+        InstrumentErrors::new(&self.instrument, seed, &self.array, &self.channels())
     }
 
     /// All frames of the daughters.
@@ -117,7 +126,8 @@ impl Spacecraft {
             seed,
         };
         let counts = Arc::default();
-        let mut sampler = Sampler::new(scene, self.daughters.clone(), vec![self.window], Arc::clone(&counts));
+        let mut sampler = Sampler::new(scene, self.daughters.clone(), vec![self.window], Arc::clone(&counts))
+            .with_errors(self.errors(seed).map(Arc::new));
         let mut out = Outlet::collect();
         while sampler.next(&mut out).unwrap() == Flow::Continue {}
         let counts = *counts.lock().unwrap();

@@ -116,6 +116,99 @@ fn gains_and_phases_scale_visibilities_and_calibration_corrects_them() {
 }
 
 #[test]
+fn errors_of_the_instrument_turn_samples_as_they_turn_visibilities() {
+    let frequencies_hz = vec![1e6, 7e6];
+    let mut craft = Spacecraft::new(ArrayConfig::default(), frequencies_hz.clone(), constant(0.5), 16.0);
+    let given = |of: fn(f64) -> f64| (0..8).map(|n| of(f64::from(n))).collect::<Vec<f64>>();
+    craft.instrument.amplitude.constant = given(|n| 0.1 * (n - 3.5));
+    // Phases that turn by up to 48 deg over the window.
+    craft.instrument.phase_deg.constant = given(|n| 50.0 * n);
+    craft.instrument.phase_deg.rate_per_day = given(|n| 86_400.0 * (n - 3.5) * 6.0 / 7.0);
+    craft.instrument.clock_ns.constant = given(|n| 40.0 * (n - 2.0));
+    craft.rule.duration_s_max = 0.25;
+    let blocks = craft.run(23);
+    for (channel, hz) in frequencies_hz.iter().enumerate() {
+        for pair in all_pairs(8) {
+            // V' = g_i conj(g_j) V with g = exp(a + i p), p = phase - 2 pi nu tau.
+            let gain = |n: u8, t_s: f64| {
+                let k = f64::from(n);
+                let phase_deg = 50.0 * k + (k - 3.5) * 6.0 / 7.0 * t_s;
+                let clock_turns = hz * 40e-9 * (k - 2.0);
+                Complex64::from_polar((0.1 * (k - 3.5)).exp(), phase_deg.to_radians() - TAU * clock_turns)
+            };
+            let wanted = |t_s: f64| 0.5 * gain(pair.i, t_s) * gain(pair.j, t_s).conj();
+            let found = measured(&blocks, pair, channel as u16);
+            assert!(found.len() >= 60, "{}", found.len());
+            let (scaled, error) = ratio(&found, wanted);
+            // 3e-3: synthesis; phases turn by 1.5 deg in an integration, whose mean loses 1e-4.
+            assert!(
+                (scaled - 1.0).norm() < 4.0 * COMMON * error + 3e-3,
+                "{pair} {channel}: {scaled} +- {error}"
+            );
+        }
+    }
+}
+
+#[test]
+fn tilted_dipoles_act_on_samples_as_on_visibilities() {
+    // One source that all see; powers and products of the samples are those of the projections of the dipoles.
+    let nside = 1;
+    let array = lunarray::array::Array::new(&ArrayConfig::default()).unwrap();
+    let start_s = lunarray::array::ObservingWindows::new(&array, 0.0, 1e9).next().unwrap().start.seconds();
+    let up = array.position_m(0, start_s);
+    let directions = lunarray::sky::healpix::pixel_directions(nside);
+    let height = |k: &usize| dot(directions[*k], up);
+    let place = (0..12).max_by(|a, b| height(a).total_cmp(&height(b))).unwrap();
+    let mut values = vec![0.0; 12];
+    values[place] = 12.0 / (4.0 * std::f64::consts::PI); // 1 K sr
+    let map = lunarray::sky::SkyMap::new(lunarray::sky::Frame::Ecliptic, values).unwrap();
+    let n_hat = directions[place];
+    let mut errors = lunarray::daughters::InstrumentConfig::default();
+    errors.tilt_along_deg.constant = (0..8).map(|n| 5.0 * f64::from(n)).collect();
+    errors.pattern.constant = (0..8).map(|n| 0.05 * f64::from(n)).collect();
+    let mut craft = Spacecraft::new(ArrayConfig::default(), vec![1e6], constant(0.5), 16.0);
+    craft.instrument = errors;
+    let drawn = craft.errors(24).unwrap();
+    let shared = std::sync::Arc::clone(&craft.array);
+    let antennas: std::sync::Arc<dyn lunarray::response::model::AntennaPatterns> = std::sync::Arc::new(
+        lunarray::daughters::AntennaErrors::new(&drawn, shared, &[craft.window], true).unwrap(),
+    );
+    let moon_m = craft.array.moon_radius_m();
+    craft.sky = Box::new(move |frequency_hz| {
+        let response = lunarray::frames::AntennaResponse::DipoleNormal;
+        let sum = lunarray::response::model::DirectSum::new(&map, frequency_hz, moon_m, response);
+        Box::new(lunarray::response::model::AntennaSum::new(sum, std::sync::Arc::clone(&antennas)))
+    });
+    // Noise far above the source, so that products of samples scatter by their weights.
+    craft.receiver_noise_k_sr = 1.0;
+    craft.rule.duration_s_max = 0.5;
+    let blocks = craft.run(24);
+    for pair in all_pairs(8) {
+        let voltage = |n: u8, t_s: f64| {
+            let (r_m, k) = (array.position_m(n.into(), t_s), f64::from(n));
+            let (normal, up) = (array.orbit_normal_hat(t_s), lunarray::units::vector::unit(r_m));
+            let track = lunarray::units::vector::cross(normal, up);
+            let angle = (5.0 * k).to_radians();
+            let axis: [f64; 3] = std::array::from_fn(|m| angle.cos() * normal[m] + angle.sin() * track[m]);
+            let factor = 1.0 + 0.05 * k * (1.5 * dot(axis, n_hat).powi(2) - 0.5);
+            // The part across the direction of the wave.
+            let along = dot(axis, n_hat);
+            (0..3).map(|m| factor * (axis[m] - along * n_hat[m])).collect::<Vec<f64>>()
+        };
+        let wanted = |t_s: f64| {
+            let (a, b) = (voltage(pair.i, t_s), voltage(pair.j, t_s));
+            let [r_i, r_j] = [pair.i, pair.j].map(|n| array.position_m(n.into(), t_s));
+            let response: f64 = a.iter().zip(&b).map(|(a, b)| a * b).sum();
+            response * crate::craft::fringe(n_hat, 1e6, r_i, r_j)
+        };
+        let (found, error) = ratio(&measured(&blocks, pair, 0), wanted);
+        // 8e-3: synthesis, and fringes that turn by up to an eighth of a wavelength in an integration: sinc(pi / 8) for the
+        // longest, which has least weight here.
+        assert!((found - 1.0).norm() < 4.0 * COMMON * error + 0.03, "{pair}: {found} +- {error}");
+    }
+}
+
+#[test]
 fn late_clocks_shift_each_frequency_by_its_own_phase() {
     let (frequency_hz, bands) = (1e6, 8);
     let mut craft = Spacecraft::new(ArrayConfig::default(), vec![frequency_hz], constant(0.5), 16.0);

@@ -183,7 +183,11 @@ fn a_generated_sky_is_interpolated_correctly_between_its_maps() {
     };
     let nodes_hz = NinthSky::nodes_hz([30e6, 120e6]);
     let mut sky = NinthSky::Maps(nodes_hz.iter().map(|&at_hz| (at_hz, model(at_hz))).collect());
-    let places = [3e3, 6e3].map(|t_s| DaughterPosition { r_m: position(t_s), normal_hat: [0.0, 0.0, 1.0] });
+    let places = [3e3, 6e3].map(|t_s| DaughterPosition {
+        r_m: position(t_s),
+        normal_hat: [0.0, 0.0, 1.0],
+        ..DaughterPosition::default()
+    });
     let frequencies_hz = [30e6, 47e6, 82e6, 120e6];
     let found = sky.powers(&places, &frequencies_hz).unwrap();
     for (k, frequency_hz) in frequencies_hz.into_iter().enumerate() {

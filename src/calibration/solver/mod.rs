@@ -10,6 +10,8 @@
 //! | `table` | tables, and the file of gains |
 
 mod config;
+#[cfg(test)]
+mod cramer_rao;
 mod dense;
 mod model;
 mod monitor;

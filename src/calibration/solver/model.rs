@@ -9,16 +9,16 @@ use super::sums::{MODEL_TERMS, ModelTerms};
 use crate::array::{track_axes, track_offset_m};
 use crate::frames::{Channel, Instrument, PlacedVisibilities};
 use crate::response::beacon::Beacon;
-use crate::response::model::{DirectSum, ModelError, PairPosition, VisibilityModel};
+use crate::response::model::{DirectMoments, DirectSum, ModelError, PairPosition, VisibilityModel};
 use crate::sky::{MapError, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, sub};
 
 /// Sums over a map and, where positions are solved for, over the map times each component of the direction, which
 /// give the derivatives by the baseline.
-struct ChannelSky {
-    value: DirectSum,
-    gradient: Option<[DirectSum; 3]>,
+enum ChannelSky {
+    Value(DirectSum),
+    Gradient(DirectMoments),
 }
 
 /// The known signal in every channel.
@@ -52,18 +52,12 @@ impl KnownSignal {
                 nside if nside > map.nside() => map.upgrade(nside)?,
                 _ => map.clone(),
             };
-            let sum = |map: &SkyMap| {
-                DirectSum::new(map, channel.frequency_hz, instrument.moon_radius_m, instrument.response)
-            };
-            let directions = map.directions_ecliptic();
-            let times = |axis: usize| {
-                let mut times = map.clone();
-                let values = times.values_mut().iter_mut().zip(&directions);
-                values.for_each(|(value, n_hat)| *value *= n_hat[axis]);
-                sum(&times)
-            };
-            let gradient = moves.then(|| [times(0), times(1), times(2)]);
-            Ok(ChannelSky { value: sum(&map), gradient })
+            let (hz, moon_m, response) =
+                (channel.frequency_hz, instrument.moon_radius_m, instrument.response);
+            Ok(match moves {
+                true => ChannelSky::Gradient(DirectMoments::new(&map, hz, moon_m, response)),
+                false => ChannelSky::Value(DirectSum::new(&map, hz, moon_m, response)),
+            })
         };
         let skies = maps.iter().zip(&instrument.channels).filter(|_| uses_sky).map(sky);
         Ok(Self {
@@ -104,15 +98,15 @@ impl KnownSignal {
         let mut values = vec![Complex64::ZERO; positions.len()];
         let mut gradients = vec![[Complex64::ZERO; 3]; if self.moves { positions.len() } else { 0 }];
         let per_m = Complex64::new(0.0, -TAU * frequency_hz / SPEED_OF_LIGHT_M_S);
-        if let Some(sky) = self.sky.get_mut(channel) {
-            sky.value.predict(&positions, &mut values)?;
-            for (axis, sum) in sky.gradient.iter_mut().flatten().enumerate() {
-                let mut part = vec![Complex64::ZERO; positions.len()];
-                sum.predict(&positions, &mut part)?;
-                for (gradient, part) in gradients.iter_mut().zip(part) {
-                    gradient[axis] = per_m * part;
+        match self.sky.get_mut(channel) {
+            Some(ChannelSky::Value(sum)) => sum.predict(&positions, &mut values)?,
+            Some(ChannelSky::Gradient(sum)) => {
+                for (k, [value, moments @ ..]) in sum.predict(&positions)?.into_iter().enumerate() {
+                    values[k] = value;
+                    gradients[k] = moments.map(|moment| per_m * moment);
                 }
             }
+            None => {}
         }
         if with_beacon {
             let from_hat = self.beacon.from_hat();

@@ -8,9 +8,12 @@ use crate::units::{Checks, InvalidValue};
 /// Shortest correlation time of a drift, s: some thousand nodes in a pass.
 const DRIFT_TIME_S_MIN: f64 = 60.0;
 
+/// Shortest time in which clocks are steered, s.
+const STEERING_S_MIN: f64 = 600.0;
+
 /// The `[instrument]` section: what is wrong with the daughters, in either fidelity. Without any of it, data are as
 /// they are without the section.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct InstrumentConfig {
     /// Number of the realisation: other random errors with the same sky and noise.
@@ -27,6 +30,16 @@ pub struct InstrumentConfig {
     pub across_m: ErrorTerms,
     /// The same away from the Moon, m.
     pub radial_m: ErrorTerms,
+    /// Tilt of the antenna's axis from the orbit's normal towards the direction of the track, deg, by daughter.
+    pub tilt_along_deg: ErrorTerms,
+    /// The same away from the Moon, deg.
+    pub tilt_radial_deg: ErrorTerms,
+    /// Distortion q of the voltage pattern, by daughter: a factor 1 + q (3 cos^2 - 1) / 2 with the angle from the axis.
+    pub pattern: ErrorTerms,
+    /// Allan deviation of every clock at 1 s; it falls as the root of time (white noise of frequency).
+    pub clock_allan_deviation: f64,
+    /// Time within which clocks are brought back, s: that noise is forgotten as exp(-|t| / this).
+    pub clock_steering_s: f64,
     /// Daughters that deliver noise and no signal, from 1.
     pub dead_daughters: Vec<u32>,
     /// Daughter, from 1, and channel, from 0, of receivers that deliver noise and no signal.
@@ -41,8 +54,41 @@ pub struct InstrumentConfig {
     pub burst_s: f64,
     /// Power of a burst at a daughter, K sr.
     pub burst_k_sr: f64,
+    /// Power of interference from the Earth at the Moon's limb at a daughter, K sr; 0 for none.
+    pub leak_k_sr: f64,
+    /// Angle below the limb over which its power falls by a factor e, deg.
+    pub leak_depth_deg: f64,
     /// Artificial signal.
     pub beacon: BeaconSchedule,
+}
+
+impl Default for InstrumentConfig {
+    fn default() -> Self {
+        Self {
+            realisation: 0,
+            amplitude: ErrorTerms::default(),
+            phase_deg: ErrorTerms::default(),
+            clock_ns: ErrorTerms::default(),
+            along_m: ErrorTerms::default(),
+            across_m: ErrorTerms::default(),
+            radial_m: ErrorTerms::default(),
+            tilt_along_deg: ErrorTerms::default(),
+            tilt_radial_deg: ErrorTerms::default(),
+            pattern: ErrorTerms::default(),
+            clock_allan_deviation: 0.0,
+            clock_steering_s: 86_400.0,
+            dead_daughters: Vec::new(),
+            dead_channels: Vec::new(),
+            outlier_probability: 0.0,
+            outlier_sigma: 0.0,
+            burst_every_s: 0.0,
+            burst_s: 0.0,
+            burst_k_sr: 0.0,
+            leak_k_sr: 0.0,
+            leak_depth_deg: 1.0,
+            beacon: BeaconSchedule::default(),
+        }
+    }
 }
 
 /// Terms of one error, which add up. Random terms are Gaussian, zero on average, and independent from daughter to daughter
@@ -153,7 +199,7 @@ impl ErrorTerms {
             checks.number(format!("{name}.{key}"), rms, rms >= 0.0, "a standard deviation, not negative");
         }
         if smooth {
-            let expected = "0: positions in packets are interpolated, and their errors have to be smooth";
+            let expected = "0: positions in packets are interpolated, and antennas turn slowly, so that their errors have to be smooth";
             checks.number(format!("{name}.drift_rms"), self.drift_rms, self.drift_rms == 0.0, expected);
             checks.number(format!("{name}.step_rms"), self.step_rms, self.step_rms == 0.0, expected);
         }
@@ -184,6 +230,8 @@ impl InstrumentConfig {
             || !(self.dead_daughters.is_empty() && self.dead_channels.is_empty())
             || has_outliers
             || self.has_bursts()
+            || self.leak_k_sr > 0.0
+            || self.clock_allan_deviation > 0.0
             || self.beacon.k_sr > 0.0
     }
 
@@ -205,13 +253,19 @@ impl InstrumentConfig {
         [&self.along_m, &self.across_m, &self.radial_m].iter().any(|terms| !terms.is_none())
     }
 
+    /// Whether antennas differ from the ideal one.
+    #[must_use]
+    pub fn has_own_antennas(&self) -> bool {
+        [&self.tilt_along_deg, &self.tilt_radial_deg, &self.pattern].iter().any(|terms| !terms.is_none())
+    }
+
     /// Whether anything changes within a pass.
     #[must_use]
     pub fn changes_in_a_pass(&self) -> bool {
-        self.terms().iter().any(|(_, terms)| terms.changes_in_a_pass())
+        self.clock_allan_deviation > 0.0 || self.terms().iter().any(|(_, terms)| terms.changes_in_a_pass())
     }
 
-    fn terms(&self) -> [(&'static str, &ErrorTerms); 6] {
+    fn terms(&self) -> [(&'static str, &ErrorTerms); 9] {
         [
             ("amplitude", &self.amplitude),
             ("phase_deg", &self.phase_deg),
@@ -219,7 +273,29 @@ impl InstrumentConfig {
             ("along_m", &self.along_m),
             ("across_m", &self.across_m),
             ("radial_m", &self.radial_m),
+            ("tilt_along_deg", &self.tilt_along_deg),
+            ("tilt_radial_deg", &self.tilt_radial_deg),
+            ("pattern", &self.pattern),
         ]
+    }
+
+    /// Requires what tilts, clocks and leaks can be.
+    fn check_rest(&self, checks: &mut Checks) {
+        for (name, terms) in
+            [("tilt_along_deg", &self.tilt_along_deg), ("tilt_radial_deg", &self.tilt_radial_deg)]
+        {
+            let given = terms.constant.iter().chain([&terms.constant_rms, &terms.pass_rms, &terms.orbit_rms]);
+            let most = given.fold(0.0, |most: f64, deg| most.max(deg.abs()));
+            checks.number(name, most, most <= 45.0, "tilts of at most 45 deg");
+        }
+        let deviation = self.clock_allan_deviation;
+        let expected = "0 (none) to 1e-6, at 1 s";
+        checks.number("clock_allan_deviation", deviation, (0.0..=1e-6).contains(&deviation), expected);
+        let steering_s = self.clock_steering_s;
+        let good = (STEERING_S_MIN..=1e7).contains(&steering_s);
+        checks.number("clock_steering_s", steering_s, good, "600 s to 1e7 s");
+        let depth_deg = self.leak_depth_deg;
+        checks.number("leak_depth_deg", depth_deg, (1e-3..=180.0).contains(&depth_deg), "0.001 to 180 deg");
     }
 
     /// Everything that is wrong with the section for an array of `satellites` and a number of channels; `samples` says
@@ -228,8 +304,10 @@ impl InstrumentConfig {
     pub fn problems(&self, satellites: usize, channels: usize, samples: bool) -> Vec<InvalidValue> {
         let mut checks = Checks::of("instrument");
         for (name, terms) in self.terms() {
-            terms.check(name, satellites, name.ends_with("_m"), &mut checks);
+            let smooth = !["amplitude", "phase_deg", "clock_ns"].contains(&name);
+            terms.check(name, satellites, smooth, &mut checks);
         }
+        self.check_rest(&mut checks);
         let known = |number: u32, count: usize| (1..=count).contains(&(number as usize));
         for (index, &daughter) in self.dead_daughters.iter().enumerate() {
             let expected = format!("a daughter, 1 to {satellites}");
@@ -258,6 +336,7 @@ impl InstrumentConfig {
             ("burst_every_s", self.burst_every_s),
             ("burst_s", self.burst_s),
             ("burst_k_sr", self.burst_k_sr),
+            ("leak_k_sr", self.leak_k_sr),
             ("beacon.on_s", self.beacon.on_s),
             ("beacon.every_s", self.beacon.every_s),
         ] {
@@ -273,6 +352,7 @@ impl InstrumentConfig {
             ("dead_channels", !self.dead_channels.is_empty()),
             ("outlier_probability", probability > 0.0),
             ("burst_k_sr", self.has_bursts()),
+            ("leak_k_sr", self.leak_k_sr > 0.0),
             ("beacon.k_sr", self.beacon.k_sr > 0.0),
         ] {
             checks.require(key, "(on)", !(samples && on), expected);

@@ -1,15 +1,17 @@
-//! Errors of the instrument, the same for integrated visibilities and for samples: gains, clocks, positions, dead
-//! receivers, outliers and bursts.
+//! Errors of the instrument, the same for integrated visibilities and for samples: gains, clocks, positions, antennas,
+//! dead receivers, outliers, bursts and leaks.
 //!
 //! A daughter's signal is multiplied by its voltage gain `g = exp(a + i p)`, `p = phase - 2 pi nu tau` (signals rotate
 //! as exp(-2 pi i nu t), so a clock that is late by tau turns them back), and a visibility by `g_i conj(g_j)`. Noise
 //! passes the same gain. The packets' positions are those flown plus an error along the track, along the orbit's normal
 //! and away from the Moon.
 
+mod attitude;
 mod config;
 mod series;
 mod truth;
 
+pub use attitude::AntennaErrors;
 pub use config::{BeaconSchedule, ErrorTerms, InstrumentConfig};
 pub use truth::truth_csv;
 
@@ -46,6 +48,8 @@ pub struct PassErrors {
     clock_ns: Vec<Series>,
     /// By daughter: along, across, radial.
     offset_m: Vec<[Series; 3]>,
+    /// By daughter: tilt along the track, tilt away from the Moon (deg), distortion.
+    antennas: Vec<[Series; 3]>,
 }
 
 impl InstrumentErrors {
@@ -68,13 +72,40 @@ impl InstrumentErrors {
         &self.config
     }
 
+    /// One error of a daughter over a pass.
+    fn series(&self, window: ObservingWindow, error: u8, terms: &ErrorTerms, [n, c]: [usize; 2]) -> Series {
+        let span = (window.index, [window.start.seconds(), window.end.seconds()]);
+        let draws = Draws { seed: self.seed, error, daughter: n, channel: c };
+        Series::new(terms, draws, span, self.orbital_period_s)
+    }
+
+    /// Tilts and distortion of every daughter over a pass.
+    fn antennas(&self, window: ObservingWindow) -> Vec<[Series; 3]> {
+        let InstrumentConfig { tilt_along_deg, tilt_radial_deg, pattern, .. } = &self.config;
+        let errors = [(6, tilt_along_deg), (7, tilt_radial_deg), (8, pattern)];
+        let of = |n: usize| errors.map(|(error, terms)| self.series(window, error, terms, [n, 0]));
+        (0..self.satellites).map(of).collect()
+    }
+
+    /// The clock of a daughter over a pass, ns.
+    fn clock_ns(&self, window: ObservingWindow, n: usize) -> Series {
+        let InstrumentConfig { clock_ns, clock_allan_deviation, clock_steering_s, .. } = &self.config;
+        let draws = Draws { seed: self.seed, error: 2, daughter: n, channel: 0 };
+        let span_s = [window.start.seconds(), window.end.seconds()];
+        self.series(window, 2, clock_ns, [n, 0]).with_walk(
+            1e9 * clock_allan_deviation,
+            *clock_steering_s,
+            draws,
+            span_s,
+        )
+    }
+
     /// The errors over a pass.
     #[must_use]
     pub fn pass(&self, window: ObservingWindow) -> PassErrors {
-        let Self { config, seed, satellites, channels, orbital_period_s } = self;
-        let span = (window.index, [window.start.seconds(), window.end.seconds()]);
+        let Self { config, satellites, channels, .. } = self;
         let series = |error: u8, terms: &ErrorTerms, daughter: usize, channel: usize| {
-            Series::new(terms, Draws { seed: *seed, error, daughter, channel }, span, *orbital_period_s)
+            self.series(window, error, terms, [daughter, channel])
         };
         let by_channel = |error: u8, terms: &ErrorTerms| -> Vec<Vec<Series>> {
             let of = |n: usize| (0..channels.len()).map(|c| series(error, terms, n, c)).collect();
@@ -89,13 +120,14 @@ impl InstrumentErrors {
             amplitude: by_channel(0, &config.amplitude),
             phase_deg: by_channel(1, &config.phase_deg),
             dead: (0..*satellites).map(|n| (0..channels.len()).map(|c| dead(n, c)).collect()).collect(),
-            clock_ns: (0..*satellites).map(|n| series(2, &config.clock_ns, n, 0)).collect(),
+            clock_ns: (0..*satellites).map(|n| self.clock_ns(window, n)).collect(),
             offset_m: (0..*satellites)
                 .map(|n| {
                     let axes = [(3, &config.along_m), (4, &config.across_m), (5, &config.radial_m)];
                     axes.map(|(error, terms)| series(error, terms, n, 0))
                 })
                 .collect(),
+            antennas: self.antennas(window),
         }
     }
 
@@ -105,6 +137,17 @@ impl InstrumentErrors {
         let identity = 254_u64 << 40 | (channel as u64) << 16 | u64::from(pair.i) << 8 | u64::from(pair.j);
         let stream = || random_stream(self.seed, StreamKind::Instrument, [identity, window.start.0 as u64]);
         (self.config.outlier_probability > 0.0 && self.config.outlier_sigma > 0.0).then(stream)
+    }
+
+    /// Power of the interference that leaks about the Moon's limb to a daughter at a time, K sr: whole with the Earth at the
+    /// limb or above it, less by a factor e for each `leak_depth_deg` below it.
+    #[must_use]
+    pub fn leak_k_sr(&self, array: &Array, daughter: usize, t_s: f64) -> f64 {
+        if self.config.leak_k_sr == 0.0 {
+            return 0.0;
+        }
+        let below_deg = array.earth_below_limb_rad(daughter, t_s).to_degrees().max(0.0);
+        self.config.leak_k_sr * (-below_deg / self.config.leak_depth_deg).exp()
     }
 
     /// Power of a burst of interference at a time, K sr.

@@ -11,9 +11,11 @@ use crate::units::{StreamKind, random_stream};
 /// Nodes of a Gauss-Markov process in a correlation time. Between them it is linear, which lacks
 /// 1 / (6 x 64) of its variance half-way.
 const NODES_PER_TIME: f64 = 64.0;
-/// Nodes from one independent value of the process to the next: 32 correlation times, after which
-/// exp(-32) = 1e-14 of the correlation would be left. A power of two.
-const INDEPENDENT_NODES: i64 = 2048;
+/// Correlation times from one independent value of a process to the next, at least: exp(-32) = 1e-14 of the correlation would be
+/// left. The number of nodes between is a power of two.
+const INDEPENDENT_TIMES: f64 = 32.0;
+/// Spacing of the nodes of a clock's noise, s.
+const WALK_STEP_S: f64 = 1.0;
 
 /// Which error of what is drawn.
 #[derive(Clone, Copy, Debug)]
@@ -36,6 +38,7 @@ enum Term {
     Orbit = 2,
     Drift = 3,
     Step = 4,
+    Walk = 5,
 }
 
 impl Draws {
@@ -62,6 +65,8 @@ pub(super) struct Series {
     orbit_rad_per_s: f64,
     /// Number of the first node, step (s), values.
     drift: Option<(i64, f64, Vec<f64>)>,
+    /// The same of a clock's noise.
+    walk: Option<(i64, f64, Vec<f64>)>,
     /// Level since each of these times, s; the first holds before, too.
     steps: Vec<(f64, f64)>,
 }
@@ -85,9 +90,27 @@ impl Series {
             rate_per_s: given(&terms.rate_per_day) / DAY_S,
             orbit: [0, 1].map(|part| random(terms.orbit_rms, Term::Orbit, part)),
             orbit_rad_per_s: std::f64::consts::TAU / period_s,
-            drift: (terms.drift_rms > 0.0).then(|| drift(terms, draws, [from_s, to_s])),
+            drift: (terms.drift_rms > 0.0).then(|| {
+                let process =
+                    Process { rms: terms.drift_rms, time_s: terms.drift_time_s, nodes: NODES_PER_TIME };
+                process.over([from_s, to_s], &|node| draws.normal(Term::Drift, node))
+            }),
+            walk: None,
             steps: if terms.step_rms > 0.0 { steps(terms, draws, [from_s, to_s]) } else { Vec::new() },
         }
+    }
+
+    /// Adds a random walk over an interval whose increments have a variance of `per_root_s`^2 each second, and which is
+    /// forgotten within `steering_s`.
+    pub(super) fn with_walk(self, per_root_s: f64, steering_s: f64, draws: Draws, span_s: [f64; 2]) -> Self {
+        // Increments over t of a Gauss-Markov process have 2 rms^2 (1 - exp(-t / time)).
+        let process = Process {
+            rms: per_root_s * (0.5 * steering_s).sqrt(),
+            time_s: steering_s,
+            nodes: steering_s / WALK_STEP_S,
+        };
+        let walk = || process.over(span_s, &|node| draws.normal(Term::Walk, node));
+        Self { walk: (per_root_s > 0.0).then(walk), ..self }
     }
 
     /// Its value at a time, s since the epoch.
@@ -97,7 +120,7 @@ impl Series {
             let (sin, cos) = (self.orbit_rad_per_s * t_s).sin_cos();
             value += self.orbit[0] * cos + self.orbit[1] * sin;
         }
-        if let Some((first, step_s, nodes)) = &self.drift {
+        for (first, step_s, nodes) in [&self.drift, &self.walk].into_iter().flatten() {
             // From whole nodes since the epoch, so that no bit depends on where the pass begins.
             let place = t_s / step_s;
             let node = (place.floor() as i64).clamp(*first, first + nodes.len() as i64 - 2);
@@ -109,25 +132,36 @@ impl Series {
     }
 }
 
-/// A stationary Gauss-Markov process at its nodes over an interval. Its value at a node is drawn between two nodes that
-/// are known, from the coarsest to the finest, so that any interval has the same values without what was before.
-fn drift(terms: &ErrorTerms, draws: Draws, [from_s, to_s]: [f64; 2]) -> (i64, f64, Vec<f64>) {
-    let step_s = terms.drift_time_s / NODES_PER_TIME;
-    let [first, last] = [(from_s / step_s).floor() as i64, (to_s / step_s).ceil() as i64 + 1];
-    let mut nodes = vec![0.0; (last - first + 1) as usize];
-    let draw = |node: i64| draws.normal(Term::Drift, node);
-    let mut bridge = Bridge { draw: &draw, first, nodes: &mut nodes };
-    let mut left = first.div_euclid(INDEPENDENT_NODES) * INDEPENDENT_NODES;
-    while left <= last {
-        let right = left + INDEPENDENT_NODES;
-        let ends = [draw(left), draw(right)];
-        bridge.set(left, ends[0]);
-        bridge.set(right, ends[1]);
-        bridge.fill([left, right], ends);
-        left = right;
+/// A stationary Gauss-Markov process.
+struct Process {
+    rms: f64,
+    /// Correlation time, s.
+    time_s: f64,
+    /// Nodes in a correlation time.
+    nodes: f64,
+}
+
+impl Process {
+    /// Number of the first node, step (s) and values over an interval. The value at a node is drawn between two nodes that
+    /// are known, from the coarsest to the finest, so that any interval has the same values without what was before.
+    fn over(&self, [from_s, to_s]: [f64; 2], draw: &dyn Fn(i64) -> f64) -> (i64, f64, Vec<f64>) {
+        let step_s = self.time_s / self.nodes;
+        let independent = ((INDEPENDENT_TIMES * self.nodes).ceil() as u64).next_power_of_two() as i64;
+        let [first, last] = [(from_s / step_s).floor() as i64, (to_s / step_s).ceil() as i64 + 1];
+        let mut nodes = vec![0.0; (last - first + 1) as usize];
+        let mut bridge = Bridge { draw, first, nodes: &mut nodes, nodes_per_time: self.nodes };
+        let mut left = first.div_euclid(independent) * independent;
+        while left <= last {
+            let right = left + independent;
+            let ends = [draw(left), draw(right)];
+            bridge.set(left, ends[0]);
+            bridge.set(right, ends[1]);
+            bridge.fill([left, right], ends);
+            left = right;
+        }
+        nodes.iter_mut().for_each(|node| *node *= self.rms);
+        (first, step_s, nodes)
     }
-    nodes.iter_mut().for_each(|node| *node *= terms.drift_rms);
-    (first, step_s, nodes)
 }
 
 /// Nodes between two known ones.
@@ -135,6 +169,7 @@ struct Bridge<'a> {
     draw: &'a dyn Fn(i64) -> f64,
     first: i64,
     nodes: &'a mut [f64],
+    nodes_per_time: f64,
 }
 
 impl Bridge<'_> {
@@ -152,7 +187,7 @@ impl Bridge<'_> {
         }
         let middle = left + (right - left) / 2;
         // With correlation r to either end, whose own is r^2.
-        let r = (-((middle - left) as f64) / NODES_PER_TIME).exp();
+        let r = (-((middle - left) as f64) / self.nodes_per_time).exp();
         let deviation = ((1.0 - r * r) / (1.0 + r * r)).sqrt();
         let value = (ends[0] + ends[1]) * r / (1.0 + r * r) + deviation * (self.draw)(middle);
         self.set(middle, value);
@@ -211,6 +246,48 @@ mod tests {
         assert!((squares / count / 3.0 - 4.0).abs() < 0.25, "{}", squares / count / 3.0);
         assert!((products / count - 4.0 * (-0.5_f64).exp()).abs() < 0.33, "{}", products / count);
         assert!((far / count - 4.0 * (-2.0_f64).exp()).abs() < 0.33, "{}", far / count);
+    }
+
+    #[test]
+    fn a_clock_has_the_allan_deviation_it_was_given() {
+        // 3e-11 at 1 s, in ns; steered within some thirty hours.
+        let (at_1_s, steering_s) = (0.03, 1e5);
+        let none = ErrorTerms::default();
+        let clock = |pass: u64| {
+            let from_s = 8_248.68 * pass as f64;
+            let span_s = [from_s, from_s + 2750.0];
+            let series = Series::new(&none, draws(0), (pass, span_s), 8000.0);
+            (from_s, series.with_walk(at_1_s, steering_s, draws(0), span_s))
+        };
+        for tau_s in [10.0, 100.0, 300.0_f64] {
+            let (mut sum, mut count) = (0.0, 0.0);
+            for pass in 0..400 {
+                let (from_s, clock) = clock(pass);
+                // Far enough apart to be independent.
+                for k in 0..(2700.0 / (2.0 * tau_s)) as usize {
+                    let [a, b, c] = [0.0, 1.0, 2.0].map(|m| clock.at(from_s + tau_s * (2.0 * k as f64 + m)));
+                    sum += (c - 2.0 * b + a).powi(2);
+                    count += 1.0;
+                }
+            }
+            // sigma_y^2 = <(x_2 - 2 x_1 + x_0)^2> / (2 tau^2).
+            // Straight lines between nodes of 1 s lack 1 / 6 of a second's variance at each of the three instants, with weights
+            // 1, 4 and 1 of 2 tau.
+            let lines = 1.0 - 1.0 / (2.0 * tau_s);
+            let (found, law) = ((sum / count / 2.0).sqrt() / tau_s, at_1_s * (lines / tau_s).sqrt());
+            // Four standard deviations of a deviation from `count` values, and what steering takes.
+            let bound = 4.0 / (2.0 * count).sqrt() + tau_s / steering_s;
+            assert!((found / law - 1.0).abs() < bound, "{tau_s} s: {found} for {law}, within {bound}");
+        }
+        // Any interval has the same values.
+        let (from_s, whole) = clock(7);
+        let span_s = [from_s + 1000.0, from_s + 1100.0];
+        let part =
+            Series::new(&none, draws(0), (7, span_s), 8000.0).with_walk(at_1_s, steering_s, draws(0), span_s);
+        for k in 0..100 {
+            let t_s = from_s + 1000.0 + f64::from(k);
+            assert_eq!(whole.at(t_s), part.at(t_s));
+        }
     }
 
     #[test]

@@ -150,9 +150,64 @@ fn packets_say_positions_that_are_off_along_the_named_axes() {
 }
 
 #[test]
+fn dipoles_lean_by_the_angles_that_are_given() {
+    let array = std::sync::Arc::new(Array::new(&ArrayConfig::default()).unwrap());
+    let mut config = InstrumentConfig::default();
+    config.tilt_along_deg.constant = (0..8).map(|n| 2.0 * f64::from(n)).collect();
+    config.tilt_radial_deg.pass_rms = 5.0;
+    config.pattern.constant = (0..8).map(|n| 0.01 * f64::from(n)).collect();
+    let errors = errors(config);
+    let windows = [window(0), window(1), window(4)];
+    let antennas = AntennaErrors::new(&errors, std::sync::Arc::clone(&array), &windows, true).unwrap();
+    for window in windows {
+        let (t_s, pass) = (window.start.seconds() + 1000.0, errors.pass(window));
+        for n in 0..8_u8 {
+            let found = crate::response::model::AntennaPatterns::antenna(&antennas, n, t_s);
+            let [along_deg, radial_deg, distortion] = pass.antenna(n.into(), t_s);
+            assert!(along_deg == 2.0 * f64::from(n) && distortion == 0.01 * f64::from(n));
+            assert!(found.is_dipole && found.distortion == distortion);
+            // Seen along the radius the axis is off by one angle, seen along the track by the other.
+            let (up, normal) = (unit(array.position_m(n.into(), t_s)), array.normal_hat(n.into(), t_s));
+            let track = unit(array.state(n.into(), t_s).velocity_m_s);
+            let seen_deg = |axis| dot(found.axis_hat, axis).atan2(dot(found.axis_hat, normal)).to_degrees();
+            // The velocity is along the track but for precession and breathing, some 1e-4 of it.
+            assert!((seen_deg(track) - along_deg).abs() < 0.02, "{n}: {}", seen_deg(track));
+            assert!((seen_deg(up) - radial_deg).abs() < 1e-6, "{n}: {}", seen_deg(up));
+        }
+    }
+    assert!(errors.pass(window(0)).antenna(3, 0.0)[1] != errors.pass(window(1)).antenna(3, 0.0)[1]);
+    let straight = self::errors(InstrumentConfig { leak_k_sr: 1.0, ..Default::default() });
+    assert!(AntennaErrors::new(&straight, array, &windows, true).is_none());
+}
+
+#[test]
+fn a_leak_falls_with_the_angle_below_the_limb() {
+    let array = Array::new(&ArrayConfig::default()).unwrap();
+    let config = InstrumentConfig { leak_k_sr: 1e6, leak_depth_deg: 2.0, ..Default::default() };
+    let errors = errors(config);
+    let (mut hidden, mut seen) = (0, 0);
+    for k in 0..400 {
+        let t_s = 20.7 * f64::from(k);
+        // The Moon's disc has the angular radius asin(R / r); the Earth's distance from its centre is that from the nadir.
+        let r_m = array.position_m(2, t_s);
+        let nadir = unit([-r_m[0], -r_m[1], -r_m[2]]);
+        let earth_deg = dot(nadir, array.earth_hat(t_s)).acos().to_degrees();
+        let disc_deg = (1737.1e3 / 2037.1e3_f64).asin().to_degrees();
+        let expected = if earth_deg < disc_deg { (-(disc_deg - earth_deg) / 2.0).exp() } else { 1.0 };
+        let found = errors.leak_k_sr(&array, 2, t_s) / 1e6;
+        assert!((found / expected - 1.0).abs() < 1e-9, "{t_s}: {found} {expected}");
+        assert_eq!(earth_deg < disc_deg, array.earth_depth_of_m(2, t_s) > 0.0);
+        (hidden, seen) = if earth_deg < disc_deg { (hidden + 1, seen) } else { (hidden, seen + 1) };
+    }
+    assert!(hidden > 100 && seen > 100);
+}
+
+#[test]
 fn everything_wrong_with_the_section_is_said() {
     let text = "dead_daughters = [9]\ndead_channels = [[1, 4]]\noutlier_probability = 2.0\nburst_every_s = 1.0\nburst_s = 2.0\n\
         phase_deg = { constant = [1.0], pass_rms = -1.0, drift_time_s = 1.0 }\nalong_m = { drift_rms = 1.0 }\n\
+        tilt_along_deg = { constant_rms = 60.0 }\npattern = { step_rms = 1.0 }\nclock_allan_deviation = 1.0\n\
+        clock_steering_s = 1.0\nleak_depth_deg = 0.0\nleak_k_sr = -1.0\n\
         beacon = { k_sr = -1.0, direction_deg = [0.0, 91.0] }";
     let config: InstrumentConfig = toml::from_str(text).unwrap();
     let keys: Vec<String> = config.problems(8, 3, false).into_iter().map(|problem| problem.key).collect();
@@ -161,9 +216,15 @@ fn everything_wrong_with_the_section_is_said() {
         "phase_deg.pass_rms",
         "phase_deg.drift_time_s",
         "along_m.drift_rms",
+        "pattern.step_rms",
+        "tilt_along_deg",
+        "clock_allan_deviation",
+        "clock_steering_s",
+        "leak_depth_deg",
         "dead_daughters[0]",
         "dead_channels[0]",
         "outlier_probability",
+        "leak_k_sr",
         "burst_s",
         "beacon.k_sr",
         "beacon.direction_deg",

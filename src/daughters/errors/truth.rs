@@ -8,11 +8,13 @@ use crate::frames::ObservingWindow;
 /// Comma-separated values, one line a pass, instant (its middle; also start and end if
 /// errors change within a pass), daughter and channel: the natural
 /// logarithm of the gain's amplitude, its phase without the clock (deg), the clock (ns), the error of the position (m,
-/// along, across and away from the Moon), and 1 for a dead receiver.
+/// along, across and away from the Moon), 1 for a dead receiver, the tilt of the antenna (deg, along the track and away from the
+/// Moon), and the distortion of its pattern.
 #[must_use]
 pub fn truth_csv(errors: &InstrumentErrors, windows: &[ObservingWindow]) -> String {
     let mut text = String::from(
-        "pass,time_s,daughter,channel,frequency_hz,ln_amplitude,phase_deg,clock_ns,along_m,across_m,radial_m,dead\n",
+        "pass,time_s,daughter,channel,frequency_hz,ln_amplitude,phase_deg,clock_ns,along_m,across_m,radial_m,dead,\
+         tilt_along_deg,tilt_radial_deg,pattern\n",
     );
     for window in windows {
         let pass = errors.pass(*window);
@@ -22,12 +24,14 @@ pub fn truth_csv(errors: &InstrumentErrors, windows: &[ObservingWindow]) -> Stri
         for t_s in instants.into_iter().take(count) {
             for daughter in 0..errors.satellites {
                 let [along, across, radial] = pass.offset_m(daughter, t_s);
+                let [tilt_along, tilt_radial, pattern] = pass.antenna(daughter, t_s);
                 let clock_ns = pass.clock_ns[daughter].at(t_s);
                 for (channel, of) in errors.channels.iter().enumerate() {
                     // Writing to a String cannot fail.
                     let _ = writeln!(
                         text,
-                        "{},{t_s:.6},{},{},{},{:.9},{:.7},{clock_ns:.7},{along:.6},{across:.6},{radial:.6},{}",
+                        "{},{t_s:.6},{},{},{},{:.9},{:.7},{clock_ns:.7},{along:.6},{across:.6},{radial:.6},{},\
+                         {tilt_along:.7},{tilt_radial:.7},{pattern:.9}",
                         window.index,
                         daughter + 1,
                         channel,

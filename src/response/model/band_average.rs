@@ -54,6 +54,10 @@ impl VisibilityModel for BandAverage {
         self.model.batch()
     }
 
+    fn has_own_antennas(&self) -> bool {
+        self.model.has_own_antennas()
+    }
+
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
         // A batch at a time, to bound memory.
         let batch = self.model.batch().max(1024);

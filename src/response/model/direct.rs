@@ -5,7 +5,7 @@ use num_complex::Complex64;
 use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
 use crate::frames::AntennaResponse;
 use crate::response::pixel::{
-    Comb, Directions, PairGeometry, SingleGeometry, comb_sums, sky_powers, sky_sums,
+    Comb, Directions, PairGeometry, SingleGeometry, comb_sums, four_sky_sums, sky_powers, sky_sums,
 };
 use crate::sky::SkyMap;
 use crate::sky::healpix::pixel_area_sr;
@@ -40,7 +40,21 @@ impl DirectSum {
 }
 
 impl DirectSum {
-    fn pairs(&self, positions: &[PairPosition]) -> Result<Vec<PairGeometry>, ModelError> {
+    /// Directions of the pixels, their values (K) and their area, sr.
+    pub(super) fn sky(&self) -> (&Directions, &[f32], f64) {
+        (&self.directions, &self.values, self.area_sr)
+    }
+
+    pub(super) fn single(&self, daughter: &DaughterPosition) -> SingleGeometry {
+        SingleGeometry {
+            r_m: daughter.r_m,
+            normal_hat: daughter.normal_hat,
+            moon_radius_m: self.moon_radius_m,
+            response: self.response,
+        }
+    }
+
+    pub(super) fn pairs(&self, positions: &[PairPosition]) -> Result<Vec<PairGeometry>, ModelError> {
         if positions.iter().any(|position| position.span_rad != 0.0) {
             return Err(ModelError::Smearing { frequency_hz: self.frequency_hz });
         }
@@ -60,6 +74,39 @@ impl DirectSum {
     }
 }
 
+/// A direct sum with its moments by direction, which give its derivatives by the baseline.
+#[derive(Clone, Debug)]
+pub struct DirectMoments {
+    sum: DirectSum,
+    /// The sky times each component of its direction, K.
+    moments: [Vec<f32>; 3],
+}
+
+impl DirectMoments {
+    /// Builds the model of `sky` (K, any frame) at `frequency_hz`.
+    #[must_use]
+    pub fn new(sky: &SkyMap, frequency_hz: f64, moon_radius_m: f64, response: AntennaResponse) -> Self {
+        let directions = sky.directions_ecliptic();
+        let moment = |axis: usize| {
+            sky.values().iter().zip(&directions).map(|(value, n_hat)| (value * n_hat[axis]) as f32).collect()
+        };
+        let moments = [moment(0), moment(1), moment(2)];
+        Self { sum: DirectSum::new(sky, frequency_hz, moon_radius_m, response), moments }
+    }
+
+    /// For each position the visibility, and the sums over the sky times the x, y and z of its direction on ecliptic axes, K sr.
+    ///
+    /// # Errors
+    /// As [`VisibilityModel::predict`].
+    pub fn predict(&self, positions: &[PairPosition]) -> Result<Vec<[Complex64; 4]>, ModelError> {
+        let pairs = self.sum.pairs(positions)?;
+        let [x, y, z] = self.moments.each_ref().map(Vec::as_slice);
+        let skies_k = [&self.sum.values[..], x, y, z];
+        // Lengths agree by construction, so the sums cannot fail.
+        Ok(four_sky_sums(&pairs, &self.sum.directions, skies_k, self.sum.area_sr).unwrap_or_default())
+    }
+}
+
 impl VisibilityModel for DirectSum {
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
         let pairs = self.pairs(positions)?;
@@ -72,13 +119,7 @@ impl VisibilityModel for DirectSum {
     }
 
     fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
-        let single = |daughter: &DaughterPosition| SingleGeometry {
-            r_m: daughter.r_m,
-            normal_hat: daughter.normal_hat,
-            moon_radius_m: self.moon_radius_m,
-            response: self.response,
-        };
-        let singles: Vec<SingleGeometry> = daughters.iter().map(single).collect();
+        let singles: Vec<SingleGeometry> = daughters.iter().map(|daughter| self.single(daughter)).collect();
         // As above.
         let powers = sky_powers(&singles, &self.directions, &self.values, self.area_sr).unwrap_or_default();
         for (out, power) in out.iter_mut().zip(powers) {

@@ -247,7 +247,12 @@ mod tests {
             }
             let r_m = positions[0].r_i_m;
             let mut power = [0.0];
-            model.predict_powers(&[DaughterPosition { r_m, normal_hat }], &mut power).unwrap();
+            model
+                .predict_powers(
+                    &[DaughterPosition { r_m, normal_hat, ..DaughterPosition::default() }],
+                    &mut power,
+                )
+                .unwrap();
             // The cap of half angle asin(R / r): 2 pi (1 - cos), and for dipoles across its axis less 2 pi
             // (2/3 - cos + cos^3 / 3) / 2.
             let cos = (1.0 - (moon_m / norm(r_m)).powi(2)).sqrt();

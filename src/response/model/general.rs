@@ -169,7 +169,14 @@ mod tests {
         let r_m = array.position_m(3, 4e3);
         let mut power = [0.0];
         model
-            .predict_powers(&[DaughterPosition { r_m, normal_hat: array.orbit_normal_hat(4e3) }], &mut power)
+            .predict_powers(
+                &[DaughterPosition {
+                    r_m,
+                    normal_hat: array.orbit_normal_hat(4e3),
+                    ..DaughterPosition::default()
+                }],
+                &mut power,
+            )
             .unwrap();
         // All directions but those within asin(R / r) of the nadir.
         let hidden = (array.moon_radius_m() / norm(r_m)).asin();

@@ -172,6 +172,7 @@ mod tests {
         let daughters = [0.0, 1500.0, 3e6].map(|t_s| DaughterPosition {
             r_m: array.position_m(4, t_s),
             normal_hat: array.orbit_normal_hat(t_s),
+            at: None,
         });
         for response in [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal] {
             let setup = HarmonicSumSetup {

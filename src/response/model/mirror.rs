@@ -137,7 +137,7 @@ impl VisibilityModel for SphereMirrored {
         self.sky.predict_powers(daughters, out)?;
         let (response, image) = (self.response, &self.image);
         out.par_iter_mut().zip(daughters).for_each(|(out, daughter)| {
-            let DaughterPosition { r_m, normal_hat } = *daughter;
+            let DaughterPosition { r_m, normal_hat, .. } = *daughter;
             let seen = image.seen_from(r_m);
             let single = SingleGeometry { r_m, normal_hat, moon_radius_m: 0.0, response };
             // As above.
@@ -252,7 +252,11 @@ mod tests {
             assert!((at[1] - found[0]).norm() < 1e-5 && (at[0] - found[0]).norm() > 0.01, "{at:?}");
             // And its power is that of no baseline.
             let mut power = [0.0];
-            let daughter = DaughterPosition { r_m: r_i_m, normal_hat: array.orbit_normal_hat(9e5) };
+            let daughter = DaughterPosition {
+                r_m: r_i_m,
+                normal_hat: array.orbit_normal_hat(9e5),
+                ..DaughterPosition::default()
+            };
             model.predict_powers(&[daughter], &mut power).unwrap();
             model.predict(&[pair(r_i_m, r_i_m)], &mut found).unwrap();
             assert!((found[0] - power[0]).norm() < 1e-5, "{} {power:?}", found[0]);

@@ -2,9 +2,10 @@
 //!
 //! [`VisibilityModel`] is the interface, for one sky at one frequency. [`DirectSum`] sums over the sky's pixels,
 //! [`HarmonicSum`] uses spherical harmonics on a common circle, [`GeneralSum`] anywhere; [`Reflected`] adds the image of the sky in
-//! a flat Moon, [`SphereMirrored`] in a round one, [`Emitting`] the Moon's own emission, [`BandAverage`] averages over a channel, and
+//! a flat Moon, [`SphereMirrored`] in a round one, [`AntennaSum`] antennas that differ, [`Emitting`] the Moon's own emission, [`BandAverage`] averages over a channel, and
 //! [`ModelPlan`] chooses by cost. Equal arguments give equal results, whatever the threads.
 
+mod antennas;
 mod band_average;
 mod choice;
 mod direct;
@@ -14,9 +15,10 @@ mod harmonic;
 mod mirror;
 mod reflection;
 
+pub use antennas::{AntennaPatterns, AntennaSum};
 pub use band_average::BandAverage;
 pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
-pub use direct::DirectSum;
+pub use direct::{DirectMoments, DirectSum};
 pub use emission::Emitting;
 pub use general::GeneralSum;
 pub use harmonic::{HarmonicSum, HarmonicSumSetup};
@@ -52,6 +54,8 @@ pub struct DaughterPosition {
     pub r_m: Vec3,
     /// Normal of the orbit, a unit vector; dipoles point along it.
     pub normal_hat: Vec3,
+    /// Daughter, from 0, and mission time, s, where antennas differ.
+    pub at: Option<(u8, f64)>,
 }
 
 /// Why a prediction failed.
@@ -120,6 +124,11 @@ pub trait VisibilityModel: Send + Sync {
     /// # Errors
     /// As [`Self::predict`].
     fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError>;
+
+    /// Whether daughters at one place have different powers.
+    fn has_own_antennas(&self) -> bool {
+        false
+    }
 
     /// Predicts the visibilities (K sr) of each position at the frequencies of `comb`: `comb.count` values a position.
     ///

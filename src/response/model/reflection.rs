@@ -32,6 +32,10 @@ impl VisibilityModel for Reflected {
         self.sky.batch()
     }
 
+    fn has_own_antennas(&self) -> bool {
+        self.sky.has_own_antennas()
+    }
+
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
         let mut image = vec![Complex64::ZERO; out.len()];
         self.above.predict(positions, &mut image)?;
@@ -90,7 +94,11 @@ mod tests {
             let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: None };
             let (mut found, mut power) = ([Complex64::ZERO], [0.0]);
             reflected.predict(&[position], &mut found).unwrap();
-            let daughter = DaughterPosition { r_m: r_i_m, normal_hat: array.orbit_normal_hat(9e5) };
+            let daughter = DaughterPosition {
+                r_m: r_i_m,
+                normal_hat: array.orbit_normal_hat(9e5),
+                ..DaughterPosition::default()
+            };
             reflected.predict_powers(&[daughter], &mut power).unwrap();
             // Two waves from each direction: one straight, one by the mirror, with the mirrored direction's own fringe.
             let middle = add(r_i_m, r_j_m);

@@ -52,6 +52,17 @@ impl PairGeometry {
     }
 }
 
+/// Antenna of one satellite that may be off: a short dipole, or an isotropic antenna with an axis.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Antenna {
+    /// Its axis, a unit vector.
+    pub axis_hat: Vec3,
+    /// Whether it is a dipole along the axis.
+    pub is_dipole: bool,
+    /// q in the factor `1 + q P_2(cos)` of its voltage, with the angle from the axis.
+    pub distortion: f64,
+}
+
 /// Position and antenna of one satellite.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SingleGeometry {

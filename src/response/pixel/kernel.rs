@@ -3,7 +3,7 @@
 //! Kernels are plain loops over short buffers. `multiversion` compiles each of them for AVX-512, AVX2 and the baseline
 //! and selects one at run time.
 
-use super::{PairGeometry, SingleGeometry};
+use super::{Antenna, PairGeometry, SingleGeometry};
 use crate::frames::AntennaResponse;
 use crate::units::arithmetic::{fused, fused64};
 use crate::units::vector::{Vec3, dot, scale};
@@ -55,6 +55,8 @@ pub(super) struct Prepared {
     pub limb_j: f64,
     /// Direction of the dipoles, if there are any.
     pub dipole: Option<Vec3>,
+    /// Antennas that differ, in place of those.
+    pub antennas: Option<[Antenna; 2]>,
 }
 
 /// Direction of a position, and the cosine of the angle between the limb and the Moon's centre.
@@ -73,7 +75,19 @@ impl Prepared {
             // Without an orbital plane the dipoles have no direction, and the result is not a number.
             AntennaResponse::DipoleNormal => Some(pair.orbit_normal().unwrap_or([f64::NAN; 3])),
         };
-        Self { u: pair.baseline_wavelengths(), i_hat, limb_i, j_hat, limb_j, dipole }
+        Self { u: pair.baseline_wavelengths(), i_hat, limb_i, j_hat, limb_j, dipole, antennas: None }
+    }
+
+    /// A pair whose antennas differ.
+    pub fn antenna_pair((pair, antennas): &(PairGeometry, [Antenna; 2])) -> Self {
+        let ideal = PairGeometry { response: AntennaResponse::Isotropic, ..*pair };
+        Self { antennas: Some(*antennas), ..Self::pair(&ideal) }
+    }
+
+    /// A satellite with an antenna of its own.
+    pub fn antenna_single((single, antenna): &(SingleGeometry, Antenna)) -> Self {
+        let ideal = SingleGeometry { response: AntennaResponse::Isotropic, ..*single };
+        Self { antennas: Some([*antenna; 2]), ..Self::single(&ideal) }
     }
 
     pub fn single(single: &SingleGeometry) -> Self {
@@ -82,7 +96,7 @@ impl Prepared {
             AntennaResponse::Isotropic => None,
             AntennaResponse::DipoleNormal => Some(single.normal_hat),
         };
-        Self { u: [0.0; 3], i_hat, limb_i, j_hat: i_hat, limb_j: limb_i, dipole }
+        Self { u: [0.0; 3], i_hat, limb_i, j_hat: i_hat, limb_j: limb_i, dipole, antennas: None }
     }
 
     /// How far direction (x, y, z) lies above the limb for satellite i and for satellite j; negative where hidden.
@@ -100,13 +114,24 @@ impl Prepared {
         (depth_i >= 0.0) & (depth_j >= 0.0)
     }
 
-    /// Multiplies a chunk of values by the antennas' power response, 1 - (n . d)^2 for dipoles along d.
+    /// Multiplies a chunk of values by the antennas' power response, 1 - (n . d)^2 for dipoles along d. Of dipoles along d and e an
+    /// unpolarised wave leaves d . e - (n . d) (n . e): the product of their parts across its direction.
     #[inline(always)]
     pub fn apply_antenna<const FMA: bool>(&self, [x, y, z]: ChunkDirections<'_>, values: &mut [f32; CHUNK]) {
         if let Some(dipole) = self.dipole {
             for k in 0..CHUNK {
                 let along = dot64::<FMA>(dipole, x[k], y[k], z[k]) as f32;
                 values[k] *= fused::<FMA>(-along, along, 1.0);
+            }
+        }
+        if let Some([a, b]) = self.antennas {
+            let (both, common) = (a.is_dipole && b.is_dipole, dot(a.axis_hat, b.axis_hat));
+            let distorted = |q: f64, cos: f64| 1.0 + q * (1.5 * cos * cos - 0.5);
+            for k in 0..CHUNK {
+                let p = dot64::<FMA>(a.axis_hat, x[k], y[k], z[k]);
+                let q = dot64::<FMA>(b.axis_hat, x[k], y[k], z[k]);
+                let dipoles = if both { common - p * q } else { 1.0 };
+                values[k] *= (dipoles * distorted(a.distortion, p) * distorted(b.distortion, q)) as f32;
             }
         }
     }

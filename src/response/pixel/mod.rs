@@ -8,6 +8,8 @@
 //! |---|---|
 //! | [`RowMaker`] | rows of B: at pixel centres, or averaged over pixels |
 //! | [`sky_sums`], [`sky_powers`] | visibilities and auto-correlation powers of a sky |
+//! | [`antenna_sums`], [`antenna_powers`] | the same with antennas that differ |
+//! | [`four_sky_sums`] | visibilities of four skies together |
 //! | [`comb_sums`] | visibilities of a sky at equally spaced frequencies |
 //! | [`exact`] | the same in `f64`, for verification |
 //!
@@ -31,9 +33,9 @@ use thiserror::Error;
 
 pub use combs::{Comb, comb_sums};
 pub use directions::Directions;
-pub use geometry::{PairGeometry, SingleGeometry};
+pub use geometry::{Antenna, PairGeometry, SingleGeometry};
 pub use rows::{RowMaker, RowValue};
-pub use sums::{SkySum, sky_powers, sky_sums};
+pub use sums::{SkySum, antenna_powers, antenna_sums, four_sky_sums, sky_powers, sky_sums};
 
 /// Sample points along each side of a pixel in pixel averages: the paper evaluates at nside 1024 and averages down to
 /// nside 64.

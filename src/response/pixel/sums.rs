@@ -5,7 +5,7 @@ use num_complex::Complex64;
 use rayon::prelude::*;
 
 use super::kernel::{CHUNK, ChunkDirections, PaddedChunk, Prepared, dot64, total};
-use super::{Directions, PairGeometry, ResponseError, SingleGeometry};
+use super::{Antenna, Directions, PairGeometry, ResponseError, SingleGeometry};
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 
 /// Pairs of one task.
@@ -53,6 +53,64 @@ pub fn sky_powers(
 ) -> Result<Vec<f64>, ResponseError> {
     let sums = sums_of(singles, Prepared::single, directions, sky_k, area_sr)?;
     Ok(sums.into_iter().map(|sum| sum.zero_spacing_k_sr).collect())
+}
+
+/// [`sky_sums`] of pairs whose antennas differ, in place of their response.
+///
+/// # Errors
+/// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
+pub fn antenna_sums(
+    pairs: &[(PairGeometry, [Antenna; 2])],
+    directions: &Directions,
+    sky_k: &[f32],
+    area_sr: f64,
+) -> Result<Vec<SkySum>, ResponseError> {
+    sums_of(pairs, Prepared::antenna_pair, directions, sky_k, area_sr)
+}
+
+/// [`sky_powers`] of satellites with antennas of their own, in place of their response.
+///
+/// # Errors
+/// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
+pub fn antenna_powers(
+    singles: &[(SingleGeometry, Antenna)],
+    directions: &Directions,
+    sky_k: &[f32],
+    area_sr: f64,
+) -> Result<Vec<f64>, ResponseError> {
+    let sums = sums_of(singles, Prepared::antenna_single, directions, sky_k, area_sr)?;
+    Ok(sums.into_iter().map(|sum| sum.zero_spacing_k_sr).collect())
+}
+
+/// Sums of T A S_i S_j exp(-2 pi i u . n) dOmega of each pair for four skies (K) at the same `directions`, K sr. Fringes are
+/// computed once for the four; each sum has the bits that [`sky_sums`] gives its sky.
+///
+/// # Errors
+/// [`ResponseError::SkyLength`] unless each sky has one value for each direction.
+pub fn four_sky_sums(
+    pairs: &[PairGeometry],
+    directions: &Directions,
+    skies_k: [&[f32]; 4],
+    area_sr: f64,
+) -> Result<Vec<[Complex64; 4]>, ResponseError> {
+    if let Some(sky) = skies_k.iter().find(|sky| sky.len() != directions.len()) {
+        return Err(ResponseError::SkyLength { sky: sky.len(), directions: directions.len() });
+    }
+    let mut sums = vec![[Complex64::ZERO; 4]; pairs.len()];
+    sums.par_chunks_mut(PAIRS_PER_TASK).zip(pairs.par_chunks(PAIRS_PER_TASK)).for_each(|(sums, pairs)| {
+        let prepared: Vec<Prepared> = pairs.iter().map(Prepared::pair).collect();
+        for first in (0..directions.len()).step_by(SECTION) {
+            let range = first..directions.len().min(first + SECTION);
+            let n = [&directions.x, &directions.y, &directions.z].map(|axis| &axis[range.clone()]);
+            let skies_k = skies_k.map(|sky| &sky[range.clone()]);
+            for (sums, pair) in sums.iter_mut().zip(&prepared) {
+                let parts = sum_four_sections(pair, n, skies_k);
+                sums.iter_mut().zip(parts).for_each(|(sum, [re, im])| *sum += Complex64::new(re, im));
+            }
+        }
+        sums.iter_mut().flatten().for_each(|sum| *sum *= area_sr);
+    });
+    Ok(sums)
 }
 
 /// [`sky_sums`] of geometries that `prepare` reduces.
@@ -104,49 +162,83 @@ fn sum_prepared(
 fn sum_section(pair: &Prepared, n: [&[f64]; 3], sky_k: &[f32]) -> [f64; 3] {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
-    section::<FMA>(pair, n, sky_k)
+    let ([[re, im]], zero) = section::<FMA, 1>(pair, n, [sky_k]);
+    [re, im, zero]
 }
 
+/// The same of four skies, without zero spacings.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn sum_four_sections(pair: &Prepared, n: [&[f64]; 3], skies_k: [&[f32]; 4]) -> [[f64; 2]; 4] {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
+    section::<FMA, 4>(pair, n, skies_k).0
+}
+
+/// Real and imaginary part of the sum of each sky, and the zero spacing of the first.
 #[inline(always)]
-fn section<const FMA: bool>(pair: &Prepared, n: [&[f64]; 3], sky_k: &[f32]) -> [f64; 3] {
-    let mut total = [0.0_f64; 3];
-    for (k, values) in sky_k.chunks(CHUNK).enumerate() {
-        let n = n.map(|axis| &axis[k * CHUNK..k * CHUNK + values.len()]);
-        let sums = match (values.try_into(), n.map(<&[f64; CHUNK]>::try_from)) {
-            (Ok(values), [Ok(x), Ok(y), Ok(z)]) => chunk::<FMA>(pair, [x, y, z], values),
+fn section<const FMA: bool, const SKIES: usize>(
+    pair: &Prepared,
+    n: [&[f64]; 3],
+    skies_k: [&[f32]; SKIES],
+) -> ([[f64; 2]; SKIES], f64) {
+    let (mut totals, mut zero) = ([[0.0_f64; 2]; SKIES], 0.0);
+    for first in (0..n[0].len()).step_by(CHUNK) {
+        let range = first..n[0].len().min(first + CHUNK);
+        let n = n.map(|axis| &axis[range.clone()]);
+        let skies_k = skies_k.map(|sky| &sky[range.clone()]);
+        let whole = (n.map(<&[f64; CHUNK]>::try_from), skies_k.map(<&[f32; CHUNK]>::try_from));
+        let (sums, zero_of_chunk) = match whole {
+            ([Ok(x), Ok(y), Ok(z)], skies_k) if skies_k.iter().all(Result::is_ok) => {
+                // All are whole.
+                const NONE: &[f32; CHUNK] = &[0.0; CHUNK];
+                chunk::<FMA, SKIES>(pair, [x, y, z], skies_k.map(|sky_k| sky_k.unwrap_or(NONE)))
+            }
             _ => {
-                let padded = PaddedChunk::new(n, values);
-                chunk::<FMA>(pair, padded.directions(), &padded.sky_k)
+                let padded = skies_k.map(|sky_k| PaddedChunk::new(n, sky_k));
+                let skies_k = padded.each_ref().map(|padded| &padded.sky_k);
+                chunk::<FMA, SKIES>(pair, padded[0].directions(), skies_k)
             }
         };
-        for (total, sum) in total.iter_mut().zip(sums) {
+        for (total, sum) in totals.iter_mut().flatten().zip(sums.iter().flatten()) {
             *total += sum;
         }
+        zero += zero_of_chunk;
     }
-    total
+    (totals, zero)
 }
 
 #[inline(always)]
-fn chunk<const FMA: bool>(pair: &Prepared, n: ChunkDirections<'_>, sky_k: &[f32; CHUNK]) -> [f64; 3] {
+fn chunk<const FMA: bool, const SKIES: usize>(
+    pair: &Prepared,
+    n: ChunkDirections<'_>,
+    skies_k: [&[f32; CHUNK]; SKIES],
+) -> ([[f64; 2]; SKIES], f64) {
     let [x, y, z] = n;
     let mut turns = [0.0_f32; CHUNK];
-    let mut seen = [0.0_f32; CHUNK];
+    let mut seen = [[0.0_f32; CHUNK]; SKIES];
     for k in 0..CHUNK {
         turns[k] = fraction_of_turn(dot64::<FMA>(pair.u, x[k], y[k], z[k]));
-        seen[k] = if pair.sees::<FMA>(x[k], y[k], z[k]) { sky_k[k] } else { 0.0 };
-    }
-    pair.apply_antenna::<FMA>(n, &mut seen);
-    const LANES: usize = 16;
-    let mut lanes = [[0.0_f32; LANES]; 3];
-    for (turns, seen) in turns.as_chunks::<LANES>().0.iter().zip(seen.as_chunks::<LANES>().0) {
-        for k in 0..LANES {
-            let (cos, sin) = cos_sin_turns::<FMA>(turns[k]);
-            lanes[0][k] = fused::<FMA>(seen[k], cos, lanes[0][k]);
-            lanes[1][k] = fused::<FMA>(-seen[k], sin, lanes[1][k]);
-            lanes[2][k] += seen[k];
+        let sees = pair.sees::<FMA>(x[k], y[k], z[k]);
+        for (seen, sky_k) in seen.iter_mut().zip(skies_k) {
+            seen[k] = if sees { sky_k[k] } else { 0.0 };
         }
     }
-    [total(&lanes[0]), total(&lanes[1]), total(&lanes[2])]
+    seen.iter_mut().for_each(|seen| pair.apply_antenna::<FMA>(n, seen));
+    const LANES: usize = 16;
+    let mut lanes = [[[0.0_f32; LANES]; 2]; SKIES];
+    let mut zero = [0.0_f32; LANES];
+    for (part, turns) in turns.as_chunks::<LANES>().0.iter().enumerate() {
+        for k in 0..LANES {
+            let (cos, sin) = cos_sin_turns::<FMA>(turns[k]);
+            for (lanes, seen) in lanes.iter_mut().zip(&seen) {
+                let seen = seen[part * LANES + k];
+                lanes[0][k] = fused::<FMA>(seen, cos, lanes[0][k]);
+                lanes[1][k] = fused::<FMA>(-seen, sin, lanes[1][k]);
+            }
+            zero[k] += seen[0][part * LANES + k];
+        }
+    }
+    (lanes.map(|[re, im]| [total(&re), total(&im)]), total(&zero))
 }
 
 #[cfg(test)]
@@ -188,6 +280,36 @@ mod tests {
             // As documented for sums of f32.
             assert!((found / (3.0 * exact * area_sr) - 1.0).abs() < 1e-6, "{response:?}");
         }
+    }
+
+    #[test]
+    fn four_skies_together_have_the_bits_of_each_alone() {
+        let n = pixel_directions(16);
+        let directions = Directions::from(n.as_slice());
+        let skies: [Vec<f32>; 4] = std::array::from_fn(|m| {
+            n.iter().map(|n| 2.0 + (n[m % 3] * (m as f64 + 1.5)).sin() as f32).collect()
+        });
+        let pairs: Vec<PairGeometry> = (1..70)
+            .map(|k| {
+                let one = single(AntennaResponse::DipoleNormal);
+                let along = scale(53.0 * f64::from(k), unit(cross(one.normal_hat, one.r_m)));
+                PairGeometry {
+                    r_i_m: one.r_m,
+                    r_j_m: crate::units::vector::add(one.r_m, along),
+                    frequency_hz: 1e7,
+                    moon_radius_m: MOON_M,
+                    response: AntennaResponse::DipoleNormal,
+                }
+            })
+            .collect();
+        let together = four_sky_sums(&pairs, &directions, skies.each_ref().map(Vec::as_slice), 0.5).unwrap();
+        for (m, sky) in skies.iter().enumerate() {
+            for (k, alone) in sky_sums(&pairs, &directions, sky, 0.5).unwrap().iter().enumerate() {
+                assert_eq!(together[k][m], alone.visibility_k_sr, "sky {m}, pair {k}");
+            }
+        }
+        let short = [&skies[0][..], &skies[1][1..], &skies[2][..], &skies[3][..]];
+        assert!(four_sky_sums(&pairs, &directions, short, 0.5).is_err());
     }
 
     #[test]

@@ -1,0 +1,164 @@
+//! Direct sums with antennas that differ from daughter to daughter.
+
+use std::sync::Arc;
+
+use num_complex::Complex64;
+
+use super::direct::DirectSum;
+use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
+use crate::response::pixel::{Antenna, antenna_powers, antenna_sums};
+
+/// The antenna of each daughter at any time.
+pub trait AntennaPatterns: Send + Sync {
+    /// That of a daughter, from 0, at a mission time, s.
+    fn antenna(&self, daughter: u8, t_s: f64) -> Antenna;
+}
+
+/// A direct sum in which every daughter has its own antenna: of two dipoles along d and e an unpolarised wave from n leaves
+/// `d . e - (n . d) (n . e)`.
+///
+/// Positions have to say whose they are (`at`); those that do not have the response of the sum.
+pub struct AntennaSum {
+    sum: DirectSum,
+    patterns: Arc<dyn AntennaPatterns>,
+}
+
+impl AntennaSum {
+    /// A direct sum with these antennas in place of its own.
+    #[must_use]
+    pub fn new(sum: DirectSum, patterns: Arc<dyn AntennaPatterns>) -> Self {
+        Self { sum, patterns }
+    }
+}
+
+impl VisibilityModel for AntennaSum {
+    fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
+        let at: Option<Vec<_>> = positions.iter().map(|position| position.at).collect();
+        let Some(at) = at else { return self.sum.predict(positions, out) };
+        let pairs = self.sum.pairs(positions)?.into_iter().zip(at).map(|(geometry, (pair, t_s))| {
+            (geometry, [pair.i, pair.j].map(|daughter| self.patterns.antenna(daughter, t_s)))
+        });
+        let pairs: Vec<_> = pairs.collect();
+        let (directions, values, area_sr) = self.sum.sky();
+        // Lengths agree by construction, so the sums cannot fail.
+        let sums = antenna_sums(&pairs, directions, values, area_sr).unwrap_or_default();
+        out.iter_mut().zip(sums).for_each(|(out, sum)| *out = sum.visibility_k_sr);
+        Ok(())
+    }
+
+    fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
+        let at: Option<Vec<_>> = daughters.iter().map(|daughter| daughter.at).collect();
+        let Some(at) = at else { return self.sum.predict_powers(daughters, out) };
+        let singles = daughters
+            .iter()
+            .zip(at)
+            .map(|(daughter, (number, t_s))| (self.sum.single(daughter), self.patterns.antenna(number, t_s)));
+        let singles: Vec<_> = singles.collect();
+        let (directions, values, area_sr) = self.sum.sky();
+        // As above.
+        let powers = antenna_powers(&singles, directions, values, area_sr).unwrap_or_default();
+        out.iter_mut().zip(powers).for_each(|(out, power)| *out = power);
+        Ok(())
+    }
+
+    fn has_own_antennas(&self) -> bool {
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::array::{Array, ArrayConfig};
+    use crate::frames::AntennaResponse;
+    use crate::sky::healpix::{pixel_area_sr, pixel_directions};
+    use crate::sky::{Frame, SkyMap};
+    use crate::units::Pair;
+    use crate::units::vector::{Vec3, dot, scale, sub, unit};
+
+    const NSIDE: usize = 8;
+
+    /// Antennas that turn with the daughter's number.
+    struct Tilted {
+        is_dipole: bool,
+    }
+
+    impl AntennaPatterns for Tilted {
+        fn antenna(&self, daughter: u8, t_s: f64) -> Antenna {
+            let k = f64::from(daughter) + t_s * 1e-6;
+            let axis_hat = unit([0.3 * k, -0.5 + 0.1 * k, 0.9]);
+            Antenna { axis_hat, is_dipole: self.is_dipole, distortion: 0.1 * k }
+        }
+    }
+
+    /// A source in one pixel, and where it is.
+    fn source() -> (SkyMap, Vec3) {
+        let mut values = vec![0.0; 12 * NSIDE * NSIDE];
+        // High above all daughters at the epoch, who are on the x axis.
+        let directions = pixel_directions(NSIDE);
+        let above = (0..values.len()).max_by(|a, b| directions[*a][0].total_cmp(&directions[*b][0])).unwrap();
+        values[above] = 1e4;
+        (SkyMap::new(Frame::Ecliptic, values).unwrap(), directions[above])
+    }
+
+    #[test]
+    fn one_source_is_seen_through_the_projections_of_both_dipoles() {
+        let array = Array::new(&ArrayConfig::default()).unwrap();
+        let (sky, n_hat) = source();
+        for is_dipole in [true, false] {
+            let sum = DirectSum::new(&sky, 3e6, array.moon_radius_m(), AntennaResponse::Isotropic);
+            let mut plain = sum.clone();
+            let mut model = AntennaSum::new(sum, Arc::new(Tilted { is_dipole }));
+            for (i, j) in [(0_u8, 1_u8), (2, 5), (1, 7)] {
+                let t_s = 4e5 + f64::from(j);
+                let [r_i_m, r_j_m] = [i, j].map(|n| array.position_m(n.into(), 0.0));
+                let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: Some((Pair { i, j }, t_s)) };
+                let (mut found, mut ideal) = ([Complex64::ZERO], [Complex64::ZERO]);
+                model.predict(&[position], &mut found).unwrap();
+                plain.predict(&[position], &mut ideal).unwrap();
+                // Voltages of a wave of either polarisation: the parts of the dipoles across its direction.
+                let [a, b] = [i, j].map(|n| Tilted { is_dipole }.antenna(n, t_s));
+                let across = |axis: Vec3| sub(axis, scale(dot(axis, n_hat), n_hat));
+                let dipoles = if is_dipole { dot(across(a.axis_hat), across(b.axis_hat)) } else { 1.0 };
+                let legendre = |axis: Vec3| (3.0 * dot(axis, n_hat).powi(2) - 1.0) / 2.0;
+                let factor = dipoles
+                    * (1.0 + a.distortion * legendre(a.axis_hat))
+                    * (1.0 + b.distortion * legendre(b.axis_hat));
+                // Single precision of the fringe.
+                assert!((found[0] - factor * ideal[0]).norm() < 2e-6 * ideal[0].norm(), "{i} {j}: {found:?}");
+                let mut power = [0.0];
+                let daughter =
+                    DaughterPosition { r_m: r_i_m, normal_hat: [0.0, 0.0, 1.0], at: Some((i, t_s)) };
+                model.predict_powers(&[daughter], &mut power).unwrap();
+                let own = if is_dipole { dot(across(a.axis_hat), across(a.axis_hat)) } else { 1.0 };
+                let expected =
+                    1e4 * pixel_area_sr(NSIDE) * own * (1.0 + a.distortion * legendre(a.axis_hat)).powi(2);
+                assert!((power[0] / expected - 1.0).abs() < 1e-6, "{} {expected}", power[0]);
+            }
+        }
+    }
+
+    #[test]
+    fn straight_antennas_are_those_of_the_response() {
+        struct Straight(Array);
+        impl AntennaPatterns for Straight {
+            fn antenna(&self, daughter: u8, t_s: f64) -> Antenna {
+                let axis_hat = self.0.normal_hat(daughter.into(), t_s);
+                Antenna { axis_hat, is_dipole: true, distortion: 0.0 }
+            }
+        }
+        let array = Array::new(&ArrayConfig::default()).unwrap();
+        let values = pixel_directions(NSIDE).iter().map(|n| 3.0 + n[0] + n[1] * n[2]).collect();
+        let sky = SkyMap::new(Frame::Ecliptic, values).unwrap();
+        let mut plain = DirectSum::new(&sky, 3e6, array.moon_radius_m(), AntennaResponse::DipoleNormal);
+        let mut model = AntennaSum::new(plain.clone(), Arc::new(Straight(array.clone())));
+        let t_s = 3e6;
+        let [r_i_m, r_j_m] = [1, 5].map(|n| array.position_m(n, t_s));
+        let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: Some((Pair { i: 1, j: 5 }, t_s)) };
+        let (mut found, mut expected) = ([Complex64::ZERO], [Complex64::ZERO]);
+        model.predict(&[position], &mut found).unwrap();
+        plain.predict(&[position], &mut expected).unwrap();
+        // Single precision of a sky of 40 K sr.
+        assert!((found[0] - expected[0]).norm() < 4e-5, "{found:?} {expected:?}");
+    }
+}
