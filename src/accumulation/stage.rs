@@ -12,7 +12,7 @@ use super::{
     PixelSetup, PixelSums, SumCounts, automatic_weight_max,
 };
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
-use crate::ranks::Ranks;
+use crate::ranks::{RankShare, Ranks};
 use crate::runtime::{Cancel, Ledger, Outlet, Stage, Units};
 use crate::units::ChannelId;
 use crate::units::vector::{norm, sub};
@@ -175,6 +175,17 @@ impl Accumulator {
         Self { ranks: ranks.clone(), ..self }
     }
 
+    /// One with the same settings and ledger, without data.
+    #[must_use]
+    pub fn without_sums(&self) -> Self {
+        let (config, ledger) = (self.config.clone(), self.ledger.clone());
+        Self::new(config, ledger)
+            .among(&self.ranks)
+            .of_group(self.group.clone())
+            .within_memory(self.memory_max_bytes)
+            .cancelled_by(&self.cancel)
+    }
+
     /// Those that hold parts of the sums.
     #[must_use]
     pub fn ranks(&self) -> &Ranks {
@@ -229,6 +240,20 @@ impl Accumulator {
     /// # Errors
     /// Engines that are damaged, or of another kind than configured.
     pub fn resume(self, state: AccumulatorState, from: &mut dyn Read) -> Result<Self, AccumulationError> {
+        self.resume_part(state, from, RankShare::WHOLE)
+    }
+
+    /// As [`Accumulator::resume`], from engines of which the rank that wrote them holds `part`. What this one holds of it is kept; the
+    /// other parts are to be joined.
+    ///
+    /// # Errors
+    /// Likewise.
+    pub fn resume_part(
+        self,
+        state: AccumulatorState,
+        from: &mut dyn Read,
+        part: RankShare,
+    ) -> Result<Self, AccumulationError> {
         let mut channels = Vec::new();
         for has_engine in state.channels {
             if !has_engine {
@@ -237,11 +262,35 @@ impl Accumulator {
             }
             let engine = match self.config.engine {
                 EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
-                EngineKind::Harmonic => Engine::Harmonic(Box::new(HarmonicEngine::restore(from)?)),
+                EngineKind::Harmonic => {
+                    Engine::Harmonic(Box::new(HarmonicEngine::restore_part(from, part, &self.ranks)?))
+                }
             };
             channels.push(Some(ChannelSums { engine, span_s: NO_SPAN_S, snapshots: 0 }));
         }
         Ok(Self { instrument: state.instrument.map(Arc::new), channels, ..self })
+    }
+
+    /// Takes in another part of the same sums, channel by channel: of the same visibilities, at other alphas.
+    ///
+    /// # Errors
+    /// Parts of different sums.
+    pub fn join(&mut self, other: Self) -> Result<(), AccumulationError> {
+        let apart = AccumulationError::Mismatch { what: "channels, or sums that have no parts," };
+        if self.channels.len() != other.channels.len() {
+            return Err(apart);
+        }
+        for (slot, theirs) in self.channels.iter_mut().zip(other.channels) {
+            match (slot, theirs) {
+                (None, None) => {}
+                (
+                    Some(ChannelSums { engine: Engine::Harmonic(ours), .. }),
+                    Some(ChannelSums { engine: Engine::Harmonic(theirs), .. }),
+                ) => ours.join(*theirs)?,
+                _ => return Err(apart),
+            }
+        }
+        Ok(())
     }
 
     /// Adds the sums of another accumulator, channel by channel.
