@@ -5,7 +5,7 @@ use std::io::{Read, Write};
 use std::sync::Arc;
 
 use super::harmonic::{
-    HarmonicEngine, HarmonicSetup, HarmonicSums, RefinedSetup, VisibilityArchive, orbit_of,
+    HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, RefinedSetup, VisibilityArchive, orbit_of,
 };
 use super::{
     AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine,
@@ -46,6 +46,13 @@ pub enum SnapshotSums {
 }
 
 impl SnapshotSums {
+    fn with_noises(self, noises: Option<NoiseSums>) -> Self {
+        match (self, noises) {
+            (Self::Harmonic(sums), Some(noises)) => Self::Harmonic(Box::new(sums.with_noises(noises))),
+            (other, _) => other,
+        }
+    }
+
     /// Number and weight of the visibilities in the sums.
     #[must_use]
     pub fn counts(&self) -> SumCounts {
@@ -131,6 +138,8 @@ const NO_SPAN_S: [f64; 2] = [f64::INFINITY, f64::NEG_INFINITY];
 /// The engine of one channel, and the span of its data.
 struct ChannelSums {
     engine: Engine,
+    /// Noises of further realisations, of the harmonic engine.
+    noises: Option<NoiseSums>,
     span_s: [f64; 2],
     snapshots: u32,
 }
@@ -149,6 +158,8 @@ pub struct Accumulator {
     group: Option<ChannelGroup>,
     /// Those that hold the other parts of the sums.
     ranks: Ranks,
+    /// Seeds of further realisations of noise.
+    noise_seeds: Vec<u64>,
 }
 
 impl Accumulator {
@@ -166,6 +177,7 @@ impl Accumulator {
             memory_max_bytes: None,
             group: None,
             ranks: Ranks::one(),
+            noise_seeds: Vec::new(),
         }
     }
 
@@ -173,6 +185,12 @@ impl Accumulator {
     #[must_use]
     pub fn among(self, ranks: &Ranks) -> Self {
         Self { ranks: ranks.clone(), ..self }
+    }
+
+    /// Sums noise of further realisations as well, one a seed, for the final sums of the harmonic engine.
+    #[must_use]
+    pub fn with_noises(self, seeds: &[u64]) -> Self {
+        Self { noise_seeds: seeds.to_vec(), ..self }
     }
 
     /// One with the same settings and ledger, without data.
@@ -266,7 +284,7 @@ impl Accumulator {
                     Engine::Harmonic(Box::new(HarmonicEngine::restore_part(from, part, &self.ranks)?))
                 }
             };
-            channels.push(Some(ChannelSums { engine, span_s: NO_SPAN_S, snapshots: 0 }));
+            channels.push(Some(ChannelSums { engine, noises: None, span_s: NO_SPAN_S, snapshots: 0 }));
         }
         Ok(Self { instrument: state.instrument.map(Arc::new), channels, ..self })
     }
@@ -396,7 +414,13 @@ impl Accumulator {
         if slot.is_none() {
             let Some(engine) = engine(&self.config, instrument, placed)? else { return Ok(None) };
             let engine = engine.among(&self.ranks);
-            *slot = Some(ChannelSums { engine, span_s: NO_SPAN_S, snapshots: 0 });
+            let noises = match &engine {
+                Engine::Harmonic(engine) if !self.noise_seeds.is_empty() => {
+                    Some(NoiseSums::new(engine, &self.noise_seeds))
+                }
+                _ => None,
+            };
+            *slot = Some(ChannelSums { engine, noises, span_s: NO_SPAN_S, snapshots: 0 });
         }
         Ok(slot.as_mut())
     }
@@ -418,6 +442,9 @@ impl Accumulator {
             return Ok(None);
         };
         let Added { visibilities, refused } = sums.engine.add(&near)?;
+        if let (Engine::Harmonic(engine), Some(noises)) = (&sums.engine, &mut sums.noises) {
+            noises.add(engine, &near);
+        }
         let offered_s = near.time_s.first().zip(near.time_s.last()).map(|(&first, &last)| [first, last]);
         if let Some([first, last]) = offered_s {
             sums.span_s = [sums.span_s[0].min(first), sums.span_s[1].max(last)];
@@ -560,7 +587,7 @@ impl Stage for Accumulator {
             if out.is_closed() {
                 return Ok(());
             }
-            let Some(ChannelSums { engine, span_s, snapshots, .. }) =
+            let Some(ChannelSums { engine, noises, span_s, snapshots }) =
                 slot.filter(|sums| !sums.engine.is_empty())
             else {
                 continue;
@@ -572,7 +599,7 @@ impl Stage for Accumulator {
                 is_final: true,
                 span_s,
                 nside: self.config.nside,
-                sums: engine.into_sums(),
+                sums: engine.into_sums().with_noises(noises),
             });
         }
         Ok(())

@@ -79,6 +79,12 @@ impl Ground {
         Self { accumulator: self.accumulator.among(ranks), ..self }
     }
 
+    /// Sums noise of further realisations as well, one a seed: for final maps of the harmonic engine, without an archive.
+    #[must_use]
+    pub fn with_noises(self, seeds: &[u64]) -> Self {
+        Self { accumulator: self.accumulator.with_noises(seeds), ..self }
+    }
+
     /// Tells senders that wait for it, through `answers`, what its checkpoints hold. To be of use, it needs an archive, and has to take
     /// the stream of the source that shares `answers`, from its beginning.
     #[must_use]

@@ -336,8 +336,9 @@ fn a_full_disk_of_one_rank_ends_the_job() {
     assert!(!checkpoints(&state).is_empty());
     // A job with a disk goes on.
     let replay = |out: &str| ["replay", &downlink, "--map", &place.pipeline, "--out", out].map(str::to_owned);
-    let kept = [&borrowed(&replay(&out))[..], &["--mpi", "--state", &state]].concat();
-    succeeded(job(&program, 2, &kept).output().unwrap());
+    let shared = replay(&out);
+    let shared = [&borrowed(&shared)[..], &["--mpi", "--state", &state]].concat();
+    succeeded(job(&program, 2, &shared).output().unwrap());
     succeed(&borrowed(&replay(&alone)));
     let maps = |out: &str| {
         let mut maps = files(out.as_ref());

@@ -23,6 +23,7 @@ mod coverage;
 mod exact;
 mod grid;
 mod lines;
+mod noises;
 mod operator;
 mod refined;
 mod setup;
@@ -39,6 +40,7 @@ use std::sync::{Arc, OnceLock};
 pub use blocks::{OrderBlocks, OrderFactors};
 pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
+pub use noises::NoiseSums;
 pub use refined::{
     Departures, REFINED_VISIBILITY_BYTES, RefinedData, RefinedSetup, RefinedSums, VisibilityArchive,
 };
@@ -130,6 +132,7 @@ impl HarmonicBasis {
             counts,
             right: OnceLock::new(),
             noise: OnceLock::new(),
+            further: Vec::new(),
         }
     }
 }

@@ -6,6 +6,7 @@ use std::sync::{Arc, OnceLock};
 use super::HarmonicSetup;
 use super::blocks::OrderBlocks;
 use super::grid::Grids;
+use super::noises::NoiseSums;
 use super::operator::{Operator, RightHandSide, SharedTori};
 use super::tori::Tori;
 use crate::accumulation::{Accuracy, NormalSums, SumCounts};
@@ -35,6 +36,8 @@ pub struct HarmonicSums {
     pub(super) counts: SumCounts,
     pub(super) right: OnceLock<Vec<f64>>,
     pub(super) noise: OnceLock<Vec<f64>>,
+    /// Of noise of further realisations.
+    pub(super) further: Vec<Vec<f64>>,
 }
 
 impl HarmonicSums {
@@ -44,11 +47,24 @@ impl HarmonicSums {
         &self.setup
     }
 
-    fn operator(&self) -> &Operator {
+    pub(super) fn operator(&self) -> &Operator {
         self.tables.get_or_init(|| self.setup.operator(&self.grids))
     }
 
-    fn shared(&self) -> SharedTori<'_> {
+    /// With the noises of further realisations.
+    #[must_use]
+    pub fn with_noises(mut self, noises: NoiseSums) -> Self {
+        self.further = noises.into_right_hand_sides(&self);
+        self
+    }
+
+    /// Right-hand sides of noise of further realisations than the companion's.
+    #[must_use]
+    pub fn further_noises(&self) -> &[Vec<f64>] {
+        &self.further
+    }
+
+    pub(super) fn shared(&self) -> SharedTori<'_> {
         let reached = self.reached.get_or_init(|| self.tori.reached(&self.ranks)).clone();
         SharedTori { ranks: &self.ranks, tori: &self.tori, reached }
     }

@@ -635,3 +635,28 @@ fn what_are_no_parts_of_the_same_sums_is_refused() {
     let other = read(0, 0).unwrap().join(engine(&blocks[..1])).unwrap_err();
     assert!(matches!(other, AccumulationError::Mismatch { .. }), "{other}");
 }
+
+#[test]
+fn further_realisations_have_the_bits_of_their_own_engines() {
+    let blocks = blocks(0, 12);
+    let of_seed = |seed: u64| {
+        let mut engine = HarmonicEngine::new(HarmonicSetup { companion_seed: seed, ..setup() }).unwrap();
+        blocks.iter().for_each(|block| drop(engine.add(block).unwrap()));
+        engine.into_sums().noise_right_hand_side().to_vec()
+    };
+    // Two share a row, and the last one has it for itself.
+    let seeds = [7, 8, 1 << 40];
+    let mut engine = HarmonicEngine::new(setup()).unwrap();
+    let mut noises = NoiseSums::new(&engine, &seeds);
+    for block in &blocks {
+        noises.add(&engine, block);
+        engine.add(block).unwrap();
+    }
+    let sums = engine.into_sums().with_noises(noises);
+    assert_eq!(sums.further_noises().len(), seeds.len());
+    for (seed, found) in seeds.into_iter().zip(sums.further_noises()) {
+        let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
+        assert!(bits(found) == bits(&of_seed(seed)), "seed {seed}");
+    }
+    assert!(sums.further_noises()[0] == sums.noise_right_hand_side());
+}

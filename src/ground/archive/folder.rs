@@ -57,6 +57,11 @@ impl StateFolder {
         Ok(Self { path: path.to_owned(), held, lock, ranks: ranks.clone() })
     }
 
+    /// Those that share it.
+    pub(super) fn ranks(&self) -> &Ranks {
+        &self.ranks
+    }
+
     /// The newest checkpoint that holds, read by `read`, or `None` if there is no checkpoint; and notes on newer ones that
     /// are damaged, which are renamed if `sets_aside`. `read` gets the first of its files.
     ///

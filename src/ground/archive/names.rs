@@ -49,12 +49,10 @@ impl Numbered {
 
     /// Removes its files; whether none is left.
     pub(super) fn remove(self, folder: &Path) -> bool {
-        let gone = |path: PathBuf| match fs::remove_file(path) {
-            Ok(()) => true,
-            Err(error) => error.kind() == ErrorKind::NotFound,
-        };
+        let stays =
+            |path: &PathBuf| fs::remove_file(path).is_err_and(|error| error.kind() != ErrorKind::NotFound);
         // All of them, also after one that stays.
-        self.paths(folder).into_iter().map(gone).fold(true, |all, one| all && one)
+        self.paths(folder).iter().filter(|path| stays(path)).count() == 0
     }
 
     /// The checkpoint and the part that a file is by its name; `None` for other files, or names that none has.

@@ -258,7 +258,9 @@ impl Opened {
     pub(super) fn resume(self, config: &GroundConfig, interval: u64) -> Result<Ground, GroundError> {
         let Self { folder, contents, notes, settings, posts } = self;
         let contents = contents.unwrap_or_else(|| ArchiveContents::empty(config, &posts));
-        let ArchiveContents { collector, ephemeris, autos, mut accumulator, journal } = contents;
+        let ArchiveContents { collector, ephemeris, autos, accumulator, journal } = contents;
+        // Also of a new archive.
+        let mut accumulator = accumulator.among(folder.ranks());
         let outcome = GroundOutcome::default();
         outcome.saving.begin();
         outcome.ledger.post_report(&journal.ledger());

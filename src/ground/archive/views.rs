@@ -203,6 +203,7 @@ mod tests {
         let first = &bytes[..bytes.len() / 2];
         let session_in = |folder: &Path, ranks: &Ranks, bytes: &[u8]| {
             let mut ground = Ground::open_among(folder, &config, u64::MAX, ranks).unwrap();
+            assert_eq!(ground.ranks().share(), ranks.share());
             ground.step(bytes.to_vec(), &mut Outlet::collect()).unwrap();
             ground.finish(&mut Outlet::collect()).unwrap();
             let told: Vec<String> = ground.notes().map(str::to_owned).collect();
