@@ -266,7 +266,10 @@ fn a_state_of_ranks_goes_on_with_another_number_of_them() {
     let Some(program) = mpi_program() else { return };
     let program = program.canonicalize().unwrap();
     let place = Workplace::new(SHARED);
-    let downlink = place.simulate("x.ccsds", &["--set", "spacecraft.every_nth_window=40"]);
+    // So many data that no job comes to its end before it is told to.
+    let more = ["spacecraft.every_nth_window=10", "spacecraft.every_nth_integration=1"];
+    let sets: Vec<&str> = more.iter().flat_map(|set| ["--set", set]).collect();
+    let downlink = place.simulate("x.ccsds", &sets);
     let state = place.path("state");
     let words = |out: &str, more: &[&str]| -> Vec<String> {
         let replay = ["replay", &downlink, "--map", &place.pipeline, "--out", out];
@@ -275,7 +278,7 @@ fn a_state_of_ranks_goes_on_with_another_number_of_them() {
     };
     let alone = place.path("alone");
     succeed(&borrowed(&words(&alone, &[])));
-    let kept = ["--mpi", "--state", &state, "--checkpoint-every", "1000"];
+    let kept = ["--mpi", "--state", &state, "--checkpoint-every", "500"];
     // Jobs of several sizes, one of whose ranks is killed, or told to end, after the first checkpoint that all of them have.
     for (signal, rank, count) in [("KILL", 1, 3), ("INT", 0, 2), ("KILL", 0, 4), ("TERM", 1, 2)] {
         let out = place.path(&format!("{signal}-{rank}"));
