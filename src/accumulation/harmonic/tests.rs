@@ -650,7 +650,7 @@ fn further_realisations_have_the_bits_of_their_own_engines() {
     let mut noises = NoiseSums::new(&engine, &seeds);
     for block in &blocks {
         noises.add(&engine, block);
-        engine.add(block).unwrap();
+        assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
     }
     let sums = engine.into_sums().with_noises(noises);
     assert_eq!(sums.further_noises().len(), seeds.len());
