@@ -97,8 +97,7 @@ impl NoiseSums {
     }
 
     /// The right-hand sides, one a seed, beside the sums of the same visibilities.
-    #[must_use]
-    pub fn into_right_hand_sides(mut self, sums: &HarmonicSums) -> Vec<Vec<f64>> {
+    fn into_right_hand_sides(mut self, sums: &HarmonicSums) -> Vec<Vec<f64>> {
         self.flush();
         let Self { seeds, grids, quanta, pairs, .. } = self;
         let of_pair = |nodes: PairTori| {
@@ -117,5 +116,14 @@ impl NoiseSums {
                 .map(|of| unknowns_of_gradient(&sums.operator().project(&shared, of)))
         };
         pairs.into_iter().flat_map(of_pair).take(seeds.len()).collect()
+    }
+}
+
+impl HarmonicSums {
+    /// With the noises of further realisations.
+    #[must_use]
+    pub fn with_noises(mut self, noises: NoiseSums) -> Self {
+        self.further = noises.into_right_hand_sides(&self);
+        self
     }
 }

@@ -6,7 +6,6 @@ use std::sync::{Arc, OnceLock};
 use super::HarmonicSetup;
 use super::blocks::OrderBlocks;
 use super::grid::Grids;
-use super::noises::NoiseSums;
 use super::operator::{Operator, RightHandSide, SharedTori};
 use super::tori::Tori;
 use crate::accumulation::{Accuracy, NormalSums, SumCounts};
@@ -49,13 +48,6 @@ impl HarmonicSums {
 
     pub(super) fn operator(&self) -> &Operator {
         self.tables.get_or_init(|| self.setup.operator(&self.grids))
-    }
-
-    /// With the noises of further realisations.
-    #[must_use]
-    pub fn with_noises(mut self, noises: NoiseSums) -> Self {
-        self.further = noises.into_right_hand_sides(&self);
-        self
     }
 
     /// Right-hand sides of noise of further realisations than the companion's.
