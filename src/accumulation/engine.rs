@@ -146,7 +146,7 @@ impl<B: SkyBasis> ExactEngine<B> {
     }
 
     /// An engine that holds the sums made by `exact`, which is called only if the setup is valid.
-    fn of(
+    pub(super) fn of(
         setup: B::Setup,
         totals: Totals,
         exact: impl FnOnce(&B) -> Result<B::Exact, AccumulationError>,
@@ -237,6 +237,15 @@ impl<B: SkyBasis> ExactEngine<B> {
             let (basis, direction) = (Arc::clone(&self.basis), self.direction);
             self.exact.change(move |exact| basis.sum(exact, &batch, direction));
         }
+    }
+
+    /// These sums and those of another part of them, which are of the same visibilities.
+    pub(super) fn halves(&mut self, other: Self) -> Result<(&mut B::Exact, B::Exact), AccumulationError> {
+        if self.setup != other.setup || self.totals != other.totals {
+            return Err(AccumulationError::Mismatch { what: "data, of which each holds a part," });
+        }
+        self.flush();
+        Ok((self.exact.get(), other.exact.here()))
     }
 
     fn combine(&mut self, mut other: Self, direction: Direction) -> Result<(), AccumulationError> {

@@ -75,11 +75,6 @@ pub enum AccumulationError {
          map.refine.passes_max = 0 with a saved state"
     )]
     HeldInMemory,
-    /// Sums of which each rank holds a part cannot be saved.
-    #[error(
-        "each rank of a job holds a part of the sums, and there is no checkpoint of parts; expected no saved state with --mpi"
-    )]
-    Shared,
     /// A checkpoint could not be read or written.
     #[error("checkpoint: {0}")]
     Io(#[from] std::io::Error),

@@ -6,11 +6,25 @@ use rand_distr::{Distribution, StandardNormal};
 use crate::frames::PlacedVisibilities;
 use crate::units::{MissionTime, StreamKind, random_stream};
 
-/// Unit normal noise of a visibility's real and imaginary part; it depends on channel, sub-band, pair and time alone.
+/// What tells a visibility's noise from that of others: channel, sub-band, pair and time alone.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct NoiseKey([u64; 2]);
+
+impl NoiseKey {
+    pub(super) fn of(placed: &PlacedVisibilities, k: usize) -> Self {
+        let pair = u64::from(placed.pair.i) << 8 | u64::from(placed.pair.j);
+        let what = u64::from(placed.channel.0) << 32 | u64::from(placed.band) << 16 | pair;
+        Self([what, MissionTime::from_seconds(placed.time_s[k]).0 as u64])
+    }
+}
+
+/// Unit normal noise of a visibility's real and imaginary part.
 pub(super) fn companion_noise(seed: u64, placed: &PlacedVisibilities, k: usize) -> Complex64 {
-    let pair = u64::from(placed.pair.i) << 8 | u64::from(placed.pair.j);
-    let what = u64::from(placed.channel.0) << 32 | u64::from(placed.band) << 16 | pair;
-    let identity = [what, MissionTime::from_seconds(placed.time_s[k]).0 as u64];
+    unit_noise(seed, NoiseKey::of(placed, k))
+}
+
+/// That of the visibility with this key.
+pub(super) fn unit_noise(seed: u64, NoiseKey(identity): NoiseKey) -> Complex64 {
     let mut stream = random_stream(seed, StreamKind::CompanionNoise, identity);
     let mut draw = || -> f64 { StandardNormal.sample(&mut stream) };
     let re = draw();

@@ -5,14 +5,14 @@ use std::io::{Read, Write};
 use std::sync::Arc;
 
 use super::harmonic::{
-    HarmonicEngine, HarmonicSetup, HarmonicSums, RefinedSetup, VisibilityArchive, orbit_of,
+    HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, RefinedSetup, VisibilityArchive, orbit_of,
 };
 use super::{
     AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine,
     PixelSetup, PixelSums, SumCounts, automatic_weight_max,
 };
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
-use crate::ranks::Ranks;
+use crate::ranks::{RankShare, Ranks};
 use crate::runtime::{Cancel, Ledger, Outlet, Stage, Units};
 use crate::units::ChannelId;
 use crate::units::vector::{norm, sub};
@@ -46,6 +46,13 @@ pub enum SnapshotSums {
 }
 
 impl SnapshotSums {
+    fn with_noises(self, noises: Option<NoiseSums>) -> Self {
+        match (self, noises) {
+            (Self::Harmonic(sums), Some(noises)) => Self::Harmonic(Box::new(sums.with_noises(noises))),
+            (other, _) => other,
+        }
+    }
+
     /// Number and weight of the visibilities in the sums.
     #[must_use]
     pub fn counts(&self) -> SumCounts {
@@ -131,6 +138,8 @@ const NO_SPAN_S: [f64; 2] = [f64::INFINITY, f64::NEG_INFINITY];
 /// The engine of one channel, and the span of its data.
 struct ChannelSums {
     engine: Engine,
+    /// Noises of further realisations, of the harmonic engine.
+    noises: Option<NoiseSums>,
     span_s: [f64; 2],
     snapshots: u32,
 }
@@ -149,6 +158,8 @@ pub struct Accumulator {
     group: Option<ChannelGroup>,
     /// Those that hold the other parts of the sums.
     ranks: Ranks,
+    /// Seeds of further realisations of noise.
+    noise_seeds: Vec<u64>,
 }
 
 impl Accumulator {
@@ -166,6 +177,7 @@ impl Accumulator {
             memory_max_bytes: None,
             group: None,
             ranks: Ranks::one(),
+            noise_seeds: Vec::new(),
         }
     }
 
@@ -173,6 +185,23 @@ impl Accumulator {
     #[must_use]
     pub fn among(self, ranks: &Ranks) -> Self {
         Self { ranks: ranks.clone(), ..self }
+    }
+
+    /// Sums noise of further realisations as well, one a seed, for the final sums of the harmonic engine.
+    #[must_use]
+    pub fn with_noises(self, seeds: &[u64]) -> Self {
+        Self { noise_seeds: seeds.to_vec(), ..self }
+    }
+
+    /// One with the same settings and ledger, without data.
+    #[must_use]
+    pub fn without_sums(&self) -> Self {
+        let (config, ledger) = (self.config.clone(), self.ledger.clone());
+        Self::new(config, ledger)
+            .among(&self.ranks)
+            .of_group(self.group.clone())
+            .within_memory(self.memory_max_bytes)
+            .cancelled_by(&self.cancel)
     }
 
     /// Those that hold parts of the sums.
@@ -229,6 +258,20 @@ impl Accumulator {
     /// # Errors
     /// Engines that are damaged, or of another kind than configured.
     pub fn resume(self, state: AccumulatorState, from: &mut dyn Read) -> Result<Self, AccumulationError> {
+        self.resume_part(state, from, RankShare::WHOLE)
+    }
+
+    /// As [`Accumulator::resume`], from engines of which the rank that wrote them holds `part`. What this one holds of it is kept; the
+    /// other parts are to be joined.
+    ///
+    /// # Errors
+    /// Likewise.
+    pub fn resume_part(
+        self,
+        state: AccumulatorState,
+        from: &mut dyn Read,
+        part: RankShare,
+    ) -> Result<Self, AccumulationError> {
         let mut channels = Vec::new();
         for has_engine in state.channels {
             if !has_engine {
@@ -237,11 +280,35 @@ impl Accumulator {
             }
             let engine = match self.config.engine {
                 EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
-                EngineKind::Harmonic => Engine::Harmonic(Box::new(HarmonicEngine::restore(from)?)),
+                EngineKind::Harmonic => {
+                    Engine::Harmonic(Box::new(HarmonicEngine::restore_part(from, part, &self.ranks)?))
+                }
             };
-            channels.push(Some(ChannelSums { engine, span_s: NO_SPAN_S, snapshots: 0 }));
+            channels.push(Some(ChannelSums { engine, noises: None, span_s: NO_SPAN_S, snapshots: 0 }));
         }
         Ok(Self { instrument: state.instrument.map(Arc::new), channels, ..self })
+    }
+
+    /// Takes in another part of the same sums, channel by channel: of the same visibilities, at other alphas.
+    ///
+    /// # Errors
+    /// Parts of different sums.
+    pub fn join(&mut self, other: Self) -> Result<(), AccumulationError> {
+        let apart = AccumulationError::Mismatch { what: "channels, or sums that have no parts," };
+        if self.channels.len() != other.channels.len() {
+            return Err(apart);
+        }
+        for (slot, theirs) in self.channels.iter_mut().zip(other.channels) {
+            match (slot, theirs) {
+                (None, None) => {}
+                (
+                    Some(ChannelSums { engine: Engine::Harmonic(ours), .. }),
+                    Some(ChannelSums { engine: Engine::Harmonic(theirs), .. }),
+                ) => ours.join(*theirs)?,
+                _ => return Err(apart),
+            }
+        }
+        Ok(())
     }
 
     /// Adds the sums of another accumulator, channel by channel.
@@ -352,7 +419,13 @@ impl Accumulator {
             empty => match engine(&self.config, instrument, placed)? {
                 Ok(engine) => {
                     let engine = engine.among(&self.ranks);
-                    empty.insert(ChannelSums { engine, span_s: NO_SPAN_S, snapshots: 0 })
+                    let noises = match &engine {
+                        Engine::Harmonic(engine) if !self.noise_seeds.is_empty() => {
+                            Some(NoiseSums::new(engine, &self.noise_seeds))
+                        }
+                        _ => None,
+                    };
+                    empty.insert(ChannelSums { engine, noises, span_s: NO_SPAN_S, snapshots: 0 })
                 }
                 Err(reason) => return Ok(Err(reason)),
             },
@@ -380,6 +453,9 @@ impl Accumulator {
             }
         };
         let Added { visibilities, refused } = sums.engine.add(&near)?;
+        if let (Engine::Harmonic(engine), Some(noises)) = (&sums.engine, &mut sums.noises) {
+            noises.add(engine, &near);
+        }
         let offered_s = near.time_s.first().zip(near.time_s.last()).map(|(&first, &last)| [first, last]);
         if let Some([first, last]) = offered_s {
             sums.span_s = [sums.span_s[0].min(first), sums.span_s[1].max(last)];
@@ -526,7 +602,7 @@ impl Stage for Accumulator {
             if out.is_closed() {
                 return Ok(());
             }
-            let Some(ChannelSums { engine, span_s, snapshots, .. }) =
+            let Some(ChannelSums { engine, noises, span_s, snapshots }) =
                 slot.filter(|sums| !sums.engine.is_empty())
             else {
                 continue;
@@ -538,7 +614,7 @@ impl Stage for Accumulator {
                 is_final: true,
                 span_s,
                 nside: self.config.nside,
-                sums: engine.into_sums(),
+                sums: engine.into_sums().with_noises(noises),
             });
         }
         Ok(())

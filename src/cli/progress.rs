@@ -16,6 +16,7 @@ use crate::downlink::transport::socket::ListenStatus;
 use crate::pipeline::{CalibrateProgress, ChannelCost, GroupStep, Plan, RunGroups, Watched};
 use crate::runtime::Cancel;
 use crate::solve::Solving;
+use crate::units::ChannelId;
 
 /// Refresh interval on a terminal, and of looking for an interrupt.
 const POLL: Duration = Duration::from_millis(200);
@@ -167,6 +168,7 @@ pub(super) fn time_left(left_s: Option<f64>) -> String {
 pub(super) struct GroupSteps {
     groups: RunGroups,
     parts: Parts,
+    channels_hz: Vec<f64>,
 }
 
 impl GroupSteps {
@@ -178,7 +180,8 @@ impl GroupSteps {
         let simulated = groups.simulated.iter().map(|group| seconds(group, ChannelCost::simulation_s));
         let mapped = groups.mapped.iter().map(|group| seconds(group, |cost| cost.mapping_s));
         // The downlink takes next to no time.
-        Self { groups: groups.clone(), parts: Parts::new(simulated.chain([0.0]).chain(mapped)) }
+        let parts = Parts::new(simulated.chain([0.0]).chain(mapped));
+        Self { groups: groups.clone(), parts, channels_hz: plan.config.spacecraft.channels_hz.clone() }
     }
 
     pub(super) fn begin(&mut self, group: GroupStep) {
@@ -187,6 +190,7 @@ impl GroupSteps {
             GroupStep::Simulated(number) => ("simulated", number, simulated),
             GroupStep::Merged => ("merged", simulated.len(), simulated),
             GroupStep::Mapped(number) => ("mapped", number, mapped),
+            GroupStep::Sky(channel) => return self.tell_sky(channel),
         };
         let place = if group == GroupStep::Mapped(number) { simulated.len() + 1 + number } else { number };
         let left_s = self.parts.begin(place);
@@ -197,12 +201,20 @@ impl GroupSteps {
                 format!("group {} of {}: simulating channels {listed}{left}", number + 1, of.len())
             }
             GroupStep::Merged => format!("the downlink of all channels{left}"),
-            GroupStep::Mapped(_) => {
+            GroupStep::Mapped(_) | GroupStep::Sky(_) => {
                 format!("group {} of {}: mapping channels {listed}{left}", number + 1, of.len())
             }
         };
         let fields = json!({ "what": what, "number": number + 1, "of": of.len(), "channels": channels, "left_s": left_s });
         say("group", &fields, text);
+    }
+
+    /// Skies take seconds each, and there may be many before anything moves.
+    fn tell_sky(&self, channel: ChannelId) {
+        let frequency_hz = self.channels_hz.get(usize::from(channel.0)).copied().unwrap_or_default();
+        let (mhz, of) = (frequency_hz / 1e6, self.channels_hz.len());
+        let fields = json!({ "channel": channel.0, "of": of, "frequency_hz": frequency_hz });
+        say("sky", &fields, format_args!("the sky of channel {channel} of {of}: {mhz:.3} MHz"));
     }
 }
 

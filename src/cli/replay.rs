@@ -118,9 +118,9 @@ pub(super) struct ReplayArgs {
     #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
     memory_max: Option<u64>,
     /// Share the sums of each map of the harmonic engine with the other ranks of an MPI job: mpirun -n 4 lunarray replay --mpi ...
-    /// Every rank reads the files; the first writes the products, which are those of one process. Needs a program built with
-    /// --features mpi.
-    #[arg(long, conflicts_with_all = ["live", "pace", "state", "groups", "events"])]
+    /// Every rank reads the files; the first writes the products, which are those of one process. With --state each rank keeps its
+    /// part, and any number of ranks goes on from it. Needs a program built with --features mpi.
+    #[arg(long, conflicts_with_all = ["live", "pace", "groups", "events"])]
     #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]
     mpi: bool,
     /// Replace one setting, for example --set map.nside=8; may be repeated.
@@ -189,10 +189,12 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     };
     let settings = args.limited(config.ground(args.wait_bytes.unwrap_or(wait_bytes)));
     let ground = match &args.state {
-        Some(folder) => Ground::open(folder, &settings, args.checkpoint_every)?,
+        Some(folder) => Ground::open_among(folder, &settings, args.checkpoint_every, job.ranks())?,
         None => Ground::new(&settings)?.among(job.ranks()),
     };
-    print_notes(ground.notes());
+    if job.is_first() {
+        print_notes(ground.notes());
+    }
     let saving = ground.outcome().saving;
     let interrupt = Interrupt::default();
     let page = args.serve.start(&config, "ground", args.state.as_deref())?;
@@ -234,7 +236,14 @@ impl ReplayArgs {
     /// Without a map file: with the settings that belong to the state and the downlink.
     fn with_known_settings(&self, source: ConfigSource, job: &Job) -> ConfigSource {
         // A state that cannot be read is told when it is opened.
-        let of_state = self.state.as_deref().and_then(|folder| source.clone().of_state(folder).ok());
+        let of_state = self.state.as_deref().and_then(|folder| {
+            let source = source.clone();
+            let found = match job.ranks().are_many() {
+                true => source.of_state_for_ranks(folder),
+                false => source.of_state(folder),
+            };
+            found.ok()
+        });
         let (source, from) = of_state.unwrap_or(source).of_downlink(&self.files);
         if let Some(from) = from.filter(|_| job.is_first()) {
             let fields = json!({ "from": from });

@@ -124,14 +124,15 @@ fn in_groups(args: &RunArgs, plan: &Plan, size: GroupSize, out: &Path) -> Comman
     let mut progress = None;
     let windows = plan.windows_watched();
     let ended = run_in_groups(plan, &groups, out, interrupt.cancel(), &mut |group, watched| {
-        interrupt.arm_or_note();
         // The bar of the group before ends first.
         progress = None;
         steps.begin(group);
+        let Some(watched) = watched else { return };
+        interrupt.arm_or_note();
         let (stage, total) = match group {
             GroupStep::Simulated(_) => (INTEGRATE, windows),
             GroupStep::Merged => (MERGE, 0),
-            GroupStep::Mapped(_) => (READ, 0),
+            GroupStep::Mapped(_) | GroupStep::Sky(_) => (READ, 0),
         };
         progress = Some(Progress::watch(watched, stage, total, interrupt.cancel()));
     });

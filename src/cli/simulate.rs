@@ -135,19 +135,15 @@ fn in_groups(args: &SimulateArgs, plan: &Plan, size: GroupSize, out: &Path) -> C
     let mut steps = GroupSteps::new(plan, &groups);
     let mut progress = None;
     let windows = plan.windows_watched();
-    let count = groups.simulated.len();
-    let ended =
-        simulate_in_groups(plan, &groups.simulated, out, interrupt.cancel(), &mut |number, watched| {
-            interrupt.arm_or_note();
-            // The bar of the group before ends first.
-            progress = None;
-            let (group, stage, total) = match number < count {
-                true => (GroupStep::Simulated(number), INTEGRATE, windows),
-                false => (GroupStep::Merged, MERGE, 0),
-            };
-            steps.begin(group);
-            progress = Some(Progress::watch(watched, stage, total, interrupt.cancel()));
-        });
+    let ended = simulate_in_groups(plan, &groups.simulated, out, interrupt.cancel(), &mut |step, watched| {
+        // The bar of the group before ends first.
+        progress = None;
+        steps.begin(step);
+        let Some(watched) = watched else { return };
+        interrupt.arm_or_note();
+        let (stage, total) = if step == GroupStep::Merged { (MERGE, 0) } else { (INTEGRATE, windows) };
+        progress = Some(Progress::watch(watched, stage, total, interrupt.cancel()));
+    });
     drop(progress);
     let reports = ended?;
     let is_cancelled = reports.last().is_some_and(|report| report.cancelled);

@@ -84,6 +84,7 @@ pub(super) fn execute(args: &StudyArgs) -> CommandResult {
                 (watched, "simulating for", INTEGRATE, case.plan.windows_watched())
             }
             StudyStep::Map(watched) => (watched, "mapping", READ, 0),
+            StudyStep::Realise(watched) => (watched, "noise of", READ, 0),
         };
         // The last one ends before the next begins.
         drop(progress.take());

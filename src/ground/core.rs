@@ -79,6 +79,12 @@ impl Ground {
         Self { accumulator: self.accumulator.among(ranks), ..self }
     }
 
+    /// Sums noise of further realisations as well, one a seed: for final maps of the harmonic engine, without an archive.
+    #[must_use]
+    pub fn with_noises(self, seeds: &[u64]) -> Self {
+        Self { accumulator: self.accumulator.with_noises(seeds), ..self }
+    }
+
     /// Tells senders that wait for it, through `answers`, what its checkpoints hold. To be of use, it needs an archive, and has to take
     /// the stream of the source that shares `answers`, from its beginning.
     #[must_use]
@@ -118,8 +124,12 @@ impl Ground {
             };
             self.apply(delivery, out)?;
             if self.archive.as_ref().is_some_and(Archive::is_due) {
+                let written = self.checkpoint();
+                if self.ranks().are_many() {
+                    // Without it the parts of the others are worth nothing.
+                    written?;
+                }
                 // Nothing is lost yet if it fails: the outcome says so, and it is tried again.
-                let _ = self.checkpoint();
             }
         }
     }
@@ -208,15 +218,20 @@ impl Ground {
         written
     }
 
-    /// Writes the last checkpoint of a session. Maps are made even if it fails for good; the outcome says so.
-    fn last_checkpoint(&mut self) {
+    /// Writes the last checkpoint of a session. Maps are made even if it fails for good; the outcome says so. Not so with ranks: see
+    /// [`Ground::advance`]; one that was told to end is not where the others are.
+    fn last_checkpoint(&mut self) -> Result<(), GroundError> {
+        if self.ranks().are_many() {
+            return if self.cancel.is_cancelled() { Ok(()) } else { self.checkpoint() };
+        }
         for wait in LAST_WAITS {
             if self.checkpoint().is_ok() {
-                return;
+                return Ok(());
             }
             std::thread::sleep(wait);
         }
         let _ = self.checkpoint();
+        Ok(())
     }
 }
 
@@ -256,7 +271,7 @@ impl Stage for Ground {
         self.collector.finish();
         self.advance(out)?;
         // The checkpoint keeps held packets as they are; the final maps use them without their positions.
-        self.last_checkpoint();
+        self.last_checkpoint()?;
         self.flush(out)?;
         fill(&self.outcome.completeness, self.calibrator.close(self.missing_packets()));
         if let Some(archive) = &self.archive {

@@ -42,6 +42,15 @@ pub enum GroundError {
         /// What has become of it.
         what: &'static str,
     },
+    /// Ranks of a job that see different folders.
+    #[error(
+        "{}: not the same folder on all ranks of the job; expected one on a file system that all of them share",
+        path.display()
+    )]
+    NotShared {
+        /// The folder.
+        path: PathBuf,
+    },
     /// A damaged checkpoint.
     #[error("{}: found {found}; expected {expected}", path.display())]
     Damaged {

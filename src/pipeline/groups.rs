@@ -2,6 +2,7 @@
 //! at a time. Maps and ledger are those of all channels at once. A group that is mapped stays mapped: a run that was cancelled goes
 //! on with the next one.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::fs;
@@ -376,25 +377,25 @@ pub fn run_in_groups(
     let marker = out.join(SIMULATED);
     let is_made = |key: String| fs::read(&marker).is_ok_and(|found| found == key.as_bytes());
     if !is_made(downlink_key(plan, &file)) {
-        let reports = simulate_in_groups(plan, simulated, &file, cancel, &mut |number, watched| {
-            let group = simulated.get(number);
-            watch(group.map_or(GroupStep::Merged, |_| GroupStep::Simulated(number)), watched);
-        })?;
+        let reports = simulate_in_groups(plan, simulated, &file, cancel, watch)?;
         if reports.last().is_some_and(|report| report.cancelled) {
             return Ok(None);
         }
         write_atomically(&marker, downlink_key(plan, &file).as_bytes())
             .map_err(|source| ProductsError::Write { path: marker.clone(), source })?;
     }
+    let watch = RefCell::new(watch);
     let truth = |group: &ChannelGroup| {
         group.iter().try_fold(Truth::unknown(), |truth, &channel| {
+            (watch.borrow_mut())(GroupStep::Sky(channel), None);
             Ok(truth.with(channel, &space_segment::sky(plan, channel)?, config.map_shape())?)
         })
     };
     let files = [file];
     let passes = Passes { scope: RunScope::Whole, files: &files, config, groups: mapped, out };
-    let summary =
-        passes.run(&truth, cancel, &mut |number, watched| watch(GroupStep::Mapped(number), watched))?;
+    let summary = passes.run(&truth, cancel, &mut |number, watched| {
+        (watch.borrow_mut())(GroupStep::Mapped(number), Some(watched));
+    })?;
     let summary = finish(summary, out)?;
     if !summary.cancelled {
         let _ = fs::remove_file(&marker);
@@ -405,6 +406,8 @@ pub fn run_in_groups(
 /// What a run in groups is about to do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GroupStep {
+    /// Make the sky of a channel.
+    Sky(ChannelId),
     /// Simulate the group of this number, from 0.
     Simulated(usize),
     /// Make the downlink of all that was simulated.
@@ -413,8 +416,8 @@ pub enum GroupStep {
     Mapped(usize),
 }
 
-/// Receives what is about to be done, and the handles of its graph.
-pub type GroupStepWatcher<'a> = &'a mut dyn FnMut(GroupStep, Watched);
+/// Receives what is about to be done, and the handles of its graph; a sky is made without one.
+pub type GroupStepWatcher<'a> = &'a mut dyn FnMut(GroupStep, Option<Watched>);
 
 /// Name of the file that says that the downlink of a run in groups is whole, and of what.
 const SIMULATED: &str = ".simulated";

@@ -17,6 +17,7 @@ mod ground_segment;
 mod groups;
 mod memory;
 pub(crate) mod models;
+mod noise_maps;
 mod notes;
 pub(crate) mod plan;
 mod problems;

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::error::PipelineError;
+use super::noise_maps::noise_file;
 use super::study::CaseSummary;
 use crate::files::write_atomically;
 use crate::products::{ChannelFigures, ProductsError};
@@ -29,7 +30,7 @@ pub struct RealisationSpread {
     pub sigma_scatter: f64,
     /// Angular power of the noise-only maps.
     pub noise: PowerSpread,
-    /// Angular power of the maps, if they were compared with their input.
+    /// Angular power of the maps, if they differ and were compared with their input.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub map: Option<PowerSpread>,
     /// Its files, in the study's folder.
@@ -71,7 +72,7 @@ impl PowerSpread {
 }
 
 /// Spreads of the cases of a study that differ in their realisation alone, `groups` with their labels; leaves for each channel maps of
-/// sigma and tables of covariances in `out`. Groups of fewer than two are left out.
+/// sigma and tables of covariances in `out`. Groups of fewer than two realisations are left out.
 ///
 /// # Errors
 /// Maps that cannot be read; files that cannot be written.
@@ -80,11 +81,13 @@ pub(super) fn spreads(
     out: &Path,
 ) -> Result<Vec<RealisationSpread>, PipelineError> {
     let mut found = Vec::new();
-    for (case, members) in groups.iter().filter(|(_, members)| members.len() > 1) {
+    let are_many =
+        |members: &[&CaseSummary]| members.iter().map(|member| member.realisations).sum::<usize>() > 1;
+    for (case, members) in groups.iter().filter(|(_, members)| are_many(members)) {
         for place in 0..members[0].figures.channels.len() {
-            let of_channel: Vec<(&Path, &ChannelFigures)> = members
+            let of_channel: Vec<(&CaseSummary, &ChannelFigures)> = members
                 .iter()
-                .filter_map(|member| Some((Path::new(&member.folder), member.figures.channels.get(place)?)))
+                .filter_map(|member| Some((*member, member.figures.channels.get(place)?)))
                 .collect();
             if of_channel.len() == members.len() {
                 let number = found.len() + 1;
@@ -98,7 +101,7 @@ pub(super) fn spreads(
 fn channel_spread(
     case: &str,
     number: usize,
-    members: &[(&Path, &ChannelFigures)],
+    members: &[(&CaseSummary, &ChannelFigures)],
     out: &Path,
 ) -> Result<RealisationSpread, PipelineError> {
     let (_, first) = members[0];
@@ -106,8 +109,11 @@ fn channel_spread(
     let mut squares: Vec<f64> = Vec::new();
     let mut noise_k2 = Vec::new();
     let mut frame = None;
-    for (folder, _) in members {
-        let path = out.join(folder).join(&mhz).join("noise.fits");
+    let files = members.iter().flat_map(|(member, _)| {
+        let folder = out.join(&member.folder);
+        (1..=member.realisations).map(move |number| noise_file(&folder, first.frequency_hz, number))
+    });
+    for path in files {
         let noise = read_whole_map(&path, &ReadOptions::default())?;
         squares.resize(noise.values().len(), 0.0);
         squares.iter_mut().zip(noise.values()).for_each(|(sum, value)| *sum += value * value);
@@ -115,7 +121,7 @@ fn channel_spread(
         noise_k2.push(auto_cl(&noise.harmonics(l_max, &AnalysisOptions::default())?));
         frame = Some(noise.frame());
     }
-    let count = members.len();
+    let count = noise_k2.len();
     let sigma: Vec<f64> = squares.iter().map(|sum| (sum / count as f64).sqrt()).collect();
     let pixels = sigma.len() as f64;
     let mean_square = sigma.iter().map(|s| s * s).sum::<f64>() / pixels;
@@ -125,7 +131,8 @@ fn channel_spread(
         .iter()
         .map(|(_, figures)| Some(figures.power.as_ref()?.map_k2.iter().map(|c| c.unwrap_or(0.0)).collect()))
         .collect();
-    let map = map_k2.map(|spectra| PowerSpread::of(&spectra));
+    // Realisations of noise alone share a map.
+    let map = map_k2.filter(|spectra| spectra.len() > 1).map(|spectra| PowerSpread::of(&spectra));
     let mut files = Vec::new();
     if let Some(frame) = frame {
         let name = PathBuf::from(format!("sigma-{number}-{mhz}.fits"));

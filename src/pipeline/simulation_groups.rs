@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::error::PipelineError;
-use super::groups::{GroupSize, GroupWatcher, partition};
+use super::groups::{GroupSize, GroupStep, GroupStepWatcher, partition};
 use super::memory::MemoryLimit;
 use super::plan::Plan;
 use super::run::{self, Watched};
@@ -66,8 +66,7 @@ fn spool_path(file: &Path, group: &ChannelGroup) -> PathBuf {
 /// As [`simulate`](super::simulate) to a file, group by group. Groups that an earlier call, which was cancelled, has put aside are
 /// taken as they are; what was put aside is removed once the downlink is whole.
 ///
-/// `watch` gets the number of the group that is about to be simulated, and their number itself when the downlink is made of them.
-/// The reports are of each that ran, and last of the downlink; the last one says whether all were cancelled.
+/// `watch` gets what is about to be done. The reports are of each that ran, and last of the downlink; the last one says whether all were cancelled.
 ///
 /// # Errors
 /// The first failure of any stage; another process that simulates to the same file.
@@ -76,7 +75,7 @@ pub fn simulate_in_groups(
     groups: &[ChannelGroup],
     file: &Path,
     cancel: &Cancel,
-    watch: GroupWatcher<'_>,
+    watch: GroupStepWatcher<'_>,
 ) -> Result<Vec<Report>, PipelineError> {
     let key = plan.spool_key();
     run::write_instrument_truth(plan, file)?;
@@ -90,17 +89,22 @@ pub fn simulate_in_groups(
         }
         let writer = SpoolWriter::create(&path, key, plan.windows.len())?;
         let mut graph = Graph::new();
+        let mut sky = |channel: ChannelId| {
+            watch(GroupStep::Sky(channel), None);
+            space_segment::sky(plan, channel)
+        };
         let skies: Vec<Option<SkyMap>> = (0..plan.schedules.len())
             .map(|channel| ChannelId(channel as u16))
-            .map(|channel| group.contains(&channel).then(|| space_segment::sky(plan, channel)).transpose())
+            .map(|channel| group.contains(&channel).then(|| sky(channel)).transpose())
             .collect::<Result<_, _>>()?;
         let present: Vec<Option<&SkyMap>> = skies.iter().map(Option::as_ref).collect();
         let frames = space_segment::integrate(&mut graph, plan, &present)?;
         drop(skies);
         graph.sink(SPOOL, frames, writer);
         let watched = Watched::of_space(&graph);
-        let report =
-            run::start_alone(graph, &plan.config.runtime, cancel, watched, &mut |w| watch(number, w))?;
+        let report = run::start_alone(graph, &plan.config.runtime, cancel, watched, &mut |watched| {
+            watch(GroupStep::Simulated(number), Some(watched));
+        })?;
         let is_cut = report.cancelled;
         reports.push(report);
         if is_cut {
@@ -126,8 +130,9 @@ pub fn simulate_in_groups(
     let bytes = run::add_link(&mut graph, bytes, &plan.config, file)?;
     graph.sink(run::RECORD, bytes, recorder);
     let watched = Watched::of_space(&graph);
-    let report =
-        run::start_alone(graph, &plan.config.runtime, cancel, watched, &mut |w| watch(groups.len(), w))?;
+    let report = run::start_alone(graph, &plan.config.runtime, cancel, watched, &mut |watched| {
+        watch(GroupStep::Merged, Some(watched));
+    })?;
     if !report.cancelled {
         remove_spools(groups, file)?;
     }

@@ -16,9 +16,25 @@ impl ConfigSource {
     ///
     /// # Errors
     /// A folder without a usable state.
-    pub fn of_state(mut self, folder: &Path) -> Result<Self, GroundError> {
+    pub fn of_state(self, folder: &Path) -> Result<Self, GroundError> {
+        self.of_settings(folder, Ground::settings_in)
+    }
+
+    /// As [`ConfigSource::of_state`], for each of several ranks before they open the folder.
+    ///
+    /// # Errors
+    /// Likewise.
+    pub fn of_state_for_ranks(self, folder: &Path) -> Result<Self, GroundError> {
+        self.of_settings(folder, Ground::settings_for_ranks)
+    }
+
+    fn of_settings(
+        mut self,
+        folder: &Path,
+        settings_in: impl Fn(&Path) -> Result<Vec<(String, String)>, GroundError>,
+    ) -> Result<Self, GroundError> {
         if self.file.is_none() {
-            let settings = Ground::settings_in(folder)?;
+            let settings = settings_in(folder)?;
             let overrides =
                 settings.iter().filter_map(|(key, value)| Some(format!("{key}={}", toml_of(value)?)));
             self.overrides = overrides.chain(std::mem::take(&mut self.overrides)).collect();

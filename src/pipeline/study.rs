@@ -14,6 +14,7 @@ use super::calibrate::{CalibrateJob, CalibrateProgress, calibrate, with_gains};
 use super::config::Config;
 use super::config_source::{ConfigSource, is_study};
 use super::error::PipelineError;
+use super::noise_maps::NoiseMaps;
 use super::plan::Plan;
 use super::realisations::{RealisationSpread, csv_of, spreads};
 use super::run::{Destination, Watched, downlink_file, replay_knowing, simulate_sky};
@@ -115,7 +116,7 @@ pub struct Study {
     pub name: String,
     /// Its cases, in order; those that differ in their realisation alone follow each other.
     pub cases: Vec<StudyCase>,
-    /// Realisations of each case; 1 for no such axis.
+    /// Realisations of each case; 1 for none but its own.
     pub realisations: usize,
     /// Maps of the sky to calibrate with, K; empty if none is calibrated, or if an artificial signal is enough.
     pub models: Vec<SkyMap>,
@@ -132,6 +133,10 @@ pub struct StudyCase {
     pub plan: Plan,
     /// Whether gains are found from its data and applied.
     pub calibrated: bool,
+    /// Seeds of further realisations of its noise-only map, which share all the rest with it.
+    pub noise_seeds: Vec<u64>,
+    /// The number of what its realisations have in common, from 0.
+    family: usize,
     /// A number that changes with the maps to calibrate with.
     models_hash: u64,
 }
@@ -208,21 +213,31 @@ impl Study {
             let source = ConfigSource { file: pipeline.clone(), overrides, seed: None };
             // What is wrong is told with the case.
             let base = source.load().ok();
+            let companion = base.as_ref().map_or(0, |base| base.map.companion_seed);
+            let seed = |number: usize| companion.wrapping_add(number as u64);
+            if base.as_ref().is_some_and(|base| realisations > 1 && base.shares_realisations())
+                && !file.calibrated
+            {
+                let (mut labels, mut sets) = (labels, sets);
+                labels.push(format!("realisations 1 to {realisations}"));
+                sets.push(format!("map.companion_seed={}", seed(1)));
+                realised.push(vec![(labels, sets, (2..=realisations).map(seed).collect())]);
+                continue;
+            }
+            let mut of_case = Vec::new();
             for number in 1..=realisations {
                 let (mut labels, mut sets) = (labels.clone(), sets.clone());
                 if let Some(base) = base.as_ref().filter(|_| realisations > 1) {
                     labels.push(format!("realisation {number}"));
-                    sets.push(format!(
-                        "map.companion_seed={}",
-                        base.map.companion_seed.wrapping_add(number as u64)
-                    ));
+                    sets.push(format!("map.companion_seed={}", seed(number)));
                     if base.instrument.is_on() {
                         let realisation = base.instrument.realisation.saturating_add(number as u32);
                         sets.push(format!("instrument.realisation={realisation}"));
                     }
                 }
-                realised.push((labels, sets));
+                of_case.push((labels, sets, Vec::new()));
             }
+            realised.push(of_case);
         }
         let models: Vec<PathBuf> = file.model.iter().map(beside).collect();
         if !models.is_empty() && !file.calibrated {
@@ -231,24 +246,26 @@ impl Study {
         let (models, models_hash) = read_models(&models)?;
         let kinds: &[bool] = if file.calibrated { &[false, true] } else { &[false] };
         // Realisations of a case stay together.
-        let realised = realised.chunks(realisations).flat_map(|of_case| {
-            kinds.iter().flat_map(move |&calibrated| {
-                of_case.iter().map(move |(labels, sets)| {
+        let realised = realised.iter().enumerate().flat_map(|(number, of_case)| {
+            kinds.iter().enumerate().flat_map(move |(kind, &calibrated)| {
+                let family = number * kinds.len() + kind;
+                of_case.iter().map(move |(labels, sets, noise_seeds)| {
                     let mut labels = labels.clone();
                     if file.calibrated {
                         labels.insert(0, if calibrated { "calibrated" } else { "as sent" }.to_owned());
                     }
-                    (labels, sets, calibrated)
+                    (labels, sets, noise_seeds, family, calibrated)
                 })
             })
         });
-        let cases = realised.map(|(labels, sets, calibrated)| {
+        let cases = realised.map(|(labels, sets, noise_seeds, family, calibrated)| {
             let overrides = [file.set.as_slice(), sets, more].concat();
             let source = ConfigSource { file: pipeline.clone(), overrides: overrides.clone(), seed: None };
             let plan = source.load().map_err(PipelineError::from).and_then(Plan::new);
             let plan = plan
                 .map_err(|source| StudyError::Case { label: labels.join(", "), source: Box::new(source) })?;
-            Ok(StudyCase { labels, overrides, plan, calibrated, models_hash })
+            let noise_seeds: Vec<u64> = noise_seeds.clone();
+            Ok(StudyCase { labels, overrides, plan, calibrated, noise_seeds, family, models_hash })
         });
         let cases = cases.collect::<Result<Vec<StudyCase>, StudyError>>()?;
         let mut folders = BTreeSet::new();
@@ -322,6 +339,8 @@ pub enum StudyStep {
     Calibrate(CalibrateProgress),
     /// Mapping it, with the handles of the graph.
     Map(Watched),
+    /// Making further realisations of its noise-only map, with the handles of the graph.
+    Realise(Watched),
 }
 
 /// Follows a study: the number of the case, from 0, and what is done for it.
@@ -350,6 +369,8 @@ pub struct CaseSummary {
     pub folder: String,
     /// Its overrides of the pipeline.
     pub overrides: Vec<String>,
+    /// Realisations of its noise-only map.
+    pub realisations: usize,
     /// Its figures.
     pub figures: RunFigures,
 }
@@ -372,6 +393,9 @@ impl CaseMarker {
             if case.calibrated {
                 sections.insert("calibrated_with".to_owned(), case.models_hash.into());
             }
+            if !case.noise_seeds.is_empty() {
+                sections.insert("realisations".to_owned(), case.noise_seeds.len().into());
+            }
         }
         Self { space_hash: config.space_hash(), ground_hash: config.ground_hash(), config: value }
     }
@@ -382,6 +406,8 @@ const MARKER: &str = "case.json";
 
 /// What a case is mapped from: data, gains, and sums that it shares with others.
 struct Given<'a> {
+    file: &'a Path,
+    /// That file, unless the state has taken it in.
     files: &'a [PathBuf],
     gains: Option<&'a Path>,
     state: Option<&'a PathBuf>,
@@ -514,7 +540,8 @@ impl Making<'_> {
             for (number, &k) in same.iter().enumerate() {
                 // The state has taken the file in once its first case is made.
                 let files = if number == 0 || !is_shared { &[file.to_owned()][..] } else { &[] };
-                let given = Given { files, gains: gains.as_deref(), state: is_shared.then_some(&state) };
+                let given =
+                    Given { file, files, gains: gains.as_deref(), state: is_shared.then_some(&state) };
                 if !self.map(k, given, &skies, &mut last)? {
                     return Ok(false);
                 }
@@ -556,7 +583,7 @@ impl Making<'_> {
         skies: &[SkyMap],
         last: &mut Option<LastTruth>,
     ) -> Result<bool, PipelineError> {
-        let Given { files, gains, state } = given;
+        let Given { file, files, gains, state } = given;
         let case = &self.study.cases[number];
         let with_gains = gains.map(|gains| with_gains(&case.plan.config, gains.to_owned()));
         let config = with_gains.as_ref().unwrap_or(&case.plan.config);
@@ -577,13 +604,24 @@ impl Making<'_> {
         let summary = replay_knowing(truth, source, config, ground, &folder, self.cancel, &mut |watched| {
             watch(number, StudyStep::Map(watched));
         })?;
-        if summary.cancelled {
+        if summary.cancelled || !self.map_noises(number, config, file)? {
             return Ok(false);
         }
         let path = folder.join(MARKER);
         let text = serde_json::to_vec_pretty(&CaseMarker::of(case)).unwrap_or_default();
         write_atomically(&path, &text).map_err(|source| ProductsError::Write { path, source })?;
         Ok(true)
+    }
+}
+
+impl Making<'_> {
+    /// Makes the further realisations of a case's noise-only map; whether all of them were made.
+    fn map_noises(&mut self, number: usize, config: &Config, file: &Path) -> Result<bool, PipelineError> {
+        let case = &self.study.cases[number];
+        let out = self.out.join(case.folder());
+        let maps = NoiseMaps { config, file, out: &out, seeds: &case.noise_seeds };
+        let watch = &mut self.watch;
+        maps.make(self.cancel, &mut |watched| watch(number, StudyStep::Realise(watched)))
     }
 }
 
@@ -601,7 +639,8 @@ fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary,
             Some((_, members)) => members.push(cases.len()),
             None => groups.push((key, vec![cases.len()])),
         }
-        cases.push(CaseSummary { folder: case.folder(), overrides: case.overrides.clone(), figures });
+        let (folder, realisations) = (case.folder(), 1 + case.noise_seeds.len());
+        cases.push(CaseSummary { folder, overrides: case.overrides.clone(), realisations, figures });
     }
     let groups: Vec<Vec<&RunFigures>> = groups
         .into_iter()
@@ -644,8 +683,8 @@ fn note_power_kept(done: &[&StudyCase], cases: &mut [CaseSummary]) {
 
 /// Cases that differ in their realisation alone, with what they have in common.
 fn realised<'a>(study: &Study, cases: &'a [CaseSummary]) -> Vec<(String, Vec<&'a CaseSummary>)> {
-    let labels = study.cases.chunks(study.realisations);
-    labels
+    let families = study.cases.chunk_by(|a, b| a.family == b.family);
+    families
         .map(|members| {
             let folders: BTreeSet<String> = members.iter().map(StudyCase::folder).collect();
             let label = members[0].labels.split_last().map(|(_, common)| common.join(", "));

@@ -104,7 +104,7 @@ pub fn solve_harmonics(
 
 /// A random vector times the blocks of BtN^-1B that keep m, several times over: a beginning near the vectors with the largest
 /// eigenvalues, at the cost of less than a product.
-fn lifted(blocks: &OrderBlocks, unknowns: usize) -> Vec<f64> {
+pub(super) fn lifted(blocks: &OrderBlocks, unknowns: usize) -> Vec<f64> {
     let mut vector = random_vector(unknowns);
     for _ in 0..LIFTS {
         blocks.multiply(&mut vector);

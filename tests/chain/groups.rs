@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use lunarray::pipeline::{ConfigSource, GroupSize, GroupStep, Plan, RunSummary, run_in_groups};
 use lunarray::runtime::Cancel;
+use lunarray::units::ChannelId;
 use serde_json::Value;
 
 use crate::common::workplace::{SMALL, Workplace, fail, files, json, lunarray, succeed};
@@ -196,7 +197,9 @@ fn a_run_in_groups_goes_on_where_it_was_cancelled() {
         assert_eq!(cut.is_none(), place < 4, "{at:?}");
         assert!(cut.is_none_or(|cut| cut.cancelled));
         let mut seen = Vec::new();
-        let again = run_in_groups(&plan, &groups, &out, &Cancel::default(), &mut |step, _| seen.push(step));
+        let again = run_in_groups(&plan, &groups, &out, &Cancel::default(), &mut |step, graph| {
+            seen.extend(graph.map(|_| step));
+        });
         let again = again.unwrap().unwrap();
         // What was done before is not done again.
         assert_eq!(seen, steps[place..], "{at:?}");
@@ -230,8 +233,9 @@ fn other_settings_begin_anew() {
     let mut seen = Vec::new();
     run_in_groups(&second, &groups, folder.path(), &Cancel::default(), &mut |step, _| seen.push(step))
         .unwrap();
-    // The downlink is the same; no map is.
-    assert_eq!(seen, [GroupStep::Mapped(0), GroupStep::Mapped(1)]);
+    // The downlink is the same; no map is. Skies, which take a while, are told as well.
+    let of_channel = |number: u16| [GroupStep::Sky(ChannelId(number)), GroupStep::Mapped(number.into())];
+    assert_eq!(seen, [of_channel(0), of_channel(1)].concat());
     let expected = tempfile::tempdir().unwrap();
     lunarray::pipeline::run(&second, expected.path(), &Cancel::default(), &mut |_| {}).unwrap();
     assert!(products_of(folder.path()) == products_of(expected.path()));

@@ -1,4 +1,5 @@
-//! Ranks of an MPI job that share the sums of a map. `LUNARRAY_MPI` names a program built with `--features mpi`.
+//! Ranks of an MPI job that share the sums of a map. `LUNARRAY_MPI` names a program built with `--features mpi`, and `LUNARRAY_MPIRUN`
+//! what launches its jobs: `mpirun`, if it is not set.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -40,7 +41,7 @@ const SOON: Duration = Duration::from_secs(10);
 
 /// A command as a job of so many ranks.
 fn job(program: &Path, ranks: usize, words: &[&str]) -> Command {
-    let mut command = Command::new("mpirun");
+    let mut command = Command::new(std::env::var_os("LUNARRAY_MPIRUN").unwrap_or("mpirun".into()));
     command
         .args(["-n", &ranks.to_string()])
         .arg(program)
@@ -130,7 +131,7 @@ fn what_ranks_cannot_share_is_refused_by_name() {
     let place = Workplace::new(SHARED);
     let out = place.path("out");
     let replay = ["replay", "x.ccsds", "--out", &out, "--mpi"];
-    for other in [["--state", "s"], ["--groups", "2"], ["--speed", "2"]] {
+    for other in [["--groups", "2"], ["--speed", "2"], ["--events", "x"]] {
         let said = fail(&[&replay[..], &other].concat());
         assert!(said.contains("--mpi") && said.contains(other[0]), "{said}");
     }
@@ -228,19 +229,124 @@ fn a_job_ends_soon_after_one_of_its_ranks() {
             assert!(since.elapsed() < Duration::from_secs(120), "it does not begin");
             std::thread::sleep(Duration::from_millis(100));
         }
-        let ranks = ranks_of(&running, &program);
-        assert_eq!(ranks.len(), 3);
-        let told = Command::new("kill").args([&format!("-{signal}"), &ranks[rank].to_string()]).status();
-        assert!(told.unwrap().success());
-        let since = Instant::now();
-        let status = loop {
-            if let Some(status) = running.try_wait().unwrap() {
-                break status;
-            }
-            assert!(since.elapsed() < SOON, "{signal} {rank}: the job goes on");
-            std::thread::sleep(Duration::from_millis(50));
-        };
-        assert!(!status.success(), "{signal} {rank}");
+        end_one(&mut running, &program, 3, rank, signal);
         assert!(!Path::new(&out).join("summary.json").exists());
     }
+}
+
+/// Sends a signal to one rank of a job, which then ends soon, and not well.
+fn end_one(running: &mut Child, program: &Path, count: usize, rank: usize, signal: &str) {
+    let ranks = ranks_of(running, program);
+    assert_eq!(ranks.len(), count);
+    let told = Command::new("kill").args([&format!("-{signal}"), &ranks[rank].to_string()]).status();
+    assert!(told.unwrap().success());
+    let since = Instant::now();
+    let status = loop {
+        if let Some(status) = running.try_wait().unwrap() {
+            break status;
+        }
+        assert!(since.elapsed() < SOON, "{signal} {rank}: the job goes on");
+        std::thread::sleep(Duration::from_millis(50));
+    };
+    assert!(!status.success(), "{signal} {rank}");
+}
+
+/// Files of checkpoints in a folder, in their order.
+fn checkpoints(state: &str) -> Vec<String> {
+    let entries = std::fs::read_dir(state).into_iter().flatten().flatten();
+    let names = entries.map(|entry| entry.file_name().into_string().unwrap());
+    let mut names: Vec<String> =
+        names.filter(|name| name.starts_with("checkpoint-") && name.ends_with(".lunarray")).collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn a_state_of_ranks_goes_on_with_another_number_of_them() {
+    let Some(program) = mpi_program() else { return };
+    let program = program.canonicalize().unwrap();
+    let place = Workplace::new(SHARED);
+    // So many data that no job comes to its end before it is told to.
+    let more = ["spacecraft.every_nth_window=10", "spacecraft.every_nth_integration=1"];
+    let sets: Vec<&str> = more.iter().flat_map(|set| ["--set", set]).collect();
+    let downlink = place.simulate("x.ccsds", &sets);
+    let state = place.path("state");
+    let words = |out: &str, more: &[&str]| -> Vec<String> {
+        let replay = ["replay", &downlink, "--map", &place.pipeline, "--out", out];
+        let usual = ["--set", "map.snapshot_every_s=0"];
+        replay.iter().chain(&usual).chain(more).map(|word| (*word).to_owned()).collect()
+    };
+    let alone = place.path("alone");
+    succeed(&borrowed(&words(&alone, &[])));
+    let kept = ["--mpi", "--state", &state, "--checkpoint-every", "500"];
+    // Jobs of several sizes, one of whose ranks is killed, or told to end, after the first checkpoint that all of them have.
+    for (signal, rank, count) in [("KILL", 1, 3), ("INT", 0, 2), ("KILL", 0, 4), ("TERM", 1, 2)] {
+        let out = place.path(&format!("{signal}-{rank}"));
+        let (before, mut command) =
+            (checkpoints(&state), job(&program, count, &borrowed(&words(&out, &kept))));
+        let mut running = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        let since = Instant::now();
+        let is_new = |name: &String| !before.contains(name);
+        while checkpoints(&state).iter().filter(|name| is_new(name)).count() < count {
+            assert!(running.try_wait().unwrap().is_none(), "it ended before it was told to");
+            assert!(since.elapsed() < Duration::from_secs(120), "it does not begin");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        end_one(&mut running, &program, count, rank, signal);
+        assert!(!Path::new(&out).join("summary.json").exists());
+    }
+    // To its end, and once more without ranks, of which none is needed.
+    let (shared, again) = (place.path("shared"), place.path("again"));
+    succeeded(job(&program, 3, &borrowed(&words(&shared, &kept))).output().unwrap());
+    let of_maps = |out: &str| {
+        let mut maps = files(out.as_ref());
+        maps.retain(|path, _| path.extension().is_some_and(|extension| extension == "fits"));
+        maps
+    };
+    let expected = of_maps(&alone);
+    assert!(!expected.is_empty() && of_maps(&shared) == expected);
+    succeed(&borrowed(&words(&again, &["--state", &state])));
+    assert!(of_maps(&again) == expected);
+    let ledger = |out: &str| products(out).1[1].clone();
+    assert_eq!([ledger(&shared), ledger(&again)], [ledger(&alone), ledger(&alone)]);
+}
+
+#[test]
+fn a_full_disk_of_one_rank_ends_the_job() {
+    let Some(program) = mpi_program() else { return };
+    let place = Workplace::new(SHARED);
+    let downlink = place.simulate("x.ccsds", &[]);
+    let (state, out, alone) = (place.path("state"), place.path("out"), place.path("alone"));
+    let library = place.path("fault.so");
+    let mut compiler = Command::new("cc");
+    compiler.args(["-O1", "-shared", "-fPIC", "-o", &library]);
+    compiler.args([concat!(env!("CARGO_MANIFEST_DIR"), "/tests/ground_state/fault.c"), "-ldl"]);
+    assert!(compiler.status().unwrap().success());
+    // The second rank's disk is full after some writes to the state.
+    let script = format!(
+        "if [ \"${{OMPI_COMM_WORLD_RANK:-$PMI_RANK}}\" = 1 ]; then\n\
+             export LD_PRELOAD={library} FAULT_BELOW={state} FAULT_KIND=ENOSPC FAULT_AT=20 FAULT_ON=1 FAULT_LOG={library}.log\n\
+         fi\n\
+         exec {} replay {downlink} --map {} --out {out} --mpi --state {state} --checkpoint-every 1000",
+        program.display(),
+        place.pipeline
+    );
+    let mut command = job(Path::new("sh"), 2, &["-c", &script]);
+    let output = command.output().unwrap();
+    let said = text(&output.stderr);
+    assert!(!output.status.success() && said.contains("No space left on device"), "{said}");
+    assert!(!Path::new(&out).join("summary.json").exists());
+    assert!(!checkpoints(&state).is_empty());
+    // A job with a disk goes on.
+    let replay = |out: &str| ["replay", &downlink, "--map", &place.pipeline, "--out", out].map(str::to_owned);
+    let shared = replay(&out);
+    let shared = [&borrowed(&shared)[..], &["--mpi", "--state", &state]].concat();
+    succeeded(job(&program, 2, &shared).output().unwrap());
+    succeed(&borrowed(&replay(&alone)));
+    let maps = |out: &str| {
+        let mut maps = files(out.as_ref());
+        maps.retain(|path, _| path.ends_with("map.fits") || path.ends_with("noise.fits"));
+        maps
+    };
+    assert!(!maps(&alone).is_empty() && maps(&out) == maps(&alone));
 }

@@ -4,6 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 
 use lunarray::pipeline::Study;
+use lunarray::sky::fits::{ReadOptions, read_whole_map};
 use serde_json::Value;
 
 use super::common::process::{signal, start};
@@ -208,6 +209,45 @@ realisations = 60
         );
     }
     assert!(bytes(format!("{out}/realisations.csv")).starts_with(b"case,frequency_hz,realisations,l,"));
+}
+
+#[test]
+fn realisations_that_share_their_weights_are_those_of_runs_of_their_own() {
+    let place = Workplace::new(SMALL);
+    let set = ["map.engine=\"harmonic\"", "map.l_max=8", "map.residual_max=1e-3", "map.snapshot_every_s=0"];
+    let study = format!("name = \"many\"\npipeline = \"pipeline.toml\"\nset = {set:?}\nrealisations = 4\n");
+    let (study, out) = (place.file("many.toml", study.as_bytes()), place.path("many"));
+    let summary = json(&["study", &study, "--out", &out]);
+    let cases = summary["cases"].as_array().unwrap();
+    assert_eq!((cases.len(), &cases[0]["realisations"]), (1, &4.into()));
+    let spreads = summary["spreads"].as_array().unwrap();
+    assert_eq!(spreads.len(), 2);
+    // Their maps are one.
+    assert!(spreads.iter().all(|spread| spread["count"] == 4 && spread.get("map").is_none()));
+    let values = |path: String| {
+        let map = read_whole_map(Path::new(&path), &ReadOptions::default()).unwrap();
+        map.values().iter().map(|value| value.to_bits()).collect::<Vec<u64>>()
+    };
+    let folder = format!("{out}/{}", cases[0]["folder"].as_str().unwrap());
+    let mut seen = Vec::new();
+    for number in 1..=4 {
+        let own = place.path(&format!("own-{number}"));
+        let seed = format!("map.companion_seed={}", 1 + number);
+        let sets = set.iter().copied().chain([seed.as_str()]).flat_map(|set| ["--set", set]);
+        let words = ["run", &place.pipeline, "--out", &own];
+        succeed(&words.into_iter().chain(sets).collect::<Vec<_>>());
+        for mhz in ["3.000MHz", "10.000MHz"] {
+            let expected = values(format!("{own}/{mhz}/noise.fits"));
+            let found = match number {
+                1 => values(format!("{folder}/{mhz}/noise.fits")),
+                _ => values(format!("{folder}/{mhz}/realisations/noise-{number:04}.fits")),
+            };
+            assert!(found == expected, "realisation {number}, {mhz}");
+            assert!(!seen.contains(&found));
+            seen.push(found);
+        }
+        assert_eq!(values(format!("{own}/3.000MHz/map.fits")), values(format!("{folder}/3.000MHz/map.fits")));
+    }
 }
 
 #[test]

@@ -5,9 +5,11 @@
 use super::HarmonicSetup;
 use super::exact::{ExactNode, ExactTori};
 use super::grid::Grids;
+use super::workspace::ALPHAS;
 use crate::accumulation::AccumulationError;
 use crate::accumulation::checkpoint::{FrameReader, FrameWriter, RESPONSES, number_of, refused};
 use crate::accumulation::fixed_point::rows::IntegerRow;
+use crate::ranks::RankShare;
 use crate::response::harmonic::{GeometryLimits, NominalOrbit};
 
 /// A setup of the harmonic engine in a checkpoint.
@@ -87,7 +89,13 @@ impl ExactTori {
         Ok(())
     }
 
-    pub(super) fn read(grids: &Grids, from: &mut FrameReader<'_>) -> Result<Self, AccumulationError> {
+    /// Reads what was written by a process that holds `part`; keeps the rows that `kept` holds.
+    pub(super) fn read(
+        grids: &Grids,
+        from: &mut FrameReader<'_>,
+        part: RankShare,
+        kept: RankShare,
+    ) -> Result<Self, AccumulationError> {
         let mut tori = Self::zeros(grids);
         let mut held = vec![0; tori.nodes.len()];
         from.read(&mut held)?;
@@ -98,13 +106,21 @@ impl ExactTori {
             if held == 1 {
                 // Memory follows the data that is there: a forged head ends at the first row that is not.
                 let mut read = ExactNode::zeros(grids);
-                for row in &mut read.weights {
-                    *row = IntegerRow::read(grids.weight_row(), |bytes| from.read(bytes))?;
+                let rows = [(&mut read.weights, grids.weight_row()), (&mut read.right, grids.data_row())];
+                for (rows, layout) in rows {
+                    for (alpha, place) in rows.iter_mut().enumerate() {
+                        let row = IntegerRow::read(layout, |bytes| from.read(bytes))?;
+                        let block = alpha / ALPHAS;
+                        if !row.is_empty() && !part.holds(block) {
+                            let found = format!("sums of block {block} of alphas");
+                            return Err(refused(found, "those of the rank's own blocks"));
+                        }
+                        if kept.holds(block) {
+                            *place = row;
+                        }
+                    }
                 }
-                for row in &mut read.right {
-                    *row = IntegerRow::read(grids.data_row(), |bytes| from.read(bytes))?;
-                }
-                *node = Some(read);
+                *node = (!read.is_empty()).then_some(read);
             }
         }
         Ok(tori)

@@ -10,6 +10,8 @@ use rayon::prelude::*;
 use super::grid::{Grids, NODES};
 use super::spread::{Located, TorusPoint, spread};
 use super::tori::{NodeSums, Tori};
+use crate::accumulation::AccumulationError;
+use crate::accumulation::checkpoint::refused;
 use crate::accumulation::engine::Accepted;
 use crate::accumulation::fixed_point::rows::IntegerRow;
 use crate::accumulation::fixed_point::{Direction, WeightScale};
@@ -131,6 +133,20 @@ impl ExactTori {
                 rows.iter_mut().zip(others).for_each(|(row, other)| row.combine(other, direction));
             }
         });
+    }
+
+    /// Takes in sums of other alphas.
+    pub(super) fn join(&mut self, grids: &Grids, other: &Self) -> Result<(), AccumulationError> {
+        for (node, other) in self.nodes.iter().zip(&other.nodes) {
+            let (Some(node), Some(other)) = (node, other) else { continue };
+            let rows = node.weights.iter().chain(&node.right);
+            let mut both = rows.zip(other.weights.iter().chain(&other.right));
+            if both.any(|(row, other)| !row.is_empty() && !other.is_empty()) {
+                return Err(refused("the same alphas in two parts".into(), "each alpha in one"));
+            }
+        }
+        self.combine(grids, other, Direction::In);
+        Ok(())
     }
 
     /// The sums in f32.

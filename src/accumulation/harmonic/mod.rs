@@ -23,6 +23,7 @@ mod coverage;
 mod exact;
 mod grid;
 mod lines;
+mod noises;
 mod operator;
 mod refined;
 mod setup;
@@ -33,11 +34,13 @@ mod tests;
 mod tori;
 mod workspace;
 
+use std::io::Read;
 use std::sync::{Arc, OnceLock};
 
 pub use blocks::{OrderBlocks, OrderFactors};
 pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
+pub use noises::NoiseSums;
 pub use refined::{
     Departures, REFINED_VISIBILITY_BYTES, RefinedData, RefinedSetup, RefinedSums, VisibilityArchive,
 };
@@ -57,7 +60,7 @@ use super::checkpoint::{BasisKind, FrameReader, FrameWriter};
 use super::engine::{Accepted, CommonSetup, ExactEngine, SkyBasis};
 use super::fixed_point::{Direction, WeightScale};
 use super::{AccumulationError, Refusal, SumCounts};
-use crate::ranks::Ranks;
+use crate::ranks::{RankShare, Ranks};
 use crate::response::harmonic::PairOrientation;
 use crate::units::vector::Vec3;
 
@@ -84,6 +87,37 @@ impl HarmonicEngine {
         self.basis = Arc::new(HarmonicBasis { setup, quanta, grids, tables, ranks });
         self
     }
+
+    /// An engine from what one rank of a job wrote of its part (`part`; all of it of a process alone), as one of `ranks`, which may be
+    /// others than those that wrote: it keeps what it holds.
+    ///
+    /// # Errors
+    /// As [`NormalEngine::restore`]; sums that the rank which wrote does not hold.
+    ///
+    /// [`NormalEngine::restore`]: super::NormalEngine::restore
+    pub fn restore_part(
+        from: &mut dyn Read,
+        part: RankShare,
+        ranks: &Ranks,
+    ) -> Result<Self, AccumulationError> {
+        let (mut from, (head, totals)) = FrameReader::new(from, HarmonicBasis::KIND)?;
+        let kept = ranks.share();
+        let engine = Self::of(HarmonicBasis::setup_of(head)?, totals, |basis| {
+            ExactTori::read(&basis.grids, &mut from, part, kept)
+        })?;
+        from.finish()?;
+        Ok(engine.among(ranks))
+    }
+
+    /// Takes in another part of the same sums: those of the same visibilities at other alphas.
+    ///
+    /// # Errors
+    /// Parts of different sums, or of the same alphas.
+    pub fn join(&mut self, other: Self) -> Result<(), AccumulationError> {
+        let basis = Arc::clone(&self.basis);
+        let (ours, theirs) = self.halves(other)?;
+        ours.join(&basis.grids, &theirs)
+    }
 }
 
 impl HarmonicBasis {
@@ -98,6 +132,7 @@ impl HarmonicBasis {
             counts,
             right: OnceLock::new(),
             noise: OnceLock::new(),
+            further: Vec::new(),
         }
     }
 }
@@ -173,13 +208,10 @@ impl SkyBasis for HarmonicBasis {
     }
 
     fn write(&self, exact: &ExactTori, out: &mut FrameWriter<'_>) -> Result<(), AccumulationError> {
-        if self.ranks.are_many() {
-            return Err(AccumulationError::Shared);
-        }
         exact.write(&self.grids, out)
     }
 
     fn read(&self, from: &mut FrameReader<'_>) -> Result<ExactTori, AccumulationError> {
-        ExactTori::read(&self.grids, from)
+        ExactTori::read(&self.grids, from, RankShare::WHOLE, RankShare::WHOLE)
     }
 }

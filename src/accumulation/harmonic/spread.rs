@@ -1,5 +1,6 @@
 //! Spreads visibilities onto the sums at the nodes.
 
+use num_complex::Complex64;
 use pulp::{Arch, Simd, WithSimd};
 
 use super::exact::{BIAS, ExactNode, Quanta, TERM_MAX, biases};
@@ -179,12 +180,83 @@ pub(super) fn spread(
     );
 }
 
-/// Calls `add` with groups of consecutive visibilities in one cell of the grid, and of one power of two.
-fn in_groups<C: PartialEq>(
-    reaching: &[&Located],
-    cell: impl Fn(&Located) -> C,
-    mut add: impl FnMut(&Located, &[&Located]),
+/// A visibility's place on the grid of data, and noises of it in quanta.
+#[derive(Clone, Debug)]
+pub(super) struct LocatedNoise {
+    pub(super) first_node: usize,
+    u: [f32; LANES],
+    first: [u32; 2],
+    alpha: [f32; LANES],
+    parts: [u16; LANES],
+    gamma: [f32; LANES],
+    /// Of two realisations each, in 2^shift quanta.
+    pairs: Vec<([f32; 4], [u32; 4])>,
+}
+
+impl LocatedNoise {
+    /// Of noises in (K sr)^-1, two realisations each.
+    pub(super) fn new(
+        grids: &Grids,
+        quanta: Quanta,
+        place: &TorusPoint,
+        noises: impl Iterator<Item = [Complex64; 2]>,
+    ) -> Self {
+        let (first_node, u) = grids.u.spread((place.u - grids.nodes.first) / grids.nodes.step);
+        let points = grids.data_points();
+        let (a, alpha) = Grids::on_circle(&grids.data, points, place.alpha_rad);
+        let (g, gamma) = Grids::on_circle(&grids.data, points, place.gamma_rad);
+        let of_one = |noise: Complex64| shifted([noise.re, noise.im].map(|term| term / quanta.right));
+        let of_two = |[one, other]: [Complex64; 2]| {
+            let (([a, b], one), ([c, d], other)) = (of_one(one), of_one(other));
+            ([a, b, c, d], [one, one, other, other])
+        };
+        Self {
+            first_node: first_node.max(0) as usize,
+            u,
+            first: [a, g],
+            alpha,
+            parts: parts(&alpha),
+            gamma,
+            pairs: noises.map(of_two).collect(),
+        }
+    }
+}
+
+/// Adds the noises of two realisations, number `pair` of each visibility's, to their sums at node `index`, which all of them reach.
+pub(super) fn spread_noises(
+    grids: &Grids,
+    index: usize,
+    pair: usize,
+    reaching: &[&LocatedNoise],
+    rows: &mut [IntegerRow],
 ) {
+    let arch = Arch::new();
+    in_groups(
+        reaching,
+        |one| (one.first_node, one.first, one.pairs[pair].1),
+        |first, group| {
+            let rows = Rows {
+                rows: &mut *rows,
+                share: grids.share,
+                stride: grids.data_stride(),
+                first: first.first,
+                alphas: grids.data.width(),
+                used: 4,
+                shifts: first.pairs[pair].1,
+                direction: Direction::In,
+            };
+            rows.add(arch, group, |one| Term {
+                values: one.pairs[pair].0.map(|term| term * one.u[index - one.first_node]),
+                alphas: &one.alpha,
+                parts: &one.parts,
+                gammas: &one.gamma,
+            });
+        },
+    );
+}
+
+/// Calls `add` with groups of consecutive visibilities in one cell of the grid, and of one power of two.
+fn in_groups<T, C: PartialEq>(reaching: &[&T], cell: impl Fn(&T) -> C, mut add: impl FnMut(&T, &[&T])) {
     for run in reaching.chunk_by(|a, b| cell(a) == cell(b)) {
         for group in run.chunks(GROUP) {
             add(group[0], group);
@@ -214,7 +286,7 @@ struct Rows<'a, const K: usize> {
 impl<const K: usize> Rows<'_, K> {
     /// Adds the terms of a group of at most [`GROUP`] visibilities together, in registers.
     #[inline(always)]
-    fn add<'t>(self, arch: Arch, group: &[&'t Located], term: impl Fn(&'t Located) -> Term<'t, K>) {
+    fn add<'t, T>(self, arch: Arch, group: &[&'t T], term: impl Fn(&'t T) -> Term<'t, K>) {
         let mut terms = [Term::EMPTY; GROUP];
         for (to, one) in terms.iter_mut().zip(group) {
             *to = term(one);

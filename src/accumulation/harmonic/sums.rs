@@ -35,6 +35,8 @@ pub struct HarmonicSums {
     pub(super) counts: SumCounts,
     pub(super) right: OnceLock<Vec<f64>>,
     pub(super) noise: OnceLock<Vec<f64>>,
+    /// Of noise of further realisations.
+    pub(super) further: Vec<Vec<f64>>,
 }
 
 impl HarmonicSums {
@@ -44,11 +46,17 @@ impl HarmonicSums {
         &self.setup
     }
 
-    fn operator(&self) -> &Operator {
+    pub(super) fn operator(&self) -> &Operator {
         self.tables.get_or_init(|| self.setup.operator(&self.grids))
     }
 
-    fn shared(&self) -> SharedTori<'_> {
+    /// Right-hand sides of noise of further realisations than the companion's.
+    #[must_use]
+    pub fn further_noises(&self) -> &[Vec<f64>] {
+        &self.further
+    }
+
+    pub(super) fn shared(&self) -> SharedTori<'_> {
         let reached = self.reached.get_or_init(|| self.tori.reached(&self.ranks)).clone();
         SharedTori { ranks: &self.ranks, tori: &self.tori, reached }
     }

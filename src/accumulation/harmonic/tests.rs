@@ -565,8 +565,6 @@ fn ranks_hold_parts_and_answer_as_one() {
                 }
                 // A snapshot on the way asks the same.
                 assert!(answers(&engine.sums()) == expected);
-                let refused = engine.checkpoint(&mut Vec::new());
-                assert_eq!(refused.is_err(), count > 1);
                 let sums = engine.into_sums();
                 (answers(&sums) == expected, weights(&sums), sums.counts() == alone.counts())
             });
@@ -574,4 +572,91 @@ fn ranks_hold_parts_and_answer_as_one() {
             assert_eq!(found.iter().map(|(_, weights, _)| weights).sum::<usize>(), weight_count);
         }
     }
+}
+
+#[test]
+fn any_number_of_ranks_goes_on_from_the_parts_of_others() {
+    let blocks = blocks(0, 12);
+    let (before, after) = blocks.split_at(blocks.len() / 2);
+    let mut whole = Vec::new();
+    engine(before).checkpoint(&mut whole).unwrap();
+    let expected = answers(&engine(&blocks).into_sums());
+    let share = |rank, count| RankShare { rank, count };
+    for written in [1, 2, 3, 9] {
+        let parts: Vec<Vec<u8>> = on_threads(written, |ranks| {
+            let mut engine = HarmonicEngine::new(setup()).unwrap().among(ranks);
+            before.iter().for_each(|block| drop(engine.add(block).unwrap()));
+            let mut part = Vec::new();
+            engine.checkpoint(&mut part).unwrap();
+            part
+        });
+        let joined = |ranks: &Ranks| {
+            let read = |(rank, part): (usize, &Vec<u8>)| {
+                HarmonicEngine::restore_part(&mut &part[..], share(rank, written), ranks).unwrap()
+            };
+            let mut engines = parts.iter().enumerate().map(read);
+            let mut first = engines.next().unwrap();
+            engines.for_each(|other| first.join(other).unwrap());
+            first
+        };
+        // A process alone, whose checkpoint is the one that it would have written itself.
+        let mut again = Vec::new();
+        joined(&Ranks::one()).checkpoint(&mut again).unwrap();
+        assert!(again == whole, "{written} parts");
+        for count in [2, 3] {
+            let found = on_threads(count, |ranks| {
+                let mut engine = joined(ranks);
+                after.iter().for_each(|block| drop(engine.add(block).unwrap()));
+                answers(&engine.into_sums()) == expected
+            });
+            assert!(found.iter().all(|is_equal| *is_equal), "{written} parts, {count} ranks");
+        }
+    }
+}
+
+#[test]
+fn what_are_no_parts_of_the_same_sums_is_refused() {
+    let blocks = blocks(0, 4);
+    let parts: Vec<Vec<u8>> = on_threads(2, |ranks| {
+        let mut engine = HarmonicEngine::new(setup()).unwrap().among(ranks);
+        blocks.iter().for_each(|block| drop(engine.add(block).unwrap()));
+        let mut part = Vec::new();
+        engine.checkpoint(&mut part).unwrap();
+        part
+    });
+    let read = |at: usize, rank| {
+        HarmonicEngine::restore_part(&mut &parts[at][..], RankShare { rank, count: 2 }, &Ranks::one())
+    };
+    // One that has the other's name.
+    assert!(read(0, 1).unwrap_err().to_string().contains("the rank's own blocks"));
+    // The same twice, and one of other data.
+    let same = read(0, 0).unwrap().join(read(0, 0).unwrap()).unwrap_err();
+    assert!(same.to_string().contains("the same alphas"), "{same}");
+    let other = read(0, 0).unwrap().join(engine(&blocks[..1])).unwrap_err();
+    assert!(matches!(other, AccumulationError::Mismatch { .. }), "{other}");
+}
+
+#[test]
+fn further_realisations_have_the_bits_of_their_own_engines() {
+    let blocks = blocks(0, 12);
+    let of_seed = |seed: u64| {
+        let mut engine = HarmonicEngine::new(HarmonicSetup { companion_seed: seed, ..setup() }).unwrap();
+        blocks.iter().for_each(|block| drop(engine.add(block).unwrap()));
+        engine.into_sums().noise_right_hand_side().to_vec()
+    };
+    // Two share a row, and the last one has it for itself.
+    let seeds = [7, 8, 1 << 40];
+    let mut engine = HarmonicEngine::new(setup()).unwrap();
+    let mut noises = NoiseSums::new(&engine, &seeds);
+    for block in &blocks {
+        noises.add(&engine, block);
+        assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
+    }
+    let sums = engine.into_sums().with_noises(noises);
+    assert_eq!(sums.further_noises().len(), seeds.len());
+    for (seed, found) in seeds.into_iter().zip(sums.further_noises()) {
+        let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
+        assert!(bits(found) == bits(&of_seed(seed)), "seed {seed}");
+    }
+    assert!(sums.further_noises()[0] == sums.noise_right_hand_side());
 }

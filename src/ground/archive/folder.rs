@@ -1,40 +1,69 @@
 //! The folder of an archive: numbered checkpoints, of which the newest two are kept. Room for three lets both stay until
 //! another is whole; room for two is enough.
+//!
+//! Ranks of a job share a folder. Each writes its part of every checkpoint at the same place of the stream, and nobody waits for the
+//! others: a checkpoint counts once all its parts are there, and an older one goes once there are two newer ones.
 
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use super::checkpoint;
-use crate::files::{AtomicFile, FolderLock, IfUnfinished, read_folder};
+use super::names::{NUMBER_MAX, Numbered, numbered};
+use crate::files::{AtomicFile, FolderLock, IfUnfinished};
 use crate::ground::GroundError;
+use crate::ranks::Ranks;
 
-const PREFIX: &str = "checkpoint-";
-const SUFFIX: &str = ".lunarray";
-/// Greatest number of a checkpoint, which no state that counts from 1 reaches.
-const NUMBER_MAX: u64 = u64::MAX / 2;
+/// Checkpoints that are kept.
+const KEPT: usize = 2;
 
-/// A folder that one process uses at a time.
+/// A folder that one process, or one job of ranks, uses at a time.
 #[derive(Debug)]
 pub(super) struct StateFolder {
     path: PathBuf,
-    /// Numbers of its checkpoints, oldest first.
-    numbers: Vec<u64>,
-    lock: FolderLock,
+    /// Its checkpoints, oldest first.
+    held: Vec<Numbered>,
+    /// Of the first rank.
+    lock: Option<FolderLock>,
+    ranks: Ranks,
 }
 
 impl StateFolder {
     /// Creates the folder if needed, and locks it.
     pub(super) fn open(path: &Path) -> Result<Self, GroundError> {
-        let lock = FolderLock::acquire(path, "lock", false).map_err(|error| match error.kind() {
+        Self::open_among(path, &Ranks::one())
+    }
+
+    /// As [`StateFolder::open`], together with the other ranks.
+    pub(super) fn open_among(path: &Path, ranks: &Ranks) -> Result<Self, GroundError> {
+        let lock = ranks.is_first().then(|| FolderLock::acquire(path, LOCK, false)).transpose();
+        let lock = lock.map_err(|error| match error.kind() {
             ErrorKind::ResourceBusy => GroundError::Locked { path: path.to_owned() },
             _ => GroundError::io(path, "lock the folder")(error),
         })?;
-        Ok(Self { path: path.to_owned(), numbers: numbers(path)?, lock })
+        if ranks.is_first() {
+            let [_, unfinished] = numbered(path)?;
+            // What a job left that was ended meanwhile must not become whole by parts of another.
+            for set in unfinished {
+                set.remove(path);
+            }
+        }
+        // None of them looks before it is clean, and locked.
+        let _ = ranks.all(true);
+        if !ranks.is_first() && !path.join(LOCK).is_file() {
+            return Err(GroundError::NotShared { path: path.to_owned() });
+        }
+        let [held, _] = numbered(path)?;
+        Ok(Self { path: path.to_owned(), held, lock, ranks: ranks.clone() })
+    }
+
+    /// Those that share it.
+    pub(super) fn ranks(&self) -> &Ranks {
+        &self.ranks
     }
 
     /// The newest checkpoint that holds, read by `read`, or `None` if there is no checkpoint; and notes on newer ones that
-    /// are damaged, which are renamed if `sets_aside`.
+    /// are damaged, which are renamed if `sets_aside`. `read` gets the first of its files.
     ///
     /// A checkpoint that the system does not let us read may well hold: that is an error, and changes nothing.
     pub(super) fn load<T>(
@@ -42,35 +71,55 @@ impl StateFolder {
         sets_aside: bool,
         read: impl Fn(&Path) -> Result<T, GroundError>,
     ) -> Result<(Option<T>, Vec<String>), GroundError> {
-        let mut bad: Vec<(PathBuf, GroundError)> = Vec::new();
-        for (index, &number) in self.numbers.iter().enumerate().rev() {
-            let path = self.name(number);
-            match read(&path) {
-                Ok(found) => {
-                    for (path, _) in bad.iter().filter(|_| sets_aside) {
-                        let mut aside = path.clone().into_os_string();
-                        aside.push(".damaged");
-                        fs::rename(path, aside).map_err(GroundError::io(path, "rename"))?;
-                    }
-                    self.numbers.truncate(index + 1);
-                    return Ok((Some(found), bad.iter().map(|(_, error)| note(error, &path)).collect()));
+        let mut bad: Vec<(Numbered, GroundError)> = Vec::new();
+        let mut found = None;
+        for (index, checkpoint) in self.held.iter().enumerate().rev() {
+            match read(&checkpoint.path(&self.path, 0)) {
+                Ok(read) => {
+                    found = Some((index, read));
+                    break;
                 }
-                Err(error @ GroundError::Damaged { .. }) => bad.push((path, error)),
+                Err(error @ GroundError::Damaged { .. }) => bad.push((*checkpoint, error)),
                 Err(error) => return Err(error),
             }
         }
-        let checkpoints = bad.len();
-        match bad.into_iter().next() {
-            None => Ok((None, Vec::new())),
-            Some((_, newest)) => {
-                let (path, newest) = (self.path.clone(), Box::new(newest));
-                Err(GroundError::NoneHolds { path, checkpoints, newest })
-            }
+        let used = found.as_ref().and_then(|(index, _)| self.held.get(*index)).copied();
+        // Others may be reading what is to be renamed.
+        let chosen = used.map_or([0; 2], |used| [used.number as i64, used.parts as i64]);
+        if !self.ranks.agree(&chosen) {
+            return Err(GroundError::NotShared { path: self.path.clone() });
         }
+        let Some((index, read)) = found else {
+            let checkpoints = bad.len();
+            return match bad.into_iter().next() {
+                None => Ok((None, Vec::new())),
+                Some((_, newest)) => {
+                    let (path, newest) = (self.path.clone(), Box::new(newest));
+                    Err(GroundError::NoneHolds { path, checkpoints, newest })
+                }
+            };
+        };
+        if sets_aside && self.ranks.is_first() {
+            bad.iter().try_for_each(|(checkpoint, _)| self.set_aside(*checkpoint))?;
+        }
+        // Nobody writes before that.
+        let _ = self.ranks.all(true);
+        self.held.truncate(index + 1);
+        let path = used.map_or_else(PathBuf::new, |used| used.path(&self.path, 0));
+        Ok((Some(read), bad.iter().map(|(_, error)| note(error, &path)).collect()))
     }
 
-    /// Writes a checkpoint, whole or not at all, and removes all but the newest two. If there is no room for a third, the
-    /// older of the two gives way, once the newer one has been found to hold.
+    fn set_aside(&self, checkpoint: Numbered) -> Result<(), GroundError> {
+        for path in checkpoint.paths(&self.path) {
+            let mut aside = path.clone().into_os_string();
+            aside.push(".damaged");
+            fs::rename(&path, aside).map_err(GroundError::io(&path, "rename"))?;
+        }
+        Ok(())
+    }
+
+    /// Writes a checkpoint, or this rank's part of one, whole or not at all, and removes all but the newest two. If there is no room
+    /// for a third, the older of the two gives way, once the newer one has been found to hold; not to a part.
     pub(super) fn save(
         &mut self,
         mut write: impl FnMut(&mut AtomicFile, &Path) -> Result<(), GroundError>,
@@ -85,20 +134,25 @@ impl StateFolder {
         &mut self,
         mut write: impl FnMut(&mut AtomicFile, &Path) -> Result<(), GroundError>,
     ) -> Result<(), GroundError> {
-        let number = self.numbers.last().map_or(1, |newest| newest + 1);
-        let path = self.name(number);
+        let number = self.held.last().map_or(1, |newest| newest.number + 1);
+        let next = Numbered { number, parts: self.ranks.share().count };
+        let path = next.path(&self.path, self.ranks.share().rank);
         if number > NUMBER_MAX {
-            return Err(GroundError::CheckpointName { path: self.name(NUMBER_MAX) });
+            let greatest = Numbered { number: NUMBER_MAX, ..next };
+            return Err(GroundError::CheckpointName { path: greatest.path(&self.path, 0) });
         }
         match self.write(&path, &mut write) {
-            Err(error) if is_out_of_room(&error) && self.numbers.len() > 1 => {
+            Err(error) if is_out_of_room(&error) && self.held.len() > 1 && !self.ranks.are_many() => {
                 self.drop_older()?;
                 self.write(&path, &mut write)?;
             }
             written => written?,
         }
-        self.numbers.push(number);
-        self.remove_all_but(2);
+        self.held.push(next);
+        match self.ranks.are_many() {
+            true => self.remove_superseded(),
+            false => self.remove_all_but(KEPT),
+        }
         Ok(())
     }
 
@@ -116,8 +170,8 @@ impl StateFolder {
 
     /// Removes all checkpoints but the newest. That has to hold: otherwise an error, and nothing is removed.
     pub(super) fn drop_older(&mut self) -> Result<(), GroundError> {
-        if let Some(&newest) = self.numbers.last() {
-            checkpoint::verify(&self.name(newest))?;
+        if let Some(newest) = self.held.last() {
+            newest.paths(&self.path).iter().try_for_each(|path| checkpoint::verify(path))?;
             self.remove_all_but(1);
         }
         Ok(())
@@ -125,7 +179,7 @@ impl StateFolder {
 
     /// Checks that the path still leads to the folder that was locked: another process may use what is there now.
     fn check_place(&self) -> Result<(), GroundError> {
-        match self.lock.lost() {
+        match self.lock.as_ref().and_then(FolderLock::lost) {
             None => Ok(()),
             Some(what) => Err(GroundError::FolderLost { path: self.path.clone(), what }),
         }
@@ -133,54 +187,47 @@ impl StateFolder {
 
     /// Removes all checkpoints but the newest ones. One that stays takes room and does no harm: the next time again.
     fn remove_all_but(&mut self, most: usize) {
-        let oldest = self.numbers.len().saturating_sub(most);
+        let oldest = self.held.len().saturating_sub(most);
         let (path, mut index) = (&self.path, 0);
-        self.numbers.retain(|&number| {
+        self.held.retain(|checkpoint| {
             index += 1;
-            let removed = || fs::remove_file(name(path, number));
-            index > oldest || removed().is_err_and(|error| error.kind() != ErrorKind::NotFound)
+            index > oldest || !checkpoint.remove(path)
         });
     }
 
-    fn name(&self, number: u64) -> PathBuf {
-        name(&self.path, number)
+    /// Removes what all ranks have written two newer ones of: this rank its own part, the first one also those of other jobs. What
+    /// stays takes room and does no harm.
+    fn remove_superseded(&mut self) {
+        let Ok([whole, _]) = numbered(&self.path) else { return };
+        let Some(oldest) = whole.iter().rev().nth(KEPT - 1).map(|kept| kept.number) else { return };
+        let share = self.ranks.share();
+        let path = &self.path;
+        self.held.retain(|held| {
+            if held.number >= oldest {
+                return true;
+            }
+            if held.parts == share.count {
+                let _ = fs::remove_file(held.path(path, share.rank));
+            } else if share.rank == 0 {
+                held.remove(path);
+            }
+            false
+        });
     }
 }
+
+/// Name of the lock of a folder.
+const LOCK: &str = "lock";
 
 /// A note on a checkpoint that cannot be used when an older one is.
 pub(super) fn note(error: &GroundError, used: &Path) -> String {
     format!("{error}; resuming from the previous checkpoint, {}", used.display())
 }
 
-/// The checkpoints in a folder, oldest first.
+/// The checkpoints in a folder, oldest first: the first file of each.
 pub(super) fn checkpoints(folder: &Path) -> Result<Vec<PathBuf>, GroundError> {
-    Ok(numbers(folder)?.into_iter().map(|number| name(folder, number)).collect())
-}
-
-fn name(folder: &Path, number: u64) -> PathBuf {
-    folder.join(file_name(number))
-}
-
-fn file_name(number: u64) -> String {
-    format!("{PREFIX}{number:08}{SUFFIX}")
-}
-
-/// Numbers of the checkpoints, in order. A name that is like theirs and that none can have may hide one: it is refused.
-fn numbers(folder: &Path) -> Result<Vec<u64>, GroundError> {
-    let mut numbers = Vec::new();
-    for entry in read_folder(folder).map_err(GroundError::io(folder, "read the folder"))? {
-        let name = entry.map_err(GroundError::io(folder, "read the folder"))?.file_name();
-        let text = name.to_string_lossy();
-        let Some(digits) = text.strip_prefix(PREFIX).and_then(|text| text.strip_suffix(SUFFIX)) else {
-            continue;
-        };
-        match digits.parse::<u64>() {
-            Ok(number) if number <= NUMBER_MAX && file_name(number) == text => numbers.push(number),
-            _ => return Err(GroundError::CheckpointName { path: folder.join(&name) }),
-        }
-    }
-    numbers.sort_unstable();
-    Ok(numbers)
+    let [whole, _] = numbered(folder)?;
+    Ok(whole.into_iter().map(|checkpoint| checkpoint.path(folder, 0)).collect())
 }
 
 /// Whether the disk or a quota is full.
@@ -221,6 +268,14 @@ mod tests {
         })
     }
 
+    fn file_name(number: u64) -> String {
+        Numbered { number, parts: 1 }.file_name(0)
+    }
+
+    fn name(folder: &StateFolder, number: u64) -> PathBuf {
+        folder.path.join(file_name(number))
+    }
+
     fn names(folder: &Path) -> Vec<String> {
         let entries = fs::read_dir(folder).unwrap();
         let mut names: Vec<String> =
@@ -236,7 +291,7 @@ mod tests {
         let mut folder = StateFolder::open(place.path()).unwrap();
         for (number, room) in [(1, 3), (2, 3), (3, 3), (4, 2), (5, 2)] {
             save_in(&mut folder, room, &number.to_string()).unwrap();
-            assert_eq!(fs::read(folder.name(number)).unwrap(), sealed(&number.to_string()));
+            assert_eq!(fs::read(name(&folder, number)).unwrap(), sealed(&number.to_string()));
             // Both stay where there is room for a third.
             let kept = if room == 3 { number.min(2) } else { 2 };
             assert_eq!(checkpoints(place.path()).unwrap().len() as u64, kept);
@@ -253,7 +308,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let mut folder = StateFolder::open(place.path()).unwrap();
         ["1", "2"].iter().for_each(|text| save(&mut folder, text).unwrap());
-        fs::write(folder.name(2), b"damaged, and more than twenty-four bytes").unwrap();
+        fs::write(name(&folder, 2), b"damaged, and more than twenty-four bytes").unwrap();
         assert!(matches!(save_in(&mut folder, 2, "3"), Err(GroundError::Damaged { .. })));
         assert_eq!(names(place.path()), [1, 2].map(file_name));
     }
@@ -303,6 +358,6 @@ mod tests {
         {
             fs::write(place.path().join(name), b"x").unwrap();
         }
-        assert!(StateFolder::open(place.path()).unwrap().numbers.is_empty());
+        assert!(StateFolder::open(place.path()).unwrap().held.is_empty());
     }
 }

@@ -44,7 +44,10 @@
 //! is kept, and used, with a note, if the newest is damaged. Damaged is one whose checksum or contents are wrong, not one
 //! that the system fails to read: that is an error, after which the folder is as it was.
 //!
-//! A checkpoint that cannot be written ends nothing. The ground goes on and tries again, first after an eighth of the
+//! Ranks of a job (`--mpi`) write a file each, `checkpoint-00000007.2-of-4.lunarray`: the whole head, and of the sums those that the
+//! rank holds. The heads of a set are equal, or it is damaged. Any number of ranks reads a set, and so does a process alone.
+//!
+//! A checkpoint that cannot be written ends nothing, but for a job of ranks, which it ends: a set without it is none. The ground goes on and tries again, first after an eighth of the
 //! interval, then after twice as long each time, and three times at the end of the session; then it makes its maps, and
 //! says what the state lacks. Room for two checkpoints is enough: when a third finds none, the older one goes first.
 
@@ -53,6 +56,7 @@ mod draft;
 mod folder;
 mod gaps;
 mod journal;
+mod names;
 mod packet_order;
 mod retract;
 mod sessions;

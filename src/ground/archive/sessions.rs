@@ -8,6 +8,7 @@ use super::folder::{StateFolder, checkpoints};
 use super::store::{Archive, Opened};
 use crate::accumulation::Snapshot;
 use crate::ground::{Ground, GroundConfig, GroundError};
+use crate::ranks::Ranks;
 use crate::runtime::{Outlet, Stage};
 
 impl Ground {
@@ -19,7 +20,21 @@ impl Ground {
     /// A folder that cannot be used or is in use; an archive that was made with other settings, or without a usable
     /// checkpoint; calibration that cannot be read.
     pub fn open(folder: &Path, config: &GroundConfig, checkpoint_every: u64) -> Result<Self, GroundError> {
-        Opened::new(folder, config, true)?.resume(config, checkpoint_every)
+        Self::open_among(folder, config, checkpoint_every, &Ranks::one())
+    }
+
+    /// As [`Ground::open`], as one rank of several, all of which open the folder: each writes its part of every checkpoint. The
+    /// checkpoint may be one of other ranks, or of a process alone.
+    ///
+    /// # Errors
+    /// Likewise; a folder that ranks do not share.
+    pub fn open_among(
+        folder: &Path,
+        config: &GroundConfig,
+        checkpoint_every: u64,
+        ranks: &Ranks,
+    ) -> Result<Self, GroundError> {
+        Opened::among(folder, config, true, ranks)?.resume(config, checkpoint_every)
     }
 
     /// Merges archives into a new one, in the folder `into`; those of `parts` stay as they are.
@@ -63,13 +78,22 @@ impl Ground {
         if checkpoints(folder)?.is_empty() {
             return Err(GroundError::without_checkpoint(folder));
         }
-        let (found, _) = StateFolder::open(folder)?.load(false, |path| {
-            checkpoint::read(path, |head, engines| {
-                std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
-                Ok(head.settings)
-            })
-        })?;
+        let (found, _) = StateFolder::open(folder)?.load(false, settings_at)?;
         found.ok_or_else(|| GroundError::without_checkpoint(folder))
+    }
+
+    /// As [`Ground::settings_in`], for each of several ranks before they open the folder: it is not locked.
+    ///
+    /// # Errors
+    /// A folder without a usable checkpoint.
+    pub fn settings_for_ranks(folder: &Path) -> Result<Vec<(String, String)>, GroundError> {
+        for path in checkpoints(folder)?.iter().rev() {
+            match settings_at(path) {
+                Err(GroundError::Damaged { .. }) => {}
+                found => return found,
+            }
+        }
+        Err(GroundError::without_checkpoint(folder))
     }
 
     /// The sums of an archive, with the packets that it holds, as at the end of a session. The archive stays as it is.
@@ -98,4 +122,12 @@ impl Ground {
     pub fn notes(&self) -> impl Iterator<Item = &str> {
         self.archive.iter().flat_map(Archive::notes)
     }
+}
+
+/// The settings in a checkpoint.
+fn settings_at(path: &Path) -> Result<Vec<(String, String)>, GroundError> {
+    checkpoint::read(path, |head, engines| {
+        std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
+        Ok(head.settings)
+    })
 }

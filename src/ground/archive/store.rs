@@ -4,10 +4,11 @@ use std::io::ErrorKind;
 use std::path::Path;
 use std::time::Duration;
 
-use super::checkpoint::{self, ArchiveHeadView};
+use super::checkpoint::{self, ArchiveHead, ArchiveHeadView};
 use super::draft::RecordDraft;
 use super::folder::StateFolder;
 use super::journal::{Journal, OtherRecord};
+use super::names::parts_with;
 use super::settings::{compare, settings_of};
 use crate::accumulation::{AccumulationError, Accumulator};
 use crate::array::Ephemeris;
@@ -20,6 +21,7 @@ use crate::ground::{
     Collector, CollectorState, DeliveredPacket, Ground, GroundConfig, GroundError, GroundOutcome,
     SharedSaving,
 };
+use crate::ranks::{RankShare, Ranks};
 use crate::runtime::{Cancel, Ledger, LedgerReport};
 
 /// After a failure a checkpoint is tried again after this part of the interval, then after twice that, and so on.
@@ -165,6 +167,44 @@ impl ArchiveContents {
     }
 }
 
+/// Reads a checkpoint, of all parts that there are, into an accumulator without sums; `check` looks at its head first.
+fn read_parts(
+    path: &Path,
+    empty: &Accumulator,
+    check: impl Fn(&ArchiveHead) -> Result<(), GroundError>,
+) -> Result<(ArchiveHead, Accumulator), GroundError> {
+    let of_part = |path: &Path, part: RankShare, empty: Accumulator| {
+        checkpoint::read(path, |head, engines| {
+            check(&head)?;
+            let sums = empty.resume_part(head.accumulator.clone(), engines, part);
+            Ok((head, sums.map_err(|error| unreadable(path, error))?))
+        })
+    };
+    let mut whole: Option<(ArchiveHead, Accumulator)> = None;
+    for (path, part) in parts_with(path) {
+        let (head, sums) = of_part(&path, part, empty.without_sums())?;
+        match &mut whole {
+            None => whole = Some((head, sums)),
+            Some((first, _)) if *first != head => {
+                let found = "another state than that of the first part".to_owned();
+                return Err(GroundError::Damaged { path, found, expected: "parts of one checkpoint" });
+            }
+            Some((_, joined)) => joined.join(sums)?,
+        }
+    }
+    whole.ok_or_else(|| GroundError::without_checkpoint(path))
+}
+
+/// What the reader's error means: data that end too early are damaged, what the system refuses may well hold.
+fn unreadable(path: &Path, error: AccumulationError) -> GroundError {
+    match error {
+        AccumulationError::Io(source) if source.kind() != ErrorKind::UnexpectedEof => {
+            GroundError::io(path, "read")(source)
+        }
+        other => other.into(),
+    }
+}
+
 /// A folder that is open, and what its newest usable checkpoint holds.
 pub(super) struct Opened {
     pub(super) folder: StateFolder,
@@ -177,26 +217,28 @@ pub(super) struct Opened {
 impl Opened {
     /// Opens a folder. Checkpoints that cannot be used get another name if `sets_aside`.
     pub(super) fn new(folder: &Path, config: &GroundConfig, sets_aside: bool) -> Result<Self, GroundError> {
+        Self::among(folder, config, sets_aside, &Ranks::one())
+    }
+
+    /// As [`Opened::new`], as one rank of several.
+    pub(super) fn among(
+        folder: &Path,
+        config: &GroundConfig,
+        sets_aside: bool,
+        ranks: &Ranks,
+    ) -> Result<Self, GroundError> {
         if config.map.refine.is_on() {
             return Err(AccumulationError::HeldInMemory.into());
         }
-        let mut folder = StateFolder::open(folder)?;
+        let mut folder = StateFolder::open_among(folder, ranks)?;
         let settings = settings_of(config)?;
         let posts = Ledger::new();
         let (contents, notes) = folder.load(sets_aside, |path| {
-            checkpoint::read(path, |head, engines| {
-                compare(path, &head.settings, &settings)?;
-                let of_file = |error| match error {
-                    AccumulationError::Io(source) if source.kind() != ErrorKind::UnexpectedEof => {
-                        GroundError::io(path, "read")(source)
-                    }
-                    other => other.into(),
-                };
-                let accumulator = config.accumulator(&posts).resume(head.accumulator, engines);
-                let accumulator = accumulator.map_err(of_file)?;
-                let (collector, ephemeris, autos) = (head.collector, head.ephemeris, head.autos);
-                Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal: head.journal })
-            })
+            let empty = config.accumulator(&posts).among(ranks);
+            let (head, accumulator) =
+                read_parts(path, &empty, |head| compare(path, &head.settings, &settings))?;
+            let ArchiveHead { collector, ephemeris, autos, journal, .. } = head;
+            Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal })
         })?;
         Ok(Self { folder, contents, notes, settings, posts })
     }
@@ -216,7 +258,9 @@ impl Opened {
     pub(super) fn resume(self, config: &GroundConfig, interval: u64) -> Result<Ground, GroundError> {
         let Self { folder, contents, notes, settings, posts } = self;
         let contents = contents.unwrap_or_else(|| ArchiveContents::empty(config, &posts));
-        let ArchiveContents { collector, ephemeris, autos, mut accumulator, journal } = contents;
+        let ArchiveContents { collector, ephemeris, autos, accumulator, journal } = contents;
+        // Also of a new archive.
+        let mut accumulator = accumulator.among(folder.ranks());
         let outcome = GroundOutcome::default();
         outcome.saving.begin();
         outcome.ledger.post_report(&journal.ledger());

@@ -101,10 +101,13 @@ impl Journal {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+    use std::path::Path;
+
     use num_complex::Complex32;
 
     use super::*;
-    use crate::accumulation::MapConfig;
+    use crate::accumulation::{EngineKind, MapConfig};
     use crate::calibration::CalibrationConfig;
     use crate::downlink::receive::PacketReading;
     use crate::downlink::{
@@ -116,6 +119,7 @@ mod tests {
     };
     use crate::ground::archive::RecordDraft;
     use crate::ground::{DeliveredPacket, Ground, GroundConfig};
+    use crate::ranks::{Ranks, on_threads};
     use crate::runtime::{Outlet, Stage};
     use crate::units::Pair;
 
@@ -186,6 +190,58 @@ mod tests {
         let mut again = Ground::open(folder.path(), &config, u64::MAX).unwrap();
         again.finish(&mut Outlet::collect()).unwrap();
         assert_eq!((again.outcome.ledger.close().unwrap(), again.collector.counters()), said);
+    }
+
+    #[test]
+    fn ranks_keep_a_state_together() {
+        let (folder, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let map = MapConfig { engine: EngineKind::Harmonic, ..MapConfig::default() };
+        let calibration = CalibrationConfig::default();
+        let config =
+            GroundConfig { calibration, map, wait_bytes: 1 << 20, memory_max_bytes: None, group: None };
+        let bytes = transmission();
+        let first = &bytes[..bytes.len() / 2];
+        let session_in = |folder: &Path, ranks: &Ranks, bytes: &[u8]| {
+            let mut ground = Ground::open_among(folder, &config, u64::MAX, ranks).unwrap();
+            assert_eq!(ground.ranks().share(), ranks.share());
+            ground.step(bytes.to_vec(), &mut Outlet::collect()).unwrap();
+            ground.finish(&mut Outlet::collect()).unwrap();
+            let told: Vec<String> = ground.notes().map(str::to_owned).collect();
+            (ground.outcome.ledger.close().unwrap(), ground.collector.counters(), told)
+        };
+        let session = |ranks: &Ranks, bytes: &[u8]| session_in(folder.path(), ranks, bytes);
+        let expected = [first, &bytes, &[]].map(|bytes| session_in(other.path(), &Ranks::one(), bytes));
+        let names = || {
+            let entries = std::fs::read_dir(folder.path()).unwrap();
+            let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+            names.filter(|name| name.ends_with(".lunarray")).collect::<BTreeSet<String>>()
+        };
+        let set = |number: usize, parts: usize| {
+            (1..=parts).map(move |part| format!("checkpoint-{number:08}.{part}-of-{parts}.lunarray"))
+        };
+        assert!(on_threads(3, |ranks| session(ranks, first)).iter().all(|found| *found == expected[0]));
+        assert_eq!(names(), set(1, 3).collect());
+        // Another number of ranks goes on; a part of a job that was ended does not count, and goes.
+        std::fs::copy(
+            folder.path().join("checkpoint-00000001.2-of-3.lunarray"),
+            folder.path().join("checkpoint-00000002.2-of-3.lunarray"),
+        )
+        .unwrap();
+        let whole = on_threads(2, |ranks| session(ranks, &bytes));
+        assert_eq!(names(), set(1, 3).chain(set(2, 2)).collect());
+        assert!(whole.iter().all(|found| *found == expected[1]));
+        // A part that is damaged, or of another place in the stream, takes its set with it.
+        let damaged = folder.path().join("checkpoint-00000002.2-of-2.lunarray");
+        std::fs::copy(folder.path().join("checkpoint-00000001.2-of-3.lunarray"), damaged).unwrap();
+        let again = on_threads(2, |ranks| session(ranks, &bytes));
+        assert!(again[0].2[0].contains("parts of one checkpoint"), "{:?}", again[0].2);
+        assert_eq!((&again[1].0, &again[1].1), (&expected[1].0, &expected[1].1));
+        // A process alone goes on, and what it writes takes the place of the sets before.
+        let alone = session(&Ranks::one(), &[]);
+        assert_eq!((&alone.0, &alone.1), (&expected[2].0, &expected[2].1));
+        session(&Ranks::one(), &[]);
+        let own = [3, 4].map(|number| format!("checkpoint-{number:08}.lunarray"));
+        assert_eq!(names(), own.into_iter().collect());
     }
 
     #[test]

@@ -1,0 +1,141 @@
+//! Names of checkpoints: a file of a process, or a file of each rank of a job.
+//!
+//! `checkpoint-00000007.lunarray` is a whole one; `checkpoint-00000007.2-of-4.lunarray` is the second rank's part of a set of four. A
+//! set counts once all of its parts are there. Every part has the whole head; of the sums it has those that its rank held.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+use crate::files::read_folder;
+use crate::ground::GroundError;
+use crate::ranks::RankShare;
+
+const PREFIX: &str = "checkpoint-";
+const SUFFIX: &str = ".lunarray";
+/// Greatest number of a checkpoint, which no state that counts from 1 reaches.
+pub(super) const NUMBER_MAX: u64 = u64::MAX / 2;
+/// Most parts of a set.
+const PARTS_MAX: usize = 1 << 20;
+
+/// A checkpoint of a folder.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Numbered {
+    pub(super) number: u64,
+    /// Files that it consists of.
+    pub(super) parts: usize,
+}
+
+impl Numbered {
+    /// Name of one of its files.
+    pub(super) fn file_name(self, part: usize) -> String {
+        let Self { number, parts } = self;
+        match parts {
+            1 => format!("{PREFIX}{number:08}{SUFFIX}"),
+            _ => format!("{PREFIX}{number:08}.{}-of-{parts}{SUFFIX}", part + 1),
+        }
+    }
+
+    /// One of its files.
+    pub(super) fn path(self, folder: &Path, part: usize) -> PathBuf {
+        folder.join(self.file_name(part))
+    }
+
+    /// Its files.
+    pub(super) fn paths(self, folder: &Path) -> Vec<PathBuf> {
+        (0..self.parts).map(|part| self.path(folder, part)).collect()
+    }
+
+    /// Removes its files; whether none is left.
+    pub(super) fn remove(self, folder: &Path) -> bool {
+        let stays =
+            |path: &PathBuf| fs::remove_file(path).is_err_and(|error| error.kind() != ErrorKind::NotFound);
+        // All of them, also after one that stays.
+        self.paths(folder).iter().filter(|path| stays(path)).count() == 0
+    }
+
+    /// The checkpoint and the part that a file is by its name; `None` for other files, or names that none has.
+    fn of_name(text: &str) -> Option<(Self, usize)> {
+        let name = inner(text)?;
+        let (number, part) = name.split_once('.').unwrap_or((name, ""));
+        let (part, parts) = match part.split_once("-of-") {
+            Some((part, parts)) => (part.parse::<usize>().ok()?.checked_sub(1)?, parts.parse().ok()?),
+            None => (0, 1),
+        };
+        let found = Self { number: number.parse().ok()?, parts };
+        let is_one = found.number <= NUMBER_MAX && part < parts && parts <= PARTS_MAX;
+        (is_one && found.file_name(part) == text).then_some((found, part))
+    }
+}
+
+/// What stands between the beginning and the end of a checkpoint's name.
+fn inner(text: &str) -> Option<&str> {
+    text.strip_prefix(PREFIX)?.strip_suffix(SUFFIX)
+}
+
+/// The files of the checkpoint to which a file belongs, and which parts they hold; of other names the file alone, as a whole.
+pub(super) fn parts_with(path: &Path) -> Vec<(PathBuf, RankShare)> {
+    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    match (Numbered::of_name(&name), path.parent()) {
+        (Some((found, _)), Some(folder)) if found.parts > 1 => {
+            let share = |rank| RankShare { rank, count: found.parts };
+            found.paths(folder).into_iter().enumerate().map(|(rank, path)| (path, share(rank))).collect()
+        }
+        _ => vec![(path.to_owned(), RankShare::WHOLE)],
+    }
+}
+
+/// The checkpoints in a folder, oldest first: those of which all parts are there, and the others. A name that is like theirs and that
+/// none can have may hide one: it is refused.
+pub(super) fn numbered(folder: &Path) -> Result<[Vec<Numbered>; 2], GroundError> {
+    let mut found: BTreeMap<Numbered, BTreeSet<usize>> = BTreeMap::new();
+    for entry in read_folder(folder).map_err(GroundError::io(folder, "read the folder"))? {
+        let name = entry.map_err(GroundError::io(folder, "read the folder"))?.file_name();
+        let text = name.to_string_lossy();
+        if inner(&text).is_none() {
+            continue;
+        }
+        let Some((checkpoint, part)) = Numbered::of_name(&text) else {
+            return Err(GroundError::CheckpointName { path: folder.join(&name) });
+        };
+        found.entry(checkpoint).or_default().insert(part);
+    }
+    let is_whole = |checkpoint: &Numbered| found[checkpoint].len() == checkpoint.parts;
+    let (whole, others) = found.keys().partition(|checkpoint| is_whole(checkpoint));
+    Ok([whole, others])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_set_counts_once_all_of_its_parts_are_there() {
+        let place = tempfile::tempdir().unwrap();
+        let put = |name: &str| fs::write(place.path().join(name), b"x").unwrap();
+        put("checkpoint-00000001.lunarray");
+        put("checkpoint-00000002.2-of-3.lunarray");
+        put("checkpoint-00000002.3-of-3.lunarray");
+        let [one, set] = [(1, 1), (2, 3)].map(|(number, parts)| Numbered { number, parts });
+        assert_eq!(numbered(place.path()).unwrap(), [vec![one], vec![set]]);
+        put("checkpoint-00000002.1-of-3.lunarray");
+        assert_eq!(numbered(place.path()).unwrap(), [vec![one, set], vec![]]);
+        let parts = parts_with(&set.path(place.path(), 0));
+        assert_eq!(parts.len(), 3);
+        assert_eq!(parts[2].1, RankShare { rank: 2, count: 3 });
+        assert_eq!(parts_with(&one.path(place.path(), 0))[0].1, RankShare::WHOLE);
+        assert!(set.remove(place.path()));
+        assert_eq!(numbered(place.path()).unwrap(), [vec![one], vec![]]);
+    }
+
+    #[test]
+    fn names_that_no_part_has_are_refused() {
+        for name in ["0-of-2", "3-of-2", "1-of-1", "01-of-2", "1-of-", "x", "1-of-2.1-of-2"] {
+            let place = tempfile::tempdir().unwrap();
+            fs::write(place.path().join(format!("checkpoint-00000001.{name}.lunarray")), b"x").unwrap();
+            let found = numbered(place.path());
+            assert!(matches!(found, Err(GroundError::CheckpointName { .. })), "{name}");
+        }
+    }
+}

@@ -1,0 +1,46 @@
+//! Maps of noise of many realisations, which share everything but their right-hand sides.
+
+use super::conjugate_gradients::System;
+use super::error::SolveError;
+use super::harmonic::{HarmonicRequest, W_MAX_TOLERANCE, lifted};
+use super::lanczos::largest_eigenvalue_from;
+use super::tikhonov::check_request;
+use super::watch::NamedWatch;
+use crate::accumulation::NormalSums;
+use crate::accumulation::harmonic::{HarmonicSums, coefficients};
+use crate::sky::harmonics::synthesis;
+
+/// The noise-only maps, K, of the further realisations that the sums hold ([`HarmonicSums::further_noises`]): each as
+/// [`crate::solve::solve_harmonics`] makes it of sums with that realisation as their companion.
+///
+/// # Errors
+/// No data; [`SolveError::Interrupted`].
+pub fn solve_noises(
+    sums: &HarmonicSums,
+    request: HarmonicRequest,
+    watch: NamedWatch<'_>,
+) -> Result<Vec<Vec<f64>>, SolveError> {
+    check_request(sums, request.epsilon)?;
+    let blocks = sums.order_blocks();
+    let w_max = {
+        let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
+        let start = lifted(&blocks, sums.unknowns());
+        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |step, change| task.report(step, change))
+            .value
+    };
+    let regularisation = request.epsilon * w_max;
+    let factors = blocks.factors(regularisation);
+    drop(blocks);
+    let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
+    let l_max = sums.setup().l_max;
+    let map = |right: &Vec<f64>| {
+        let mut solved = vec![0.0; sums.unknowns()];
+        let task = watch.start("noise map", request.rule.residual_max);
+        system.solve(right, &mut solved, request.rule, &task);
+        if !watch.goes_on() {
+            return Err(SolveError::Interrupted);
+        }
+        Ok(synthesis(&coefficients(&solved, l_max), request.nside)?)
+    };
+    sums.further_noises().iter().map(map).collect()
+}
