@@ -336,6 +336,7 @@ fn replay(bytes: &[u8], sent: u64) {
         let calibration = CalibrationConfig::default();
         let ground = Ground::new(&GroundConfig {
             calibration,
+            calibrate: Default::default(),
             map,
             wait_bytes: WAIT_BYTES,
             memory_max_bytes: None,

@@ -1,5 +1,6 @@
 //! Calibration of a downlink: solutions pass by pass from a known signal, in turn with the map if asked for.
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -8,14 +9,14 @@ use super::calibrate_products::{create, write, write_json};
 use super::config::Config;
 use super::error::PipelineError;
 use super::run::{lock_folder, replay};
-use crate::array::{Ephemeris, orbit_normal_hat};
+use crate::array::Ephemeris;
 use crate::calibration::solver::{
-    CalibrationMode, GainState, InstrumentEvent, KnownSignal, ModelledBlock, Offsets, PassData, PassSolution,
-    SolverConfig, gains_file, instrument_events, solve_pass,
+    CalibrationMode, GainState, InstrumentEvent, PassBlocks, PassSolution, PassSolver, SolverConfig,
+    gains_file, instrument_events,
 };
-use crate::calibration::{CalibrationHook, GainsFile, VanVleck};
+use crate::calibration::{CalibrationHook, GainsFile, SolvedGains, VanVleck};
 use crate::downlink::{DownlinkReader, FileSource};
-use crate::frames::{Flags, GroundFrame, Instrument, PlacedVisibilities, VisibilityBlock};
+use crate::frames::{GroundFrame, Instrument, VisibilityBlock};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::runtime::Cancel;
 use crate::sky::SkyMap;
@@ -24,8 +25,11 @@ use crate::sky::harmonics::AnalysisOptions;
 use crate::sky::spectra::auto_cl;
 use crate::units::InvalidValue;
 
-/// Time between the two positions that give an orbit's plane, s.
-const NORMAL_S: f64 = 60.0;
+/// Most events that are printed.
+const EVENTS_SHOWN: usize = 20;
+
+/// What names the maps of the known sky.
+const MODEL: &str = "--model";
 
 /// A downlink to be calibrated.
 pub struct CalibrateJob<'a> {
@@ -108,6 +112,31 @@ pub struct CalibrateSummary {
     pub cancelled: bool,
 }
 
+impl fmt::Display for CalibrateSummary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [bad, all] = self.gains_not_good;
+        write!(
+            f,
+            "{} passes: {} solutions, {} of them converged; {} visibilities, {} outliers, {} unused, {} late; {bad} of {all} gains \
+             are not good",
+            self.passes,
+            self.solutions,
+            self.converged,
+            self.visibilities,
+            self.outliers,
+            self.unused,
+            self.late,
+        )?;
+        for event in self.events.iter().take(EVENTS_SHOWN) {
+            write!(f, "\nevent: {event}")?;
+        }
+        match self.events.len().saturating_sub(EVENTS_SHOWN) {
+            0 => Ok(()),
+            more => write!(f, "\nand {more} more events, in solutions.json"),
+        }
+    }
+}
+
 /// Finds the gains of every pass, and writes them: `gains.json` for a replay, `solutions.csv`, `solutions.json` and
 /// `solutions.png`. Nothing of it is there before all of it is known, so a repetition after an interruption gives the same.
 ///
@@ -118,15 +147,12 @@ pub fn calibrate(job: CalibrateJob<'_>, cancel: &Cancel) -> Result<CalibrateSumm
     let solver = &config.calibrate;
     check(config, &models)?;
     let _lock = lock_folder(out)?;
-    let first = match (solver.mode, models.is_empty()) {
-        (CalibrationMode::Joint, true) => SolverConfig { mode: CalibrationMode::Beacon, ..solver.clone() },
-        _ => solver.clone(),
-    };
+    let first = SolverConfig { mode: solver.known_signal(!models.is_empty()), ..solver.clone() };
     let van_vleck = config.calibration.van_vleck()?;
     let bytes = files.iter().map(|file| std::fs::metadata(file).map_or(0, |file| file.len())).sum::<u64>();
     let last_round = solver.map_rounds;
     let solve = |round: u32, solver: &SolverConfig, maps: &[SkyMap], watch: CalibrateWatcher<'_>| {
-        let passes = Passes { solver, files, maps, van_vleck: van_vleck.as_ref(), cancel };
+        let passes = Passes { solver, files, maps, model_key: MODEL, van_vleck: van_vleck.as_ref(), cancel };
         passes.solve(&mut |passes, read_bytes| {
             let read = read_bytes as f64 / bytes.max(1) as f64;
             watch(CalibrateProgress { round, last_round, passes: Some(passes), read });
@@ -179,7 +205,7 @@ fn check(config: &Config, models: &[SkyMap]) -> Result<(), PipelineError> {
             "1: gains are of channels as they are sent",
         ));
     }
-    if calibration.hook != CalibrationHook::Identity {
+    if calibration.hook == CalibrationHook::AntennaGains {
         return Err(invalid(
             "calibration.hook",
             "\"antenna-gains\"",
@@ -189,7 +215,7 @@ fn check(config: &Config, models: &[SkyMap]) -> Result<(), PipelineError> {
     let needs_sky = solver.mode == CalibrationMode::Sky;
     if needs_sky && models.is_empty() {
         let expected = "maps of the sky, one a channel, or calibrate.mode = \"beacon\" or \"joint\"";
-        return Err(invalid("--model", "(none)", expected));
+        return Err(invalid(MODEL, "(none)", expected));
     }
     if solver.mode == CalibrationMode::Beacon && solver.map_rounds > 0 {
         let expected = "0 with calibrate.mode = \"beacon\", which uses no map";
@@ -203,6 +229,7 @@ struct Passes<'a> {
     solver: &'a SolverConfig,
     files: &'a [PathBuf],
     maps: &'a [SkyMap],
+    model_key: &'static str,
     van_vleck: Option<&'a VanVleck>,
     cancel: &'a Cancel,
 }
@@ -229,7 +256,7 @@ impl Passes<'_> {
     fn solve(&self, watch: &mut dyn FnMut(u64, u64)) -> Result<FoundSolutions, PipelineError> {
         let mut found = FoundSolutions::default();
         let mut ephemeris = Ephemeris::default();
-        let mut signal: Option<KnownSignal> = None;
+        let mut solver = PassSolver::new(self.solver, self.van_vleck.cloned(), self.maps.to_vec());
         let mut open = OpenPass::default();
         let mut bytes_before = 0;
         for file in self.files {
@@ -240,7 +267,7 @@ impl Passes<'_> {
                 }
                 match frame {
                     GroundFrame::Instrument(instrument) if found.instrument.is_none() => {
-                        signal = Some(self.signal(&instrument)?);
+                        solver.describe(&instrument, self.model_key)?;
                         found.instrument = Some(instrument);
                     }
                     GroundFrame::Ephemeris(segment) => {
@@ -253,7 +280,7 @@ impl Passes<'_> {
                         match open.span_s {
                             Some([_, until_s]) if of[0] > until_s + gap_s => {
                                 let pass = std::mem::take(&mut open);
-                                self.close(pass, &ephemeris, &mut signal, &mut found)?;
+                                found.close(pass, &mut solver, &ephemeris)?;
                                 watch(found.passes, bytes_before + reader.bytes());
                             }
                             Some([from_s, _]) if of[1] < from_s - gap_s => {
@@ -271,153 +298,53 @@ impl Passes<'_> {
             }
             bytes_before += reader.bytes();
         }
-        self.close(open, &ephemeris, &mut signal, &mut found)?;
+        found.close(open, &mut solver, &ephemeris)?;
         if found.instrument.is_none() {
             let names: Vec<String> = self.files.iter().map(|file| file.display().to_string()).collect();
             return Err(invalid("downlink", names.join(", "), "files with a description of the instrument"));
         }
         Ok(found)
     }
-
-    fn signal(&self, instrument: &Instrument) -> Result<KnownSignal, PipelineError> {
-        let (maps, channels) = (self.maps.len(), instrument.channels.len());
-        if maps != 0 && maps != channels {
-            return Err(invalid(
-                "--model",
-                format!("({maps} maps)"),
-                format!("{channels}: one a channel of the downlink"),
-            ));
-        }
-        let reference = self.solver.reference_daughter;
-        if reference > u32::from(instrument.satellites) {
-            let expected = format!("1 to {}, the daughters of the downlink", instrument.satellites);
-            return Err(invalid("calibrate.reference_daughter", reference, expected));
-        }
-        Ok(KnownSignal::new(self.solver, instrument, self.maps)?)
-    }
-
-    /// Solves a pass.
-    fn close(
-        &self,
-        pass: OpenPass,
-        ephemeris: &Ephemeris,
-        signal: &mut Option<KnownSignal>,
-        found: &mut FoundSolutions,
-    ) -> Result<(), PipelineError> {
-        let (Some([from_s, until_s]), Some(signal)) = (pass.span_s, signal.as_mut()) else { return Ok(()) };
-        let Some(instrument) = &found.instrument else { return Ok(()) };
-        let all: usize = pass.blocks.iter().map(VisibilityBlock::len).sum();
-        let placed = self.placed(pass.blocks, ephemeris, instrument);
-        let used: usize = placed.iter().map(|(placed, _)| placed.len()).sum();
-        found.unused += (all - used) as u64;
-        let number = found.passes;
-        found.passes += 1;
-        let middle_s = 0.5 * (from_s + until_s);
-        let normal = |n: usize| {
-            let [before, after] =
-                [-0.5, 0.5].map(|part| ephemeris.position_at(middle_s + part * NORMAL_S, n));
-            orbit_normal_hat(before?, after?)
-        };
-        let normals: Option<Vec<_>> = (0..usize::from(instrument.satellites)).map(normal).collect();
-        let Some(normal_hat) = normals else {
-            found.unused += used as u64;
-            return Ok(());
-        };
-        let frequencies: Vec<f64> = instrument.channels.iter().map(|channel| channel.frequency_hz).collect();
-        let parts = self.solver.solutions_per_pass;
-        // The end belongs to the last part.
-        let step_s = (until_s - from_s) / f64::from(parts) * (1.0 + 1e-9) + 1e-6;
-        let spans = (0..parts).map(|k| {
-            let start_s = from_s + f64::from(k) * step_s;
-            [start_s, start_s + step_s]
-        });
-        let mut offsets =
-            Offsets { offset_m: vec![[0.0; 3]; normal_hat.len()], normal_hat: normal_hat.clone() };
-        let moves = self.solver.position_sigma_m > 0.0;
-        let mut solutions = Vec::new();
-        for _ in 0..if moves { self.solver.position_rounds } else { 1 } {
-            let mut blocks = modelled(&placed, signal, &offsets)?;
-            let solve = |span_s: [f64; 2]| {
-                let normal_hat = normal_hat.clone();
-                solve_pass(
-                    self.solver,
-                    &frequencies,
-                    PassData { pass: number, span_s, blocks: &mut blocks, normal_hat },
-                )
-            };
-            solutions = spans.clone().map(solve).collect();
-            let [solution] = &solutions[..] else { break };
-            let now: Vec<[f64; 3]> = solution.daughters.iter().map(|daughter| daughter.position_m).collect();
-            let sigma = |n: usize, axis: usize| solution.daughters[n].position_sigma_m[axis];
-            let apart = |(n, (now, before)): (usize, (&[f64; 3], &[f64; 3]))| {
-                (0..3).any(|axis| (now[axis] - before[axis]).abs() > 0.1 * sigma(n, axis))
-            };
-            let moved = now.iter().zip(&offsets.offset_m).enumerate().any(apart);
-            offsets.offset_m = now;
-            if !moved {
-                break;
-            }
-        }
-        let every = u64::from(self.solver.hold_out_every);
-        let is_held_out = every > 0 && number % every == every - 1;
-        found
-            .solutions
-            .extend(solutions.into_iter().map(|solution| PassSolution { is_held_out, ..solution }));
-        Ok(())
-    }
-
-    /// Visibilities with positions, and whether the artificial signal is on in them.
-    fn placed(
-        &self,
-        blocks: Vec<VisibilityBlock>,
-        ephemeris: &Ephemeris,
-        instrument: &Instrument,
-    ) -> Vec<(PlacedVisibilities, bool)> {
-        let with = |mut block: VisibilityBlock, is_on: bool| {
-            let channel = instrument.channel_of(block.channel, block.pair)?;
-            for flags in &mut block.flags {
-                let fits = *flags == if is_on { Flags::BEACON } else { Flags::GOOD };
-                *flags = if fits { Flags::GOOD } else { Flags::UNCALIBRATED };
-            }
-            if let Some(van_vleck) = self.van_vleck {
-                van_vleck.apply(&mut block, channel.width_hz);
-            }
-            let (placed, _) = ephemeris.place(&block, channel.frequency_hz);
-            (!placed.is_empty()).then_some((placed, is_on))
-        };
-        let mode = self.solver.mode;
-        blocks
-            .into_iter()
-            .flat_map(|block| {
-                let on = (mode != CalibrationMode::Sky).then(|| with(block.clone(), true)).flatten();
-                let off = (mode != CalibrationMode::Beacon).then(|| with(block, false)).flatten();
-                [on, off]
-            })
-            .flatten()
-            .collect()
-    }
-}
-
-fn modelled(
-    placed: &[(PlacedVisibilities, bool)],
-    signal: &mut KnownSignal,
-    offsets: &Offsets,
-) -> Result<Vec<ModelledBlock>, PipelineError> {
-    let block = |(placed, is_on): &(PlacedVisibilities, bool)| {
-        Ok(ModelledBlock {
-            channel: placed.channel.0.into(),
-            pair: placed.pair,
-            time_s: placed.time_s.clone(),
-            value_k_sr: placed.value_k_sr.clone(),
-            weight: placed.weight.clone(),
-            model: signal.model(placed, offsets, *is_on)?,
-            is_out: vec![false; placed.len()],
-        })
-    };
-    placed.iter().map(block).collect()
 }
 
 impl FoundSolutions {
+    /// What a ground has found so far.
+    pub(super) fn of(gains: &SolvedGains) -> Self {
+        let passes = gains.passes();
+        Self {
+            instrument: gains.instrument(),
+            passes: passes.len() as u64,
+            unused: passes.iter().map(|pass| pass.unused).sum(),
+            late: gains.late(),
+            solutions: passes.into_iter().flat_map(|pass| pass.solutions).collect(),
+        }
+    }
+
+    /// The summary of solutions with the given maps, or without.
+    pub(super) fn of_one_round(&self, solver: &SolverConfig, has_maps: bool) -> CalibrateSummary {
+        let mut summary = self.summary(solver);
+        summary.rounds = vec![self.round(0, solver.known_signal(has_maps), None, Vec::new())];
+        summary
+    }
+
+    /// Solves a pass that has ended.
+    fn close(
+        &mut self,
+        pass: OpenPass,
+        solver: &mut PassSolver,
+        ephemeris: &Ephemeris,
+    ) -> Result<(), PipelineError> {
+        let OpenPass { blocks, span_s: Some(span_s) } = pass else { return Ok(()) };
+        if self.instrument.is_none() {
+            return Ok(());
+        }
+        let solved = solver.solve(PassBlocks { number: self.passes, span_s, blocks }, ephemeris)?;
+        self.passes += 1;
+        self.unused += solved.unused;
+        self.solutions.extend(solved.solutions);
+        Ok(())
+    }
+
     /// The file of gains; `None` without solutions.
     pub(super) fn gains(&self, without_held_out: bool) -> Option<GainsFile> {
         let instrument = self.instrument.as_ref()?;
@@ -495,7 +422,8 @@ fn change_rms(before: &[PassSolution], after: &[PassSolution]) -> f64 {
 }
 
 /// `config` with the gains of a file.
-pub(super) fn with_gains(config: &Config, gains: PathBuf) -> Config {
+#[must_use]
+pub fn with_gains(config: &Config, gains: PathBuf) -> Config {
     let mut config = config.clone();
     config.calibration.hook = CalibrationHook::AntennaGains;
     config.calibration.gains_file = Some(gains);

@@ -15,6 +15,7 @@ pub(crate) mod error;
 mod file_problems;
 mod ground_segment;
 mod groups;
+mod live_gains;
 mod memory;
 pub(crate) mod models;
 mod notes;
@@ -35,6 +36,7 @@ mod summary;
 
 pub use calibrate::{
     CalibrateJob, CalibrateProgress, CalibrateRound, CalibrateSummary, CalibrateWatcher, calibrate,
+    with_gains,
 };
 pub use config::Config;
 pub use config_reader::ReadProblem;

@@ -13,6 +13,7 @@ mod figures;
 mod groups;
 mod harmonic;
 mod instrument;
+mod live_gains;
 mod orbits;
 mod outputs;
 mod paper;

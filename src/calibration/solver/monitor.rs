@@ -9,6 +9,7 @@
 //! | burst | outliers at one time, of most pairs and channels |
 
 use std::f64::consts::{PI, TAU};
+use std::fmt;
 
 use serde::Serialize;
 
@@ -74,6 +75,50 @@ pub enum InstrumentEvent {
         /// End, s.
         until_s: f64,
     },
+}
+
+impl InstrumentEvent {
+    /// The pass of it, or after it.
+    #[must_use]
+    pub fn pass(&self) -> u64 {
+        match self {
+            Self::ClockJump { pass, .. }
+            | Self::PhaseStep { pass, .. }
+            | Self::GainStep { pass, .. }
+            | Self::Interference { pass, .. }
+            | Self::Burst { pass, .. } => *pass,
+        }
+    }
+}
+
+impl fmt::Display for InstrumentEvent {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let list = |channels: &[(usize, f64)], unit: &str| {
+            let each =
+                channels.iter().map(|(channel, value)| format!("{value:.4}{unit} in channel {channel}"));
+            each.collect::<Vec<_>>().join(", ")
+        };
+        match self {
+            Self::ClockJump { pass, daughter, change_ns } => {
+                write!(f, "pass {pass}: the clock of daughter {daughter} jumped by {change_ns:.3} ns")
+            }
+            Self::PhaseStep { pass, daughter, channels } => {
+                write!(f, "pass {pass}: phases of daughter {daughter} changed by {}", list(channels, " deg"))
+            }
+            Self::GainStep { pass, daughter, channels } => {
+                let factors = list(channels, "");
+                write!(f, "pass {pass}: amplitudes of daughter {daughter} changed by factors of {factors}")
+            }
+            Self::Interference { pass, channel, outliers } => write!(
+                f,
+                "pass {pass}: interference in channel {channel}, {:.1} % of its visibilities are outliers",
+                100.0 * outliers
+            ),
+            Self::Burst { pass, from_s, until_s } => {
+                write!(f, "pass {pass}: a burst in all channels from {from_s:.1} s to {until_s:.1} s")
+            }
+        }
+    }
 }
 
 /// Changes of a daughter from one solution to the next, by channel.
