@@ -283,7 +283,8 @@ impl Stage for Door {
         self.collector.push(&bytes);
         loop {
             let ephemeris = self.calibrator.ephemeris();
-            let Some(delivery) = self.collector.next_delivery(&|span| ephemeris.covers(span))? else {
+            let Some(delivery) = self.collector.next_delivery(&|outline| ephemeris.covers(outline.span))?
+            else {
                 return Ok(());
             };
             if let Some(frame) = delivery.frame {

@@ -543,7 +543,9 @@ fn better_gains_replace_those_of_a_state_exactly() {
         let mut reader = DownlinkReader::open(Path::new(&alone)).unwrap();
         while let Some(frame) = reader.next_frame().unwrap() {
             if matches!(&frame, GroundFrame::Visibilities(block)
-                if !block.is_empty() && (span_s[0] - 60.0..span_s[1] + 60.0).contains(&block.middle_s(0)))
+                if !block.is_empty()
+                    && block.middle_s(block.len() - 1) > span_s[0] - 60.0
+                    && block.middle_s(0) < span_s[1] + 60.0)
             {
                 pass.push(packet.clone());
             }
