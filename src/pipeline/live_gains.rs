@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use super::calibrate::{CalibrateSummary, FoundSolutions};
 use super::calibrate_products::write;
 use super::config::Config;
 use super::error::PipelineError;
+use super::found_solutions::{CalibrateSummary, FoundSolutions};
 use crate::calibration::SolvedGains;
 use crate::calibration::solver::SolverConfig;
 

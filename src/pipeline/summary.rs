@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
 use serde::{Deserialize, Serialize};
 
-use super::calibrate::CalibrateSummary;
 use super::config::Config;
+use super::found_solutions::CalibrateSummary;
 use super::ground_segment::SOLVE;
 use super::sample_summary::SampleSummary;
 use crate::calibration::Completeness;
