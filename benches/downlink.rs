@@ -283,7 +283,8 @@ impl Stage for Door {
         self.collector.push(&bytes);
         loop {
             let ephemeris = self.calibrator.ephemeris();
-            let Some(delivery) = self.collector.next_delivery(&|span| ephemeris.covers(span))? else {
+            let Some(delivery) = self.collector.next_delivery(&|outline| ephemeris.covers(outline.span))?
+            else {
                 return Ok(());
             };
             if let Some(frame) = delivery.frame {
@@ -336,6 +337,7 @@ fn replay(bytes: &[u8], sent: u64) {
         let calibration = CalibrationConfig::default();
         let ground = Ground::new(&GroundConfig {
             calibration,
+            calibrate: Default::default(),
             map,
             wait_bytes: WAIT_BYTES,
             memory_max_bytes: None,

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{AntennaGains, Calibration, CalibrationError, Identity, SubBands, VanVleck};
+use super::{AntennaGains, Calibration, CalibrationError, Identity, SolvedGains, SubBands, VanVleck};
 use crate::units::{Checks, InvalidValue};
 
 /// Most sub-bands of a channel.
@@ -22,6 +22,8 @@ pub enum CalibrationHook {
     Identity,
     /// Complex gains of every antenna, from a file.
     AntennaGains,
+    /// Gains that are found from the data, pass by pass, by the settings of `[calibrate]`.
+    Solve,
 }
 
 /// The `[calibration]` section.
@@ -60,9 +62,14 @@ impl CalibrationConfig {
         );
         let sub_bands = self.sub_bands;
         checks.require("sub_bands", sub_bands, (1..=SUB_BANDS_MAX).contains(&sub_bands), "1 to 64");
+        let single = self.hook != CalibrationHook::Solve || sub_bands == 1;
+        let expected = "1 with hook = \"solve\": gains are of channels as they are sent";
+        checks.require("sub_bands", sub_bands, single, expected);
         let expected = match (self.hook, &self.gains_file) {
             (CalibrationHook::AntennaGains, None) => "the path of a file, for hook = \"antenna-gains\"",
-            (CalibrationHook::Identity, Some(_)) => "no such key, or hook = \"antenna-gains\"",
+            (CalibrationHook::Identity | CalibrationHook::Solve, Some(_)) => {
+                "no such key, or hook = \"antenna-gains\""
+            }
             _ => return checks.finish(),
         };
         let value = self.gains_file.as_ref().map_or("(missing)".to_owned(), |path| format!("{path:?}"));
@@ -88,7 +95,8 @@ impl CalibrationConfig {
         })
     }
 
-    /// The calibration; `folder` is that of the configuration.
+    /// The calibration; `folder` is that of the configuration. Gains that are to be found are not known: what applies them is a
+    /// ground with [`SolvedGains`].
     ///
     /// # Errors
     /// The first of [`CalibrationConfig::problems`], or an invalid gains file.
@@ -103,6 +111,7 @@ impl CalibrationConfig {
                 let file = self.gains_file.as_deref().unwrap_or(Path::new(""));
                 Box::new(AntennaGains::read(&folder.join(file))?)
             }
+            CalibrationHook::Solve => Box::new(SolvedGains::default()),
         };
         Ok(match self.sub_bands {
             1 => calibration,

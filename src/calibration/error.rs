@@ -67,6 +67,15 @@ pub enum CalibrationError {
         /// Channels of the downlink.
         channels: usize,
     },
+    /// A map of the known sky that cannot be read.
+    #[error(transparent)]
+    ModelFile(#[from] crate::sky::fits::FitsError),
+    /// A map of the known sky that cannot be used.
+    #[error("map of calibrate.model_files or --model: {0}")]
+    ModelMap(#[from] crate::sky::MapError),
+    /// Positions that the model of the known sky does not cover.
+    #[error(transparent)]
+    Model(#[from] crate::response::model::ModelError),
     /// A satellite without gains.
     #[error("no gains for pair {pair}: the gains file has {satellites} satellites; is it for this array?")]
     Satellite {

@@ -112,6 +112,27 @@ impl AntennaGains {
         }
     }
 
+    /// Whether it corrects positions anywhere.
+    #[must_use]
+    pub fn moves(&self) -> bool {
+        !self.positions.is_empty()
+    }
+
+    /// Whether it does to visibilities of a pair between two times (s) exactly what `other` does; it may say no where
+    /// nothing differs.
+    #[must_use]
+    pub fn does_as(&self, other: &Self, frequency_hz: f64, pair: Pair, span_s: [f64; 2]) -> bool {
+        let tables = (self.table(frequency_hz, pair), other.table(frequency_hz, pair));
+        let (Ok(ours), Ok(theirs)) = tables else { return false };
+        self.interpolation == other.interpolation
+            && ours.rows(self.satellites, pair, span_s).eq(theirs.rows(other.satellites, pair, span_s))
+            && self.moves_within(span_s).eq(other.moves_within(span_s))
+    }
+
+    fn moves_within(&self, [from_s, until_s]: [f64; 2]) -> impl Iterator<Item = &PositionSolution> {
+        self.positions.iter().filter(move |position| position.from_s <= until_s && position.until_s >= from_s)
+    }
+
     /// The table for a channel, after checking that it has both satellites.
     fn table(&self, frequency_hz: f64, pair: Pair) -> Result<&ChannelTable, CalibrationError> {
         if usize::from(pair.i.max(pair.j)) >= self.satellites {
@@ -135,6 +156,19 @@ impl ChannelTable {
         let satellites = gain.len() / time_s.len().max(1);
         let log_step = gain.iter().zip(gain.iter().skip(satellites)).map(|(g_0, g_1)| (g_1 / g_0).ln());
         Self { frequency_hz, time_s, log_step: log_step.collect(), gain }
+    }
+
+    /// Times and gains of a pair that matter between two times.
+    fn rows(
+        &self,
+        satellites: usize,
+        pair: Pair,
+        [from_s, until_s]: [f64; 2],
+    ) -> impl Iterator<Item = (f64, Complex64, Complex64)> {
+        let later = |time_s: f64| self.time_s.partition_point(|&t| t <= time_s);
+        let rows = later(from_s).saturating_sub(1)..(later(until_s) + 1).min(self.time_s.len());
+        let gain = move |row: usize, n: u8| self.gain[row * satellites + usize::from(n)];
+        rows.map(move |row| (self.time_s[row], gain(row, pair.i), gain(row, pair.j)))
     }
 
     fn factor(&self, interpolation: Interpolation, satellites: usize, pair: Pair, time_s: f64) -> Complex64 {
@@ -188,19 +222,10 @@ impl Calibration for AntennaGains {
             block.r_j_m[kept] = block.r_j_m[k];
             kept += 1;
         }
-        truncate(block, kept);
+        block.truncate(kept);
         self.correct_positions(block);
         Ok(CalibrationReport { kept, unusable_gain: count - kept })
     }
-}
-
-fn truncate(block: &mut PlacedVisibilities, len: usize) {
-    let PlacedVisibilities { time_s, r_i_m, r_j_m, value_k_sr, weight, .. } = block;
-    time_s.truncate(len);
-    r_i_m.truncate(len);
-    r_j_m.truncate(len);
-    value_k_sr.truncate(len);
-    weight.truncate(len);
 }
 
 #[cfg(test)]

@@ -3,7 +3,8 @@
 //! The [`Calibrator`] gives visibilities their positions and applies corrections in order: [`VanVleck`] undoes the effect
 //! of coarse quantisers on correlations; a [`Calibration`] turns them into what ideal antennas would have measured
 //! ([`Identity`] changes nothing, [`AntennaGains`] divides by complex gains from a file, and corrects positions); [`SubBands`] combines sub-bands
-//! of a channel. [`CalibrationConfig`] chooses. The [`solver`] finds the gains of such a file from the data.
+//! of a channel. [`CalibrationConfig`] chooses. The [`solver`] finds the gains of such a file from the data;
+//! [`SolvedGains`] are those that a ground finds while the data arrive.
 //!
 //! Uses [`crate::frames`] and [`crate::array`]. Every block is used once; every visibility that is left out is in the
 //! ledger with its reason.
@@ -14,6 +15,7 @@ mod config;
 mod error;
 mod gains;
 mod gains_file;
+mod solved;
 pub mod solver;
 mod stage;
 mod sub_bands;
@@ -25,6 +27,7 @@ pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 pub use gains::AntennaGains;
 pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation, PositionSolution};
+pub use solved::{ClosedPass, SolvedGains};
 pub use stage::Calibrator;
 pub use sub_bands::SubBands;
 pub use van_vleck::{QuantiserBitsError, VanVleck};

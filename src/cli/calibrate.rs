@@ -25,7 +25,7 @@ pub(super) struct CalibrateArgs {
     /// Downlink files in the order of time.
     #[arg(required = true, value_name = "FILE", value_parser = input_path())]
     files: Vec<PathBuf>,
-    /// HEALPix map of the sky in K; one a channel of the downlink, in their order.
+    /// HEALPix map of the sky in K; one a channel of the downlink, in their order; calibrate.model_files if not given.
     #[arg(long, value_name = "MAP.fits", num_args = 1..)]
     model: Vec<PathBuf>,
     /// Map file (TOML): settings of the ground segment; the defaults of pipelines/reference.toml if not given.
@@ -49,7 +49,10 @@ pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
     let config = source.load_ground()?;
     use_threads(&config.runtime)?;
     let options = args.maps.options();
-    let models = args.model.iter().map(|path| read_whole_map(path, &options)).collect::<Result<_, _>>()?;
+    let models = match args.model.is_empty() {
+        true => config.calibrate.models()?,
+        false => args.model.iter().map(|path| read_whole_map(path, &options)).collect::<Result<_, _>>()?,
+    };
     let interrupt = Interrupt::default();
     interrupt.arm_or_note();
     let mut lines = CalibrateLines::new();
@@ -70,18 +73,7 @@ pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
 }
 
 fn told(summary: &CalibrateSummary, args: &CalibrateArgs) -> String {
-    let [bad, all] = summary.gains_not_good;
-    let mut lines = vec![format!(
-        "{} passes: {} solutions, {} of them converged; {} visibilities, {} outliers, {} unused, {} late; {bad} of {all} gains \
-         are not good",
-        summary.passes,
-        summary.solutions,
-        summary.converged,
-        summary.visibilities,
-        summary.outliers,
-        summary.unused,
-        summary.late,
-    )];
+    let mut lines = vec![summary.to_string()];
     for round in &summary.rounds {
         let number = |value: Option<f64>| value.map_or_else(|| "-".to_owned(), |value| format!("{value:.4}"));
         lines.push(format!(
@@ -99,13 +91,6 @@ fn told(summary: &CalibrateSummary, args: &CalibrateArgs) -> String {
             channel,
             sigmas.join(", ")
         ));
-    }
-    const SHOWN: usize = 20;
-    for event in summary.events.iter().take(SHOWN) {
-        lines.push(format!("event: {event:?}"));
-    }
-    if summary.events.len() > SHOWN {
-        lines.push(format!("and {} more events, in solutions.json", summary.events.len() - SHOWN));
     }
     match summary.cancelled {
         true => lines.push("Ended early: nothing is written".to_owned()),

@@ -14,6 +14,7 @@ use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 use serde::Serialize;
 
 use super::output::{CommandError, json_text, print_notes};
+use crate::calibration::solver::InstrumentEvent;
 use crate::downlink::ReceptionCounters;
 use crate::frames::VisibilityReason;
 use crate::ground::SavingReport;
@@ -124,6 +125,10 @@ enum Entry<'a> {
     },
     StageEnded {
         stage: &'a str,
+    },
+    /// Something happened to the instrument.
+    Instrument {
+        what: InstrumentEvent,
     },
     End(&'a End),
 }
@@ -277,6 +282,7 @@ impl Lines {
 struct Told {
     ended: Vec<bool>,
     saving: SavingReport,
+    instrument: usize,
 }
 
 /// Writes until the end, or until nobody reads.
@@ -337,6 +343,11 @@ fn progress(
             lines.write(Entry::Checkpoint { saving: saving.clone() })?;
         }
         told.saving = saving;
+    }
+    let gains = ground.and_then(|ground| ground.gains.as_ref());
+    for what in gains.map(|gains| gains.events_since(told.instrument)).unwrap_or_default() {
+        lines.write(Entry::Instrument { what })?;
+        told.instrument += 1;
     }
     lines.write(counts_of(watched, &stages, untold.load(Ordering::Relaxed)))
 }

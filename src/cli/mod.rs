@@ -27,6 +27,7 @@ mod notify;
 mod output;
 mod predict;
 mod progress;
+mod recalibrate;
 mod replay;
 mod retract;
 mod run;
@@ -93,6 +94,7 @@ enum Command {
     Export(export::ExportArgs),
     Gaps(gaps::GapsArgs),
     Merge(merge::MergeArgs),
+    Recalibrate(recalibrate::RecalibrateArgs),
     Retract(retract::RetractArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
@@ -159,6 +161,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Export(args) => export::execute(&args),
         Command::Gaps(args) => gaps::execute(&args),
         Command::Merge(args) => merge::execute(&args),
+        Command::Recalibrate(args) => recalibrate::execute(&args),
         Command::Retract(args) => retract::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),

@@ -65,6 +65,7 @@ impl Progress {
                     say("interrupted", &Value::Null, INTERRUPTED);
                     is_told = true;
                 }
+                shown.tell_events(&watched);
                 if is_over {
                     break;
                 }
@@ -224,6 +225,8 @@ struct ProgressView {
     /// Bytes received from all senders at the last refresh, and its time.
     received: (u64, Instant),
     since: Instant,
+    /// Events of the instrument that were told.
+    events_told: usize,
     /// The solution being shown: its number, when it was first shown, and its residual then.
     solution: Option<(u64, Instant, f64)>,
 }
@@ -240,7 +243,7 @@ impl ProgressView {
             ProgressBar::new(total).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
         });
         let now = Instant::now();
-        Self { bar, total, received: (0, now), since: now, solution: None }
+        Self { bar, total, received: (0, now), since: now, events_told: 0, solution: None }
     }
 
     /// The state of the solver, with the time left if the residual keeps falling at the same rate.
@@ -271,6 +274,15 @@ impl ProgressView {
             1e-6 * rate,
             1e-6 * status.backlog_bytes() as f64
         )
+    }
+
+    /// Says what happened to the instrument, as it happens.
+    fn tell_events(&mut self, watched: &Watched) {
+        let gains = watched.ground.as_ref().and_then(|ground| ground.gains.as_ref());
+        for event in gains.map(|gains| gains.events_since(self.events_told)).unwrap_or_default() {
+            say("instrument", &json!({ "what": event }), &event);
+            self.events_told += 1;
+        }
     }
 
     fn show(&mut self, watched: &Watched, stage: &str) {

@@ -22,6 +22,7 @@ use super::output::{
 };
 use super::progress::{Parts, Progress, time_left};
 use super::serving::{Page, ServeArgs};
+use crate::calibration::CalibrationHook;
 use crate::downlink::transport::socket::{
     HeldAnswers, ListenNote, SocketError, SocketSource, Stations, TcpUrl, Until,
 };
@@ -184,6 +185,8 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
         return in_groups(args, &config, size);
     }
     let wait_bytes = match (&args.state, &args.listen) {
+        // A pass waits until its gains are known.
+        _ if config.calibration.hook == CalibrationHook::Solve => WAIT_BYTES,
         (None, Some(_)) => WAIT_BYTES_LIVE,
         _ => WAIT_BYTES,
     };

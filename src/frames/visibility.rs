@@ -123,4 +123,14 @@ impl PlacedVisibilities {
     pub fn is_empty(&self) -> bool {
         self.time_s.is_empty()
     }
+
+    /// Keeps the first `len` visibilities.
+    pub fn truncate(&mut self, len: usize) {
+        let Self { time_s, r_i_m, r_j_m, value_k_sr, weight, .. } = self;
+        time_s.truncate(len);
+        r_i_m.truncate(len);
+        r_j_m.truncate(len);
+        value_k_sr.truncate(len);
+        weight.truncate(len);
+    }
 }

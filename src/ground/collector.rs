@@ -5,16 +5,15 @@ use std::path::Path;
 
 use bincode::{Decode, Encode};
 
-use super::hold_buffer::{HeldPacket, HoldBuffer, Sent};
+use super::hold_buffer::{Due, HeldPacket, HoldBuffer, Sent};
 use crate::downlink::error::{DownlinkError, require_packets};
 use crate::downlink::receive::{
     ByteFeed, Decoder, DecoderState, Event, Intake, PacketInsertion, PacketReading, ReceivedSet,
     ReceptionCounters,
 };
-use crate::downlink::wire::payload::visibilities_span;
+use crate::downlink::wire::payload::visibilities_outline;
 use crate::downlink::wire::{Kind, PacketHeader, PacketSegment};
 use crate::frames::{GroundFrame, Instrument, VisibilityBlock};
-use crate::units::MissionTime;
 
 /// What a checkpoint keeps of a collector: the packets it holds, and its instrument. Packets that were delivered are in
 /// the journal.
@@ -99,8 +98,18 @@ pub struct Delivery {
     pub frame: Option<GroundFrame>,
 }
 
-/// Whether positions are known over a span of time.
-pub type Placed<'a> = &'a dyn Fn([MissionTime; 2]) -> bool;
+/// What a collector did last.
+#[derive(Clone, Debug, PartialEq)]
+pub enum CollectorStep {
+    /// Packets are to be applied that have not waited.
+    Delivery(Delivery),
+    /// Packets are to be applied that were held.
+    Waited(Delivery),
+    /// A new packet of visibilities is held.
+    Held(PacketHeader),
+    /// It needs more bytes.
+    Nothing,
+}
 
 /// Takes bytes of a downlink as they arrive, and delivers what every packet says once: visibilities as soon as their
 /// positions are known, as far as the [`HoldBuffer`] reaches, everything else at once.
@@ -212,23 +221,49 @@ impl Collector {
     ///
     /// # Errors
     /// [`DownlinkError::OtherInstrument`].
-    pub fn next_delivery(&mut self, placed: Placed<'_>) -> Result<Option<Delivery>, DownlinkError> {
+    pub fn next_delivery(&mut self, is_due: Due<'_>) -> Result<Option<Delivery>, DownlinkError> {
+        loop {
+            match self.next_step(is_due)? {
+                CollectorStep::Delivery(found) | CollectorStep::Waited(found) => return Ok(Some(found)),
+                CollectorStep::Held(_) => {}
+                CollectorStep::Nothing => return Ok(None),
+            }
+        }
+    }
+
+    /// Goes on to the next delivery, or to the next packet of visibilities that has to wait.
+    ///
+    /// # Errors
+    /// [`DownlinkError::OtherInstrument`].
+    pub fn next_step(&mut self, is_due: Due<'_>) -> Result<CollectorStep, DownlinkError> {
         loop {
             if self.knows_instrument() {
-                if let Some(found) = self.next_due(placed) {
-                    return Ok(Some(found));
+                if let Some(found) = self.next_due(is_due) {
+                    return Ok(CollectorStep::Waited(found));
                 }
             } else {
                 self.drop_unreadable();
             }
-            match self.take_event(placed)? {
+            match self.take_event(is_due)? {
                 // Once for all positions of a piece of the stream: much may be held.
                 Handled::Nothing if self.reconsider() => {}
-                Handled::Nothing => return Ok(None),
+                Handled::Nothing => return Ok(CollectorStep::Nothing),
                 Handled::Event => {}
-                Handled::Delivery(found) => return Ok(Some(found)),
+                Handled::Held(header) => return Ok(CollectorStep::Held(header)),
+                Handled::Delivery(found) => return Ok(CollectorStep::Delivery(found)),
             }
         }
+    }
+
+    /// The next of the held packets that are due; takes nothing from the stream.
+    pub fn next_waiting(&mut self, is_due: Due<'_>) -> Option<Delivery> {
+        if self.knows_instrument() { self.next_due(is_due) } else { None }
+    }
+
+    /// All held packets may be due.
+    pub fn consider_held(&mut self) {
+        self.has_new_positions = true;
+        self.reconsider();
     }
 
     /// Delivers the next held packet, due or not. A checkpoint must be written before.
@@ -346,13 +381,13 @@ impl Collector {
     }
 
     /// The next held packets that are due; the instrument is known.
-    fn next_due(&mut self, placed: Placed<'_>) -> Option<Delivery> {
+    fn next_due(&mut self, is_due: Due<'_>) -> Option<Delivery> {
         loop {
             while let Some(header) = self.candidates.pop_front() {
                 let found = match header.kind {
                     // The next session considers all of them.
                     Kind::Visibilities if self.sets_aside => None,
-                    Kind::Visibilities => self.held.release(&header, placed).map(|packet| vec![packet]),
+                    Kind::Visibilities => self.held.release(&header, is_due).map(|packet| vec![packet]),
                     _ => self.held.take_payload(&header),
                 };
                 if let Some(packets) = found {
@@ -410,7 +445,7 @@ impl Collector {
     }
 
     /// Takes one event of the stream.
-    fn take_event(&mut self, placed: Placed<'_>) -> Result<Handled, DownlinkError> {
+    fn take_event(&mut self, is_due: Due<'_>) -> Result<Handled, DownlinkError> {
         let Some(event) = self.intake.next_event() else { return Ok(Handled::Nothing) };
         let Event::Packet(packet) = event else {
             self.link.accept(&event);
@@ -442,7 +477,7 @@ impl Collector {
         if header.kind == Kind::Visibilities
             && !(self.sets_aside && self.held.has_room(&header))
             && self.decoder.instrument().is_some()
-            && visibilities_span(packet.payload).is_none_or(placed)
+            && visibilities_outline(packet.payload).as_ref().is_none_or(is_due)
         {
             let (frame, reading) = self.decoder.decode(packet, false);
             let packets = vec![DeliveredPacket { header, check: packet.check, reading }];
@@ -454,7 +489,7 @@ impl Collector {
         }
         if header.kind == Kind::Visibilities {
             self.candidates.push_back(header);
-            return Ok(Handled::Event);
+            return Ok(Handled::Held(header));
         }
         let Some(payload) = self.held.take_payload(&header) else { return Ok(Handled::Event) };
         if describes {
@@ -477,6 +512,8 @@ enum Handled {
     Nothing,
     /// Nothing to deliver yet.
     Event,
+    /// Visibilities wait.
+    Held(PacketHeader),
     Delivery(Delivery),
 }
 

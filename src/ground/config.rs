@@ -3,8 +3,10 @@
 use std::path::Path;
 
 use super::GroundError;
+use super::pass_gate::{MODEL, PassGate};
 use crate::accumulation::{AccumulationError, Accumulator, ChannelGroup, MapConfig};
-use crate::calibration::{CalibrationConfig, CalibrationError, Calibrator};
+use crate::calibration::solver::{PassSolver, SolverConfig};
+use crate::calibration::{CalibrationConfig, CalibrationError, CalibrationHook, Calibrator};
 use crate::frames::{Instrument, VisibilityReason};
 use crate::runtime::Ledger;
 
@@ -19,6 +21,8 @@ const SEGMENTS_MAX: usize = 8192;
 pub struct GroundConfig {
     /// Calibration.
     pub calibration: CalibrationConfig,
+    /// How gains are found, for `calibration.hook = "solve"`.
+    pub calibrate: SolverConfig,
     /// Sums.
     pub map: MapConfig,
     /// Bytes of visibilities that may wait for their positions. An archive keeps the value that it was made with.
@@ -36,6 +40,10 @@ impl GroundConfig {
     /// Calibration that was not made for it; settings of the map that do not fit it; too many channels, or too
     /// little memory for them.
     pub fn fits(&self, instrument: &Instrument) -> Result<(), GroundError> {
+        if self.calibration.hook == CalibrationHook::Solve {
+            let maps = self.calibrate.model_files.len();
+            self.calibrate.fits(instrument, maps, MODEL).map_err(CalibrationError::from)?;
+        }
         let channels = self.described(instrument)?.channels.len();
         if let Some(misfit) = self.map.misfits(channels).into_iter().next() {
             return Err(AccumulationError::from(misfit).into());
@@ -51,12 +59,28 @@ impl GroundConfig {
         Ok(self.calibration.build(Path::new(""))?.describe(instrument)?)
     }
 
-    /// A calibrator without data, posting to `ledger`.
+    /// What holds visibilities until their gains are known, if gains are to be found.
+    pub(super) fn gate(&self) -> Result<Option<PassGate>, CalibrationError> {
+        if self.calibration.hook != CalibrationHook::Solve {
+            return Ok(None);
+        }
+        if let Some(problem) = self.calibrate.problems_of_hook().into_iter().next() {
+            return Err(problem.into());
+        }
+        let (van_vleck, maps) = (self.calibration.van_vleck()?, self.calibrate.models()?);
+        Ok(Some(PassGate::new(PassSolver::new(&self.calibrate, van_vleck, maps))))
+    }
+
+    /// A calibrator without data, posting to `ledger`, with the gains that `gate` finds.
     pub(super) fn calibrator(
         &self,
+        gate: Option<&PassGate>,
         ledger: &Ledger<VisibilityReason>,
     ) -> Result<Calibrator, CalibrationError> {
-        let calibration = self.calibration.build(Path::new(""))?;
+        let calibration = match gate {
+            Some(gate) => Box::new(gate.gains().clone()),
+            None => self.calibration.build(Path::new(""))?,
+        };
         Ok(Calibrator::new(calibration, ledger.clone())
             .with_van_vleck(self.calibration.van_vleck()?)
             .with_autos()

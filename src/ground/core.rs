@@ -5,12 +5,14 @@ use std::time::Duration;
 
 use super::archive::{Archive, RecordDraft};
 use super::lookout::{Occasion, Spotter};
+use super::pass_gate::{PassGate, PassObserver};
 use super::promises::SenderPromises;
-use super::{Collector, DeliveredPacket, Delivery, GroundConfig, GroundError, GroundOutcome};
+use super::{Collector, CollectorStep, DeliveredPacket, Delivery, GroundConfig, GroundError, GroundOutcome};
 use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::{Calibrator, MissingPackets};
 use crate::downlink::transport::socket::HeldAnswers;
-use crate::downlink::{CucTime, Kind};
+use crate::downlink::wire::VisibilitiesOutline;
+use crate::downlink::{CucTime, Kind, PacketHeader};
 use crate::frames::{GroundFrame, Instrument, PlacedFrame};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Outlet, Stage, Units};
@@ -28,6 +30,8 @@ const STEPS_SHOWN: u64 = 32;
 pub struct Ground {
     pub(super) collector: Collector,
     pub(super) calibrator: Calibrator,
+    /// If gains are to be found.
+    pub(super) gate: Option<PassGate>,
     pub(super) accumulator: Accumulator,
     pub(super) outcome: GroundOutcome,
     pub(super) archive: Option<Archive>,
@@ -49,10 +53,13 @@ impl Ground {
     /// # Errors
     /// Calibration that cannot be read.
     pub fn new(config: &GroundConfig) -> Result<Self, GroundError> {
-        let outcome = GroundOutcome::default();
+        let gate = config.gate()?;
+        let gains = gate.as_ref().map(|gate| gate.gains().clone());
+        let outcome = GroundOutcome { gains, ..GroundOutcome::default() };
         Ok(Self {
             collector: Collector::new(config.wait_bytes),
-            calibrator: config.calibrator(&outcome.ledger)?,
+            calibrator: config.calibrator(gate.as_ref(), &outcome.ledger)?,
+            gate,
             accumulator: config.accumulator(&outcome.ledger),
             spotter: Spotter::of(&outcome.lookout),
             outcome,
@@ -92,6 +99,15 @@ impl Ground {
         Self { promises: self.promises.answering(answers), ..self }
     }
 
+    /// Tells `observer` of each pass whose gains it has found, on its own thread.
+    #[must_use]
+    pub fn observed_by(mut self, observer: PassObserver) -> Self {
+        if let Some(gate) = &mut self.gate {
+            gate.observed_by(observer);
+        }
+        self
+    }
+
     /// Those that hold parts of the sums.
     #[must_use]
     pub fn ranks(&self) -> &Ranks {
@@ -118,9 +134,24 @@ impl Ground {
                 None if self.cancel.elapsed().is_some_and(|elapsed| elapsed >= self.linger) => return Ok(()),
                 _ => {}
             }
-            let ephemeris = self.calibrator.ephemeris();
-            let Some(delivery) = self.collector.next_delivery(&|span| ephemeris.covers(span))? else {
-                return Ok(());
+            self.catch_up();
+            if self.collector.held().is_full() {
+                self.close_passes();
+            }
+            let Self { collector, calibrator, gate, .. } = self;
+            let delivery = match collector.next_step(&|outline| is_due(calibrator, gate.as_ref(), outline))? {
+                CollectorStep::Waited(delivery) => delivery,
+                CollectorStep::Delivery(delivery) => {
+                    if let (Some(gate), Some(GroundFrame::Visibilities(block))) = (gate, &delivery.frame) {
+                        gate.count_late(block);
+                    }
+                    delivery
+                }
+                CollectorStep::Held(header) => {
+                    self.note(&header, true);
+                    continue;
+                }
+                CollectorStep::Nothing => return Ok(()),
             };
             self.apply(delivery, out)?;
             if self.archive.as_ref().is_some_and(Archive::is_due) {
@@ -134,9 +165,63 @@ impl Ground {
         }
     }
 
+    /// Takes note of a packet that waits for its gains; closes the pass that it ends.
+    fn note(&mut self, header: &PacketHeader, is_new: bool) {
+        let Self { collector, gate: Some(gate), archive, cancel, .. } = self else { return };
+        if archive.is_some() && cancel.is_cancelled() {
+            // The next session does, in the order of sending.
+            return;
+        }
+        let Some(block) = collector.held().get(header).and_then(|packet| collector.decoded(packet)) else {
+            return;
+        };
+        let ended = gate.ended_by(&block);
+        if let Some(which) = ended {
+            self.close_pass(which);
+        }
+        if let Some(gate) = &mut self.gate
+            && !gate.note(&block)
+            && is_new
+        {
+            gate.count_late(&block);
+        }
+    }
+
+    /// Takes note of what was held before the instrument was known, or in an earlier session.
+    fn catch_up(&mut self) {
+        let Self { collector, gate: Some(gate), .. } = self else { return };
+        if !gate.is_behind || collector.instrument().is_none() {
+            return;
+        }
+        gate.is_behind = false;
+        let held: Vec<PacketHeader> = collector.held().packets().map(|packet| packet.header).collect();
+        held.iter()
+            .filter(|header| header.kind == Kind::Visibilities)
+            .for_each(|header| self.note(header, false));
+        self.collector.consider_held();
+    }
+
+    fn close_passes(&mut self) {
+        let open = self.gate.as_ref().map(PassGate::open_passes).unwrap_or_default();
+        open.into_iter().for_each(|which| self.close_pass(which));
+    }
+
+    /// Finds the gains of a pass from what has arrived of it, in the order of sending.
+    fn close_pass(&mut self, which: usize) {
+        let Self { collector, calibrator, gate: Some(gate), .. } = self else { return };
+        let waiting = collector.held().packets().filter(|packet| packet.header.kind == Kind::Visibilities);
+        let blocks = waiting.filter_map(|packet| collector.decoded(packet));
+        let blocks = blocks.filter(|block| gate.holds(which, block)).collect();
+        gate.close(which, blocks, calibrator.ephemeris());
+        collector.consider_held();
+    }
+
     /// Takes a delivery through calibration into the sums, and into the journal if there is an archive.
     fn apply(&mut self, delivery: Delivery, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         let Delivery { packets, frame } = delivery;
+        if let (Some(GroundFrame::Instrument(instrument)), Some(gate)) = (&frame, &mut self.gate) {
+            gate.describe(instrument)?;
+        }
         if let Some(GroundFrame::Visibilities(block)) = &frame {
             let bad = packets.iter().map(|packet| u64::from(packet.reading.visibilities_bad_value)).sum();
             self.calibrator.count_bad(block.start, bad);
@@ -173,8 +258,18 @@ impl Ground {
         Ok(())
     }
 
-    /// Applies what is held, without its positions.
+    /// Ends the passes that are open, and applies what is held, without its positions.
     pub(super) fn flush(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
+        if !(self.archive.is_some() && self.cancel.is_cancelled()) {
+            self.catch_up();
+            self.close_passes();
+            loop {
+                let Self { collector, calibrator, gate, .. } = self;
+                let waiting = collector.next_waiting(&|outline| is_due(calibrator, gate.as_ref(), outline));
+                let Some(delivery) = waiting else { break };
+                self.apply(delivery, out)?;
+            }
+        }
         while let Some(delivery) = self.collector.flush_next() {
             match &delivery.frame {
                 Some(GroundFrame::Visibilities(block))
@@ -213,7 +308,11 @@ impl Ground {
     /// Writes a checkpoint, if there is an archive.
     pub(super) fn checkpoint(&mut self) -> Result<(), GroundError> {
         let Some(archive) = &mut self.archive else { return Ok(()) };
-        let written = archive.checkpoint(&self.collector, &self.calibrator, &mut self.accumulator);
+        let written = archive.checkpoint(
+            &self.collector,
+            (&self.calibrator, self.gate.as_ref()),
+            &mut self.accumulator,
+        );
         self.promises.keep(self.collector.packets(), written.is_ok());
         written
     }
@@ -233,6 +332,11 @@ impl Ground {
         let _ = self.checkpoint();
         Ok(())
     }
+}
+
+/// Whether visibilities wait for nothing.
+fn is_due(calibrator: &Calibrator, gate: Option<&PassGate>, outline: &VisibilitiesOutline) -> bool {
+    calibrator.ephemeris().covers(outline.span) && gate.is_none_or(|gate| gate.is_due(outline))
 }
 
 fn placed(

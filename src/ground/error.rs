@@ -4,10 +4,46 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
+use crate::units::ChannelId;
+
 /// Errors of the ground and its archive.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum GroundError {
+    /// Archives whose gains were found from different data.
+    #[error(
+        "states with calibration.hook = \"solve\" cannot be merged: each has found its gains from its own data; replay the \
+         files into one state"
+    )]
+    SolvedApart,
+    /// Other gains for packets that no file has.
+    #[error(
+        "{missing} packets of visibilities in the state have other gains now and are in none of the files, packet {count} among \
+         them; expected all of them, as they were received: the state stays as it is"
+    )]
+    GainsWithoutData {
+        /// How many.
+        missing: usize,
+        /// Count of one.
+        count: u64,
+    },
+    /// Visibilities whose positions have changed since they were added.
+    #[error(
+        "packet {count}: the positions that are known now are others than those that it was placed by; the state stays as it is"
+    )]
+    OtherPositions {
+        /// Count of the packet.
+        count: u64,
+    },
+    /// Sums whose first data change.
+    #[error(
+        "the sums of channel {channel} begin with other data or positions under the new gains; expected all files of the channel, or a \
+         new state: this one stays as it is"
+    )]
+    OtherBeginning {
+        /// The channel.
+        channel: ChannelId,
+    },
     /// An archive that is to be merged with itself.
     #[error("{}: named twice; expected each state once", path.display())]
     NamedTwice {

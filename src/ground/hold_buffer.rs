@@ -5,8 +5,10 @@ use std::collections::BTreeMap;
 use bincode::{Decode, Encode};
 
 use crate::downlink::receive::Packet;
-use crate::downlink::wire::payload::visibilities_span;
-use crate::downlink::wire::{COUNT_MAX, CucTime, Kind, PACKET_BYTES_MAX, PacketHeader, PacketSegment};
+use crate::downlink::wire::payload::visibilities_outline;
+use crate::downlink::wire::{
+    COUNT_MAX, CucTime, Kind, PACKET_BYTES_MAX, PacketHeader, PacketSegment, VisibilitiesOutline,
+};
 use crate::units::MissionTime;
 
 /// Memory of a held packet, beyond its bytes.
@@ -20,6 +22,9 @@ const BEFORE_INSTRUMENT_BYTES: u64 = 1 << 26;
 
 /// Most segments of a payload on either side of one.
 const SEGMENTS_MAX: usize = 4096;
+
+/// Whether visibilities can be delivered: their positions are known, and what else is needed.
+pub type Due<'a> = &'a dyn Fn(&VisibilitiesOutline) -> bool;
 
 /// Order of sending within a kind: creation time and count.
 pub(super) type Sent = (CucTime, u64);
@@ -52,7 +57,13 @@ impl HeldPacket {
     /// First and last instant of the visibilities in it; `None` if its span is unknown.
     #[must_use]
     pub fn span(&self) -> Option<[MissionTime; 2]> {
-        visibilities_span(&self.payload).filter(|_| self.header.kind == Kind::Visibilities)
+        self.outline().map(|outline| outline.span)
+    }
+
+    /// What visibilities it claims to hold; `None` if it does not say so.
+    #[must_use]
+    pub fn outline(&self) -> Option<VisibilitiesOutline> {
+        visibilities_outline(&self.payload).filter(|_| self.header.kind == Kind::Visibilities)
     }
 
     fn cost(&self) -> u64 {
@@ -145,13 +156,9 @@ impl HoldBuffer {
         found
     }
 
-    /// Releases a packet of visibilities once the ephemeris covers its span, or if its span is unknown.
-    pub fn release(
-        &mut self,
-        header: &PacketHeader,
-        placed: &dyn Fn([MissionTime; 2]) -> bool,
-    ) -> Option<HeldPacket> {
-        if self.get(header)?.span().is_none_or(placed) { self.remove(header) } else { None }
+    /// Releases a packet of visibilities once `is_due` holds of what it claims to hold, or if it does not say that.
+    pub fn release(&mut self, header: &PacketHeader, is_due: Due<'_>) -> Option<HeldPacket> {
+        if self.get(header)?.outline().as_ref().is_none_or(is_due) { self.remove(header) } else { None }
     }
 
     /// Whether one more packet of visibilities stays within its capacity.
@@ -282,7 +289,8 @@ mod tests {
         let seen = std::cell::RefCell::new(Vec::new());
         let until = |end: i64| {
             let seen = &seen;
-            move |[from, to]: [MissionTime; 2]| {
+            move |outline: &VisibilitiesOutline| {
+                let [from, to] = outline.span;
                 seen.borrow_mut().push((from.0, to.0));
                 to.0 <= end
             }

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::{GroundError, Lookout};
 
-use crate::calibration::Completeness;
+use crate::calibration::{Completeness, SolvedGains};
 use crate::downlink::ReceptionCounters;
 use crate::frames::{AutoPower, VisibilityReason};
 use crate::runtime::Ledger;
@@ -23,6 +23,8 @@ pub struct GroundOutcome {
     pub reception: Arc<Mutex<ReceptionCounters>>,
     /// Auto-correlations, by channel, daughter and time.
     pub autos: Arc<Mutex<Vec<AutoPower>>>,
+    /// The gains that it finds, if it finds any.
+    pub gains: Option<SolvedGains>,
     /// How its checkpoints went, at any time.
     pub saving: SharedSaving,
     /// Where visitors see it at work.

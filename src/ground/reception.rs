@@ -32,7 +32,8 @@ impl Reception {
     fn advance(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), DownlinkError> {
         loop {
             let ephemeris = &self.ephemeris;
-            let Some(delivery) = self.collector.next_delivery(&|span| ephemeris.covers(span))? else {
+            let Some(delivery) = self.collector.next_delivery(&|outline| ephemeris.covers(outline.span))?
+            else {
                 return Ok(());
             };
             self.emit(delivery, out);

@@ -4,8 +4,8 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::calibrate::{CalibrateSummary, FoundSolutions};
 use super::error::PipelineError;
+use super::found_solutions::{CalibrateSummary, FoundSolutions};
 use crate::calibration::solver::{GainEstimate, GainState, PassSolution, solutions_csv};
 use crate::files::write_atomically;
 use crate::products::ProductsError;

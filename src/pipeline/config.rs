@@ -8,7 +8,7 @@ use super::problems::Problems;
 use crate::accumulation::{EngineKind, MapConfig};
 use crate::array::{Array, ArrayConfig};
 use crate::calibration::solver::SolverConfig;
-use crate::calibration::{CalibrationConfig, VanVleck};
+use crate::calibration::{CalibrationConfig, CalibrationHook, VanVleck};
 use crate::daughters::{DaughtersConfig, InstrumentConfig};
 use crate::downlink::DownlinkConfig;
 use crate::mother::{Antenna, Fidelity, MoonMirror, SpacecraftConfig};
@@ -186,6 +186,9 @@ impl Config {
         found.extend(self.downlink.listen.problems());
         found.extend(self.calibration.problems());
         found.extend(self.calibrate.problems());
+        if self.calibration.hook == CalibrationHook::Solve {
+            found.extend(self.calibrate.problems_of_hook());
+        }
         found.extend(self.map.problems());
         found.extend(self.products.problems());
         found.extend(self.runtime.problems());
@@ -218,7 +221,12 @@ impl Config {
         let (mut calibration, mut map) = (self.calibration.clone(), self.map.clone());
         calibration.gains_file = calibration.gains_file.as_deref().map(contents);
         map.prior_files = map.prior_files.iter().map(|path| contents(path)).collect();
-        hash(&(calibration, map))
+        if calibration.hook != CalibrationHook::Solve {
+            return hash(&(calibration, map));
+        }
+        let mut calibrate = self.calibrate.clone();
+        calibrate.model_files = calibrate.model_files.iter().map(|path| contents(path)).collect();
+        hash(&(calibration, map, calibrate))
     }
 }
 

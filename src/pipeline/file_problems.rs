@@ -30,6 +30,9 @@ impl Plan {
         if let Err(problem) = self.config.calibration.build(Path::new("")) {
             found.push(|| problem);
         }
+        if let Err(problem) = self.config.calibrate.models() {
+            found.push(|| problem);
+        }
         found
     }
 }

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use super::config::Config;
 use super::error::PipelineError;
+use super::live_gains::GainsWriter;
 use crate::ground::{Ground, GroundConfig, GroundOutcome};
 use crate::products::{ChannelSummary, MapWatch, ProductsError, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link, Sink};
@@ -21,8 +22,9 @@ impl Config {
     /// Configuration of the ground, with a hold buffer of `wait_bytes`.
     #[must_use]
     pub fn ground(&self, wait_bytes: u64) -> GroundConfig {
-        let (calibration, map) = (self.calibration.clone(), self.map.clone());
-        GroundConfig { calibration, map, wait_bytes, memory_max_bytes: None, group: None }
+        let (calibration, calibrate) = (self.calibration.clone(), self.calibrate.clone());
+        let map = self.map.clone();
+        GroundConfig { calibration, calibrate, map, wait_bytes, memory_max_bytes: None, group: None }
     }
 
     /// Setup of the solver, which `watch` follows.
@@ -92,6 +94,8 @@ pub(super) fn add(
     let channels = Arc::clone(&outcome.channels);
     let publisher =
         Publisher::new(config.products.clone(), out, truth, provenance, channels)?.shown_to(viewers);
+    let mut writer = GainsWriter::new(config, out);
+    let ground = ground.observed_by(Box::new(move |gains| writer.update(gains)));
     // Sums are large: one waits while another is solved.
     let sums = graph.stage(GROUND, 1, bytes, ground);
     let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));

@@ -13,8 +13,10 @@ mod downlink_settings;
 mod engine_cost;
 pub(crate) mod error;
 mod file_problems;
+mod found_solutions;
 mod ground_segment;
 mod groups;
+mod live_gains;
 mod memory;
 pub(crate) mod models;
 mod noise_maps;
@@ -34,14 +36,13 @@ mod state;
 mod study;
 mod summary;
 
-pub use calibrate::{
-    CalibrateJob, CalibrateProgress, CalibrateRound, CalibrateSummary, CalibrateWatcher, calibrate,
-};
+pub use calibrate::{CalibrateJob, CalibrateProgress, CalibrateWatcher, calibrate, with_gains};
 pub use config::Config;
 pub use config_reader::ReadProblem;
 pub use config_source::{ConfigError, ConfigSource, QUICKLOOK};
 pub use cost::{ChannelCost, Cost, RankCost, Segment};
 pub use error::PipelineError;
+pub use found_solutions::{CalibrateRound, CalibrateSummary};
 pub use groups::{
     GroupSize, GroupStep, GroupStepWatcher, GroupWatcher, MemoryAdvice, RunGroups, channel_groups,
     replay_in_groups, run_in_groups,

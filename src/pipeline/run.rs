@@ -7,6 +7,7 @@ use std::time::Duration;
 use super::config::Config;
 use super::error::PipelineError;
 use super::ground_segment::{Mapping, SegmentOutcome};
+use super::live_gains::GainsWriter;
 use super::plan::Plan;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
@@ -467,6 +468,8 @@ pub(super) fn summarise(
     (summary.listening, summary.samples) = (listening, samples);
     summary.completeness = ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
     summary.saving = ground.saving.report();
+    let gains = ground.gains.as_ref().map(|gains| GainsWriter::new(config, out).write(gains));
+    summary.calibration = gains.transpose()?;
     Ok(summary)
 }
 

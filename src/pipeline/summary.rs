@@ -9,6 +9,7 @@ use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
 use serde::{Deserialize, Serialize};
 
 use super::config::Config;
+use super::found_solutions::CalibrateSummary;
 use super::ground_segment::SOLVE;
 use super::sample_summary::SampleSummary;
 use crate::calibration::Completeness;
@@ -64,6 +65,9 @@ pub struct RunSummary {
     /// Checkpoints of the ground's state, if it keeps one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub saving: Option<SavingReport>,
+    /// The gains that were found, with `calibration.hook = "solve"`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<CalibrateSummary>,
     /// Stages: throughput, times, queues; of the last pass, if the channels were mapped in groups.
     pub report: Report,
     /// Of the passes before it.
@@ -97,6 +101,7 @@ impl RunSummary {
             reception,
             listening: None,
             saving: None,
+            calibration: None,
             report,
             earlier_reports: Vec::new(),
         }
@@ -233,6 +238,9 @@ impl fmt::Display for RunSummary {
         }
         if let Some(saving) = self.saving.as_ref().filter(|saving| saving.failed > 0) {
             writeln!(f, "State\n{saving}\n")?;
+        }
+        if let Some(gains) = &self.calibration {
+            writeln!(f, "Gains\n{gains}\n")?;
         }
         writeln!(f, "Maps")?;
         for channel in &self.channels {

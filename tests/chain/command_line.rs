@@ -46,6 +46,7 @@ fn every_command_has_help_that_teaches() {
         "gaps",
         "merge",
         "retract",
+        "recalibrate",
         "bench",
         "export",
         "explain",

@@ -14,6 +14,7 @@ mod first_contact;
 mod groups;
 mod harmonic;
 mod instrument;
+mod live_gains;
 mod orbits;
 mod outputs;
 mod paper;

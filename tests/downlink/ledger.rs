@@ -379,7 +379,14 @@ fn a_slow_link_and_a_small_store_lose_what_the_policy_says() {
 fn ground_of(arrived: &[u8]) -> (LedgerReport<VisibilityReason>, Completeness) {
     let map = MapConfig { nside: 1, baseline_bp_max: 1e6, weight_max: 1e3, ..MapConfig::default() };
     let (calibration, wait_bytes) = (CalibrationConfig::default(), 1 << 24);
-    let config = GroundConfig { calibration, map, wait_bytes, memory_max_bytes: None, group: None };
+    let config = GroundConfig {
+        calibration,
+        calibrate: Default::default(),
+        map,
+        wait_bytes,
+        memory_max_bytes: None,
+        group: None,
+    };
     let mut ground = Ground::new(&config).unwrap();
     let outcome = ground.outcome();
     let mut maps = Outlet::collect();

@@ -104,7 +104,14 @@ impl Mission {
         assert!(packets.len() <= 64);
         let map = MapConfig { nside: 2, ..MapConfig::default() };
         let (calibration, wait_bytes) = (CalibrationConfig::default(), 1 << 20);
-        let config = GroundConfig { calibration, map, wait_bytes, memory_max_bytes: None, group: None };
+        let config = GroundConfig {
+            calibration,
+            calibrate: Default::default(),
+            map,
+            wait_bytes,
+            memory_max_bytes: None,
+            group: None,
+        };
         Self { config, packets, headers, windows }
     }
 

@@ -1,8 +1,13 @@
 //! Configuration of the solver.
 
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
 
+use crate::calibration::CalibrationError;
 use crate::response::beacon::Beacon;
+use crate::sky::SkyMap;
+use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::units::{Checks, InvalidValue};
 
 /// The signal whose visibilities are known.
@@ -29,7 +34,7 @@ pub enum AmplitudeScale {
     UnitMean,
 }
 
-/// The `[calibrate]` section, for `lunarray calibrate`. Standard deviations are those of what is expected before the
+/// The `[calibrate]` section, for `lunarray calibrate` and `calibration.hook = "solve"`. Standard deviations are those of what is expected before the
 /// data are seen; a parameter with 0 is not solved for.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -64,6 +69,8 @@ pub struct SolverConfig {
     pub phase_sigma_deg_max: f64,
     /// Gain amplitude below which a receiver is taken to be dead.
     pub dead_amplitude: f64,
+    /// Maps of the known sky (K, FITS), one a channel of the downlink.
+    pub model_files: Vec<PathBuf>,
     /// nside to which the model map's pixels are split; 0 for its own.
     pub model_nside: usize,
     /// Power of the artificial signal at a daughter, K sr.
@@ -96,6 +103,7 @@ impl Default for SolverConfig {
             position_rounds: 3,
             phase_sigma_deg_max: 30.0,
             dead_amplitude: 0.05,
+            model_files: Vec::new(),
             model_nside: 0,
             beacon_k_sr: 0.0,
             beacon_direction_deg: [0.0, 0.0],
@@ -111,6 +119,39 @@ impl SolverConfig {
     #[must_use]
     pub fn beacon(&self) -> Beacon {
         Beacon { k_sr: self.beacon_k_sr, direction_deg: self.beacon_direction_deg }
+    }
+
+    /// The signal that is known with maps of the sky, or without: without a map both is the artificial signal.
+    #[must_use]
+    pub fn known_signal(&self, has_maps: bool) -> CalibrationMode {
+        match (self.mode, has_maps) {
+            (CalibrationMode::Joint, false) => CalibrationMode::Beacon,
+            (mode, _) => mode,
+        }
+    }
+
+    /// The maps of the known sky.
+    ///
+    /// # Errors
+    /// A map that cannot be read.
+    pub fn models(&self) -> Result<Vec<SkyMap>, CalibrationError> {
+        let read = |path: &PathBuf| Ok(read_whole_map(path, &ReadOptions::default())?);
+        self.model_files.iter().map(read).collect()
+    }
+
+    /// Everything that keeps it from being used while the data arrive; empty if nothing does.
+    #[must_use]
+    pub fn problems_of_hook(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("calibrate");
+        let known = self.mode != CalibrationMode::Sky || !self.model_files.is_empty();
+        let expected =
+            "maps of the sky, one a channel, with calibration.hook = \"solve\" and calibrate.mode = \"sky\"";
+        checks.require("model_files", "[]", known, expected);
+        let rounds = self.map_rounds;
+        let expected =
+            "0 with calibration.hook = \"solve\": data that are gone cannot be calibrated with a later map";
+        checks.require("map_rounds", rounds, rounds == 0, expected);
+        checks.finish()
     }
 
     /// What the data do not determine, and what decides it instead.

@@ -6,6 +6,7 @@
 //! | `sums` | what a solution needs of the data, by channel and pair |
 //! | `newton` | parameters, priors, starting values, Gauss-Newton |
 //! | `solution` | robust rounds, and the solution of a pass |
+//! | `passes` | a pass from packets to its solutions |
 //! | `monitor` | what happened to the instrument |
 //! | `table` | tables, and the file of gains |
 
@@ -16,6 +17,7 @@ mod dense;
 mod model;
 mod monitor;
 mod newton;
+mod passes;
 mod solution;
 mod sums;
 mod table;
@@ -25,6 +27,7 @@ mod tests;
 pub use config::{AmplitudeScale, CalibrationMode, SolverConfig};
 pub use model::{KnownSignal, Offsets};
 pub use monitor::{InstrumentEvent, instrument_events};
+pub use passes::{PassBlocks, PassSolver, SolvedPass};
 pub use solution::{
     DaughterEstimate, GainEstimate, GainState, OutlierParts, PassData, PassSolution, solve_pass,
 };

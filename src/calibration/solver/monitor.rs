@@ -9,6 +9,7 @@
 //! | burst | outliers at one time, of most pairs and channels |
 
 use std::f64::consts::{PI, TAU};
+use std::fmt;
 
 use serde::Serialize;
 
@@ -76,6 +77,50 @@ pub enum InstrumentEvent {
     },
 }
 
+impl InstrumentEvent {
+    /// The pass of it, or after it.
+    #[must_use]
+    pub fn pass(&self) -> u64 {
+        match self {
+            Self::ClockJump { pass, .. }
+            | Self::PhaseStep { pass, .. }
+            | Self::GainStep { pass, .. }
+            | Self::Interference { pass, .. }
+            | Self::Burst { pass, .. } => *pass,
+        }
+    }
+}
+
+impl fmt::Display for InstrumentEvent {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let list = |channels: &[(usize, f64)], unit: &str| {
+            let each =
+                channels.iter().map(|(channel, value)| format!("{value:.4}{unit} in channel {channel}"));
+            each.collect::<Vec<_>>().join(", ")
+        };
+        match self {
+            Self::ClockJump { pass, daughter, change_ns } => {
+                write!(f, "pass {pass}: the clock of daughter {daughter} jumped by {change_ns:.3} ns")
+            }
+            Self::PhaseStep { pass, daughter, channels } => {
+                write!(f, "pass {pass}: phases of daughter {daughter} changed by {}", list(channels, " deg"))
+            }
+            Self::GainStep { pass, daughter, channels } => {
+                let factors = list(channels, "");
+                write!(f, "pass {pass}: amplitudes of daughter {daughter} changed by factors of {factors}")
+            }
+            Self::Interference { pass, channel, outliers } => write!(
+                f,
+                "pass {pass}: interference in channel {channel}, {:.1} % of its visibilities are outliers",
+                100.0 * outliers
+            ),
+            Self::Burst { pass, from_s, until_s } => {
+                write!(f, "pass {pass}: a burst in all channels from {from_s:.1} s to {until_s:.1} s")
+            }
+        }
+    }
+}
+
 /// Changes of a daughter from one solution to the next, by channel.
 struct Change {
     /// Place of the later solution.
@@ -104,11 +149,16 @@ pub fn instrument_events(solutions: &[PassSolution]) -> Vec<InstrumentEvent> {
 
 fn changes(solutions: &[PassSolution]) -> Vec<Change> {
     let mut found = Vec::new();
+    let spoilt: Vec<Vec<bool>> = solutions.iter().map(spoilt_channels).collect();
+    let is_spoilt = |at: usize, channel: usize| spoilt[at].get(channel) == Some(&true);
     for (at, two) in solutions.windows(2).enumerate() {
         for (n, (before, after)) in two[0].daughters.iter().zip(&two[1].daughters).enumerate() {
+            // What outliers leave of a disturbed channel is no gain to judge the daughter by.
             let known = |gain: &GainEstimate| gain.state == GainState::Good;
             let pairs = before.gains.iter().zip(&after.gains).enumerate();
-            let pairs: Vec<_> = pairs.filter(|(_, (a, b))| known(a) && known(b)).collect();
+            let pairs: Vec<_> = pairs
+                .filter(|(c, (a, b))| known(a) && known(b) && !is_spoilt(at, *c) && !is_spoilt(at + 1, *c))
+                .collect();
             let phase = |(c, (a, b)): &(usize, (&GainEstimate, &GainEstimate))| {
                 let change = wrapped((b.phase_deg - a.phase_deg).to_radians());
                 (*c, change, a.phase_sigma_deg.hypot(b.phase_sigma_deg).to_radians())
@@ -228,15 +278,22 @@ fn clock_ns(change: &Change, solution: &PassSolution) -> Option<f64> {
     (cost(late_s) < FIT).then_some(1e9 * late_s)
 }
 
+/// Whether most of a list is spoilt, of what is known.
+fn most(list: &[f64]) -> bool {
+    let known: Vec<&f64> = list.iter().filter(|part| part.is_finite()).collect();
+    known.iter().filter(|part| ***part > SPOILT).count() * 2 > known.len()
+}
+
+/// Whether each channel is disturbed most of the time.
+fn spoilt_channels(solution: &PassSolution) -> Vec<bool> {
+    solution.outlier_parts.by_channel_and_time.iter().map(|times| most(times)).collect()
+}
+
 /// Disturbances within a pass.
 fn disturbances(solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
     let (pass, parts) = (solution.pass, &solution.outlier_parts);
-    let most = |list: &[f64]| {
-        let known: Vec<&f64> = list.iter().filter(|part| part.is_finite()).collect();
-        known.iter().filter(|part| ***part > SPOILT).count() * 2 > known.len()
-    };
     let channels = parts.by_channel_and_time.len();
-    let spoilt: Vec<bool> = parts.by_channel_and_time.iter().map(|times| most(times)).collect();
+    let spoilt = spoilt_channels(solution);
     for (channel, _) in spoilt.iter().enumerate().filter(|(_, spoilt)| **spoilt) {
         let times: Vec<f64> =
             parts.by_channel_and_time[channel].iter().copied().filter(|part| part.is_finite()).collect();

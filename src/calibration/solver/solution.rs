@@ -1,5 +1,6 @@
 //! Solutions of a pass: robust rounds about Gauss-Newton, and what is told of them.
 
+use bincode::{Decode, Encode};
 use num_complex::Complex64;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -16,7 +17,7 @@ const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
 const SPREAD_SETTLED: f64 = 0.02;
 
 /// What became of the gain of a daughter in a channel.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Encode, Decode)]
 #[serde(rename_all = "kebab-case")]
 pub enum GainState {
     /// Known.
@@ -32,7 +33,7 @@ pub enum GainState {
 }
 
 /// Gain of one daughter in one channel.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Encode, Decode)]
 pub struct GainEstimate {
     /// Centre of the channel, Hz.
     pub frequency_hz: f64,
@@ -53,7 +54,7 @@ pub struct GainEstimate {
 }
 
 /// What is known of one daughter.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Encode, Decode)]
 pub struct DaughterEstimate {
     /// From 1.
     pub daughter: u32,
@@ -70,17 +71,25 @@ pub struct DaughterEstimate {
 }
 
 /// Where outliers are.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Encode, Decode)]
 pub struct OutlierParts {
     /// Part of the visibilities that are outliers, by channel and by sixtieth of the interval; not a number without any.
     pub by_channel_and_time: Vec<Vec<f64>>,
+}
+
+impl OutlierParts {
+    /// Whether they are of so many channels.
+    pub(in crate::calibration) fn is_of(&self, channels: usize) -> bool {
+        let parts = &self.by_channel_and_time;
+        parts.len() == channels && parts.iter().all(|times| times.len() == TIME_PARTS)
+    }
 }
 
 /// Parts of an interval by which outliers are counted.
 const TIME_PARTS: usize = 60;
 
 /// The solution of a pass, or of a part of one.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Encode, Decode)]
 pub struct PassSolution {
     /// Number of the pass in the data, from 0.
     pub pass: u64,

@@ -27,5 +27,5 @@ pub use header::{
 };
 pub use kind::{APID_BASE, Kind};
 pub use packetizer::Packetizer;
-pub use payload::{NODES_MIN, PayloadFault};
+pub use payload::{NODES_MIN, PayloadFault, VisibilitiesOutline};
 pub use transmission::Transmission;

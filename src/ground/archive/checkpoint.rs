@@ -4,11 +4,12 @@ use std::fs::File;
 use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
+use bincode::Encode;
 use bincode::enc::write::SizeWriter;
 use bincode::error::{DecodeError, EncodeError};
-use bincode::{Decode, Encode};
 use crc_fast::{CrcAlgorithm, Digest};
 
+use super::calibration_state::CalibrationState;
 use super::journal::Journal;
 use crate::accumulation::AccumulatorState;
 use crate::calibration::AutoTable;
@@ -31,7 +32,7 @@ const PIECE_BYTES: u64 = 1 << 20;
 const MEMORY_A_BYTE: usize = 16;
 
 /// A checkpoint without its engines: data, and the journal.
-#[derive(Clone, Debug, PartialEq, Decode)]
+#[derive(Clone, Debug, PartialEq)]
 pub(super) struct ArchiveHead {
     /// Keys and values of the settings that shape sums.
     pub(super) settings: Vec<(String, String)>,
@@ -40,6 +41,8 @@ pub(super) struct ArchiveHead {
     pub(super) autos: AutoTable,
     pub(super) accumulator: AccumulatorState,
     pub(super) journal: Journal,
+    /// The first, without passes, if the head ends before it.
+    pub(super) calibration: CalibrationState,
 }
 
 /// An [`ArchiveHead`] borrowed for writing: the same fields, without copies of the large ones.
@@ -51,6 +54,7 @@ pub(super) struct ArchiveHeadView<'a> {
     pub(super) autos: &'a AutoTable,
     pub(super) accumulator: AccumulatorState,
     pub(super) journal: &'a Journal,
+    pub(super) calibration: CalibrationState,
 }
 
 /// Forms a checksum of what is written.
@@ -161,6 +165,9 @@ pub(super) fn read_from<T>(
     if !head.collector.is_sound() || !head.journal.is_sound() {
         return Err(damaged("packets that cannot exist".into(), "packets that were received"));
     }
+    if !head.calibration.passes.is_sound(head.collector.instrument()) {
+        return Err(damaged("passes that cannot exist".into(), "passes of the instrument"));
+    }
     let mut engines = from.take(bytes - FIXED_BYTES - length);
     let found = rest(head, &mut engines)?;
     match engines.limit() {
@@ -187,7 +194,15 @@ fn decode(bytes: &[u8]) -> Result<(ArchiveHead, usize), DecodeError> {
 }
 
 fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(ArchiveHead, usize), DecodeError> {
-    bincode::decode_from_slice(bytes, bincode::config::standard().with_limit::<LIMIT>())
+    let config = bincode::config::standard().with_limit::<LIMIT>();
+    let (fields, used) = bincode::decode_from_slice(bytes, config)?;
+    let (settings, collector, ephemeris, autos, accumulator, journal) = fields;
+    let (calibration, more) = match &bytes[used..] {
+        [] => (CalibrationState::default(), 0),
+        rest => bincode::decode_from_slice(rest, config)?,
+    };
+    let head = ArchiveHead { settings, collector, ephemeris, autos, accumulator, journal, calibration };
+    Ok((head, used + more))
 }
 
 /// Length of a checkpoint whose checksum holds.
@@ -300,6 +315,7 @@ mod tests {
             autos: calibrator.autos().unwrap(),
             accumulator: accumulator.state(),
             journal: &journal,
+            calibration: CalibrationState::default(),
         })
     }
 

@@ -31,6 +31,12 @@
 //! flagged as a duplicate of one that is removed stays flagged. Both checkpoints of the folder are written again, so
 //! that a damaged one does not bring the packets back.
 //!
+//! # Other gains
+//! [`crate::ground::Ground::recalibrate`] subtracts packets under the gains that they were added with, and adds them under
+//! others: those whose gains change, all of which have to be there. The gains of a state have a number, from 1. With gains that are
+//! found while the data arrive, packets of a pass are held until it is closed; a checkpoint has the solutions of closed passes and
+//! the spans of open ones.
+//!
 //! # Size
 //! The journal takes some 95 bytes a packet of visibilities in a checkpoint and 300 in memory: of 26 million, in packets
 //! of 215 as windows give them, 12 MB and 36 MB a channel, of 550 MB of downlink. Held packets take up to `wait_bytes` in
@@ -51,6 +57,7 @@
 //! interval, then after twice as long each time, and three times at the end of the session; then it makes its maps, and
 //! says what the state lacks. Room for two checkpoints is enough: when a third finds none, the older one goes first.
 
+mod calibration_state;
 mod checkpoint;
 mod draft;
 mod folder;
@@ -58,6 +65,7 @@ mod gaps;
 mod journal;
 mod names;
 mod packet_order;
+mod recalibrate;
 mod retract;
 mod sessions;
 mod settings;
@@ -71,6 +79,7 @@ pub use gaps::{
     VisibilityPacket, find_gaps,
 };
 pub use journal::JournalEntry;
+pub use recalibrate::Recalibrated;
 pub use retract::{RefusedPacket, Retracted};
 pub(super) use store::Archive;
 pub use survey::CoverageSurvey;

@@ -244,7 +244,8 @@ impl Retraction {
         if is_empty {
             // As if nothing had ever been received.
             ground.collector = Collector::new(ground.collector.held().bytes_max());
-            ground.calibrator = config.calibrator(&ground.outcome.ledger)?;
+            ground.gate = config.gate()?;
+            ground.calibrator = config.calibrator(ground.gate.as_ref(), &ground.outcome.ledger)?;
             ground.accumulator = config.accumulator(&ground.outcome.ledger);
         }
         ground.checkpoint()?;

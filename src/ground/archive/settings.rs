@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use crate::calibration::CalibrationHook;
 use crate::ground::{GroundConfig, GroundError};
 
 /// The settings that shape sums, the contents of the gains file among them.
@@ -12,11 +13,25 @@ pub(super) fn settings_of(config: &GroundConfig) -> Result<Vec<(String, String)>
     settings.push(("calibration.quantiser_bits".to_owned(), config.calibration.quantiser_bits.to_string()));
     settings.push(("calibration.sub_bands".to_owned(), config.calibration.sub_bands.to_string()));
     if let Some(path) = &config.calibration.gains_file {
-        let bytes = std::fs::read(path).map_err(GroundError::io(path, "read"))?;
-        let sum = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes);
-        settings.push(("calibration.gains_file".to_owned(), format!("a file of checksum {sum:016x}")));
+        settings.push(("calibration.gains_file".to_owned(), checksum(path)?));
+    }
+    if config.calibration.hook == CalibrationHook::Solve {
+        // Its keys have a JSON form, which is that of TOML.
+        let keys = serde_json::to_value(&config.calibrate).unwrap_or_default();
+        let keys = keys.as_object().into_iter().flatten().filter(|(key, _)| *key != "model_files");
+        settings.extend(keys.map(|(key, value)| (format!("calibrate.{key}"), value.to_string())));
+        for (number, path) in config.calibrate.model_files.iter().enumerate() {
+            settings.push((format!("calibrate.model_files[{number}]"), checksum(path)?));
+        }
     }
     Ok(settings)
+}
+
+/// A file by its contents.
+fn checksum(path: &Path) -> Result<String, GroundError> {
+    let bytes = std::fs::read(path).map_err(GroundError::io(path, "read"))?;
+    let sum = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes);
+    Ok(format!("a file of checksum {sum:016x}"))
 }
 
 /// Refuses a checkpoint that was made with other settings.

@@ -4,6 +4,7 @@ use std::io::ErrorKind;
 use std::path::Path;
 use std::time::Duration;
 
+use super::calibration_state::CalibrationState;
 use super::checkpoint::{self, ArchiveHead, ArchiveHeadView};
 use super::draft::RecordDraft;
 use super::folder::StateFolder;
@@ -16,6 +17,7 @@ use crate::calibration::{AutoTable, Calibrator};
 use crate::downlink::{DownlinkError, Kind};
 use crate::frames::{EphemerisSegment, VisibilityReason};
 use crate::ground::lookout::Spotter;
+use crate::ground::pass_gate::PassGate;
 use crate::ground::promises::SenderPromises;
 use crate::ground::{
     Collector, CollectorState, DeliveredPacket, Ground, GroundConfig, GroundError, GroundOutcome,
@@ -32,6 +34,8 @@ pub(in crate::ground) struct Archive {
     pub(super) folder: StateFolder,
     /// Settings that shape the sums.
     settings: Vec<(String, String)>,
+    /// Number of the calibration that the sums were made with, from 1.
+    pub(super) version: u32,
     pub(super) journal: Journal,
     /// Checkpoints that could not be used, in words.
     notes: Vec<String>,
@@ -71,6 +75,16 @@ impl Archive {
         posts
     }
 
+    /// Where applying packets posts.
+    pub(super) fn posts(&self) -> Ledger<VisibilityReason> {
+        self.posts.clone()
+    }
+
+    /// Binds it to other settings.
+    pub(super) fn set_settings(&mut self, settings: Vec<(String, String)>) {
+        self.settings = settings;
+    }
+
     /// Checkpoints that could not be used, in words.
     pub(super) fn notes(&self) -> impl Iterator<Item = &str> {
         self.notes.iter().map(String::as_str)
@@ -90,10 +104,10 @@ impl Archive {
     pub(in crate::ground) fn checkpoint(
         &mut self,
         collector: &Collector,
-        calibrator: &Calibrator,
+        (calibrator, gate): (&Calibrator, Option<&PassGate>),
         accumulator: &mut Accumulator,
     ) -> Result<(), GroundError> {
-        let written = self.write(collector, calibrator, accumulator);
+        let written = self.write(collector, (calibrator, gate), accumulator);
         let failed_before = self.saving.update(written.as_ref().err());
         self.since_attempt = 0;
         self.wait = match (&written, failed_before) {
@@ -107,7 +121,7 @@ impl Archive {
     fn write(
         &mut self,
         collector: &Collector,
-        calibrator: &Calibrator,
+        (calibrator, gate): (&Calibrator, Option<&PassGate>),
         accumulator: &mut Accumulator,
     ) -> Result<(), GroundError> {
         let no_autos = AutoTable::default();
@@ -118,6 +132,10 @@ impl Archive {
             autos: calibrator.autos().unwrap_or(&no_autos),
             accumulator: accumulator.state(),
             journal: &self.journal,
+            calibration: CalibrationState {
+                version: self.version,
+                passes: gate.map(PassGate::state).unwrap_or_default(),
+            },
         };
         self.folder.save(|out, path| {
             let of_file = |error| match error {
@@ -136,6 +154,7 @@ pub(super) struct ArchiveContents {
     pub(super) autos: AutoTable,
     pub(super) accumulator: Accumulator,
     pub(super) journal: Journal,
+    pub(super) calibration: CalibrationState,
 }
 
 impl ArchiveContents {
@@ -147,6 +166,7 @@ impl ArchiveContents {
             autos: AutoTable::default(),
             accumulator: config.accumulator(posts),
             journal: Journal::default(),
+            calibration: CalibrationState::default(),
         }
     }
 
@@ -155,6 +175,10 @@ impl ArchiveContents {
     /// # Errors
     /// Another instrument; a packet of visibilities that is in both journals.
     pub(super) fn merge(&mut self, other: Self) -> Result<(), GroundError> {
+        if self.calibration.is_solved() || other.calibration.is_solved() {
+            return Err(GroundError::SolvedApart);
+        }
+        self.calibration.version = self.calibration.version.max(other.calibration.version);
         self.journal.merge(other.journal).map_err(|count| {
             let apid = Kind::Visibilities.apid();
             DownlinkError::TakenTwice { apid, count }
@@ -237,8 +261,8 @@ impl Opened {
             let empty = config.accumulator(&posts).among(ranks);
             let (head, accumulator) =
                 read_parts(path, &empty, |head| compare(path, &head.settings, &settings))?;
-            let ArchiveHead { collector, ephemeris, autos, journal, .. } = head;
-            Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal })
+            let ArchiveHead { collector, ephemeris, autos, journal, calibration, .. } = head;
+            Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal, calibration })
         })?;
         Ok(Self { folder, contents, notes, settings, posts })
     }
@@ -258,26 +282,44 @@ impl Opened {
     pub(super) fn resume(self, config: &GroundConfig, interval: u64) -> Result<Ground, GroundError> {
         let Self { folder, contents, notes, settings, posts } = self;
         let contents = contents.unwrap_or_else(|| ArchiveContents::empty(config, &posts));
-        let ArchiveContents { collector, ephemeris, autos, accumulator, journal } = contents;
+        let ArchiveContents { collector, ephemeris, autos, accumulator, journal, calibration } = contents;
         // Also of a new archive.
         let mut accumulator = accumulator.among(folder.ranks());
-        let outcome = GroundOutcome::default();
+        let mut outcome = GroundOutcome::default();
         outcome.saving.begin();
         outcome.ledger.post_report(&journal.ledger());
         accumulator.set_spans(&journal.spans_s());
         let instrument = collector.instrument().cloned();
-        let calibrator = config.calibrator(&posts)?.resume(instrument, ephemeris, autos, journal.blocks());
+        let mut gate = config.gate()?;
+        if let (Some(gate), Some(instrument)) = (&mut gate, &instrument) {
+            gate.describe(instrument)?;
+            gate.resume(calibration.passes);
+        }
+        outcome.gains = gate.as_ref().map(|gate| gate.gains().clone());
+        let calibrator = config.calibrator(gate.as_ref(), &posts)?;
+        let calibrator = calibrator.resume(instrument, ephemeris, autos, journal.blocks());
         let collector = Collector::resume(collector, journal.delivered(), journal.reception());
-        let (interval, saving) = (interval.max(1), outcome.saving.clone());
+        let (interval, saving, version) = (interval.max(1), outcome.saving.clone(), calibration.version);
         let (wait, since_attempt) = (interval, 0);
-        let archive =
-            Archive { folder, settings, journal, notes, posts, interval, wait, since_attempt, saving };
+        let archive = Archive {
+            folder,
+            settings,
+            version,
+            journal,
+            notes,
+            posts,
+            interval,
+            wait,
+            since_attempt,
+            saving,
+        };
         let (cancel, linger, steps) = (Cancel::new(), Duration::ZERO, 0);
         let promises = SenderPromises::since(collector.packets());
         let spotter = Spotter::of(&outcome.lookout);
         Ok(Ground {
             collector,
             calibrator,
+            gate,
             accumulator,
             outcome,
             archive: Some(archive),

@@ -172,7 +172,14 @@ mod tests {
     fn what_a_ground_counts_is_what_is_folded() {
         let folder = tempfile::tempdir().unwrap();
         let (calibration, map) = (CalibrationConfig::default(), MapConfig::default());
-        let config = GroundConfig { calibration, map, wait_bytes: 0, memory_max_bytes: None, group: None };
+        let config = GroundConfig {
+            calibration,
+            calibrate: Default::default(),
+            map,
+            wait_bytes: 0,
+            memory_max_bytes: None,
+            group: None,
+        };
         let mut ground = Ground::open(folder.path(), &config, u64::MAX).unwrap();
         ground.step(transmission(), &mut Outlet::collect()).unwrap();
         {

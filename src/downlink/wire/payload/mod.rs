@@ -20,9 +20,10 @@ pub use ephemeris::NODES_MIN;
 pub(crate) use ephemeris::{decode as decode_ephemeris, encode as encode_ephemeris};
 pub(crate) use housekeeping::{decode as decode_housekeeping, encode as encode_housekeeping};
 pub(crate) use instrument::{decode as decode_instrument, encode as encode_instrument};
+pub use visibilities::VisibilitiesOutline;
 pub(crate) use visibilities::{
     VISIBILITY_BYTES, capacity as visibilities_in, check as check_visibilities, count as count_visibilities,
-    decode as decode_visibilities, encode as encode_visibilities, span as visibilities_span,
+    decode as decode_visibilities, encode as encode_visibilities, outline as visibilities_outline,
 };
 
 /// Maximum length of a record; bincode refuses to allocate more, for any value of a length field.

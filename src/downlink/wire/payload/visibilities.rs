@@ -86,16 +86,34 @@ pub(crate) fn count(bytes: &[u8]) -> u64 {
         .map_or(0, |(record, rest)| u64::from(record.count).min((rest.len() / VISIBILITY_BYTES) as u64))
 }
 
-/// First and last instant of the visibilities that a payload claims, if it can be read.
-pub(crate) fn span(bytes: &[u8]) -> Option<[MissionTime; 2]> {
+/// What a payload of visibilities claims to hold.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VisibilitiesOutline {
+    /// The pair.
+    pub pair: Pair,
+    /// First and last instant.
+    pub span: [MissionTime; 2],
+    /// Middle of the first integration, s since the epoch.
+    pub middle_s: f64,
+}
+
+/// The outline of a payload, if it can be read.
+pub(crate) fn outline(bytes: &[u8]) -> Option<VisibilitiesOutline> {
     let (record, rest) = take_record::<VisibilityRecord>("visibility", bytes).ok()?;
     let count = record.count as usize;
     require_length("visibility arrays", count.saturating_mul(VISIBILITY_BYTES), rest.len()).ok()?;
     let mut arrays = Arrays(rest);
     let (offsets, durations) = (arrays.u32(count), arrays.u32(count));
     let start = MissionTime(record.start_ticks);
+    let first = start.plus_ticks(i64::from(*offsets.first()?));
     let end = i64::from(*offsets.last()?) + i64::from(*durations.last()?);
-    Some([start.plus_ticks(i64::from(*offsets.first()?)), start.plus_ticks(end)])
+    Some(VisibilitiesOutline {
+        pair: Pair { i: record.i, j: record.j },
+        span: [first, start.plus_ticks(end)],
+        // As a block has it, bit for bit.
+        middle_s: start.seconds()
+            + (f64::from(*offsets.first()?) + 0.5 * f64::from(*durations.first()?)) * 1e-6,
+    })
 }
 
 /// Checks the invariants of a block as a whole.

@@ -1,0 +1,70 @@
+//! `lunarray recalibrate`: better gains for the data of a state.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::arguments::StateMapArgs;
+use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
+use crate::ground::{Ground, WAIT_BYTES};
+use crate::pipeline::{Config, use_threads, with_gains};
+
+/// Give the data of a state other gains.
+///
+/// Visibilities of the files are taken out of the sums under the gains that they were added with, and added under the new
+/// ones; both are exact, so that the sums are those of a new state made with the new gains. Packets to which the new gains do
+/// what the old ones did need not be in the files, all others have to be. The state then belongs to the new gains: later data
+/// are replayed with the same --calibration. Its number of calibrations grows by one. If interrupted, the folder holds either
+/// the old state or the new one.
+///
+/// Example: lunarray recalibrate pass.ccsds --state state/ --old-calibration old/gains.json --calibration new/gains.json
+#[derive(Debug, Args)]
+pub(super) struct RecalibrateArgs {
+    /// Downlink files whose visibilities get other gains.
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// State folder of `lunarray replay --state`.
+    #[arg(long, value_name = "DIR")]
+    state: PathBuf,
+    /// The new gains, as `lunarray calibrate` writes them.
+    #[arg(long, value_name = "GAINS")]
+    calibration: PathBuf,
+    /// The gains that the state was made with, if they are those of a file.
+    #[arg(long, value_name = "GAINS")]
+    old_calibration: Option<PathBuf>,
+    #[command(flatten)]
+    map: StateMapArgs,
+    /// Print one JSON object instead of text.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn execute(args: &RecalibrateArgs) -> CommandResult {
+    let mut source = args.map.source(&args.state)?;
+    if let Some(path) = &args.old_calibration {
+        source.overrides.push("calibration.hook=antenna-gains".to_owned());
+        source.overrides.push(format!("calibration.gains_file={:?}", path.display().to_string()));
+    }
+    let config = source.load_ground()?;
+    use_threads(&config.runtime)?;
+    let new = with_gains(&config, args.calibration.clone());
+    let ground = |config: &Config| config.ground(WAIT_BYTES);
+    let (found, notes) = Ground::recalibrate(&args.state, &args.files, &ground(&config), &ground(&new))?;
+    print_notes(notes.iter().map(String::as_str));
+    if args.json {
+        print_json_line(&found)?;
+        return Ok(Completion::Done);
+    }
+    print_text(&format!(
+        "{} packets of {} have other gains: {} visibilities were in the sums, {} are; {} packets have the gains that they had. \
+         Calibration {}: {}",
+        found.packets,
+        args.state.display(),
+        found.accumulated_before,
+        found.accumulated,
+        found.unchanged,
+        found.version,
+        found.gains,
+    ))?;
+    Ok(Completion::Done)
+}

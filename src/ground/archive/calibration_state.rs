@@ -1,0 +1,50 @@
+//! What a checkpoint knows of the calibration of its sums.
+
+use bincode::de::Decoder;
+use bincode::enc::Encoder;
+use bincode::error::{DecodeError, EncodeError};
+use bincode::{Decode, Encode};
+
+use crate::ground::PassGateState;
+
+/// The number of the calibration, and what is known of passes.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct CalibrationState {
+    /// Number of the calibration that the sums were made with, from 1.
+    pub(super) version: u32,
+    /// Passes, where gains are found.
+    pub(super) passes: PassGateState,
+}
+
+impl Default for CalibrationState {
+    fn default() -> Self {
+        Self { version: 1, passes: PassGateState::default() }
+    }
+}
+
+impl CalibrationState {
+    /// Whether gains were found for it.
+    pub(super) fn is_solved(&self) -> bool {
+        self.passes != PassGateState::default()
+    }
+}
+
+/// Nothing is written of the first calibration without passes: most states are like that, and are as they were before there
+/// were others.
+impl Encode for CalibrationState {
+    fn encode<E: Encoder>(&self, encoder: &mut E) -> Result<(), EncodeError> {
+        if *self == Self::default() {
+            return Ok(());
+        }
+        (self.version, &self.passes).encode(encoder)
+    }
+}
+
+impl<Context> Decode<Context> for CalibrationState {
+    fn decode<D: Decoder<Context = Context>>(decoder: &mut D) -> Result<Self, DecodeError> {
+        let (version, passes) = Decode::decode(decoder)?;
+        Ok(Self { version, passes })
+    }
+}
+
+bincode::impl_borrow_decode!(CalibrationState);
