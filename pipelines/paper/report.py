@@ -527,7 +527,8 @@ def main():
         ("Fig. 16: rows at centres and averaged, rho_l without noise",
          "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("rho", "no noise", "The paper: rows at centres are well below 1 from b_p on; averaged rows are not, and "
-                   "b < 2 b_p and b < 4 b_p are alike.")),
+                   "b < 2 b_p and b < 4 b_p are alike. So it is here, at nside 16; its study has what data it is from. Many windows matter more "
+                   "than many integrations of each: every 4th is half a wavelength from the last.")),
         ("Fig. 17: the same, SNR_l with thermal noise", "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("snr", "thermal noise", "Rows at centres are not made smaller by the pixel, so that they take long baselines for better measured "
                    "than they are: less noise, and so a greater SNR_l, of maps that Fig. 16 shows to be wrong.")),

@@ -202,7 +202,8 @@ mod tests {
             assert!((found.fwhm_major_deg / major - 1.0).abs() < 0.01, "{found:?}");
             assert!((found.fwhm_minor_deg / minor - 1.0).abs() < 0.01, "{found:?}");
             assert!((found.angle_deg - angle_deg).abs() < 2.0 && found.offset_deg < 0.05, "{found:?}");
-            assert!((found.peak_k / 0.7 - 1.0).abs() < 5e-3, "{found:?}");
+            // The nearest pixel's centre is up to 0.16 degrees off the middle: 4 ln 2 (0.16 / 3.9)^2.
+            assert!((found.peak_k / 0.7 - 1.0).abs() < 6e-3, "{found:?}");
         }
         let nothing = SkyMap::constant(16, Frame::Ecliptic, 0.0).unwrap();
         assert_eq!(BeamWidths::around(&nothing, 16, [0.0, 0.0]), None);

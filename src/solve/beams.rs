@@ -6,20 +6,12 @@ use super::conjugate_gradients::System;
 use super::error::SolveError;
 use super::harmonic::HarmonicRequest;
 use super::regulariser::Regulariser;
+use super::tikhonov::PointBeam;
 use super::watch::NamedWatch;
 use crate::accumulation::NormalSums;
 use crate::accumulation::harmonic::{HarmonicSums, coefficients, unknowns};
 use crate::sky::harmonics::Transform;
 use crate::sky::healpix::pixel_count;
-
-/// The map of a sky that is 1 K in one pixel.
-#[derive(Clone, Debug, PartialEq)]
-pub struct PointBeam {
-    /// The pixel.
-    pub pixel: usize,
-    /// Map, K, HEALPix RING; of the pixel's degrees up to the map's, if it is one of harmonics.
-    pub map_k: Vec<f64>,
-}
 
 /// Beams of a harmonic map at pixels of its nside, solved for as the map is; `w_max` is the largest eigenvalue over harmonics. Those
 /// that are reached before an interruption.

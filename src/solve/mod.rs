@@ -23,7 +23,7 @@ mod traces;
 mod vectors;
 mod watch;
 
-pub use beams::{PointBeam, harmonic_beams};
+pub use beams::harmonic_beams;
 pub use cholesky::{Cholesky, NotPositive};
 pub use conjugate_gradients::{Convergence, StoppingRule};
 pub use diagnostics::{Spectrum, spectrum};
@@ -35,6 +35,6 @@ pub use probing::{effective_beam, noise_variance, regularisation};
 pub use refined::{ChiSquares, RefineRule, RefineSteps, Refinement, solve_refined};
 pub use regulariser::Regulariser;
 pub use stage::{Solution, Solver, SolverSetup};
-pub use tikhonov::{Diagnostics, PixelExtras, PixelSolution, solve_pixels, solve_pixels_with};
+pub use tikhonov::{Diagnostics, PixelExtras, PixelSolution, PointBeam, solve_pixels, solve_pixels_with};
 pub use traces::{Estimate, HELD_MAX, Traces, UnsupportedEpsilon, probed_traces, traces};
 pub use watch::{NamedWatch, SolveWatch, Solving};

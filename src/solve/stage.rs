@@ -4,11 +4,11 @@ use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use super::beams::{PointBeam, harmonic_beams};
+use super::beams::harmonic_beams;
 use super::harmonic::{HarmonicRequest, solve_regularised};
 use super::passes::PassFile;
 use super::refined::{RefineRule, RefineSteps, Refinement, solve_refined};
-use super::tikhonov::{PixelExtras, solve_pixels_with};
+use super::tikhonov::{PixelExtras, PointBeam, solve_pixels_with};
 use super::{Diagnostics, Regulariser, SolveError, SolveWatch, StoppingRule};
 use crate::accumulation::{Snapshot, SnapshotSums, SumCounts};
 use crate::frames::Instrument;

@@ -2,7 +2,6 @@
 
 use serde::Serialize;
 
-use super::beams::PointBeam;
 use super::cholesky::{Cholesky, NotPositive};
 use super::conjugate_gradients::Convergence;
 use super::error::SolveError;
@@ -58,6 +57,15 @@ impl Diagnostics {
         }
         self
     }
+}
+
+/// The map of a sky that is 1 K in one pixel.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PointBeam {
+    /// The pixel.
+    pub pixel: usize,
+    /// Map, K, HEALPix RING; of the pixel's degrees up to the map's, if it is one of harmonics.
+    pub map_k: Vec<f64>,
 }
 
 /// A map and its noise-only companion.
