@@ -316,6 +316,48 @@ def traces(name="fig15-traces"):
     return text
 
 
+def epsilon_rules(*names):
+    """What the rules choose, of each study that was made with traces."""
+    rows = []
+    for name in names:
+        study = load(f"{name}/study.json")
+        for found in (study or {}).get("epsilons", []):
+            def told(rule):
+                choice = found[rule]
+                if choice["epsilon"] is None:
+                    return "none: " + choice["note"]
+                low, high = choice["open"] or (choice["epsilon"],) * 2
+                return f"{choice['epsilon']:.1e}" + (f" ({low:.0e} to {high:.0e} open)" if low < high else "")
+            rows.append([f"`{name}`", f"{found['numbers']:,}", f"{found['power_a_number']:.3g}",
+                         *[told(rule) for rule in ("crossing", "cross_validation", "risk", "l_curve")]])
+    if not rows:
+        return ""
+    head = ["study", "n", "V'N^-1V / n", "crossing for T²", "generalised cross-validation", "predictive risk", "L-curve"]
+    return "\n### epsilon by four rules\n\n" + table(head, rows) + (
+        "\n[What each rule is](engines.md#choosing-epsilon).\n"
+    )
+
+
+def point_beams():
+    study = load("beams/study.json")
+    if study is None:
+        return missing("lunarray study pipelines/paper/beams.toml")
+    rows = []
+    for case in study["cases"]:
+        path = OUT / "beams" / case["folder"] / "summary.json"
+        for beam in json.loads(path.read_text())["channels"][0]["point_beams"]:
+            def told(widths):
+                if not widths:
+                    return ["-", "-"]
+                major, minor = widths["fwhm_major_deg"], widths["fwhm_minor_deg"]
+                return [f"{math.sqrt(major * minor):.2f}", f"{major:.2f} x {minor:.2f}"]
+            rows.append([case["figures"]["name"], f"{beam['latitude_deg']:.1f}", *told(beam.get("solved")), *told(beam.get("processed"))])
+    head = ["case", "ecliptic latitude, deg", "FWHM, deg", "axes", "after post-processing", "axes"]
+    return table(head, rows) + (
+        "\nAt nside 16 and smoothed to 4 degrees; the paper, at nside 64 and smoothed to 1 degree: about 1.3 degrees, four times which is 5.2.\n"
+    )
+
+
 def with_all_windows(thinned):
     """Where the traces cross if the noise falls as the data grow: Tr Sigma_n over the factor, Tr Sigma_s as it is."""
     study = load("fig15-pixels/study.json")
@@ -480,11 +522,13 @@ def main():
          f"`{patch_command('10', 0)}` and so on", patches()),
         ("Fig. 15: traces against epsilon", "`lunarray study pipelines/paper/fig15-traces.toml`",
          traces() + "\n![rho, SNR, power and traces against epsilon](paper-fig15.png)\n" + basis()
-         + "\n### In pixels, nside 16\n\n`lunarray study pipelines/paper/fig15-pixels.toml`\n\n" + traces("fig15-pixels") + with_all_windows(40)),
+         + "\n### In pixels, nside 16\n\n`lunarray study pipelines/paper/fig15-pixels.toml`\n\n" + traces("fig15-pixels") + with_all_windows(40)
+         + epsilon_rules("fig15-traces", "fig15-pixels")),
         ("Fig. 16: rows at centres and averaged, rho_l without noise",
          "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("rho", "no noise", "The paper: rows at centres are well below 1 from b_p on; averaged rows are not, and "
-                   "b < 2 b_p and b < 4 b_p are alike.")),
+                   "b < 2 b_p and b < 4 b_p are alike. So it is here, at nside 16; its study has what data it is from. Many windows matter more "
+                   "than many integrations of each: every 4th is half a wavelength from the last.")),
         ("Fig. 17: the same, SNR_l with thermal noise", "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("snr", "thermal noise", "Rows at centres are not made smaller by the pixel, so that they take long baselines for better measured "
                    "than they are: less noise, and so a greater SNR_l, of maps that Fig. 16 shows to be wrong.")),
@@ -495,6 +539,7 @@ def main():
          sensitivity() + pair_sensitivity()
          + "\n### At nside 64\n\n`lunarray study pipelines/paper/fig19-nside64.toml`, from every 40th window\n\n"
          + sensitivity("fig19-nside64", 64) + flatness()),
+        ("FWHM after post-processing", "`lunarray study pipelines/paper/beams.toml`", point_beams()),
         ("Fig. 20 and the appendix: N_b and Sigma_b", f"`{FIGURE.format('sub-pixel')}`", figure("sub-pixel", sub_pixel)),
     ]
     print("# The paper, figure by figure\n")

@@ -21,7 +21,8 @@ use super::error::AccumulationError;
 use crate::frames::AntennaResponse;
 
 const MAGIC: &[u8; 8] = b"LNRENGIN";
-const VERSION: u16 = 1;
+const VERSION: u16 = 2;
+const CURRENT: &str = "an engine's checkpoint, version 2: sum the data again";
 /// Beginnings of the magics of earlier formats, one for each engine.
 const EARLIER: [&[u8]; 2] = [b"LNRPIX", b"LNRHRM"];
 
@@ -127,14 +128,14 @@ impl<'a> FrameReader<'a> {
         let magic: [u8; 8] = from.array()?;
         if EARLIER.iter().any(|earlier| magic.starts_with(earlier)) {
             let found = format!("an engine of an earlier format ({})", magic.escape_ascii());
-            return Err(refused(found, "an engine's checkpoint, version 1: sum the data again"));
+            return Err(refused(found, CURRENT));
         }
         if &magic != MAGIC {
             return Err(refused(format!("{magic:02x?}"), "an engine's checkpoint"));
         }
         let version = u16::from_le_bytes(from.array()?);
         if version != VERSION {
-            return Err(refused(format!("version {version} of an engine's checkpoint"), "version 1"));
+            return Err(refused(format!("version {version} of an engine's checkpoint"), CURRENT));
         }
         let [found] = from.array()?;
         if found != kind as u8 {
@@ -231,7 +232,11 @@ mod tests {
     fn other_magics_versions_and_kinds_are_refused() {
         for (bytes, expected) in [
             (frame(b"LNRSTA04", VERSION, 1), "expected an engine's checkpoint"),
-            (frame(MAGIC, VERSION + 1, 1), "expected version 1"),
+            (frame(MAGIC, VERSION + 1, 1), "expected an engine's checkpoint, version 2"),
+            (
+                frame(MAGIC, 1, 1),
+                "found version 1 of an engine's checkpoint, expected an engine's checkpoint, version 2: sum",
+            ),
             (frame(MAGIC, VERSION, 2), "found sums of kind 2, expected sums over pixels"),
             (frame(MAGIC, VERSION, 3), "found sums of kind 3"),
         ] {

@@ -23,6 +23,9 @@ pub const HARMONIC_ENGINE_NSIDE_MAX: usize = 1024;
 /// Default number of degrees of a harmonic map per nside: as many as pixels represent to 1e-6.
 const DEGREES_PER_NSIDE: f64 = 2.5;
 
+/// Most directions in which beams are solved for, a solution each.
+const BEAMS_MAX: usize = 100;
+
 /// Channels whose sums are in memory at one time.
 pub type ChannelGroup = BTreeSet<ChannelId>;
 
@@ -60,6 +63,15 @@ pub struct MapConfig {
     pub baseline_bp_max: f64,
     /// Regularisation epsilon: R = epsilon W_max I.
     pub epsilon: PerChannel<f64>,
+    /// How R grows with the degree: `R_l = epsilon W_max (l + 1)^exponent`. Harmonic engine; 0 for the identity.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub regularisation_exponent: f64,
+    /// Tables of l and C_l (K^2), one a channel: `R_l = epsilon / C_l`. Harmonic engine; empty for none.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub regularisation_files: Vec<PathBuf>,
+    /// Ecliptic longitudes and latitudes, degrees, at which the effective beam of a final map is solved for.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub beams_deg: Vec<[f64; 2]>,
     /// Prior map: a uniform temperature, K; 0 for none.
     pub prior_k: PerChannel<f64>,
     /// Prior maps: HEALPix FITS files, one per channel, in K; empty for none.
@@ -130,6 +142,9 @@ impl Default for MapConfig {
             l_max: 0,
             baseline_bp_max: 2.0,
             epsilon: PerChannel::All(1e-4),
+            regularisation_exponent: 0.0,
+            regularisation_files: Vec::new(),
+            beams_deg: Vec::new(),
             prior_k: PerChannel::All(0.0),
             prior_files: Vec::new(),
             prior_frame: None,
@@ -147,7 +162,18 @@ impl Default for MapConfig {
     }
 }
 
+/// So that what is not set changes no hash of a configuration.
+fn is_zero(value: &f64) -> bool {
+    *value == 0.0
+}
+
 impl MapConfig {
+    /// Whether R is `epsilon W_max` times the identity.
+    #[must_use]
+    pub fn is_plain(&self) -> bool {
+        is_zero(&self.regularisation_exponent) && self.regularisation_files.is_empty()
+    }
+
     /// All invalid settings; empty if there are none.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
@@ -182,6 +208,7 @@ impl MapConfig {
             checks.number(key, value, value >= 0.0, "not negative");
         }
         self.check_refinement(&mut checks);
+        self.check_regularisation(&mut checks);
         let weight = self.weight_max;
         checks.number(
             "weight_max",
@@ -224,6 +251,39 @@ impl MapConfig {
         }
     }
 
+    /// Checks R, and that nothing is asked for that holds for multiples of the identity alone.
+    fn check_regularisation(&self, checks: &mut Checks) {
+        let (exponent, files) = (self.regularisation_exponent, self.regularisation_files.len());
+        checks.number("regularisation_exponent", exponent, (-10.0..=10.0).contains(&exponent), "-10 to 10");
+        let one = files == 0 || exponent == 0.0;
+        checks.require(
+            "regularisation_files",
+            format!("({files} files)"),
+            one,
+            "none with map.regularisation_exponent",
+        );
+        let beams = self.beams_deg.len();
+        let few = beams <= BEAMS_MAX && (beams == 0 || !self.refine.is_on());
+        checks.require(
+            "beams_deg",
+            format!("({beams} directions)"),
+            few,
+            "at most 100, and none with map.refine",
+        );
+        for &[longitude_deg, latitude_deg] in &self.beams_deg {
+            let good = longitude_deg.abs() <= 360.0 && latitude_deg.abs() <= 90.0;
+            let found = format!("[{longitude_deg}, {latitude_deg}]");
+            checks.require("beams_deg", found, good, "ecliptic longitude and latitude, degrees");
+        }
+        if !self.is_plain() {
+            let expected = "0 with this R: traces are those of R = epsilon W_max I";
+            checks.require("trace_probes", self.trace_probes, self.trace_probes == 0, expected);
+            let refined = self.refine.is_on();
+            let expected = "no map.regularisation_exponent and no map.regularisation_files with it";
+            checks.require("refine.passes_max", self.refine.passes_max, !refined, expected);
+        }
+    }
+
     /// Requires that keys of the other engine are not set.
     fn check_effects(&self, checks: &mut Checks) {
         let usual = Self::default();
@@ -234,6 +294,8 @@ impl MapConfig {
                     ("l_max", self.l_max != usual.l_max),
                     ("residual_max", self.residual_max != usual.residual_max),
                     ("iterations_max", self.iterations_max != usual.iterations_max),
+                    ("regularisation_exponent", self.regularisation_exponent != 0.0),
+                    ("regularisation_files", !self.regularisation_files.is_empty()),
                     ("limits", self.limits != usual.limits),
                     ("refine", self.refine != usual.refine),
                 ],
@@ -267,6 +329,9 @@ impl MapConfig {
             channels: mapped,
             channels_max: _,
             epsilon: _,
+            regularisation_exponent: _,
+            regularisation_files: _,
+            beams_deg: _,
             prior_k: _,
             prior_files: _,
             prior_frame: _,
@@ -344,7 +409,7 @@ impl MapConfig {
     /// Settings by channel that do not match an instrument of `channels` channels.
     #[must_use]
     pub fn misfits(&self, channels: usize) -> Vec<InvalidValue> {
-        let files = self.prior_files.len();
+        let (files, tables) = (self.prior_files.len(), self.regularisation_files.len());
         let mut checks = Checks::of("map");
         let expected =
             format!("at least the {channels} channels of the instrument, each of which needs memory");
@@ -357,6 +422,7 @@ impl MapConfig {
             ("epsilon", self.epsilon.fits(channels), self.epsilon.values().len()),
             ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),
             ("prior_files", files == 0 || files == channels, files),
+            ("regularisation_files", [0, channels].contains(&tables), tables),
         ] {
             let expected = format!("one value, or one for each of the {channels} channels");
             checks.require(key, format!("({found} values)"), fits, expected);

@@ -196,7 +196,7 @@ impl<B: SkyBasis> ExactEngine<B> {
         // Not in the pool, which sums the batch before: this is the other half of the work.
         let found: Vec<_> = (0..placed.len()).map(|k| self.accept(placed, k)).collect();
         let scale = self.scale;
-        let one = |accepted: &Accepted<B::Place>| Totals::one(scale, accepted.weight);
+        let one = |accepted: &Accepted<B::Place>| Totals::one(scale, accepted.weight, accepted.value_k_sr);
         if direction == Direction::Out {
             let mut accepted = found.iter().flatten();
             let left = accepted.try_fold(self.totals, |totals, removed| totals.and(one(removed), direction));

@@ -35,13 +35,15 @@ use serde::Serialize;
 use crate::frames::{PlacedVisibilities, VisibilityReason};
 use crate::response::harmonic::GeometryRefusal;
 
-/// Number and weight of the visibilities in an engine or its sums.
+/// Number, weight and power of the visibilities in an engine or its sums.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct SumCounts {
     /// Visibilities in the sums.
     pub visibilities: u64,
     /// Sum of their weights, (K sr)^-2.
     pub weight: f64,
+    /// `V'N^-1V`: the sum of their squares times weights.
+    pub power: f64,
 }
 
 /// Why an engine refuses a visibility.

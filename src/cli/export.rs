@@ -8,7 +8,8 @@ use clap::{Args, Subcommand, ValueEnum};
 use super::arguments::{ArrayArgs, MapFileArgs, frame, input_path, is_standard, output_path, time_s};
 use super::log::utc_text;
 use super::output::{
-    CommandError, CommandResult, Completion, of_stdout, print_config_notes, print_json_line, print_notes, print_text,
+    CommandError, CommandResult, Completion, of_stdout, print_config_notes, print_json_line, print_notes,
+    print_text,
 };
 use crate::array::{Array, OemExport};
 use crate::files::write_atomically;

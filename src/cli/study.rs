@@ -13,13 +13,15 @@ use super::progress::{CalibrateLines, Progress};
 use crate::pipeline::{
     INTEGRATE, MemoryLimit, READ, Segment, Study, StudyStep, StudySummary, run_study, use_threads,
 };
+use crate::products::{EpsilonChoice, EpsilonChoices};
 
 /// Run a pipeline at every combination of some settings, and show the results side by side.
 ///
 /// A study names a pipeline file and axes: a key with values, or named cases of several settings. Cases that differ only
 /// in the ground segment share one simulation, and those that differ only in epsilon or prior share their sums. Leaves the
 /// products of every case, tables (study.csv, spectra.csv, study.json) and overlaid curves (study.png): rho_l, SNR_l, C_l,
-/// and, with map.trace_probes, the traces of thermal noise and imperfection against epsilon, with their crossing. With
+/// and, with map.trace_probes, the traces of thermal noise and imperfection against epsilon, with their crossing, and epsilon as cross-
+/// validation, predictive risk and L-curve choose it (epsilons.csv, epsilons.png). With
 /// `realisations = N` each case is made for N realisations of noise and random errors, for maps of sigma and covariances of C_l. With
 /// `calibrated = true` each case is made twice, from the data as sent and with gains that are found from them; cases with errors of the
 /// instrument are compared with the one without. Cases that are finished are not made again: to resume after an interruption, repeat
@@ -172,5 +174,28 @@ fn table(summary: &StudySummary) -> String {
             of(crossing.epsilon_first_power)
         ));
     }
+    lines.extend(summary.epsilons.iter().flat_map(told_epsilons));
     lines.join("\n")
+}
+
+/// epsilon as each rule chooses it, a line a rule.
+fn told_epsilons(choices: &EpsilonChoices) -> Vec<String> {
+    let at = format!("{}, {:.3} MHz", choices.of, choices.frequency_hz / 1e6);
+    let rules = [
+        ("crossing of the traces", &choices.crossing),
+        ("generalised cross-validation", &choices.cross_validation),
+        ("predictive risk", &choices.risk),
+        ("L-curve", &choices.l_curve),
+    ];
+    let told = |(rule, choice): (&str, &EpsilonChoice)| {
+        let chosen = choice.epsilon.map_or_else(|| "none".to_owned(), |epsilon| format!("{epsilon:.2e}"));
+        let open = choice.open.filter(|[low, high]| low < high);
+        let open =
+            open.map_or_else(String::new, |[low, high]| format!(", {low:.0e} to {high:.0e} within the bars"));
+        let note = choice.note.as_ref().map_or_else(String::new, |note| format!(" ({note})"));
+        format!("epsilon by {rule}: {chosen}{open}{note}")
+    };
+    std::iter::once(format!("{at}: V'N^-1V is {:.3e} a number", choices.power_a_number))
+        .chain(rules.map(told))
+        .collect()
 }

@@ -221,6 +221,7 @@ impl Config {
         let (mut calibration, mut map) = (self.calibration.clone(), self.map.clone());
         calibration.gains_file = calibration.gains_file.as_deref().map(contents);
         map.prior_files = map.prior_files.iter().map(|path| contents(path)).collect();
+        map.regularisation_files = map.regularisation_files.iter().map(|path| contents(path)).collect();
         if calibration.hook != CalibrationHook::Solve {
             return hash(&(calibration, map));
         }

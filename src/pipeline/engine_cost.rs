@@ -168,7 +168,10 @@ impl EngineCost {
             other_bytes: (memory.tables + memory.workspace) as f64 + vectors * vector_bytes,
             visibility_s: 1.0 / (HARMONIC_VISIBILITIES_PER_S * cores()),
             solution_s: APPLICATIONS * application_s,
-            probes_s: map.trace_probes as f64 * PROBE_APPLICATIONS * application_s,
+            // A beam takes half of what the map and its noise take.
+            probes_s: (map.trace_probes as f64 * PROBE_APPLICATIONS
+                + 0.5 * APPLICATIONS * map.beams_deg.len() as f64)
+                * application_s,
             visibility_multiply_adds: SPREAD_MULTIPLY_ADDS,
             solution_multiply_adds: APPLICATIONS * size.matrix_multiply_adds,
         }

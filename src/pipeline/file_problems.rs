@@ -6,6 +6,7 @@ use super::plan::Plan;
 use super::problems::Problems;
 use crate::sky::AddedSky;
 use crate::sky::fits::{ReadOptions, read_sky, read_whole_map};
+use crate::solve::Regulariser;
 
 impl Plan {
     /// Reads every file that the configuration names; everything that is wrong with them, empty if they are good.
@@ -22,6 +23,11 @@ impl Plan {
         let options = ReadOptions { frame_if_missing: self.config.map.prior_frame, ..ReadOptions::default() };
         let priors = priors.map(|path| read_whole_map(path, &options));
         for problem in skies.chain(priors).filter_map(Result::err) {
+            found.push(|| problem);
+        }
+        for problem in
+            self.config.map.regularisation_files.iter().filter_map(|path| Regulariser::read(path).err())
+        {
             found.push(|| problem);
         }
         if let Some(Err(problem)) = sky.added.as_ref().map(AddedSky::check) {

@@ -6,11 +6,12 @@ use std::sync::{Arc, Mutex};
 use super::config::Config;
 use super::error::PipelineError;
 use super::live_gains::GainsWriter;
+use crate::accumulation::MapConfig;
 use crate::ground::{Ground, GroundConfig, GroundOutcome};
 use crate::products::{ChannelSummary, MapWatch, ProductsError, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link, Sink};
 use crate::sky::fits::{ReadOptions, read_whole_map};
-use crate::solve::{RefineRule, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
+use crate::solve::{RefineRule, Regulariser, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
 
 /// Name of the stage that keeps the state.
 pub(super) const GROUND: &str = "ground";
@@ -30,11 +31,13 @@ impl Config {
     /// Setup of the solver, which `watch` follows.
     ///
     /// # Errors
-    /// Prior maps that cannot be read.
+    /// Prior maps and tables of power that cannot be read.
     pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
         let map = &self.map;
         Ok(SolverSetup {
             epsilon: map.epsilon.clone(),
+            regularisers: regularisers(map)?,
+            beams_deg: map.beams_deg.clone(),
             moon_reflection: map.moon_reflection,
             prior_k: map.prior_k.clone(),
             prior_maps: prior_maps(self)?,
@@ -113,6 +116,14 @@ impl Sink for Bystander {
     fn take(&mut self, _solution: Solution) -> Result<(), ProductsError> {
         Ok(())
     }
+}
+
+/// How R depends on the degree, by channel.
+fn regularisers(map: &MapConfig) -> Result<Vec<Regulariser>, PipelineError> {
+    if map.regularisation_files.is_empty() {
+        return Ok(vec![Regulariser::Power(map.regularisation_exponent)]);
+    }
+    map.regularisation_files.iter().map(|path| Ok(Regulariser::read(path)?)).collect()
 }
 
 fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {

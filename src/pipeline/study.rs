@@ -24,7 +24,8 @@ use crate::downlink::{FileSource, Recorder};
 use crate::files::{FolderLock, write_atomically};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::products::{
-    Crossing, MapShape, ProductsError, RunFigures, Truth, crossings, draw_runs, runs_csv, spectra_csv,
+    Crossing, EpsilonChoices, MapShape, ProductsError, RunFigures, Truth, crossings, draw_epsilons,
+    draw_runs, epsilon_choices, epsilons_csv, runs_csv, spectra_csv,
 };
 use crate::runtime::Cancel;
 use crate::sky::SkyMap;
@@ -357,6 +358,9 @@ pub struct StudySummary {
     pub cases: Vec<CaseSummary>,
     /// Where the traces cross, for cases that differ in map.epsilon alone.
     pub crossings: Vec<Crossing>,
+    /// epsilon as several rules choose it, for the same cases, where at least three have traces.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub epsilons: Vec<EpsilonChoices>,
     /// What realisations scatter by.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub spreads: Vec<RealisationSpread>,
@@ -646,10 +650,10 @@ fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary,
         .into_iter()
         .map(|(_, members)| members.into_iter().map(|k| &cases[k].figures).collect())
         .collect();
-    let crossings = crossings(&groups);
+    let (crossings, epsilons) = (crossings(&groups), epsilon_choices(&groups));
     note_power_kept(&done, &mut cases);
     let spreads = if study.realisations > 1 { spreads(&realised(study, &cases), out)? } else { Vec::new() };
-    Ok(StudySummary { name: study.name.clone(), cancelled, cases, crossings, spreads })
+    Ok(StudySummary { name: study.name.clone(), cancelled, cases, crossings, epsilons, spreads })
 }
 
 /// Compares each case of a study of the instrument's errors with the one that has none of them and is not calibrated.
@@ -702,9 +706,10 @@ fn write_results(summary: &StudySummary, out: &Path) -> Result<(), PipelineError
         ("study.json", json),
         ("study.csv", runs_csv(&runs).into_bytes()),
         ("spectra.csv", spectra_csv(&runs).into_bytes()),
-        ("realisations.csv", csv_of(&summary.spreads).into_bytes()),
+        ("realisations.csv", if_any(&summary.spreads, csv_of)),
+        ("epsilons.csv", if_any(&summary.epsilons, epsilons_csv)),
     ] {
-        if name == "realisations.csv" && summary.spreads.is_empty() {
+        if bytes.is_empty() {
             continue;
         }
         let path = out.join(name);
@@ -714,5 +719,16 @@ fn write_results(summary: &StudySummary, out: &Path) -> Result<(), PipelineError
     for name in ["study.png", "study.svg"] {
         picture.write(&out.join(name)).map_err(ProductsError::from)?;
     }
+    if !summary.epsilons.is_empty() {
+        let picture = draw_epsilons(&summary.name, &summary.epsilons).map_err(ProductsError::from)?;
+        for name in ["epsilons.png", "epsilons.svg"] {
+            picture.write(&out.join(name)).map_err(ProductsError::from)?;
+        }
+    }
     Ok(())
+}
+
+/// A table of something; empty of nothing.
+fn if_any<T>(of: &[T], table: impl Fn(&[T]) -> String) -> Vec<u8> {
+    if of.is_empty() { Vec::new() } else { table(of).into_bytes() }
 }

@@ -10,10 +10,12 @@ use super::pictures::{
     Axis, Bars, ColourScale, Curve, MapPanel, Palette, Picture, PictureError, Plot, Sampling, Scaling, Sheet,
     View, draw_map, draw_plots, draw_sheet,
 };
+use super::point_beams::{PointBeamSummary, beams_csv};
 use super::provenance::Provenance;
 use super::summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 use super::truth::ChannelTruth;
 use super::viewer::{MapWatch, PublishedMap};
+use crate::files::write_atomically;
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::spectra::gaussian_beam;
 use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with, is_unseen};
@@ -42,6 +44,7 @@ pub(super) struct ChannelFolder {
     snapshots: Vec<SnapshotSummary>,
     files: Vec<String>,
     summary: Option<ChannelSummary>,
+    beams: Vec<PointBeamSummary>,
 }
 
 impl ChannelFolder {
@@ -68,6 +71,7 @@ impl ChannelFolder {
             snapshots: Vec::new(),
             files: Vec::new(),
             summary: None,
+            beams: Vec::new(),
         })
     }
 
@@ -102,6 +106,7 @@ impl ChannelFolder {
             for maps in [Some(&solved), processed.as_ref()].into_iter().flatten() {
                 self.write_final(maps, origin)?;
             }
+            self.write_beams(origin)?;
             if self.config.pictures {
                 self.draw_final(shown, comparison.as_ref(), origin)?;
             }
@@ -198,6 +203,7 @@ impl ChannelFolder {
             snr,
             power,
             beam,
+            point_beams: self.beams.clone(),
             latitudes,
             files: Vec::new(),
         }
@@ -246,6 +252,28 @@ impl ChannelFolder {
         self.write_map(&format!("noise{ending}.fits"), noise, processing, origin)?;
         if let Some(input) = self.input(processing).map(|input| input.map.clone()) {
             self.write_map(&format!("input{ending}.fits"), &input, processing, origin)?;
+        }
+        Ok(())
+    }
+
+    /// Maps of points, as solved and post-processed, and a table of their widths.
+    fn write_beams(&mut self, origin: Origin<'_>) -> Result<(), ProductsError> {
+        let Origin { solution, .. } = origin;
+        for (number, beam) in solution.beams.iter().enumerate() {
+            let map = SkyMap::new(Frame::Ecliptic, beam.map_k.clone())?;
+            let processing = self.config.processing();
+            let processed = processing.map(|processing| processing.apply(&map)).transpose()?;
+            self.write_map(&format!("beam-{}.fits", number + 1), &map, None, origin)?;
+            if let Some(processed) = &processed {
+                self.write_map(&format!("beam-{}-smooth.fits", number + 1), processed, processing, origin)?;
+            }
+            let l_max = solution.diagnostics.l_max;
+            self.beams.push(PointBeamSummary::new(beam.pixel, &map, l_max, processed.as_ref())?);
+        }
+        if !self.beams.is_empty() {
+            let path = self.file("beams.csv");
+            write_atomically(&path, beams_csv(&self.beams).as_bytes())
+                .map_err(|source| ProductsError::Write { path, source })?;
         }
         Ok(())
     }

@@ -10,10 +10,12 @@ mod autos;
 mod beam;
 mod channel;
 mod config;
+mod epsilons;
 mod error;
 mod hips;
 mod latitudes;
 pub mod pictures;
+mod point_beams;
 mod provenance;
 mod publisher;
 mod runs;
@@ -27,14 +29,18 @@ pub use autos::{AutoSummary, summarise, write_autos};
 pub use beam::EffectiveBeam;
 pub use channel::{draw_comparison, draw_relative_error};
 pub use config::{PostProcessing, ProductsConfig};
+pub use epsilons::{
+    EpsilonChoice, EpsilonChoices, EpsilonPoint, draw_epsilons, epsilon_choices, epsilons_csv,
+};
 pub use error::ProductsError;
 pub use hips::{Hips, HipsReport};
 pub use latitudes::LatitudeError;
+pub use point_beams::{BeamWidths, PointBeamSummary};
 pub use provenance::Provenance;
 pub use publisher::Publisher;
 pub use runs::{
-    BeamFigures, ChannelFigures, Crossing, DiagnosticFigures, EstimateFigures, PowerFigures, RunFigures,
-    TraceFigures, crossings, draw_runs, runs_csv, spectra_csv,
+    BeamFigures, ChannelFigures, Crossing, DiagnosticFigures, EstimateFigures, FitFigures, PowerFigures,
+    RunFigures, TraceFigures, crossings, draw_runs, runs_csv, spectra_csv,
 };
 pub use summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 pub use time_coverage::draw_coverage;

@@ -1,5 +1,7 @@
 //! Provenance of the maps.
 
+use std::path::Path;
+
 use super::config::PostProcessing;
 use crate::accumulation::{EngineKind, MapConfig};
 use crate::downlink::receive::inspect::tai_text;
@@ -77,6 +79,17 @@ impl Provenance {
         let (limit_m, limit) = (map.baseline_m_max(frequency_hz), map.baseline_bp_max);
         cards.push(Card::real("BASEMAX", limit_m, "[m] longest baseline used"));
         cards.push(Card::real("BPMAX", limit, "the same in units of b_p = wavelength / pixel"));
+        let channel = usize::from(solution.channel.0);
+        if map.regularisation_exponent != 0.0 {
+            cards.push(Card::real(
+                "REXPON",
+                map.regularisation_exponent,
+                "R_l = EPSILON WMAX (l + 1)^REXPON",
+            ));
+        }
+        if let Some(path) = map.regularisation_files.get(channel) {
+            cards.push(Card::text("RPOWER", &file_name(path), "R_l = EPSILON / C_l of this table"));
+        }
         cards.push(Card::text("PRIOR", &self.prior(usize::from(solution.channel.0)), "prior map"));
         cards
     }
@@ -84,13 +97,8 @@ impl Provenance {
     /// The prior of a channel in words.
     fn prior(&self, channel: usize) -> String {
         let map = &self.map;
-        match map.prior_files.get(channel).map(|path| path.file_name().unwrap_or(path.as_os_str())) {
-            // A header card holds 68 characters.
-            Some(name) => {
-                let name: String = name.to_string_lossy().chars().filter(char::is_ascii_graphic).collect();
-                let start = name.len().saturating_sub(30);
-                format!("{}, FWHM {} deg", &name[start..], map.prior_fwhm_deg)
-            }
+        match map.prior_files.get(channel) {
+            Some(path) => format!("{}, FWHM {} deg", file_name(path), map.prior_fwhm_deg),
             None => match map.prior_k.get(channel) {
                 Some(level_k) if level_k != 0.0 => format!("uniform, {level_k:e} K"),
                 _ => "none".to_owned(),
@@ -102,13 +110,25 @@ impl Provenance {
     pub(super) fn caption(&self, solution: &Solution) -> String {
         let map = &self.map;
         let prior = self.prior(usize::from(solution.channel.0));
+        let shape = match (map.regularisation_exponent, map.regularisation_files.is_empty()) {
+            (_, false) => " / C_{l}".to_owned(),
+            (0.0, true) => String::new(),
+            (exponent, true) => format!(" (l + 1)^{exponent}"),
+        };
         format!(
-            "epsilon {:e}, b < {} b_p, prior: {prior}, thermal noise {}",
+            "epsilon {:e}{shape}, b < {} b_p, prior: {prior}, thermal noise {}",
             solution.diagnostics.epsilon,
             map.baseline_bp_max,
             noise(&solution.instrument)
         )
     }
+}
+
+/// The end of a file's name: a header card holds 68 characters.
+fn file_name(path: &Path) -> String {
+    let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy();
+    let name: String = name.chars().filter(char::is_ascii_graphic).collect();
+    name[name.len().saturating_sub(30)..].to_owned()
 }
 
 fn noise(instrument: &Instrument) -> &'static str {

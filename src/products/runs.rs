@@ -92,6 +92,22 @@ pub struct DiagnosticFigures {
     pub w_max: f64,
     /// Traces, if they were asked for.
     pub traces: Option<TraceFigures>,
+    /// What the map leaves of the data, likewise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fit: Option<FitFigures>,
+}
+
+/// A map against its data.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FitFigures {
+    /// Real numbers in the data.
+    pub numbers: u64,
+    /// `V'N^-1V`.
+    pub data_power: f64,
+    /// `|V - B T|^2` in units of their noise.
+    pub residual: EstimateFigures,
+    /// `|T - T_p|^2` over the pixels, K^2.
+    pub solution_k2: f64,
 }
 
 /// Traces of the covariances (the paper, Sect. 4).
@@ -101,6 +117,9 @@ pub struct TraceFigures {
     pub sigma_n_k2: EstimateFigures,
     /// Tr Sigma_s.
     pub sigma_s: EstimateFigures,
+    /// Tr A (A + R)^-1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub measured: Option<EstimateFigures>,
 }
 
 /// A value with its error; `None` if nothing bounds it.
@@ -267,7 +286,7 @@ pub fn runs_csv(runs: &[&RunFigures]) -> String {
                     cl_ratio_20_120,coherent_power_20_120\n"
             .to_owned();
     for (run, channel) in runs.iter().flat_map(|run| run.channels.iter().map(move |channel| (run, channel))) {
-        let DiagnosticFigures { epsilon, w_max, traces } = &channel.diagnostics;
+        let DiagnosticFigures { epsilon, w_max, traces, .. } = &channel.diagnostics;
         let [n, s] =
             [|t: &TraceFigures| t.sigma_n_k2, |t: &TraceFigures| t.sigma_s].map(|of| traces.as_ref().map(of));
         let [cl_ratio, coherent] = channel.power_kept_means();
@@ -445,7 +464,7 @@ mod tests {
 
     fn run(label: &str, epsilon: f64, n: f64, s: f64) -> RunFigures {
         let estimate = |value| EstimateFigures { value, error: None };
-        let traces = TraceFigures { sigma_n_k2: estimate(n), sigma_s: estimate(s) };
+        let traces = TraceFigures { sigma_n_k2: estimate(n), sigma_s: estimate(s), measured: None };
         // A mean of 10 K.
         let c0 = 4.0 * std::f64::consts::PI * 100.0;
         let power = PowerFigures {
@@ -461,7 +480,7 @@ mod tests {
             mean_k: 9.5,
             noise_rms_k: 0.5,
             thermal_noise: true,
-            diagnostics: DiagnosticFigures { epsilon, w_max: 2.0, traces: Some(traces) },
+            diagnostics: DiagnosticFigures { epsilon, w_max: 2.0, traces: Some(traces), fit: None },
             rho: Some(vec![Some(1.0), None]),
             rho_noise_subtracted: None,
             snr: None,

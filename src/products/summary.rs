@@ -7,6 +7,7 @@ use serde::Serialize;
 use super::beam::EffectiveBeam;
 use super::config::PostProcessing;
 use super::latitudes::LatitudeError;
+use super::point_beams::{BeamWidths, PointBeamSummary};
 use crate::solve::{Diagnostics, Refinement};
 
 /// One snapshot.
@@ -87,6 +88,9 @@ pub struct ChannelSummary {
     /// The effective beam, and noise in it; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub beam: Option<EffectiveBeam>,
+    /// Effective beams in the directions of `map.beams_deg`; absent without any.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub point_beams: Vec<PointBeamSummary>,
     /// Relative error by distance from the ecliptic; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub latitudes: Option<Vec<LatitudeError>>,
@@ -130,6 +134,19 @@ impl fmt::Display for ChannelSummary {
             write!(
                 f,
                 "\n             effective beam: FWHM {fwhm_deg:.2} deg, noise {noise_jy:.3e} Jy rms in it"
+            )?;
+        }
+        for beam in &self.point_beams {
+            let width = |widths: Option<BeamWidths>| {
+                widths.map_or_else(|| "-".to_owned(), |widths| format!("{:.2} deg", widths.fwhm_deg()))
+            };
+            write!(
+                f,
+                "\n             beam at {:.1}, {:.1} deg: FWHM {}, after post-processing {}",
+                beam.longitude_deg,
+                beam.latitude_deg,
+                width(beam.solved),
+                width(beam.processed)
             )?;
         }
         let noise = if self.thermal_noise { "with the map's thermal noise" } else { "without thermal noise" };

@@ -1,5 +1,6 @@
 //! Conjugate gradients for `(BtN^-1B + R) x = b`.
 
+use super::regulariser::Diagonal;
 use super::vectors::{dot, subtract};
 use super::watch::SolveTask;
 use crate::accumulation::NormalSums;
@@ -27,8 +28,7 @@ pub struct Convergence {
 /// A symmetric system.
 pub(super) struct System<'a> {
     pub(super) sums: &'a dyn NormalSums,
-    /// R = `regularisation` I.
-    pub(super) regularisation: f64,
+    pub(super) regularisation: Diagonal,
     /// Multiplies a vector by the preconditioner, in place.
     pub(super) precondition: &'a dyn Fn(&mut [f64]),
 }
@@ -36,9 +36,7 @@ pub(super) struct System<'a> {
 impl System<'_> {
     fn apply(&self, x: &[f64], y: &mut [f64]) {
         self.sums.apply(x, y);
-        for (y, x) in y.iter_mut().zip(x) {
-            *y += self.regularisation * x;
-        }
+        self.regularisation.add_product(x, y);
     }
 
     /// Solves for the right-hand side `b` in place, from the first guess `x`; the best so far is left whenever it ends.

@@ -35,6 +35,22 @@ pub enum SolveError {
         /// Pixels of the map.
         expected: usize,
     },
+    /// A table of angular power that cannot be used.
+    #[error("map.regularisation_files: {}: {found}; expected a table of l and C_l in K^2, from l = 0 on, all above 0", path.display())]
+    Power {
+        /// Its path.
+        path: std::path::PathBuf,
+        /// What was found.
+        found: String,
+    },
+    /// A table of angular power that ends too early.
+    #[error("map.regularisation_files: {found} degrees; expected {expected}, up to the greatest of the map")]
+    PowerLength {
+        /// Degrees in it.
+        found: usize,
+        /// Degrees of the map.
+        expected: usize,
+    },
     /// A pixel that is not on the map.
     #[error("there is no pixel {pixel} on a map of {pixels}")]
     NoPixel {

@@ -2,7 +2,9 @@
 
 use super::conjugate_gradients::{Convergence, StoppingRule, System};
 use super::error::SolveError;
+use super::fit::Fitted;
 use super::lanczos::{LargestEigenvalue, largest_eigenvalue_from, normalised, random_vector};
+use super::regulariser::Regulariser;
 use super::tikhonov::{Diagnostics, check_request, subtract_prediction};
 use super::traces::traces;
 use super::vectors::add;
@@ -27,7 +29,8 @@ pub struct HarmonicRequest {
     pub nside: usize,
     /// When to stop.
     pub rule: StoppingRule,
-    /// Random probes for the traces of the covariances where the matrix is too large to be held; 0 for no traces.
+    /// Random probes for the traces of the covariances where the matrix is too large to be held; 0 for no traces. Traces are those of
+    /// an R that is a multiple of the identity.
     pub probes: usize,
 }
 
@@ -59,6 +62,21 @@ pub fn solve_harmonics(
     start: Option<&[Vec<f64>; 2]>,
     watch: NamedWatch<'_>,
 ) -> Result<HarmonicSolution, SolveError> {
+    solve_regularised(sums, request, &Regulariser::default(), prior_k, start, watch)
+}
+
+/// As [`solve_harmonics`], with an R that may depend on the degree.
+///
+/// # Errors
+/// Also a table of power that ends before the map's degrees.
+pub fn solve_regularised(
+    sums: &HarmonicSums,
+    request: HarmonicRequest,
+    regulariser: &Regulariser,
+    prior_k: Option<&[f64]>,
+    start: Option<&[Vec<f64>; 2]>,
+    watch: NamedWatch<'_>,
+) -> Result<HarmonicSolution, SolveError> {
     check_request(sums, request.epsilon)?;
     let l_max = sums.setup().l_max;
     let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
@@ -68,13 +86,13 @@ pub fn solve_harmonics(
         let start = lifted(&blocks, sums.unknowns());
         largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |step, change| task.report(step, change))
     };
-    let regularisation = request.epsilon * w_max;
+    let regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
     let mut right = sums.right_hand_side().to_vec();
     if let Some(prior) = &prior {
         subtract_prediction(sums, prior, &mut right);
     }
     let right_hand_sides = [right.as_slice(), sums.noise_right_hand_side()];
-    let factors = blocks.factors(regularisation);
+    let factors = blocks.factors_with(&|l| regularisation.at(l));
     // At high degrees they take as much as the factors.
     drop(blocks);
     let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
@@ -94,8 +112,21 @@ pub fn solve_harmonics(
         noise_convergence: Some(convergence[1]),
         traces: None,
         traces_refused: None,
+        fit: None,
     };
     if request.probes > 0 {
+        let mut product = vec![0.0; whole.len()];
+        sums.apply(&whole, &mut product);
+        let fitted = Fitted {
+            counts: sums.counts(),
+            accuracy: sums.accuracy(),
+            w_max,
+            right: sums.right_hand_side(),
+            whole: &whole,
+            product: &product,
+            solved: &solved[0],
+        };
+        diagnostics.fit = Some(fitted.fit(area_sr));
         let found = traces(sums, request.epsilon, w_max, request.probes, watch);
         diagnostics = diagnostics.with_traces(found, area_sr);
     }

@@ -22,6 +22,7 @@ use super::SolveError;
 use super::conjugate_gradients::{Convergence, StoppingRule, System};
 use super::harmonic::{HarmonicRequest, HarmonicSolution, W_MAX_TOLERANCE, prior_unknowns};
 use super::lanczos::{LargestEigenvalue, largest_eigenvalue};
+use super::regulariser::Diagonal;
 use super::tikhonov::{Diagnostics, check_request};
 use super::vectors::{add, dot, subtract};
 use super::watch::NamedWatch;
@@ -158,6 +159,7 @@ pub fn solve_refined(
         noise_convergence: Some(noise.convergence()),
         traces: None,
         traces_refused: None,
+        fit: None,
     };
     let refinement = Refinement {
         convergence: map.convergence(),
@@ -257,7 +259,7 @@ impl Refining<'_> {
         let factors = self.sums.circle.order_blocks().factors(self.regularisation);
         let circle = System {
             sums: &self.sums.circle,
-            regularisation: self.regularisation,
+            regularisation: Diagonal::Uniform(self.regularisation),
             precondition: &|v| factors.solve(v),
         };
         let inner = StoppingRule { residual_max: INNER_RESIDUAL, ..self.inner };

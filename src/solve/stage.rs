@@ -4,15 +4,16 @@ use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use super::harmonic::{HarmonicRequest, solve_harmonics};
+use super::beams::harmonic_beams;
+use super::harmonic::{HarmonicRequest, solve_regularised};
 use super::passes::PassFile;
 use super::refined::{RefineRule, RefineSteps, Refinement, solve_refined};
-use super::tikhonov::solve_pixels_watched;
-use super::{Diagnostics, SolveError, SolveWatch, StoppingRule};
+use super::tikhonov::{PixelExtras, PointBeam, solve_pixels_with};
+use super::{Diagnostics, Regulariser, SolveError, SolveWatch, StoppingRule};
 use crate::accumulation::{Snapshot, SnapshotSums, SumCounts};
 use crate::frames::Instrument;
 use crate::runtime::{Outlet, Stage, Units};
-use crate::sky::healpix::pixel_count;
+use crate::sky::healpix::{pixel_area_sr, pixel_count, pixel_of};
 use crate::units::{ChannelId, PerChannel};
 
 /// A map of one channel.
@@ -35,6 +36,8 @@ pub struct Solution {
     pub map_k: Vec<f64>,
     /// Map of noise alone, made from noise of the data's weights, K.
     pub noise_k: Vec<f64>,
+    /// Effective beams, if directions were asked for.
+    pub beams: Vec<PointBeam>,
     /// Regularisation and convergence.
     pub diagnostics: Diagnostics,
     /// How it was refined, and the residuals that remain; only with `map.refine`.
@@ -49,6 +52,11 @@ const QUESTIONS: usize = 7;
 pub struct SolverSetup {
     /// epsilon of R = epsilon W_max I.
     pub epsilon: PerChannel<f64>,
+    /// How R depends on the degree, by channel: harmonic maps only. The last holds for the channels beyond; the identity if there
+    /// is none.
+    pub regularisers: Vec<Regulariser>,
+    /// Ecliptic longitudes and latitudes, degrees, at which a final map's effective beam is solved for.
+    pub beams_deg: Vec<[f64; 2]>,
     /// Uniform prior, K.
     pub prior_k: PerChannel<f64>,
     /// Prior maps by channel, K, at the map's nside; empty for none.
@@ -66,6 +74,22 @@ pub struct SolverSetup {
     pub trace_probes: usize,
     /// Receives progress, and may interrupt.
     pub watch: SolveWatch,
+}
+
+impl SolverSetup {
+    /// Pixels at which beams are wanted.
+    fn beam_pixels(&self, nside: usize) -> Vec<usize> {
+        let pixel = |&[longitude_deg, latitude_deg]: &[f64; 2]| {
+            let (sin_l, cos_l) = longitude_deg.to_radians().sin_cos();
+            let (sin_b, cos_b) = latitude_deg.to_radians().sin_cos();
+            pixel_of(nside, [cos_l * cos_b, sin_l * cos_b, sin_b])
+        };
+        self.beams_deg.iter().map(pixel).collect()
+    }
+
+    fn regulariser(&self, channel: usize) -> Regulariser {
+        self.regularisers.get(channel).or(self.regularisers.last()).cloned().unwrap_or_default()
+    }
 }
 
 /// Solves every snapshot.
@@ -108,7 +132,7 @@ impl Stage for Solver {
 
     fn step(&mut self, snapshot: Snapshot, out: &mut Outlet<Solution>) -> Result<(), SolveError> {
         let Snapshot { instrument, channel, number, is_final, span_s, nside, sums } = snapshot;
-        let SumCounts { visibilities, weight } = sums.counts();
+        let SumCounts { visibilities, weight, .. } = sums.counts();
         let data = [span_s[0], span_s[1], weight].map(|x| x.to_bits().cast_signed());
         let which = [i64::from(channel.0), i64::from(number), i64::from(is_final), visibilities as i64];
         if !self.setup.watch.agrees(&[which.as_slice(), &data].concat()) {
@@ -125,24 +149,33 @@ impl Stage for Solver {
         if !watch.goes_on() {
             return Ok(());
         }
-        let mut refinement = None;
+        let (mut refinement, mut beams) = (None, Vec::new());
+        let pixels: Vec<usize> = if is_final { self.setup.beam_pixels(nside) } else { Vec::new() };
         let (map_k, noise_k, diagnostics) = match sums {
             SnapshotSums::Pixel(sums) => {
-                let solved = match solve_pixels_watched(sums, epsilon, prior.as_deref(), probes, watch) {
+                let extras = PixelExtras { probes, beams: &pixels };
+                let solved = match solve_pixels_with(sums, epsilon, prior.as_deref(), extras, watch) {
                     Err(SolveError::Interrupted) => return Ok(()),
                     // The first data alone, or what a stranger sent, may not determine a map. The next snapshot has more; that the
                     // last one fails is an error.
                     Err(SolveError::NotPositive { .. }) if !is_final => return Ok(()),
                     solved => solved?,
                 };
+                beams = solved.beams;
                 (solved.map_k, solved.noise_k, solved.diagnostics)
             }
             SnapshotSums::Harmonic(sums) => {
+                let regulariser = self.setup.regulariser(index);
                 let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes };
                 let start = self.last.remove(&channel);
-                let solved = solve_harmonics(&sums, request, prior.as_deref(), start.as_ref(), watch)?;
+                let (prior, start) = (prior.as_deref(), start.as_ref());
+                let solved = solve_regularised(&sums, request, &regulariser, prior, start, watch)?;
                 if !watch.goes_on() && !is_final {
                     return Ok(());
+                }
+                if !pixels.is_empty() {
+                    let with = (&regulariser, solved.diagnostics.w_max / pixel_area_sr(nside));
+                    beams = harmonic_beams(&sums, request, with, &pixels, watch)?;
                 }
                 if !is_final {
                     self.last.insert(channel, solved.unknowns);
@@ -191,6 +224,7 @@ impl Stage for Solver {
             nside,
             map_k: self.reduced(map_k),
             noise_k: self.reduced(noise_k),
+            beams,
             diagnostics,
             refinement,
         });

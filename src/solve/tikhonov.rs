@@ -5,6 +5,7 @@ use serde::Serialize;
 use super::cholesky::{Cholesky, NotPositive};
 use super::conjugate_gradients::Convergence;
 use super::error::SolveError;
+use super::fit::{Fit, Fitted};
 use super::lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
 use super::traces::{Traces, UnsupportedEpsilon, traces};
 use super::vectors::{add, subtract};
@@ -35,6 +36,9 @@ pub struct Diagnostics {
     /// Why there are no traces, if they were requested and cannot be had.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub traces_refused: Option<UnsupportedEpsilon>,
+    /// What the map leaves of the data, if traces were requested.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fit: Option<Fit>,
 }
 
 impl Diagnostics {
@@ -55,6 +59,15 @@ impl Diagnostics {
     }
 }
 
+/// The map of a sky that is 1 K in one pixel.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PointBeam {
+    /// The pixel.
+    pub pixel: usize,
+    /// Map, K, HEALPix RING; of the pixel's degrees up to the map's, if it is one of harmonics.
+    pub map_k: Vec<f64>,
+}
+
 /// A map and its noise-only companion.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PixelSolution {
@@ -62,8 +75,19 @@ pub struct PixelSolution {
     pub map_k: Vec<f64>,
     /// Map of noise alone, K.
     pub noise_k: Vec<f64>,
+    /// Effective beams that were asked for.
+    pub beams: Vec<PointBeam>,
     /// How they were found.
     pub diagnostics: Diagnostics,
+}
+
+/// What is solved for besides the maps.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct PixelExtras<'a> {
+    /// Probes for traces, where the matrix is too large to be decomposed; 0 for neither traces nor fit.
+    pub probes: usize,
+    /// Pixels whose effective beams are wanted.
+    pub beams: &'a [usize],
 }
 
 /// Whether there is data, and a regularisation.
@@ -96,21 +120,22 @@ pub fn solve_pixels(
     epsilon: f64,
     prior_k: Option<&[f64]>,
 ) -> Result<PixelSolution, SolveError> {
-    solve_pixels_watched(sums, epsilon, prior_k, 0, SolveWatch::default().named("map"))
+    solve_pixels_with(sums, epsilon, prior_k, PixelExtras::default(), SolveWatch::default().named("map"))
 }
 
-/// As [`solve_pixels`], with traces from `probes` probes unless that is 0, as long as `watch` says so.
+/// As [`solve_pixels`], with more besides, as long as `watch` says so.
 ///
 /// # Errors
-/// Also [`SolveError::Interrupted`].
-pub(super) fn solve_pixels_watched(
+/// Also [`SolveError::Interrupted`], and a pixel for a beam that the map does not have.
+pub fn solve_pixels_with(
     sums: PixelSums,
     epsilon: f64,
     prior_k: Option<&[f64]>,
-    probes: usize,
+    extras: PixelExtras<'_>,
     watch: NamedWatch<'_>,
 ) -> Result<PixelSolution, SolveError> {
     check_request(&sums, epsilon)?;
+    let PixelExtras { probes, beams } = extras;
     let pixels = sums.unknowns();
     let LargestEigenvalue { value: w_max, iterations, .. } =
         largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| watch.goes_on());
@@ -123,7 +148,9 @@ pub(super) fn solve_pixels_watched(
         }
         subtract_prediction(&sums, prior_k, &mut map_k);
     }
-    let PixelSums { mut normal, noise: mut noise_k, .. } = sums;
+    let accuracy = sums.accuracy();
+    let mut beams = beams.iter().map(|&pixel| seen_point(&sums, pixel)).collect::<Result<Vec<_>, _>>()?;
+    let PixelSums { mut normal, right, noise: mut noise_k, counts, .. } = sums;
     normal.add_to_diagonal(epsilon * w_max);
     for step in 0..normal.along() {
         if !watch.goes_on() {
@@ -134,9 +161,18 @@ pub(super) fn solve_pixels_watched(
     }
     let factor = Cholesky::of(normal);
     rayon::join(|| factor.solve(&mut map_k), || factor.solve(&mut noise_k));
+    beams.iter_mut().for_each(|beam| factor.solve(&mut beam.map_k));
+    let solved = (probes > 0).then(|| map_k.clone());
     if let Some(prior_k) = prior_k {
         add(&mut map_k, prior_k);
     }
+    let fit = solved.map(|solved| {
+        // (A + R) y = b - A T_p: A (y + T_p) is b - R y.
+        let mut product = right.clone();
+        subtract(&mut product, epsilon * w_max, &solved);
+        let (right, whole, product, solved) = (&right, &map_k, &product, &solved);
+        Fitted { counts, accuracy, w_max, right, whole, product, solved }.fit(1.0)
+    });
     let diagnostics = Diagnostics {
         epsilon,
         w_max,
@@ -146,10 +182,21 @@ pub(super) fn solve_pixels_watched(
         noise_convergence: None,
         traces: None,
         traces_refused: None,
+        fit,
     };
     let diagnostics = match traces {
         Some(found) => diagnostics.with_traces(found, 1.0),
         None => diagnostics,
     };
-    Ok(PixelSolution { map_k, noise_k, diagnostics })
+    Ok(PixelSolution { map_k, noise_k, beams, diagnostics })
+}
+
+/// `BtN^-1B` times a sky that is 1 K in one pixel.
+fn seen_point(sums: &PixelSums, pixel: usize) -> Result<PointBeam, SolveError> {
+    let pixels = sums.unknowns();
+    let mut point = vec![0.0; pixels];
+    *point.get_mut(pixel).ok_or(SolveError::NoPixel { pixel, pixels })? = 1.0;
+    let mut seen = vec![0.0; pixels];
+    sums.apply(&point, &mut seen);
+    Ok(PointBeam { pixel, map_k: seen })
 }

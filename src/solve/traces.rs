@@ -1,4 +1,5 @@
-//! Traces of the covariances of a map: thermal noise and imperfection (the paper, Sect. 4), with their error.
+//! Traces of the covariances of a map: thermal noise and imperfection (the paper, Sect. 4), and of what the data decide, with their
+//! error.
 //!
 //! Where the matrix can be held, its eigenvalues give them without probes. Otherwise random probes do: the trace of f(A) is
 //! the mean of `v.f(A)v` over vectors v of random signs (Hutchinson), and k Lanczos steps from v bound each of these.
@@ -54,6 +55,8 @@ pub struct Traces {
     pub sigma_n_k2: Estimate,
     /// `sum (eps / (W + eps))^2` over the unknowns.
     pub sigma_s: Estimate,
+    /// `Tr A (A + R)^-1 = sum W / (W + eps)`, A the normal matrix: as many unknowns do the data decide.
+    pub measured: Estimate,
     /// Random probes; 0 if the matrix was held.
     pub probes: usize,
 }
@@ -150,7 +153,10 @@ fn eigenvalues_of(mut matrix: Mat<f64>) -> Option<Vec<f64>> {
     Some(eigenvalues.into_iter().map(|w| w * scale).collect())
 }
 
-/// The two functions of an eigenvalue whose sums are the traces.
+/// Number of the traces.
+const COUNT: usize = 3;
+
+/// The functions of an eigenvalue whose sums are the traces.
 #[derive(Clone, Copy)]
 struct Functions {
     /// eps, K^-2.
@@ -170,11 +176,12 @@ impl Functions {
     /// The traces, unless accuracy leaves too much of them open.
     fn accept(
         self,
-        (traces, open): (Traces, [f64; 2]),
+        (traces, open): (Traces, [f64; COUNT]),
         epsilon: f64,
         w_max: f64,
     ) -> Result<Traces, UnsupportedEpsilon> {
         let values = [traces.sigma_n_k2.value, traces.sigma_s.value];
+        // What is open of an eigenvalue near nothing is at most 1 of the third trace, which counts all the others.
         let is_known = values.iter().zip(open).all(|(value, open)| open <= OPEN_MAX * value);
         if is_known { Ok(traces) } else { Err(UnsupportedEpsilon { epsilon, accuracy: self.delta / w_max }) }
     }
@@ -187,19 +194,23 @@ impl Functions {
         (self.eps / (w + self.eps)).powi(2)
     }
 
-    /// How far both terms of an eigenvalue may be off: it is not negative, and as near to what was found as the accuracy says.
-    fn open(self, w: f64) -> [f64; 2] {
+    fn measured(self, w: f64) -> f64 {
+        w / (w + self.eps)
+    }
+
+    /// How far the terms of an eigenvalue may be off: it is not negative, and as near to what was found as the accuracy says.
+    fn open(self, w: f64) -> [f64; COUNT] {
         let w = w.max(0.0);
         let off = self.relative * w + self.delta;
         let (low, high) = ((w - off).max(0.0), w + off);
         // The first rises up to eps, and falls beyond.
         let ends = [low, high, self.eps.clamp(low, high)].map(|x| (self.thermal(x) - self.thermal(w)).abs());
-        let falls = [low, high].map(|x| (self.imperfect(x) - self.imperfect(w)).abs());
-        [ends.into_iter().fold(0.0, f64::max), falls[0].max(falls[1])]
+        let most = |f: &dyn Fn(f64) -> f64| (f(low) - f(w)).abs().max((f(high) - f(w)).abs());
+        [ends.into_iter().fold(0.0, f64::max), most(&|x| self.imperfect(x)), most(&|x| self.measured(x))]
     }
 
     /// The traces from one exact sum, or from those of several probes; and what accuracy leaves open of them.
-    fn traces(self, sums: &[Bounds]) -> (Traces, [f64; 2]) {
+    fn traces(self, sums: &[Bounds]) -> (Traces, [f64; COUNT]) {
         let count = sums.len() as f64;
         let mean = |of: &dyn Fn(&Bounds) -> f64| sums.iter().map(of).sum::<f64>() / count;
         let exact = sums.iter().all(|sum| sum.is_exact);
@@ -216,29 +227,29 @@ impl Functions {
             let open = mean(&|sum| sum.open[k]);
             (Estimate { value, error: scatter + half + open }, open)
         };
-        let ((sigma_n_k2, open_n), (sigma_s, open_s)) = (estimate(0), estimate(1));
-        (Traces { sigma_n_k2, sigma_s, probes: if exact { 0 } else { sums.len() } }, [open_n, open_s])
+        let [(sigma_n_k2, open_n), (sigma_s, open_s), (measured, open_m)] = [0, 1, 2].map(estimate);
+        let probes = if exact { 0 } else { sums.len() };
+        (Traces { sigma_n_k2, sigma_s, measured, probes }, [open_n, open_s, open_m])
     }
 }
 
-/// Bounds on the two traces, or on those of one probe.
+/// Bounds on the traces, or on those of one probe.
 struct Bounds {
-    low: [f64; 2],
-    high: [f64; 2],
+    low: [f64; COUNT],
+    high: [f64; COUNT],
     /// What the accuracy of the matrix leaves open.
-    open: [f64; 2],
+    open: [f64; COUNT],
     is_exact: bool,
 }
 
 impl Bounds {
     fn exact(functions: Functions, eigenvalues: &[f64]) -> Self {
-        let mut sums = [0.0; 2];
-        let mut open = [0.0; 2];
+        let mut sums = [0.0; COUNT];
+        let mut open = [0.0; COUNT];
         for &w in eigenvalues {
             let w = w.max(0.0);
-            for (sum, term) in sums.iter_mut().zip([functions.thermal(w), functions.imperfect(w)]) {
-                *sum += term;
-            }
+            let terms = [functions.thermal(w), functions.imperfect(w), functions.measured(w)];
+            sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
             open.iter_mut().zip(functions.open(w)).for_each(|(sum, term)| *sum += term);
         }
         Self { low: sums, high: sums, open, is_exact: true }
@@ -323,13 +334,14 @@ fn quadratures(krylov: &Krylov, functions: Functions, is_open: bool, length: f64
     let [low_1, low_2] = [1, 2].map(|power| sum(&gauss, power));
     let [high_1, high_2] = [1, 2].map(|power| sum(&radau, power));
     // w / (w + eps)^2 = g1 - eps g2.
-    let mut open = [0.0; 2];
+    let mut open = [0.0; COUNT];
     for (w, c) in &gauss {
         open.iter_mut().zip(functions.open(*w)).for_each(|(sum, term)| *sum += length * c * term);
     }
     Some(Bounds {
-        low: [(low_1 - eps * high_2).max(0.0), eps * eps * low_2],
-        high: [high_1 - eps * low_2, eps * eps * high_2],
+        // w / (w + eps) = 1 - eps g1, and the square of the probe is `length`.
+        low: [(low_1 - eps * high_2).max(0.0), eps * eps * low_2, (length - eps * high_1).max(0.0)],
+        high: [high_1 - eps * low_2, eps * eps * high_2, length - eps * low_1],
         open,
         is_exact: false,
     })

@@ -95,7 +95,21 @@ fn a_study_gives_the_maps_of_separate_runs() {
     let longer = STUDY.replace("[1e-6, 1e-2]", "[1e-6, 1e-1, 1e-2]");
     let longer = place.file("longer.toml", longer.as_bytes());
     assert_eq!(json(&["study", &study, "--out", &out]), summary);
-    assert_eq!(json(&["study", &longer, "--out", &out])["cases"].as_array().unwrap().len(), 6);
+    let longer = json(&["study", &longer, "--out", &out]);
+    assert_eq!(longer["cases"].as_array().unwrap().len(), 6);
+    // Of three epsilons one can be chosen, for each limit and channel.
+    assert!(summary.get("epsilons").is_none());
+    let choices = longer["epsilons"].as_array().unwrap();
+    assert_eq!(choices.len(), 4);
+    for choice in choices {
+        assert_eq!(choice["points"].as_array().unwrap().len(), 3);
+        for rule in ["crossing", "cross_validation", "risk", "l_curve"] {
+            // One of them, or why not.
+            assert!(choice[rule]["epsilon"].is_f64() || choice[rule]["note"].is_string(), "{choice}");
+        }
+    }
+    assert_eq!(String::from_utf8(bytes(format!("{out}/epsilons.csv"))).unwrap().lines().count(), 1 + 4 * 3);
+    assert!(bytes(format!("{out}/epsilons.png")).starts_with(b"\x89PNG"));
     assert_eq!(made(), before);
     // Finished runs can be put side by side.
     let [first, second] = [CASES[0][2], CASES[3][2]].map(|name| format!("{out}/{name}"));

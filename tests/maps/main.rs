@@ -6,6 +6,7 @@ mod common;
 
 mod closed_loop;
 mod engines;
+mod epsilon;
 mod exact_sums;
 mod forged;
 mod refined;

@@ -20,6 +20,8 @@ const SIGNAL_TO_NOISE_MAX: f64 = 16_384.0;
 const WEIGHT_PART_MIN: f64 = 2.273_736_754_432_320_6e-13; // 2^-42
 /// Weights are counted in this part of the scale.
 const WEIGHT_STEPS: f64 = 18_446_744_073_709_551_616.0; // 2^64
+/// Powers are counted in this part of a standard deviation's square: each is at most 2^29, so that 2^51 have room.
+const POWER_STEPS: f64 = 281_474_976_710_656.0; // 2^48
 
 /// Greatest weight of thermal visibilities in a channel, (K sr)^-2, with head room.
 ///
@@ -94,29 +96,40 @@ impl Direction {
     }
 }
 
-/// Number of visibilities in the sums, and their weight in 2^-64 of the scale: exact as the sums are.
+/// Number of visibilities in the sums, their weight in 2^-64 of the scale, and the sum of their squares in 2^-48 of their noise:
+/// exact as the sums are.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 pub struct Totals {
     visibilities: u64,
     weight: u128,
+    power: u128,
 }
 
 impl Totals {
-    pub(in crate::accumulation) fn one(scale: WeightScale, weight: f64) -> Self {
-        Self { visibilities: 1, weight: (weight / scale.weight * WEIGHT_STEPS).round() as u128 }
+    /// Of one visibility that [`WeightScale::check`] lets in; its value is in K sr.
+    pub(in crate::accumulation) fn one(scale: WeightScale, weight: f64, value: Complex64) -> Self {
+        Self {
+            visibilities: 1,
+            weight: (weight / scale.weight * WEIGHT_STEPS).round() as u128,
+            power: (value.norm_sqr() * weight * POWER_STEPS).round() as u128,
+        }
     }
 
     /// `None` if more would be removed than is there, or more added than can be counted.
     pub(in crate::accumulation) fn and(self, other: Self, direction: Direction) -> Option<Self> {
-        let (visibilities, weight) = match direction {
-            Direction::In => {
-                (self.visibilities.checked_add(other.visibilities), self.weight.checked_add(other.weight))
-            }
-            Direction::Out => {
-                (self.visibilities.checked_sub(other.visibilities), self.weight.checked_sub(other.weight))
-            }
-        };
-        Some(Self { visibilities: visibilities?, weight: weight? })
+        let Self { visibilities, weight, power } = other;
+        Some(match direction {
+            Direction::In => Self {
+                visibilities: self.visibilities.checked_add(visibilities)?,
+                weight: self.weight.checked_add(weight)?,
+                power: self.power.checked_add(power)?,
+            },
+            Direction::Out => Self {
+                visibilities: self.visibilities.checked_sub(visibilities)?,
+                weight: self.weight.checked_sub(weight)?,
+                power: self.power.checked_sub(power)?,
+            },
+        })
     }
 
     /// The weight in units of the scale, rounded.
@@ -125,7 +138,11 @@ impl Totals {
     }
 
     pub(in crate::accumulation) fn counts(self, scale: WeightScale) -> SumCounts {
-        SumCounts { visibilities: self.visibilities, weight: self.scales() * scale.weight }
+        SumCounts {
+            visibilities: self.visibilities,
+            weight: self.scales() * scale.weight,
+            power: self.power as f64 / POWER_STEPS,
+        }
     }
 }
 
@@ -155,6 +172,21 @@ mod tests {
         for weight in [0.5_f64.powi(43), f64::from(f32::from_bits(1))] {
             assert_eq!(check(weight), Err(Refusal::OutOfRange));
         }
+    }
+
+    /// 3 and 4 K sr in the parts of a value of weight 2 are a power of 50.
+    #[test]
+    fn totals_add_up_and_go_back_to_nothing() {
+        let scale = WeightScale::new(4.0).unwrap();
+        let one = Totals::one(scale, 2.0, Complex64::new(3.0, -4.0));
+        let two = one.and(Totals::one(scale, 1.0, Complex64::new(0.5, 0.0)), Direction::In).unwrap();
+        assert_eq!(two.counts(scale), SumCounts { visibilities: 2, weight: 3.0, power: 50.25 });
+        let other = two.and(one, Direction::Out).unwrap();
+        assert_eq!(other.counts(scale), SumCounts { visibilities: 1, weight: 1.0, power: 0.25 });
+        assert_eq!(other.and(one, Direction::Out), None);
+        // The greatest that is let in leaves room for 2^51 of them.
+        let greatest = Complex64::new(1.0, 1.0) * SIGNAL_TO_NOISE_MAX;
+        assert!(Totals::one(scale, 1.0, greatest).power.leading_zeros() >= 51 - 1);
     }
 
     /// Cane's 4.96e6, 2.92e5 and 1.78e4 K at 3, 10 and 30 MHz, as tabulated to three digits.

@@ -82,14 +82,22 @@ impl OrderBlocks {
     /// Factors of the blocks plus `regularisation` I; a block without a factor leaves its unknowns unchanged.
     #[must_use]
     pub fn factors(&self, regularisation: f64) -> OrderFactors {
-        let factor = |block: &Mat<f64>| {
+        self.factors_with(&|_| regularisation)
+    }
+
+    /// Factors of the blocks plus an R that depends on the degree.
+    #[must_use]
+    pub fn factors_with(&self, of_degree: &(dyn Fn(usize) -> f64 + Sync)) -> OrderFactors {
+        let factor = |m: usize, parity: usize, block: &Mat<f64>| {
             let mut block = block.clone();
             for k in 0..block.nrows() {
-                block[(k, k)] += regularisation;
+                block[(k, k)] += of_degree(m + parity + 2 * k);
             }
             block.llt(Side::Lower).ok()
         };
-        let factors = self.blocks.par_iter().map(|blocks| [factor(&blocks[0]), factor(&blocks[1])]).collect();
+        let both =
+            |(m, blocks): (usize, &[Mat<f64>; 2])| [0, 1].map(|parity| factor(m, parity, &blocks[parity]));
+        let factors = self.blocks.par_iter().enumerate().map(both).collect();
         OrderFactors { l_max: self.l_max, factors }
     }
 }

@@ -48,7 +48,7 @@ pub use setup::{
     ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, SharedSize, application_size, memory, orbit_of,
     shared_size,
 };
-pub use sums::{HarmonicSums, coefficients, unknowns, unknowns_of_gradient};
+pub use sums::{HarmonicSums, coefficients, degrees, unknowns, unknowns_of_gradient};
 
 use self::checkpoint::HarmonicHead;
 use self::exact::{ExactTori, Quanta, SCALES_MAX};

@@ -110,11 +110,12 @@ impl VisibilityArchive {
         Ok(HeldVisibility { at, band: placed.band, value_k_sr, weight })
     }
 
-    /// Number and weight of the visibilities.
+    /// Number, weight and power of the visibilities.
     #[must_use]
     pub fn counts(&self) -> SumCounts {
         let weight = self.held.iter().map(|held| held.weight).sum();
-        SumCounts { visibilities: self.held.len() as u64, weight }
+        let power = self.held.iter().map(|held| held.value_k_sr.norm_sqr() * held.weight).sum();
+        SumCounts { visibilities: self.held.len() as u64, weight, power }
     }
 
     /// Sorts the visibilities, plans their rows, and sums them on the nearest circle.

@@ -106,6 +106,13 @@ impl NormalSums for HarmonicSums {
     }
 }
 
+/// The degree of each unknown.
+pub fn degrees(l_max: usize) -> impl Iterator<Item = usize> {
+    let of_order =
+        move |m: usize| (m..=l_max).flat_map(move |l| std::iter::repeat_n(l, if m == 0 { 1 } else { 2 }));
+    (0..=l_max).flat_map(of_order)
+}
+
 /// Coefficients from a vector of unknowns; missing ones are zero.
 #[must_use]
 pub fn coefficients(unknowns: &[f64], l_max: usize) -> Alm {
