@@ -127,7 +127,7 @@ impl Sink for Realiser {
         let request = HarmonicRequest { epsilon, nside, rule: setup.rule, probes: 0 };
         let frequency_hz = instrument.channels.get(index).map_or(0.0, |channel| channel.frequency_hz);
         let name = format!("{:.3} MHz", frequency_hz / 1e6);
-        let maps = match solve_noises(&sums, request, setup.watch.named(&name)) {
+        let maps = match solve_noises(&sums, request, &setup.regulariser(index), setup.watch.named(&name)) {
             Err(SolveError::Interrupted) => return Ok(()),
             maps => maps?,
         };

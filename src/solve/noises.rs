@@ -4,6 +4,7 @@ use super::conjugate_gradients::System;
 use super::error::SolveError;
 use super::harmonic::{HarmonicRequest, W_MAX_TOLERANCE, lifted};
 use super::lanczos::largest_eigenvalue_from;
+use super::regulariser::Regulariser;
 use super::tikhonov::check_request;
 use super::watch::NamedWatch;
 use crate::accumulation::NormalSums;
@@ -11,13 +12,14 @@ use crate::accumulation::harmonic::{HarmonicSums, coefficients};
 use crate::sky::harmonics::synthesis;
 
 /// The noise-only maps, K, of the further realisations that the sums hold ([`HarmonicSums::further_noises`]): each as
-/// [`crate::solve::solve_harmonics`] makes it of sums with that realisation as their companion.
+/// [`crate::solve::solve_regularised`] makes it of sums with that realisation as their companion.
 ///
 /// # Errors
-/// No data; [`SolveError::Interrupted`].
+/// No data; a table of power that ends before the map's degrees; [`SolveError::Interrupted`].
 pub fn solve_noises(
     sums: &HarmonicSums,
     request: HarmonicRequest,
+    regulariser: &Regulariser,
     watch: NamedWatch<'_>,
 ) -> Result<Vec<Vec<f64>>, SolveError> {
     check_request(sums, request.epsilon)?;
@@ -28,11 +30,11 @@ pub fn solve_noises(
         largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |step, change| task.report(step, change))
             .value
     };
-    let regularisation = request.epsilon * w_max;
-    let factors = blocks.factors(regularisation);
+    let l_max = sums.setup().l_max;
+    let regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
+    let factors = blocks.factors_with(&|l| regularisation.at(l));
     drop(blocks);
     let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
-    let l_max = sums.setup().l_max;
     let map = |right: &Vec<f64>| {
         let mut solved = vec![0.0; sums.unknowns()];
         let task = watch.start("noise map", request.rule.residual_max);

@@ -87,7 +87,9 @@ impl SolverSetup {
         self.beams_deg.iter().map(pixel).collect()
     }
 
-    fn regulariser(&self, channel: usize) -> Regulariser {
+    /// R of a channel.
+    #[must_use]
+    pub fn regulariser(&self, channel: usize) -> Regulariser {
         self.regularisers.get(channel).or(self.regularisers.last()).cloned().unwrap_or_default()
     }
 }

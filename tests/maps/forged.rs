@@ -93,7 +93,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             weight_max: 1.0,
         };
         let mut sums = PixelEngine::new(setup).unwrap().into_sums();
-        sums.counts = SumCounts { visibilities: 4, weight: 1e-12 };
+        sums.counts = SumCounts { visibilities: 4, weight: 1e-12, power: 0.0 };
         let snapshot = Snapshot {
             instrument: Arc::new(instrument()),
             channel: ChannelId(0),
@@ -105,6 +105,8 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
         };
         let setup = SolverSetup {
             epsilon: PerChannel::All(1e-4),
+            regularisers: Vec::new(),
+            beams_deg: Vec::new(),
             prior_k: PerChannel::All(0.0),
             prior_maps: Vec::new(),
             moon_reflection: 0.0,

@@ -204,8 +204,14 @@ mod tests {
         let (folder, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         let map = MapConfig { engine: EngineKind::Harmonic, ..MapConfig::default() };
         let calibration = CalibrationConfig::default();
-        let config =
-            GroundConfig { calibration, map, wait_bytes: 1 << 20, memory_max_bytes: None, group: None };
+        let config = GroundConfig {
+            calibration,
+            calibrate: Default::default(),
+            map,
+            wait_bytes: 1 << 20,
+            memory_max_bytes: None,
+            group: None,
+        };
         let bytes = transmission();
         let first = &bytes[..bytes.len() / 2];
         let session_in = |folder: &Path, ranks: &Ranks, bytes: &[u8]| {
