@@ -234,7 +234,7 @@ fn propagated_orbits_are_flown_and_exported() {
     let mut pipeline = TRIPLE.replace("every_nth_window = 100", "duration_s = 86400.0\nevery_nth_window = 5");
     pipeline.replace_range(
         kepler,
-        "arcs_m = [600.0, 1500.0]\n[array.propagate]\ndays = 1.1\nkeep_every_days = 0.5\n",
+        "arcs_m = [600.0, 1500.0]\n[array.propagate]\ndays = 1.25\nkeep_every_days = 0.5\n",
     );
     let place = Workplace::new(&pipeline);
     succeed(&["check", &place.pipeline]);
@@ -242,8 +242,8 @@ fn propagated_orbits_are_flown_and_exported() {
     succeed(&["figure", "baselines", &place.pipeline, "--out", &figures]);
     let folder = place.path("orbits");
     let made = json(&["export", "orbits", "--pipeline", &place.pipeline, "--out", &folder]);
-    // 1.1 days in steps of 120 s, and twice the state of each correction.
-    assert_eq!((made["files"].as_u64(), made["states"].as_u64()), (Some(3), Some(3 * (793 + 2))), "{made}");
+    // 1.25 days in steps of 120 s, and twice the state of each correction.
+    assert_eq!((made["files"].as_u64(), made["states"].as_u64()), (Some(3), Some(3 * (901 + 2))), "{made}");
     let files = format!("array.oem=[\"{folder}/sat1.oem\", \"{folder}/sat2.oem\", \"{folder}/sat3.oem\"]");
     let plain = ["--set", "array.arcs_m=[]", "--set", "array.propagate.days=0", "--set", &files];
     let (flown, read) = (places(&place.pipeline, &[]), places(&place.pipeline, &plain));
