@@ -1,11 +1,13 @@
 //! The folder of an archive: numbered checkpoints, of which the newest two are kept. Room for three lets both stay until
 //! another is whole; room for two is enough.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use super::checkpoint;
+use crate::accumulation::harmonic::HeldSegment;
 use crate::files::{AtomicFile, FolderLock, IfUnfinished, read_folder};
 use crate::ground::GroundError;
 
@@ -20,6 +22,8 @@ pub(super) struct StateFolder {
     path: PathBuf,
     /// Numbers of its checkpoints, oldest first.
     numbers: Vec<u64>,
+    /// The segments that checkpoints name, of those checkpoints that this process has read or written.
+    segments: BTreeMap<u64, Vec<HeldSegment>>,
     lock: FolderLock,
 }
 
@@ -30,7 +34,7 @@ impl StateFolder {
             ErrorKind::ResourceBusy => GroundError::Locked { path: path.to_owned() },
             _ => GroundError::io(path, "lock the folder")(error),
         })?;
-        Ok(Self { path: path.to_owned(), numbers: numbers(path)?, lock })
+        Ok(Self { path: path.to_owned(), numbers: numbers(path)?, segments: BTreeMap::new(), lock })
     }
 
     /// The newest checkpoint that holds, read by `read`, or `None` if there is no checkpoint; and notes on newer ones that
@@ -69,6 +73,36 @@ impl StateFolder {
         }
     }
 
+    /// Where the next checkpoint will be, and its number.
+    pub(super) fn next(&self) -> (PathBuf, u64) {
+        (self.path.clone(), self.numbers.last().map_or(1, |newest| newest + 1))
+    }
+
+    /// Says which segments the newest checkpoint names. Those that none names are removed, once it is known of all.
+    pub(super) fn names<'a>(&mut self, segments: impl Iterator<Item = &'a HeldSegment>) {
+        if let Some(&newest) = self.numbers.last() {
+            self.segments.insert(newest, segments.copied().collect());
+        }
+        self.remove_unnamed();
+    }
+
+    /// Removes segments that no checkpoint names: of older ones, or of one that was never finished. One that stays takes room and does
+    /// no harm.
+    fn remove_unnamed(&mut self) {
+        self.segments.retain(|number, _| self.numbers.contains(number));
+        if self.segments.len() < self.numbers.len() {
+            return;
+        }
+        let named = || self.segments.values().flatten().map(HeldSegment::file_name);
+        for entry in read_folder(&self.path).into_iter().flatten().flatten() {
+            let name = entry.file_name();
+            let name = name.to_string_lossy();
+            if HeldSegment::is_name(&name) && !named().any(|other| other == name) && self.lock.lost().is_none() {
+                let _ = fs::remove_file(entry.path());
+            }
+        }
+    }
+
     /// Writes a checkpoint, whole or not at all, and removes all but the newest two. If there is no room for a third, the
     /// older of the two gives way, once the newer one has been found to hold.
     pub(super) fn save(
@@ -85,7 +119,7 @@ impl StateFolder {
         &mut self,
         mut write: impl FnMut(&mut AtomicFile, &Path) -> Result<(), GroundError>,
     ) -> Result<(), GroundError> {
-        let number = self.numbers.last().map_or(1, |newest| newest + 1);
+        let (_, number) = self.next();
         let path = self.name(number);
         if number > NUMBER_MAX {
             return Err(GroundError::CheckpointName { path: self.name(NUMBER_MAX) });
@@ -118,7 +152,11 @@ impl StateFolder {
     pub(super) fn drop_older(&mut self) -> Result<(), GroundError> {
         if let Some(&newest) = self.numbers.last() {
             checkpoint::verify(&self.name(newest))?;
+            for segment in self.segments.get(&newest).into_iter().flatten() {
+                segment.verify(&self.path)?;
+            }
             self.remove_all_but(1);
+            self.remove_unnamed();
         }
         Ok(())
     }

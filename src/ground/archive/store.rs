@@ -9,6 +9,7 @@ use super::draft::RecordDraft;
 use super::folder::StateFolder;
 use super::journal::{Journal, OtherRecord};
 use super::settings::{compare, settings_of};
+use crate::accumulation::harmonic::SegmentPlace;
 use crate::accumulation::{AccumulationError, Accumulator};
 use crate::array::Ephemeris;
 use crate::calibration::{AutoTable, Calibrator};
@@ -24,6 +25,9 @@ use crate::runtime::{Cancel, Ledger, LedgerReport};
 
 /// After a failure a checkpoint is tried again after this part of the interval, then after twice that, and so on.
 const RETRIES: u64 = 8;
+
+/// What is expected of a file that a checkpoint names.
+const SEGMENT: &str = "the visibilities that the checkpoint beside it names";
 
 /// Keeps a journal of what a ground applies, and writes checkpoints of the ground into a folder.
 pub(in crate::ground) struct Archive {
@@ -117,13 +121,17 @@ impl Archive {
             accumulator: accumulator.state(),
             journal: &self.journal,
         };
+        let (folder, number) = self.folder.next();
+        let place = SegmentPlace { folder: &folder, number };
         self.folder.save(|out, path| {
             let of_file = |error| match error {
                 AccumulationError::Io(source) => GroundError::io(path, "write")(source),
                 other => other.into(),
             };
-            checkpoint::write(out, path, &head, |out| accumulator.write_engines(out).map_err(of_file))
-        })
+            checkpoint::write(out, path, &head, |out| accumulator.write_engines(out, place).map_err(of_file))
+        })?;
+        self.folder.names(accumulator.segments());
+        Ok(())
     }
 }
 
@@ -177,9 +185,7 @@ pub(super) struct Opened {
 impl Opened {
     /// Opens a folder. Checkpoints that cannot be used get another name if `sets_aside`.
     pub(super) fn new(folder: &Path, config: &GroundConfig, sets_aside: bool) -> Result<Self, GroundError> {
-        if config.map.refine.is_on() {
-            return Err(AccumulationError::HeldInMemory.into());
-        }
+        let place = folder;
         let mut folder = StateFolder::open(folder)?;
         let settings = settings_of(config)?;
         let posts = Ledger::new();
@@ -190,15 +196,30 @@ impl Opened {
                     AccumulationError::Io(source) if source.kind() != ErrorKind::UnexpectedEof => {
                         GroundError::io(path, "read")(source)
                     }
+                    AccumulationError::Segment { path, found } => {
+                        GroundError::Damaged { path, found, expected: SEGMENT }
+                    }
                     other => other.into(),
                 };
-                let accumulator = config.accumulator(&posts).resume(head.accumulator, engines);
+                let accumulator =
+                    config.accumulator(&posts).resume(head.accumulator, engines, Some(place));
                 let accumulator = accumulator.map_err(of_file)?;
                 let (collector, ephemeris, autos) = (head.collector, head.ephemeris, head.autos);
                 Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal: head.journal })
             })
         })?;
+        if let Some(contents) = &contents {
+            folder.names(contents.accumulator.segments());
+        }
         Ok(Self { folder, contents, notes, settings, posts })
+    }
+
+    /// From now on the contents belong into another folder, which is new.
+    pub(super) fn move_to(&mut self, folder: StateFolder) {
+        self.folder = folder;
+        if let Some(contents) = &mut self.contents {
+            contents.accumulator.leave_segments();
+        }
     }
 
     /// Merges the contents of another folder into these.
