@@ -33,6 +33,8 @@ pub enum BasisKind {
     Pixel = 1,
     /// Over spherical harmonics.
     Harmonic = 2,
+    /// None: visibilities one by one.
+    Held = 3,
 }
 
 impl BasisKind {
@@ -40,6 +42,7 @@ impl BasisKind {
         match self {
             Self::Pixel => "sums over pixels (kind 1)",
             Self::Harmonic => "sums over harmonics (kind 2)",
+            Self::Held => "visibilities held for refinement (kind 3)",
         }
     }
 }

@@ -104,6 +104,9 @@ pub struct MapConfig {
     pub refine: RefineConfig,
 }
 
+/// Value of `map.refine.passes_max` among the settings of sums that hold visibilities one by one.
+pub const REFINED: &str = "above 0";
+
 /// Refinement of a harmonic map: conjugate gradients with the rows of B of the true positions, preconditioned by the sums of the
 /// nearest circle. Nothing is refused for its geometry then.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -235,13 +238,7 @@ impl MapConfig {
         );
         checks.require("refine.visibilities_max", visibilities_max, visibilities_max > 0, "at least 1");
         if self.refine.is_on() {
-            let (every, probes) = (self.snapshot_every_s, self.trace_probes);
-            checks.number(
-                "snapshot_every_s",
-                every,
-                every == 0.0,
-                "0 with map.refine: visibilities are held until the end",
-            );
+            let probes = self.trace_probes;
             checks.require(
                 "trace_probes",
                 probes,
@@ -341,8 +338,8 @@ impl MapConfig {
             residual_max: _,
             iterations_max: _,
             trace_probes: _,
-            l_max: _,  // As `degree`.
-            refine: _, // There is no saved state with it.
+            l_max: _, // As `degree`.
+            refine,
         } = self;
         let mut settings = vec![
             ("map.nside", nside.to_string()),
@@ -359,6 +356,10 @@ impl MapConfig {
             EngineKind::Harmonic => {
                 settings.push(("map.l_max", self.degree().to_string()));
                 settings.push(("map.limits", format!("{limits:?}")));
+                if refine.is_on() {
+                    // How often and how well a map is refined is no matter of the visibilities that are held for it.
+                    settings.push(("map.refine.passes_max", REFINED.to_owned()));
+                }
             }
         }
         settings

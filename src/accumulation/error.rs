@@ -1,5 +1,7 @@
 //! Why visibilities could not be summed.
 
+use std::path::PathBuf;
+
 use thiserror::Error;
 
 use crate::response::harmonic::GeometryRefusal;
@@ -69,12 +71,32 @@ pub enum AccumulationError {
     /// Positions without a row of B.
     #[error("a visibility has no row of the beam matrix: {0}")]
     Rows(GeometryRefusal),
-    /// Visibilities that are held for refinement cannot be kept, merged or removed.
+    /// More visibilities than may be held for refinement.
     #[error(
-        "map.refine holds visibilities in memory until the map is made, and they cannot be saved, merged or retracted; expected \
-         map.refine.passes_max = 0 with a saved state"
+        "channel {channel} of the merged states holds {found} visibilities for refinement; expected at most \
+         map.refine.visibilities_max = {most}: raise it"
     )]
-    HeldInMemory,
+    TooManyHeld {
+        /// Channel.
+        channel: ChannelId,
+        /// Visibilities of all.
+        found: u64,
+        /// The limit.
+        most: u64,
+    },
+    /// Ranks that hold visibilities one by one.
+    #[error(
+        "map.refine with a saved state of several ranks; expected one process, or map.refine.passes_max = 0"
+    )]
+    HeldByRank,
+    /// A segment of visibilities that is missing or damaged.
+    #[error("{}: found {found}; expected the visibilities that the checkpoint names", path.display())]
+    Segment {
+        /// The file.
+        path: PathBuf,
+        /// What was found.
+        found: String,
+    },
     /// A checkpoint could not be read or written.
     #[error("checkpoint: {0}")]
     Io(#[from] std::io::Error),

@@ -20,7 +20,7 @@ mod noise;
 mod pixel;
 mod stage;
 
-pub use config::{ChannelGroup, EngineKind, MapConfig, RefineConfig};
+pub use config::{ChannelGroup, EngineKind, MapConfig, REFINED, RefineConfig};
 pub use engine::ExactEngine;
 pub use error::AccumulationError;
 pub use fixed_point::automatic_weight_max;

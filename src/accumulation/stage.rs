@@ -2,10 +2,12 @@
 
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
+use std::path::Path;
 use std::sync::Arc;
 
 use super::harmonic::{
-    HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, RefinedSetup, VisibilityArchive, orbit_of,
+    HarmonicEngine, HarmonicSetup, HarmonicSums, HeldSegment, NoiseSums, RefinedSetup, SegmentPlace,
+    VisibilityArchive, orbit_of,
 };
 use super::{
     AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine,
@@ -92,7 +94,7 @@ impl Engine {
         match self {
             Self::Pixel(engine) => engine.remove(placed),
             Self::Harmonic(engine) => engine.remove(placed),
-            Self::Refined(_) => Err(AccumulationError::HeldInMemory),
+            Self::Refined(archive) => archive.remove(placed),
         }
     }
 
@@ -106,12 +108,13 @@ impl Engine {
         counts.visibilities == 0
     }
 
-    fn sums(&mut self) -> SnapshotSums {
-        match self {
+    /// A copy of the sums; of visibilities that are held, their sums on the nearest circle.
+    fn sums(&mut self) -> Result<SnapshotSums, AccumulationError> {
+        Ok(match self {
             Self::Pixel(engine) => SnapshotSums::Pixel(engine.sums()),
             Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.sums())),
-            Self::Refined(archive) => SnapshotSums::Refined(archive.clone()),
-        }
+            Self::Refined(archive) => SnapshotSums::Harmonic(Box::new(archive.circle_sums()?)),
+        })
     }
 
     fn into_sums(self) -> SnapshotSums {
@@ -237,28 +240,54 @@ impl Accumulator {
         }
     }
 
-    /// Writes its engines one after another.
+    /// Writes its engines one after another; visibilities that are held go into files of their own at `place`.
     ///
     /// # Errors
     /// The writer's.
-    pub fn write_engines(&mut self, out: &mut dyn Write) -> Result<(), AccumulationError> {
+    pub fn write_engines(
+        &mut self,
+        out: &mut dyn Write,
+        place: SegmentPlace<'_>,
+    ) -> Result<(), AccumulationError> {
         for sums in self.channels.iter_mut().flatten() {
             match &mut sums.engine {
                 Engine::Pixel(engine) => engine.checkpoint(out)?,
                 Engine::Harmonic(engine) => engine.checkpoint(out)?,
-                Engine::Refined(_) => return Err(AccumulationError::HeldInMemory),
+                Engine::Refined(archive) => archive.checkpoint(out, place)?,
             }
         }
         Ok(())
     }
 
-    /// Resumes from a state and its engines, as [`Accumulator::write_engines`] wrote them. The channels' spans are not
-    /// part of it: see [`Accumulator::set_spans`].
+    /// The files that engines were written to or read from, besides the checkpoint.
+    pub fn segments(&self) -> impl Iterator<Item = &HeldSegment> {
+        self.channels.iter().flatten().flat_map(|sums| match &sums.engine {
+            Engine::Refined(archive) => archive.segments(),
+            Engine::Pixel(_) | Engine::Harmonic(_) => &[],
+        })
+    }
+
+    /// From now on another folder is meant, which has none of those files.
+    pub fn leave_segments(&mut self) {
+        for sums in self.channels.iter_mut().flatten() {
+            if let Engine::Refined(archive) = &mut sums.engine {
+                archive.leave_segments();
+            }
+        }
+    }
+
+    /// Resumes from a state and its engines, as [`Accumulator::write_engines`] wrote them, with files in `folder`. The channels' spans
+    /// are not part of it: see [`Accumulator::set_spans`].
     ///
     /// # Errors
     /// Engines that are damaged, or of another kind than configured.
-    pub fn resume(self, state: AccumulatorState, from: &mut dyn Read) -> Result<Self, AccumulationError> {
-        self.resume_part(state, from, RankShare::WHOLE)
+    pub fn resume(
+        self,
+        state: AccumulatorState,
+        from: &mut dyn Read,
+        folder: Option<&Path>,
+    ) -> Result<Self, AccumulationError> {
+        self.resume_part(state, from, folder, RankShare::WHOLE)
     }
 
     /// As [`Accumulator::resume`], from engines of which the rank that wrote them holds `part`. What this one holds of it is kept; the
@@ -270,8 +299,10 @@ impl Accumulator {
         self,
         state: AccumulatorState,
         from: &mut dyn Read,
+        folder: Option<&Path>,
         part: RankShare,
     ) -> Result<Self, AccumulationError> {
+        let refine = self.config.refine;
         let mut channels = Vec::new();
         for has_engine in state.channels {
             if !has_engine {
@@ -280,6 +311,10 @@ impl Accumulator {
             }
             let engine = match self.config.engine {
                 EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
+                EngineKind::Harmonic if refine.is_on() => {
+                    let most = refine.visibilities_max;
+                    Engine::Refined(Box::new(VisibilityArchive::restore(from, folder, most)?))
+                }
                 EngineKind::Harmonic => {
                     Engine::Harmonic(Box::new(HarmonicEngine::restore_part(from, part, &self.ranks)?))
                 }
@@ -330,6 +365,7 @@ impl Accumulator {
                     match (&mut ours.engine, theirs.engine) {
                         (Engine::Pixel(ours), Engine::Pixel(theirs)) => ours.merge(*theirs)?,
                         (Engine::Harmonic(ours), Engine::Harmonic(theirs)) => ours.merge(*theirs)?,
+                        (Engine::Refined(ours), Engine::Refined(theirs)) => ours.merge(*theirs)?,
                         _ => return Err(AccumulationError::Mismatch { what: "kinds" }),
                     }
                     let ([first, last], [from, to]) = (ours.span_s, theirs.span_s);
@@ -380,12 +416,12 @@ impl Accumulator {
             PlacedFrame::Instrument(instrument) => self.open(instrument)?,
             PlacedFrame::Visibilities(placed) => {
                 if let Some(&time_s) = placed.time_s.first() {
-                    self.emit_if_due(time_s, out);
+                    self.emit_if_due(time_s, out)?;
                 }
                 return self.add(&placed);
             }
             PlacedFrame::Elsewhere(counted) => {
-                self.emit_if_due(counted.first_s, out);
+                self.emit_if_due(counted.first_s, out)?;
                 self.ledger.left_out(VisibilityReason::ChannelNotMapped, counted.visibilities);
             }
             PlacedFrame::Housekeeping(_) => {}
@@ -469,11 +505,11 @@ impl Accumulator {
     }
 
     /// Emits a snapshot of each channel.
-    fn emit(&mut self, out: &mut Outlet<Snapshot>) {
-        let Some(instrument) = &self.instrument else { return };
+    fn emit(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
+        let Some(instrument) = &self.instrument else { return Ok(()) };
         for (index, slot) in self.channels.iter_mut().enumerate() {
             if self.cancel.is_cancelled() {
-                return;
+                return Ok(());
             }
             let Some(channel) = slot.as_mut().filter(|channel| !channel.engine.is_empty()) else { continue };
             channel.snapshots += 1;
@@ -484,27 +520,29 @@ impl Accumulator {
                 is_final: false,
                 span_s: channel.span_s,
                 nside: self.config.nside,
-                sums: channel.engine.sums(),
+                sums: channel.engine.sums()?,
             };
             out.push_unless(snapshot, &self.cancel);
         }
+        Ok(())
     }
 
     /// Emits snapshots when data of a later step of mission time arrives.
-    fn emit_if_due(&mut self, time_s: f64, out: &mut Outlet<Snapshot>) {
+    fn emit_if_due(&mut self, time_s: f64, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
         let every_s = self.config.snapshot_every_s;
         if every_s <= 0.0 {
-            return;
+            return Ok(());
         }
         let next_s = ((time_s / every_s).floor() + 1.0) * every_s;
         match self.next_snapshot_s {
             Some(due_s) if time_s >= due_s => {
-                self.emit(out);
+                self.emit(out)?;
                 self.next_snapshot_s = Some(next_s);
             }
             Some(_) => {}
             None => self.next_snapshot_s = Some(next_s),
         }
+        Ok(())
     }
 }
 

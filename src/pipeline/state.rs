@@ -5,6 +5,7 @@ use std::path::Path;
 use super::config::Config;
 use super::config_source::ConfigSource;
 use super::error::PipelineError;
+use crate::accumulation::REFINED;
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
 use crate::runtime::{Outlet, Stage};
 use crate::solve::{Solution, SolveWatch, Solver, SolverSetup};
@@ -43,11 +44,17 @@ impl ConfigSource {
     }
 }
 
+/// Passes of a map from a state that holds visibilities one by one, if nobody says how many: `map.refine.residual_max` ends them.
+const PASSES_MAX: usize = 10;
+
 /// A setting as a checkpoint has it (Rust's debug form: `16`, `AntennaGains`, `Limits { a: 1.0, b: 2.0 }`) as a value of TOML;
 /// `None` for a file, of which only the checksum is known.
 fn toml_of(value: &str) -> Option<String> {
     if value.starts_with("a file of") {
         return None;
+    }
+    if value == REFINED {
+        return Some(PASSES_MAX.to_string());
     }
     if let Some((_, fields)) = value.split_once(" { ") {
         return Some(format!("{{ {}", fields.replace(": ", " = ")));
@@ -97,7 +104,7 @@ pub fn solve_state(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::accumulation::{EngineKind, MapConfig};
+    use crate::accumulation::{EngineKind, MapConfig, RefineConfig};
     use crate::calibration::{CalibrationConfig, CalibrationHook};
     use crate::response::harmonic::GeometryLimits;
     use crate::response::pixel::PixelMethod;
@@ -110,7 +117,9 @@ mod tests {
             MapConfig { nside: 4, rows: PixelMethod::AverageExact, weight_max: 2e-9, ..MapConfig::default() };
         let limits = GeometryLimits { altitude_m_max: 1e-3, ..GeometryLimits::default() };
         let harmonic = MapConfig { engine: EngineKind::Harmonic, l_max: 7, limits, ..MapConfig::default() };
-        for map in [pixel, harmonic] {
+        let refine = RefineConfig { passes_max: PASSES_MAX, ..RefineConfig::default() };
+        let refined = MapConfig { refine, ..harmonic.clone() };
+        for map in [pixel, harmonic, refined] {
             let mut overrides: Vec<String> = map
                 .of_sums()
                 .iter()

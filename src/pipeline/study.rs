@@ -532,9 +532,9 @@ impl Making<'_> {
             let (same, rest): (Vec<usize>, Vec<usize>) =
                 left.iter().partition(|&&k| sums_key(&cases[k]) == key);
             let state = self.out.join(format!("state-{key:016x}"));
-            // A refined map needs its visibilities, which no state keeps; snapshots need the data to arrive.
+            // Snapshots need the data to arrive.
             let map = &cases[first].plan.config.map;
-            let is_shared = same.len() > 1 && !map.refine.is_on() && map.snapshot_every_s == 0.0;
+            let is_shared = same.len() > 1 && map.snapshot_every_s == 0.0;
             let gains = if cases[first].calibrated {
                 let Some(gains) = self.calibrate(first, file)? else { return Ok(false) };
                 Some(gains)

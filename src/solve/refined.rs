@@ -27,7 +27,9 @@ use super::tikhonov::{Diagnostics, check_request};
 use super::vectors::{add, dot, subtract};
 use super::watch::NamedWatch;
 use crate::accumulation::AccumulationError;
-use crate::accumulation::harmonic::{Departures, RefinedSums, coefficients, unknowns_of_gradient};
+use crate::accumulation::harmonic::{
+    Departures, RefinedSums, coefficients, orbit_phase_deg, unknowns_of_gradient,
+};
 use crate::sky::harmonics::{Alm, synthesis};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::constants::DAY_S;
@@ -71,7 +73,13 @@ pub struct ChiSquares {
     pub by_daughter: BTreeMap<u16, f64>,
     /// By day of mission time, from 0.
     pub by_day: BTreeMap<i64, f64>,
+    /// By phase of the orbit from its ascending node, in bins of 15 degrees named by their beginning. Visibilities without a neighbour,
+    /// whose plane is not known, are in none.
+    pub by_phase_deg: BTreeMap<u16, f64>,
 }
+
+/// Width of a bin of phase, degrees.
+const PHASE_BIN_DEG: u16 = 15;
 
 impl fmt::Display for Refinement {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -348,9 +356,13 @@ fn chi_squares(sums: &RefinedSums, left: &[Complex64]) -> ChiSquares {
         }
     }
     let mut all = Mean::default();
-    let (mut pairs, mut daughters, mut days) =
-        (BTreeMap::<_, Mean>::new(), BTreeMap::<_, Mean>::new(), BTreeMap::<_, Mean>::new());
-    for ((at, left), weight) in sums.at.iter().zip(left).zip(&sums.data.weight) {
+    let (mut pairs, mut daughters, mut days, mut phases) = (
+        BTreeMap::<_, Mean>::new(),
+        BTreeMap::<_, Mean>::new(),
+        BTreeMap::<_, Mean>::new(),
+        BTreeMap::<_, Mean>::new(),
+    );
+    for (k, ((at, left), weight)) in sums.at.iter().zip(left).zip(&sums.data.weight).enumerate() {
         let value = 0.5 * left.norm_sqr() * weight;
         all.add(value);
         pairs.entry((at.pair.i, at.pair.j)).or_default().add(value);
@@ -358,6 +370,9 @@ fn chi_squares(sums: &RefinedSums, left: &[Complex64]) -> ChiSquares {
             daughters.entry(u16::from(daughter) + 1).or_default().add(value);
         }
         days.entry((at.time_s / DAY_S).floor() as i64).or_default().add(value);
+        if let Some(phase_deg) = orbit_phase_deg(&sums.at, k) {
+            phases.entry(phase_deg as u16 / PHASE_BIN_DEG * PHASE_BIN_DEG).or_default().add(value);
+        }
     }
     ChiSquares {
         all: all.value(),
@@ -367,5 +382,6 @@ fn chi_squares(sums: &RefinedSums, left: &[Complex64]) -> ChiSquares {
             .collect(),
         by_daughter: daughters.into_iter().map(|(daughter, mean)| (daughter, mean.value())).collect(),
         by_day: days.into_iter().map(|(day, mean)| (day, mean.value())).collect(),
+        by_phase_deg: phases.into_iter().map(|(phase_deg, mean)| (phase_deg, mean.value())).collect(),
     }
 }

@@ -4,6 +4,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use super::refined::REFINED;
 use super::{ENGINES, Ground, checkpoints};
 
 /// Kills for each engine.
@@ -65,6 +66,22 @@ fn killed_at_any_moment_it_goes_on_to_the_same_bits() {
         assert!(place.maps("killed") == place.maps("whole"), "{engine}");
         eprintln!("{engine}: {} kills, none differs; {resumed} sessions left or found a checkpoint", kills());
     }
+}
+
+#[test]
+fn killed_at_any_moment_it_holds_the_visibilities_of_a_refined_map() {
+    let place = Ground::with(REFINED);
+    let file = place.simulate("longer.ccsds", &["--set", "spacecraft.every_nth_window=100"]);
+    let every = ["--checkpoint-every", "300"];
+    let since = Instant::now();
+    place.replay("whole", &[&file], &every);
+    let session = since.elapsed();
+    let args = place.session("killed", &[&file], &every);
+    // What the checkpoints name depends on when they were written, so that maps are compared.
+    kill(kills(), session, || start(&args), |_| ());
+    place.replay("killed", &[&file], &every);
+    assert!(place.maps("killed") == place.maps("whole"));
+    assert_eq!(checkpoints(Path::new(&place.path("killed"))).len(), 2);
 }
 
 #[test]

@@ -14,6 +14,7 @@ mod kill;
 mod merge;
 mod model;
 mod order;
+mod refined;
 mod retract;
 
 use std::path::{Path, PathBuf};

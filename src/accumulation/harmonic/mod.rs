@@ -17,15 +17,18 @@
 //! `2^-24 sqrt(M)`, those above 2^21 of these to 21 bits (see the module `exact`); there is room for a total weight of
 //! `2^32 M`.
 
+mod archive;
 mod blocks;
 mod checkpoint;
 mod coverage;
 mod exact;
 mod grid;
+mod held;
 mod lines;
 mod noises;
 mod operator;
 mod refined;
+mod segments;
 mod setup;
 mod spread;
 mod sums;
@@ -37,13 +40,14 @@ mod workspace;
 use std::io::Read;
 use std::sync::{Arc, OnceLock};
 
+pub use archive::{REFINED_VISIBILITY_BYTES, VisibilityArchive};
 pub use blocks::{OrderBlocks, OrderFactors};
 pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
+pub use held::RefinedSetup;
 pub use noises::NoiseSums;
-pub use refined::{
-    Departures, REFINED_VISIBILITY_BYTES, RefinedData, RefinedSetup, RefinedSums, VisibilityArchive,
-};
+pub use refined::{Departures, RefinedData, RefinedSums, orbit_phase_deg};
+pub use segments::{HELD_BYTES, HeldSegment, SegmentPlace};
 pub use setup::{
     ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, SharedSize, application_size, memory, orbit_of,
     shared_size,

@@ -1,159 +1,48 @@
-//! Visibilities kept one by one, for a map that is refined with their own positions.
+//! Visibilities one by one, and their sums on the nearest circle.
 //!
 //! The circle's sums (see [`super`]) place each visibility on the nearest circle: near enough to precondition, not to map.
-//! The true rows need the positions, so that visibilities are held in memory until the map is made. They are sorted before
-//! anything is summed: results do not depend on the order in which they arrived.
+//! The true rows need the positions of each.
 
 use num_complex::Complex64;
 use rayon::prelude::*;
 use serde::Serialize;
 
+use super::held::{HeldVisibility, RefinedSetup};
 use super::setup::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
 use super::{HarmonicEngine, HarmonicSetup, HarmonicSums};
-use crate::accumulation::fixed_point::WeightScale;
 use crate::accumulation::noise::companion_noise;
-use crate::accumulation::{AccumulationError, Added, NormalEngine, Refusal, SumCounts};
-use crate::frames::{AntennaResponse, PlacedVisibilities};
-use crate::response::general::{GeneralRows, PairAt, RowPlan, RowsSetup, check_positions};
+use crate::accumulation::{AccumulationError, NormalEngine};
+use crate::frames::PlacedVisibilities;
+use crate::response::general::{GeneralRows, PairAt, RowPlan, RowsSetup};
 use crate::response::harmonic::{GeometryLimits, NominalOrbit, PairOrientation};
-use crate::units::ChannelId;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
-use crate::units::vector::cross;
+use crate::units::vector::{Vec3, cross, dot};
 
-/// Memory of a visibility while it is held, sorted and refined with, bytes: the arrays' elements, and what they grow by.
-pub const REFINED_VISIBILITY_BYTES: u64 = 400;
-
-/// Setup of an archive of visibilities.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RefinedSetup {
-    /// Channel.
-    pub channel: ChannelId,
-    /// Greatest degree of the map.
-    pub l_max: usize,
-    /// Frequency, Hz.
-    pub frequency_hz: f64,
-    /// Longest baseline that is accepted, m.
-    pub baseline_m_max: f64,
-    /// Radius of the body that hides the sky, m.
-    pub moon_radius_m: f64,
-    /// Antenna response.
-    pub response: AntennaResponse,
-    /// Seed of the noise-only companion.
-    pub companion_seed: u64,
-    /// Greatest weight that is accepted, (K sr)^-2.
-    pub weight_max: f64,
-    /// Departures from the circle up to which its sums alone would hold.
-    pub limits: GeometryLimits,
-    /// Most visibilities that are held.
-    pub visibilities_max: u64,
-}
-
-/// A visibility that is held.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct HeldVisibility {
-    at: PairAt,
-    band: u16,
-    value_k_sr: Complex64,
-    weight: f64,
-}
-
-/// The visibilities of one channel, in memory.
-#[derive(Clone, Debug)]
-pub struct VisibilityArchive {
-    setup: RefinedSetup,
-    scale: WeightScale,
+/// Plans the rows of sorted visibilities, and sums them on the nearest circle.
+pub(super) fn refined_sums(
+    setup: &RefinedSetup,
     held: Vec<HeldVisibility>,
-}
-
-impl VisibilityArchive {
-    /// An empty archive.
-    ///
-    /// # Errors
-    /// A greatest weight out of range.
-    pub fn new(setup: RefinedSetup) -> Result<Self, AccumulationError> {
-        Ok(Self { setup, scale: WeightScale::new(setup.weight_max)?, held: Vec::new() })
-    }
-
-    /// Takes visibilities.
-    ///
-    /// # Errors
-    /// A block of another frequency. A visibility without a row of B, or for which there is no room, is counted as refused.
-    pub fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        if placed.frequency_hz != self.setup.frequency_hz {
-            return Err(AccumulationError::Frequency {
-                expected_hz: self.setup.frequency_hz,
-                found_hz: placed.frequency_hz,
-            });
-        }
-        let mut added = Added::default();
-        for k in 0..placed.len() {
-            match self.accept(placed, k) {
-                Ok(held) => {
-                    self.held.push(held);
-                    added.visibilities += 1;
-                }
-                Err(reason) => added.refuse(reason),
-            }
-        }
-        Ok(added)
-    }
-
-    fn accept(&self, placed: &PlacedVisibilities, k: usize) -> Result<HeldVisibility, Refusal> {
-        let (r_i_m, r_j_m) = (placed.r_i_m[k], placed.r_j_m[k]);
-        check_positions(r_i_m, r_j_m, self.setup.moon_radius_m)?;
-        let (value_k_sr, weight) = (placed.value_k_sr[k], placed.weight[k]);
-        self.scale.check(value_k_sr, weight, self.setup.weight_max)?;
-        if self.held.len() as u64 >= self.setup.visibilities_max {
-            return Err(Refusal::Full);
-        }
-        let at = PairAt { pair: placed.pair, time_s: placed.time_s[k], r_i_m, r_j_m };
-        Ok(HeldVisibility { at, band: placed.band, value_k_sr, weight })
-    }
-
-    /// Number, weight and power of the visibilities.
-    #[must_use]
-    pub fn counts(&self) -> SumCounts {
-        let weight = self.held.iter().map(|held| held.weight).sum();
-        let power = self.held.iter().map(|held| held.value_k_sr.norm_sqr() * held.weight).sum();
-        SumCounts { visibilities: self.held.len() as u64, weight, power }
-    }
-
-    /// Sorts the visibilities, plans their rows, and sums them on the nearest circle.
-    ///
-    /// # Errors
-    /// A setup that an engine does not take; no data.
-    pub fn into_sums(self) -> Result<RefinedSums, AccumulationError> {
-        let Self { setup, mut held, .. } = self;
-        held.par_sort_unstable_by(|a, b| {
-            order(a).partial_cmp(&order(b)).unwrap_or(std::cmp::Ordering::Equal)
-        });
-        let noise = noises(&setup, &held);
-        let at: Vec<PairAt> = held.iter().map(|held| held.at).collect();
-        let data = RefinedData {
-            value_k_sr: held.iter().map(|held| held.value_k_sr).collect(),
-            weight: held.iter().map(|held| held.weight).collect(),
-            noise,
-        };
-        let bands: Vec<u16> = held.iter().map(|held| held.band).collect();
-        drop(held);
-        let (orbit, departures) = nearest_circle(&setup, &at);
-        let circle = circle_sums(&setup, orbit, &at, &bands, &data)?;
-        let rows = GeneralRows::new(RowsSetup {
-            l_max: setup.l_max,
-            wavelength_m: SPEED_OF_LIGHT_M_S / setup.frequency_hz,
-            moon_radius_m: setup.moon_radius_m,
-            response: setup.response,
-        });
-        // Each visibility was checked when it came.
-        let plan = rows.plan(&at).map_err(|error| AccumulationError::Rows(error.refusal))?;
-        Ok(RefinedSums { circle, rows, plan, at, data, departures })
-    }
-}
-
-/// What visibilities are sorted by: nothing in it depends on how they arrived.
-fn order(held: &HeldVisibility) -> (u8, u8, f64, u16, f64, f64, f64) {
-    let HeldVisibility { at, band, value_k_sr, weight } = held;
-    (at.pair.i, at.pair.j, at.time_s, *band, value_k_sr.re, value_k_sr.im, *weight)
+) -> Result<RefinedSums, AccumulationError> {
+    let noise = noises(setup, &held);
+    let at: Vec<PairAt> = held.iter().map(|held| held.at).collect();
+    let data = RefinedData {
+        value_k_sr: held.iter().map(|held| held.value_k_sr).collect(),
+        weight: held.iter().map(|held| held.weight).collect(),
+        noise,
+    };
+    let bands: Vec<u16> = held.iter().map(|held| held.band).collect();
+    drop(held);
+    let (orbit, departures) = nearest_circle(setup, &|k| at[k], at.len());
+    let circle = circle_sums(setup, orbit, &at, &bands, &data)?;
+    let rows = GeneralRows::new(RowsSetup {
+        l_max: setup.l_max,
+        wavelength_m: SPEED_OF_LIGHT_M_S / setup.frequency_hz,
+        moon_radius_m: setup.moon_radius_m,
+        response: setup.response,
+    });
+    // Each visibility was checked when it came.
+    let plan = rows.plan(&at).map_err(|error| AccumulationError::Rows(error.refusal))?;
+    Ok(RefinedSums { circle, rows, plan, at, data, departures })
 }
 
 /// Noise of the companion, by visibility.
@@ -194,31 +83,56 @@ pub struct Departures {
 /// A satellite's positions further apart in time than this say nothing of its plane, s: a quarter of a low orbit.
 const SAME_PASS_S: f64 = 1500.0;
 
-/// Mean inclination of the orbits' planes, from where satellites move between visibilities; `None` if each stands alone. The
-/// planes of pairs lie across them if satellites do not follow each other.
-fn orbit_inclination_rad(at: &[PairAt]) -> Option<f64> {
-    let (mut sum, mut count) = (0.0, 0.0);
-    for (before, after) in at.iter().zip(at.iter().skip(1)) {
-        let apart_s = after.time_s - before.time_s;
-        if before.pair == after.pair && apart_s > 0.0 && apart_s < SAME_PASS_S {
-            let normal = cross(before.r_i_m, after.r_i_m);
+/// The normal of the orbit, m^2 and as the satellite turns, from where it moves to until the next visibility of the pair; `None` if
+/// the next is another pair's or another pass's. The planes of pairs lie across the orbit's if satellites do not follow each other.
+fn orbit_normal(before: &PairAt, after: &PairAt) -> Option<Vec3> {
+    let apart_s = after.time_s - before.time_s;
+    let is_near = before.pair == after.pair && apart_s > 0.0 && apart_s < SAME_PASS_S;
+    is_near.then(|| cross(before.r_i_m, after.r_i_m))
+}
+
+/// Mean inclination of the orbits' planes; `None` if each visibility stands alone.
+fn orbit_inclination_rad(at: &dyn Fn(usize) -> PairAt, count: usize) -> Option<f64> {
+    let (mut sum, mut found) = (0.0, 0.0);
+    for k in 1..count {
+        if let Some(normal) = orbit_normal(&at(k - 1), &at(k)) {
             sum += normal[0].hypot(normal[1]).atan2(normal[2]);
-            count += 1.0;
+            found += 1.0;
         }
     }
-    (count > 0.0).then(|| sum / count)
+    (found > 0.0).then(|| sum / found)
+}
+
+/// Phase of the orbit at visibility `k` of sorted ones, degrees from 0 to 360: the angle of satellite i from the ascending node, in the
+/// plane in which it moves from or to a neighbouring visibility. `None` without one, or for an orbit over the equator.
+#[must_use]
+pub fn orbit_phase_deg(at: &[PairAt], k: usize) -> Option<f64> {
+    let here = at.get(k)?;
+    let after = at.get(k + 1).and_then(|after| orbit_normal(here, after));
+    let before = k.checked_sub(1).and_then(|before| orbit_normal(at.get(before)?, here));
+    let normal = after.or(before)?;
+    let node = [-normal[1], normal[0], 0.0];
+    let across = cross(normal, node);
+    let length = node[0].hypot(node[1]);
+    let turned = dot(normal, normal).sqrt();
+    let phase = (dot(here.r_i_m, across) / turned).atan2(dot(here.r_i_m, node));
+    (length > 0.0).then(|| phase.to_degrees().rem_euclid(360.0))
 }
 
 /// The circle of the mean radius and inclination of all.
-fn nearest_circle(setup: &RefinedSetup, at: &[PairAt]) -> (NominalOrbit, Departures) {
+pub(super) fn nearest_circle(
+    setup: &RefinedSetup,
+    at: &dyn Fn(usize) -> PairAt,
+    count: usize,
+) -> (NominalOrbit, Departures) {
     use std::f64::consts::PI;
-    let found: Vec<PairOrientation> =
-        at.iter().filter_map(|at| PairOrientation::of(at.r_i_m, at.r_j_m).ok()).collect();
+    let orientation = |at: PairAt| PairOrientation::of(at.r_i_m, at.r_j_m).ok();
+    let found: Vec<PairOrientation> = (0..count).filter_map(|k| orientation(at(k))).collect();
     // A satellite j that leads turns the pair's plane upside down.
     let prograde = |pair: &PairOrientation| pair.inclination_rad.min(PI - pair.inclination_rad);
     let mean =
         |of: &dyn Fn(&PairOrientation) -> f64| found.iter().map(of).sum::<f64>() / found.len().max(1) as f64;
-    let orbit_rad = orbit_inclination_rad(at).unwrap_or_else(|| mean(&prograde));
+    let orbit_rad = orbit_inclination_rad(at, count).unwrap_or_else(|| mean(&prograde));
     let inclination_deg = (orbit_rad.to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
     let radius_m = (mean(&|pair| pair.radius_m) / RADIUS_STEP_M).round() * RADIUS_STEP_M;
     let inclination_rad = inclination_deg.to_radians();
@@ -255,7 +169,24 @@ fn nearest_circle(setup: &RefinedSetup, at: &[PairAt]) -> (NominalOrbit, Departu
 }
 
 /// Visibilities that are handed to the circle's engine together.
-const BLOCK: usize = 65_536;
+pub(super) const BLOCK: usize = 65_536;
+
+/// An engine for sums on a circle.
+pub(super) fn circle_engine(
+    setup: &RefinedSetup,
+    orbit: NominalOrbit,
+) -> Result<HarmonicEngine, AccumulationError> {
+    HarmonicEngine::new(HarmonicSetup {
+        l_max: setup.l_max,
+        frequency_hz: setup.frequency_hz,
+        baseline_m_max: setup.baseline_m_max,
+        moon_radius_m: setup.moon_radius_m,
+        response: setup.response,
+        orbit,
+        companion_seed: setup.companion_seed,
+        weight_max: setup.weight_max,
+    })
+}
 
 /// The sums of all visibilities on the circle.
 fn circle_sums(
@@ -265,16 +196,7 @@ fn circle_sums(
     bands: &[u16],
     data: &RefinedData,
 ) -> Result<HarmonicSums, AccumulationError> {
-    let mut engine = HarmonicEngine::new(HarmonicSetup {
-        l_max: setup.l_max,
-        frequency_hz: setup.frequency_hz,
-        baseline_m_max: setup.baseline_m_max,
-        moon_radius_m: setup.moon_radius_m,
-        response: setup.response,
-        orbit,
-        companion_seed: setup.companion_seed,
-        weight_max: setup.weight_max,
-    })?;
+    let mut engine = circle_engine(setup, orbit)?;
     let mut first = 0;
     while first < at.len() {
         let same = |k: &usize| at[*k].pair == at[first].pair && bands[*k] == bands[first];
@@ -323,4 +245,39 @@ pub struct RefinedSums {
     pub data: RefinedData,
     /// How far they are from the circle.
     pub departures: Departures,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::units::Pair;
+
+    /// A circular orbit turned about x by its inclination and about z by its node, as text books have it.
+    #[test]
+    fn phases_are_those_from_the_ascending_node() {
+        for (inclination_deg, node_deg) in [(30.0_f64, 0.0_f64), (30.0, 200.0), (150.0, -40.0), (89.0, 77.0)]
+        {
+            let ((si, ci), (so, co)) =
+                (inclination_deg.to_radians().sin_cos(), node_deg.to_radians().sin_cos());
+            let at = |k: usize| {
+                let (sp, cp) = (0.3 + 0.2 * k as f64).sin_cos();
+                let [x, y] = [2e6 * cp, 2e6 * sp];
+                let r_i_m = [x * co - y * so * ci, x * so + y * co * ci, y * si];
+                PairAt { pair: Pair { i: 0, j: 1 }, time_s: 60.0 * k as f64, r_i_m, r_j_m: [0.0; 3] }
+            };
+            let all: Vec<PairAt> = (0..40).map(at).collect();
+            for k in 0..all.len() {
+                let expected = (0.3 + 0.2 * k as f64).to_degrees().rem_euclid(360.0);
+                let found = orbit_phase_deg(&all, k).unwrap();
+                assert!(
+                    (found - expected).abs() < 1e-6,
+                    "{inclination_deg} {node_deg} {k}: {found} {expected}"
+                );
+            }
+            // Alone, or long before the next, its plane is not known.
+            assert_eq!(orbit_phase_deg(&all[..1], 0), None);
+            let late = PairAt { time_s: 1e6, ..all[1] };
+            assert_eq!(orbit_phase_deg(&[all[0], late], 0), None);
+        }
+    }
 }

@@ -4,13 +4,15 @@
 //! Ranks of a job share a folder. Each writes its part of every checkpoint at the same place of the stream, and nobody waits for the
 //! others: a checkpoint counts once all its parts are there, and an older one goes once there are two newer ones.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use super::checkpoint;
 use super::names::{NUMBER_MAX, Numbered, numbered};
-use crate::files::{AtomicFile, FolderLock, IfUnfinished};
+use crate::accumulation::harmonic::HeldSegment;
+use crate::files::{AtomicFile, FolderLock, IfUnfinished, read_folder};
 use crate::ground::GroundError;
 use crate::ranks::Ranks;
 
@@ -23,6 +25,8 @@ pub(super) struct StateFolder {
     path: PathBuf,
     /// Its checkpoints, oldest first.
     held: Vec<Numbered>,
+    /// The segments that checkpoints name, of those checkpoints that this process has read or written.
+    segments: BTreeMap<u64, Vec<HeldSegment>>,
     /// Of the first rank.
     lock: Option<FolderLock>,
     ranks: Ranks,
@@ -54,7 +58,7 @@ impl StateFolder {
             return Err(GroundError::NotShared { path: path.to_owned() });
         }
         let [held, _] = numbered(path)?;
-        Ok(Self { path: path.to_owned(), held, lock, ranks: ranks.clone() })
+        Ok(Self { path: path.to_owned(), held, segments: BTreeMap::new(), lock, ranks: ranks.clone() })
     }
 
     /// Those that share it.
@@ -118,6 +122,36 @@ impl StateFolder {
         Ok(())
     }
 
+    /// Where the next checkpoint will be, and its number.
+    pub(super) fn next(&self) -> (PathBuf, u64) {
+        (self.path.clone(), self.held.last().map_or(1, |newest| newest.number + 1))
+    }
+
+    /// Says which segments the newest checkpoint names. Those that none names are removed, once it is known of all.
+    pub(super) fn names<'a>(&mut self, segments: impl Iterator<Item = &'a HeldSegment>) {
+        if let Some(newest) = self.held.last() {
+            self.segments.insert(newest.number, segments.copied().collect());
+        }
+        self.remove_unnamed();
+    }
+
+    /// Removes segments that no checkpoint names: of older ones, or of one that was never finished. One that stays takes room and does
+    /// no harm. Ranks have none.
+    fn remove_unnamed(&mut self) {
+        self.segments.retain(|number, _| self.held.iter().any(|held| held.number == *number));
+        if self.segments.len() < self.held.len() || self.check_place().is_err() || self.ranks.are_many() {
+            return;
+        }
+        let named = || self.segments.values().flatten().map(HeldSegment::file_name);
+        for entry in read_folder(&self.path).into_iter().flatten().flatten() {
+            let name = entry.file_name();
+            let name = name.to_string_lossy();
+            if HeldSegment::is_name(&name) && !named().any(|other| other == name) {
+                let _ = fs::remove_file(entry.path());
+            }
+        }
+    }
+
     /// Writes a checkpoint, or this rank's part of one, whole or not at all, and removes all but the newest two. If there is no room
     /// for a third, the older of the two gives way, once the newer one has been found to hold; not to a part.
     pub(super) fn save(
@@ -134,7 +168,7 @@ impl StateFolder {
         &mut self,
         mut write: impl FnMut(&mut AtomicFile, &Path) -> Result<(), GroundError>,
     ) -> Result<(), GroundError> {
-        let number = self.held.last().map_or(1, |newest| newest.number + 1);
+        let (_, number) = self.next();
         let next = Numbered { number, parts: self.ranks.share().count };
         let path = next.path(&self.path, self.ranks.share().rank);
         if number > NUMBER_MAX {
@@ -170,9 +204,13 @@ impl StateFolder {
 
     /// Removes all checkpoints but the newest. That has to hold: otherwise an error, and nothing is removed.
     pub(super) fn drop_older(&mut self) -> Result<(), GroundError> {
-        if let Some(newest) = self.held.last() {
+        if let Some(newest) = self.held.last().copied() {
             newest.paths(&self.path).iter().try_for_each(|path| checkpoint::verify(path))?;
+            for segment in self.segments.get(&newest.number).into_iter().flatten() {
+                segment.verify(&self.path)?;
+            }
             self.remove_all_but(1);
+            self.remove_unnamed();
         }
         Ok(())
     }

@@ -60,7 +60,7 @@ impl Ground {
             }
         }
         let mut whole = whole.ok_or_else(|| GroundError::without_checkpoint(into))?;
-        whole.folder = StateFolder::open(into)?;
+        whole.move_to(StateFolder::open(into)?);
         if !checkpoints(into)?.is_empty() {
             return Err(GroundError::Occupied { path: into.to_owned() });
         }

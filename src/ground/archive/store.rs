@@ -11,6 +11,7 @@ use super::folder::StateFolder;
 use super::journal::{Journal, OtherRecord};
 use super::names::parts_with;
 use super::settings::{compare, settings_of};
+use crate::accumulation::harmonic::SegmentPlace;
 use crate::accumulation::{AccumulationError, Accumulator};
 use crate::array::Ephemeris;
 use crate::calibration::{AutoTable, Calibrator};
@@ -28,6 +29,9 @@ use crate::runtime::{Cancel, Ledger, LedgerReport};
 
 /// After a failure a checkpoint is tried again after this part of the interval, then after twice that, and so on.
 const RETRIES: u64 = 8;
+
+/// What is expected of a file that a checkpoint names.
+const SEGMENT: &str = "the visibilities that the checkpoint beside it names";
 
 /// Keeps a journal of what a ground applies, and writes checkpoints of the ground into a folder.
 pub(in crate::ground) struct Archive {
@@ -137,13 +141,17 @@ impl Archive {
                 passes: gate.map(PassGate::state).unwrap_or_default(),
             },
         };
+        let (folder, number) = self.folder.next();
+        let place = SegmentPlace { folder: &folder, number };
         self.folder.save(|out, path| {
             let of_file = |error| match error {
                 AccumulationError::Io(source) => GroundError::io(path, "write")(source),
                 other => other.into(),
             };
-            checkpoint::write(out, path, &head, |out| accumulator.write_engines(out).map_err(of_file))
-        })
+            checkpoint::write(out, path, &head, |out| accumulator.write_engines(out, place).map_err(of_file))
+        })?;
+        self.folder.names(accumulator.segments());
+        Ok(())
     }
 }
 
@@ -200,7 +208,7 @@ fn read_parts(
     let of_part = |path: &Path, part: RankShare, empty: Accumulator| {
         checkpoint::read(path, |head, engines| {
             check(&head)?;
-            let sums = empty.resume_part(head.accumulator.clone(), engines, part);
+            let sums = empty.resume_part(head.accumulator.clone(), engines, path.parent(), part);
             Ok((head, sums.map_err(|error| unreadable(path, error))?))
         })
     };
@@ -225,6 +233,7 @@ fn unreadable(path: &Path, error: AccumulationError) -> GroundError {
         AccumulationError::Io(source) if source.kind() != ErrorKind::UnexpectedEof => {
             GroundError::io(path, "read")(source)
         }
+        AccumulationError::Segment { path, found } => GroundError::Damaged { path, found, expected: SEGMENT },
         other => other.into(),
     }
 }
@@ -251,8 +260,8 @@ impl Opened {
         sets_aside: bool,
         ranks: &Ranks,
     ) -> Result<Self, GroundError> {
-        if config.map.refine.is_on() {
-            return Err(AccumulationError::HeldInMemory.into());
+        if config.map.refine.is_on() && ranks.are_many() {
+            return Err(AccumulationError::HeldByRank.into());
         }
         let mut folder = StateFolder::open_among(folder, ranks)?;
         let settings = settings_of(config)?;
@@ -264,7 +273,18 @@ impl Opened {
             let ArchiveHead { collector, ephemeris, autos, journal, calibration, .. } = head;
             Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal, calibration })
         })?;
+        if let Some(contents) = &contents {
+            folder.names(contents.accumulator.segments());
+        }
         Ok(Self { folder, contents, notes, settings, posts })
+    }
+
+    /// From now on the contents belong into another folder, which is new.
+    pub(super) fn move_to(&mut self, folder: StateFolder) {
+        self.folder = folder;
+        if let Some(contents) = &mut self.contents {
+            contents.accumulator.leave_segments();
+        }
     }
 
     /// Merges the contents of another folder into these.

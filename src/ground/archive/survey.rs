@@ -105,7 +105,7 @@ impl CoverageSurvey {
         let head: ArchiveHead =
             checkpoint::read_from(&mut Cursor::new(bytes), Path::new("memory"), |head, engines| {
                 let accumulator = Accumulator::new(map.clone(), Ledger::default());
-                accumulator.resume(head.accumulator.clone(), engines)?;
+                accumulator.resume(head.accumulator.clone(), engines, None)?;
                 Ok(head)
             })?;
         Ok(Self::of_head(head))
