@@ -7,7 +7,7 @@ use super::{InstrumentErrors, PassErrors};
 use crate::array::{Array, track_axes};
 use crate::frames::ObservingWindow;
 use crate::response::model::AntennaPatterns;
-use crate::response::pixel::Antenna;
+use crate::response::pixel::TiltedAntenna;
 use crate::units::vector::{Vec3, add, scale, unit};
 
 /// Axis of a dipole that leans from the orbit's normal by an angle (deg) towards the track's direction, and by one away
@@ -60,14 +60,14 @@ impl AntennaErrors {
 }
 
 impl AntennaPatterns for AntennaErrors {
-    fn antenna(&self, daughter: u8, t_s: f64) -> Antenna {
+    fn antenna(&self, daughter: u8, t_s: f64) -> TiltedAntenna {
         let number = usize::from(daughter);
         let errors = self.pass(t_s).and_then(|daughters| daughters.get(number));
         let [along_deg, radial_deg, distortion] =
             errors.map_or([0.0; 3], |errors| errors.each_ref().map(|series| series.at(t_s)));
         let (r_m, normal_hat) = (self.array.position_m(number, t_s), self.array.normal_hat(number, t_s));
         let axis_hat = tilted_axis(r_m, normal_hat, [along_deg, radial_deg]);
-        Antenna { axis_hat, is_dipole: self.is_dipole, distortion }
+        TiltedAntenna { axis_hat, is_dipole: self.is_dipole, distortion }
     }
 }
 

@@ -6,12 +6,12 @@ use num_complex::Complex64;
 
 use super::direct::DirectSum;
 use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
-use crate::response::pixel::{Antenna, antenna_powers, antenna_sums};
+use crate::response::pixel::{TiltedAntenna, antenna_powers, antenna_sums};
 
 /// The antenna of each daughter at any time.
 pub trait AntennaPatterns: Send + Sync {
     /// That of a daughter, from 0, at a mission time, s.
-    fn antenna(&self, daughter: u8, t_s: f64) -> Antenna;
+    fn antenna(&self, daughter: u8, t_s: f64) -> TiltedAntenna;
 }
 
 /// A direct sum in which every daughter has its own antenna: of two dipoles along d and e an unpolarised wave from n leaves
@@ -84,10 +84,10 @@ mod tests {
     }
 
     impl AntennaPatterns for Tilted {
-        fn antenna(&self, daughter: u8, t_s: f64) -> Antenna {
+        fn antenna(&self, daughter: u8, t_s: f64) -> TiltedAntenna {
             let k = f64::from(daughter) + t_s * 1e-6;
             let axis_hat = unit([0.3 * k, -0.5 + 0.1 * k, 0.9]);
-            Antenna { axis_hat, is_dipole: self.is_dipole, distortion: 0.1 * k }
+            TiltedAntenna { axis_hat, is_dipole: self.is_dipole, distortion: 0.1 * k }
         }
     }
 
@@ -142,9 +142,9 @@ mod tests {
     fn straight_antennas_are_those_of_the_response() {
         struct Straight(Array);
         impl AntennaPatterns for Straight {
-            fn antenna(&self, daughter: u8, t_s: f64) -> Antenna {
+            fn antenna(&self, daughter: u8, t_s: f64) -> TiltedAntenna {
                 let axis_hat = self.0.normal_hat(daughter.into(), t_s);
-                Antenna { axis_hat, is_dipole: true, distortion: 0.0 }
+                TiltedAntenna { axis_hat, is_dipole: true, distortion: 0.0 }
             }
         }
         let array = Array::new(&ArrayConfig::default()).unwrap();

@@ -54,7 +54,7 @@ impl PairGeometry {
 
 /// Antenna of one satellite that may be off: a short dipole, or an isotropic antenna with an axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Antenna {
+pub struct TiltedAntenna {
     /// Its axis, a unit vector.
     pub axis_hat: Vec3,
     /// Whether it is a dipole along the axis.

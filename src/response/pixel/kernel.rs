@@ -3,7 +3,7 @@
 //! Kernels are plain loops over short buffers. `multiversion` compiles each of them for AVX-512, AVX2 and the baseline
 //! and selects one at run time.
 
-use super::{Antenna, PairGeometry, SingleGeometry};
+use super::{PairGeometry, SingleGeometry, TiltedAntenna};
 use crate::frames::AntennaResponse;
 use crate::units::arithmetic::{fused, fused64};
 use crate::units::vector::{Vec3, dot, scale};
@@ -56,7 +56,7 @@ pub(super) struct Prepared {
     /// Direction of the dipoles, if there are any.
     pub dipole: Option<Vec3>,
     /// Antennas that differ, in place of those.
-    pub antennas: Option<[Antenna; 2]>,
+    pub antennas: Option<[TiltedAntenna; 2]>,
 }
 
 /// Direction of a position, and the cosine of the angle between the limb and the Moon's centre.
@@ -79,13 +79,13 @@ impl Prepared {
     }
 
     /// A pair whose antennas differ.
-    pub fn antenna_pair((pair, antennas): &(PairGeometry, [Antenna; 2])) -> Self {
+    pub fn antenna_pair((pair, antennas): &(PairGeometry, [TiltedAntenna; 2])) -> Self {
         let ideal = PairGeometry { response: AntennaResponse::Isotropic, ..*pair };
         Self { antennas: Some(*antennas), ..Self::pair(&ideal) }
     }
 
     /// A satellite with an antenna of its own.
-    pub fn antenna_single((single, antenna): &(SingleGeometry, Antenna)) -> Self {
+    pub fn antenna_single((single, antenna): &(SingleGeometry, TiltedAntenna)) -> Self {
         let ideal = SingleGeometry { response: AntennaResponse::Isotropic, ..*single };
         Self { antennas: Some([*antenna; 2]), ..Self::single(&ideal) }
     }

@@ -33,7 +33,7 @@ use thiserror::Error;
 
 pub use combs::{Comb, comb_sums};
 pub use directions::Directions;
-pub use geometry::{Antenna, PairGeometry, SingleGeometry};
+pub use geometry::{PairGeometry, SingleGeometry, TiltedAntenna};
 pub use rows::{RowMaker, RowValue};
 pub use sums::{SkySum, antenna_powers, antenna_sums, four_sky_sums, sky_powers, sky_sums};
 

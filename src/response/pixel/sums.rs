@@ -5,7 +5,7 @@ use num_complex::Complex64;
 use rayon::prelude::*;
 
 use super::kernel::{CHUNK, ChunkDirections, PaddedChunk, Prepared, dot64, total};
-use super::{Antenna, Directions, PairGeometry, ResponseError, SingleGeometry};
+use super::{Directions, PairGeometry, ResponseError, SingleGeometry, TiltedAntenna};
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 
 /// Pairs of one task.
@@ -60,7 +60,7 @@ pub fn sky_powers(
 /// # Errors
 /// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
 pub fn antenna_sums(
-    pairs: &[(PairGeometry, [Antenna; 2])],
+    pairs: &[(PairGeometry, [TiltedAntenna; 2])],
     directions: &Directions,
     sky_k: &[f32],
     area_sr: f64,
@@ -73,7 +73,7 @@ pub fn antenna_sums(
 /// # Errors
 /// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
 pub fn antenna_powers(
-    singles: &[(SingleGeometry, Antenna)],
+    singles: &[(SingleGeometry, TiltedAntenna)],
     directions: &Directions,
     sky_k: &[f32],
     area_sr: f64,
