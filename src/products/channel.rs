@@ -253,6 +253,11 @@ impl ChannelFolder {
         if let Some(input) = self.input(processing).map(|input| input.map.clone()) {
             self.write_map(&format!("input{ending}.fits"), &input, processing, origin)?;
         }
+        if let Some(refinement) = &origin.solution.refinement {
+            let path = self.file("residuals.csv");
+            write_atomically(&path, refinement.chi_square.csv().as_bytes())
+                .map_err(|source| ProductsError::Write { path, source })?;
+        }
         Ok(())
     }
 

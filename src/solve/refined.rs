@@ -81,6 +81,27 @@ pub struct ChiSquares {
 /// Width of a bin of phase, degrees.
 const PHASE_BIN_DEG: u16 = 15;
 
+impl ChiSquares {
+    /// A table: a line for all, and for each pair, daughter, phase and day.
+    #[must_use]
+    pub fn csv(&self) -> String {
+        let mut table = String::from(
+            "# Mean of |V - B x|^2 w / 2: what the map leaves of the data, in units of their noise; 1 for noise alone.\n\
+             # by: all; pair; daughter, from 1; phase: beginning of 15 deg from the ascending node; day of the mission, from 0.\n\
+             by,which,chi_square\n",
+        );
+        let mut line = |by: &str, which: &dyn fmt::Display, value: f64| {
+            table.push_str(&format!("{by},{which},{value:.6e}\n"));
+        };
+        line("all", &"all", self.all);
+        self.by_pair.iter().for_each(|(pair, value)| line("pair", pair, *value));
+        self.by_daughter.iter().for_each(|(daughter, value)| line("daughter", daughter, *value));
+        self.by_phase_deg.iter().for_each(|(phase_deg, value)| line("phase", phase_deg, *value));
+        self.by_day.iter().for_each(|(day, value)| line("day", day, *value));
+        table
+    }
+}
+
 impl fmt::Display for Refinement {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { convergence, departures, chi_square, .. } = self;

@@ -190,9 +190,8 @@ impl Stage for Solver {
                 let rule = self.setup.refine;
                 let of = [which.as_slice(), &data, &[epsilon.to_bits().cast_signed()]].concat();
                 let file = self.setup.passes.as_ref().map(|folder| PassFile::new(folder, channel, &of));
-                let begun = file.as_ref().and_then(PassFile::read);
-                // What was interrupted is nearer than the map before.
-                let start = begun.or_else(|| self.last.remove(&channel));
+                // Not from a map on the way: that is the circle's, with which the iteration begins anyway.
+                let start = file.as_ref().and_then(PassFile::read);
                 let mut passed = |x: [&[f64]; 2]| {
                     if let Some(file) = &file {
                         file.write(x);
@@ -207,9 +206,6 @@ impl Stage for Solver {
                 // Whoever makes it again wants it from its beginning, unless it was interrupted.
                 if let Some(file) = file.filter(|_| watch.goes_on()) {
                     file.remove();
-                }
-                if !is_final {
-                    self.last.insert(channel, solved.unknowns);
                 }
                 refinement = Some(found);
                 (solved.map_k, solved.noise_k, solved.diagnostics)

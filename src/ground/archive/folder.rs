@@ -127,17 +127,16 @@ impl StateFolder {
         (self.path.clone(), self.held.last().map_or(1, |newest| newest.number + 1))
     }
 
-    /// Says which segments the newest checkpoint names. Those that none names are removed, once it is known of all.
+    /// Says which segments the newest checkpoint names.
     pub(super) fn names<'a>(&mut self, segments: impl Iterator<Item = &'a HeldSegment>) {
         if let Some(newest) = self.held.last() {
             self.segments.insert(newest.number, segments.copied().collect());
         }
-        self.remove_unnamed();
     }
 
-    /// Removes segments that no checkpoint names: of older ones, or of one that was never finished. One that stays takes room and does
-    /// no harm. Ranks have none.
-    fn remove_unnamed(&mut self) {
+    /// Removes segments that no checkpoint names, of older ones or of one that was never finished, once it is known what all of them
+    /// name. One that stays takes room and does no harm. Ranks have none.
+    pub(super) fn remove_unnamed(&mut self) {
         self.segments.retain(|number, _| self.held.iter().any(|held| held.number == *number));
         if self.segments.len() < self.held.len() || self.check_place().is_err() || self.ranks.are_many() {
             return;

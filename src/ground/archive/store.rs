@@ -151,6 +151,7 @@ impl Archive {
             checkpoint::write(out, path, &head, |out| accumulator.write_engines(out, place).map_err(of_file))
         })?;
         self.folder.names(accumulator.segments());
+        self.folder.remove_unnamed();
         Ok(())
     }
 }
