@@ -133,14 +133,17 @@ impl EngineCost {
         let row_s = ROW_S * l_max * (l_max + TAU * u_max);
         let pass_s = visibilities * (row_s / VISIBILITIES_PER_ROW + INTERPOLATION_S) / cores();
         let rows = row_tables_bytes(map.degree(), u_max, rayon::current_num_threads()) as f64;
+        // Maps on the way are made from sums on a circle, and a copy of them.
+        let is_watched = map.snapshot_every_s > 0.0;
+        let on_the_way = if is_watched { circle.sums_bytes + circle.copy_bytes } else { 0.0 };
         Self {
             sums_bytes: held,
             copy_bytes: 0.0,
             copies_last: true,
-            other_bytes: circle.other_bytes + 2.0 * circle.sums_bytes + rows,
+            other_bytes: circle.other_bytes + 2.0 * circle.sums_bytes + rows + on_the_way,
             // Forth and back, for the map and its noise, and an inner solution of each.
             solution_s: (passes + 1.0) * (circle.solution_s + pass_s) + visibilities * circle.visibility_s,
-            visibility_s: 0.0,
+            visibility_s: if is_watched { circle.visibility_s } else { 0.0 },
             solution_multiply_adds: (passes + 1.0) * circle.solution_multiply_adds,
             ..circle
         }
