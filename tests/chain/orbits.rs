@@ -158,7 +158,7 @@ fn a_triple_on_ellipses_is_mapped_by_refinement() {
     assert!(refinement["convergence"]["converged"].as_bool().unwrap(), "{refinement}");
     assert!(refinement["departures"]["by_refinement"].as_u64().unwrap() > 500, "{refinement}");
     assert!(refinement["chi_square"]["by_pair"].as_object().unwrap().len() == 3, "{refinement}");
-    let table = std::fs::read_to_string(format!("{out}/10.000MHz/residuals.csv")).unwrap();
+    let table = std::fs::read_to_string(format!("{out}/3.000MHz/residuals.csv")).unwrap();
     let lines = |by: &str| table.lines().filter(|line| line.starts_with(by)).count();
     assert_eq!((lines("all,"), lines("pair,"), lines("daughter,")), (1, 3, 3), "{table}");
     assert!(lines("phase,") > 3 && lines("day,") > 3, "{table}");
