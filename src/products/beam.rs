@@ -1,6 +1,6 @@
 //! The effective beam of a map, from what it keeps of each degree, and noise in janskys a beam.
 
-use std::f64::consts::{LN_2, TAU};
+use std::f64::consts::{FRAC_PI_2, LN_2, TAU};
 
 use serde::Serialize;
 
@@ -9,23 +9,20 @@ use crate::units::constants::{BOLTZMANN_J_K, SPEED_OF_LIGHT_M_S};
 
 /// One jansky, W m^-2 Hz^-1.
 const JANSKY: f64 = 1e-26;
-/// Degrees below which the shortest baselines, not the beam, decide what a map keeps.
-const L_MIN: usize = 20;
-/// Least share of a degree that counts in the fit.
-const KEPT_MIN: f64 = 0.1;
-/// Degrees over which the share is averaged to tell where it ends.
-const RUN: usize = 9;
-
-/// What a map keeps of each degree of the sky, and the Gaussian beam that keeps as much.
+/// Step in angle times the number of degrees, rad: a tenth of the narrowest beam's half width.
+const STEP: f64 = 0.2;
+/// Halvings of a step: rounding is reached.
+const BISECTIONS: usize = 50;
+/// What a map keeps of each degree of the sky, and the beam that keeps as much.
 #[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
 pub struct EffectiveBeam {
     /// `w_l = C_l^X / C_l^in` of the map and the input, from l = 0; with the Gaussian beam of post-processing, which the
     /// comparison's input has too. NaN (null) where the input has no power.
     pub w: Vec<f64>,
-    /// FWHM of the Gaussian beam `exp(-l (l + 1) sigma^2 / 2)` that fits w_l best from l = 20 to where it falls below 0.1,
-    /// degrees; absent if w_l does not fall.
+    /// FWHM of the effective beam `sum_l (2 l + 1) w_l P_l(cos theta) / 4 pi`, degrees; absent without a peak. A map that keeps all
+    /// degrees up to l_max has 4.430 / (l_max + 1) rad.
     pub fwhm_deg: Option<f64>,
-    /// Its solid angle, sr.
+    /// Solid angle of a Gaussian beam of that width, `2 pi sigma^2`, sr.
     pub area_sr: Option<f64>,
     /// RMS of the noise-only map, K, as compared.
     pub noise_rms_k: f64,
@@ -41,12 +38,12 @@ impl EffectiveBeam {
         let share = comparison.cl_cross.iter().zip(&comparison.cl_truth).map(|(cross, input)| cross / input);
         let w: Vec<f64> =
             share.enumerate().map(|(l, w)| w * smoothing.get(l).copied().unwrap_or(1.0)).collect();
-        let variance = gaussian_variance(&w);
-        let area_sr = variance.map(|variance| TAU * variance);
+        let fwhm_rad = fwhm_rad(&w);
+        let area_sr = fwhm_rad.map(|fwhm_rad| TAU * fwhm_rad.powi(2) / (8.0 * LN_2));
         let noise_rms_k = (noise.iter().map(|x| x * x).sum::<f64>() / noise.len().max(1) as f64).sqrt();
         Self {
             w,
-            fwhm_deg: variance.map(|variance| (8.0 * LN_2 * variance).sqrt().to_degrees()),
+            fwhm_deg: fwhm_rad.map(f64::to_degrees),
             area_sr,
             noise_rms_k,
             noise_rms_jy: area_sr.map(|area_sr| flux_jy(noise_rms_k, frequency_hz, area_sr)),
@@ -60,18 +57,36 @@ fn flux_jy(temperature_k: f64, frequency_hz: f64, area_sr: f64) -> f64 {
     2.0 * BOLTZMANN_J_K * temperature_k * per_m * per_m * area_sr / JANSKY
 }
 
-/// sigma^2 of the Gaussian beam that fits `ln w_l = -l (l + 1) sigma^2 / 2` best, rad^2.
-fn gaussian_variance(w: &[f64]) -> Option<f64> {
-    let mean = |l: usize| w.get(l..l + RUN).map(|run| run.iter().sum::<f64>() / RUN as f64);
-    let end = (L_MIN..).find(|&l| mean(l).is_none_or(|mean| mean.is_nan() || mean < KEPT_MIN))?;
-    let (mut product, mut square) = (0.0, 0.0);
-    for (l, &share) in w.iter().enumerate().take(end).skip(L_MIN).filter(|(_, share)| **share > 0.0) {
-        let degree = (l * (l + 1)) as f64;
-        product -= 2.0 * degree * share.ln();
-        square += degree * degree;
+/// Full width at half maximum of `sum_l (2 l + 1) w_l P_l(cos theta)`, rad; degrees without a value count nothing. `None` if it has no
+/// peak at 0, or does not fall to half of it within 90 degrees.
+fn fwhm_rad(w: &[f64]) -> Option<f64> {
+    let weights: Vec<f64> =
+        (0..).zip(w).map(|(l, w)| f64::from(2 * l + 1) * if w.is_finite() { *w } else { 0.0 }).collect();
+    let peak: f64 = weights.iter().sum();
+    if peak <= 0.0 {
+        return None;
     }
-    let variance = product / square;
-    (variance.is_finite() && variance > 0.0).then_some(variance)
+    let above = |theta: f64| legendre_series(&weights, theta.cos()) - 0.5 * peak;
+    let step = STEP / weights.len() as f64;
+    let steps = (FRAC_PI_2 / step) as u32;
+    let first = (1..=steps).map(|k| f64::from(k) * step).find(|&theta| above(theta) <= 0.0)?;
+    let (mut inside, mut outside) = (first - step, first);
+    for _ in 0..BISECTIONS {
+        let middle = 0.5 * (inside + outside);
+        if above(middle) > 0.0 { inside = middle } else { outside = middle }
+    }
+    Some(2.0 * inside)
+}
+
+/// `sum_l weights[l] P_l(x)` by the recurrence of P_l.
+fn legendre_series(weights: &[f64], x: f64) -> f64 {
+    let (mut before, mut now, mut sum) = (0.0, 1.0, 0.0);
+    for (l, weight) in (0..).zip(weights) {
+        sum += weight * now;
+        let l = f64::from(l);
+        (before, now) = (now, ((2.0 * l + 1.0) * x * now - l * before) / (l + 1.0));
+    }
+    sum
 }
 
 #[cfg(test)]
@@ -87,16 +102,25 @@ mod tests {
     }
 
     #[test]
-    fn a_gaussian_beam_is_found_again() {
+    fn the_width_is_that_of_the_profile() {
+        // A Gaussian on the sphere differs from its plane one by the square of its width.
         for fwhm_deg in [0.7_f64, 1.3, 5.0] {
-            let mut w = gaussian_beam(fwhm_deg.to_radians(), 400);
-            // Below l = 20 the array sees little, and the end is noise.
-            w[..18].fill(0.3);
-            let fwhm = (8.0 * LN_2 * gaussian_variance(&w).unwrap()).sqrt().to_degrees();
-            assert!((fwhm / fwhm_deg - 1.0).abs() < 1e-9, "{fwhm} {fwhm_deg}");
+            let fwhm = fwhm_rad(&gaussian_beam(fwhm_deg.to_radians(), 1500)).unwrap().to_degrees();
+            assert!((fwhm / fwhm_deg - 1.0).abs() < fwhm_deg.to_radians().powi(2), "{fwhm} {fwhm_deg}");
         }
-        for hopeless in [vec![1.0; 100], vec![f64::NAN; 100], vec![0.0; 100], vec![0.5; 10]] {
-            assert_eq!(gaussian_variance(&hopeless), None);
+        // All degrees up to l_max alike: 2 J_1(x) / x with x = (l_max + 1) theta, half at x = 2.21509 (tables), for small angles.
+        for l_max in [48_usize, 160] {
+            let fwhm = fwhm_rad(&vec![1.0; l_max + 1]).unwrap();
+            let expected = 2.0 * 2.21509 / (l_max + 1) as f64;
+            assert!((fwhm / expected - 1.0).abs() < expected * expected, "{fwhm} {expected}");
+        }
+        // Large scales that are missing or unknown hardly count.
+        let mut w = gaussian_beam(0.02, 400);
+        let whole = fwhm_rad(&w).unwrap();
+        w[..18].fill(f64::NAN);
+        assert!((fwhm_rad(&w).unwrap() / whole - 1.0).abs() < 0.03);
+        for hopeless in [vec![], vec![f64::NAN; 100], vec![0.0; 100], vec![-1.0; 10], vec![1.0]] {
+            assert_eq!(fwhm_rad(&hopeless), None, "{hopeless:?}");
         }
     }
 }
