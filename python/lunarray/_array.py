@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import _native
-from ._settings import Settings, overrides
+from ._settings import Settings, hertz, overrides
 
 #: Mean radius of the Moon, m.
 MOON_RADIUS_M = 1_737_100.0
@@ -57,7 +57,7 @@ class Array:
         times = np.asarray(t, dtype=float)
         return self._native.positions(times.ravel()).reshape(*times.shape, self.satellites, 3)
 
-    def geometry(self, t: float, frequency_hz: float = 10e6) -> dict[str, Any]:
+    def geometry(self, t: float, frequency_hz: float | str = 10e6) -> dict[str, Any]:
         """Everything at a time, s, as ``lunarray geometry --json`` prints it: positions, baselines r_i - r_j by pair and their
         lengths, m; and for an array of a pipeline whether it observes (the Moon hides the Earth), the direction of the Earth, and
         the integration time of each pair at a frequency, s."""
@@ -75,6 +75,6 @@ class Array:
             observing, earth = self._native.earth(float(t))
             found["observing"], found["earth_hat"] = observing, np.array(earth)
             found["dt_s"] = np.array(
-                [self._native.integration_s(float(t), i - 1, j - 1, frequency_hz) for i, j in self.pairs]
+                [self._native.integration_s(float(t), i - 1, j - 1, hertz(frequency_hz)) for i, j in self.pairs]
             )
         return found

@@ -119,10 +119,12 @@ def replay(
 
 
 class State:
-    """The state folder of a ground (``replay(state=..)``): everything that it has received."""
+    """The state folder of a ground (``replay(state=..)``): everything that it has received. It has to be there."""
 
     def __init__(self, path: str | PathLike[str]) -> None:
         self.path = os.fspath(path)
+        if not os.path.isdir(self.path):
+            raise _native.LunarrayError(f"no state in {self.path}: expected a folder that replay(state=..) or lunarray replay --state has made")
 
     def solve(
         self,

@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from . import _native
 from ._array import Array
 from ._map import Map, sky_of
+from ._settings import hertz
 
 
 def predict(
     sky: str | PathLike[str] | Map | ArrayLike,
-    freq: float,
+    freq: float | str,
     t: ArrayLike,
     pairs: Iterable[tuple[int, int]] | None = None,
     array: Array | None = None,
@@ -24,7 +25,7 @@ def predict(
     """Visibilities of a sky by a direct sum over its pixel centres, in double precision, K sr.
 
     ``sky`` is a HEALPix map in K: a file, a :class:`Map`, or pixels in RING order (``frame`` E, G or C; ecliptic if not said).
-    ``freq`` in Hz, ``t`` in s since the epoch, ``pairs`` of satellites from 1 (all if not given), ``array`` an :class:`Array` (the
+    ``freq`` in Hz or with its unit (``"3MHz"``), ``t`` in s since the epoch, ``pairs`` of satellites from 1 (all if not given), ``array`` an :class:`Array` (the
     paper's if not given). Returns shape ``t.shape + (pairs,)``. Directions that the Moon hides from either satellite count
     nothing.
     """
@@ -35,5 +36,5 @@ def predict(
     places = array.positions(times.ravel()).reshape(times.size, -1)
     # Number 0 becomes one that no array has, so that it is refused like any other.
     indices = [tuple(n - 1 if n > 0 else 2**32 for n in pair) for pair in pairs]
-    found = _native.predict(pixels, letter, float(freq), places, indices, array.moon_radius_m, array.dipoles)
+    found = _native.predict(pixels, letter, hertz(freq), places, indices, array.moon_radius_m, array.dipoles)
     return found.reshape(*times.shape, len(pairs))

@@ -7,6 +7,8 @@ from typing import Any, Iterable, Mapping, Union
 
 import numpy as np
 
+from . import _native
+
 #: A dictionary by key, or texts `key=value`.
 Settings = Union[Mapping[str, Any], str, Iterable[str], None]
 
@@ -41,3 +43,12 @@ def overrides(settings: Settings, **more: Any) -> list[str]:
     else:
         found = [str(text) for text in settings]
     return found + [f"{key.replace('__', '.')}={toml(value)}" for key, value in more.items() if value is not None]
+
+
+def hertz(frequency: Any) -> float:
+    """A frequency in Hz: a number of Hz, a text such as ``"3MHz"``, or a quantity of astropy."""
+    if isinstance(frequency, str):
+        return _native.frequency_hz(frequency)
+    if hasattr(frequency, "to_value"):
+        return float(frequency.to_value("Hz"))
+    return float(frequency)

@@ -21,6 +21,13 @@ fn run_command(py: Python<'_>, words: Vec<OsString>) -> u8 {
     py.detach(|| lunarray::cli::run_command(words))
 }
 
+/// Hz from a frequency such as `3MHz`.
+#[pyfunction]
+fn frequency_hz(text: &str) -> PyResult<f64> {
+    let wrong = |expected| error::refused(format!("a frequency is {text:?}: {expected}"));
+    lunarray::units::Dimension::Frequency.parse(text).map_err(wrong)
+}
+
 /// Native part of the package.
 #[pymodule]
 #[pyo3(name = "_native")]
@@ -38,7 +45,7 @@ mod native {
     #[pymodule_export]
     use super::maps::{analysis, compare, read_map};
     #[pymodule_export]
-    use super::run_command;
+    use super::{frequency_hz, run_command};
 
     #[pymodule_export]
     const VERSION: &str = env!("CARGO_PKG_VERSION");

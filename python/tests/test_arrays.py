@@ -1,5 +1,6 @@
 """Positions, and visibilities of a sky against a dense sum by numpy."""
 
+import astropy.units
 import healpy
 import numpy as np
 import pytest
@@ -37,6 +38,8 @@ def test_predictions_are_dense_sums():
             # Rounding of 3072 terms and of phases of some hundred turns.
             assert abs(found[a, b] - expected) < 1e-9 * np.abs(pixels).sum() * healpy.nside2pixarea(16)
     assert lunarray.predict(pixels, 3e6, 0.0).shape == (28,)
+    for frequency in ["3MHz", "3000 kHz", astropy.units.Quantity(3, "MHz")]:
+        assert (lunarray.predict(pixels, frequency, times, pairs) == found).all()
 
 
 def test_a_galactic_sky_is_turned_as_healpy_turns_it():
@@ -87,6 +90,7 @@ def test_what_cannot_be_is_refused():
     refusals = [
         (dict(pairs=[(1, 9)]), "pair 1-9: expected two of the array's 8 satellites"),
         (dict(pairs=[(0, 1)]), "expected two of the array's 8 satellites"),
+        (dict(freq="3 feet"), "frequency is .3 feet.: expected a number of Hz, or one with"),
         (dict(freq=1e12), "frequency 1000000000000 Hz: expected"),
         (dict(sky=np.ones(13)), "13"),
         (dict(sky=np.full(12, np.nan)), "NaN"),

@@ -90,6 +90,8 @@ def test_a_state_is_solved_without_new_data_or_settings(small, tmp_path):
         lunarray.State(state).solve(set={"map.nside": 8})
     with pytest.raises(lunarray.Error, match="no checkpoint"):
         lunarray.State(tmp_path).solve()
+    with pytest.raises(lunarray.Error, match="no state in .*nix: expected a folder"):
+        lunarray.State(tmp_path / "nix")
 
 
 def test_settings_that_are_wrong_are_told_together():
