@@ -6,7 +6,7 @@ use std::sync::{Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{DecimalBytes, HumanCount, ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
 use super::events::progress_of;
@@ -165,6 +165,14 @@ pub(super) fn time_left(left_s: Option<f64>) -> String {
     }
 }
 
+/// How much a stage has handled, for people.
+fn amount(count: u64, unit: &str) -> String {
+    match unit {
+        "bytes" => DecimalBytes(count).to_string(),
+        _ => format!("{} {unit}", HumanCount(count)),
+    }
+}
+
 /// Says which group of a run begins, and the time left for all.
 pub(super) struct GroupSteps {
     groups: RunGroups,
@@ -295,7 +303,7 @@ impl ProgressView {
         let mut message: Vec<String> = stages
             .iter()
             .filter(|s| !s.units.name.is_empty() && s.units.count > 0)
-            .map(|s| format!("{} {} {}", s.name, s.units.count, s.units.name))
+            .map(|s| format!("{} {}", s.name, amount(s.units.count, s.units.name)))
             .collect();
         if let Some(listening) = &watched.listening {
             message.insert(0, self.senders(&listening.status));
@@ -324,5 +332,16 @@ impl ProgressView {
                 print_line(format_args!("{elapsed_s:>5} s:{of} {message}"));
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn amounts_are_for_people() {
+        assert_eq!(amount(51_785_266, "bytes"), "51.79 MB");
+        assert_eq!(amount(2_257_040, "visibilities"), "2,257,040 visibilities");
     }
 }

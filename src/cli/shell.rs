@@ -21,12 +21,21 @@ const NAME: &str = "lunarray";
 pub(super) struct CompletionsArgs {
     /// Shell.
     shell: Shell,
+    /// Print one JSON object: shell, script.
+    #[arg(long)]
+    json: bool,
 }
 
 pub(super) fn completions(args: &CompletionsArgs, mut command: Command) -> CommandResult {
     let mut text = Vec::new();
     clap_complete::generate(args.shell, &mut command, NAME, &mut text);
-    print_text(String::from_utf8_lossy(&text).trim_end())?;
+    let script = String::from_utf8_lossy(&text);
+    let script = script.trim_end();
+    if args.json {
+        print_json_line(&serde_json::json!({ "shell": args.shell.to_string(), "script": script }))?;
+    } else {
+        print_text(script)?;
+    }
     Ok(Completion::Done)
 }
 

@@ -107,6 +107,8 @@ fn completions_and_manuals_name_every_command() {
     for shell in ["bash", "zsh", "fish"] {
         let script = said(&["completions", shell]);
         assert!(commands.iter().all(|command| script.contains(command)), "{shell}");
+        let told: Value = serde_json::from_str(&said(&["completions", shell, "--json"])).unwrap();
+        assert_eq!((&told["shell"], &told["script"]), (&shell.into(), &script.trim_end().into()));
     }
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("man1");
