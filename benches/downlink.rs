@@ -342,6 +342,7 @@ fn replay(bytes: &[u8], sent: u64) {
             wait_bytes: WAIT_BYTES,
             memory_max_bytes: None,
             group: None,
+            part: None,
         })
         .unwrap();
         let outcome = ground.outcome();

@@ -16,6 +16,7 @@ use lunarray::units::all_pairs;
 use lunarray::units::constants::SPEED_OF_LIGHT_M_S;
 use lunarray::units::vector::{norm, sub};
 use num_complex::Complex64;
+use rayon::prelude::*;
 
 fn geometry(array: &Array, frequency_hz: f64) -> PatternGeometry {
     PatternGeometry {
@@ -128,6 +129,19 @@ fn matrix_product_flops() -> f64 {
         best = best.min(since.elapsed().as_secs_f64());
     }
     2.0 * (N * N * N) as f64 / best
+}
+
+/// Bytes a second that all threads together read from memory: the best of five sums over 1 GiB.
+fn memory_bandwidth() -> f64 {
+    let values = vec![1_u64; 1 << 27];
+    let mut best = f64::INFINITY;
+    for _ in 0..5 {
+        let since = Instant::now();
+        let sum: u64 = values.par_chunks(1 << 20).map(|chunk| chunk.iter().sum::<u64>()).sum();
+        best = best.min(since.elapsed().as_secs_f64());
+        assert_eq!(sum, 1 << 27);
+    }
+    size_of_val(&values[..]) as f64 / best
 }
 
 /// Visibilities of every pair below `length_m_max` over a window, as the ground places them.
@@ -249,6 +263,17 @@ fn engine(array: &Array, l_max: usize) {
         flops,
         1e-9 * flops / times[2]
     );
+    let (products, bandwidth) = (matrix_product_flops(), memory_bandwidth());
+    println!(
+        "  {:.3} products a second; reading its {:.2} GB of weights at the measured {:.1} GB/s alone would take {:.0} % of that, its matrix \
+         products at the measured {:.0} Gflop/s {:.0} %",
+        1.0 / times[2],
+        1e-9 * sums.weight_bytes() as f64,
+        1e-9 * bandwidth,
+        100.0 * sums.weight_bytes() as f64 / bandwidth / times[2],
+        1e-9 * products,
+        100.0 * flops / products / times[2]
+    );
     let clock = Clock::start();
     let factors = sums.order_blocks().factors(1e-3 * y[0].abs());
     println!("  preconditioner {:.2} s", clock.read().0);
@@ -261,9 +286,6 @@ fn main() {
     let windows: Vec<_> = ObservingWindows::new(&array, 0.0, 7.0 * day).collect();
     let wanted: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with('-')).collect();
     let runs = |name: &str| wanted.is_empty() || wanted.iter().any(|w| name.contains(w.as_str()));
-    if wanted.is_empty() || wanted.iter().any(|w| w.starts_with("engine")) {
-        println!("matrix products: {:.0} Gflop/s f32", 1e-9 * matrix_product_flops());
-    }
     for l_max in [64, 128, 160, 191] {
         if runs(&format!("engine-{l_max}")) {
             engine(&array, l_max);

@@ -251,6 +251,18 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     file.finish().map(|_| ())
 }
 
+/// A new file in a folder that has no name there: it is gone once it is closed, however the process ends.
+///
+/// # Errors
+/// The system's error.
+pub fn nameless_file(folder: &Path) -> io::Result<File> {
+    fs::create_dir_all(folder)?;
+    let (path, _lock) = create_partial(&folder.join("nameless"))?;
+    let file = File::options().read(true).write(true).open(&path);
+    fs::remove_file(&path)?;
+    file
+}
+
 /// A folder that one process uses at a time: holds a lock on a file in it.
 ///
 /// The system unlocks it however the process ends.

@@ -239,6 +239,13 @@ impl<B: SkyBasis> ExactEngine<B> {
         }
     }
 
+    /// Its basis, and all that it holds.
+    pub(super) fn into_exact(mut self) -> (Arc<B>, B::Exact, SumCounts) {
+        self.flush();
+        let counts = self.counts();
+        (self.basis, self.exact.here(), counts)
+    }
+
     /// These sums and those of another part of them, which are of the same visibilities.
     pub(super) fn halves(&mut self, other: Self) -> Result<(&mut B::Exact, B::Exact), AccumulationError> {
         if self.setup != other.setup || self.totals != other.totals {

@@ -56,6 +56,14 @@ pub enum AccumulationError {
         /// The limit, bytes.
         limit_bytes: u64,
     },
+    /// Sums that wait on disk cannot be written.
+    #[error("cannot keep sums in {}: {source}; expected room for all of them", folder.display())]
+    Store {
+        /// Folder.
+        folder: PathBuf,
+        /// The system's error.
+        source: std::io::Error,
+    },
     /// Engines of different setups.
     #[error("engines of different {what} cannot be merged")]
     Mismatch {

@@ -192,6 +192,11 @@ pub trait NormalSums: Send {
 
     /// How well the eigenvalues of `BtN^-1B` are known.
     fn accuracy(&self) -> Accuracy;
+
+    /// Why sums on disk could not be read: products are not numbers from then on.
+    fn failure(&self) -> Option<&str> {
+        None
+    }
 }
 
 /// What rounding and the approximations of an engine leave open of an eigenvalue W of `BtN^-1B`: `relative` W + `absolute`

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use super::harmonic::{
-    HarmonicEngine, HarmonicSetup, HarmonicSums, HeldSegment, NoiseSums, RefinedSetup, SegmentPlace,
+    HarmonicEngine, HarmonicSetup, HarmonicSums, HeldSegment, NoiseSums, RefinedSetup, SegmentPlace, SumPart,
     VisibilityArchive, orbit_of,
 };
 use super::{
@@ -161,6 +161,8 @@ pub struct Accumulator {
     group: Option<ChannelGroup>,
     /// Those that hold the other parts of the sums.
     ranks: Ranks,
+    /// The part of the sums that is made now, where they are made one after the other.
+    part: Option<SumPart>,
     /// Seeds of further realisations of noise.
     noise_seeds: Vec<u64>,
 }
@@ -180,6 +182,7 @@ impl Accumulator {
             memory_max_bytes: None,
             group: None,
             ranks: Ranks::one(),
+            part: None,
             noise_seeds: Vec::new(),
         }
     }
@@ -188,6 +191,13 @@ impl Accumulator {
     #[must_use]
     pub fn among(self, ranks: &Ranks) -> Self {
         Self { ranks: ranks.clone(), ..self }
+    }
+
+    /// Makes a part of the sums of the harmonic engine, and emits them with the last part; there are no snapshots on the way. `None` makes all of
+    /// them at once.
+    #[must_use]
+    pub fn in_part(self, part: Option<SumPart>) -> Self {
+        Self { part, ..self }
     }
 
     /// Sums noise of further realisations as well, one a seed, for the final sums of the harmonic engine.
@@ -203,6 +213,7 @@ impl Accumulator {
         Self::new(config, ledger)
             .among(&self.ranks)
             .of_group(self.group.clone())
+            .in_part(self.part.clone())
             .within_memory(self.memory_max_bytes)
             .cancelled_by(&self.cancel)
     }
@@ -454,7 +465,10 @@ impl Accumulator {
             Some(sums) => sums,
             empty => match engine(&self.config, instrument, placed)? {
                 Ok(engine) => {
-                    let engine = engine.among(&self.ranks);
+                    let engine = match &self.part {
+                        Some(part) => engine.among(&part.ranks()),
+                        None => engine.among(&self.ranks),
+                    };
                     let noises = match &engine {
                         Engine::Harmonic(engine) if !self.noise_seeds.is_empty() => {
                             Some(NoiseSums::new(engine, &self.noise_seeds))
@@ -530,7 +544,7 @@ impl Accumulator {
     /// Emits snapshots when data of a later step of mission time arrives.
     fn emit_if_due(&mut self, time_s: f64, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
         let every_s = self.config.snapshot_every_s;
-        if every_s <= 0.0 {
+        if every_s <= 0.0 || self.part.is_some() {
             return Ok(());
         }
         let next_s = ((time_s / every_s).floor() + 1.0) * every_s;
@@ -645,6 +659,15 @@ impl Stage for Accumulator {
             else {
                 continue;
             };
+            let sums = match (&self.part, engine) {
+                // Later parts would be of other data.
+                (Some(_), _) if self.cancel.is_cancelled() => continue,
+                (Some(part), Engine::Harmonic(engine)) => match engine.finish_part(part)? {
+                    Some(sums) => SnapshotSums::Harmonic(Box::new(sums)),
+                    None => continue,
+                },
+                (_, engine) => engine.into_sums().with_noises(noises),
+            };
             out.push(Snapshot {
                 instrument: Arc::clone(&instrument),
                 channel: ChannelId(index as u16),
@@ -652,7 +675,7 @@ impl Stage for Accumulator {
                 is_final: true,
                 span_s,
                 nside: self.config.nside,
-                sums: engine.into_sums().with_noises(noises),
+                sums,
             });
         }
         Ok(())

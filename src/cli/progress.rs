@@ -187,7 +187,7 @@ impl GroupSteps {
             group.iter().filter_map(|channel| costs.get(usize::from(channel.0))).map(of).sum()
         };
         let simulated = groups.simulated.iter().map(|group| seconds(group, ChannelCost::simulation_s));
-        let mapped = groups.mapped.iter().map(|group| seconds(group, |cost| cost.mapping_s));
+        let mapped = groups.mapped.iter().map(|group| seconds(&group.channels, |cost| cost.mapping_s));
         // The downlink takes next to no time.
         let parts = Parts::new(simulated.chain([0.0]).chain(mapped));
         Self { groups: groups.clone(), parts, channels_hz: plan.config.spacecraft.channels_hz.clone() }
@@ -195,26 +195,31 @@ impl GroupSteps {
 
     pub(super) fn begin(&mut self, group: GroupStep) {
         let RunGroups { simulated, mapped } = &self.groups;
-        let (what, number, of) = match group {
-            GroupStep::Simulated(number) => ("simulated", number, simulated),
-            GroupStep::Merged => ("merged", simulated.len(), simulated),
-            GroupStep::Mapped(number) => ("mapped", number, mapped),
+        let (what, number, of, place) = match group {
+            GroupStep::Simulated(number) => ("simulated", number, simulated.len(), number),
+            GroupStep::Merged => ("merged", simulated.len(), simulated.len(), simulated.len()),
+            GroupStep::Mapped(step) => ("mapped", step.group, mapped.len(), simulated.len() + 1 + step.group),
             GroupStep::Sky(channel) => return self.tell_sky(channel),
         };
-        let place = if group == GroupStep::Mapped(number) { simulated.len() + 1 + number } else { number };
         let left_s = self.parts.begin(place);
-        let channels: Vec<String> = of.get(number).into_iter().flatten().map(ToString::to_string).collect();
+        let of_group = match group {
+            GroupStep::Simulated(number) => simulated.get(number),
+            GroupStep::Mapped(step) => mapped.get(step.group).map(|group| &group.channels),
+            GroupStep::Merged | GroupStep::Sky(_) => None,
+        };
+        let channels: Vec<String> = of_group.into_iter().flatten().map(ToString::to_string).collect();
         let (left, listed) = (time_left(left_s), channels.join(", "));
         let text = match group {
             GroupStep::Simulated(_) => {
-                format!("group {} of {}: simulating channels {listed}{left}", number + 1, of.len())
+                format!("group {} of {of}: simulating channels {listed}{left}", number + 1)
             }
-            GroupStep::Merged => format!("the downlink of all channels{left}"),
-            GroupStep::Mapped(_) | GroupStep::Sky(_) => {
-                format!("group {} of {}: mapping channels {listed}{left}", number + 1, of.len())
+            GroupStep::Merged | GroupStep::Sky(_) => format!("the downlink of all channels{left}"),
+            GroupStep::Mapped(step) => {
+                format!("group {} of {of}: mapping channels {listed}{step}{left}", number + 1)
             }
         };
-        let fields = json!({ "what": what, "number": number + 1, "of": of.len(), "channels": channels, "left_s": left_s });
+        let fields =
+            json!({ "what": what, "number": number + 1, "of": of, "channels": channels, "left_s": left_s });
         say("group", &fields, text);
     }
 

@@ -287,21 +287,28 @@ fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResu
     let interrupt = Interrupt::default();
     let cancel = interrupt.cancel();
     let events = args.events.start(config, "ground")?;
-    let mut parts = Parts::new(groups.iter().map(|group| group.len() as f64));
+    let mut parts = Parts::new(groups.iter().map(|group| group.channels.len() as f64));
     let mut progress = None;
-    let ended = replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |number, watched| {
+    let ended = replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |step, watched| {
+        let number = step.group;
         if number == 0 {
             interrupt.arm_or_note();
         }
         // The bar of the group before ends first.
         progress = None;
-        let channels: Vec<String> =
-            groups[number..].iter().take(1).flatten().map(|c| c.to_string()).collect();
+        let channels: Vec<String> = groups[number..]
+            .iter()
+            .take(1)
+            .flat_map(|group| &group.channels)
+            .map(|c| c.to_string())
+            .collect();
         let (of, listed) = (groups.len(), channels.join(", "));
         let left_s = parts.begin(number);
-        let fields = json!({ "number": number + 1, "of": of, "channels": channels, "left_s": left_s });
+        let fields = json!({
+            "number": number + 1, "of": of, "channels": channels, "part": step.part + 1, "parts": step.parts, "left_s": left_s
+        });
         let left = time_left(left_s);
-        say("group", &fields, format_args!("group {} of {of}: channels {listed}{left}", number + 1));
+        say("group", &fields, format_args!("group {} of {of}: channels {listed}{step}{left}", number + 1));
         events.watch(&watched);
         progress = Some(Progress::watch(watched, READ, 0, cancel));
     });

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::GroundError;
 use super::pass_gate::{MODEL, PassGate};
+use crate::accumulation::harmonic::SumPart;
 use crate::accumulation::{AccumulationError, Accumulator, ChannelGroup, MapConfig};
 use crate::calibration::solver::{PassSolver, SolverConfig};
 use crate::calibration::{CalibrationConfig, CalibrationError, CalibrationHook, Calibrator};
@@ -31,6 +32,8 @@ pub struct GroundConfig {
     pub memory_max_bytes: Option<u64>,
     /// The channels that are summed; `None` for all.
     pub group: Option<ChannelGroup>,
+    /// The part of the sums that is made; `None` for all of them.
+    pub part: Option<SumPart>,
 }
 
 impl GroundConfig {
@@ -93,5 +96,6 @@ impl GroundConfig {
         Accumulator::new(self.map.clone(), ledger.clone())
             .within_memory(self.memory_max_bytes)
             .of_group(self.group.clone())
+            .in_part(self.part.clone())
     }
 }

@@ -88,6 +88,38 @@ impl EngineCost {
         }
     }
 
+    /// The cost of sums that are made in so many parts and wait on disk: a part in memory, then for each thread the block that it reads.
+    pub(super) fn in_parts(self, parts: usize, map: &MapConfig) -> Self {
+        if parts < 2 {
+            return self;
+        }
+        let blocks = shared_size(map.degree()).blocks;
+        let part = blocks.div_ceil(parts) as f64 / blocks as f64;
+        // Two blocks of each thread: one that is used, and the allocator's last.
+        let read = 2.0 * rayon::current_num_threads() as f64 / blocks as f64 * self.copy_bytes;
+        let solving = read + self.other_bytes;
+        Self {
+            sums_bytes: (part * self.sums_bytes).max(solving),
+            copy_bytes: 0.0,
+            copies_last: false,
+            other_bytes: 0.0,
+            ..self
+        }
+    }
+
+    /// The least number of parts, of those that halve each other, with which a channel fits `limit_bytes` by `needed`; `None` if none does.
+    pub(super) fn parts_within(
+        self,
+        map: &MapConfig,
+        limit_bytes: f64,
+        needed: impl Fn(Self) -> f64,
+    ) -> Option<usize> {
+        let can_wait = map.engine == EngineKind::Harmonic && !map.refine.is_on();
+        let most = if can_wait { shared_size(map.degree()).blocks } else { 1 };
+        let counts = (0..).map(|k| 1_usize << k).take_while(|parts| *parts <= most);
+        counts.into_iter().find(|&parts| needed(self.in_parts(parts, map)) <= limit_bytes)
+    }
+
     /// Bytes that a rank gives to the others in one solution.
     pub(super) fn reduced_bytes(map: &MapConfig) -> f64 {
         APPLICATIONS * shared_size(map.degree()).product_bytes as f64

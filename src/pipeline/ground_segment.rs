@@ -25,7 +25,15 @@ impl Config {
     pub fn ground(&self, wait_bytes: u64) -> GroundConfig {
         let (calibration, calibrate) = (self.calibration.clone(), self.calibrate.clone());
         let map = self.map.clone();
-        GroundConfig { calibration, calibrate, map, wait_bytes, memory_max_bytes: None, group: None }
+        GroundConfig {
+            calibration,
+            calibrate,
+            map,
+            wait_bytes,
+            memory_max_bytes: None,
+            group: None,
+            part: None,
+        }
     }
 
     /// Setup of the solver, which `watch` follows.

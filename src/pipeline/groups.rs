@@ -21,6 +21,7 @@ use super::run::{Watched, downlink_file, finish, ground_alone, lock_folder, summ
 use super::simulation_groups::simulate_in_groups;
 use super::space_segment;
 use super::summary::{PassRecord, RunScope, RunSummary};
+use crate::accumulation::harmonic::SumPart;
 use crate::accumulation::{ChannelGroup, MapConfig};
 use crate::downlink::FileSource;
 use crate::files::write_atomically;
@@ -39,8 +40,37 @@ pub enum GroupSize {
     Channels(usize),
 }
 
-/// Receives the number of a group, from 0, and the handles of its graph, which is about to run.
-pub type GroupWatcher<'a> = &'a mut dyn FnMut(usize, Watched);
+/// Channels that are mapped together.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct MapGroup {
+    /// Channels.
+    pub channels: ChannelGroup,
+    /// Parts in which their sums are made, each by reading the downlink, to wait on disk for the solution; 1 for sums in memory.
+    pub parts: usize,
+}
+
+/// A reading of the downlink that is about to begin.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MapStep {
+    /// Number of the group, from 0.
+    pub group: usize,
+    /// Part of its sums, from 0.
+    pub part: usize,
+    /// Parts of its sums.
+    pub parts: usize,
+}
+
+impl fmt::Display for MapStep {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.parts {
+            1 => Ok(()),
+            parts => write!(f, ", part {} of {parts} of the sums", self.part + 1),
+        }
+    }
+}
+
+/// Receives what is about to be read, and the handles of its graph, which is about to run.
+pub type GroupWatcher<'a> = &'a mut dyn FnMut(MapStep, Watched);
 
 /// Groups of the channels that the first of `files` describes, in their order.
 ///
@@ -54,7 +84,7 @@ pub fn channel_groups(
     config: &Config,
     size: GroupSize,
     limit: Option<MemoryLimit>,
-) -> Result<Vec<ChannelGroup>, PipelineError> {
+) -> Result<Vec<MapGroup>, PipelineError> {
     if let Some(path) = files.iter().find(|path| !path.is_file()) {
         return Err(PipelineError::NotRepeatable { path: path.clone() });
     }
@@ -79,14 +109,28 @@ fn groups_of(
     config: &Config,
     size: GroupSize,
     limit: Option<MemoryLimit>,
-) -> Result<Vec<ChannelGroup>, PipelineError> {
+) -> Result<Vec<MapGroup>, PipelineError> {
     let map = &config.map;
     let costs = complete_costs(instrument, map);
-    let needed = |group: &[ChannelId]| {
-        let costs: Vec<EngineCost> = group.iter().filter_map(|channel| costs.get(channel)).copied().collect();
-        memory_bytes(0.0, &costs, solutions_of(map))
+    let of_costs = |costs: &[EngineCost]| memory_bytes(0.0, costs, solutions_of(map));
+    // Of a channel alone: what its sums in parts need, which have no snapshots on the way.
+    let parts = |channel: &ChannelId| {
+        let needed = |cost| match cost == costs[channel] {
+            true => of_costs(&[cost]),
+            false => memory_bytes(0.0, &[cost], 1),
+        };
+        limit.map_or(Some(1), |limit| costs[channel].parts_within(map, limit.bytes as f64, needed))
     };
-    partition(costs.keys().copied(), size, limit, needed)
+    let needed = |group: &[ChannelId]| match group {
+        [only] if parts(only).is_some_and(|parts| parts > 1) => 0.0,
+        _ => of_costs(&group.iter().filter_map(|channel| costs.get(channel)).copied().collect::<Vec<_>>()),
+    };
+    let groups = partition(costs.keys().copied(), size, limit, needed)?;
+    let with_parts = |channels: ChannelGroup| {
+        let alone = channels.first().filter(|_| channels.len() == 1);
+        MapGroup { parts: alone.and_then(parts).unwrap_or(1), channels }
+    };
+    Ok(groups.into_iter().map(with_parts).collect())
 }
 
 /// What a channel's sums cost at the end of a mission of any length.
@@ -205,7 +249,7 @@ pub(super) fn partition(
 pub fn replay_in_groups(
     files: &[PathBuf],
     config: &Config,
-    groups: &[ChannelGroup],
+    groups: &[MapGroup],
     out: &Path,
     cancel: &Cancel,
     watch: GroupWatcher<'_>,
@@ -221,7 +265,7 @@ struct Passes<'a> {
     scope: RunScope,
     files: &'a [PathBuf],
     config: &'a Config,
-    groups: &'a [ChannelGroup],
+    groups: &'a [MapGroup],
     out: &'a Path,
 }
 
@@ -236,7 +280,7 @@ impl Passes<'_> {
         let Self { scope, files, config, groups, out } = *self;
         let mut done: Vec<PassRecord> = Vec::new();
         let mut last: Option<RunSummary> = None;
-        for (number, group) in groups.iter().enumerate() {
+        for (number, MapGroup { channels: group, parts }) in groups.iter().enumerate() {
             let (path, key) = (out.join(record_name(group)), self.key(group));
             let is_last = number + 1 == groups.len();
             // The summary is that of the last pass, which is always made.
@@ -244,12 +288,26 @@ impl Passes<'_> {
                 done.push(record);
                 continue;
             }
-            let settings = GroundConfig { group: Some(group.clone()), ..config.ground(WAIT_BYTES) };
-            let (source, ground) = (FileSource::open(files)?, Ground::new(&settings)?);
-            let truth = truth(group)?;
-            let ended = ground_alone(truth, source, config, ground, out, cancel, &mut |watched| {
-                watch(number, watched);
-            })?;
+            let mut step = MapStep { group: number, part: 0, parts: *parts };
+            let mut part = (*parts > 1).then(|| SumPart::first(*parts, out));
+            let ended = loop {
+                let next = part.as_ref().and_then(SumPart::next);
+                let settings = GroundConfig {
+                    group: Some(group.clone()),
+                    part: part.take(),
+                    ..config.ground(WAIT_BYTES)
+                };
+                let (source, ground) = (FileSource::open(files)?, Ground::new(&settings)?);
+                // Only with the last part there is a map.
+                let truth = if next.is_some() { Truth::unknown() } else { truth(group)? };
+                let mut watch = |watched| watch(step, watched);
+                let ended = ground_alone(truth, source, config, ground, out, cancel, &mut watch)?;
+                if next.is_none() || cancel.is_cancelled() {
+                    break ended;
+                }
+                part = next;
+                step.part += 1;
+            };
             let powers = ended.powers();
             let mut pass = summarise(scope, config, out, ended)?;
             if number > 0 {
@@ -291,7 +349,7 @@ impl Passes<'_> {
         if !summary.cancelled {
             // Whoever repeats the command wants all of it again.
             groups.iter().for_each(|group| {
-                let _ = fs::remove_file(out.join(record_name(group)));
+                let _ = fs::remove_file(out.join(record_name(&group.channels)));
             });
         }
         Ok(summary)
@@ -321,22 +379,24 @@ pub struct RunGroups {
     /// Those that are simulated together.
     pub simulated: Vec<ChannelGroup>,
     /// Those that are mapped together.
-    pub mapped: Vec<ChannelGroup>,
+    pub mapped: Vec<MapGroup>,
 }
 
 impl fmt::Display for RunGroups {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let listed = |groups: &[ChannelGroup]| -> String {
-            let range = |group: &ChannelGroup| match (group.first(), group.last()) {
-                (Some(first), Some(last)) if first != last => format!("{first}-{last}"),
-                (Some(only), _) => only.to_string(),
-                _ => String::new(),
-            };
-            groups.iter().map(range).collect::<Vec<_>>().join(", ")
+        let range = |group: &ChannelGroup| match (group.first(), group.last()) {
+            (Some(first), Some(last)) if first != last => format!("{first}-{last}"),
+            (Some(only), _) => only.to_string(),
+            _ => String::new(),
         };
-        let Self { simulated, mapped } = self;
-        writeln!(f, "simulated        in {} groups of channels: {}", simulated.len(), listed(simulated))?;
-        write!(f, "mapped           in {} groups of channels: {}", mapped.len(), listed(mapped))
+        let mapped = |group: &MapGroup| match group.parts {
+            1 => range(&group.channels),
+            parts => format!("{} (sums on disk, in {parts} parts)", range(&group.channels)),
+        };
+        let simulated: Vec<String> = self.simulated.iter().map(range).collect();
+        let mapped: Vec<String> = self.mapped.iter().map(mapped).collect();
+        writeln!(f, "simulated        in {} groups of channels: {}", simulated.len(), simulated.join(", "))?;
+        write!(f, "mapped           in {} groups of channels: {}", mapped.len(), mapped.join(", "))
     }
 }
 
@@ -393,8 +453,8 @@ pub fn run_in_groups(
     };
     let files = [file];
     let passes = Passes { scope: RunScope::Whole, files: &files, config, groups: mapped, out };
-    let summary = passes.run(&truth, cancel, &mut |number, watched| {
-        (watch.borrow_mut())(GroupStep::Mapped(number), Some(watched));
+    let summary = passes.run(&truth, cancel, &mut |step, watched| {
+        (watch.borrow_mut())(GroupStep::Mapped(step), Some(watched));
     })?;
     let summary = finish(summary, out)?;
     if !summary.cancelled {
@@ -412,8 +472,8 @@ pub enum GroupStep {
     Simulated(usize),
     /// Make the downlink of all that was simulated.
     Merged,
-    /// Map the group of this number, from 0.
-    Mapped(usize),
+    /// Read the downlink for a group, and map it.
+    Mapped(MapStep),
 }
 
 /// Receives what is about to be done, and the handles of its graph; a sky is made without one.
@@ -448,7 +508,10 @@ mod tests {
         let plan = crate::pipeline::Plan::new(config).unwrap();
         let limit = Some(MemoryLimit::of_user(limit_gb * 1_000_000_000));
         let groups = groups_of(&plan.instrument, &plan.config, size, limit)?;
-        Ok(groups.into_iter().map(|group| group.into_iter().map(|channel| channel.0).collect()).collect())
+        Ok(groups
+            .into_iter()
+            .map(|group| group.channels.into_iter().map(|channel| channel.0).collect())
+            .collect())
     }
 
     #[test]

@@ -44,8 +44,8 @@ pub use cost::{ChannelCost, Cost, RankCost, Segment};
 pub use error::PipelineError;
 pub use found_solutions::{CalibrateRound, CalibrateSummary};
 pub use groups::{
-    GroupSize, GroupStep, GroupStepWatcher, GroupWatcher, MemoryAdvice, RunGroups, channel_groups,
-    replay_in_groups, run_in_groups,
+    GroupSize, GroupStep, GroupStepWatcher, GroupWatcher, MapGroup, MapStep, MemoryAdvice, RunGroups,
+    channel_groups, replay_in_groups, run_in_groups,
 };
 pub use memory::{MemoryLimit, MemorySource};
 pub use plan::{Expected, Plan};

@@ -71,6 +71,12 @@ impl Ranks {
         Self { share: RankShare::WHOLE, exchange: None }
     }
 
+    /// A process alone that holds a part at a time, and never asks the others.
+    #[must_use]
+    pub fn part(share: RankShare) -> Self {
+        Self { share, exchange: None }
+    }
+
     /// One rank of several.
     #[must_use]
     pub fn new(share: RankShare, exchange: Arc<dyn RankExchange>) -> Self {

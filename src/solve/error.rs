@@ -18,6 +18,9 @@ pub enum SolveError {
          growing, or was one of them interrupted?"
     )]
     Ranks,
+    /// Sums on disk that could not be read.
+    #[error("{0}")]
+    Sums(String),
     /// Nothing to solve.
     #[error("there is no data for a map")]
     NoData,

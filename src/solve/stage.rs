@@ -10,7 +10,7 @@ use super::passes::PassFile;
 use super::refined::{RefineRule, RefineSteps, Refinement, solve_refined};
 use super::tikhonov::{PixelExtras, PointBeam, solve_pixels_with};
 use super::{Diagnostics, Regulariser, SolveError, SolveWatch, StoppingRule};
-use crate::accumulation::{Snapshot, SnapshotSums, SumCounts};
+use crate::accumulation::{NormalSums, Snapshot, SnapshotSums, SumCounts};
 use crate::frames::Instrument;
 use crate::runtime::{Outlet, Stage, Units};
 use crate::sky::healpix::{pixel_area_sr, pixel_count, pixel_of};
@@ -171,7 +171,11 @@ impl Stage for Solver {
                 let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes };
                 let start = self.last.remove(&channel);
                 let (prior, start) = (prior.as_deref(), start.as_ref());
-                let solved = solve_regularised(&sums, request, &regulariser, prior, start, watch)?;
+                let solved = solve_regularised(&sums, request, &regulariser, prior, start, watch);
+                if let Some(reason) = sums.failure() {
+                    return Err(SolveError::Sums(reason.to_owned()));
+                }
+                let solved = solved?;
                 if !watch.goes_on() && !is_final {
                     return Ok(());
                 }

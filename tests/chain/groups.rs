@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use lunarray::pipeline::{ConfigSource, GroupSize, GroupStep, Plan, RunSummary, run_in_groups};
+use lunarray::pipeline::{ConfigSource, GroupSize, GroupStep, MapStep, Plan, RunSummary, run_in_groups};
 use lunarray::runtime::Cancel;
 use lunarray::units::ChannelId;
 use serde_json::Value;
@@ -38,6 +38,57 @@ fn groups_of_channels_give_the_bytes_of_all_at_once() {
             channels.map(|channel| channel["files"].clone()).collect()
         };
         assert_eq!(maps(&summary), maps(&whole), "{size}");
+    }
+}
+
+#[test]
+fn sums_that_wait_on_disk_give_the_bytes_of_those_in_memory() {
+    let place = place();
+    fn with<'a>(more: &[&'a str]) -> Vec<&'a str> {
+        let settings = ["map.engine=harmonic", "map.nside=16", "map.snapshot_every_s=0"];
+        more.iter().copied().chain(settings.into_iter().flat_map(|setting| ["--set", setting])).collect()
+    }
+    let downlink = place.simulate("x.ccsds", &[]);
+    let (whole, parted) = (place.path("whole"), place.path("parted"));
+    let all = json(&with(&["replay", &downlink, "--map", &place.pipeline, "--out", &whole]));
+    // The least memory that is enough, to ten megabytes.
+    let limits = (1..200).map(|k| format!("{}MB", 10 * k));
+    let found = limits.into_iter().find_map(|limit| {
+        let output = lunarray(&with(&[
+            "check",
+            &place.pipeline,
+            "--groups",
+            "auto",
+            "--memory-max",
+            &limit,
+            "--json",
+        ]));
+        output.status.success().then(|| (limit, serde_json::from_slice::<Value>(&output.stdout).unwrap()))
+    });
+    let (limit, checked) = found.unwrap();
+    let parts =
+        checked["groups"]["mapped"].as_array().unwrap().iter().map(|group| group["parts"].as_u64().unwrap());
+    assert!(parts.clone().all(|parts| parts > 1), "{checked}");
+    let args = [
+        "replay",
+        &downlink,
+        "--map",
+        &place.pipeline,
+        "--out",
+        &parted,
+        "--groups",
+        "auto",
+        "--memory-max",
+        &limit,
+    ];
+    let output = lunarray(&with(&args));
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && told.contains("part 2 of"), "{told}");
+    assert!(files(parted.as_ref()) == files(whole.as_ref()));
+    let summary: Value =
+        serde_json::from_slice(&std::fs::read(format!("{parted}/summary.json")).unwrap()).unwrap();
+    for key in ["ledger", "channels"] {
+        assert_eq!(summary[key], all[key], "{key}");
     }
 }
 
@@ -119,7 +170,8 @@ fn a_run_in_groups_leaves_the_bytes_of_one_of_all_channels() {
         assert!(std::fs::read(one).unwrap() == std::fs::read(grouped).unwrap(), "{size}");
     }
     let checked = json(&["check", &place.pipeline, "--groups", "2"]);
-    assert_eq!(checked["groups"], serde_json::json!({"simulated": [[0, 1], [2]], "mapped": [[0, 1], [2]]}));
+    let mapped = serde_json::json!([{"channels": [0, 1], "parts": 1}, {"channels": [2], "parts": 1}]);
+    assert_eq!(checked["groups"], serde_json::json!({"simulated": [[0, 1], [2]], "mapped": mapped}));
     let samples = fail(&["run", &place.pipeline, "--groups", "1", "--set", "spacecraft.fidelity=samples"]);
     assert!(samples.contains("--groups: found spacecraft.fidelity"), "{samples}");
 }
@@ -141,6 +193,11 @@ fn a_ground_is_told_when_its_sums_will_outgrow_memory() {
         "{small}"
     );
     assert!(!said(&["--memory-max", "200GB"]).contains("the sums of"));
+}
+
+/// The only reading of a group.
+fn mapped(group: usize) -> GroupStep {
+    GroupStep::Mapped(MapStep { group, part: 0, parts: 1 })
 }
 
 /// All files but `summary.json`, which has times.
@@ -181,9 +238,9 @@ fn a_run_in_groups_goes_on_where_it_was_cancelled() {
         GroupStep::Simulated(1),
         GroupStep::Simulated(2),
         GroupStep::Merged,
-        GroupStep::Mapped(0),
-        GroupStep::Mapped(1),
-        GroupStep::Mapped(2),
+        mapped(0),
+        mapped(1),
+        mapped(2),
     ];
     for (place, at) in steps.into_iter().enumerate() {
         let out = folder.path().join(format!("cancelled-{place}"));
@@ -225,7 +282,7 @@ fn other_settings_begin_anew() {
     let groups = first.run_groups(GroupSize::Channels(1), None).unwrap();
     let cancel = Cancel::default();
     run_in_groups(&first, &groups, folder.path(), &cancel, &mut |step, _| {
-        if step == GroupStep::Mapped(1) {
+        if step == mapped(1) {
             cancel.cancel();
         }
     })
@@ -234,7 +291,7 @@ fn other_settings_begin_anew() {
     run_in_groups(&second, &groups, folder.path(), &Cancel::default(), &mut |step, _| seen.push(step))
         .unwrap();
     // The downlink is the same; no map is. Skies, which take a while, are told as well.
-    let of_channel = |number: u16| [GroupStep::Sky(ChannelId(number)), GroupStep::Mapped(number.into())];
+    let of_channel = |number: u16| [GroupStep::Sky(ChannelId(number)), mapped(number.into())];
     assert_eq!(seen, [of_channel(0), of_channel(1)].concat());
     let expected = tempfile::tempdir().unwrap();
     lunarray::pipeline::run(&second, expected.path(), &Cancel::default(), &mut |_| {}).unwrap();

@@ -386,6 +386,7 @@ fn ground_of(arrived: &[u8]) -> (LedgerReport<VisibilityReason>, Completeness) {
         wait_bytes,
         memory_max_bytes: None,
         group: None,
+        part: None,
     };
     let mut ground = Ground::new(&config).unwrap();
     let outcome = ground.outcome();

@@ -111,6 +111,7 @@ impl Mission {
             wait_bytes,
             memory_max_bytes: None,
             group: None,
+            part: None,
         };
         Self { config, packets, headers, windows }
     }

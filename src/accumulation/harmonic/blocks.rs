@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::HarmonicSetup;
 use super::grid::{Grids, NODES};
-use super::tori::Tori;
+use super::tori::{Tori, TorusPart};
 use super::workspace::ALPHAS;
 use crate::accumulation::fixed_point::parts::sum_of_parts;
 use crate::ranks::Ranks;
@@ -150,22 +150,25 @@ fn size(l_max: usize, m: usize, parity: usize) -> usize {
 /// Weights of each pair of neighbouring nodes, summed over alpha and gamma: `[node][diagonal]`.
 fn totals(grids: &Grids, tori: &Tori, ranks: &Ranks) -> Vec<[f64; NODES]> {
     let stride = grids.weight_stride();
-    let len = NODES * tori.nodes.len();
+    let len = NODES * grids.nodes.count;
     // Block by block of alphas, as products are summed.
-    let part = |first: usize| {
+    let part = |block: usize| {
         let mut totals = vec![0.0; len];
-        for (node, totals) in tori.nodes.iter().zip(totals.as_chunks_mut::<NODES>().0) {
-            let rows = node.iter().flat_map(|node| node.weights.chunks_exact(NODES * stride));
-            for rows in rows.skip(first).take(ALPHAS) {
-                for (total, row) in totals.iter_mut().zip(rows.chunks_exact(stride)) {
+        let Some(rows) = tori.block(grids, TorusPart::Weights, block) else { return vec![f64::NAN] };
+        for (node, totals) in totals.as_chunks_mut::<NODES>().0.iter_mut().enumerate() {
+            for row in
+                (0..ALPHAS.min(grids.points - block * ALPHAS)).filter_map(|alpha| rows.row(node, alpha))
+            {
+                for (total, row) in totals.iter_mut().zip(row.chunks_exact(stride)) {
                     *total += row.iter().map(|w| f64::from(*w)).sum::<f64>();
                 }
             }
         }
         totals
     };
-    let firsts: Vec<usize> = (0..grids.rows(grids.points)).step_by(ALPHAS).collect();
-    let parts: Vec<Vec<f64>> = firsts.into_par_iter().map(part).collect();
+    let blocks: Vec<usize> =
+        (0..grids.points.div_ceil(ALPHAS)).filter(|block| grids.share.holds(*block)).collect();
+    let parts: Vec<Vec<f64>> = blocks.into_par_iter().map(part).collect();
     sum_of_parts(ranks, &parts, len, grids.points.div_ceil(ALPHAS)).as_chunks().0.to_vec()
 }
 

@@ -152,12 +152,12 @@ impl ExactTori {
     /// The sums in f32.
     pub(super) fn values(&self, grids: &Grids, quanta: Quanta) -> Tori {
         let value = |node: &ExactNode| (!node.is_empty()).then(|| node.values(grids, quanta));
-        Tori { nodes: self.nodes.par_iter().map(|node| node.as_ref().and_then(value)).collect() }
+        Tori::held(self.nodes.par_iter().map(|node| node.as_ref().and_then(value)).collect())
     }
 
     /// The sums in f32; their integers are freed node by node.
     pub(super) fn into_values(self, grids: &Grids, quanta: Quanta) -> Tori {
         let value = |node: ExactNode| (!node.is_empty()).then(|| node.values(grids, quanta));
-        Tori { nodes: self.nodes.into_par_iter().map(|node| node.and_then(value)).collect() }
+        Tori::held(self.nodes.into_par_iter().map(|node| node.and_then(value)).collect())
     }
 }

@@ -31,6 +31,7 @@ mod refined;
 mod segments;
 mod setup;
 mod spread;
+mod stored;
 mod sums;
 #[cfg(test)]
 mod tests;
@@ -52,6 +53,7 @@ pub use setup::{
     ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, SharedSize, application_size, memory, orbit_of,
     shared_size,
 };
+pub use stored::SumPart;
 pub use sums::{HarmonicSums, coefficients, degrees, unknowns, unknowns_of_gradient};
 
 use self::checkpoint::HarmonicHead;
@@ -125,6 +127,12 @@ impl HarmonicEngine {
 }
 
 impl HarmonicBasis {
+    /// The same of a process that holds all sums.
+    fn whole(&self) -> Self {
+        let grids = Arc::new(Grids { share: RankShare::WHOLE, ..Grids::clone(&self.grids) });
+        Self { setup: self.setup, quanta: self.quanta, grids, tables: Arc::default(), ranks: Ranks::one() }
+    }
+
     fn sums(&self, tori: Tori, counts: SumCounts) -> HarmonicSums {
         HarmonicSums {
             setup: self.setup,

@@ -110,7 +110,7 @@ impl NoiseSums {
                 }
                 NodeSums { weights: Vec::new(), right }
             };
-            let tori = Tori { nodes: nodes.into_par_iter().map(|rows| rows.map(value)).collect() };
+            let tori = Tori::held(nodes.into_par_iter().map(|rows| rows.map(value)).collect());
             let shared = SharedTori { tori: &tori, ..sums.shared() };
             [RightHandSide::Data, RightHandSide::Noise]
                 .map(|of| unknowns_of_gradient(&sums.operator().project(&shared, of)))

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use super::grid::{Grids, NODE_GROUP, NODES};
 use super::lines::multiply_line;
-use super::tori::{NodeSums, Tori};
+use super::tori::{BlockRows, Tori, TorusPart};
 use super::workspace::{ALPHAS, NodeRange, Workspace};
 use crate::accumulation::fixed_point::parts::sum_of_parts;
 use crate::ranks::Ranks;
@@ -96,7 +96,7 @@ impl Operator {
     /// Operations of the products with patterns and rotations in one application.
     pub(super) fn matrix_product_flops(&self, tori: &Tori) -> f64 {
         let reach = self.reach(tori.reached(&Ranks::one()));
-        let used = tori.alphas(&self.grids, self.grids.points, |node| &node.weights);
+        let used = tori.alphas(&self.grids, TorusPart::Weights);
         let blocks = used.chunks(ALPHAS).filter(|block| block.contains(&true)).count();
         let patterns: usize = (0..=self.l_max).map(|mu| 2 * reach.count * degrees(self.l_max, mu)).sum();
         let rotations: usize = (0..=self.l_max).map(|l| orders(l) * (l + 1)).sum();
@@ -114,14 +114,15 @@ impl Operator {
         let tori = shared.tori;
         let reach = self.reach(shared.reached.clone());
         let circle = Circle { points: self.grids.points };
-        let used = tori.alphas(&self.grids, circle.points, |node| &node.weights);
+        let used = tori.alphas(&self.grids, TorusPart::Weights);
         self.over_blocks(shared.ranks, &used, reach, |work, alphas| {
+            let rows = tori.block(&self.grids, TorusPart::Weights, alphas[0] / ALPHAS)?;
             self.turn(sky, circle, alphas, &mut work.turned);
             self.multiply_patterns(work, reach);
             for (place, &alpha) in alphas.iter().enumerate() {
-                self.multiply_weights(tori, alpha, place, work, reach);
+                self.multiply_weights(&rows, alpha % ALPHAS, place, work, reach);
             }
-            self.gradient(work, reach, circle, alphas, None)
+            Some(self.gradient(work, reach, circle, alphas, None))
         })
     }
 
@@ -130,14 +131,15 @@ impl Operator {
         let tori = shared.tori;
         let reach = self.reach(shared.reached.clone());
         let circle = Circle { points: self.grids.data_points() };
-        let used = tori.alphas(&self.grids, circle.points, |node| &node.right);
+        let used = tori.alphas(&self.grids, TorusPart::Right);
         self.over_blocks(shared.ranks, &used, reach, |work, alphas| {
+            let rows = tori.block(&self.grids, TorusPart::Right, alphas[0] / ALPHAS)?;
             work.products.fill(0.0);
             for (place, &alpha) in alphas.iter().enumerate() {
                 for group in (0..reach.count).step_by(NODE_GROUP) {
                     for (k, line) in work.group.iter_mut().enumerate() {
-                        let node = tori.nodes.get(reach.first + group + k).and_then(Option::as_ref);
-                        self.read_right_hand_side(node, alpha, of, line);
+                        let row = rows.row(reach.first + group + k, alpha % ALPHAS);
+                        self.read_right_hand_side(row, of, line);
                         work.transforms.inverse(line);
                         for (mu, factor) in self.correction.iter().enumerate() {
                             line[mu] *= *factor as f32;
@@ -149,18 +151,18 @@ impl Operator {
                     work.scatter(place, 0, group);
                 }
             }
-            self.gradient(work, reach, circle, alphas, Some(&self.correction))
+            Some(self.gradient(work, reach, circle, alphas, Some(&self.correction)))
         })
     }
 
     /// Sums `block` over blocks of alphas: of each fixed range of them those in use. The sum has the same bits in any order,
-    /// so that it does not depend on who computes which block.
+    /// so that it does not depend on who computes which block. It is NaN if `block` has none for one of them.
     fn over_blocks(
         &self,
         ranks: &Ranks,
         used: &[bool],
         reach: NodeRange,
-        block: impl Fn(&mut Workspace, &[usize]) -> Vec<f64> + Sync,
+        block: impl Fn(&mut Workspace, &[usize]) -> Option<Vec<f64>> + Sync,
     ) -> Alm {
         let points = used.len();
         let of_range = |first: usize| -> Vec<usize> {
@@ -170,7 +172,10 @@ impl Operator {
             (0..points).step_by(ALPHAS).map(of_range).filter(|alphas| !alphas.is_empty()).collect();
         let parts: Vec<Vec<f64>> = blocks
             .par_iter()
-            .map_init(|| Workspace::new(self.l_max, points, reach), |work, alphas| block(work, alphas))
+            .map_init(
+                || Workspace::new(self.l_max, points, reach),
+                |work, alphas| block(work, alphas).unwrap_or_else(|| vec![f64::NAN]),
+            )
             .collect();
         let mut sum = Alm::zeros(self.l_max);
         let sums = sum_of_parts(ranks, &parts, 2 * sum.values().len(), points.div_ceil(ALPHAS));
@@ -238,23 +243,18 @@ impl Operator {
         }
     }
 
-    /// For one alpha, which is `place` in its block: from orders mu to gamma, times the weights of neighbouring nodes, and
-    /// back.
+    /// For one alpha, which is `alpha` in its block and `place` among those in use: from orders mu to gamma, times the weights of neighbouring
+    /// nodes, and back.
     fn multiply_weights(
         &self,
-        tori: &Tori,
+        block: &BlockRows<'_>,
         alpha: usize,
         place: usize,
         work: &mut Workspace,
         reach: NodeRange,
     ) {
         const BEHIND: usize = NODES - 1;
-        let row = NODES * self.grids.weight_stride();
-        let rows = |node: usize| {
-            let weights = &tori.nodes.get(node)?.as_ref()?.weights;
-            let from = self.grids.row(alpha) * row;
-            Some(&weights[from..from + row])
-        };
+        let rows = |node: usize| block.row(node, alpha);
         work.ring.iter_mut().for_each(|line| line.fill(Complex32::ZERO));
         // Nodes come in groups, and leave in groups that lag behind by as many as weights reach.
         for group in (0..reach.count + NODE_GROUP).step_by(NODE_GROUP) {
@@ -280,20 +280,13 @@ impl Operator {
     }
 
     /// A node's data at one alpha.
-    fn read_right_hand_side(
-        &self,
-        node: Option<&NodeSums>,
-        alpha: usize,
-        of: RightHandSide,
-        line: &mut [Complex32],
-    ) {
+    fn read_right_hand_side(&self, row: Option<&[f32]>, of: RightHandSide, line: &mut [Complex32]) {
         let stride = self.grids.data_stride();
-        let Some(node) = node else {
+        let Some(row) = row else {
             line.fill(Complex32::ZERO);
             return;
         };
-        let rows = &node.right[(self.grids.row(alpha) * 4 + 2 * of as usize) * stride..];
-        let (re, im) = rows[..2 * stride].split_at(stride);
+        let (re, im) = row[2 * of as usize * stride..][..2 * stride].split_at(stride);
         for ((out, re), im) in line.iter_mut().zip(re).zip(im) {
             *out = Complex32::new(*re, *im);
         }

@@ -67,6 +67,12 @@ impl HarmonicSums {
         self.operator().matrix_product_flops(&self.tori)
     }
 
+    /// Bytes of this process's weights, each of which one [`NormalSums::apply`] reads once.
+    #[must_use]
+    pub fn weight_bytes(&self) -> u64 {
+        self.tori.weight_bytes(&self.grids)
+    }
+
     /// The blocks of BtN^-1B that keep m, with weights averaged over the phase: all of it once the orbit has swept all nodes
     /// and phases evenly.
     #[must_use]
@@ -103,6 +109,10 @@ impl NormalSums for HarmonicSums {
 
     fn accuracy(&self) -> Accuracy {
         ACCURACY
+    }
+
+    fn failure(&self) -> Option<&str> {
+        self.tori.stored.as_ref()?.failure()
     }
 }
 

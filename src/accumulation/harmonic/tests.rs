@@ -345,7 +345,63 @@ fn blocks_snapshots_and_checkpoints_do_not_change_a_bit() {
         }
     }
     let parts = parts.into_sums();
-    assert!(parts.tori == whole.tori && parts.counts == whole.counts && parts.setup == whole.setup);
+    assert!(
+        parts.tori.nodes == whole.tori.nodes && parts.counts == whole.counts && parts.setup == whole.setup
+    );
+}
+
+/// Engines that make sums in parts, and what the last of them leaves.
+fn in_parts(
+    count: usize,
+    blocks: impl Fn(usize) -> Vec<PlacedVisibilities>,
+) -> Result<HarmonicSums, AccumulationError> {
+    let folder = tempfile::tempdir().unwrap();
+    let mut part = SumPart::first(count, folder.path());
+    for number in 0.. {
+        let mut engine = HarmonicEngine::new(setup()).unwrap().among(&part.ranks());
+        for block in blocks(number) {
+            let _ = engine.add(&block).unwrap();
+        }
+        if let Some(sums) = engine.finish_part(&part)? {
+            // Nothing is left, whatever happens to the process.
+            assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+            return Ok(sums);
+        }
+        part = part.next().unwrap();
+    }
+    unreachable!()
+}
+
+#[test]
+fn sums_on_disk_have_the_bits_of_those_in_memory() {
+    let blocks = blocks(0, 6);
+    let whole = engine(&blocks).into_sums();
+    let bits = |values: &[f64]| values.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+    let all = |sums: &HarmonicSums| {
+        let (x, mut y) = (vector(8), vec![0.0; sums.unknowns()]);
+        sums.apply(&x, &mut y);
+        let mut order = vector(9);
+        sums.order_blocks().multiply(&mut order);
+        [bits(&y), bits(sums.right_hand_side()), bits(sums.noise_right_hand_side()), bits(&order)]
+    };
+    for count in [1, 2, 3, 7, 1000] {
+        let sums = in_parts(count, |_| blocks.clone()).unwrap();
+        assert!(all(&sums) == all(&whole) && sums.counts() == whole.counts(), "{count} parts");
+        assert_eq!(sums.matrix_product_flops(), whole.matrix_product_flops());
+        assert!(sums.failure().is_none());
+    }
+    // Other data in one of the readings.
+    let other = in_parts(3, |number| blocks[..blocks.len() - usize::from(number == 1)].to_vec());
+    assert!(matches!(other, Err(AccumulationError::Mismatch { .. })));
+    // A disk that loses what it was given.
+    let mut sums = in_parts(2, |_| blocks.clone()).unwrap();
+    sums.tori.stored.as_ref().unwrap().cut(1000);
+    let mut y = vec![0.0; sums.unknowns()];
+    sums.apply(&vector(8), &mut y);
+    assert!(y.iter().all(|y| y.is_nan()));
+    assert!(sums.failure().unwrap().contains("expected to read what was written"), "{:?}", sums.failure());
+    sums.right = OnceLock::new();
+    assert!(sums.right_hand_side().iter().all(|y| y.is_nan()));
 }
 
 #[test]

@@ -179,6 +179,7 @@ mod tests {
             wait_bytes: 0,
             memory_max_bytes: None,
             group: None,
+            part: None,
         };
         let mut ground = Ground::open(folder.path(), &config, u64::MAX).unwrap();
         ground.step(transmission(), &mut Outlet::collect()).unwrap();
@@ -211,6 +212,7 @@ mod tests {
             wait_bytes: 1 << 20,
             memory_max_bytes: None,
             group: None,
+            part: None,
         };
         let bytes = transmission();
         let first = &bytes[..bytes.len() / 2];
