@@ -5,6 +5,7 @@ use std::fmt::Write;
 use super::oem::{Stretch, epoch_text, seconds, to_equatorial};
 use super::orbit::Array;
 use super::state::SatelliteState;
+use crate::units::constants::DAY_S;
 use crate::units::{Checks, InvalidValue};
 
 /// States of a stretch, at least: as many as its interpolation takes.
@@ -18,7 +19,18 @@ pub struct OemExport {
     step_s: f64,
 }
 
+/// Days from 1958-01-01, with which TAI begins, to 1970-01-01.
+const DAYS_BEFORE_1970: f64 = 12.0 * 365.0 + 3.0;
+/// TDB less TAI, s, but for milliseconds.
+const TDB_LESS_TAI_S: f64 = 32.184;
+
 impl OemExport {
+    /// The epoch (TDB) that is `tai_s` from 1958-01-01T00:00:00 TAI.
+    #[must_use]
+    pub fn epoch_of(tai_s: f64) -> String {
+        epoch_text(tai_s - DAYS_BEFORE_1970 * DAY_S + TDB_LESS_TAI_S)
+    }
+
     /// Files whose first epoch is `epoch` (TDB), such as 2030-01-31T12:00:00, that end `until_s` later, with states at most `step_s` apart.
     ///
     /// # Errors
@@ -120,7 +132,6 @@ fn letters(number: usize) -> String {
 mod tests {
     use super::*;
     use crate::array::{ArrayConfig, PropagateConfig};
-    use crate::units::constants::DAY_S;
     use crate::units::vector::{norm, sub};
 
     #[test]

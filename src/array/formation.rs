@@ -118,7 +118,9 @@ impl Formation {
     #[must_use]
     pub fn next_turnaround_s(&self, t_s: f64) -> f64 {
         let half_s = 0.5 * self.period_s;
-        ((t_s / half_s).floor() + 1.0) * half_s
+        let number = (t_s / half_s).floor() + 1.0;
+        // The quotient of a turnaround may be rounded to below its number.
+        if number * half_s > t_s { number * half_s } else { (number + 1.0) * half_s }
     }
 }
 
@@ -165,6 +167,25 @@ mod tests {
         for (found, expected) in found.iter().zip(expected) {
             // Powers and differences of f64.
             assert!((found - expected).abs() <= 1e-12 * expected.abs(), "{found} {expected}");
+        }
+    }
+
+    #[test]
+    fn turnarounds_follow_one_another() {
+        // Of these periods some turnarounds, divided by half a period, come out below their number.
+        for period_s in [1_200_000.1, 27.321_661 * 86_400.0, 86_400.0, 1e5 / 3.0, 777.7] {
+            let breathing = BreathingConfig { period_s, ..BreathingConfig::default() };
+            let formation = Formation::new(&config(8, breathing)).unwrap();
+            let mut t_s = 0.0;
+            for number in 1..2000 {
+                let next_s = formation.next_turnaround_s(t_s);
+                // Of f64.
+                assert!(
+                    (next_s / (0.5 * period_s) - f64::from(number)).abs() < 1e-9,
+                    "{period_s}: {number}, {next_s}"
+                );
+                t_s = next_s;
+            }
         }
     }
 

@@ -70,6 +70,16 @@ pub(super) fn input_path() -> impl TypedValueParser<Value = PathBuf> {
     PathBufValueParser::new().map(|path| if is_standard(&path) { PathBuf::from("/dev/stdin") } else { path })
 }
 
+/// Refuses what cannot be read as often as a command reads it: a pipe, or standard input. What is not there is told by whoever opens it.
+pub(super) fn require_repeatable(path: &Path, reason: &str) -> Result<(), String> {
+    match std::fs::metadata(path) {
+        Ok(found) if !found.is_file() => {
+            Err(format!("{}: not a regular file; expected one, as {reason}", path.display()))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// A file or folder to be written, which must have a name.
 pub(super) fn output_path() -> impl TypedValueParser<Value = PathBuf> {
     PathBufValueParser::new().try_map(|path| match is_standard(&path) {

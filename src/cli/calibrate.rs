@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::arguments::{MapFileArgs, input_path, output_path};
+use super::arguments::{MapFileArgs, input_path, output_path, require_repeatable};
 use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_json_line, print_notes, print_text};
 use super::progress::CalibrateLines;
@@ -47,6 +47,10 @@ pub(super) struct CalibrateArgs {
 pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
     let source = ConfigSource { file: args.map.clone(), overrides: args.overrides.clone(), seed: None };
     let config = source.load_ground()?;
+    if config.calibrate.map_rounds > 0 {
+        let reason = "calibrate.map_rounds above 0 reads the downlink again for each round";
+        args.files.iter().try_for_each(|path| require_repeatable(path, reason))?;
+    }
     use_threads(&config.runtime)?;
     let options = args.maps.options();
     let models = match args.model.is_empty() {

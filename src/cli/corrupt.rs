@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::arguments::{input_path, output_path};
+use super::arguments::{input_path, output_path, require_repeatable};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::downlink::link::{LinkConfig, corrupt, truth_path};
 
@@ -72,6 +72,7 @@ pub(super) struct CorruptArgs {
 }
 
 pub(super) fn execute(args: &CorruptArgs) -> CommandResult {
+    require_repeatable(&args.file, "its beginning is read twice")?;
     let config = LinkConfig {
         bit_error_rate: args.bit_error_rate,
         burst_every_bits: args.burst_every_bits,

@@ -131,11 +131,12 @@ struct OrbitArgs {
     /// Most time between states, with an optional unit s, h or d.
     #[arg(long, value_name = "TIME", value_parser = time_s, default_value = "120s")]
     step: f64,
-    /// First epoch, that of the mission.
-    #[arg(long, default_value = "2030-12-31T00:00:00")]
-    epoch: String,
+    /// First epoch, TDB, such as 2030-01-31T12:00:00; that of the mission if not given: array.oem_epoch with array.oem, else
+    /// spacecraft.epoch_tai_s.
+    #[arg(long)]
+    epoch: Option<String>,
     /// Folder for the files.
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: PathBuf,
     /// Print one JSON object instead of text: folder, files, states.
     #[arg(long)]
@@ -292,7 +293,18 @@ fn orbits(args: &OrbitArgs) -> CommandResult {
     let config = args.array.source().load()?;
     print_config_notes(&config);
     let until_s = args.duration.unwrap_or(config.spacecraft.duration_s);
-    let export = OemExport::new(&args.epoch, until_s, args.step)?;
+    let epoch = match (&args.epoch, &config.array) {
+        (Some(epoch), _) => epoch.clone(),
+        (None, array) if array.oem.is_empty() => OemExport::epoch_of(config.spacecraft.epoch_tai_s),
+        (None, array) if array.oem_epoch.is_empty() => {
+            return Err(
+                "--epoch: not given; expected the epoch of the files' orbits, here or as array.oem_epoch"
+                    .into(),
+            );
+        }
+        (None, array) => array.oem_epoch.clone(),
+    };
+    let export = OemExport::new(&epoch, until_s, args.step)?;
     let array = Array::new(&config.array)?;
     let mut states = 0;
     for satellite in 0..array.satellites() {

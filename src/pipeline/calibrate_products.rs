@@ -56,7 +56,13 @@ pub(super) fn write(
     // Last: where it is, all the others are.
     match found.gains(false) {
         Some(gains) => write_json(&out.join("gains.json"), &gains),
-        None => Ok(()),
+        // Those of an earlier command would be taken for this one's.
+        None => match std::fs::remove_file(out.join("gains.json")) {
+            Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
+                Err(ProductsError::Write { path: out.join("gains.json"), source }.into())
+            }
+            _ => Ok(()),
+        },
     }
 }
 

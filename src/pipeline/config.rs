@@ -161,6 +161,10 @@ impl Config {
             let expected = format!("{expected} with instrument.tilt_along_deg, tilt_radial_deg or pattern");
             checks.require(key, value, good, expected);
         }
+        // A flat mirror's image is seen from below, where an antenna that leans away from the Moon has another response.
+        let upright = spacecraft.moon_reflection == 0.0 || self.instrument.tilt_radial_deg.is_none();
+        let expected = "0 with instrument.tilt_radial_deg";
+        checks.require("spacecraft.moon_reflection", spacecraft.moon_reflection, upright, expected);
     }
 
     /// Requires that a van Vleck correction is that of the daughters' quantiser.

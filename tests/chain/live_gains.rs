@@ -294,6 +294,36 @@ fn killed_and_resumed_a_state_has_every_bit() {
 }
 
 #[test]
+fn parts_of_ranks_that_solved_alike_are_one_checkpoint() {
+    // A pass without visibilities in some of its sixtieths has parts of outliers that are not numbers.
+    let mission = Mission::new(&ERRORS);
+    let state = mission.place.path("state");
+    let solving = mission.solving();
+    let sets = sets_of(&solving.iter().map(String::as_str).collect::<Vec<_>>());
+    let out = mission.place.path("out");
+    let replay =
+        [&["replay", "--map", &mission.place.pipeline, "--out", &out, "--state", &state][..], &sets].concat();
+    let map = std::fs::read_to_string(&mission.place.pipeline).unwrap();
+    std::fs::write(&mission.place.pipeline, map.replace("rows = \"centre\"", "engine = \"harmonic\""))
+        .unwrap();
+    succeed(&[&replay[..], &[&mission.file]].concat());
+    let checkpoints = || -> Vec<std::path::PathBuf> {
+        let found = std::fs::read_dir(&state).unwrap().map(|entry| entry.unwrap().path());
+        found.filter(|path| path.to_str().unwrap().contains("checkpoint-")).collect()
+    };
+    let newest = checkpoints().into_iter().max().unwrap();
+    let bytes = std::fs::read(&newest).unwrap();
+    let name = newest.to_str().unwrap().strip_suffix(".lunarray").unwrap().to_owned();
+    checkpoints().iter().for_each(|path| std::fs::remove_file(path).unwrap());
+    for part in [1, 2] {
+        std::fs::write(format!("{name}.{part}-of-2.lunarray"), &bytes).unwrap();
+    }
+    // They are of one job as far as their heads tell; that both have all sums is what is wrong with them.
+    let said = fail(&replay);
+    assert!(said.contains("sums of block") && !said.contains("another state"), "{said}");
+}
+
+#[test]
 fn perfect_data_stay_as_they_are() {
     let mission = Mission::new(&[]);
     let plain = mission.replay("plain", &[&mission.file]);

@@ -72,6 +72,12 @@ fn a_round_moon_shows_the_sky_smaller() {
     // The image fills the Moon's disc, 3.0 sr, instead of 2 pi below the horizontal: baselines of a wavelength and more have less of
     // it. Its power is held to the disc's in `receiver`.
     assert!(round != none && (round - none).abs() < 0.5 * (flat - none), "{none} {round} {flat}");
+    // The image of an antenna that leans away from the Moon is another antenna's.
+    let (direct, leans) = ("spacecraft.model=direct", "instrument.tilt_radial_deg.constant_rms=3");
+    let check = ["check", &place.pipeline, "--set", direct, "--set", leans];
+    let refused = fail(&[&check[..], &["--set", reflects]].concat());
+    assert!(refused.contains("expected 0 with instrument.tilt_radial_deg"), "{refused}");
+    json(&check);
     // Without reflection there is nothing to mirror.
     assert!((mean("dark", &[sphere]) - none).abs() < 1e-9 * none);
     for model in ["auto", "harmonic", "general"] {

@@ -359,6 +359,78 @@ fn a_full_disk_costs_no_maps_and_is_told() {
     assert_eq!((&saving["written"], saving["unsaved"].is_string()), (&0.into(), true), "{saving}");
 }
 
+/// Two channels whose visibilities are held one by one, in files beside the checkpoints.
+const TINY_REFINED: &str = r#"
+[spacecraft]
+channels_hz = [3.0e6, 5.0e6]
+every_nth_window = 300
+[map]
+engine = "harmonic"
+residual_max = 1e-9
+refine = { passes_max = 2 }
+[runtime]
+threads = 1
+"#;
+
+#[test]
+fn a_disk_that_fills_up_takes_no_held_visibility() {
+    let mut settings: toml::Table = TINY.parse().unwrap();
+    let more: toml::Table = TINY_REFINED.parse().unwrap();
+    for (section, keys) in more {
+        let known =
+            settings.entry(section).or_insert_with(|| toml::Table::new().into()).as_table_mut().unwrap();
+        known.extend(keys.as_table().unwrap().clone());
+    }
+    let ground = Ground(Workplace::new(&settings.to_string()));
+    let before = PathBuf::from(ground.path("before"));
+    std::fs::create_dir(&before).unwrap();
+    std::fs::copy(&ground.pipeline, before.join("pipeline.toml")).unwrap();
+    let file = ground.simulate("before/small.ccsds", &[]);
+    let packets = packets(&file);
+    let first = ground.file("first.ccsds", &packets[..packets.len() / 2].concat());
+    ground.replay("before/state", &[&first], &["--checkpoint-every", "60"]);
+    std::fs::remove_dir_all(before.join("state.out")).unwrap();
+    assert_eq!(checkpoints(&before.join("state")).len(), 2);
+    let args = |place: &Path| {
+        let [file, map, out, state] =
+            ["small.ccsds", "pipeline.toml", "out", "state"].map(|name| path(place, name));
+        strings(&[
+            "replay",
+            &file,
+            "--map",
+            &map,
+            "--out",
+            &out,
+            "--state",
+            &state,
+            "--checkpoint-every",
+            "60",
+        ])
+    };
+    // A later session without data finds all that the state was said to hold.
+    let result = |place: &Path| {
+        let [map, again, state] = ["pipeline.toml", "again", "state"].map(|name| path(place, name));
+        let output = lunarray(&["replay", "--map", &map, "--out", &again, "--state", &state]);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && !said.contains("segment"), "{said}");
+        files(again.as_ref()).into_iter().filter(|(path, _)| path.ends_with("map.fits")).collect()
+    };
+    let victim = Victim { name: "held", before, args: &args, result: &result, is_done: "" };
+    let expected = victim.undisturbed();
+    let calls = victim.calls("ENOSPC");
+    let every = if std::env::var("LUNARRAY_LONG").is_ok_and(|text| text == "1") { 1 } else { 3 };
+    let tried: Vec<u64> = (1..=calls).step_by(every).collect();
+    let met = tried
+        .iter()
+        .filter(|&&at| {
+            let fault = Fault { kind: "ENOSPC", at, goes_on: false };
+            victim.attack(fault, Some("No space left on device"), &expected)
+        })
+        .count();
+    eprintln!("held: ENOSPC at {} of {calls} calls, met {met}", tried.len());
+    assert!(met + 2 >= tried.len());
+}
+
 #[test]
 fn a_checkpoint_that_cannot_be_read_is_not_damaged() {
     let (_ground, before) = ground();

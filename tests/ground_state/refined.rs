@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::common::workplace::{fail, json, succeed};
+use super::common::workplace::{fail, json, lunarray, succeed};
 use super::{Ground, VISIBILITIES, checkpoints, identity, leave_out, packets};
 
 /// Two passes show all that more would, and an inner solution goes on to where it depends on the sums alone.
@@ -45,8 +45,26 @@ fn any_order_and_any_sessions_make_the_same_refined_map() {
     let last = place.replay("thrice", &[], &[]);
     assert_eq!(last["ledger"]["accumulated"], once["ledger"]["accumulated"]);
     assert!(place.maps("thrice") == place.maps("once"));
-    // Each of the two checkpoints that are kept has its segments, and nothing else is left.
-    assert!(!segments(&place.path("thrice")).is_empty());
+    // Each of the two checkpoints that are kept has its segments, and nothing else is left: without any of the files one of them does not
+    // hold.
+    let state = place.path("thrice");
+    assert!(!segments(&state).is_empty() && checkpoints(state.as_ref()).len() == 2);
+    for segment in segments(&state) {
+        let bytes = std::fs::read(&segment).unwrap();
+        std::fs::remove_file(&segment).unwrap();
+        let broken = |checkpoint: &PathBuf| {
+            let alone = tempfile::tempdir().unwrap();
+            for file in segments(&state).iter().chain([checkpoint]) {
+                std::fs::copy(file, alone.path().join(file.file_name().unwrap())).unwrap();
+            }
+            let [out, alone] = [place.path("alone"), alone.path().to_str().unwrap().to_owned()];
+            !lunarray(&["replay", "--map", &place.pipeline, "--out", &out, "--state", &alone])
+                .status
+                .success()
+        };
+        assert!(checkpoints(state.as_ref()).iter().any(broken), "{}", segment.display());
+        std::fs::write(&segment, bytes).unwrap();
+    }
     // States of different stations, put together in either order.
     for station in 0..2 {
         let hears = |packet: &Vec<u8>| {

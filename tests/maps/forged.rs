@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use lunarray::accumulation::{
-    Accumulator, EngineKind, MapConfig, NormalEngine, PixelEngine, PixelSetup, Snapshot, SnapshotSums,
-    SumCounts,
+    Accumulator, EngineKind, MapConfig, NormalEngine, PixelEngine, PixelSetup, RefineConfig, Snapshot,
+    SnapshotSums, SumCounts,
 };
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{
@@ -54,6 +54,43 @@ fn block(weight: f64) -> PlacedVisibilities {
 fn lowered(block: &PlacedVisibilities, part: f64) -> PlacedVisibilities {
     let lower = |places: &[[f64; 3]]| places.iter().map(|&place| scale(part, place)).collect();
     PlacedVisibilities { r_i_m: lower(&block.r_i_m), r_j_m: lower(&block.r_j_m), ..block.clone() }
+}
+
+#[test]
+fn positions_just_above_the_surface_or_far_away_end_no_refined_ground() {
+    let (good, moon_m) = (block(1e-11), instrument().moon_radius_m);
+    let heights = [(moon_m + 40.0) / norm(good.r_i_m[0]), 1.0, 1e4];
+    for part in heights {
+        // All that is moved is the place of both: the baseline stays.
+        let shift = |places: &[[f64; 3]]| -> Vec<[f64; 3]> {
+            let by = |k: usize| scale(part - 1.0, good.r_i_m[k]);
+            places
+                .iter()
+                .enumerate()
+                .map(|(k, place)| std::array::from_fn(|axis| place[axis] + by(k)[axis]))
+                .collect()
+        };
+        let mut bad =
+            PlacedVisibilities { r_i_m: shift(&good.r_i_m), r_j_m: shift(&good.r_j_m), ..good.clone() };
+        let ledger = Ledger::new();
+        let refine = RefineConfig { passes_max: 1, ..RefineConfig::default() };
+        let map = MapConfig {
+            engine: EngineKind::Harmonic,
+            nside: 4,
+            refine,
+            snapshot_every_s: 5e3,
+            ..MapConfig::default()
+        };
+        let mut accumulator = Accumulator::new(map, ledger.clone());
+        let mut out = Outlet::collect();
+        accumulator.step(PlacedFrame::Instrument(instrument()), &mut out).unwrap();
+        for _ in 0..2 {
+            ledger.sampled(bad.len() as u64);
+            accumulator.step(PlacedFrame::Visibilities(bad.clone()), &mut out).unwrap();
+            bad.time_s.iter_mut().for_each(|time_s| *time_s += 1e4);
+        }
+        assert!(out.into_vec().iter().any(|snapshot| !snapshot.is_final), "{part}");
+    }
 }
 
 #[test]

@@ -204,7 +204,7 @@ fn tilted_dipoles_act_on_samples_as_on_visibilities() {
         let (found, error) = ratio(&measured(&blocks, pair, 0), wanted);
         // 8e-3: synthesis, and fringes that turn by up to an eighth of a wavelength in an integration: sinc(pi / 8) for the
         // longest, which has least weight here.
-        assert!((found - 1.0).norm() < 4.0 * COMMON * error + 0.03, "{pair}: {found} +- {error}");
+        assert!((found - 1.0).norm() < 4.0 * COMMON * error + 8e-3, "{pair}: {found} +- {error}");
     }
 }
 

@@ -70,7 +70,7 @@ impl VisibilityArchive {
     /// A block of another frequency. A visibility without a row of B, or for which there is no room, is counted as refused.
     pub fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
         self.check_frequency(placed)?;
-        self.settle();
+        self.flush();
         let mut added = Added::default();
         for k in 0..placed.len() {
             match self.checked(placed, k).and_then(|held| Ok((self.with(&held)?, held))) {
@@ -123,8 +123,8 @@ impl VisibilityArchive {
             let what = "map sizes, frequencies, baselines, limits, responses, seeds or greatest weights";
             return Err(AccumulationError::Mismatch { what });
         }
-        self.settle();
-        other.settle();
+        self.flush();
+        other.flush();
         let (found, most) = ((self.held.len() + other.held.len()) as u64, self.setup.visibilities_max);
         if found > most {
             return Err(AccumulationError::TooManyHeld { channel: self.setup.channel, found, most });
@@ -159,7 +159,7 @@ impl VisibilityArchive {
     pub fn into_sums(mut self) -> Result<RefinedSums, AccumulationError> {
         self.circle = None;
         self.sort();
-        self.settle();
+        self.flush();
         refined_sums(&self.setup, self.held)
     }
 
@@ -169,7 +169,7 @@ impl VisibilityArchive {
     /// # Errors
     /// A setup that an engine does not take.
     pub fn circle_sums(&mut self) -> Result<HarmonicSums, AccumulationError> {
-        self.settle();
+        self.flush();
         let mut circle = match self.circle.take() {
             Some(circle) => circle,
             None => {
@@ -203,7 +203,7 @@ impl VisibilityArchive {
         out: &mut dyn Write,
         place: SegmentPlace<'_>,
     ) -> Result<(), AccumulationError> {
-        self.settle();
+        self.flush();
         self.save(place)?;
         let mut out = FrameWriter::new(out, BasisKind::Held, (HeldHead::new(&self.setup), self.totals))?;
         out.write(&(self.segments.len() as u32).to_le_bytes())?;
@@ -216,14 +216,15 @@ impl VisibilityArchive {
     }
 
     fn save(&mut self, place: SegmentPlace<'_>) -> Result<(), AccumulationError> {
+        // One of this number belongs to a checkpoint that failed, and may be gone: it is written again.
+        while self.segments.pop_if(|last| last.number >= place.number).is_some() {}
         let all = self.held.len() as u64;
         let mut saved: u64 = self.segments.iter().map(|segment| segment.visibilities).sum();
         if all == saved {
             return Ok(());
         }
-        // One of this number belongs to a checkpoint that failed: what is written now replaces it.
         while let Some(last) = self.segments.last()
-            && (last.number >= place.number || last.visibilities < 2 * (all - saved))
+            && last.visibilities < 2 * (all - saved)
         {
             saved -= last.visibilities;
             self.segments.pop();
@@ -322,7 +323,7 @@ impl VisibilityArchive {
     }
 
     /// Lets go what is to go.
-    fn settle(&mut self) {
+    fn flush(&mut self) {
         let removed = std::mem::take(&mut self.removed);
         if removed.is_empty() {
             return;

@@ -134,7 +134,9 @@ pub(super) fn nearest_circle(
         |of: &dyn Fn(&PairOrientation) -> f64| found.iter().map(of).sum::<f64>() / found.len().max(1) as f64;
     let orbit_rad = orbit_inclination_rad(at, count).unwrap_or_else(|| mean(&prograde));
     let inclination_deg = (orbit_rad.to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
-    let radius_m = (mean(&|pair| pair.radius_m) / RADIUS_STEP_M).round() * RADIUS_STEP_M;
+    let mean_m = (mean(&|pair| pair.radius_m) / RADIUS_STEP_M).round() * RADIUS_STEP_M;
+    // A circle above the surface, which has room for the longest baseline: positions may be just above it, or anything that was sent.
+    let radius_m = mean_m.max(setup.moon_radius_m.max(setup.baseline_m_max) + RADIUS_STEP_M);
     let inclination_rad = inclination_deg.to_radians();
     let limited = NominalOrbit { inclination_rad, radius_m, limits: setup.limits };
     let wavelength_m = SPEED_OF_LIGHT_M_S / setup.frequency_hz;

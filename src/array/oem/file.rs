@@ -289,6 +289,9 @@ pub(in crate::array) fn epoch_text(seconds: f64) -> String {
     while days_before(year + 1) <= days {
         year += 1;
     }
+    while days_before(year) > days {
+        year -= 1;
+    }
     let mut day = days - days_before(year);
     let mut month = 0;
     let lengths = month_lengths(year);
@@ -366,6 +369,10 @@ mod tests {
         for (expected, seconds) in [
             ("1970-01-01T00:00:00.000000", 0.0),
             ("1969-12-31T23:59:59.000000", -1.0),
+            // `date -u -d 1968-12-31 +%s`, and so on.
+            ("1968-12-31T00:00:00.000000", -31_622_400.0),
+            ("1960-12-31T12:00:00.000000", -284_040_000.0),
+            ("1901-01-01T00:00:00.000000", -2_177_452_800.0),
             ("2000-01-01T12:00:00.000000", 946_728_000.0),
             ("2024-02-29T23:59:59.500000", 1_709_251_199.5),
             ("2024-03-01T00:00:00.000000", 1_709_251_199.999_999_8),

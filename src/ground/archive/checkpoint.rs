@@ -43,6 +43,8 @@ pub(super) struct ArchiveHead {
     pub(super) journal: Journal,
     /// The first, without passes, if the head ends before it.
     pub(super) calibration: CalibrationState,
+    /// Checksum of the bytes that it was read from: heads of the same bytes are equal, whatever is not a number in them.
+    pub(super) checksum: u64,
 }
 
 /// An [`ArchiveHead`] borrowed for writing: the same fields, without copies of the large ones.
@@ -156,9 +158,10 @@ pub(super) fn read_from<T>(
     if length > bytes - FIXED_BYTES {
         return Err(damaged(format!("a head of {length} bytes"), "a head that fits in the file"));
     }
-    let mut head = vec![0; length as usize];
-    from.read_exact(&mut head).map_err(failed())?;
-    let (head, used) = decode(&head).map_err(|error| damaged(error.to_string(), "a head"))?;
+    let mut encoded = vec![0; length as usize];
+    from.read_exact(&mut encoded).map_err(failed())?;
+    let (mut head, used) = decode(&encoded).map_err(|error| damaged(error.to_string(), "a head"))?;
+    head.checksum = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &encoded);
     if used as u64 != length {
         return Err(damaged("bytes behind the head".into(), "none"));
     }
@@ -201,7 +204,8 @@ fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(ArchiveHead, usize
         [] => (CalibrationState::default(), 0),
         rest => bincode::decode_from_slice(rest, config)?,
     };
-    let head = ArchiveHead { settings, collector, ephemeris, autos, accumulator, journal, calibration };
+    let head =
+        ArchiveHead { settings, collector, ephemeris, autos, accumulator, journal, calibration, checksum: 0 };
     Ok((head, used + more))
 }
 

@@ -218,7 +218,7 @@ fn read_parts(
         let (head, sums) = of_part(&path, part, empty.without_sums())?;
         match &mut whole {
             None => whole = Some((head, sums)),
-            Some((first, _)) if *first != head => {
+            Some((first, _)) if first.checksum != head.checksum => {
                 let found = "another state than that of the first part".to_owned();
                 return Err(GroundError::Damaged { path, found, expected: "parts of one checkpoint" });
             }
