@@ -16,7 +16,7 @@ use serde::Serialize;
 
 use super::error::ProductsError;
 use super::pictures::{ColourScale, Palette, Scaling, tile_png};
-use crate::files::write_atomically;
+use crate::files::{FolderLock, write_atomically};
 use crate::sky::fits::{Card, image_bytes};
 use crate::sky::healpix::{face_direction, nested_to_face, pixel_of};
 use crate::sky::{Frame, Rotation, SkyMap, is_unseen, rotate};
@@ -32,6 +32,8 @@ const PREVIEW_WIDTH: usize = 64;
 /// Tiles of order 3, and how many of them stand in a row of the picture of the whole sky.
 const PREVIEW_TILES: usize = 768;
 const PREVIEW_COLUMNS: usize = 27;
+/// Name of the lock of a folder that is being written; what is left of it by an export that was broken off says whose the tiles are.
+const UNFINISHED: &str = ".lunarray-hips";
 
 /// How a map is written as HiPS.
 #[derive(Clone, Debug, PartialEq)]
@@ -101,15 +103,20 @@ impl Hips {
         let properties = folder.join("properties");
         let mut left = Vec::new();
         for entry in fs::read_dir(folder).map_err(failed(folder))? {
-            let path = entry.map_err(failed(folder))?.path();
-            let is_tiles = path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("Norder"));
-            if !is_tiles || properties.exists() {
-                return Err(ProductsError::NotEmpty { path: folder.to_owned() });
-            }
-            left.push(path);
+            left.push(entry.map_err(failed(folder))?.path());
         }
-        // Of an export that was broken off: a full disk, a signal.
-        for path in &left {
+        // Of an export that was broken off, by a full disk or a signal, the lock stays: without it the tiles are somebody else's.
+        let begins = |path: &Path, start: &str| {
+            path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(start))
+        };
+        let is_ours = left.iter().any(|path| begins(path, UNFINISHED));
+        let (tiles, others): (Vec<&PathBuf>, Vec<&PathBuf>) =
+            left.iter().filter(|path| !begins(path, UNFINISHED)).partition(|path| begins(path, "Norder"));
+        if !others.is_empty() || (!tiles.is_empty() && !is_ours) {
+            return Err(ProductsError::NotEmpty { path: folder.to_owned() });
+        }
+        let _lock = FolderLock::acquire(folder, UNFINISHED, true).map_err(failed(folder))?;
+        for path in tiles {
             fs::remove_dir_all(path).map_err(failed(path))?;
         }
         let depth = map.nside().trailing_zeros() as u8;
@@ -349,7 +356,8 @@ mod tests {
         assert!(properties.contains("em_min               = 9.993"), "{properties}");
         let again = hips.write(&map, &out).unwrap_err().to_string();
         assert!(again.contains("expected a new or empty folder"), "{again}");
-        // One that was broken off has no `properties` and a tile that is not whole. What is not ours stays.
+        // One that was broken off has no `properties`, a tile that is not whole, and its lock. What is not ours stays, and so do tiles without
+        // the lock.
         let tile = out.join("Norder3/Dir0/Npix5.fits");
         let whole = fs::read(&tile).unwrap();
         fs::remove_file(out.join("properties")).unwrap();
@@ -358,7 +366,10 @@ mod tests {
         fs::write(&foreign, b"mine").unwrap();
         assert!(hips.write(&map, &out).is_err() && tile.exists() && foreign.exists());
         fs::remove_file(&foreign).unwrap();
+        assert!(hips.write(&map, &out).is_err() && tile.exists());
+        fs::write(out.join(UNFINISHED), b"").unwrap();
         hips.write(&map, &out).unwrap();
+        assert!(!out.join(UNFINISHED).exists());
         assert_eq!(fs::read(&tile).unwrap(), whole);
         // With one pixel for four at each order, the mean of what is seen is that of all.
         let preview = fs::read(out.join("Norder0/Dir0/Npix0.fits")).unwrap();
