@@ -9,12 +9,14 @@ mod calibrate;
 mod coded;
 mod command_line;
 mod ending;
+
 mod figures;
 mod first_contact;
 mod groups;
 mod harmonic;
 mod instrument;
 mod live_gains;
+mod navigation;
 mod orbits;
 mod outputs;
 mod paper;
