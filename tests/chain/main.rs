@@ -9,7 +9,7 @@ mod calibrate;
 mod coded;
 mod command_line;
 mod ending;
-
+mod ephemerides;
 mod figures;
 mod first_contact;
 mod groups;
