@@ -29,7 +29,8 @@ class Array:
     @classmethod
     def from_positions(cls, t: ArrayLike, xyz: ArrayLike, moon_radius_m: float = MOON_RADIUS_M) -> Array:
         """Satellites at given positions: ``t`` in s at equal steps, at least 8; ``xyz`` of shape (times, satellites, 3), m in
-        Moon-centred ecliptic axes. Between times they are interpolated as the ground does (eight nodes)."""
+        Moon-centred ecliptic axes, above the surface and at least 1 m apart. Between times they are interpolated as the ground does
+        (eight nodes)."""
         times = np.ascontiguousarray(t, dtype=float)
         places = np.ascontiguousarray(xyz, dtype=float)
         if times.ndim != 1 or places.ndim != 3 or places.shape[2] != 3:
@@ -38,7 +39,7 @@ class Array:
                 "(times, satellites, 3)"
             )
         array = cls.__new__(cls)
-        array._native = _native.NativeEphemeris(times, places.reshape(len(places), -1))
+        array._native = _native.NativeEphemeris(times, places.reshape(len(places), -1), float(moon_radius_m))
         array.moon_radius_m, array.dipoles = float(moon_radius_m), False
         return array
 

@@ -9,7 +9,7 @@ use lunarray::pipeline::{Config, ConfigSource};
 use lunarray::response::pixel::{PairGeometry, exact};
 use lunarray::runtime::Cancel;
 use lunarray::sky::healpix::pixel_area_sr;
-use lunarray::units::vector::Vec3;
+use lunarray::units::vector::{Vec3, norm, sub};
 use lunarray::units::{MAX_SATELLITES, MissionTime};
 use num_complex::Complex64;
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
@@ -22,6 +22,10 @@ use crate::wait::wait;
 
 /// Times beyond which nothing is known, s.
 const TIME_S_MAX: f64 = 1e9;
+
+/// Farthest that a satellite may be, and nearest that two may be to each other, m: as in files of orbits.
+const FAR_M: f64 = 1e9;
+const APART_M: f64 = 1.0;
 
 /// Positions at times, m: a row a time, three columns a satellite; NaN where unknown.
 pub(crate) fn places<'py>(
@@ -116,7 +120,11 @@ pub(crate) struct NativeEphemeris {
 impl NativeEphemeris {
     /// Of times, s, and as many rows of positions, m, three columns a satellite.
     #[new]
-    fn new(times_s: PyReadonlyArray1<'_, f64>, positions_m: PyReadonlyArray2<'_, f64>) -> PyResult<Self> {
+    fn new(
+        times_s: PyReadonlyArray1<'_, f64>,
+        positions_m: PyReadonlyArray2<'_, f64>,
+        moon_radius_m: f64,
+    ) -> PyResult<Self> {
         let (times_s, positions) = (times_s.as_array(), positions_m.as_array());
         let (nodes, columns) = positions.dim();
         let satellites = columns / 3;
@@ -155,6 +163,7 @@ impl NativeEphemeris {
             satellites: satellites as u8,
             positions_m: (0..nodes).flat_map(row).collect(),
         };
+        require_flown(&segment.positions_m, satellites, &times_s.to_vec(), moon_radius_m)?;
         let mut ephemeris = Ephemeris::default();
         ephemeris.insert(segment);
         Ok(Self { ephemeris, satellites })
@@ -172,6 +181,37 @@ impl NativeEphemeris {
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         places(py, &times_s, self.satellites, |t_s, n| self.ephemeris.position_at(t_s, n))
     }
+}
+
+/// Requires satellites above the surface, and apart.
+fn require_flown(
+    positions_m: &[Vec3],
+    satellites: usize,
+    times_s: &[f64],
+    moon_radius_m: f64,
+) -> PyResult<()> {
+    for (places_m, t_s) in positions_m.chunks_exact(satellites).zip(times_s) {
+        for (n, place_m) in places_m.iter().enumerate() {
+            let radius_m = norm(*place_m);
+            if radius_m <= moon_radius_m || radius_m > FAR_M {
+                return Err(refused(format!(
+                    "satellite {} at t = {t_s} s is {:.3} km from the Moon's centre: expected above its surface, {:.3} km, within 1e6 km",
+                    n + 1,
+                    radius_m / 1e3,
+                    moon_radius_m / 1e3
+                )));
+            }
+            let other = places_m[..n].iter().position(|other_m| norm(sub(*other_m, *place_m)) < APART_M);
+            if let Some(other) = other {
+                return Err(refused(format!(
+                    "satellites {} and {} at t = {t_s} s are at one place: expected places of their own",
+                    other + 1,
+                    n + 1
+                )));
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Visibilities, K sr, of a sky (K, RING order, in the frame of a letter) at positions (a row a time, three columns a

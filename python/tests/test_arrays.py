@@ -100,11 +100,30 @@ def test_what_cannot_be_is_refused():
         arguments = {"sky": sky(1), "freq": 3e6, "t": 0.0, **changed}
         with pytest.raises(lunarray.Error, match=text):
             lunarray.predict(**arguments)
+
+
+def test_odd_tables_of_positions_are_refused():
     t = 60.0 * np.arange(9)
     places = np.ones((9, 2, 3)) * 2e6
+    places[:, 1] += 500.0
+
+    def changed(value, k=4):
+        odd = places.copy()
+        odd[k, 1] = value
+        return odd
+
     for times, positions, text in [
         (t[:5], places[:5], "at least 8 times"),
         (t**2, places, "expected equal steps"),
+        # A gap, an overlap, times that run back, none.
+        (np.where(t > 200, t + 60, t), places, "step after time 3 is 120 s"),
+        (np.where(t > 200, t - 60, t), places, "step after time 3 is 0 s"),
+        (t[::-1], places, "the first -60 s; expected equal steps"),
+        (t * np.nan, places, "t = NaN"),
+        (t, changed(np.nan), "a position is NaN"),
+        (t, changed(1e6 / 3**0.5), "satellite 2 at t = 240 s is 1000.000 km from the Moon's centre: expected above its surface"),
+        (t, changed(1e9), "satellite 2 at t = 240 s .* within 1e6 km"),
+        (t, changed(places[4, 0]), "satellites 1 and 2 at t = 240 s are at one place"),
         (t, places[:, 0], "expected .times,. and"),
         (t, places * np.inf, "a position is inf"),
     ]:

@@ -13,13 +13,15 @@ use super::schedule::{Integration, Schedule};
 use super::troubles::PairTroubles;
 use crate::array::{Array, EarthShadow, segments_for};
 use crate::daughters::{InstrumentErrors, PassErrors};
-use crate::frames::{Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, VisibilityBlock};
+use crate::frames::{
+    EphemerisSegment, Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, VisibilityBlock,
+};
 use crate::response::model::{ModelError, PairPosition, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{ChannelId, MissionTime, Pair, StreamKind, TICKS_PER_SECOND, all_pairs, random_stream};
 
 /// Largest spacing of tabulated positions, s; interpolation is then accurate to micrometres.
-pub(super) const EPHEMERIS_STEP_S: f64 = 60.0;
+const EPHEMERIS_STEP_S: f64 = 60.0;
 
 /// Queued visibilities of all channels at which they are predicted in any case; bounds memory to some 200 MB.
 const QUEUED_VISIBILITIES_MAX: usize = 1_000_000;
@@ -218,7 +220,13 @@ impl Integrator {
                 let (shadow, pass) = (shadows.get(k), passes.get(k));
                 self.autos(WindowChannel { window, channel: *channel, powers: &powers[k], shadow, pass })
             });
-            self.sampled += send_window(visibilities.chain(autos), window, self.sampled, out);
+            let blocks = visibilities.chain(autos).map(|mut block| {
+                if let Some(pass) = passes.get(k) {
+                    pass.tag(&mut block);
+                }
+                block
+            });
+            self.sampled += send_window(blocks, window, self.sampled, out);
             if out.is_closed() {
                 return Ok(());
             }
@@ -427,12 +435,29 @@ pub(super) fn describe(
     out: &mut Outlet<GroundFrame>,
 ) {
     out.push(GroundFrame::Instrument(instrument.clone()));
-    for mut segment in segments_for(array, window.start, window.end, EPHEMERIS_STEP_S) {
-        if let Some(pass) = pass {
-            pass.mislead(&mut segment, array);
-        }
+    for segment in positions_said(array, window, pass) {
         out.push(GroundFrame::Ephemeris(segment));
     }
+}
+
+/// The ephemeris of a window as packets say it; beyond the window where time tags may lie outside it.
+pub(super) fn positions_said(
+    array: &Array,
+    window: ObservingWindow,
+    pass: Option<&PassErrors>,
+) -> Vec<EphemerisSegment> {
+    let reach_s = pass.map_or(0.0, PassErrors::reach_s);
+    let reach = MissionTime::from_seconds(reach_s).0;
+    let (mut from, mut until) = (window.start.plus_ticks(-reach), window.end.plus_ticks(reach));
+    if let Some([from_s, until_s]) = array.known_s().filter(|_| reach > 0) {
+        from = from.max(MissionTime::from_seconds(from_s).plus_ticks(1)).min(window.start);
+        until = until.min(MissionTime::from_seconds(until_s).plus_ticks(-1)).max(window.end);
+    }
+    let mut segments = segments_for(array, from, until, EPHEMERIS_STEP_S);
+    if let Some(pass) = pass {
+        segments.iter_mut().for_each(|segment| pass.mislead(segment, array));
+    }
+    segments
 }
 
 /// Sends the visibilities of a window and closes it; returns their number. `sampled` is that of all windows before.

@@ -9,7 +9,7 @@ use crate::accumulation::{EngineKind, MapConfig};
 use crate::array::{Array, ArrayConfig};
 use crate::calibration::solver::SolverConfig;
 use crate::calibration::{CalibrationConfig, CalibrationHook, VanVleck};
-use crate::daughters::{DaughtersConfig, InstrumentConfig};
+use crate::daughters::{DaughtersConfig, InstrumentConfig, NavigationConfig};
 use crate::downlink::DownlinkConfig;
 use crate::mother::{Antenna, Fidelity, MoonMirror, SpacecraftConfig};
 use crate::products::ProductsConfig;
@@ -37,6 +37,8 @@ pub struct Config {
     pub daughters: DaughtersConfig,
     /// Errors of the instrument.
     pub instrument: InstrumentConfig,
+    /// Errors of the positions and times in packets.
+    pub navigation: NavigationConfig,
     /// The spacecraft.
     pub spacecraft: SpacecraftConfig,
     /// The downlink.
@@ -92,11 +94,25 @@ impl Config {
         found.extend(self.daughters.problems(self.array.satellites, width_hz));
         let samples = self.spacecraft.fidelity == Fidelity::Samples;
         found.extend(self.instrument.problems(self.array.satellites, channels, samples));
+        found.extend(self.navigation.problems(self.array.satellites));
         found.extend(spacecraft);
         found.extend(self.downlink.problems());
         found.extend(self.map.misfits(channels));
         found.append(self.ground_problems());
         found
+    }
+
+    /// Whether anything differs from an ideal instrument, or from what packets say of it.
+    #[must_use]
+    pub(super) fn has_errors(&self) -> bool {
+        self.instrument.is_on() || self.navigation.is_on()
+    }
+
+    /// The same without any of these errors; with the schedule of the artificial signal.
+    #[must_use]
+    pub(super) fn without_errors(&self) -> Self {
+        let instrument = self.instrument.without_errors();
+        Self { instrument, navigation: NavigationConfig::default(), ..self.clone() }
     }
 
     /// Requires that positions are known for the whole mission.
@@ -204,7 +220,7 @@ impl Config {
     /// formats.
     #[must_use]
     pub fn space_hash(&self) -> u64 {
-        let Self { name, seed, sky, array, daughters, instrument, spacecraft, .. } = self;
+        let Self { name, seed, sky, array, daughters, instrument, navigation, spacecraft, .. } = self;
         let (mut sky, mut array) = (sky.clone(), array.clone());
         array.oem = array.oem.iter().map(|path| contents(path)).collect();
         sky.file = sky.file.map(|files| files.map(|path| contents(path)));
@@ -212,9 +228,10 @@ impl Config {
             added.catalogue = added.catalogue.as_deref().map(contents);
         }
         // Data of an ideal instrument are those of before there were errors, byte for byte.
-        match instrument.is_on() {
-            true => hash(&(name, seed, sky, &array, daughters, spacecraft, instrument)),
-            false => hash(&(name, seed, sky, &array, daughters, spacecraft)),
+        match (instrument.is_on(), navigation.is_on()) {
+            (false, false) => hash(&(name, seed, sky, &array, daughters, spacecraft)),
+            (true, false) => hash(&(name, seed, sky, &array, daughters, spacecraft, instrument)),
+            (_, true) => hash(&(name, seed, sky, &array, daughters, spacecraft, instrument, navigation)),
         }
     }
 

@@ -14,6 +14,13 @@ use crate::units::shortened;
 const OPTIONAL_KEYS: [&str; 5] =
     ["sky.file", "sky.frame", "sky.added", "calibration.gains_file", "map.prior_frame"];
 
+/// Keys that have another place now.
+const MOVED_KEYS: [(&str, &str); 3] = [
+    ("instrument.along_m", "navigation.along_m"),
+    ("instrument.across_m", "navigation.across_m"),
+    ("instrument.radial_m", "navigation.radial_m"),
+];
+
 /// Most characters of a key, an override or the parser's message that are shown.
 pub(super) const SHOWN_MAX: usize = 160;
 
@@ -166,6 +173,10 @@ fn alone(path: &[&str], value: Value) -> Table {
 /// The keys of the section in which `path` is none, for a message; first the one that is spelled most like it.
 fn keys_of(path: &[&str], known: &Table) -> String {
     let Some((wrong, path)) = path.split_last() else { return String::new() };
+    let whole = [path, &[*wrong]].concat().join(".");
+    if let Some((_, now)) = MOVED_KEYS.iter().find(|(before, _)| *before == whole) {
+        return format!("it is {now} now");
+    }
     let section = path.join(".");
     let optional = OPTIONAL_KEYS.iter().filter_map(|key| key.rsplit_once('.'));
     let optional = optional.filter(|(of, _)| *of == section).map(|(_, key)| key);

@@ -40,7 +40,7 @@ impl Config {
     /// Whether realisations of the noise-only map can share all but their noise: with the harmonic engine, without refinement, and if
     /// errors of the instrument do not differ with them.
     pub(super) fn shares_realisations(&self) -> bool {
-        self.map.engine == EngineKind::Harmonic && !self.map.refine.is_on() && !self.instrument.is_on()
+        self.map.engine == EngineKind::Harmonic && !self.map.refine.is_on() && !self.has_errors()
     }
 }
 

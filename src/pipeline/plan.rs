@@ -83,11 +83,12 @@ impl Plan {
         (limit > 0.0).then_some([needed, limit])
     }
 
-    /// Errors of the instrument; `None` if it is ideal.
+    /// Errors of the instrument and of what packets say of positions and times; `None` if there are none.
     #[must_use]
     pub fn instrument_errors(&self) -> Option<Arc<InstrumentErrors>> {
-        let Config { instrument, seed, spacecraft, .. } = &self.config;
-        InstrumentErrors::new(instrument, *seed, &self.array, &spacecraft.channels()).map(Arc::new)
+        let Config { instrument, navigation, seed, spacecraft, .. } = &self.config;
+        let channels = spacecraft.channels();
+        InstrumentErrors::new(instrument, navigation, *seed, &self.array, &channels).map(Arc::new)
     }
 
     /// Antennas of the daughters that are not ideal; `None` if all are.
@@ -99,7 +100,7 @@ impl Plan {
         Some(Arc::new(found))
     }
 
-    /// The true errors of the instrument in every pass as a table (CSV); `None` if it is ideal.
+    /// The true errors in every pass as a table (CSV); `None` if there are none.
     #[must_use]
     pub fn instrument_truth(&self) -> Option<String> {
         self.instrument_errors().map(|errors| truth_csv(&errors, &self.windows))

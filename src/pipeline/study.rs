@@ -231,7 +231,7 @@ impl Study {
                 if let Some(base) = base.as_ref().filter(|_| realisations > 1) {
                     labels.push(format!("realisation {number}"));
                     sets.push(format!("map.companion_seed={}", seed(number)));
-                    if base.instrument.is_on() {
+                    if base.has_errors() {
                         let realisation = base.instrument.realisation.saturating_add(number as u32);
                         sets.push(format!("instrument.realisation={realisation}"));
                     }
@@ -659,14 +659,14 @@ fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary,
 /// Compares each case of a study of the instrument's errors with the one that has none of them and is not calibrated.
 fn note_power_kept(done: &[&StudyCase], cases: &mut [CaseSummary]) {
     let ideal_of = |case: &StudyCase| {
-        let mut config = case.plan.config.clone();
-        config.instrument = config.instrument.without_errors();
+        let mut config = case.plan.config.without_errors();
         config.calibrate = SolverConfig::default();
         serde_json::to_value(&config).unwrap_or_default()
     };
     let has_errors = |case: &StudyCase| {
-        let instrument = &case.plan.config.instrument;
-        case.calibrated || *instrument != instrument.without_errors()
+        let config = &case.plan.config;
+        let ideal = config.without_errors();
+        case.calibrated || (&config.instrument, &config.navigation) != (&ideal.instrument, &ideal.navigation)
     };
     if !done.iter().any(|case| has_errors(case)) {
         return;

@@ -34,9 +34,9 @@ const ERRORS: [&str; 6] = [
     "instrument.phase_deg={pass_rms=60.0}",
     "instrument.amplitude={pass_rms=0.1}",
     "instrument.clock_ns={pass_rms=30.0}",
-    "instrument.along_m={pass_rms=10.0}",
-    "instrument.across_m={pass_rms=10.0}",
-    "instrument.radial_m={pass_rms=10.0}",
+    "navigation.along_m={pass_rms=10.0}",
+    "navigation.across_m={pass_rms=10.0}",
+    "navigation.radial_m={pass_rms=10.0}",
 ];
 
 /// Those of them that are no positions.

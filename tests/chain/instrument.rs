@@ -37,7 +37,7 @@ const ERRORS: [&str; 6] = [
     "instrument.phase_deg={pass_rms=40.0,drift_rms=10.0,drift_time_s=2000.0}",
     "instrument.amplitude={constant_rms=0.2}",
     "instrument.clock_ns={constant=[0.0,30.0,-20.0,5.0],step_rms=3.0,step_every_s=3000.0}",
-    "instrument.along_m={orbit_rms=5.0}",
+    "navigation.along_m={orbit_rms=5.0}",
     "instrument.outlier_probability=0.1",
     "instrument.outlier_sigma=30.0",
 ];

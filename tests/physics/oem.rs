@@ -117,6 +117,11 @@ fn hostile_files_are_refused_with_a_reason() {
             replace(&line(5), "2030-01-01T00:05:00.000 2e9 0 0 1 1 1"),
             "above the Moon's surface, within 1e6 km",
         ),
+        // The velocity of escape is sqrt(2 x 4902.8 / 2037.1) = 2.194 km/s there.
+        (
+            replace(&line(5), "2030-01-01T00:05:00.000 2037.1 0 0 0 2.2 0"),
+            "found 2.200 km/s at 2037.1 km from the Moon's centre; expected less than the velocity of escape",
+        ),
         (circle(0.0).split(&line(2)).next().unwrap().to_owned(), "found 2 states"),
         (split(8, 9), "begins 60.000 s after the one before ends"),
         (split(8, 7), "begins 60.000 s before the one before ends"),

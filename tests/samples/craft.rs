@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use lunarray::array::{Array, ArrayConfig, IntegrationRule, ObservingWindows};
 use lunarray::daughters::{
-    DaughtersConfig, InstrumentConfig, InstrumentErrors, Sampler, SamplerCounts, Scene,
+    DaughtersConfig, InstrumentConfig, InstrumentErrors, NavigationConfig, Sampler, SamplerCounts, Scene,
 };
 use lunarray::frames::{
     AntennaResponse, Channel, GroundFrame, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame,
@@ -113,7 +113,13 @@ impl Spacecraft {
 
     /// Errors of the instrument, if there are any.
     pub fn errors(&self, seed: u64) -> Option<InstrumentErrors> {
-        InstrumentErrors::new(&self.instrument, seed, &self.array, &self.channels())
+        InstrumentErrors::new(
+            &self.instrument,
+            &NavigationConfig::default(),
+            seed,
+            &self.array,
+            &self.channels(),
+        )
     }
 
     /// All frames of the daughters.

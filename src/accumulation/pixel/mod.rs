@@ -208,6 +208,13 @@ impl SkyBasis for PixelBasis {
         if [r_i_m, r_j_m].into_iter().any(|r_m| !norm(r_m).is_normal()) {
             return Err(Refusal::Geometry(GeometryRefusal::NotFinite));
         }
+        // Within the Moon nothing is seen, and satellites at one place are none.
+        if [r_i_m, r_j_m].into_iter().any(|r_m| norm(r_m) <= self.setup.moon_radius_m) {
+            return Err(Refusal::Geometry(GeometryRefusal::Altitude));
+        }
+        if r_i_m == r_j_m {
+            return Err(Refusal::Geometry(GeometryRefusal::Degenerate));
+        }
         let dipoles = self.setup.response == AntennaResponse::DipoleNormal;
         if dipoles && self.pair(positions).orbit_normal().is_none() {
             return Err(Refusal::Geometry(GeometryRefusal::Degenerate));

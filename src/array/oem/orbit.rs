@@ -104,11 +104,13 @@ pub(in crate::array) fn read(
     Ok(orbits)
 }
 
-/// Requires orbits above the surface, and segments that follow each other.
+/// Requires orbits above the surface that the Moon holds, and segments that follow each other.
 fn check(file: &OemFile, moon_radius_m: f64) -> Result<(), Fault> {
     for segment in &file.segments {
-        for (k, position_m) in segment.position_m.iter().enumerate() {
-            let radius_m = norm(*position_m);
+        for (k, (position_m, velocity_m_s)) in
+            segment.position_m.iter().zip(&segment.velocity_m_s).enumerate()
+        {
+            let (radius_m, speed_m_s) = (norm(*position_m), norm(*velocity_m_s));
             if radius_m <= moon_radius_m || radius_m > 1e9 {
                 let found = format!("{:.3} km from the Moon's centre", radius_m / 1e3);
                 return Err(Fault {
@@ -116,6 +118,13 @@ fn check(file: &OemFile, moon_radius_m: f64) -> Result<(), Fault> {
                     found,
                     expected: "above the Moon's surface, within 1e6 km",
                 });
+            }
+            if 0.5 * speed_m_s * speed_m_s >= MOON_GM_M3_S2 / radius_m {
+                let found =
+                    format!("{:.3} km/s at {:.1} km from the Moon's centre", speed_m_s / 1e3, radius_m / 1e3);
+                let expected =
+                    "less than the velocity of escape: other orbits are not closed (parabolic, hyperbolic)";
+                return Err(Fault { line: segment.line + k, found, expected });
             }
         }
     }

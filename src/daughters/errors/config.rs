@@ -12,11 +12,11 @@ const DRIFT_TIME_S_MIN: f64 = 60.0;
 const STEERING_S_MIN: f64 = 600.0;
 
 /// The `[instrument]` section: what is wrong with the daughters, in either fidelity. Without any of it, data are as
-/// they are without the section.
+/// they are without the section. What is wrong with positions and times is in [`NavigationConfig`](super::NavigationConfig).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct InstrumentConfig {
-    /// Number of the realisation: other random errors with the same sky and noise.
+    /// Number of the realisation: other random errors, those of `[navigation]` included, with the same sky and noise.
     pub realisation: u32,
     /// Natural logarithm of the amplitude of the voltage gain, by daughter and channel.
     pub amplitude: ErrorTerms,
@@ -24,12 +24,6 @@ pub struct InstrumentConfig {
     pub phase_deg: ErrorTerms,
     /// Offset of the clock, ns; positive if samples are late. By daughter, for all channels.
     pub clock_ns: ErrorTerms,
-    /// Error of the position in the packets along the track, m: what they say less what was flown.
-    pub along_m: ErrorTerms,
-    /// The same across the track, along the orbit's normal, m.
-    pub across_m: ErrorTerms,
-    /// The same away from the Moon, m.
-    pub radial_m: ErrorTerms,
     /// Tilt of the antenna's axis from the orbit's normal towards the direction of the track, deg, by daughter.
     pub tilt_along_deg: ErrorTerms,
     /// The same away from the Moon, deg.
@@ -69,9 +63,6 @@ impl Default for InstrumentConfig {
             amplitude: ErrorTerms::default(),
             phase_deg: ErrorTerms::default(),
             clock_ns: ErrorTerms::default(),
-            along_m: ErrorTerms::default(),
-            across_m: ErrorTerms::default(),
-            radial_m: ErrorTerms::default(),
             tilt_along_deg: ErrorTerms::default(),
             tilt_radial_deg: ErrorTerms::default(),
             pattern: ErrorTerms::default(),
@@ -177,16 +168,14 @@ impl ErrorTerms {
         rms.iter().chain(&self.rate_per_day).any(|value| *value != 0.0)
     }
 
-    fn check(&self, name: &str, satellites: usize, smooth: bool, checks: &mut Checks) {
+    /// Requires what terms can be; `of` says how many have values of their own, and what they are.
+    pub(super) fn check(&self, name: &str, of: (usize, &str), smooth: bool, checks: &mut Checks) {
+        let (values, each) = of;
         for (key, list) in [("constant", &self.constant), ("rate_per_day", &self.rate_per_day)] {
             let (key, count) = (format!("{name}.{key}"), list.len());
-            let fits = count == 0 || count == satellites;
-            checks.require(
-                &key,
-                format!("({count} values)"),
-                fits,
-                format!("none, or {satellites}: one a daughter"),
-            );
+            let fits = count == 0 || count == values;
+            let expected = format!("none, or {values}: one {each}");
+            checks.require(&key, format!("({count} values)"), fits, expected);
             checks.numbers(&key, list, |_| true, "finite numbers");
         }
         for (key, rms) in [
@@ -247,12 +236,6 @@ impl InstrumentConfig {
         self.burst_every_s > 0.0 && self.burst_s > 0.0 && self.burst_k_sr > 0.0
     }
 
-    /// Whether positions in packets differ from those flown.
-    #[must_use]
-    pub fn moves_positions(&self) -> bool {
-        [&self.along_m, &self.across_m, &self.radial_m].iter().any(|terms| !terms.is_none())
-    }
-
     /// Whether antennas differ from the ideal one.
     #[must_use]
     pub fn has_own_antennas(&self) -> bool {
@@ -265,14 +248,11 @@ impl InstrumentConfig {
         self.clock_allan_deviation > 0.0 || self.terms().iter().any(|(_, terms)| terms.changes_in_a_pass())
     }
 
-    fn terms(&self) -> [(&'static str, &ErrorTerms); 9] {
+    fn terms(&self) -> [(&'static str, &ErrorTerms); 6] {
         [
             ("amplitude", &self.amplitude),
             ("phase_deg", &self.phase_deg),
             ("clock_ns", &self.clock_ns),
-            ("along_m", &self.along_m),
-            ("across_m", &self.across_m),
-            ("radial_m", &self.radial_m),
             ("tilt_along_deg", &self.tilt_along_deg),
             ("tilt_radial_deg", &self.tilt_radial_deg),
             ("pattern", &self.pattern),
@@ -305,7 +285,7 @@ impl InstrumentConfig {
         let mut checks = Checks::of("instrument");
         for (name, terms) in self.terms() {
             let smooth = !["amplitude", "phase_deg", "clock_ns"].contains(&name);
-            terms.check(name, satellites, smooth, &mut checks);
+            terms.check(name, (satellites, "a daughter"), smooth, &mut checks);
         }
         self.check_rest(&mut checks);
         let known = |number: u32, count: usize| (1..=count).contains(&(number as usize));

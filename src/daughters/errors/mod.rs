@@ -4,15 +4,17 @@
 //! A daughter's signal is multiplied by its voltage gain `g = exp(a + i p)`, `p = phase - 2 pi nu tau` (signals rotate
 //! as exp(-2 pi i nu t), so a clock that is late by tau turns them back), and a visibility by `g_i conj(g_j)`. Noise
 //! passes the same gain. The packets' positions are those flown plus an error along the track, along the orbit's normal
-//! and away from the Moon.
+//! and away from the Moon, and their time tags are the true times plus an error.
 
 mod attitude;
 mod config;
+mod navigation;
 mod series;
 mod truth;
 
 pub use attitude::AntennaErrors;
 pub use config::{BeaconSchedule, ErrorTerms, InstrumentConfig};
+pub use navigation::NavigationConfig;
 pub use truth::truth_csv;
 
 use std::f64::consts::TAU;
@@ -21,15 +23,17 @@ use num_complex::Complex64;
 use rand_chacha::ChaCha8Rng;
 
 use crate::array::{Array, track_offset_m};
-use crate::frames::{Channel, EphemerisSegment, ObservingWindow};
+use crate::frames::{Channel, EphemerisSegment, ObservingWindow, VisibilityBlock};
 use crate::units::vector::add;
 use crate::units::{MissionTime, Pair, StreamKind, TICKS_PER_SECOND, random_stream};
+use navigation::TIME_TAG_S_MAX;
 use series::{Draws, Series};
 
 /// The errors of an instrument, drawn from a seed.
 #[derive(Clone, Debug)]
 pub struct InstrumentErrors {
     config: InstrumentConfig,
+    navigation: NavigationConfig,
     seed: u64,
     satellites: usize,
     channels: Vec<Channel>,
@@ -48,6 +52,8 @@ pub struct PassErrors {
     clock_ns: Vec<Series>,
     /// By daughter: along, across, radial.
     offset_m: Vec<[Series; 3]>,
+    /// Of the formation; `None` if tags are true.
+    time_tag_ms: Option<Series>,
     /// By daughter: tilt along the track, tilt away from the Moon (deg), distortion.
     antennas: Vec<[Series; 3]>,
 }
@@ -55,9 +61,16 @@ pub struct PassErrors {
 impl InstrumentErrors {
     /// The errors of an array with these channels; `None` if there are none.
     #[must_use]
-    pub fn new(config: &InstrumentConfig, seed: u64, array: &Array, channels: &[Channel]) -> Option<Self> {
-        config.is_on().then(|| Self {
+    pub fn new(
+        config: &InstrumentConfig,
+        navigation: &NavigationConfig,
+        seed: u64,
+        array: &Array,
+        channels: &[Channel],
+    ) -> Option<Self> {
+        (config.is_on() || navigation.is_on()).then(|| Self {
             config: config.clone(),
+            navigation: navigation.clone(),
             // Realisations are far from each other and from seeds that users choose.
             seed: seed.wrapping_add(u64::from(config.realisation).wrapping_mul(0x9E37_79B9_7F4A_7C15)),
             satellites: array.satellites(),
@@ -70,6 +83,11 @@ impl InstrumentErrors {
     #[must_use]
     pub fn config(&self) -> &InstrumentConfig {
         &self.config
+    }
+
+    /// Whether anything changes within a pass.
+    fn changes_in_a_pass(&self) -> bool {
+        self.config.changes_in_a_pass() || self.navigation.changes_in_a_pass()
     }
 
     /// One error of a daughter over a pass.
@@ -103,7 +121,7 @@ impl InstrumentErrors {
     /// The errors over a pass.
     #[must_use]
     pub fn pass(&self, window: ObservingWindow) -> PassErrors {
-        let Self { config, satellites, channels, .. } = self;
+        let Self { config, navigation, satellites, channels, .. } = self;
         let series = |error: u8, terms: &ErrorTerms, daughter: usize, channel: usize| {
             self.series(window, error, terms, [daughter, channel])
         };
@@ -123,10 +141,12 @@ impl InstrumentErrors {
             clock_ns: (0..*satellites).map(|n| self.clock_ns(window, n)).collect(),
             offset_m: (0..*satellites)
                 .map(|n| {
-                    let axes = [(3, &config.along_m), (4, &config.across_m), (5, &config.radial_m)];
+                    let NavigationConfig { along_m, across_m, radial_m, .. } = navigation;
+                    let axes = [(3, along_m), (4, across_m), (5, radial_m)];
                     axes.map(|(error, terms)| series(error, terms, n, 0))
                 })
                 .collect(),
+            time_tag_ms: navigation.moves_tags().then(|| series(9, &navigation.time_tag_ms, 0, 0)),
             antennas: self.antennas(window),
         }
     }
@@ -190,6 +210,41 @@ impl PassErrors {
     #[must_use]
     pub fn offset_m(&self, daughter: usize, t_s: f64) -> [f64; 3] {
         self.offset_m[daughter].each_ref().map(|series| series.at(t_s))
+    }
+
+    /// Error of the time tag of what is measured at a time, s.
+    #[must_use]
+    pub fn time_tag_s(&self, t_s: f64) -> f64 {
+        let tag_s = self.time_tag_ms.as_ref().map_or(0.0, |series| 1e-3 * series.at(t_s));
+        tag_s.clamp(-TIME_TAG_S_MAX, TIME_TAG_S_MAX)
+    }
+
+    /// By how much positions have to be known before and after a pass, s, for all that is tagged in it.
+    #[must_use]
+    pub fn reach_s(&self) -> f64 {
+        if self.time_tag_ms.is_some() { TIME_TAG_S_MAX } else { 0.0 }
+    }
+
+    /// Replaces the times of a block by those that packets say, to whole ticks.
+    pub fn tag(&self, block: &mut VisibilityBlock) {
+        if self.time_tag_ms.is_none() {
+            return;
+        }
+        let ticks = |t_s: f64| MissionTime::from_seconds(self.time_tag_s(t_s)).0;
+        let middles: Vec<i64> = (0..block.len()).map(|k| ticks(block.middle_s(k))).collect();
+        let of_start = middles.first().copied().unwrap_or_default();
+        block.start = block.start.plus_ticks(of_start);
+        // A clock that is set back does not change the order: tags stand until it has caught up.
+        let mut after_half_ticks = 0;
+        for ((offset, duration), of_middle) in
+            block.offset_ticks.iter_mut().zip(&block.duration_ticks).zip(middles)
+        {
+            let duration = i64::from(*duration);
+            let least = (after_half_ticks - duration + 1).div_euclid(2);
+            let tagged = (i64::from(*offset) + of_middle - of_start).max(least).max(0);
+            *offset = u32::try_from(tagged).unwrap_or(u32::MAX);
+            after_half_ticks = 2 * i64::from(*offset) + duration + 1;
+        }
     }
 
     /// Replaces the positions flown of a segment by those that packets say.

@@ -26,8 +26,16 @@ fn window(index: u64) -> ObservingWindow {
 }
 
 fn errors(config: InstrumentConfig) -> InstrumentErrors {
+    errors_of(&config, &NavigationConfig::default())
+}
+
+fn led_astray(navigation: &NavigationConfig) -> InstrumentErrors {
+    errors_of(&InstrumentConfig::default(), navigation)
+}
+
+fn errors_of(config: &InstrumentConfig, navigation: &NavigationConfig) -> InstrumentErrors {
     let array = Array::new(&ArrayConfig::default()).unwrap();
-    InstrumentErrors::new(&config, 11, &array, &CHANNELS).unwrap()
+    InstrumentErrors::new(config, navigation, 11, &array, &CHANNELS).unwrap()
 }
 
 /// Power that a coherent average over passes and pairs keeps, by channel.
@@ -98,11 +106,11 @@ fn constant_phases_and_clocks_keep_what_their_laws_say() {
 #[test]
 fn positions_keep_what_their_law_says() {
     // 1 m of a baseline along each axis: 12 deg at 10 MHz in any direction.
-    let mut config = InstrumentConfig::default();
+    let mut config = NavigationConfig::default();
     for terms in [&mut config.along_m, &mut config.across_m, &mut config.radial_m] {
         terms.pass_rms = 0.5_f64.sqrt();
     }
-    let errors = errors(config);
+    let errors = led_astray(&config);
     let n_hat = [0.48, 0.6, 0.64];
     let (mut sums, mut count) = ([Complex64::ZERO; 3], 0.0);
     for index in 0..PASSES {
@@ -127,12 +135,12 @@ fn positions_keep_what_their_law_says() {
 #[test]
 fn packets_say_positions_that_are_off_along_the_named_axes() {
     let array = Array::new(&ArrayConfig::default()).unwrap();
-    let mut config = InstrumentConfig::default();
+    let mut config = NavigationConfig::default();
     config.along_m.constant = (0..8).map(f64::from).collect();
     config.radial_m.constant = vec![2.0; 8];
     config.across_m.constant = vec![-3.0; 8];
     let window = window(5);
-    let pass = errors(config).pass(window);
+    let pass = led_astray(&config).pass(window);
     for flown in crate::array::segments_for(&array, window.start, window.end, 60.0) {
         let mut said = flown.clone();
         pass.mislead(&mut said, &array);
@@ -205,7 +213,7 @@ fn a_leak_falls_with_the_angle_below_the_limb() {
 #[test]
 fn everything_wrong_with_the_section_is_said() {
     let text = "dead_daughters = [9]\ndead_channels = [[1, 4]]\noutlier_probability = 2.0\nburst_every_s = 1.0\nburst_s = 2.0\n\
-        phase_deg = { constant = [1.0], pass_rms = -1.0, drift_time_s = 1.0 }\nalong_m = { drift_rms = 1.0 }\n\
+        phase_deg = { constant = [1.0], pass_rms = -1.0, drift_time_s = 1.0 }\n\
         tilt_along_deg = { constant_rms = 60.0 }\npattern = { step_rms = 1.0 }\nclock_allan_deviation = 1.0\n\
         clock_steering_s = 1.0\nleak_depth_deg = 0.0\nleak_k_sr = -1.0\n\
         beacon = { k_sr = -1.0, direction_deg = [0.0, 91.0] }";
@@ -215,7 +223,6 @@ fn everything_wrong_with_the_section_is_said() {
         "phase_deg.constant",
         "phase_deg.pass_rms",
         "phase_deg.drift_time_s",
-        "along_m.drift_rms",
         "pattern.step_rms",
         "tilt_along_deg",
         "clock_allan_deviation",
@@ -232,4 +239,113 @@ fn everything_wrong_with_the_section_is_said() {
     assert_eq!(keys, expected.map(|key| format!("instrument.{key}")));
     let dead: InstrumentConfig = toml::from_str("dead_daughters = [1]").unwrap();
     assert!(dead.problems(8, 3, false).is_empty() && dead.problems(8, 3, true).len() == 1);
+}
+
+#[test]
+fn once_per_orbit_is_a_sine_of_the_given_strength() {
+    let array = Array::new(&ArrayConfig::default()).unwrap();
+    let mut config = NavigationConfig::default();
+    config.radial_m.orbit_rms = 3.0;
+    let window = window(5);
+    let rad_per_s = TAU / array.orbital_period_s();
+    let (mut squares, mut count) = (0.0, 0.0);
+    for realisation in 0..500 {
+        let instrument = InstrumentConfig { realisation, ..InstrumentConfig::default() };
+        let pass = errors_of(&instrument, &config).pass(window);
+        for segment in crate::array::segments_for(&array, window.start, window.end, 60.0) {
+            let mut said = segment.clone();
+            pass.mislead(&mut said, &array);
+            let radial_m = |node: usize| {
+                let flown_m = segment.positions_m[node * 8 + 2];
+                dot(sub(said.positions_m[node * 8 + 2], flown_m), unit(flown_m))
+            };
+            let t_s =
+                |node: usize| segment.start.plus_ticks(node as i64 * i64::from(segment.step_ticks)).seconds();
+            // Two nodes give cosine and sine; all others follow.
+            let [(s0, c0), (s1, c1)] = [0, 20].map(|node| (rad_per_s * t_s(node)).sin_cos());
+            let (e0, e1) = (radial_m(0), radial_m(20));
+            let det = c0 * s1 - c1 * s0;
+            let (cosine, sine) = ((e0 * s1 - e1 * s0) / det, (c0 * e1 - c1 * e0) / det);
+            for node in 0..segment.nodes() {
+                let (s, c) = (rad_per_s * t_s(node)).sin_cos();
+                // Positions of 2e6 m have 2e-10 m in f64; the two nodes are 50 deg apart.
+                assert!((radial_m(node) - cosine * c - sine * s).abs() < 1e-7, "{node}");
+            }
+            (squares, count) = (squares + cosine * cosine + sine * sine, count + 2.0);
+        }
+    }
+    // Four standard deviations of the mean square of 1000 Gaussians: 4 sqrt(2 / 1000) = 18 %.
+    assert!((squares / count / 9.0 - 1.0).abs() < 0.18, "{}", squares / count);
+}
+
+#[test]
+fn time_tags_are_off_by_a_constant_and_a_drift() {
+    let mut config = NavigationConfig::default();
+    config.time_tag_ms.constant = vec![250.0];
+    config.time_tag_ms.rate_per_day = vec![-864.0]; // 10 us/s
+    let pass = led_astray(&config).pass(window(3));
+    let start = window(3).start;
+    let count = 2000_u32;
+    let true_block = VisibilityBlock {
+        start,
+        offset_ticks: (0..count).map(|k| k * 1_300_000).collect(),
+        duration_ticks: vec![1_300_000; count as usize],
+        value_k_sr: vec![num_complex::Complex32::ZERO; count as usize],
+        weight: vec![1.0; count as usize],
+        flags: vec![crate::frames::Flags::GOOD; count as usize],
+        ..VisibilityBlock::default()
+    };
+    let mut said = true_block.clone();
+    pass.tag(&mut said);
+    for k in 0..count as usize {
+        let t_s = true_block.middle_s(k);
+        let late_s = 0.25 - 1e-5 * t_s;
+        // Half a tick each for the start, the offset and the rate's whole ticks.
+        assert!((said.middle_s(k) - t_s - late_s).abs() < 2e-6, "{k}");
+    }
+    assert_eq!((said.duration_ticks, said.value_k_sr), (true_block.duration_ticks, true_block.value_k_sr));
+}
+
+#[test]
+fn a_clock_that_is_set_back_keeps_the_order_of_tags() {
+    let mut config = NavigationConfig::default();
+    config.time_tag_ms.step_rms = 3000.0;
+    config.time_tag_ms.step_every_s = 100.0;
+    let pass = led_astray(&config).pass(window(3));
+    let count = 5000_u32;
+    let true_block = VisibilityBlock {
+        start: window(3).start,
+        offset_ticks: (0..count).map(|k| k * 500_000).collect(),
+        duration_ticks: vec![500_000; count as usize],
+        value_k_sr: vec![num_complex::Complex32::ZERO; count as usize],
+        weight: vec![1.0; count as usize],
+        flags: vec![crate::frames::Flags::GOOD; count as usize],
+        ..VisibilityBlock::default()
+    };
+    let mut said = true_block.clone();
+    pass.tag(&mut said);
+    let late_s = |k: usize| said.middle_s(k) - true_block.middle_s(k);
+    let stood = (1..count as usize).filter(|&k| said.middle_s(k) - said.middle_s(k - 1) < 1e-5).count();
+    let off =
+        (0..count as usize).filter(|&k| (late_s(k) - pass.time_tag_s(true_block.middle_s(k))).abs() > 2e-6);
+    assert!((1..count as usize).all(|k| said.middle_s(k) > said.middle_s(k - 1)));
+    // Some twelve of 25 jumps are back, by seconds, which is a few integrations each.
+    assert!(stood > 10 && off.count() < 400, "{stood}");
+    assert!((0..count as usize).any(|k| late_s(k) > 1.0) && (0..count as usize).any(|k| late_s(k) < -1.0));
+}
+
+#[test]
+fn everything_wrong_with_navigation_is_said() {
+    let text = "along_m = { drift_rms = 1.0 }\nacross_m = { constant = [1.0, 2.0] }\nradial_m = { step_rms = 1.0 }\n\
+        time_tag_ms = { constant = [2e4], rate_per_day = [1.0, 1.0], drift_rms = 5.0 }";
+    let config: NavigationConfig = toml::from_str(text).unwrap();
+    let keys: Vec<String> = config.problems(8).into_iter().map(|problem| problem.key).collect();
+    let expected = [
+        "along_m.drift_rms",
+        "across_m.constant",
+        "radial_m.step_rms",
+        "time_tag_ms.rate_per_day",
+        "time_tag_ms",
+    ];
+    assert_eq!(keys, expected.map(|key| format!("navigation.{key}")));
 }

@@ -9,19 +9,20 @@ use crate::frames::ObservingWindow;
 /// errors change within a pass), daughter and channel: the natural
 /// logarithm of the gain's amplitude, its phase without the clock (deg), the clock (ns), the error of the position (m,
 /// along, across and away from the Moon), 1 for a dead receiver, the tilt of the antenna (deg, along the track and away from the
-/// Moon), and the distortion of its pattern.
+/// Moon), the distortion of its pattern, and the error of the time tags (ms).
 #[must_use]
 pub fn truth_csv(errors: &InstrumentErrors, windows: &[ObservingWindow]) -> String {
     let mut text = String::from(
         "pass,time_s,daughter,channel,frequency_hz,ln_amplitude,phase_deg,clock_ns,along_m,across_m,radial_m,dead,\
-         tilt_along_deg,tilt_radial_deg,pattern\n",
+         tilt_along_deg,tilt_radial_deg,pattern,time_tag_ms\n",
     );
     for window in windows {
         let pass = errors.pass(*window);
         let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
         let instants = [0.5 * (start_s + end_s), start_s, end_s];
-        let count = if errors.config.changes_in_a_pass() { 3 } else { 1 };
+        let count = if errors.changes_in_a_pass() { 3 } else { 1 };
         for t_s in instants.into_iter().take(count) {
+            let time_tag_ms = 1e3 * pass.time_tag_s(t_s);
             for daughter in 0..errors.satellites {
                 let [along, across, radial] = pass.offset_m(daughter, t_s);
                 let [tilt_along, tilt_radial, pattern] = pass.antenna(daughter, t_s);
@@ -31,7 +32,7 @@ pub fn truth_csv(errors: &InstrumentErrors, windows: &[ObservingWindow]) -> Stri
                     let _ = writeln!(
                         text,
                         "{},{t_s:.6},{},{},{},{:.9},{:.7},{clock_ns:.7},{along:.6},{across:.6},{radial:.6},{},\
-                         {tilt_along:.7},{tilt_radial:.7},{pattern:.9}",
+                         {tilt_along:.7},{tilt_radial:.7},{pattern:.9},{time_tag_ms:.6}",
                         window.index,
                         daughter + 1,
                         channel,

@@ -10,13 +10,13 @@ use super::autos::{AutoIntegrator, RowPowers};
 use super::integrate::{COMPLETE_MIN, DumpRule, GroupIntegrator, Presence, WINDOW_S_MAX, dump_samples};
 use super::kernel::{LANES, Packed, SLICE, correlate, no_sums};
 use super::spectra::{Divider, Division, Spectra};
-use crate::array::{Array, EarthShadow, segments_for};
-use crate::daughters::InstrumentErrors;
+use crate::array::{Array, EarthShadow};
+use crate::daughters::{InstrumentErrors, PassErrors};
 use crate::frames::{
     GroundFrame, Housekeeping, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame, VisibilityBlock,
 };
 use crate::mother::Schedule;
-use crate::mother::integrator::EPHEMERIS_STEP_S;
+use crate::mother::integrator::positions_said;
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::MissionTime;
 
@@ -82,13 +82,15 @@ pub struct Correlator {
     counts: Arc<Mutex<CorrelatorCounts>>,
     sampled: u64,
     samples: u64,
-    /// Errors of the positions in packets.
+    /// Errors of the positions and times in packets.
     errors: Option<Arc<InstrumentErrors>>,
 }
 
 /// The window being correlated.
 struct Running {
     window: ObservingWindow,
+    /// Errors of the positions and times in packets.
+    pass: Option<PassErrors>,
     aligner: Aligner,
     groups: Vec<ChannelGroup>,
     /// A row held until the next one arrives, which contains its delayed samples.
@@ -132,7 +134,7 @@ impl Correlator {
         }
     }
 
-    /// Adds errors of the positions in packets.
+    /// Adds errors of the positions and times in packets.
     #[must_use]
     pub fn with_errors(self, errors: Option<Arc<InstrumentErrors>>) -> Self {
         Self { errors, ..self }
@@ -151,10 +153,7 @@ impl Correlator {
         let end = MissionTime::from_seconds(window.start.seconds() + WINDOW_S_MAX);
         window.end = window.end.min(end);
         out.push(GroundFrame::Instrument(setup.instrument.clone()));
-        for mut segment in segments_for(&setup.array, window.start, window.end, EPHEMERIS_STEP_S) {
-            if let Some(pass) = &pass {
-                pass.mislead(&mut segment, &setup.array);
-            }
+        for segment in positions_said(&setup.array, window, pass.as_ref()) {
             out.push(GroundFrame::Ephemeris(segment));
         }
         let streams = StreamShape {
@@ -182,7 +181,7 @@ impl Correlator {
             samples: 0,
         };
         let groups = setup.schedules.chunks(LANES).enumerate().map(group).collect();
-        self.running = Some(Running { window, aligner, groups, held: None });
+        self.running = Some(Running { window, pass, aligner, groups, held: None });
     }
 
     /// Accepts the next row of a window; with delays, processes the row before it.
@@ -218,7 +217,7 @@ impl Correlator {
             }
         }
         self.samples += row.blocks.iter().flatten().map(|block| block.samples.len() as u64).sum::<u64>();
-        self.emit(made, out);
+        self.emit(made, running.pass.as_ref(), out);
     }
 
     fn process_group(&self, group: &mut ChannelGroup, row: &BlockRow, made: &mut Vec<VisibilityBlock>) {
@@ -329,8 +328,11 @@ impl Correlator {
         }
     }
 
-    fn emit(&mut self, made: Vec<VisibilityBlock>, out: &mut Outlet<GroundFrame>) {
-        for block in made {
+    fn emit(&mut self, made: Vec<VisibilityBlock>, pass: Option<&PassErrors>, out: &mut Outlet<GroundFrame>) {
+        for mut block in made {
+            if let Some(pass) = pass {
+                pass.tag(&mut block);
+            }
             self.sampled += block.len() as u64;
             out.push(GroundFrame::Visibilities(block));
         }
@@ -354,7 +356,7 @@ impl Correlator {
                 autos.finish(ticks as u32, &mut made);
             }
         }
-        self.emit(made, out);
+        self.emit(made, running.pass.as_ref(), out);
         let mut counts = lock(&self.counts);
         counts.blocks.add(running.aligner.counts());
         counts.visibilities = self.sampled;

@@ -111,6 +111,10 @@ pub struct EphemerisSummary {
     pub covered_s: f64,
     /// Intervals covered: start and end, s since the mission epoch.
     pub covered: Listing<[f64; 2]>,
+    /// Segments that say other positions than one that begins at the same time, which the ground keeps.
+    pub contradictory: u64,
+    /// Greatest error of positions between nodes, m, as the nodes themselves tell; `None` without segments.
+    pub interpolation_error_m_max: Option<f64>,
 }
 
 /// The spacecraft's own counts: the latest report.

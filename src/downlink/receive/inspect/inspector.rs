@@ -10,6 +10,7 @@ use super::contents::{
     HousekeepingSummary, InstrumentSummary, KindSummary, PairSummary, TimeSpan, VisibilityCounts,
 };
 use super::tai_text;
+use crate::array::interpolation_error_m;
 use crate::downlink::error::{DownlinkError, io_error};
 use crate::downlink::receive::{Decoder, Event, EventReader, LISTED_MAX, Listing, ReceptionCounters};
 use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
@@ -119,6 +120,10 @@ struct Inspector {
     total: Tally,
     segments: u64,
     nodes: u64,
+    interpolation_error_m: Option<f64>,
+    /// By start: a checksum of a segment's positions. As many as intervals are kept apart.
+    told: BTreeMap<MissionTime, u64>,
+    contradictory: u64,
     covered: EphemerisCoverage,
     housekeeping: Option<Housekeeping>,
     seen: [KindExtent; Kind::ALL.len()],
@@ -180,6 +185,19 @@ impl Inspector {
     fn see_segment(&mut self, segment: &EphemerisSegment) {
         self.segments += 1;
         self.nodes += segment.nodes() as u64;
+        let bytes: Vec<u8> =
+            segment.positions_m.as_flattened().iter().flat_map(|x| x.to_le_bytes()).collect();
+        let sum =
+            crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes) ^ u64::from(segment.step_ticks);
+        match self.told.get(&segment.start) {
+            Some(known) => self.contradictory += u64::from(*known != sum),
+            None if self.told.len() < COVERED_MAX => drop(self.told.insert(segment.start, sum)),
+            None => {}
+        }
+        self.interpolation_error_m = [self.interpolation_error_m, interpolation_error_m(segment)]
+            .into_iter()
+            .flatten()
+            .reduce(f64::max);
         self.covered.add(segment.start, segment.end());
     }
 
@@ -242,7 +260,11 @@ impl Inspector {
             packets: packets.into(),
             visibilities: self.total.counts(),
             baselines: self.rows.iter().map(pair).collect(),
-            ephemeris: self.covered.summary(self.segments, self.nodes),
+            ephemeris: EphemerisSummary {
+                contradictory: self.contradictory,
+                interpolation_error_m_max: self.interpolation_error_m,
+                ..self.covered.summary(self.segments, self.nodes)
+            },
             housekeeping: self.housekeeping.map(|counts| HousekeepingSummary {
                 time_s: (!counts.is_last()).then(|| counts.time.seconds()),
                 sampled: counts.sampled,
@@ -327,6 +349,7 @@ impl EphemerisCoverage {
             // An empty sum of f64 is -0.
             covered_s: each().fold(0.0, |sum, [start_s, end_s]| sum + (end_s - start_s)),
             covered: Listing { count: self.0.intervals() as u64, listed: each().take(LISTED_MAX).collect() },
+            ..EphemerisSummary::default()
         }
     }
 }

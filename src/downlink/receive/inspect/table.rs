@@ -76,7 +76,18 @@ impl Contents {
         let ephemeris = &self.ephemeris;
         let (segments, intervals) = (ephemeris.segments, ephemeris.covered.count);
         let covered = duration(ephemeris.covered_s);
-        writeln!(f, "ephemeris     {segments} segments over {covered} in {intervals} intervals")
+        writeln!(f, "ephemeris     {segments} segments over {covered} in {intervals} intervals")?;
+        match ephemeris.contradictory {
+            0 => {}
+            1 => writeln!(f, "              1 segment contradicts another that begins at the same time")?,
+            count => {
+                writeln!(f, "              {count} segments contradict others that begin at the same time")?
+            }
+        }
+        match ephemeris.interpolation_error_m_max {
+            Some(error_m) => writeln!(f, "              positions between nodes to {}", length(error_m)),
+            None => Ok(()),
+        }
     }
 
     fn show_packets(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -220,5 +231,14 @@ fn show_list<T>(
     match listing.count.saturating_sub(SHOWN_MAX as u64) {
         0 => Ok(()),
         more => writeln!(f, "  and {more} more"),
+    }
+}
+
+/// A length with a unit in which it is not too long.
+fn length(length_m: f64) -> String {
+    match length_m {
+        m if m < 1e-4 => format!("{:.2} um", 1e6 * m),
+        m if m < 1e-1 => format!("{:.2} mm", 1e3 * m),
+        m => format!("{m:.3} m"),
     }
 }

@@ -1,0 +1,73 @@
+//! What the packets say of positions and times, and what was flown: orbit determination and the formation's clock.
+
+use serde::{Deserialize, Serialize};
+
+use super::config::ErrorTerms;
+use crate::units::{Checks, InvalidValue};
+
+/// Greatest error of a time tag, s. Ephemeris packets reach as far beyond a pass, so that tags find positions.
+pub(super) const TIME_TAG_S_MAX: f64 = 10.0;
+
+/// The `[navigation]` section: what the packets say less what is true. Without any of it, data are as they are without the
+/// section.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct NavigationConfig {
+    /// Error of the position in the packets along the track, m, by daughter: what they say less what was flown.
+    pub along_m: ErrorTerms,
+    /// The same across the track, along the orbit's normal, m.
+    pub across_m: ErrorTerms,
+    /// The same away from the Moon, m.
+    pub radial_m: ErrorTerms,
+    /// Error of the time tags of all data, ms: what they say less the time at which it was measured. Positions in packets are of
+    /// the true time, so that the ground takes each visibility for one from where the satellites are this much later.
+    pub time_tag_ms: ErrorTerms,
+}
+
+impl NavigationConfig {
+    /// Whether anything in the packets is off.
+    #[must_use]
+    pub fn is_on(&self) -> bool {
+        self.terms().iter().any(|(_, terms)| !terms.is_none())
+    }
+
+    /// Whether time tags are off.
+    #[must_use]
+    pub fn moves_tags(&self) -> bool {
+        !self.time_tag_ms.is_none()
+    }
+
+    /// Whether anything changes within a pass.
+    #[must_use]
+    pub fn changes_in_a_pass(&self) -> bool {
+        self.terms().iter().any(|(_, terms)| terms.changes_in_a_pass())
+    }
+
+    fn terms(&self) -> [(&'static str, &ErrorTerms); 4] {
+        [
+            ("along_m", &self.along_m),
+            ("across_m", &self.across_m),
+            ("radial_m", &self.radial_m),
+            ("time_tag_ms", &self.time_tag_ms),
+        ]
+    }
+
+    /// Everything that is wrong with the section for an array of `satellites`. Empty if it is good.
+    #[must_use]
+    pub fn problems(&self, satellites: usize) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("navigation");
+        for (name, terms) in self.terms() {
+            let of_tags = name == "time_tag_ms";
+            let of = if of_tags { (1, "for the formation") } else { (satellites, "a daughter") };
+            terms.check(name, of, !of_tags, &mut checks);
+        }
+        let terms = &self.time_tag_ms;
+        let rms = [terms.constant_rms, terms.pass_rms, terms.orbit_rms, terms.drift_rms, terms.step_rms];
+        let most = terms.constant.iter().chain(&rms).fold(0.0, |most: f64, ms| most.max(ms.abs()));
+        let most_ms = 1e3 * TIME_TAG_S_MAX;
+        let expected =
+            format!("time tags that are off by at most {most_ms} ms; further ones are kept to that");
+        checks.number("time_tag_ms", most, most <= most_ms, expected);
+        checks.finish()
+    }
+}
