@@ -24,6 +24,14 @@ const DAYS_BEFORE_1970: f64 = 12.0 * 365.0 + 3.0;
 /// TDB less TAI, s, but for milliseconds.
 const TDB_LESS_TAI_S: f64 = 32.184;
 
+/// TAI, s from 1958-01-01T00:00:00, of a date such as 2030-01-31T12:00:00 on that scale; `None` of other text.
+#[must_use]
+pub fn tai_s_of(date: &str) -> Option<f64> {
+    // Z is the mark of UTC, which is whole seconds off.
+    let from_1970_s = Some(date).filter(|date| !date.ends_with('Z')).and_then(seconds)?;
+    Some(from_1970_s + DAYS_BEFORE_1970 * DAY_S)
+}
+
 impl OemExport {
     /// The epoch (TDB) that is `tai_s` from 1958-01-01T00:00:00 TAI.
     #[must_use]

@@ -24,7 +24,7 @@ mod windows;
 pub use baseline::scaled_baseline;
 pub use config::{ArrayConfig, ArrayError, BreathingConfig, NodeMotion, Spacing};
 pub use ephemeris::{Ephemeris, Insertion, segments_for};
-pub use export::OemExport;
+pub use export::{OemExport, tai_s_of};
 pub use formation::{Formation, Progression};
 pub use integration::{IntegrationRule, integration_time_s};
 pub use interpolation::interpolation_error_m;

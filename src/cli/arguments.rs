@@ -7,6 +7,7 @@ use clap::Args;
 use clap::builder::{PathBufValueParser, TypedValueParser};
 
 use super::output::print_notes;
+use crate::array::tai_s_of;
 use crate::ground::GroundError;
 use crate::pipeline::{Config, ConfigError, ConfigSource, GroupSize, MemoryLimit};
 use crate::sky::Frame;
@@ -216,6 +217,35 @@ pub(super) fn time_s(text: &str) -> Result<f64, String> {
     }
 }
 
+/// A time of the mission: since its epoch, or a date.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum TimeOfMission {
+    /// Since the epoch, s.
+    Since(f64),
+    /// TAI since 1958, s.
+    Tai(f64),
+}
+
+impl TimeOfMission {
+    /// Seconds since an epoch, which is TAI since 1958, s.
+    pub(super) fn since_s(self, epoch_tai_s: f64) -> f64 {
+        match self {
+            Self::Since(time_s) => time_s,
+            Self::Tai(tai_s) => tai_s - epoch_tai_s,
+        }
+    }
+}
+
+/// A time such as `7d`, or a date such as `2027-01-08T12:00:00`.
+pub(super) fn time_of_mission(text: &str) -> Result<TimeOfMission, String> {
+    match tai_s_of(text) {
+        Some(tai_s) => Ok(TimeOfMission::Tai(tai_s)),
+        None => time_s(text).map(TimeOfMission::Since).map_err(|expected| {
+            format!("{expected}; or a date, TAI as inspect shows it, such as 2027-01-08T12:00:00")
+        }),
+    }
+}
+
 /// A band in Hz, for messages.
 pub(super) fn band_text([low_hz, high_hz]: [f64; 2]) -> String {
     format!("{} to {}", Dimension::Frequency.show(low_hz), Dimension::Frequency.show(high_hz))
@@ -237,6 +267,19 @@ pub(super) fn not_negative_s(text: &str) -> Result<f64, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn times_are_numbers_or_dates() {
+        // 2027-01-01T00:00:00 is 69 years and 17 leap days after 1958.
+        let epoch_tai_s = (69.0 * 365.0 + 17.0) * 86_400.0;
+        let since = |text| time_of_mission(text).map(|time| time.since_s(epoch_tai_s));
+        assert_eq!(since("1.5h"), Ok(5400.0));
+        assert_eq!(since("2027-01-08T12:00:00"), Ok(7.5 * 86_400.0));
+        assert_eq!(since("2026-12-31T23:59:59.5"), Ok(-0.5));
+        for text in ["2027-01-08T12:00:00Z", "2027-02-30T00:00:00", "2027-01-08", "soon"] {
+            assert!(since(text).unwrap_err().contains("or a date, TAI"), "{text}");
+        }
+    }
 
     #[test]
     fn channels_are_numbers_and_ranges() {

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::arguments::{input_path, output_path, time_s};
+use super::arguments::{TimeOfMission, input_path, output_path, time_of_mission};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::figures::{FIGURES, FigureRequest, make_figure};
 use crate::pipeline::{ConfigSource, Plan, use_threads};
@@ -40,10 +40,10 @@ pub(super) struct FigureArgs {
     /// Pair of rows and waterfall, such as 1-2; the one closest to 2 b_p if not given.
     #[arg(long)]
     pair: Option<Pair>,
-    /// Time of rows and waterfall since the mission epoch: a number with an optional unit s, h or d; the middle of the first
-    /// window if not given.
-    #[arg(long = "at", value_name = "TIME", value_parser = time_s)]
-    at_s: Option<f64>,
+    /// Time of rows and waterfall since the mission epoch, a number with an optional unit s, h or d, or a date (TAI); the middle of the
+    /// first window if not given.
+    #[arg(long, value_name = "TIME", value_parser = time_of_mission)]
+    at: Option<TimeOfMission>,
     /// Print the numbers as one JSON object.
     #[arg(long)]
     json: bool,
@@ -53,7 +53,8 @@ pub(super) fn execute(args: &FigureArgs) -> CommandResult {
     let source = ConfigSource { file: args.pipeline.clone(), overrides: args.overrides.clone(), seed: None };
     let plan = Plan::new(source.load()?)?;
     use_threads(&plan.config.runtime)?;
-    let request = FigureRequest { name: args.name.clone(), pair: args.pair, at_s: args.at_s };
+    let at_s = args.at.map(|time| time.since_s(plan.config.spacecraft.epoch_tai_s));
+    let request = FigureRequest { name: args.name.clone(), pair: args.pair, at_s };
     let made = make_figure(&request, &plan, &args.out)?;
     if args.json {
         print_json_line(&made)?;

@@ -3,7 +3,7 @@
 use clap::Args;
 use serde::Serialize;
 
-use super::arguments::{ArrayArgs, band_text, frequency_hz, time_s};
+use super::arguments::{ArrayArgs, TimeOfMission, band_text, frequency_hz, time_of_mission};
 use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
 use crate::array::{Array, integration_time_s};
 use crate::mother::BAND_HZ;
@@ -18,9 +18,10 @@ use crate::units::{Dimension, all_pairs};
 /// Example: lunarray geometry --at 0 12h 7d --freq-hz 3e6
 #[derive(Debug, Args)]
 pub(super) struct GeometryArgs {
-    /// Times since the mission epoch: numbers with an optional unit s, h or d, such as 7d.
-    #[arg(long = "at", value_name = "TIME", num_args = 1.., required = true, allow_negative_numbers = true, value_parser = time_s)]
-    at_s: Vec<f64>,
+    /// Times since the mission epoch, numbers with an optional unit s, h or d, such as 7d; or dates, TAI as inspect shows them, such as
+    /// 2027-01-08T12:00:00.
+    #[arg(long = "at", value_name = "TIME", num_args = 1.., required = true, allow_negative_numbers = true, value_parser = time_of_mission)]
+    at: Vec<TimeOfMission>,
     /// Frequency for the integration times, Hz, or with a unit, such as 3MHz.
     #[arg(long, default_value = "10MHz", value_parser = frequency_hz)]
     freq_hz: f64,
@@ -60,7 +61,8 @@ pub(super) fn execute(args: &GeometryArgs) -> CommandResult {
     let config = args.array.source().load()?;
     print_config_notes(&config);
     let array = Array::new(&config.array)?;
-    for &t_s in &args.at_s {
+    for time in &args.at {
+        let t_s = time.since_s(config.spacecraft.epoch_tai_s);
         let rule = config.spacecraft.rule();
         let states: Vec<_> = (0..array.satellites()).map(|n| array.state(n, t_s)).collect();
         let pairs = all_pairs(array.satellites()).into_iter().map(|pair| {

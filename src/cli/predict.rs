@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::arguments::{ArrayArgs, MapFileArgs, band_text, frequency_hz, time_s};
+use super::arguments::{ArrayArgs, MapFileArgs, TimeOfMission, band_text, frequency_hz, time_of_mission};
 use super::lines::next_line;
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
 use crate::array::Array;
@@ -32,13 +32,14 @@ pub(super) struct PredictArgs {
     #[command(flatten)]
     maps: MapFileArgs,
     /// Frequency, Hz, or with a unit, such as 3MHz.
-    #[arg(long, requires = "at_s", value_parser = frequency_hz)]
+    #[arg(long, requires = "at", value_parser = frequency_hz)]
     freq_hz: Option<f64>,
-    /// Time since the mission epoch: a number with an optional unit s, h or d, such as 7d.
-    #[arg(long = "at", value_name = "TIME", requires_all = ["freq_hz", "pair"], value_parser = time_s)]
-    at_s: Option<f64>,
+    /// Time since the mission epoch, a number with an optional unit s, h or d, such as 7d; or a date, TAI as inspect shows it, such as
+    /// 2027-01-08T12:00:00.
+    #[arg(long, value_name = "TIME", requires_all = ["freq_hz", "pair"], value_parser = time_of_mission)]
+    at: Option<TimeOfMission>,
     /// Pair of satellites, such as 1-2.
-    #[arg(long, requires = "at_s")]
+    #[arg(long, requires = "at")]
     pair: Option<Pair>,
     /// Print one JSON object per line: t_s, i, j, freq_hz, re, im (K sr).
     #[arg(long)]
@@ -93,7 +94,8 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
             answer.im
         ))
     };
-    if let (Some(t_s), Some(pair), Some(freq_hz)) = (args.at_s, args.pair, args.freq_hz) {
+    if let (Some(time), Some(pair), Some(freq_hz)) = (args.at, args.pair, args.freq_hz) {
+        let t_s = time.since_s(config.spacecraft.epoch_tai_s);
         answer(VisibilityQuery { t_s, pair, freq_hz })?;
         return Ok(Completion::Done);
     }

@@ -126,6 +126,8 @@ fn units_are_accepted_in_arguments_and_settings() {
         said(&["geometry", "--at", "1.5h", "--freq-hz", "3MHz"]),
         said(&["geometry", "--at", "5400", "--freq-hz", "3e6"])
     );
+    // The mission begins on 2027-01-01.
+    assert_eq!(said(&["geometry", "--at", "2027-01-08T12:00:00"]), said(&["geometry", "--at", "7.5d"]));
     let with = |keys: [&str; 2]| {
         let keys = keys.iter().flat_map(|key| ["--set", key]);
         let args: Vec<&str> = ["check", "--json"].into_iter().chain(keys).collect();
