@@ -11,8 +11,10 @@
 mod bessel;
 mod border;
 mod cap;
+mod frames;
 mod lanes;
 mod operator;
+mod phases;
 mod plan;
 mod turns;
 mod view;

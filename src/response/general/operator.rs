@@ -2,12 +2,13 @@
 
 use std::ops::Range;
 
-use faer::{Accum, MatMut, MatRef, Par};
 use num_complex::Complex64;
 use rayon::prelude::*;
 
 use super::cap::{CapBuffers, CapClass, NodePatterns, Patterns, batch_bytes};
+use super::frames::{Frames, Turned};
 use super::lanes::{LANES, Lanes, VALUES, Value};
+use super::phases::{PaddedShares, PhaseGrid, PhaseTable};
 use super::plan::{GROUP_NODES, Pass, RowNode, RowPlan, tables_bytes};
 use super::turns::{QuarterTurns, place};
 use super::{PairAt, RowsError, RowsSetup};
@@ -18,9 +19,6 @@ use crate::sky::harmonics::Alm;
 /// Rows of one class that a task computes together.
 const BATCH: usize = 32;
 
-/// Rows that are interpolated by one product of matrices.
-const ROWS: usize = 64;
-
 /// Groups whose gradients are held until they are added.
 const GROUPS_AT_ONCE: usize = 32;
 
@@ -30,6 +28,7 @@ pub struct GeneralRows {
     setup: RowsSetup,
     turns: QuarterTurns,
     patterns: Patterns,
+    phases: PhaseGrid,
 }
 
 impl GeneralRows {
@@ -37,7 +36,7 @@ impl GeneralRows {
     #[must_use]
     pub fn new(setup: RowsSetup) -> Self {
         let turns = QuarterTurns::new(setup.l_max);
-        Self { patterns: Patterns::new(setup), turns, setup }
+        Self { patterns: Patterns::new(setup), phases: PhaseGrid::new(setup.l_max), turns, setup }
     }
 
     /// Setup.
@@ -70,9 +69,11 @@ impl GeneralRows {
             let passes = &plan.passes[group.clone()];
             let mut amplitudes = self.no_amplitudes(passes, skies.len());
             let mut buffers = CapBuffers::default();
+            let frames = self.frames(plan, passes);
+            let basis = frames.as_ref().map(|frames| (frames, self.turned(&frames.chosen, skies)));
             for places in Self::batches(plan, passes) {
                 let Some(batch) = self.batch(plan, passes, &tables, &mut buffers, places) else { continue };
-                self.amplitudes(&batch, skies, &mut amplitudes);
+                self.amplitudes(&batch, skies, basis.as_ref(), &mut amplitudes);
             }
             self.interpolate(plan, passes, &amplitudes, skies.len())
         });
@@ -94,11 +95,16 @@ impl GeneralRows {
                 let amplitudes = self.spread(plan, passes, &values);
                 let mut gradients = vec![Alm::zeros(self.setup.l_max); values.len()];
                 let mut buffers = CapBuffers::default();
+                let frames = self.frames(plan, passes);
+                let mut basis = frames.as_ref().map(|frames| (frames, self.no_turned(frames, values.len())));
                 for places in Self::batches(plan, passes) {
                     let Some(batch) = self.batch(plan, passes, &tables, &mut buffers, places) else {
                         continue;
                     };
-                    self.gradients(&batch, &amplitudes, &mut gradients);
+                    self.gradients(&batch, &amplitudes, basis.as_mut(), &mut gradients);
+                }
+                if let Some((frames, turned)) = &basis {
+                    self.turn_back(&frames.chosen, turned, &mut gradients);
                 }
                 gradients
             });
@@ -124,7 +130,11 @@ impl GeneralRows {
                     .into_iter()
                     .filter_map(|places| self.batch(plan, passes, &tables, &mut buffers, places))
                     .collect();
-                batches.iter().for_each(|batch| self.amplitudes(batch, skies, &mut amplitudes));
+                let frames = self.frames(plan, passes);
+                let basis = frames.as_ref().map(|frames| (frames, self.turned(&frames.chosen, skies)));
+                let one = |batch: &Batch| self.amplitudes(batch, skies, basis.as_ref(), &mut amplitudes);
+                batches.iter().for_each(one);
+                drop(basis);
                 let seen = self.interpolate(plan, passes, &amplitudes, skies.len());
                 let weight = &weight[rows_of(passes)];
                 let weighted: Vec<Vec<Complex64>> =
@@ -132,7 +142,13 @@ impl GeneralRows {
                 let weighted: Vec<&[Complex64]> = weighted.iter().map(Vec::as_slice).collect();
                 let amplitudes = self.spread(plan, passes, &weighted);
                 let mut gradients = vec![Alm::zeros(self.setup.l_max); skies.len()];
-                batches.iter().for_each(|batch| self.gradients(batch, &amplitudes, &mut gradients));
+                let mut basis = frames.as_ref().map(|frames| (frames, self.no_turned(frames, skies.len())));
+                for batch in &batches {
+                    self.gradients(batch, &amplitudes, basis.as_mut(), &mut gradients);
+                }
+                if let Some((frames, turned)) = &basis {
+                    self.turn_back(&frames.chosen, turned, &mut gradients);
+                }
                 (seen, gradients)
             });
             let parts: Vec<_> = parts.collect();
@@ -142,6 +158,17 @@ impl GeneralRows {
             }
         }
         (joined(plan, skies.len(), seen), out)
+    }
+
+    /// How the frames of the passes' nodes are combined of some of them, if they are.
+    fn frames(&self, plan: &RowPlan, passes: &[Pass]) -> Option<Frames> {
+        if plan.direct { None } else { Frames::new(&plan.nodes[nodes_of(passes)], self.setup.l_max) }
+    }
+
+    /// Room for gradients of skies in the chosen frames.
+    fn no_turned(&self, frames: &Frames, skies: usize) -> Turned {
+        let (l_max, columns) = (self.setup.l_max, lanes_of(&frames.chosen) * skies);
+        (0..=l_max).map(|mu| [0, 1].map(|_| vec![0.0; columns * degrees(l_max, mu)])).collect()
     }
 
     /// Orders of an amplitude, mu = -l_max ..= l_max, and what fills the last vector.
@@ -183,10 +210,15 @@ impl GeneralRows {
         Some(Batch { places, nodes, patterns })
     }
 
-    /// Writes the amplitudes of a batch.
-    fn amplitudes(&self, batch: &Batch, skies: &[Alm], out: &mut [f64]) {
+    /// Writes the amplitudes of a batch; `basis` has the skies in the frames of which those of the batch are combined.
+    fn amplitudes(&self, batch: &Batch, skies: &[Alm], basis: Option<&(&Frames, Turned)>, out: &mut [f64]) {
         let (orders, l_max) = (self.orders(), self.setup.l_max);
-        let turned = self.turned(&batch.nodes, skies);
+        let turned = match basis {
+            None => self.turned(&batch.nodes, skies),
+            Some((frames, turned)) => {
+                frames.combined(turned, &frames.weights_of(&batch.places), [l_max, skies.len()])
+            }
+        };
         let lanes = lanes_of(&batch.nodes);
         for (mu, [re, im]) in turned.iter().enumerate() {
             for (group, places) in batch.places.chunks(LANES).enumerate() {
@@ -206,12 +238,18 @@ impl GeneralRows {
         }
     }
 
-    /// The transpose of [`Self::amplitudes`], added to `out`.
-    fn gradients(&self, batch: &Batch, amplitudes: &[f64], out: &mut [Alm]) {
+    /// The transpose of [`Self::amplitudes`], added to the gradients of what it is combined of, or to `out`.
+    fn gradients(
+        &self,
+        batch: &Batch,
+        amplitudes: &[f64],
+        basis: Option<&mut (&Frames, Turned)>,
+        out: &mut [Alm],
+    ) {
         let (orders, l_max, skies) = (self.orders(), self.setup.l_max, out.len());
         let lanes = lanes_of(&batch.nodes);
         let at = |place: usize| amplitudes[place] as Value;
-        let turned: Vec<[Vec<Value>; 2]> = (0..=l_max)
+        let turned: Turned = (0..=l_max)
             .map(|mu| {
                 let [mut re, mut im] = [0, 1].map(|_| vec![0.0; degrees(l_max, mu) * skies * lanes]);
                 for (group, places) in batch.places.chunks(LANES).enumerate() {
@@ -233,16 +271,21 @@ impl GeneralRows {
                 [re, im]
             })
             .collect();
-        self.turn_back(&batch.nodes, &turned, out);
+        match basis {
+            None => self.turn_back(&batch.nodes, &turned, out),
+            Some((frames, sums)) => {
+                frames.shared(&turned, &frames.weights_of(&batch.places), sums, [l_max, skies]);
+            }
+        }
     }
 
     /// Skies in the frames of nodes, by mu: real and imaginary parts of `t_{l mu}`, `[l = mu, mu + 2, ..][sky][lane]`.
-    fn turned(&self, nodes: &[RowNode], skies: &[Alm]) -> Vec<[Vec<Value>; 2]> {
+    fn turned(&self, nodes: &[RowNode], skies: &[Alm]) -> Turned {
         let l_max = self.setup.l_max;
         let lanes = lanes_of(nodes);
         let columns = lanes * skies.len();
         let phases = Phases::new(nodes, l_max);
-        let mut out: Vec<[Vec<Value>; 2]> =
+        let mut out: Turned =
             (0..=l_max).map(|mu| [0, 1].map(|_| vec![0.0; columns * degrees(l_max, mu)])).collect();
         let mut buffers = [0, 1].map(|_| [0, 1].map(|_| vec![0.0; columns * (l_max + 1)]));
         for l in 0..=l_max {
@@ -333,7 +376,9 @@ impl GeneralRows {
         let first = nodes_of(passes).start;
         let width = 2 * self.orders();
         let mut out = vec![Vec::with_capacity(rows_of(passes).len()); skies];
-        let (mut shares, mut sums) = (Vec::new(), vec![0.0; ROWS * skies * width]);
+        let (mut table, mut shares, mut padded) =
+            (PhaseTable::default(), Vec::new(), PaddedShares::default());
+        let mut values = vec![Complex64::ZERO; skies];
         for pass in passes {
             let amplitudes = &amplitudes[(pass.nodes.start - first) * skies * width..];
             let amplitudes = &amplitudes[..pass.nodes.len() * skies * width];
@@ -345,22 +390,12 @@ impl GeneralRows {
                 }
                 continue;
             }
-            for rows in blocks(&pass.rows) {
-                plan.shares(pass, rows.clone(), &mut shares);
-                let sums = &mut sums[..rows.len() * skies * width];
-                faer::linalg::matmul::matmul(
-                    MatMut::from_row_major_slice_mut(sums, rows.len(), skies * width),
-                    Accum::Replace,
-                    MatRef::from_row_major_slice(&shares, rows.len(), pass.nodes.len()),
-                    MatRef::from_row_major_slice(amplitudes, pass.nodes.len(), skies * width),
-                    1.0,
-                    Par::Seq,
-                );
-                for (row, sums) in rows.zip(sums.chunks_exact(skies * width)) {
-                    for (out, g) in out.iter_mut().zip(sums.chunks_exact(width)) {
-                        out.push(self.at_phase(g, plan.gamma_rad[row]));
-                    }
-                }
+            self.phases.fill(amplitudes, width / 2, [pass.nodes.len(), skies], &mut table);
+            for row in pass.rows.clone() {
+                plan.shares(pass, row, &mut shares);
+                padded.set(&table, &shares);
+                self.phases.at(&table, plan.gamma_rad[row], &padded, &mut values);
+                out.iter_mut().zip(&values).for_each(|(out, value)| out.push(*value));
             }
         }
         out
@@ -377,47 +412,34 @@ impl GeneralRows {
         let (first, first_row) = (nodes_of(passes).start, rows_of(passes).start);
         let (width, skies) = (2 * self.orders(), values.len());
         let mut out = self.no_amplitudes(passes, skies);
-        let (mut shares, mut terms) = (Vec::new(), vec![0.0; ROWS * skies * width]);
-        let write = |row: usize, to: &mut [f64]| {
-            for (values, to) in values.iter().zip(to.chunks_exact_mut(width)) {
-                let gamma_rad = plan.gamma_rad[row];
-                let lowest = values[row - first_row] * Complex64::cis(-(self.setup.l_max as f64) * gamma_rad);
-                let (re, im) = to.split_at_mut(width / 2);
-                phase_terms(lowest, gamma_rad, re, im);
-            }
-        };
+        let (mut table, mut shares, mut padded) =
+            (PhaseTable::default(), Vec::new(), PaddedShares::default());
+        let mut of_row = vec![Complex64::ZERO; skies];
         for pass in passes {
             let out = &mut out[(pass.nodes.start - first) * skies * width..];
             let out = &mut out[..pass.nodes.len() * skies * width];
             if pass.tau.is_empty() {
-                pass.rows
-                    .clone()
-                    .zip(out.chunks_exact_mut(skies * width))
-                    .for_each(|(row, to)| write(row, to));
+                for (row, to) in pass.rows.clone().zip(out.chunks_exact_mut(skies * width)) {
+                    let gamma_rad = plan.gamma_rad[row];
+                    for (values, to) in values.iter().zip(to.chunks_exact_mut(width)) {
+                        let turn = Complex64::cis(-(self.setup.l_max as f64) * gamma_rad);
+                        let (re, im) = to.split_at_mut(width / 2);
+                        phase_terms(values[row - first_row] * turn, gamma_rad, re, im);
+                    }
+                }
                 continue;
             }
-            for rows in blocks(&pass.rows) {
-                plan.shares(pass, rows.clone(), &mut shares);
-                let terms = &mut terms[..rows.len() * skies * width];
-                rows.clone().zip(terms.chunks_exact_mut(skies * width)).for_each(|(row, to)| write(row, to));
-                faer::linalg::matmul::matmul(
-                    MatMut::from_row_major_slice_mut(out, pass.nodes.len(), skies * width),
-                    Accum::Add,
-                    MatRef::from_row_major_slice(&shares, rows.len(), pass.nodes.len()).transpose(),
-                    MatRef::from_row_major_slice(terms, rows.len(), skies * width),
-                    1.0,
-                    Par::Seq,
-                );
+            self.phases.clear(&mut table, [pass.nodes.len(), skies]);
+            for row in pass.rows.clone() {
+                plan.shares(pass, row, &mut shares);
+                padded.set(&table, &shares);
+                of_row.iter_mut().zip(values).for_each(|(to, values)| *to = values[row - first_row]);
+                self.phases.add(&mut table, plan.gamma_rad[row], &padded, &of_row);
             }
+            self.phases.collect(&mut table, width / 2, out);
         }
         out
     }
-}
-
-/// Consecutive rows, in blocks.
-fn blocks(rows: &Range<usize>) -> impl Iterator<Item = Range<usize>> + use<> {
-    let end = rows.end;
-    rows.clone().step_by(ROWS).map(move |start| start..(start + ROWS).min(end))
 }
 
 /// Nodes of a batch, and what fills the last vector.

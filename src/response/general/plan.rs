@@ -30,12 +30,21 @@ const GAP_S: f64 = 900.0;
 const POSITIONS: usize = 8;
 const POSITION_STEP_S_MAX: f64 = 120.0;
 
+/// Change of a velocity at an instant, m/s, that divides a pass: what follows from positions is not smooth there. The turnarounds of a
+/// breathing formation change it by 0.2 m/s.
+const KINK_M_S: f64 = 1e-4;
+
+/// Visibilities from one that is looked at for a kink to the next, and the longest steps, s, for which the polynomial goes through as
+/// distant ones: longer it would not follow a smooth orbit.
+const KINK_STRIDE: usize = 4;
+const KINK_STEP_S_MAX: f64 = 20.0;
+
 /// Most rows from which others are interpolated together: more are longer to interpolate from, not more exact.
 const NODES_MAX: usize = 40;
 
 /// Width of a class of limbs that share quadrature points, in units of a harmonic's wave length over 2 pi: what lies between
 /// a class's limb and a pair's takes a series of as many terms more. With little memory classes are wider.
-const CLASS_WIDTH: f64 = 0.5;
+const CLASS_WIDTH: f64 = 1.5;
 const CLASSES_BYTES: f64 = 8e8;
 
 /// Most classes of limbs.
@@ -87,6 +96,8 @@ pub struct RowPlan {
     /// By row: its time within the pass, -1 to 1.
     pub(super) tau: Vec<f64>,
     pub(super) classes: Vec<NodeClass>,
+    /// Whether each row is computed for itself, with nothing in common with others.
+    pub(super) direct: bool,
 }
 
 impl RowPlan {
@@ -113,6 +124,7 @@ impl RowPlan {
             gamma_rad: vec![0.0; pairs.len()],
             tau: vec![0.0; pairs.len()],
             classes: classes.all(),
+            direct,
         };
         let mut first = 0;
         while first < pairs.len() {
@@ -122,7 +134,11 @@ impl RowPlan {
             };
             let end = (first + 1..pairs.len()).take_while(together).last().map_or(first + 1, |k| k + 1);
             let pass = PassBuilder { setup, pairs, views: &views, classes: &classes, direct };
-            pass.split(first..end, &mut plan);
+            if direct {
+                pass.each(first..end, &mut plan);
+            } else {
+                pass.smooth(first..end, &mut plan);
+            }
             first = end;
         }
         plan.group();
@@ -153,20 +169,17 @@ impl RowPlan {
         }
     }
 
-    /// The share of each node of a pass in each of these rows, row after row.
-    pub(super) fn shares(&self, pass: &Pass, rows: Range<usize>, shares: &mut Vec<f64>) {
+    /// The share of each node of a pass in a row.
+    pub(super) fn shares(&self, pass: &Pass, row: usize, shares: &mut Vec<f64>) {
         shares.clear();
-        for row in rows {
-            let tau = self.tau[row];
-            let first = shares.len();
-            if let Some(at) = pass.tau.iter().position(|node| *node == tau) {
-                shares.extend((0..pass.tau.len()).map(|k| f64::from(u8::from(k == at))));
-                continue;
-            }
-            shares.extend(pass.tau.iter().zip(&pass.weights).map(|(node, weight)| weight / (tau - node)));
-            let sum: f64 = shares[first..].iter().sum();
-            shares[first..].iter_mut().for_each(|share| *share /= sum);
+        let tau = self.tau[row];
+        if let Some(at) = pass.tau.iter().position(|node| *node == tau) {
+            shares.extend((0..pass.tau.len()).map(|k| f64::from(u8::from(k == at))));
+            return;
         }
+        shares.extend(pass.tau.iter().zip(&pass.weights).map(|(node, weight)| weight / (tau - node)));
+        let sum: f64 = shares.iter().sum();
+        shares.iter_mut().for_each(|share| *share /= sum);
     }
 }
 
@@ -243,11 +256,58 @@ struct PassBuilder<'a> {
 }
 
 impl PassBuilder<'_> {
+    /// Plans these rows, divided where a satellite changes its velocity; a few about such a place each for itself.
+    fn smooth(&self, rows: Range<usize>, plan: &mut RowPlan) {
+        let is_new =
+            |row: &usize| *row == rows.start || self.pairs[*row].time_s > self.pairs[*row - 1].time_s;
+        let distinct: Vec<usize> = rows.clone().filter(is_new).collect();
+        let change = |k: usize, stride: usize| self.change_m_s(&distinct, k, stride);
+        let (mut first, mut k) = (rows.start, POSITIONS / 2);
+        let mut begin = 0;
+        while k + POSITIONS / 2 < distinct.len() {
+            // At the ends there is no room for long steps.
+            let reach = POSITIONS / 2 * KINK_STRIDE;
+            let is_inside = k >= begin + reach && k + reach < distinct.len();
+            let step_s = self.pairs[distinct[k]].time_s - self.pairs[distinct[k - 1]].time_s;
+            let stride = if is_inside && step_s <= KINK_STEP_S_MAX { KINK_STRIDE } else { 1 };
+            if change(k, stride) > KINK_M_S {
+                let near = (k - KINK_STRIDE).max(begin + POSITIONS / 2)..=k + KINK_STRIDE;
+                let near = near.filter(|k| k + POSITIONS / 2 < distinct.len());
+                let at = near.max_by(|a, b| change(*a, 1).total_cmp(&change(*b, 1))).unwrap_or(k);
+                let [from, to] = [at - 2, at + 3].map(|place| distinct[place]);
+                self.split(first..from, plan);
+                self.each(from..to, plan);
+                // What follows knows nothing of what was before.
+                (first, begin, k) = (to, at + 3, at + 3 + POSITIONS / 2);
+            } else {
+                k += KINK_STRIDE;
+            }
+        }
+        self.split(first..rows.end, plan);
+    }
+
+    /// About the change of a satellite's velocity at the k-th of some rows: how far it is from the polynomial through four rows on
+    /// either side, `stride` apart, which at a kink is `2 / 7` of the change times a step (more or less if steps differ).
+    fn change_m_s(&self, distinct: &[usize], k: usize, stride: usize) -> f64 {
+        let at = |place: usize| &self.pairs[distinct[place]];
+        let others = || (1..=POSITIONS / 2).flat_map(|n| [k - n * stride, k + n * stride]);
+        let mut off = [at(k).r_i_m, at(k).r_j_m];
+        for other in others() {
+            let rest = others().filter(|rest| *rest != other);
+            let share: f64 = rest
+                .map(|rest| (at(k).time_s - at(rest).time_s) / (at(other).time_s - at(rest).time_s))
+                .product();
+            off = [sub(off[0], scale(share, at(other).r_i_m)), sub(off[1], scale(share, at(other).r_j_m))];
+        }
+        let step_s = 0.5 * (at(k + stride).time_s - at(k - stride).time_s);
+        off.into_iter().map(norm).fold(0.0, f64::max) * 3.5 / step_s
+    }
+
     /// Plans these rows, as one pass or divided in two.
     fn split(&self, rows: Range<usize>, plan: &mut RowPlan) {
         let count = rows.len();
-        if self.direct {
-            return self.each(rows, plan);
+        if count == 0 {
+            return;
         }
         let needed = self.nodes_needed(&rows);
         if needed >= count {
@@ -284,11 +344,18 @@ impl PassBuilder<'_> {
         let slope = views.iter().map(|view| wavelengths(view) * view.limb_rad().sin()).fold(0.0, f64::max);
         let l_max = self.setup.l_max as f64;
         let h = l_max * tilt + (l_max + TAU * slope) * limb + TAU * half_range(&wavelengths);
-        (h + 3.0 * h.cbrt() + 5.0).ceil() as usize
+        (h + 3.0 * h.cbrt() + 2.0).ceil() as usize
     }
 
     fn wavelengths(&self, view: &PairView) -> f64 {
         view.baseline_m / self.setup.wavelength_m
+    }
+
+    /// Axes with this z that turn little with it: those of the ecliptic, taken there by the least rotation.
+    fn upright(z: Vec3) -> Axes {
+        let north = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        let south = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]];
+        transported(if z[2] < 0.0 { &south } else { &north }, z)
     }
 
     /// The axes of P at a view, and the angle to the pair's own.
@@ -310,7 +377,12 @@ impl PassBuilder<'_> {
     /// A node for each row.
     fn each(&self, rows: Range<usize>, plan: &mut RowPlan) {
         let first = plan.nodes.len();
-        plan.nodes.extend(rows.clone().map(|row| self.node(&self.views[row].axes, self.views[row])));
+        for row in rows.clone() {
+            let view = self.views[row];
+            let axes = if self.direct { view.axes } else { Self::upright(view.axes[2]) };
+            plan.gamma_rad[row] = Self::place(&axes, &view).1;
+            plan.nodes.push(self.node(&axes, view));
+        }
         let nodes = first..plan.nodes.len();
         plan.passes.push(Pass { rows, nodes, tau: Vec::new(), weights: Vec::new() });
     }
@@ -327,7 +399,7 @@ impl PassBuilder<'_> {
         if distinct.len() < count.max(POSITIONS) || !distinct.windows(2).all(is_close) {
             return false;
         }
-        let reference = self.views[rows.start + rows.len() / 2].axes;
+        let reference = Self::upright(self.views[rows.start + rows.len() / 2].axes[2]);
         let tau: Vec<f64> = (0..count).map(|k| -(PI * k as f64 / (count - 1) as f64).cos()).collect();
         let nodes: Option<Vec<RowNode>> = tau
             .iter()
