@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::kepler::KeplerElements;
-use super::oem::seconds;
 use super::propagate::PropagateConfig;
+use crate::units::calendar::epoch_s;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
 
@@ -231,7 +231,7 @@ impl ArrayConfig {
 
     /// Epoch of the mission in the seconds of OEM files, if it is given.
     pub(super) fn oem_epoch_s(&self) -> Option<f64> {
-        seconds(&self.oem_epoch)
+        epoch_s(&self.oem_epoch)
     }
 
     /// Everything that is wrong with the configuration; empty if it is good.
@@ -317,7 +317,7 @@ impl ArrayConfig {
             "none where array.propagate.days is given",
         );
         let epoch = &self.oem_epoch;
-        let good = epoch.is_empty() || seconds(epoch).is_some();
+        let good = epoch.is_empty() || epoch_s(epoch).is_some();
         checks.require(
             "oem_epoch",
             format_args!("{epoch:?}"),

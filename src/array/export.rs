@@ -2,10 +2,10 @@
 
 use std::fmt::Write;
 
-use super::oem::{Stretch, epoch_text, seconds, to_equatorial};
+use super::oem::{Stretch, to_equatorial};
 use super::orbit::Array;
 use super::state::SatelliteState;
-use crate::units::constants::DAY_S;
+use crate::units::calendar::{TAI_1970_S, epoch_s, epoch_text};
 use crate::units::{Checks, InvalidValue};
 
 /// States of a stretch, at least: as many as its interpolation takes.
@@ -19,8 +19,6 @@ pub struct OemExport {
     step_s: f64,
 }
 
-/// Days from 1958-01-01, with which TAI begins, to 1970-01-01.
-const DAYS_BEFORE_1970: f64 = 12.0 * 365.0 + 3.0;
 /// TDB less TAI, s, but for milliseconds.
 const TDB_LESS_TAI_S: f64 = 32.184;
 
@@ -28,15 +26,15 @@ const TDB_LESS_TAI_S: f64 = 32.184;
 #[must_use]
 pub fn tai_s_of(date: &str) -> Option<f64> {
     // Z is the mark of UTC, which is whole seconds off.
-    let from_1970_s = Some(date).filter(|date| !date.ends_with('Z')).and_then(seconds)?;
-    Some(from_1970_s + DAYS_BEFORE_1970 * DAY_S)
+    let from_1970_s = Some(date).filter(|date| !date.ends_with('Z')).and_then(epoch_s)?;
+    Some(from_1970_s + TAI_1970_S)
 }
 
 impl OemExport {
     /// The epoch (TDB) that is `tai_s` from 1958-01-01T00:00:00 TAI.
     #[must_use]
     pub fn epoch_of(tai_s: f64) -> String {
-        epoch_text(tai_s - DAYS_BEFORE_1970 * DAY_S + TDB_LESS_TAI_S)
+        epoch_text(tai_s - TAI_1970_S + TDB_LESS_TAI_S)
     }
 
     /// Files whose first epoch is `epoch` (TDB), such as 2030-01-31T12:00:00, that end `until_s` later, with states at most `step_s` apart.
@@ -45,7 +43,7 @@ impl OemExport {
     /// The first of them that is not accepted.
     pub fn new(epoch: &str, until_s: f64, step_s: f64) -> Result<Self, InvalidValue> {
         let mut checks = Checks::of("");
-        let epoch_s = seconds(epoch);
+        let epoch_s = epoch_s(epoch);
         let expected = "an epoch such as 2030-01-31T12:00:00, of the years 1900 to 2200";
         let good = epoch_s.is_some_and(|s| (-2.3e9..7.3e9).contains(&s));
         checks.require("--epoch", format_args!("{epoch:?}"), good, expected);
@@ -140,6 +138,7 @@ fn letters(number: usize) -> String {
 mod tests {
     use super::*;
     use crate::array::{ArrayConfig, PropagateConfig};
+    use crate::units::constants::DAY_S;
     use crate::units::vector::{norm, sub};
 
     #[test]

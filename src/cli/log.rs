@@ -13,7 +13,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::output::{json_text, printable_text};
-use crate::downlink::receive::inspect::tai_text;
+use crate::units::calendar::{TAI_1970_S, tai_text};
 
 /// Form of the log.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
@@ -30,9 +30,6 @@ static IS_JSON: AtomicBool = AtomicBool::new(false);
 
 /// Lets panics be lines of the log.
 static HOOK: Once = Once::new();
-
-/// Seconds from the beginning of 1958, where dates are counted from, to that of 1970: 12 years with three leap days.
-const UNIX_EPOCH_S: f64 = 86_400.0 * (12.0 * 365.0 + 3.0);
 
 /// How much a message matters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -115,7 +112,7 @@ pub(super) fn log_json(level: Level, event: &str, fields: &Value, message: Optio
 /// A time as a date, UTC to the millisecond; that of 1970 for times before, as of a clock that was never set.
 pub(super) fn utc_text(time: SystemTime) -> String {
     let unix_s = time.duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64());
-    tai_text(unix_s + UNIX_EPOCH_S)
+    tai_text(unix_s + TAI_1970_S)
 }
 
 /// Prints a line to standard error. If that is not possible, there is nobody to tell.

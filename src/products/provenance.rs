@@ -4,10 +4,10 @@ use std::path::Path;
 
 use super::config::PostProcessing;
 use crate::accumulation::{EngineKind, MapConfig};
-use crate::downlink::receive::inspect::tai_text;
 use crate::frames::{AntennaResponse, Instrument};
 use crate::sky::fits::Card;
 use crate::solve::Solution;
+use crate::units::calendar::tai_text;
 
 /// The ground segment's share of the provenance; the rest comes with each solution.
 #[derive(Clone, Debug, PartialEq)]

@@ -4,6 +4,7 @@
 //! Uses nothing else of the crate.
 
 pub(crate) mod arithmetic;
+pub mod calendar;
 mod checks;
 pub mod constants;
 mod echo;

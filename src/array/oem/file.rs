@@ -1,9 +1,9 @@
 //! Orbit Ephemeris Messages (CCSDS 502.0-B-2, section 5) in KVN, the text form.
 
+use crate::units::calendar::epoch_s;
 use crate::units::vector::{Vec3, norm};
 
 /// Seconds of a day.
-const DAY_S: f64 = 86_400.0;
 
 /// Obliquity of the ecliptic of J2000 (IAU 1976): 84381.448 arc seconds.
 const OBLIQUITY_DEG: f64 = 84_381.448 / 3600.0;
@@ -242,7 +242,7 @@ fn data_line(content: &str, line: usize, turns: bool, segment: &mut OemSegment) 
     let fault = |found: String, expected| Err(Fault { line, found, expected });
     let mut fields = content.split_whitespace();
     let epoch = fields.next().unwrap_or_default();
-    let Some(time_s) = seconds(epoch) else {
+    let Some(time_s) = epoch_s(epoch) else {
         return fault(short(epoch), "an epoch such as 2030-01-31T12:00:00.000 or 2030-031T12:00:00");
     };
     let numbers: Vec<f64> = fields.map_while(|field| field.parse().ok()).collect();
@@ -276,123 +276,4 @@ fn turned(turns: bool, v: Vec3) -> Vec3 {
 pub(in crate::array) fn to_equatorial(v: Vec3) -> Vec3 {
     let (sin, cos) = OBLIQUITY_DEG.to_radians().sin_cos();
     [v[0], cos * v[1] - sin * v[2], cos * v[2] + sin * v[1]]
-}
-
-/// The epoch, to a microsecond, of seconds from 1970-01-01T00:00:00.
-pub(in crate::array) fn epoch_text(seconds: f64) -> String {
-    let whole = seconds.floor();
-    // To a microsecond, of which there may be a million.
-    let micros = ((seconds - whole) * 1e6).round() as i64;
-    let (whole, micros) = (whole as i64 + micros / 1_000_000, micros % 1_000_000);
-    let (days, clock) = (whole.div_euclid(86_400), whole.rem_euclid(86_400));
-    let mut year = 1970 + days.div_euclid(366);
-    while days_before(year + 1) <= days {
-        year += 1;
-    }
-    while days_before(year) > days {
-        year -= 1;
-    }
-    let mut day = days - days_before(year);
-    let mut month = 0;
-    let lengths = month_lengths(year);
-    while day >= lengths[month] {
-        day -= lengths[month];
-        month += 1;
-    }
-    let (hour, minute, second) = (clock / 3600, clock / 60 % 60, clock % 60);
-    format!("{year:04}-{:02}-{:02}T{hour:02}:{minute:02}:{second:02}.{micros:06}", month + 1, day + 1)
-}
-
-/// Seconds from 1970-01-01T00:00:00 of an epoch `YYYY-MM-DDThh:mm:ss[.d]` or `YYYY-DDDThh:mm:ss[.d]`.
-pub(in crate::array) fn seconds(epoch: &str) -> Option<f64> {
-    let (date, clock) = epoch.trim_end_matches('Z').split_once('T')?;
-    let digits = |text: &str, count: usize| -> Option<i64> {
-        (text.len() == count && text.bytes().all(|b| b.is_ascii_digit())).then(|| text.parse().ok())?
-    };
-    let parts: Vec<&str> = date.split('-').collect();
-    let days = match parts.as_slice() {
-        [year, month, day] => {
-            let (year, month, day) = (digits(year, 4)?, digits(month, 2)?, digits(day, 2)?);
-            let lengths = month_lengths(year);
-            let index = usize::try_from(month - 1).ok().filter(|index| *index < 12)?;
-            (1..=lengths[index]).contains(&day).then_some(())?;
-            days_before(year) + lengths[..index].iter().sum::<i64>() + day - 1
-        }
-        [year, day] => {
-            let (year, day) = (digits(year, 4)?, digits(day, 3)?);
-            (1..=365 + i64::from(is_leap(year))).contains(&day).then_some(())?;
-            days_before(year) + day - 1
-        }
-        _ => return None,
-    };
-    let clock: Vec<&str> = clock.split(':').collect();
-    let [hour, minute, second] = clock.as_slice() else { return None };
-    let (hour, minute) = (digits(hour, 2)?, digits(minute, 2)?);
-    let (whole, _) = second.split_once('.').unwrap_or((second, ""));
-    digits(whole, 2)?;
-    let second: f64 = second.parse().ok()?;
-    let good = hour < 24 && minute < 60 && second < 61.0;
-    good.then(|| days as f64 * DAY_S + (hour * 3600 + minute * 60) as f64 + second)
-}
-
-fn month_lengths(year: i64) -> [i64; 12] {
-    [31, 28 + i64::from(is_leap(year)), 31, 30, 31, 30, 31, 31, 30, 31, 30, 31]
-}
-
-fn is_leap(year: i64) -> bool {
-    year % 4 == 0 && (year % 100 != 0 || year % 400 == 0)
-}
-
-/// Days from 1970-01-01 to the first day of a year.
-fn days_before(year: i64) -> i64 {
-    let before = year - 1;
-    365 * (year - 1970) + (before / 4 - before / 100 + before / 400) - (1969 / 4 - 1969 / 100 + 1969 / 400)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn epochs_are_seconds_of_the_calendar() {
-        // `date -u -d ... +%s`.
-        for (epoch, expected) in [
-            ("1970-01-01T00:00:00", 0.0),
-            ("2000-01-01T12:00:00", 946_728_000.0),
-            ("2024-02-29T23:59:59.5", 1_709_251_199.5),
-            ("2024-060T23:59:59.5", 1_709_251_199.5),
-            ("2030-12-31T00:00:00Z", 1_924_905_600.0),
-            ("2030-365T00:00:00", 1_924_905_600.0),
-        ] {
-            assert_eq!(seconds(epoch), Some(expected), "{epoch}");
-        }
-        for (expected, seconds) in [
-            ("1970-01-01T00:00:00.000000", 0.0),
-            ("1969-12-31T23:59:59.000000", -1.0),
-            // `date -u -d 1968-12-31 +%s`, and so on.
-            ("1968-12-31T00:00:00.000000", -31_622_400.0),
-            ("1960-12-31T12:00:00.000000", -284_040_000.0),
-            ("1901-01-01T00:00:00.000000", -2_177_452_800.0),
-            ("2000-01-01T12:00:00.000000", 946_728_000.0),
-            ("2024-02-29T23:59:59.500000", 1_709_251_199.5),
-            ("2024-03-01T00:00:00.000000", 1_709_251_199.999_999_8),
-            ("2030-12-31T00:00:00.000000", 1_924_905_600.0),
-        ] {
-            assert_eq!(epoch_text(seconds), expected);
-        }
-        for bad in [
-            "",
-            "2030-02-29T00:00:00",
-            "2030-13-01T00:00:00",
-            "2030-366T00:00:00",
-            "2030-01-01",
-            "2030-01-01T24:00:00",
-            "2030-01-01T00:00:NaN",
-            "30-01-01T00:00:00",
-            "2030-01-01T0:00:00",
-            "2030-1-1T00:00:00",
-        ] {
-            assert_eq!(seconds(bad), None, "{bad}");
-        }
-    }
 }

@@ -3,5 +3,5 @@
 mod file;
 mod orbit;
 
-pub(super) use file::{epoch_text, seconds, to_equatorial};
+pub(super) use file::to_equatorial;
 pub(super) use orbit::{Stretch, TableOrbit, read};

@@ -9,7 +9,6 @@ use super::contents::{
     ChannelContents, Contents, DamagedEntry, EphemerisSummary, FaultEntry, GapEntry, GarbageEntry,
     HousekeepingSummary, InstrumentSummary, KindSummary, PairSummary, TimeSpan, VisibilityCounts,
 };
-use super::tai_text;
 use crate::array::interpolation_error_m;
 use crate::downlink::error::{DownlinkError, io_error};
 use crate::downlink::receive::{Decoder, Event, EventReader, LISTED_MAX, Listing, ReceptionCounters};
@@ -17,6 +16,7 @@ use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
 use crate::frames::{
     AntennaResponse, EphemerisSegment, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
 };
+use crate::units::calendar::tai_text;
 use crate::units::{ChannelId, IntervalSet, MissionTime, Pair, TICKS_PER_SECOND};
 
 /// TAI - UTC since 2017-01-01 (IERS Bulletin C).

@@ -3,12 +3,10 @@
 //! [`Contents::read`] streams the file and keeps what the file says, not its bytes: one row per pair and channel, and
 //! at most [`LISTED_MAX`](super::LISTED_MAX) entries per list. `Display` renders the contents as tables.
 
-mod calendar;
 mod contents;
 mod inspector;
 mod table;
 
-pub use calendar::tai_text;
 pub use contents::{
     ChannelContents, Contents, DamagedEntry, EphemerisSummary, FaultEntry, GapEntry, GarbageEntry,
     HousekeepingSummary, InstrumentSummary, KindSummary, PairSummary, TimeSpan, VisibilityCounts,
