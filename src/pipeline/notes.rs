@@ -113,8 +113,7 @@ mod tests {
             std::fs::write(&path, format!("{gains}, \"positions\": [{positions}]}}")).unwrap();
             path
         };
-        let position =
-            r#"{"from_s": 0, "until_s": 9, "normals_hat": [[0, 0, 1], [0, 0, 1]], "offsets_m": [[0, 0, 0], [1, 2, 3]]}"#;
+        let position = r#"{"from_s": 0, "until_s": 9, "normals_hat": [[0, 0, 1], [0, 0, 1]], "offsets_m": [[0, 0, 0], [1, 2, 3]]}"#;
         let mut config = Config::default();
         config.map.engine = EngineKind::Harmonic;
         config.calibration.hook = CalibrationHook::AntennaGains;

@@ -139,9 +139,7 @@ fn gains(seed: u32, position_m: f64) -> String {
         let gains: Vec<[f64; 2]> = (0..8).map(|_| [1.0 + 0.2 * draw(), 0.4 * draw()]).collect();
         serde_json::json!({ "time_s": time_s, "gains": gains })
     };
-    let mut channel = |frequency_hz: f64| {
-        serde_json::json!({ "frequency_hz": frequency_hz, "solutions": [solution(0.0), solution(4e7)] })
-    };
+    let mut channel = |frequency_hz: f64| serde_json::json!({ "frequency_hz": frequency_hz, "solutions": [solution(0.0), solution(4e7)] });
     let channels = [channel(3e6), channel(10e6)];
     let offsets: Vec<[f64; 3]> = (0..8).map(|n| [position_m * f64::from(n), 0.0, 0.0]).collect();
     let positions = serde_json::json!([{
@@ -156,10 +154,8 @@ fn killed_while_gains_are_replaced_it_leaves_the_old_state_or_the_new_one() {
         let place = Ground::with(more);
         let file = place.downlink();
         // Offsets along the track alone keep daughters on their circle.
-        let [old_gains, new_gains] =
-            [("old.json", 1, 0.0), ("new.json", 2, 0.5)].map(|(name, seed, position_m)| {
-                place.file(name, gains(seed, position_m).as_bytes())
-            });
+        let [old_gains, new_gains] = [("old.json", 1, 0.0), ("new.json", 2, 0.5)]
+            .map(|(name, seed, position_m)| place.file(name, gains(seed, position_m).as_bytes()));
         place.replay("whole", &[&file], &["--calibration", &old_gains]);
         let copy = |name: &str| {
             let (from, to) = (place.path("whole"), place.path(name));

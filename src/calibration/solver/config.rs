@@ -103,7 +103,7 @@ impl Default for SolverConfig {
             outlier_rounds: 3,
             iterations_max: 50,
             position_rounds: 3,
-            unexplained_max: 0.5,
+            unexplained_max: 0.15,
             phase_sigma_deg_max: 30.0,
             dead_amplitude: 0.05,
             model_files: Vec::new(),

@@ -38,7 +38,11 @@ impl Left {
             return Self::default();
         }
         let noise = count / power;
-        Self { left: (residual - count) * noise, signal: (power - count) * noise, variance: count * noise * noise }
+        Self {
+            left: (residual - count) * noise,
+            signal: (power - count) * noise,
+            variance: count * noise * noise,
+        }
     }
 
     fn with(self, other: Self) -> Self {
@@ -78,9 +82,11 @@ pub(super) fn unexplained(
             };
             let open: Vec<(usize, f64)> = (0..n).filter(|k| parts[*k] == 0.0).map(|k| (k, of(k))).collect();
             // Of two that are equally bad the reference stays.
-            let worst = open.iter().copied().filter(|(k, _)| *k != layout.reference).chain(
-                open.iter().copied().filter(|(k, _)| *k == layout.reference),
-            );
+            let worst = open
+                .iter()
+                .copied()
+                .filter(|(k, _)| *k != layout.reference)
+                .chain(open.iter().copied().filter(|(k, _)| *k == layout.reference));
             let worst = worst.fold((0, 0.0), |worst, one| if one.1 > worst.1 { one } else { worst });
             if worst.1 <= most {
                 open.into_iter().for_each(|(k, part)| parts[k] = part);

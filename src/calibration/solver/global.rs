@@ -2,23 +2,26 @@
 //!
 //! Daughter after daughter is set against those whose offsets are known, the best measured one first. A pair's gain takes what it
 //! can: at each offset e it is the best complex number, and what counts is how much of the data M(b + e) then leaves. The model at
-//! any offset follows from moments of its fringe with spherical harmonics (`expansion`), in axes that turn with the orbit, in which
+//! any offset follows from moments of its fringe with spherical harmonics (`moments`), in axes that turn with the orbit, in which
 //! offsets are constant.
+//!
+//! There are many minima. Where the ends of the baseline's direction hold most of the signal, as a diffuse sky does on long
+//! baselines, those half a wavelength apart along it are nearly alike. So several are kept, for each daughter and of all, and
+//! what follows tells which one is right, or that it cannot be told.
 
+use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 
-use faer::{Accum, MatMut, MatRef, Par};
-use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::expansion::{degree_for, harmonics, offset_factors, place, real_harmonics};
+use super::expansion::{degree_for, harmonics, offset_factors, real_harmonics};
 use super::model::KnownSignal;
-use super::robust::spread_cost;
-use crate::array::{track_axes, track_offset_m};
+use super::moments::{MomentSetup, PairMoments, fixed_axes};
+use super::positions::KEPT_COST;
 use crate::frames::PlacedVisibilities;
-use crate::response::model::{ModelError, PairPosition};
+use crate::response::model::ModelError;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
-use crate::units::vector::{Vec3, cross, dot, norm, sub, unit};
+use crate::units::vector::{Vec3, dot, norm, sub};
 
 /// Phase of one standard deviation of an offset in the lowest channel, rad, from which on all offsets are searched.
 const SEARCH_RADIANS: f64 = 0.8;
@@ -26,20 +29,27 @@ const SEARCH_RADIANS: f64 = 0.8;
 /// Standard deviations within which offsets are searched.
 const REACH: f64 = 3.0;
 
-/// Longest offset that is searched, rad: 400 harmonics, and 20,000 offsets on the grid.
+/// Longest offset that is searched, rad: 400 harmonics, and some 25,000 offsets on the grid.
 const RADIANS_MAX: f64 = 15.0;
 
-/// Step of the grid, rad: a sixth of a wavelength.
-const STEP_RADIANS: f64 = TAU / 6.0;
+/// Steps of the grid away from the Moon, along the track and across it, rad.
+const STEP_RADIANS: Vec3 = [TAU / 6.0, TAU / 12.0, TAU / 6.0];
 
-/// Offsets of the grid from which the search goes on, and the least distance between two, rad.
-const CANDIDATES: (usize, f64) = (8, 1.5);
+/// Minima of the grid from which the search goes on along the track, of a daughter.
+const STARTS: usize = 160;
 
-/// Times that the grid's step is halved about each of them.
-const HALVINGS: usize = 4;
+/// Of those, from which it goes on in all directions.
+const MINIMA: usize = 32;
 
-/// Times that each daughter is set against all others.
-const SWEEPS: usize = 2;
+/// Times that the grid's steps are halved, and moves with each step.
+const HALVINGS: i32 = 4;
+const MOVES: usize = 2;
+
+/// Offsets of all daughters that are kept.
+const KEPT: usize = 8;
+
+/// Distance, rad, within which two minima are one.
+const SAME_RADIANS: f64 = 0.7;
 
 /// Offsets whose models are computed at once.
 const BATCH: usize = 256;
@@ -50,17 +60,9 @@ pub(super) struct GlobalSearch<'a> {
     pub(super) normal_hat: &'a [Vec3],
     pub(super) reference: usize,
     pub(super) position_sigma_m: f64,
+    pub(super) amplitude_sigma: f64,
     /// Visibilities, and whether the artificial signal is on in them.
     pub(super) data: &'a [(PlacedVisibilities, bool)],
-}
-
-/// A pair about offsets of the known daughter, with moments in axes that turn with the orbit.
-struct PairMoments {
-    value: Vec<Complex64>,
-    weight: Vec<f64>,
-    power: f64,
-    /// A row a visibility: real parts of all moments, then imaginary ones.
-    moments: Vec<f32>,
 }
 
 impl GlobalSearch<'_> {
@@ -69,35 +71,50 @@ impl GlobalSearch<'_> {
         TAU * frequency_hz / SPEED_OF_LIGHT_M_S * position_sigma_m > SEARCH_RADIANS
     }
 
-    /// Offsets of all daughters, m.
-    pub(super) fn find(&self, signal: &KnownSignal) -> Result<Vec<[f64; 3]>, ModelError> {
-        let daughters = self.normal_hat.len();
-        let mut offset_m = vec![[0.0; 3]; daughters];
+    /// Offsets of all daughters, m: the best ones, best first.
+    pub(super) fn find(&self, signal: &KnownSignal) -> Result<Vec<Vec<[f64; 3]>>, ModelError> {
         let (_, frequency_hz) = signal.beacon(self.channel);
         let per_m = TAU * frequency_hz / SPEED_OF_LIGHT_M_S;
-        let grid = Grid::new((REACH * self.position_sigma_m * per_m).min(RADIANS_MAX));
-        let functions = self.functions(signal, grid.l_max);
+        let reach = (REACH * self.position_sigma_m * per_m).min(RADIANS_MAX);
+        // Of the difference of two amplitudes.
+        let amplitude_sigma = std::f64::consts::SQRT_2 * self.amplitude_sigma;
+        let grid = Grid::new(reach, self.position_sigma_m * per_m, amplitude_sigma);
+        let axes = fixed_axes(self.normal_hat[self.reference]);
+        let functions = self.functions(signal, axes, grid.l_max);
+        let Self { channel, normal_hat, .. } = *self;
+        let setup = MomentSetup { signal, channel, normal_hat, axes, l_max: grid.l_max, functions };
+        let mut kept = vec![(vec![[0.0; 3]; self.normal_hat.len()], 0.0)];
         let order = self.order();
-        for sweep in 0..SWEEPS {
-            for (k, &daughter) in order.iter().enumerate().skip(1) {
-                let known = if sweep == 0 { &order[..k] } else { &order[..] };
-                let mut pairs = Vec::new();
-                for (placed, is_on) in self.data {
-                    let [i, j] = [placed.pair.i, placed.pair.j].map(usize::from);
-                    let other = if i == daughter { j } else { i };
-                    if (i == daughter || j == daughter) && other != daughter && known.contains(&other) {
-                        let about = (daughter, &offset_m[..], &functions[..], grid.l_max);
-                        pairs.push(self.moments(placed, *is_on, about, signal)?);
-                    }
-                }
-                if !pairs.is_empty() {
-                    let sigma_radians = self.position_sigma_m * per_m;
-                    let [up, along, across] = grid.best(&pairs, sigma_radians);
+        for (k, &daughter) in order.iter().enumerate().skip(1) {
+            let is_of = |placed: &PlacedVisibilities| {
+                let [i, j] = [placed.pair.i, placed.pair.j].map(usize::from);
+                (i == daughter && order[..k].contains(&j)) || (j == daughter && order[..k].contains(&i))
+            };
+            if !self.data.iter().any(|(placed, _)| is_of(placed)) {
+                continue;
+            }
+            let mut next = Vec::new();
+            for (offset_m, cost) in &kept {
+                let of_daughter = self.data.iter().filter(|(placed, _)| is_of(placed));
+                let pairs: Vec<PairMoments> = of_daughter
+                    .map(|data| setup.moments(data, daughter, offset_m))
+                    .collect::<Result<_, ModelError>>()?;
+                for ([up, along, across], more) in grid.minima(&pairs) {
+                    let mut offset_m = offset_m.clone();
                     offset_m[daughter] = [along, across, up].map(|radians| radians / per_m);
+                    next.push((offset_m, cost + more));
                 }
             }
+            next.sort_by(|a, b| a.1.total_cmp(&b.1));
+            let most = next.first().map_or(0.0, |best| best.1 + KEPT_COST);
+            next.retain(|one| one.1 <= most);
+            next.truncate(KEPT);
+            // Without any number there is nothing to tell offsets by.
+            if !next.is_empty() {
+                kept = next;
+            }
         }
-        Ok(offset_m)
+        Ok(kept.into_iter().map(|(offset_m, _)| offset_m).collect())
     }
 
     /// Daughters in the order of their search, from the reference on: each the best measured against those before.
@@ -106,10 +123,15 @@ impl GlobalSearch<'_> {
         let mut told = vec![0.0; daughters * daughters];
         for (placed, _) in self.data {
             let [i, j] = [placed.pair.i, placed.pair.j].map(usize::from);
-            let power: f64 =
-                placed.value_k_sr.iter().zip(&placed.weight).map(|(value, weight)| 0.5 * weight * value.norm_sqr()).sum();
+            let power: f64 = placed
+                .value_k_sr
+                .iter()
+                .zip(&placed.weight)
+                .map(|(value, weight)| 0.5 * weight * value.norm_sqr())
+                .sum();
             // Visibilities, less where they are noise.
-            let signal = (power - placed.len() as f64).max(0.0) / power.max(f64::MIN_POSITIVE) * placed.len() as f64;
+            let signal =
+                (power - placed.len() as f64).max(0.0) / power.max(f64::MIN_POSITIVE) * placed.len() as f64;
             told[i * daughters + j] += signal;
             told[j * daughters + i] += signal;
         }
@@ -123,9 +145,8 @@ impl GlobalSearch<'_> {
         order
     }
 
-    /// Harmonics at the pixels of the sky, with the normal of the reference's orbit as pole.
-    fn functions(&self, signal: &KnownSignal, l_max: usize) -> Vec<f32> {
-        let axes = fixed_axes(self.normal_hat[self.reference]);
+    /// Harmonics at the pixels of the sky.
+    fn functions(&self, signal: &KnownSignal, axes: [Vec3; 3], l_max: usize) -> Vec<f32> {
         let directions = signal.directions(self.channel);
         let count = harmonics(l_max);
         let mut functions = vec![0.0; directions.len() * count];
@@ -136,149 +157,111 @@ impl GlobalSearch<'_> {
         });
         functions
     }
-
-    /// Moments of a pair with the daughter in second place.
-    fn moments(
-        &self,
-        placed: &PlacedVisibilities,
-        is_on: bool,
-        (daughter, offset_m, functions, l_max): (usize, &[[f64; 3]], &[f32], usize),
-        signal: &KnownSignal,
-    ) -> Result<PairMoments, ModelError> {
-        let turns_round = usize::from(placed.pair.i) == daughter;
-        let (first, r_first_m, r_own_m) = match turns_round {
-            true => (usize::from(placed.pair.j), &placed.r_j_m, &placed.r_i_m),
-            false => (usize::from(placed.pair.i), &placed.r_i_m, &placed.r_j_m),
-        };
-        let normal_hat = self.normal_hat[first];
-        let flown = |r_m: Vec3| sub(r_m, track_offset_m(r_m, normal_hat, offset_m[first]));
-        let place_of = |(r_i_m, r_j_m): (&Vec3, &Vec3)| PairPosition {
-            r_i_m: flown(*r_i_m),
-            r_j_m: *r_j_m,
-            ..PairPosition::default()
-        };
-        let positions: Vec<PairPosition> = r_first_m.iter().zip(r_own_m).map(place_of).collect();
-        let count = harmonics(l_max);
-        let mut moments = signal.sums_with(self.channel, &positions, functions)?;
-        moments.resize(2 * count * positions.len(), 0.0);
-        let (beacon, frequency_hz) = signal.beacon(self.channel);
-        let axes = fixed_axes(self.normal_hat[self.reference]);
-        let mut of_beacon = vec![0.0; count];
-        real_harmonics(axes.map(|axis| dot(axis, beacon.from_hat())), l_max, &mut of_beacon);
-        for (position, moments) in positions.iter().zip(moments.chunks_exact_mut(2 * count)) {
-            let (re, im) = moments.split_at_mut(count);
-            if is_on {
-                let wave = beacon.visibility_k_sr(position.r_i_m, position.r_j_m, frequency_hz);
-                re.iter_mut().zip(&of_beacon).for_each(|(moment, function)| *moment += (wave.re * function) as f32);
-                im.iter_mut().zip(&of_beacon).for_each(|(moment, function)| *moment += (wave.im * function) as f32);
-            }
-            let [_, _, up] = track_axes(position.r_j_m, self.normal_hat[daughter]);
-            turn(re, im, l_max, dot(axes[1], up).atan2(dot(axes[0], up)));
-        }
-        let conjugate = |value: &Complex64| if turns_round { value.conj() } else { *value };
-        let value: Vec<Complex64> = placed.value_k_sr.iter().map(conjugate).collect();
-        let power = value.iter().zip(&placed.weight).map(|(value, weight)| weight * value.norm_sqr()).sum();
-        Ok(PairMoments { value, weight: placed.weight.clone(), power, moments })
-    }
-}
-
-/// Axes across a pole, and the pole.
-fn fixed_axes(pole_hat: Vec3) -> [Vec3; 3] {
-    // Any direction that is not near the pole.
-    let away = if pole_hat[0].abs() < 0.7 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] };
-    let x = unit(cross(away, pole_hat));
-    [x, cross(pole_hat, x), pole_hat]
-}
-
-/// Turns moments to axes at an azimuth, and multiplies them by (-i)^l.
-fn turn(re: &mut [f32], im: &mut [f32], l_max: usize, azimuth: f64) {
-    for m in 1..=l_max as isize {
-        let (sin, cos) = (m as f64 * azimuth).sin_cos();
-        let (sin, cos) = (sin as f32, cos as f32);
-        for l in m as usize..=l_max {
-            let (plus, minus) = (place(l, m), place(l, -m));
-            for part in [&mut *re, &mut *im] {
-                let (c, s) = (part[plus], part[minus]);
-                (part[plus], part[minus]) = (cos * c + sin * s, cos * s - sin * c);
-            }
-        }
-    }
-    for l in 0..=l_max {
-        for k in l * l..(l + 1) * (l + 1) {
-            (re[k], im[k]) = match l % 4 {
-                0 => (re[k], im[k]),
-                1 => (im[k], -re[k]),
-                2 => (-re[k], -im[k]),
-                _ => (-im[k], re[k]),
-            };
-        }
-    }
 }
 
 /// Offsets in a ball, as phases in rad: away from the Moon, along the track, across it.
 struct Grid {
     l_max: usize,
     reach: f64,
-    offsets: Vec<Vec3>,
+    /// Of an offset, rad.
+    sigma: f64,
+    amplitude_sigma: f64,
+    offsets: BTreeMap<[i32; 3], Vec3>,
 }
 
 impl Grid {
-    fn new(reach: f64) -> Self {
-        let steps = (reach / STEP_RADIANS).floor() as i32;
-        let axis = || (-steps..=steps).map(|k| f64::from(k) * STEP_RADIANS);
-        let all = axis().flat_map(|x| axis().flat_map(move |y| axis().map(move |z| [x, y, z])));
-        Self { l_max: degree_for(reach), reach, offsets: all.filter(|offset| norm(*offset) <= reach).collect() }
-    }
-
-    /// The offset that leaves the least of some pairs.
-    fn best(&self, pairs: &[PairMoments], sigma: f64) -> Vec3 {
-        let costs = self.costs(pairs, &self.offsets, sigma);
-        let mut order: Vec<usize> = (0..costs.len()).collect();
-        order.sort_by(|a, b| costs[*a].total_cmp(&costs[*b]));
-        let mut starts: Vec<(Vec3, f64)> = Vec::new();
-        for k in order {
-            let is_apart = |(start, _): &(Vec3, f64)| norm(sub(*start, self.offsets[k])) > CANDIDATES.1;
-            if starts.len() < CANDIDATES.0 && starts.iter().all(is_apart) {
-                starts.push((self.offsets[k], costs[k]));
-            }
-        }
-        let refined = starts.into_iter().map(|start| self.refined(pairs, start, sigma));
-        refined.reduce(|best, one| if one.1 < best.1 { one } else { best }).map_or([0.0; 3], |best| best.0)
-    }
-
-    fn refined(&self, pairs: &[PairMoments], (mut at, mut cost): (Vec3, f64), sigma: f64) -> (Vec3, f64) {
-        let mut step = 0.5 * STEP_RADIANS;
-        for _ in 0..HALVINGS {
-            // At most as far as the next offset of the grid.
-            for _ in 0..4 {
-                let about = (0..27).map(|k| [k % 3, k / 3 % 3, k / 9].map(|k| step * (f64::from(k) - 1.0)));
-                let offsets: Vec<Vec3> = about
-                    .map(|shift| std::array::from_fn(|axis| at[axis] + shift[axis]))
-                    .filter(|offset| norm(*offset) <= self.reach)
-                    .collect();
-                let costs = self.costs(pairs, &offsets, sigma);
-                let found = offsets.into_iter().zip(costs).reduce(|best, one| if one.1 < best.1 { one } else { best });
-                match found.filter(|found| found.1 < cost) {
-                    Some(found) => (at, cost) = found,
-                    None => break,
+    fn new(reach: f64, sigma: f64, amplitude_sigma: f64) -> Self {
+        let axis = |step: f64| {
+            let steps = (reach / step).floor() as i32;
+            -steps..=steps
+        };
+        let mut offsets = BTreeMap::new();
+        for x in axis(STEP_RADIANS[0]) {
+            for y in axis(STEP_RADIANS[1]) {
+                for z in axis(STEP_RADIANS[2]) {
+                    let place = [x, y, z];
+                    let offset: Vec3 =
+                        std::array::from_fn(|axis| f64::from(place[axis]) * STEP_RADIANS[axis]);
+                    if norm(offset) <= reach {
+                        offsets.insert(place, offset);
+                    }
                 }
             }
-            step *= 0.5;
         }
-        (at, cost)
+        Self { l_max: degree_for(reach), reach, sigma, amplitude_sigma, offsets }
     }
 
-    /// What each offset leaves of the data, see [`spread_cost`], with its prior.
-    fn costs(&self, pairs: &[PairMoments], offsets: &[Vec3], sigma: f64) -> Vec<f64> {
+    /// Offsets that leave the least of some pairs, with what they leave, best first.
+    fn minima(&self, pairs: &[PairMoments]) -> Vec<(Vec3, f64)> {
+        let offsets: Vec<Vec3> = self.offsets.values().copied().collect();
+        let costs = self.costs(pairs, &offsets);
+        let by_place: BTreeMap<&[i32; 3], f64> = self.offsets.keys().zip(costs.iter().copied()).collect();
+        let is_least = |place: &[i32; 3], cost: f64| {
+            let shifts = (0..27).map(|k| [k % 3 - 1, k / 3 % 3 - 1, k / 9 - 1]);
+            let beside =
+                shifts.filter_map(|[x, y, z]| by_place.get(&[place[0] + x, place[1] + y, place[2] + z]));
+            beside.copied().all(|other| other >= cost)
+        };
+        let mut starts: Vec<(Vec3, f64)> = self
+            .offsets
+            .iter()
+            .zip(&costs)
+            .filter(|((place, _), cost)| is_least(place, **cost))
+            .map(|((_, offset), cost)| (*offset, *cost))
+            .collect();
+        best_of(&mut starts, STARTS);
+        // Along the track a position is known ten times better than across: a minimum may lie far below the nearest offset of the grid.
+        let along: Vec<Vec3> = [-1.0, 1.0].map(|sign| [0.0, sign, 0.0]).to_vec();
+        self.refine(pairs, &mut starts, &along);
+        best_of(&mut starts, MINIMA);
+        let around = (0..27).map(|k| [k % 3 - 1, k / 3 % 3 - 1, k / 9 - 1].map(f64::from));
+        self.refine(pairs, &mut starts, &around.collect::<Vec<Vec3>>());
+        best_of(&mut starts, MINIMA);
+        let mut apart: Vec<(Vec3, f64)> = Vec::new();
+        for one in starts {
+            if apart.iter().all(|other| norm(sub(one.0, other.0)) > SAME_RADIANS) {
+                apart.push(one);
+            }
+        }
+        apart
+    }
+
+    /// Moves each start to the best of the offsets about it, in steps that become smaller.
+    fn refine(&self, pairs: &[PairMoments], starts: &mut [(Vec3, f64)], about: &[Vec3]) {
+        for halving in 1..=HALVINGS {
+            let step = STEP_RADIANS.map(|step| step * 0.5_f64.powi(halving));
+            for _ in 0..MOVES {
+                let shifted = |at: &Vec3, shift: &Vec3| -> Vec3 {
+                    let to = std::array::from_fn(|axis| at[axis] + step[axis] * shift[axis]);
+                    if norm(to) <= self.reach { to } else { *at }
+                };
+                let offsets: Vec<Vec3> =
+                    starts.iter().flat_map(|(at, _)| about.iter().map(|shift| shifted(at, shift))).collect();
+                let costs = self.costs(pairs, &offsets);
+                let found = offsets.chunks(about.len()).zip(costs.chunks(about.len()));
+                for (start, (offsets, costs)) in starts.iter_mut().zip(found) {
+                    for (offset, cost) in offsets.iter().zip(costs) {
+                        if *cost < start.1 {
+                            *start = (*offset, *cost);
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// What each offset leaves of the data, with its prior.
+    fn costs(&self, pairs: &[PairMoments], offsets: &[Vec3]) -> Vec<f64> {
         let of_batch = |offsets: &[Vec3]| {
             let factors: Vec<f32> = offsets
                 .iter()
                 .flat_map(|offset| offset_factors(*offset, self.l_max))
                 .map(|factor| factor as f32)
                 .collect();
-            let mut costs: Vec<f64> = offsets.iter().map(|offset| dot(*offset, *offset) / (sigma * sigma)).collect();
+            let prior = |offset: &Vec3| dot(*offset, *offset) / (self.sigma * self.sigma);
+            let mut costs: Vec<f64> = offsets.iter().map(prior).collect();
             for pair in pairs {
-                pair.add_costs(&factors, harmonics(self.l_max), &mut costs);
+                pair.add_costs(&factors, harmonics(self.l_max), self.amplitude_sigma, &mut costs);
             }
             costs
         };
@@ -286,28 +269,8 @@ impl Grid {
     }
 }
 
-impl PairMoments {
-    /// Adds what each offset leaves, with the best gain.
-    fn add_costs(&self, factors: &[f32], count: usize, costs: &mut [f64]) {
-        let (rows, offsets) = (2 * self.value.len(), costs.len());
-        let mut model = vec![0.0_f32; rows * offsets];
-        faer::linalg::matmul::matmul(
-            MatMut::from_column_major_slice_mut(&mut model, rows, offsets),
-            Accum::Replace,
-            MatRef::from_row_major_slice(&self.moments, rows, count),
-            MatRef::from_column_major_slice(factors, count, offsets),
-            1.0,
-            Par::Seq,
-        );
-        for (model, cost) in model.chunks_exact(rows.max(1)).zip(costs) {
-            let (mut along, mut square) = (Complex64::ZERO, 0.0);
-            for (k, (value, weight)) in self.value.iter().zip(&self.weight).enumerate() {
-                let model = Complex64::new(model[2 * k].into(), model[2 * k + 1].into());
-                along += weight * model.conj() * value;
-                square += weight * model.norm_sqr();
-            }
-            let taken = if square > 0.0 { along.norm_sqr() / square } else { 0.0 };
-            *cost += spread_cost((self.power - taken).max(0.0), self.value.len() as f64);
-        }
-    }
+/// Keeps the first so many, best first.
+fn best_of(starts: &mut Vec<(Vec3, f64)>, most: usize) {
+    starts.sort_by(|a, b| a.1.total_cmp(&b.1));
+    starts.truncate(most);
 }

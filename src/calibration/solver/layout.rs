@@ -168,7 +168,12 @@ impl ParameterLayout {
     }
 
     /// The product of the gains of a pair, and the factors of the model's terms.
-    pub(super) fn pair(&self, values: &Values, channel: usize, pair: Pair) -> (Complex64, [f64; MODEL_TERMS]) {
+    pub(super) fn pair(
+        &self,
+        values: &Values,
+        channel: usize,
+        pair: Pair,
+    ) -> (Complex64, [f64; MODEL_TERMS]) {
         let [i, j] = [pair.i, pair.j].map(usize::from);
         let gain = self.gain(values, channel, i) * self.gain(values, channel, j).conj();
         let ([a, b, c], [d, e, f]) = (values.position_m[i], values.position_m[j]);

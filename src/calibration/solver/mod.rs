@@ -12,6 +12,7 @@
 //! | `fit` | whether a solution explains the data |
 //! | `positions` | positions that are off by a good part of a wavelength |
 //! | `global` | positions that are off by radians: a search over all offsets |
+//! | `moments` | a pair at any offset |
 //! | `expansion` | a plane wave of an offset by spherical harmonics |
 //! | `passes` | a pass from packets to its solutions |
 //! | `monitor` | what happened to the instrument |
@@ -26,6 +27,7 @@ mod fit;
 mod global;
 mod layout;
 mod model;
+mod moments;
 mod monitor;
 mod newton;
 mod passes;

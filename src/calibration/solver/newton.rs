@@ -5,11 +5,10 @@
 //! Priors are Gaussian about zero. The reference daughter has no phase, clock and position: those of the others are relative
 //! to it.
 
-
 use num_complex::Complex64;
 
-use super::dense::DenseFactor;
 use super::config::AmplitudeScale;
+use super::dense::DenseFactor;
 use super::layout::{ParameterLayout, Values};
 use super::sums::{MODEL_TERMS, PairSums};
 

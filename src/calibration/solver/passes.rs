@@ -146,14 +146,15 @@ impl Task<'_> {
     ) -> Result<Vec<PassSolution>, CalibrationError> {
         let Self { config, normal_hat, .. } = self;
         let moves = config.position_sigma_m > 0.0;
-        let offset_m = match moves {
-            true => self.search(placed).find(signal)?,
-            false => vec![[0.0; 3]; normal_hat.len()],
-        };
+        let sought = if moves { Some(self.search(placed).find(signal)?) } else { None };
+        let offset_m = sought
+            .as_ref()
+            .map_or_else(|| vec![[0.0; 3]; normal_hat.len()], |sought| sought.position_m.clone());
         let mut offsets = Offsets { offset_m, normal_hat: normal_hat.clone() };
         let mut solutions = Vec::new();
         for _ in 0..if moves { config.position_rounds } else { 1 } {
-            let block = |(placed, is_on): &(PlacedVisibilities, bool)| modelled(placed, signal, &offsets, *is_on);
+            let block =
+                |(placed, is_on): &(PlacedVisibilities, bool)| modelled(placed, signal, &offsets, *is_on);
             let mut blocks = placed.iter().map(block).collect::<Result<Vec<ModelledBlock>, ModelError>>()?;
             solutions = self.parts().map(|span_s| self.part(span_s, &mut blocks, &offsets)).collect();
             let [solution] = &solutions[..] else { break };
@@ -167,6 +168,9 @@ impl Task<'_> {
             if !moved {
                 break;
             }
+        }
+        if let Some(sought) = sought {
+            solutions.iter_mut().for_each(|solution| solution.doubt(|n, hz| sought.is_ambiguous(n, hz)));
         }
         Ok(solutions)
     }

@@ -24,7 +24,10 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, norm, sub};
 
 /// Most visibilities of a pair in a channel that positions are sought with.
-const THINNED: usize = 160;
+const THINNED: usize = 320;
+
+/// Most of them that all offsets are searched with.
+const SEARCHED: usize = 160;
 
 /// Distance, in wavelengths of the highest channel, that a position may move at first without a new model, and the most.
 const TRUST_WAVELENGTHS: [f64; 2] = [0.1, 0.25];
@@ -34,6 +37,15 @@ const ROUNDS: usize = 30;
 
 /// Movement, in wavelengths, that is none.
 const SETTLED_WAVELENGTHS: f64 = 1e-3;
+
+/// Positions closer than this, in wavelengths of the highest channel, are the same.
+const SAME_WAVELENGTHS: f64 = 0.1;
+
+/// Cost (-2 ln of the likelihood) above the least up to which positions are kept for the next daughter or channel.
+pub(super) const KEPT_COST: f64 = 60.0;
+
+/// Cost above the least within which other positions explain the data as well: three and a half standard deviations.
+const AMBIGUOUS_COST: f64 = 12.0;
 
 /// Most iterations of Gauss-Newton for one model.
 const ITERATIONS: usize = 20;
@@ -51,33 +63,65 @@ pub(super) struct Search<'a> {
     pub(super) placed: &'a [(PlacedVisibilities, bool)],
 }
 
+/// Positions that were found.
+pub(super) struct Sought {
+    /// Offsets of the daughters, m.
+    pub(super) position_m: Vec<[f64; 3]>,
+    /// Others that explain the data as well.
+    others_m: Vec<Vec<[f64; 3]>>,
+}
+
+impl Sought {
+    /// Whether the position of a daughter may be another one, as far as a frequency can tell.
+    pub(super) fn is_ambiguous(&self, daughter: usize, frequency_hz: f64) -> bool {
+        let most_m = SAME_WAVELENGTHS * SPEED_OF_LIGHT_M_S / frequency_hz;
+        self.others_m.iter().any(|other_m| norm(sub(other_m[daughter], self.position_m[daughter])) > most_m)
+    }
+}
+
+/// Offsets of the daughters, and their cost.
+type Place = (Vec<[f64; 3]>, f64);
+
 impl Search<'_> {
-    /// Offsets of the daughters' positions, m.
-    pub(super) fn find(&self, signal: &mut KnownSignal) -> Result<Vec<[f64; 3]>, ModelError> {
+    /// Finds the offsets of the daughters.
+    pub(super) fn find(&self, signal: &mut KnownSignal) -> Result<Sought, ModelError> {
         let ladder = ladder(self.frequencies_hz);
-        let mut position_m = self.start(&ladder, signal)?;
+        let mut kept = self.start(&ladder, signal)?;
         for top in 1..=ladder.len() {
-            position_m = Step::new(self, &ladder[..top]).climb(position_m, signal)?;
+            let step = Step::new(self, &ladder[..top], THINNED);
+            kept =
+                step.best(kept, KEPT_COST, signal)?.into_iter().map(|(position_m, _)| position_m).collect();
         }
-        Ok(position_m)
+        if kept.len() > 1 {
+            let step = Step::new(self, &ladder, usize::MAX);
+            kept = step
+                .best(kept, AMBIGUOUS_COST, signal)?
+                .into_iter()
+                .map(|(position_m, _)| position_m)
+                .collect();
+        }
+        let mut kept = kept.into_iter();
+        let position_m = kept.next().unwrap_or_else(|| vec![[0.0; 3]; self.normal_hat.len()]);
+        Ok(Sought { position_m, others_m: kept.collect() })
     }
 
     /// Offsets to begin with: none, or the best of all where they are radians in the lowest channel.
-    fn start(&self, ladder: &[usize], signal: &KnownSignal) -> Result<Vec<[f64; 3]>, ModelError> {
-        let position_sigma_m = self.config.position_sigma_m;
+    fn start(&self, ladder: &[usize], signal: &KnownSignal) -> Result<Vec<Vec<[f64; 3]>>, ModelError> {
+        let Self { config, normal_hat, .. } = *self;
+        let SolverConfig { position_sigma_m, amplitude_sigma, .. } = *config;
         let lowest = ladder.first().copied();
         let lowest = lowest.filter(|c| GlobalSearch::is_needed(position_sigma_m, self.frequencies_hz[*c]));
-        let Some(channel) = lowest else { return Ok(vec![[0.0; 3]; self.normal_hat.len()]) };
-        let thinned = self.thinned(&[channel]);
+        let Some(channel) = lowest else { return Ok(vec![vec![[0.0; 3]; normal_hat.len()]]) };
+        let thinned = self.thinned(&[channel], SEARCHED);
         let data: Vec<_> = thinned.into_iter().map(|(placed, is_on, _)| (placed, is_on)).collect();
-        let reference = (self.config.reference_daughter as usize).saturating_sub(1);
+        let reference = (config.reference_daughter as usize).saturating_sub(1);
         let search =
-            GlobalSearch { channel, normal_hat: self.normal_hat, reference, position_sigma_m, data: &data };
+            GlobalSearch { channel, normal_hat, reference, position_sigma_m, amplitude_sigma, data: &data };
         search.find(signal)
     }
 
-    /// A part of the visibilities of some channels, spread over the pass, each with its place among them.
-    fn thinned(&self, channels: &[usize]) -> Vec<(PlacedVisibilities, bool, usize)> {
+    /// At most so many visibilities of each pair in some channels, spread over the pass, each with its channel's place among them.
+    fn thinned(&self, channels: &[usize], most: usize) -> Vec<(PlacedVisibilities, bool, usize)> {
         let mut all: BTreeMap<(usize, [u8; 2], bool), Vec<&PlacedVisibilities>> = BTreeMap::new();
         for (placed, is_on) in self.placed {
             if let Some(place) = channels.iter().position(|c| *c == usize::from(placed.channel.0)) {
@@ -85,7 +129,7 @@ impl Search<'_> {
             }
         }
         let thin = |((place, _, is_on), parts): ((usize, [u8; 2], bool), Vec<&PlacedVisibilities>)| {
-            let every = parts.iter().map(|part| part.len()).sum::<usize>().div_ceil(THINNED);
+            let every = parts.iter().map(|part| part.len()).sum::<usize>().div_ceil(most);
             let mut thinned = parts.first()?.without_visibilities();
             let each = parts.iter().flat_map(|part| (0..part.len()).map(move |k| (part, k)));
             each.step_by(every.max(1)).for_each(|(part, k)| thinned.push_of(part, k));
@@ -119,23 +163,42 @@ struct Step<'a> {
 }
 
 impl<'a> Step<'a> {
-    fn new(search: &'a Search<'a>, channels: &[usize]) -> Self {
+    fn new(search: &'a Search<'a>, channels: &[usize], most: usize) -> Self {
         let frequencies_hz: Vec<f64> = channels.iter().map(|c| search.frequencies_hz[*c]).collect();
         let highest_hz = frequencies_hz.iter().copied().fold(0.0, f64::max);
         Self {
             search,
             layout: ParameterLayout::new(search.config, search.normal_hat.len(), &frequencies_hz),
-            data: search.thinned(channels),
+            data: search.thinned(channels, most),
             wavelength_m: SPEED_OF_LIGHT_M_S / highest_hz,
         }
     }
 
-    /// Goes from positions to better ones.
-    fn climb(
+    /// Where one comes to from some positions, best first, up to a cost above the least.
+    fn best(
         &self,
-        mut position_m: Vec<[f64; 3]>,
+        from_m: Vec<Vec<[f64; 3]>>,
+        cost: f64,
         signal: &mut KnownSignal,
-    ) -> Result<Vec<[f64; 3]>, ModelError> {
+    ) -> Result<Vec<Place>, ModelError> {
+        let mut places = Vec::new();
+        for position_m in from_m {
+            places.push(self.climb(position_m, signal)?);
+        }
+        places.sort_by(|a: &Place, b: &Place| a.1.total_cmp(&b.1));
+        let most = places.first().map_or(0.0, |best| best.1 + cost);
+        let mut apart: Vec<Place> = Vec::new();
+        for place in places {
+            let is_other = |other: &Place| moved_m(&other.0, &place.0) > SAME_WAVELENGTHS * self.wavelength_m;
+            if apart.is_empty() || (place.1 <= most && apart.iter().all(is_other)) {
+                apart.push(place);
+            }
+        }
+        Ok(apart)
+    }
+
+    /// Goes from positions to better ones.
+    fn climb(&self, mut position_m: Vec<[f64; 3]>, signal: &mut KnownSignal) -> Result<Place, ModelError> {
         let [first, most] = TRUST_WAVELENGTHS.map(|part| part * self.wavelength_m);
         let mut radius_m = first;
         let mut blocks = self.model(&position_m, signal)?;
@@ -164,7 +227,7 @@ impl<'a> Step<'a> {
                 break;
             }
         }
-        Ok(position_m)
+        Ok((position_m, cost))
     }
 
     /// Values of least cost with positions that stay within a distance.
@@ -197,8 +260,7 @@ impl<'a> Step<'a> {
         position_m: &[[f64; 3]],
         signal: &mut KnownSignal,
     ) -> Result<Vec<ModelledBlock>, ModelError> {
-        let offsets =
-            Offsets { offset_m: position_m.to_vec(), normal_hat: self.search.normal_hat.to_vec() };
+        let offsets = Offsets { offset_m: position_m.to_vec(), normal_hat: self.search.normal_hat.to_vec() };
         let block = |(placed, is_on, place): &(PlacedVisibilities, bool, usize)| {
             Ok(ModelledBlock { channel: *place, ..modelled(placed, signal, &offsets, *is_on)? })
         };

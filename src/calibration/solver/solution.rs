@@ -31,6 +31,8 @@ pub enum GainState {
     NotConverged,
     /// The solution leaves too much of the signal unexplained: a wrong minimum.
     PoorFit,
+    /// Another position explains the data as well.
+    Ambiguous,
 }
 
 /// Gain of one daughter in one channel.
@@ -120,6 +122,19 @@ pub struct PassSolution {
     pub normal_hat: Vec<Vec3>,
 }
 
+impl PassSolution {
+    /// Marks good gains of daughters and frequencies whose position may be another one.
+    pub(super) fn doubt(&mut self, is_ambiguous: impl Fn(usize, f64) -> bool) {
+        for (n, daughter) in self.daughters.iter_mut().enumerate() {
+            for gain in &mut daughter.gains {
+                if gain.state == GainState::Good && is_ambiguous(n, gain.frequency_hz) {
+                    gain.state = GainState::Ambiguous;
+                }
+            }
+        }
+    }
+}
+
 /// Data of a pass.
 pub struct PassData<'a> {
     /// Number of the pass.
@@ -151,7 +166,8 @@ pub(super) fn solve_from(
     let mut spreads = vec![1.0; blocks.len()];
     blocks.par_iter_mut().for_each(|block| block.is_out.fill(false));
     let mut sums = sums_of(blocks, span_s, &layout, &spreads);
-    let mut found = layout.minimise(layout.start(&sums, position_m), &sums, None, config.iterations_max as usize);
+    let mut found =
+        layout.minimise(layout.start(&sums, position_m), &sums, None, config.iterations_max as usize);
     let mut chi_squares = vec![(0.0, 0.0); blocks.len()];
     for round in 0..=config.outlier_rounds {
         let judge = |((block, spread), sums): ((&mut ModelledBlock, &mut f64), &PairSums)| {

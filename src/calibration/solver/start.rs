@@ -13,7 +13,8 @@ impl ParameterLayout {
     /// Starting values with daughters that are off by `position_m`.
     pub(super) fn start(&self, sums: &[PairSums], position_m: &[[f64; 3]]) -> Values {
         let mut values = Values { position_m: position_m.to_vec(), ..self.ideal() };
-        let fits: Vec<(&PairSums, Complex64, f64)> = sums.iter().map(|sums| self.fit(&values, sums)).collect();
+        let fits: Vec<(&PairSums, Complex64, f64)> =
+            sums.iter().map(|sums| self.fit(&values, sums)).collect();
         for c in 0..self.channels() {
             let gains = self.stefcal(&fits, c);
             let reference = gains[self.reference];

@@ -139,7 +139,8 @@ impl DirectMoments {
             let mut rows = Vec::with_capacity(2 * pairs.len() * directions.len());
             for pair in pairs {
                 let row = centre_row(pair, &directions);
-                let scaled = |(value, kelvin): (f64, &f32)| (value * self.sum.area_sr * f64::from(*kelvin)) as f32;
+                let scaled =
+                    |(value, kelvin): (f64, &f32)| (value * self.sum.area_sr * f64::from(*kelvin)) as f32;
                 let values = &self.sum.values;
                 rows.extend(row.iter().map(|value| value.re).zip(values).map(scaled));
                 rows.extend(row.iter().map(|value| value.im).zip(values).map(scaled));
