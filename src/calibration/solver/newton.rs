@@ -18,6 +18,9 @@ const MEAN_SIGMA: f64 = 1e-6;
 /// Change of every parameter, in units of its own standard deviation, below which an iteration has converged.
 const CONVERGED: f64 = 1e-3;
 
+/// Fall of the cost, with positions, that is not worth another step: a hundredth of a standard deviation.
+const PROMISED: f64 = 1e-4;
+
 /// What Gauss-Newton found.
 pub(super) struct Found {
     pub(super) values: Values,
@@ -176,8 +179,10 @@ impl ParameterLayout {
                 damped[k * order + k] *= 1.0 + damping;
             }
             let Some(factor) = DenseFactor::new(&damped, order) else { break };
-            let mut step = right;
+            let mut step = right.clone();
             factor.solve(&mut step);
+            // What the step promises: half of it is what the cost is above its least.
+            let promised: f64 = step.iter().zip(&right).map(|(step, right)| step * right).sum();
             let next = self.stepped(&values, &step);
             let next_cost = self.cost(&next, sums, near);
             // In units of the standard deviation that each would have if the others were known: never too large.
@@ -193,7 +198,9 @@ impl ParameterLayout {
             }
             (values, cost) = (next, next_cost);
             // A damping of one halves a step: what is left is as small as the step then.
-            if moved < CONVERGED && damping <= 1.0 {
+            // Where data leave a direction open, as one wave does to positions across it, rounding moves values along it for ever.
+            let is_least = self.terms() > 1 && promised < PROMISED;
+            if (moved < CONVERGED || is_least) && damping <= 1.0 {
                 converged = true;
                 break;
             }
