@@ -331,7 +331,7 @@ fn wrong_minima_are_no_good_solutions() {
         }
     }
     eprintln!("{missed} of {wrong} wrong ones are good, {refused} of {right_ones} right ones are not");
-    assert!(wrong >= 8 && right_ones >= 30);
+    assert!(wrong >= 5 && right_ones >= 30);
     // A wrong daughter leads others astray: those that are off by less than itself leave less of their signal.
     assert!(
         missed * 4 <= wrong && refused * 4 <= right_ones,
