@@ -50,6 +50,7 @@ pub(super) fn execute(args: &RecalibrateArgs) -> CommandResult {
     let new = with_gains(&config, args.calibration.clone());
     let ground = |config: &Config| config.ground(WAIT_BYTES);
     let (found, notes) = Ground::recalibrate(&args.state, &args.files, &ground(&config), &ground(&new))?;
+    print_notes(new.positions_note());
     print_notes(notes.iter().map(String::as_str));
     if args.json {
         print_json_line(&found)?;

@@ -181,6 +181,7 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     let source = ConfigSource { file: args.map.clone(), overrides, seed: None };
     let config = args.with_known_settings(source, job).load_ground()?;
     use_threads(&config.runtime)?;
+    print_notes(config.positions_note());
     if let Some(size) = args.groups {
         return in_groups(args, &config, size);
     }

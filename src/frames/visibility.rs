@@ -124,6 +124,22 @@ impl PlacedVisibilities {
         self.time_s.is_empty()
     }
 
+    /// The same channel and pair, with no visibilities.
+    #[must_use]
+    pub fn without_visibilities(&self) -> Self {
+        let Self { channel, band, frequency_hz, pair, .. } = *self;
+        Self { channel, band, frequency_hz, pair, ..Self::default() }
+    }
+
+    /// Adds visibility `k` of `other`, which has one.
+    pub fn push_of(&mut self, other: &Self, k: usize) {
+        self.time_s.push(other.time_s[k]);
+        self.r_i_m.push(other.r_i_m[k]);
+        self.r_j_m.push(other.r_j_m[k]);
+        self.value_k_sr.push(other.value_k_sr[k]);
+        self.weight.push(other.weight[k]);
+    }
+
     /// Keeps the first `len` visibilities.
     pub fn truncate(&mut self, len: usize) {
         let Self { time_s, r_i_m, r_j_m, value_k_sr, weight, .. } = self;

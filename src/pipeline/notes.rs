@@ -1,12 +1,17 @@
 //! Notes on valid configurations that are probably not meant.
 
 use std::f64::consts::TAU;
+use std::path::PathBuf;
 
 use super::config::Config;
-use crate::calibration::VanVleck;
+use crate::accumulation::EngineKind;
+use crate::calibration::{CalibrationHook, GainsFile, VanVleck};
 use crate::mother::Fidelity;
 use crate::units::Dimension;
 use crate::units::constants::{MOON_GM_M3_S2, MOON_RADIUS_M};
+
+/// Angle, deg, by which baselines that have been corrected may lie off the common circle.
+const CORRECTED_DEG: f64 = 2.0;
 
 /// Relative difference of the orbital period from Kepler's that is accepted; the paper's is 2e-4.
 const PERIOD_PART: f64 = 0.01;
@@ -15,7 +20,33 @@ impl Config {
     /// Notes on values that are valid and probably not meant.
     #[must_use]
     pub fn notes(&self) -> Vec<String> {
-        [self.period_note(), self.quantiser_note()].into_iter().flatten().collect()
+        [self.period_note(), self.quantiser_note(), self.positions_note()].into_iter().flatten().collect()
+    }
+
+    /// Positions that are corrected, and limits that refuse what is corrected.
+    #[must_use]
+    pub fn positions_note(&self) -> Option<String> {
+        let (map, calibration) = (&self.map, &self.calibration);
+        let limits = &map.limits;
+        let narrow = limits.out_of_track_deg_max.min(limits.radial_deg_max) < CORRECTED_DEG;
+        if map.engine != EngineKind::Harmonic || map.refine.is_on() || !narrow {
+            return None;
+        }
+        let has_positions =
+            |path: &PathBuf| GainsFile::read(path).is_ok_and(|file| !file.positions.is_empty());
+        let corrects = match calibration.hook {
+            CalibrationHook::AntennaGains => calibration.gains_file.as_ref().is_some_and(has_positions),
+            CalibrationHook::Solve => self.calibrate.position_sigma_m > 0.0,
+            CalibrationHook::Identity => false,
+        };
+        corrects.then(|| {
+            format!(
+                "corrected positions lie off the common circle by as much as they are not known (3.5 m are {CORRECTED_DEG} deg of \
+                 a baseline of 100 m), and the harmonic engine refuses baselines beyond map.limits.out_of_track_deg_max = {} and \
+                 map.limits.radial_deg_max = {}; {CORRECTED_DEG} for both, or map.refine.passes_max above 0, lets them in",
+                limits.out_of_track_deg_max, limits.radial_deg_max
+            )
+        })
     }
 
     /// An orbital period that does not fit the altitude.
@@ -71,5 +102,33 @@ mod tests {
         assert!(config.notes()[0].contains("calibration.quantiser_bits = 1"), "{:?}", config.notes());
         config.calibration.quantiser_bits = 1;
         assert_eq!(config.notes(), Vec::<String>::new());
+    }
+
+    #[test]
+    fn limits_that_refuse_corrected_positions_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |positions: &str| {
+            let path = folder.path().join("gains.json");
+            let gains = r#"{"channels": [{"frequency_hz": 1e7, "solutions": [{"time_s": 0, "gains": [[1, 0], [1, 0]]}]}]"#;
+            std::fs::write(&path, format!("{gains}, \"positions\": [{positions}]}}")).unwrap();
+            path
+        };
+        let position = r#"{"from_s": 0, "until_s": 9, "normals_hat": [[0, 0, 1], [0, 0, 1]], "offsets_m": [[0, 0, 0], [1, 2, 3]]}"#;
+        let mut config = Config::default();
+        config.map.engine = EngineKind::Harmonic;
+        config.calibration.hook = CalibrationHook::AntennaGains;
+        config.calibration.gains_file = Some(file(""));
+        assert_eq!(config.positions_note(), None);
+        config.calibration.gains_file = Some(file(position));
+        let note = config.positions_note().unwrap();
+        assert!(note.contains("map.limits.out_of_track_deg_max = 0.1"), "{note}");
+        let mut wide = config.clone();
+        (wide.map.limits.out_of_track_deg_max, wide.map.limits.radial_deg_max) = (2.0, 2.0);
+        assert_eq!(wide.positions_note(), None);
+        let mut refined = config.clone();
+        refined.map.refine.passes_max = 5;
+        assert_eq!(refined.positions_note(), None);
+        config.map.engine = EngineKind::Pixel;
+        assert_eq!(config.positions_note(), None);
     }
 }

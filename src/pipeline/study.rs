@@ -89,7 +89,7 @@ struct StudyFile {
     /// Whether each case is made twice: with the data as sent, and with gains that are found from them.
     #[serde(default)]
     calibrated: bool,
-    /// Maps of the sky to calibrate with, one a channel; beside the study.
+    /// Maps of the sky to calibrate with, one a channel; beside the study. Without, those of `calibrate.model_files`.
     #[serde(default)]
     model: Vec<PathBuf>,
 }
@@ -240,7 +240,13 @@ impl Study {
             }
             realised.push(of_case);
         }
-        let models: Vec<PathBuf> = file.model.iter().map(beside).collect();
+        let mut models: Vec<PathBuf> = file.model.iter().map(beside).collect();
+        if models.is_empty() && file.calibrated {
+            // As `lunarray calibrate`; what is wrong is told with the cases.
+            let overrides = [file.set.as_slice(), more].concat();
+            let common = ConfigSource { file: pipeline.clone(), overrides, seed: None }.load();
+            models = common.map_or_else(|_| Vec::new(), |common| common.calibrate.model_files);
+        }
         if !models.is_empty() && !file.calibrated {
             return Err(wrong("model without calibration".to_owned(), "calibrated = true with a model"));
         }

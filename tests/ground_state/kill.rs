@@ -126,3 +126,81 @@ fn killed_while_taking_out_it_leaves_the_old_state_or_the_new_one() {
     );
     eprintln!("{olds} left the old state, {news} the new one");
 }
+
+/// Gains of eight daughters that are near one and change between two times; errors of their positions with `position_m`.
+fn gains(seed: u32, position_m: f64) -> String {
+    let mut state = seed;
+    // Any numbers will do: a linear congruence.
+    let mut draw = || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        f64::from(state >> 8) / f64::from(1_u32 << 24) - 0.5
+    };
+    let mut solution = |time_s: f64| {
+        let gains: Vec<[f64; 2]> = (0..8).map(|_| [1.0 + 0.2 * draw(), 0.4 * draw()]).collect();
+        serde_json::json!({ "time_s": time_s, "gains": gains })
+    };
+    let mut channel = |frequency_hz: f64| serde_json::json!({ "frequency_hz": frequency_hz, "solutions": [solution(0.0), solution(4e7)] });
+    let channels = [channel(3e6), channel(10e6)];
+    let offsets: Vec<[f64; 3]> = (0..8).map(|n| [position_m * f64::from(n), 0.0, 0.0]).collect();
+    let positions = serde_json::json!([{
+        "from_s": 0.0, "until_s": 4e7, "normals_hat": vec![[0.0, 0.0, 1.0]; 8], "offsets_m": offsets
+    }]);
+    serde_json::json!({ "channels": channels, "positions": positions }).to_string()
+}
+
+#[test]
+fn killed_while_gains_are_replaced_it_leaves_the_old_state_or_the_new_one() {
+    for (engine, more) in ENGINES {
+        let place = Ground::with(more);
+        let file = place.downlink();
+        // Offsets along the track alone keep daughters on their circle.
+        let [old_gains, new_gains] = [("old.json", 1, 0.0), ("new.json", 2, 0.5)]
+            .map(|(name, seed, position_m)| place.file(name, gains(seed, position_m).as_bytes()));
+        place.replay("whole", &[&file], &["--calibration", &old_gains]);
+        let copy = |name: &str| {
+            let (from, to) = (place.path("whole"), place.path(name));
+            let _ = std::fs::remove_dir_all(&to);
+            std::fs::create_dir(&to).unwrap();
+            for path in checkpoints(Path::new(&from)) {
+                std::fs::copy(&path, Path::new(&to).join(path.file_name().unwrap())).unwrap();
+            }
+        };
+        let args = |state: &str| -> Vec<String> {
+            let state = place.path(state);
+            let args = ["recalibrate", &file, "--state", &state, "--map", &place.pipeline];
+            let gains = ["--old-calibration", &old_gains, "--calibration", &new_gains];
+            args.into_iter().chain(gains).map(str::to_owned).collect()
+        };
+        copy("recalibrated");
+        let since = Instant::now();
+        assert!(start(&args("recalibrated")).wait().unwrap().success());
+        let length = since.elapsed();
+        let (old, new) = (place.bytes("whole"), place.bytes("recalibrated"));
+        assert!(old != new, "{engine}");
+        copy("killed");
+        let (mut olds, mut news) = (0, 0);
+        kill(
+            kills(),
+            length,
+            || start(&args("killed")),
+            |_| {
+                let found = place.bytes("killed");
+                assert!(found == old || found == new, "{engine}");
+                let is_old = found == old;
+                // The same command again: from the old state to every bit of the new one; the new one is of other gains than
+                // the command says, and stays.
+                assert_eq!(start(&args("killed")).wait().unwrap().success(), is_old, "{engine}");
+                assert!(place.bytes("killed") == new, "{engine}");
+                (olds, news) = (olds + u32::from(is_old), news + u32::from(!is_old));
+                copy("killed");
+            },
+        );
+        // The sums are those of a new state with the new gains.
+        place.replay("fresh", &[&file], &["--calibration", &new_gains]);
+        place.replay("killed", &[&file], &["--calibration", &old_gains]);
+        assert!(start(&args("killed")).wait().unwrap().success(), "{engine}");
+        place.replay("killed", &[&file], &["--calibration", &new_gains]);
+        assert!(place.maps("killed") == place.maps("fresh"), "{engine}");
+        eprintln!("{engine}: {olds} left the old state, {news} the new one");
+    }
+}

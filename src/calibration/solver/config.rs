@@ -65,6 +65,8 @@ pub struct SolverConfig {
     pub iterations_max: u32,
     /// Most predictions of the model at positions found before.
     pub position_rounds: u32,
+    /// Part of a daughter's signal that a solution with positions may leave unexplained; with more, its data are left out of maps.
+    pub unexplained_max: f64,
     /// Standard deviation of a phase, deg, beyond which a daughter's data are left out of maps.
     pub phase_sigma_deg_max: f64,
     /// Gain amplitude below which a receiver is taken to be dead.
@@ -101,6 +103,7 @@ impl Default for SolverConfig {
             outlier_rounds: 3,
             iterations_max: 50,
             position_rounds: 3,
+            unexplained_max: 0.15,
             phase_sigma_deg_max: 30.0,
             dead_amplitude: 0.05,
             model_files: Vec::new(),
@@ -212,6 +215,8 @@ impl SolverConfig {
         checks.number("outlier_sigma", cut, (3.0..=1e6).contains(&cut), "3 to 1e6");
         let most = self.phase_sigma_deg_max;
         checks.number("phase_sigma_deg_max", most, most > 0.0, "degrees, above 0");
+        let part = self.unexplained_max;
+        checks.number("unexplained_max", part, part > 0.0 && part <= 1.0, "above 0 to 1");
         let dead = self.dead_amplitude;
         checks.number("dead_amplitude", dead, (0.0..1.0).contains(&dead), "0 to below 1");
         let solves = [self.amplitude_sigma, self.phase_sigma_deg, self.clock_sigma_ns, self.position_sigma_m];

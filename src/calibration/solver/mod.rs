@@ -4,8 +4,16 @@
 //! |---|---|
 //! | `model` | the known signal: a map, an artificial signal, or both |
 //! | `sums` | what a solution needs of the data, by channel and pair |
-//! | `newton` | parameters, priors, starting values, Gauss-Newton |
+//! | `layout` | parameters and priors |
+//! | `start` | starting values |
+//! | `newton` | Gauss-Newton |
+//! | `robust` | outliers, and pairs whose model is not as good as their noise |
 //! | `solution` | robust rounds, and the solution of a pass |
+//! | `fit` | whether a solution explains the data |
+//! | `positions` | positions that are off by a good part of a wavelength |
+//! | `global` | positions that are off by radians: a search over all offsets |
+//! | `moments` | a pair at any offset |
+//! | `expansion` | a plane wave of an offset by spherical harmonics |
 //! | `passes` | a pass from packets to its solutions |
 //! | `monitor` | what happened to the instrument |
 //! | `table` | tables, and the file of gains |
@@ -14,11 +22,21 @@ mod config;
 #[cfg(test)]
 mod cramer_rao;
 mod dense;
+mod expansion;
+mod fit;
+mod global;
+mod layout;
 mod model;
+mod moments;
 mod monitor;
 mod newton;
 mod passes;
+#[cfg(test)]
+mod position_tests;
+mod positions;
+mod robust;
 mod solution;
+mod start;
 mod sums;
 mod table;
 #[cfg(test)]

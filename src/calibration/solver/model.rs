@@ -68,6 +68,35 @@ impl KnownSignal {
         })
     }
 
+    /// Directions of the pixels of a channel's sky, where positions are solved for.
+    pub(super) fn directions(&self, channel: usize) -> Vec<Vec3> {
+        match self.sky.get(channel) {
+            Some(ChannelSky::Gradient(sum)) => sum.directions(),
+            _ => Vec::new(),
+        }
+    }
+
+    /// Sums over the sky of a channel as [`DirectMoments::sums_with`] gives them; nothing without a sky.
+    ///
+    /// # Errors
+    /// Positions that the model does not cover.
+    pub(super) fn sums_with(
+        &self,
+        channel: usize,
+        positions: &[PairPosition],
+        functions: &[f32],
+    ) -> Result<Vec<f32>, ModelError> {
+        match self.sky.get(channel) {
+            Some(ChannelSky::Gradient(sum)) => sum.sums_with(positions, functions),
+            _ => Ok(Vec::new()),
+        }
+    }
+
+    /// The artificial signal, and the frequency of a channel.
+    pub(super) fn beacon(&self, channel: usize) -> (Beacon, f64) {
+        (self.beacon, self.frequencies_hz[channel])
+    }
+
     /// The model of placed visibilities of a channel, about offsets of the positions; `with_beacon` says whether the
     /// artificial signal is on in them.
     ///

@@ -2,11 +2,13 @@
 
 use super::config::{CalibrationMode, SolverConfig};
 use super::model::{KnownSignal, Offsets};
-use super::solution::{PassData, PassSolution, solve_pass};
+use super::positions::{Search, modelled};
+use super::solution::{PassData, PassSolution, solve_from};
 use super::sums::ModelledBlock;
 use crate::array::{Ephemeris, orbit_normal_hat};
 use crate::calibration::{CalibrationError, VanVleck};
 use crate::frames::{Flags, Instrument, PlacedVisibilities, VisibilityBlock};
+use crate::response::model::ModelError;
 use crate::sky::SkyMap;
 use crate::units::InvalidValue;
 use crate::units::vector::Vec3;
@@ -127,29 +129,34 @@ impl SolverConfig {
 }
 
 /// One pass, and what it is solved with.
-struct Task<'a> {
-    config: &'a SolverConfig,
-    frequencies: &'a [f64],
-    number: u64,
-    span_s: [f64; 2],
-    normal_hat: Vec<Vec3>,
+pub(super) struct Task<'a> {
+    pub(super) config: &'a SolverConfig,
+    pub(super) frequencies: &'a [f64],
+    pub(super) number: u64,
+    pub(super) span_s: [f64; 2],
+    pub(super) normal_hat: Vec<Vec3>,
 }
 
 impl Task<'_> {
     /// Solutions of its parts; with positions, about those found before.
-    fn solve(
+    pub(super) fn solve(
         &self,
         placed: &[(PlacedVisibilities, bool)],
         signal: &mut KnownSignal,
     ) -> Result<Vec<PassSolution>, CalibrationError> {
         let Self { config, normal_hat, .. } = self;
-        let mut offsets =
-            Offsets { offset_m: vec![[0.0; 3]; normal_hat.len()], normal_hat: normal_hat.clone() };
         let moves = config.position_sigma_m > 0.0;
+        let sought = if moves { Some(self.search(placed).find(signal)?) } else { None };
+        let offset_m = sought
+            .as_ref()
+            .map_or_else(|| vec![[0.0; 3]; normal_hat.len()], |sought| sought.position_m.clone());
+        let mut offsets = Offsets { offset_m, normal_hat: normal_hat.clone() };
         let mut solutions = Vec::new();
         for _ in 0..if moves { config.position_rounds } else { 1 } {
-            let mut blocks = modelled(placed, signal, &offsets)?;
-            solutions = self.parts().map(|span_s| self.part(span_s, &mut blocks)).collect();
+            let block =
+                |(placed, is_on): &(PlacedVisibilities, bool)| modelled(placed, signal, &offsets, *is_on);
+            let mut blocks = placed.iter().map(block).collect::<Result<Vec<ModelledBlock>, ModelError>>()?;
+            solutions = self.parts().map(|span_s| self.part(span_s, &mut blocks, &offsets)).collect();
             let [solution] = &solutions[..] else { break };
             let now: Vec<[f64; 3]> = solution.daughters.iter().map(|daughter| daughter.position_m).collect();
             let sigma = |n: usize, axis: usize| solution.daughters[n].position_sigma_m[axis];
@@ -161,6 +168,9 @@ impl Task<'_> {
             if !moved {
                 break;
             }
+        }
+        if let Some(sought) = sought {
+            solutions.iter_mut().for_each(|solution| solution.doubt(|n, hz| sought.is_ambiguous(n, hz)));
         }
         Ok(solutions)
     }
@@ -176,10 +186,21 @@ impl Task<'_> {
         })
     }
 
-    fn part(&self, span_s: [f64; 2], blocks: &mut [ModelledBlock]) -> PassSolution {
+    fn part(&self, span_s: [f64; 2], blocks: &mut [ModelledBlock], about: &Offsets) -> PassSolution {
         let normal_hat = self.normal_hat.clone();
         let data = PassData { pass: self.number, span_s, blocks, normal_hat };
-        solve_pass(self.config, self.frequencies, data)
+        solve_from(self.config, self.frequencies, data, &about.offset_m)
+    }
+
+    fn search<'a>(&'a self, placed: &'a [(PlacedVisibilities, bool)]) -> Search<'a> {
+        let Self { config, frequencies, normal_hat, .. } = self;
+        Search { config, frequencies_hz: frequencies, span_s: self.whole_s(), normal_hat, placed }
+    }
+
+    /// All of the pass; its end belongs to it.
+    fn whole_s(&self) -> [f64; 2] {
+        let [from_s, until_s] = self.span_s;
+        [from_s, until_s + 1e-6 * (1.0 + until_s - from_s)]
     }
 }
 
@@ -221,23 +242,4 @@ fn placed(
         })
         .flatten()
         .collect()
-}
-
-fn modelled(
-    placed: &[(PlacedVisibilities, bool)],
-    signal: &mut KnownSignal,
-    offsets: &Offsets,
-) -> Result<Vec<ModelledBlock>, CalibrationError> {
-    let block = |(placed, is_on): &(PlacedVisibilities, bool)| {
-        Ok(ModelledBlock {
-            channel: placed.channel.0.into(),
-            pair: placed.pair,
-            time_s: placed.time_s.clone(),
-            value_k_sr: placed.value_k_sr.clone(),
-            weight: placed.weight.clone(),
-            model: signal.model(placed, offsets, *is_on)?,
-            is_out: vec![false; placed.len()],
-        })
-    };
-    placed.iter().map(block).collect()
 }

@@ -1,17 +1,16 @@
 //! Solutions of a pass: robust rounds about Gauss-Newton, and what is told of them.
 
 use bincode::{Decode, Encode};
-use num_complex::Complex64;
 use rayon::prelude::*;
 use serde::Serialize;
 
 use super::config::SolverConfig;
-use super::newton::{Found, ParameterLayout};
-use super::sums::{MODEL_TERMS, ModelledBlock, PairSums};
+use super::fit::unexplained;
+use super::layout::ParameterLayout;
+use super::newton::Found;
+use super::robust::judge;
+use super::sums::{ModelledBlock, PairSums};
 use crate::units::vector::Vec3;
-
-/// Median of the squared residual of a complex number, in units of the variance of a part: 2 ln 2.
-const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
 
 /// Change of a pair's spread below which a round settles.
 const SPREAD_SETTLED: f64 = 0.02;
@@ -30,6 +29,10 @@ pub enum GainState {
     Uncertain,
     /// The iteration did not converge.
     NotConverged,
+    /// The solution leaves too much of the signal unexplained: a wrong minimum.
+    PoorFit,
+    /// Another position explains the data as well.
+    Ambiguous,
 }
 
 /// Gain of one daughter in one channel.
@@ -119,6 +122,19 @@ pub struct PassSolution {
     pub normal_hat: Vec<Vec3>,
 }
 
+impl PassSolution {
+    /// Marks good gains of daughters and frequencies whose position may be another one.
+    pub(super) fn doubt(&mut self, is_ambiguous: impl Fn(usize, f64) -> bool) {
+        for (n, daughter) in self.daughters.iter_mut().enumerate() {
+            for gain in &mut daughter.gains {
+                if gain.state == GainState::Good && is_ambiguous(n, gain.frequency_hz) {
+                    gain.state = GainState::Ambiguous;
+                }
+            }
+        }
+    }
+}
+
 /// Data of a pass.
 pub struct PassData<'a> {
     /// Number of the pass.
@@ -134,17 +150,29 @@ pub struct PassData<'a> {
 /// Solves for the errors of daughters in channels of these frequencies, over one interval. Marks outliers in the blocks.
 #[must_use]
 pub fn solve_pass(config: &SolverConfig, frequencies_hz: &[f64], data: PassData<'_>) -> PassSolution {
+    let position_m = vec![[0.0; 3]; data.normal_hat.len()];
+    solve_from(config, frequencies_hz, data, &position_m)
+}
+
+/// [`solve_pass`] that begins with daughters off by `position_m`.
+pub(super) fn solve_from(
+    config: &SolverConfig,
+    frequencies_hz: &[f64],
+    data: PassData<'_>,
+    position_m: &[[f64; 3]],
+) -> PassSolution {
     let PassData { pass, span_s, blocks, normal_hat } = data;
     let layout = ParameterLayout::new(config, normal_hat.len(), frequencies_hz);
     let mut spreads = vec![1.0; blocks.len()];
     blocks.par_iter_mut().for_each(|block| block.is_out.fill(false));
     let mut sums = sums_of(blocks, span_s, &layout, &spreads);
-    let mut found = layout.minimise(layout.start(&sums), &sums, config.iterations_max as usize);
+    let mut found =
+        layout.minimise(layout.start(&sums, position_m), &sums, None, config.iterations_max as usize);
     let mut chi_squares = vec![(0.0, 0.0); blocks.len()];
     for round in 0..=config.outlier_rounds {
         let judge = |((block, spread), sums): ((&mut ModelledBlock, &mut f64), &PairSums)| {
             let before = (block.is_out.clone(), *spread);
-            let (gain, u) = layout.pair(&found.values, sums);
+            let (gain, u) = layout.pair(&found.values, sums.channel, sums.pair);
             let chi_square = judge(block, span_s, config.outlier_sigma, gain, &u, spread);
             let changed = block.is_out != before.0 || (*spread / before.1 - 1.0).abs() > SPREAD_SETTLED;
             (chi_square, changed)
@@ -157,12 +185,16 @@ pub fn solve_pass(config: &SolverConfig, frequencies_hz: &[f64], data: PassData<
             break;
         }
         sums = sums_of(blocks, span_s, &layout, &spreads);
-        found = layout.minimise(found.values, &sums, config.iterations_max as usize);
+        found = layout.minimise(found.values, &sums, None, config.iterations_max as usize);
     }
     let (square, count) =
         chi_squares.iter().fold((0.0, 0.0), |(a, b), (square, count)| (a + square, b + count));
     let counts = Counts::of(blocks, span_s, &layout);
-    let told = |n: usize| daughter(config, &layout, (&found, &counts), n);
+    let unexplained = match layout.terms() {
+        1 => vec![0.0; layout.satellites * layout.channels()],
+        _ => unexplained(&layout, &found, blocks, config.unexplained_max),
+    };
+    let told = |n: usize| daughter(config, &layout, (&found, &counts, &unexplained), n);
     PassSolution {
         pass,
         from_s: span_s[0],
@@ -179,7 +211,7 @@ pub fn solve_pass(config: &SolverConfig, frequencies_hz: &[f64], data: PassData<
     }
 }
 
-fn sums_of(
+pub(super) fn sums_of(
     blocks: &[ModelledBlock],
     span_s: [f64; 2],
     layout: &ParameterLayout,
@@ -187,42 +219,6 @@ fn sums_of(
 ) -> Vec<PairSums> {
     let of = |(block, spread): (&ModelledBlock, &f64)| PairSums::of(block, span_s, layout.terms(), *spread);
     blocks.par_iter().zip(spreads).map(of).collect()
-}
-
-/// Marks outliers of a block, and measures the spread of the others; returns the sum of their squared residuals in units of
-/// the noise, and their number.
-fn judge(
-    block: &mut ModelledBlock,
-    [from_s, until_s]: [f64; 2],
-    cut: f64,
-    gain: Complex64,
-    u: &[f64; MODEL_TERMS],
-    spread: &mut f64,
-) -> (f64, f64) {
-    let inside: Vec<usize> =
-        (0..block.time_s.len()).filter(|&k| (from_s..until_s).contains(&block.time_s[k])).collect();
-    let square = |&k: &usize| {
-        let model: Complex64 = block.model[k].iter().zip(u).map(|(term, factor)| term * factor).sum();
-        block.weight[k] * (block.value_k_sr[k] - gain * model).norm_sqr()
-    };
-    let squares: Vec<f64> = inside.iter().map(square).collect();
-    let mut sorted = squares.clone();
-    sorted.sort_unstable_by(f64::total_cmp);
-    let Some(median) = sorted.get(sorted.len() / 2) else { return (0.0, 0.0) };
-    let limit = cut * cut * (median / MEDIAN).max(1.0);
-    let (mut sum, mut count) = (0.0, 0.0);
-    for (k, square) in inside.into_iter().zip(squares) {
-        // What is not finite is out, too.
-        let keeps = square <= limit;
-        block.is_out[k] = !keeps;
-        if keeps {
-            sum += square;
-            count += 1.0;
-        }
-    }
-    // Few visibilities say little of their spread.
-    *spread = if count >= 8.0 { (sum / (2.0 * count)).max(1.0) } else { 1.0 };
-    (sum, count)
 }
 
 /// Visibilities by channel and daughter.
@@ -268,7 +264,7 @@ impl Counts {
 fn daughter(
     config: &SolverConfig,
     layout: &ParameterLayout,
-    (found, counts): (&Found, &Counts),
+    (found, counts, unexplained): (&Found, &Counts, &[f64]),
     n: usize,
 ) -> DaughterEstimate {
     let order = layout.order();
@@ -293,6 +289,7 @@ fn daughter(
             () if !found.converged => GainState::NotConverged,
             () if gain.norm() < config.dead_amplitude => GainState::Dead,
             () if phase_sigma_deg > config.phase_sigma_deg_max => GainState::Uncertain,
+            () if unexplained[c * layout.satellites + n] > config.unexplained_max => GainState::PoorFit,
             () => GainState::Good,
         };
         GainEstimate {

@@ -23,6 +23,8 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
                     GainState::Dead => "dead",
                     GainState::Uncertain => "uncertain",
                     GainState::NotConverged => "not-converged",
+                    GainState::PoorFit => "poor-fit",
+                    GainState::Ambiguous => "ambiguous",
                 };
                 let ([x, y, z], [sx, sy, sz]) = (daughter.position_m, daughter.position_sigma_m);
                 // Writing to a String cannot fail.

@@ -1,14 +1,18 @@
 //! Visibilities by direct sum over the pixels of a sky.
 
+use faer::{Accum, MatMut, MatRef, Par};
 use num_complex::Complex64;
+use rayon::prelude::*;
 
 use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
 use crate::frames::AntennaResponse;
+use crate::response::pixel::exact::centre_row;
 use crate::response::pixel::{
     Comb, Directions, PairGeometry, SingleGeometry, comb_sums, four_sky_sums, sky_powers, sky_sums,
 };
 use crate::sky::SkyMap;
 use crate::sky::healpix::pixel_area_sr;
+use crate::units::vector::Vec3;
 
 /// Sums a sky over its own pixels, at their centres, without resampling.
 ///
@@ -104,6 +108,53 @@ impl DirectMoments {
         let skies_k = [&self.sum.values[..], x, y, z];
         // Lengths agree by construction, so the sums cannot fail.
         Ok(four_sky_sums(&pairs, &self.sum.directions, skies_k, self.sum.area_sr).unwrap_or_default())
+    }
+}
+
+/// Positions whose rows are multiplied at once.
+const ROWS: usize = 16;
+
+impl DirectMoments {
+    /// Directions of the sky's pixels.
+    #[must_use]
+    pub fn directions(&self) -> Vec<Vec3> {
+        let directions = &self.sum.directions;
+        (0..directions.len()).map(|k| directions.get(k)).collect()
+    }
+
+    /// For each position the sums over the sky times some functions of the direction, K sr: real parts of all functions, then
+    /// imaginary ones. `functions` holds the values at [`Self::directions`], one after another: all functions of the first, and so on.
+    ///
+    /// # Errors
+    /// As [`VisibilityModel::predict`].
+    pub fn sums_with(&self, positions: &[PairPosition], functions: &[f32]) -> Result<Vec<f32>, ModelError> {
+        let pairs = self.sum.pairs(positions)?;
+        let directions = self.directions();
+        let count = functions.len() / directions.len().max(1);
+        let mut sums = vec![0.0; 2 * count * pairs.len()];
+        if count == 0 {
+            return Ok(sums);
+        }
+        sums.par_chunks_mut(2 * count * ROWS).zip(pairs.par_chunks(ROWS)).for_each(|(sums, pairs)| {
+            let mut rows = Vec::with_capacity(2 * pairs.len() * directions.len());
+            for pair in pairs {
+                let row = centre_row(pair, &directions);
+                let scaled =
+                    |(value, kelvin): (f64, &f32)| (value * self.sum.area_sr * f64::from(*kelvin)) as f32;
+                let values = &self.sum.values;
+                rows.extend(row.iter().map(|value| value.re).zip(values).map(scaled));
+                rows.extend(row.iter().map(|value| value.im).zip(values).map(scaled));
+            }
+            faer::linalg::matmul::matmul(
+                MatMut::from_row_major_slice_mut(sums, 2 * pairs.len(), count),
+                Accum::Replace,
+                MatRef::from_row_major_slice(&rows, 2 * pairs.len(), directions.len()),
+                MatRef::from_row_major_slice(functions, directions.len(), count),
+                1.0,
+                Par::Seq,
+            );
+        });
+        Ok(sums)
     }
 }
 

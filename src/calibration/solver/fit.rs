@@ -1,0 +1,100 @@
+//! Whether a solution explains the data.
+//!
+//! A search over positions can end in a wrong minimum, whose formal errors are as small as those of the right one. What tells them
+//! apart is how much of the signal they leave unexplained. Chi-square alone is no measure of that: with much signal, a sky that is
+//! right within a few percent has a large one, and with little signal a wrong minimum has a small one. So the test has two parts:
+//! what is left beyond the noise has to be significant, and a good part of the signal.
+
+use super::layout::ParameterLayout;
+use super::newton::Found;
+use super::sums::ModelledBlock;
+
+/// Standard deviations of noise beyond which something is left.
+const SIGNIFICANT: f64 = 3.0;
+
+/// What is left of the signal of a pair in a channel, and the signal, in units of the variance of signal and noise together:
+/// beams, beacons and pairs of any strength count by the number of their visibilities.
+#[derive(Clone, Copy, Default)]
+struct Left {
+    left: f64,
+    signal: f64,
+    /// Variance of `left` by noise.
+    variance: f64,
+}
+
+impl Left {
+    fn of(layout: &ParameterLayout, found: &Found, block: &ModelledBlock) -> Self {
+        let (gain, u) = layout.pair(&found.values, block.channel, block.pair);
+        let (mut count, mut residual, mut power) = (0.0, 0.0, 0.0);
+        for k in (0..block.time_s.len()).filter(|&k| !block.is_out[k]) {
+            let model: num_complex::Complex64 =
+                block.model[k].iter().zip(&u).map(|(term, factor)| term * factor).sum();
+            let (value, weight) = (block.value_k_sr[k], block.weight[k]);
+            count += 1.0;
+            residual += 0.5 * weight * (value - gain * model).norm_sqr();
+            power += 0.5 * weight * value.norm_sqr();
+        }
+        if power <= count {
+            return Self::default();
+        }
+        let noise = count / power;
+        Self {
+            left: (residual - count) * noise,
+            signal: (power - count) * noise,
+            variance: count * noise * noise,
+        }
+    }
+
+    fn with(self, other: Self) -> Self {
+        Self {
+            left: self.left + other.left,
+            signal: self.signal + other.signal,
+            variance: self.variance + other.variance,
+        }
+    }
+
+    /// Part of the signal that is left; none if it may be noise.
+    fn part(&self) -> f64 {
+        if self.left > SIGNIFICANT * self.variance.sqrt() { self.left / self.signal } else { 0.0 }
+    }
+}
+
+/// Part of the signal of each daughter in each channel (by channel, then daughter) that its solution leaves. The worst daughter of a
+/// channel answers for its pairs, if it is above `most`; the next one for what remains.
+pub(super) fn unexplained(
+    layout: &ParameterLayout,
+    found: &Found,
+    blocks: &[ModelledBlock],
+    most: f64,
+) -> Vec<f64> {
+    let n = layout.satellites;
+    let mut parts = vec![0.0; n * layout.channels()];
+    for (channel, parts) in parts.chunks_mut(n.max(1)).enumerate() {
+        let mut pairs: Vec<([usize; 2], Left)> = blocks
+            .iter()
+            .filter(|block| block.channel == channel)
+            .map(|block| ([block.pair.i, block.pair.j].map(usize::from), Left::of(layout, found, block)))
+            .collect();
+        loop {
+            let of = |daughter: usize| {
+                let own = pairs.iter().filter(|(pair, _)| pair.contains(&daughter));
+                own.fold(Left::default(), |sum, (_, left)| sum.with(*left)).part()
+            };
+            let open: Vec<(usize, f64)> = (0..n).filter(|k| parts[*k] == 0.0).map(|k| (k, of(k))).collect();
+            // Of two that are equally bad the reference stays.
+            let worst = open
+                .iter()
+                .copied()
+                .filter(|(k, _)| *k != layout.reference)
+                .chain(open.iter().copied().filter(|(k, _)| *k == layout.reference));
+            let worst = worst.fold((0, 0.0), |worst, one| if one.1 > worst.1 { one } else { worst });
+            if worst.1 <= most {
+                open.into_iter().for_each(|(k, part)| parts[k] = part);
+                break;
+            }
+            parts[worst.0] = worst.1;
+            pairs.retain(|(pair, _)| !pair.contains(&worst.0));
+        }
+    }
+    parts
+}
