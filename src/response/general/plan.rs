@@ -344,7 +344,7 @@ impl PassBuilder<'_> {
         let slope = views.iter().map(|view| wavelengths(view) * view.limb_rad().sin()).fold(0.0, f64::max);
         let l_max = self.setup.l_max as f64;
         let h = l_max * tilt + (l_max + TAU * slope) * limb + TAU * half_range(&wavelengths);
-        (h + 3.0 * h.cbrt() + 2.0).ceil() as usize
+        (h + 2.5 * h.cbrt() + 4.0).ceil() as usize
     }
 
     fn wavelengths(&self, view: &PairView) -> f64 {
