@@ -6,7 +6,8 @@ use rayon::prelude::*;
 
 use super::HarmonicSetup;
 use super::grid::{Grids, NODES};
-use super::tori::{Tori, TorusPart};
+use super::stored::TorusPart;
+use super::tori::Tori;
 use super::workspace::ALPHAS;
 use crate::accumulation::fixed_point::parts::sum_of_parts;
 use crate::ranks::Ranks;

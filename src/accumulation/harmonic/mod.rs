@@ -27,6 +27,7 @@ mod held;
 mod lines;
 mod noises;
 mod operator;
+mod parts;
 mod refined;
 mod segments;
 mod setup;
@@ -47,13 +48,13 @@ pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
 pub use held::RefinedSetup;
 pub use noises::NoiseSums;
+pub use parts::SumPart;
 pub use refined::{Departures, RefinedData, RefinedSums, orbit_phase_deg};
 pub use segments::{HELD_BYTES, HeldSegment, SegmentPlace};
 pub use setup::{
     ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, SharedSize, application_size, memory, orbit_of,
     shared_size,
 };
-pub use stored::SumPart;
 pub use sums::{HarmonicSums, coefficients, degrees, unknowns, unknowns_of_gradient};
 
 use self::checkpoint::HarmonicHead;

@@ -11,7 +11,8 @@ use rayon::prelude::*;
 
 use super::grid::{Grids, NODE_GROUP, NODES};
 use super::lines::multiply_line;
-use super::tori::{BlockRows, Tori, TorusPart};
+use super::stored::TorusPart;
+use super::tori::{BlockRows, Tori};
 use super::workspace::{ALPHAS, NodeRange, Workspace};
 use crate::accumulation::fixed_point::parts::sum_of_parts;
 use crate::ranks::Ranks;

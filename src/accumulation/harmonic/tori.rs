@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::grid::{Grids, NODES};
-use super::stored::StoredTori;
+use super::grid::Grids;
+use super::stored::{ReadRows, StoredTori, TorusPart};
 use super::workspace::ALPHAS;
 use crate::ranks::Ranks;
 
@@ -27,13 +27,6 @@ pub(super) struct Tori {
     pub(super) stored: Option<Arc<StoredTori>>,
 }
 
-/// Which sums of a node.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum TorusPart {
-    Weights,
-    Right,
-}
-
 /// The rows of a block of alphas, of all nodes.
 pub(super) enum BlockRows<'a> {
     Held {
@@ -43,12 +36,7 @@ pub(super) enum BlockRows<'a> {
         first: usize,
         row: usize,
     },
-    Read {
-        values: Vec<f32>,
-        /// Where each node begins, of those that have data.
-        nodes: Vec<Option<usize>>,
-        row: usize,
-    },
+    Read(ReadRows),
 }
 
 impl NodeSums {
@@ -64,24 +52,6 @@ impl NodeSums {
     }
 }
 
-impl TorusPart {
-    /// Points of the grid in alpha.
-    pub(super) fn points(self, grids: &Grids) -> usize {
-        match self {
-            Self::Weights => grids.points,
-            Self::Right => grids.data_points(),
-        }
-    }
-
-    /// Floats of a row: of one node at one alpha.
-    pub(super) fn row(self, grids: &Grids) -> usize {
-        match self {
-            Self::Weights => NODES * grids.weight_stride(),
-            Self::Right => 4 * grids.data_stride(),
-        }
-    }
-}
-
 impl BlockRows<'_> {
     /// The row of a node at the alpha `place` of the block, if it has data.
     #[inline]
@@ -91,10 +61,7 @@ impl BlockRows<'_> {
                 let sums = tori.nodes.get(node)?.as_ref()?.part(*part);
                 sums.get(first + place * row..first + (place + 1) * row)
             }
-            Self::Read { values, nodes, row } => {
-                let first = (*nodes.get(node)?)?;
-                values.get(first + place * row..first + (place + 1) * row)
-            }
+            Self::Read(read) => read.row(node, place),
         }
     }
 }
@@ -141,7 +108,7 @@ impl Tori {
     /// The rows of a block of alphas that is held here; `None` if they could not be read.
     pub(super) fn block(&self, grids: &Grids, part: TorusPart, block: usize) -> Option<BlockRows<'_>> {
         match &self.stored {
-            Some(stored) => stored.block(part, block, part.row(grids)),
+            Some(stored) => stored.block(part, block, part.row(grids)).map(BlockRows::Read),
             None => {
                 let (row, first) = (part.row(grids), grids.row(block * ALPHAS));
                 Some(BlockRows::Held { tori: self, part, first: first * row, row })
