@@ -263,6 +263,28 @@ pub fn nameless_file(folder: &Path) -> io::Result<File> {
     file
 }
 
+/// Reads bytes at a place of a file; several threads may.
+///
+/// # Errors
+/// The system's error; a system that has no such call.
+pub fn read_at(file: &File, bytes: &mut [u8], offset: u64) -> io::Result<()> {
+    #[cfg(unix)]
+    return std::os::unix::fs::FileExt::read_exact_at(file, bytes, offset);
+    #[cfg(not(unix))]
+    return Err(io::Error::new(io::ErrorKind::Unsupported, format!("{file:?}: {} at {offset}", bytes.len())));
+}
+
+/// Writes bytes at a place of a file; several threads may.
+///
+/// # Errors
+/// The system's error; a system that has no such call.
+pub fn write_at(file: &File, bytes: &[u8], offset: u64) -> io::Result<()> {
+    #[cfg(unix)]
+    return std::os::unix::fs::FileExt::write_all_at(file, bytes, offset);
+    #[cfg(not(unix))]
+    return Err(io::Error::new(io::ErrorKind::Unsupported, format!("{file:?}: {} at {offset}", bytes.len())));
+}
+
 /// A folder that one process uses at a time: holds a lock on a file in it.
 ///
 /// The system unlocks it however the process ends.

@@ -1,7 +1,6 @@
 //! Sums that memory does not hold: made part by part, by reading the data as many times, each part left on disk.
 
 use std::io;
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -16,6 +15,7 @@ use super::tori::Tori;
 use super::workspace::ALPHAS;
 use crate::accumulation::fixed_point::rows::IntegerRow;
 use crate::accumulation::{AccumulationError, SumCounts};
+use crate::files::write_at;
 use crate::ranks::{RankShare, Ranks};
 
 impl StoredTori {
@@ -77,7 +77,7 @@ impl StoredTori {
                     }
                 }
                 let bytes: &[u8] = bytemuck::cast_slice(&values);
-                self.file.write_all_at(bytes, block.offset + (place * bytes.len()) as u64)?;
+                write_at(&self.file, bytes, block.offset + (place * bytes.len()) as u64)?;
             }
             Ok(used)
         };

@@ -3,12 +3,11 @@
 use std::fs::File;
 use std::io;
 use std::ops::Range;
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
 use super::grid::{Grids, NODES};
-use crate::files::nameless_file;
+use crate::files::{nameless_file, read_at};
 
 /// Which sums of a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -135,7 +134,7 @@ impl StoredTori {
         let block = self.parts[part as usize].blocks.get(block)?;
         let floats = block.alphas * row;
         let mut values = vec![0.0_f32; block.nodes.len() * floats];
-        if let Err(error) = self.file.read_exact_at(bytemuck::cast_slice_mut(&mut values), block.offset) {
+        if let Err(error) = read_at(&self.file, bytemuck::cast_slice_mut(&mut values), block.offset) {
             let reason = format!(
                 "sums on disk in {}: {error}; expected to read what was written",
                 self.folder.display()
