@@ -204,6 +204,13 @@ impl Bench {
     }
 
     fn open(&self, folder: &Path, every: u64) -> Ground {
+        // A process that another test is starting has the descriptors of this one, and so its locks, until it runs its own program.
+        for _ in 0..500 {
+            match Ground::open(folder, &self.mission.config, every) {
+                Err(GroundError::Locked { .. }) => std::thread::sleep(std::time::Duration::from_millis(20)),
+                opened => return opened.unwrap(),
+            }
+        }
         Ground::open(folder, &self.mission.config, every).unwrap()
     }
 
