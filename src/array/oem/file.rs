@@ -3,8 +3,6 @@
 use crate::units::calendar::epoch_s;
 use crate::units::vector::{Vec3, norm};
 
-/// Seconds of a day.
-
 /// Obliquity of the ecliptic of J2000 (IAU 1976): 84381.448 arc seconds.
 const OBLIQUITY_DEG: f64 = 84_381.448 / 3600.0;
 
