@@ -148,7 +148,7 @@ impl NativeEphemeris {
         let uneven = ticks.windows(2).position(|two| two[1] - two[0] != step);
         let step_ticks = u32::try_from(step).ok().filter(|&step| step > 0);
         let (None, Some(step_ticks)) = (uneven, step_ticks) else {
-            let at = uneven.map_or(0, |k| k + 1);
+            let at = uneven.unwrap_or(0);
             return Err(refused(format!(
                 "times: the step after time {at} is {} s, the first {} s; expected equal steps of whole microseconds, from \
                  1 us to 4294 s",

@@ -118,6 +118,7 @@ def test_odd_tables_of_positions_are_refused():
         # A gap, an overlap, times that run back, none.
         (np.where(t > 200, t + 60, t), places, "step after time 3 is 120 s"),
         (np.where(t > 200, t - 60, t), places, "step after time 3 is 0 s"),
+        (np.where(t > 450, t + 60, t), places, "step after time 7 is 120 s"),
         (t[::-1], places, "the first -60 s; expected equal steps"),
         (t * np.nan, places, "t = NaN"),
         (t, changed(np.nan), "a position is NaN"),
