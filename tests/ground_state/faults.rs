@@ -231,16 +231,21 @@ fn path(place: &Path, name: &str) -> String {
     place.join(name).to_str().unwrap().to_owned()
 }
 
-/// A ground whose folders are copied from: the pipeline file, a downlink, and a state of its first half.
 fn ground() -> (Ground, PathBuf) {
-    let ground = Ground(Workplace::new(TINY));
+    ground_of(TINY, "30")
+}
+
+/// A ground whose folders are copied from: the pipeline file, a downlink, and a state of its first half with so many visibilities from one
+/// checkpoint to the next.
+fn ground_of(pipeline: &str, every: &str) -> (Ground, PathBuf) {
+    let ground = Ground(Workplace::new(pipeline));
     let before = PathBuf::from(ground.path("before"));
     std::fs::create_dir(&before).unwrap();
     std::fs::copy(&ground.pipeline, before.join("pipeline.toml")).unwrap();
     let file = ground.simulate("before/small.ccsds", &[]);
     let packets = packets(&file);
     let first = ground.file("first.ccsds", &packets[..packets.len() / 2].concat());
-    ground.replay("before/state", &[&first], &["--checkpoint-every", "30"]);
+    ground.replay("before/state", &[&first], &["--checkpoint-every", every]);
     std::fs::remove_dir_all(before.join("state.out")).unwrap();
     assert_eq!(checkpoints(&before.join("state")).len(), 2);
     (ground, before)
@@ -381,16 +386,7 @@ fn a_disk_that_fills_up_takes_no_held_visibility() {
             settings.entry(section).or_insert_with(|| toml::Table::new().into()).as_table_mut().unwrap();
         known.extend(keys.as_table().unwrap().clone());
     }
-    let ground = Ground(Workplace::new(&settings.to_string()));
-    let before = PathBuf::from(ground.path("before"));
-    std::fs::create_dir(&before).unwrap();
-    std::fs::copy(&ground.pipeline, before.join("pipeline.toml")).unwrap();
-    let file = ground.simulate("before/small.ccsds", &[]);
-    let packets = packets(&file);
-    let first = ground.file("first.ccsds", &packets[..packets.len() / 2].concat());
-    ground.replay("before/state", &[&first], &["--checkpoint-every", "60"]);
-    std::fs::remove_dir_all(before.join("state.out")).unwrap();
-    assert_eq!(checkpoints(&before.join("state")).len(), 2);
+    let (_ground, before) = ground_of(&settings.to_string(), "60");
     let args = |place: &Path| {
         let [file, map, out, state] =
             ["small.ccsds", "pipeline.toml", "out", "state"].map(|name| path(place, name));
