@@ -263,6 +263,18 @@ fn engine(array: &Array, l_max: usize) {
         flops,
         1e-9 * flops / times[2]
     );
+    let mut ratios: Vec<f64> = (0..5)
+        .map(|_| {
+            let clock = Clock::start();
+            sums.apply(&right, &mut y);
+            let one = clock.read().0;
+            let clock = Clock::start();
+            sums.apply_all(&[&right, &y]);
+            clock.read().0 / one
+        })
+        .collect();
+    ratios.sort_by(f64::total_cmp);
+    println!("  two vectors at once take {:.2} times as long as one (median of 5 pairs)", ratios[2]);
     let (products, bandwidth) = (matrix_product_flops(), memory_bandwidth());
     println!(
         "  {:.3} products a second; reading its {:.2} GB of weights at the measured {:.1} GB/s alone would take {:.0} % of that, its matrix \

@@ -155,6 +155,16 @@ impl Array {
         spans.reduce(|[from, to], [start, end]| [from.max(start), to.min(end)])
     }
 
+    /// Memory of the states of orbits that are given by tables (files, or what was propagated), bytes. Clones share it.
+    #[must_use]
+    pub fn table_bytes(&self) -> u64 {
+        let bytes = |orbit: &OwnOrbit| match orbit {
+            OwnOrbit::Table(orbit) => orbit.table_bytes(),
+            OwnOrbit::Kepler(_) => 0,
+        };
+        self.own.iter().map(bytes).sum()
+    }
+
     /// The states through which the orbit of satellite `n` (from 0) goes, if it is given by a table.
     pub(super) fn stretches(&self, n: usize) -> Option<Vec<Stretch>> {
         match self.own.get(n) {

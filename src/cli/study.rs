@@ -22,7 +22,8 @@ use crate::products::{EpsilonChoice, EpsilonChoices};
 /// products of every case, tables (study.csv, spectra.csv, study.json) and overlaid curves (study.png): rho_l, SNR_l, C_l,
 /// and, with map.trace_probes, the traces of thermal noise and imperfection against epsilon, with their crossing, and epsilon as cross-
 /// validation, predictive risk and L-curve choose it (epsilons.csv, epsilons.png). With
-/// `realisations = N` each case is made for N realisations of noise and random errors, for maps of sigma and covariances of C_l. With
+/// `realisations = N` each case is made for N realisations of noise and random errors, for maps of sigma and covariances of C_l and of pixels
+/// (`covariance_at_deg`). With
 /// `calibrated = true` each case is made twice, from the data as sent and with gains that are found from them; cases with errors of the
 /// instrument are compared with the one without. Cases that are finished are not made again: to resume after an interruption, repeat
 /// the command.

@@ -249,7 +249,8 @@ impl Plan {
         let turned = 3.0 * nsides.iter().map(sky).fold(0.0, f64::max);
         let models = self.model_plans(&nsides);
         let each = nsides.iter().zip(&models).map(|(nside, model)| sky(nside) + model.bytes).collect();
-        (turned + QUEUED_VISIBILITIES_MAX * QUEUED_VISIBILITY_BYTES + BASE_BYTES, each)
+        let tables = self.array.table_bytes() as f64;
+        (turned + tables + QUEUED_VISIBILITIES_MAX * QUEUED_VISIBILITY_BYTES + BASE_BYTES, each)
     }
 
     /// Memory of the space segment besides its models, bytes.
@@ -257,7 +258,8 @@ impl Plan {
         let pixels: Vec<f64> = nsides.iter().map(|&nside| pixel_count(nside) as f64).collect();
         // Every sky, and three copies of one that is turned and resampled.
         let skies = pixels.iter().sum::<f64>() + 3.0 * pixels.iter().copied().fold(0.0, f64::max);
-        8.0 * skies + sent.min(QUEUED_VISIBILITIES_MAX) * QUEUED_VISIBILITY_BYTES
+        let tables = self.array.table_bytes() as f64;
+        8.0 * skies + tables + sent.min(QUEUED_VISIBILITIES_MAX) * QUEUED_VISIBILITY_BYTES
     }
 }
 

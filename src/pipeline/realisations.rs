@@ -10,10 +10,11 @@ use super::noise_maps::noise_file;
 use super::study::CaseSummary;
 use crate::files::write_atomically;
 use crate::products::{ChannelFigures, ProductsError};
-use crate::sky::SkyMap;
-use crate::sky::fits::{ReadOptions, WriteOptions, read_whole_map, write_map};
+use crate::sky::fits::{Column, ReadOptions, WriteOptions, read_whole_map, write_columns, write_map};
 use crate::sky::harmonics::AnalysisOptions;
+use crate::sky::healpix::{pixel_count, pixel_of};
 use crate::sky::spectra::auto_cl;
+use crate::sky::{Frame, SkyMap};
 
 /// Realisations of one channel of one case.
 #[derive(Clone, Debug, Serialize)]
@@ -35,6 +36,57 @@ pub struct RealisationSpread {
     pub map: Option<PowerSpread>,
     /// Its files, in the study's folder.
     pub files: Vec<PathBuf>,
+}
+
+/// Most pixels whose covariance with all others is wanted.
+pub(super) const COVARIANCES_MAX: usize = 100;
+
+/// What a study's realisations leave.
+#[derive(Clone, Copy)]
+pub(super) struct SpreadProducts<'a> {
+    /// Where the noise's covariance with all pixels is wanted: longitude and latitude in the maps' frame, degrees.
+    pub(super) covariance_at_deg: &'a [[f64; 2]],
+    pub(super) folder: &'a Path,
+}
+
+/// Products of the noise with itself, summed over realisations: of each pixel, and of some with all others.
+struct PixelProducts {
+    count: f64,
+    squares: Vec<f64>,
+    /// Pixels, and their products with all.
+    rows: Vec<(usize, Vec<f64>)>,
+}
+
+impl PixelProducts {
+    fn new(nside: usize, at_deg: &[[f64; 2]]) -> Self {
+        let none = vec![0.0; pixel_count(nside)];
+        let row = |&[longitude_deg, latitude_deg]: &[f64; 2]| {
+            let (sin_l, cos_l) = longitude_deg.to_radians().sin_cos();
+            let (sin_b, cos_b) = latitude_deg.to_radians().sin_cos();
+            (pixel_of(nside, [cos_l * cos_b, sin_l * cos_b, sin_b]), none.clone())
+        };
+        Self { count: 0.0, squares: none.clone(), rows: at_deg.iter().map(row).collect() }
+    }
+
+    /// Adds a map of as many pixels.
+    fn add(&mut self, noise_k: &[f64]) {
+        self.count += 1.0;
+        self.squares.iter_mut().zip(noise_k).for_each(|(sum, value)| *sum += value * value);
+        for (pixel, row) in &mut self.rows {
+            let here = noise_k[*pixel];
+            row.iter_mut().zip(noise_k).for_each(|(sum, value)| *sum += here * value);
+        }
+    }
+
+    /// Standard deviation by pixel, K: noise has no mean.
+    fn sigma_k(&self) -> Vec<f64> {
+        self.squares.iter().map(|sum| (sum / self.count).sqrt()).collect()
+    }
+
+    /// Covariance of all pixels with each of those wanted, K^2.
+    fn covariances_k2(&self) -> impl Iterator<Item = Vec<f64>> {
+        self.rows.iter().map(|(_, row)| row.iter().map(|sum| sum / self.count).collect())
+    }
 }
 
 /// Angular power over realisations, l = 0, 1, ...
@@ -72,13 +124,13 @@ impl PowerSpread {
 }
 
 /// Spreads of the cases of a study that differ in their realisation alone, `groups` with their labels; leaves for each channel maps of
-/// sigma and tables of covariances in `out`. Groups of fewer than two realisations are left out.
+/// sigma and of covariances, and tables of those of C_l. Groups of fewer than two realisations are left out.
 ///
 /// # Errors
 /// Maps that cannot be read; files that cannot be written.
 pub(super) fn spreads(
     groups: &[(String, Vec<&CaseSummary>)],
-    out: &Path,
+    products: SpreadProducts<'_>,
 ) -> Result<Vec<RealisationSpread>, PipelineError> {
     let mut found = Vec::new();
     let are_many =
@@ -91,7 +143,7 @@ pub(super) fn spreads(
                 .collect();
             if of_channel.len() == members.len() {
                 let number = found.len() + 1;
-                found.push(channel_spread(case, number, &of_channel, out)?);
+                found.push(channel_spread(case, number, &of_channel, products)?);
             }
         }
     }
@@ -102,30 +154,26 @@ fn channel_spread(
     case: &str,
     number: usize,
     members: &[(&CaseSummary, &ChannelFigures)],
-    out: &Path,
+    products: SpreadProducts<'_>,
 ) -> Result<RealisationSpread, PipelineError> {
-    let (_, first) = members[0];
+    let (SpreadProducts { folder: out, covariance_at_deg }, (_, first)) = (products, members[0]);
     let mhz = format!("{:.3}MHz", first.frequency_hz / 1e6);
-    let mut squares: Vec<f64> = Vec::new();
     let mut noise_k2 = Vec::new();
-    let mut frame = None;
+    let mut pixels: Option<(Frame, PixelProducts)> = None;
     let files = members.iter().flat_map(|(member, _)| {
         let folder = out.join(&member.folder);
         (1..=member.realisations).map(move |number| noise_file(&folder, first.frequency_hz, number))
     });
     for path in files {
         let noise = read_whole_map(&path, &ReadOptions::default())?;
-        squares.resize(noise.values().len(), 0.0);
-        squares.iter_mut().zip(noise.values()).for_each(|(sum, value)| *sum += value * value);
+        let new = || (noise.frame(), PixelProducts::new(noise.nside(), covariance_at_deg));
+        pixels.get_or_insert_with(new).1.add(noise.values());
         let l_max = 3 * noise.nside() - 1;
         noise_k2.push(auto_cl(&noise.harmonics(l_max, &AnalysisOptions::default())?));
-        frame = Some(noise.frame());
     }
-    let count = noise_k2.len();
-    let sigma: Vec<f64> = squares.iter().map(|sum| (sum / count as f64).sqrt()).collect();
-    let pixels = sigma.len() as f64;
-    let mean_square = sigma.iter().map(|s| s * s).sum::<f64>() / pixels;
-    let mean = sigma.iter().sum::<f64>() / pixels;
+    let sigma_k = pixels.as_ref().map(|(_, pixels)| pixels.sigma_k()).unwrap_or_default();
+    let mean_of = |of: fn(f64) -> f64| sigma_k.iter().map(|s| of(*s)).sum::<f64>() / sigma_k.len() as f64;
+    let (mean_square, mean) = (mean_of(|s| s * s), mean_of(|s| s));
     let noise = PowerSpread::of(&noise_k2);
     let map_k2: Option<Vec<Vec<f64>>> = members
         .iter()
@@ -133,11 +181,18 @@ fn channel_spread(
         .collect();
     // Realisations of noise alone share a map.
     let map = map_k2.filter(|spectra| spectra.len() > 1).map(|spectra| PowerSpread::of(&spectra));
-    let mut files = Vec::new();
-    if let Some(frame) = frame {
+    let (count, mut files) = (noise_k2.len(), Vec::new());
+    if let Some((frame, pixels)) = pixels {
         let name = PathBuf::from(format!("sigma-{number}-{mhz}.fits"));
-        write_map(&out.join(&name), &SkyMap::new(frame, sigma)?, &WriteOptions::default())?;
+        write_map(&out.join(&name), &SkyMap::new(frame, sigma_k)?, &WriteOptions::default())?;
         files.push(name);
+        for ([longitude_deg, latitude_deg], values) in covariance_at_deg.iter().zip(pixels.covariances_k2()) {
+            let name =
+                PathBuf::from(format!("covariance-at-{longitude_deg},{latitude_deg}-{number}-{mhz}.fits"));
+            let column = Column { name: "COVARIANCE", unit: "K^2", values: &values };
+            write_columns(&out.join(&name), frame, &[column], &WriteOptions::default())?;
+            files.push(name);
+        }
     }
     for (what, spread) in [("noise", Some(&noise)), ("map", map.as_ref())] {
         let Some(spread) = spread else { continue };

@@ -16,7 +16,7 @@ use super::config_source::{ConfigSource, is_study};
 use super::error::PipelineError;
 use super::noise_maps::NoiseMaps;
 use super::plan::Plan;
-use super::realisations::{RealisationSpread, csv_of, spreads};
+use super::realisations::{COVARIANCES_MAX, RealisationSpread, SpreadProducts, csv_of, spreads};
 use super::run::{Destination, Watched, downlink_file, replay_knowing, simulate_sky};
 use super::space_segment;
 use crate::calibration::solver::SolverConfig;
@@ -86,6 +86,9 @@ struct StudyFile {
     axis: Vec<AxisFile>,
     /// Realisations of each case: of the noise-only map's noise, and of the instrument's random errors if it has any.
     realisations: Option<usize>,
+    /// Directions with which the noise of all pixels has a covariance that is wanted: ecliptic longitude and latitude, degrees.
+    #[serde(default)]
+    covariance_at_deg: Vec<[f64; 2]>,
     /// Whether each case is made twice: with the data as sent, and with gains that are found from them.
     #[serde(default)]
     calibrated: bool,
@@ -119,6 +122,8 @@ pub struct Study {
     pub cases: Vec<StudyCase>,
     /// Realisations of each case; 1 for none but its own.
     pub realisations: usize,
+    /// Directions with which the noise of all pixels has a covariance that is wanted: ecliptic longitude and latitude, degrees.
+    pub covariance_at_deg: Vec<[f64; 2]>,
     /// Maps of the sky to calibrate with, K; empty if none is calibrated, or if an artificial signal is enough.
     pub models: Vec<SkyMap>,
 }
@@ -204,6 +209,19 @@ impl Study {
             let found = format!("realisations = {realisations} of {} cases", combinations.len());
             return Err(wrong(found, "1 or more, at most 1000 cases in all"));
         }
+        let directions = &file.covariance_at_deg;
+        let is_direction =
+            |[longitude, latitude]: &[f64; 2]| longitude.abs() <= 360.0 && latitude.abs() <= 90.0;
+        if directions.len() > COVARIANCES_MAX || !directions.iter().all(is_direction) {
+            let expected = "at most 100 of [longitude, latitude], ecliptic, degrees";
+            return Err(wrong(format!("covariance_at_deg = {directions:?}"), expected));
+        }
+        if realisations == 1 && !directions.is_empty() {
+            return Err(wrong(
+                "covariance_at_deg without realisations".to_owned(),
+                "realisations = 2 or more with it",
+            ));
+        }
         let stem =
             path.file_stem().map_or_else(|| "study".into(), |stem| stem.to_string_lossy().into_owned());
         let beside = |pipeline: &PathBuf| path.parent().unwrap_or(Path::new("")).join(pipeline);
@@ -280,7 +298,8 @@ impl Study {
             let found = format!("two cases with products in {}", twice.folder());
             return Err(wrong(found, "labels that differ in letters or digits"));
         }
-        Ok(Self { name: file.name.unwrap_or(stem), cases, realisations, models })
+        let (name, covariance_at_deg) = (file.name.unwrap_or(stem), file.covariance_at_deg);
+        Ok(Self { name, cases, realisations, covariance_at_deg, models })
     }
 }
 
@@ -658,7 +677,9 @@ fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary,
         .collect();
     let (crossings, epsilons) = (crossings(&groups), epsilon_choices(&groups));
     note_power_kept(&done, &mut cases);
-    let spreads = if study.realisations > 1 { spreads(&realised(study, &cases), out)? } else { Vec::new() };
+    let products = SpreadProducts { covariance_at_deg: &study.covariance_at_deg, folder: out };
+    let spreads =
+        if study.realisations > 1 { spreads(&realised(study, &cases), products)? } else { Vec::new() };
     Ok(StudySummary { name: study.name.clone(), cancelled, cases, crossings, epsilons, spreads })
 }
 

@@ -37,13 +37,13 @@ pub fn harmonic_beams(
         *point.get_mut(pixel).ok_or(SolveError::NoPixel { pixel, pixels: count })? = 1.0;
         let mut right = vec![0.0; sums.unknowns()];
         sums.apply(&unknowns(&transform.adjoint(&point)?), &mut right);
-        let mut beam = vec![0.0; right.len()];
+        let mut beam = [vec![0.0; right.len()]];
         let task = watch.start(&format!("beam at pixel {pixel}"), request.rule.residual_max);
-        system.solve(&right, &mut beam, request.rule, &task);
+        system.solve(&[&right], &mut beam, request.rule, &task);
         if !watch.goes_on() {
             break;
         }
-        beams.push(PointBeam { pixel, map_k: transform.synthesis(&coefficients(&beam, l_max))? });
+        beams.push(PointBeam { pixel, map_k: transform.synthesis(&coefficients(&beam[0], l_max))? });
     }
     Ok(beams)
 }

@@ -11,6 +11,9 @@ use crate::accumulation::NormalSums;
 use crate::accumulation::harmonic::{HarmonicSums, coefficients};
 use crate::sky::harmonics::synthesis;
 
+/// Realisations that are solved together: a thread has a workspace for each.
+const AT_ONCE: usize = 4;
+
 /// The noise-only maps, K, of the further realisations that the sums hold ([`HarmonicSums::further_noises`]): each as
 /// [`crate::solve::solve_regularised`] makes it of sums with that realisation as their companion.
 ///
@@ -35,14 +38,18 @@ pub fn solve_noises(
     let factors = blocks.factors_with(&|l| regularisation.at(l));
     drop(blocks);
     let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
-    let map = |right: &Vec<f64>| {
-        let mut solved = vec![0.0; sums.unknowns()];
-        let task = watch.start("noise map", request.rule.residual_max);
-        system.solve(right, &mut solved, request.rule, &task);
+    let mut maps = Vec::new();
+    for rights in sums.further_noises().chunks(AT_ONCE) {
+        let rights: Vec<&[f64]> = rights.iter().map(Vec::as_slice).collect();
+        let mut solved = vec![vec![0.0; sums.unknowns()]; rights.len()];
+        let task = watch.start("noise maps", request.rule.residual_max);
+        system.solve(&rights, &mut solved, request.rule, &task);
         if !watch.goes_on() {
             return Err(SolveError::Interrupted);
         }
-        Ok(synthesis(&coefficients(&solved, l_max), request.nside)?)
-    };
-    sums.further_noises().iter().map(map).collect()
+        for unknowns in &solved {
+            maps.push(synthesis(&coefficients(unknowns, l_max), request.nside)?);
+        }
+    }
+    Ok(maps)
 }

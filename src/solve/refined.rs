@@ -20,16 +20,16 @@ use serde::Serialize;
 
 use super::SolveError;
 use super::conjugate_gradients::{Convergence, StoppingRule, System};
-use super::harmonic::{HarmonicRequest, HarmonicSolution, W_MAX_TOLERANCE, prior_unknowns};
-use super::lanczos::{LargestEigenvalue, largest_eigenvalue};
+use super::harmonic::{HarmonicRequest, HarmonicSolution, W_MAX_TOLERANCE, lifted, prior_unknowns};
+use super::lanczos::{LargestEigenvalue, largest_eigenvalue_from};
 use super::regulariser::Diagonal;
 use super::tikhonov::{Diagnostics, check_request};
 use super::vectors::{add, dot, subtract};
 use super::watch::NamedWatch;
-use crate::accumulation::AccumulationError;
 use crate::accumulation::harmonic::{
-    Departures, RefinedSums, coefficients, orbit_phase_deg, unknowns_of_gradient,
+    Departures, OrderFactors, RefinedSums, coefficients, orbit_phase_deg, unknowns_of_gradient,
 };
+use crate::accumulation::{AccumulationError, NormalSums};
 use crate::sky::harmonics::{Alm, synthesis};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::constants::DAY_S;
@@ -153,11 +153,17 @@ pub fn solve_refined(
     check_request(&sums.circle, request.epsilon)?;
     let l_max = sums.circle.setup().l_max;
     let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
+    let blocks = sums.circle.order_blocks();
     let LargestEigenvalue { value: w_max, iterations, .. } = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
-        largest_eigenvalue(&sums.circle, W_MAX_TOLERANCE, &mut |step, change| task.report(step, change))
+        let (start, report) =
+            (lifted(&blocks, sums.circle.unknowns()), &mut |step, change| task.report(step, change));
+        largest_eigenvalue_from(start, &sums.circle, W_MAX_TOLERANCE, report)
     };
-    let problem = Refining { sums, regularisation: request.epsilon * w_max, inner: request.rule };
+    let regularisation = request.epsilon * w_max;
+    let factors = blocks.factors(regularisation);
+    drop(blocks);
+    let problem = Refining { sums, regularisation, inner: request.rule, factors };
     let mut data = sums.data.value_k_sr.clone();
     if let Some(prior) = &prior {
         let predicted = problem.forward(&[prior.as_slice()]);
@@ -212,6 +218,8 @@ struct Refining<'a> {
     regularisation: f64,
     /// When inner iterations stop, besides their residual.
     inner: StoppingRule,
+    /// The circle's blocks of one order, plus R.
+    factors: OrderFactors,
 }
 
 /// One right-hand side on its way.
@@ -285,23 +293,23 @@ impl Refining<'_> {
         watch: NamedWatch<'_>,
     ) -> [Column; 2] {
         let task = watch.start("refined map", rule.residual_max);
-        let factors = self.sums.circle.order_blocks().factors(self.regularisation);
         let circle = System {
             sums: &self.sums.circle,
             regularisation: Diagonal::Uniform(self.regularisation),
-            precondition: &|v| factors.solve(v),
+            precondition: &|v| self.factors.solve(v),
         };
         let inner = StoppingRule { residual_max: INNER_RESIDUAL, ..self.inner };
-        let precondition = |r: &[f64]| {
-            let mut z = vec![0.0; r.len()];
-            circle.solve(r, &mut z, inner, &watch.part());
-            z
+        let precondition = |residuals: &[&[f64]]| {
+            let mut z: Vec<Vec<f64>> = residuals.iter().map(|r| vec![0.0; r.len()]).collect();
+            circle.solve(residuals, &mut z, inner, &watch.part());
+            z.into_iter()
         };
         let mut data = Some(data);
+        let mut directions = precondition(&right.iter().map(Vec::as_slice).collect::<Vec<_>>());
         let mut right = right.into_iter();
         let mut columns = [(); 2].map(|()| {
             let b = right.next().unwrap_or_default();
-            let z = precondition(&b);
+            let z = directions.next().unwrap_or_default();
             let energy = dot(&b, &z);
             Column {
                 x: vec![0.0; b.len()],
@@ -324,7 +332,10 @@ impl Refining<'_> {
                 subtract(&mut column.residual, 1.0, &product);
                 column.data.iter_mut().zip(&seen).for_each(|(left, seen)| *left -= seen);
                 column.x = x;
-                column.direction = precondition(&column.residual);
+            }
+            let z = precondition(&columns.each_ref().map(|column| column.residual.as_slice()));
+            for (column, z) in columns.iter_mut().zip(z) {
+                column.direction = z;
                 column.energy = dot(&column.residual, &column.direction);
             }
         }
@@ -338,6 +349,7 @@ impl Refining<'_> {
                 self.sums.rows.normal(&self.sums.plan, &directions, &self.sums.data.weight);
             let products = products.iter().map(unknowns_of_gradient);
             let open = columns.iter_mut().filter(|column| column.is_open());
+            let mut stepped = Vec::new();
             for ((column, mut product), seen) in open.zip(products).zip(seen) {
                 product.iter_mut().zip(&column.direction).for_each(|(y, d)| *y += self.regularisation * d);
                 let curvature = dot(&column.direction, &product);
@@ -350,7 +362,12 @@ impl Refining<'_> {
                 column.data.iter_mut().zip(&seen).for_each(|(left, seen)| *left -= step * seen);
                 let before = column.residual.clone();
                 subtract(&mut column.residual, step, &product);
-                let z = precondition(&column.residual);
+                stepped.push((column, before));
+            }
+            let z = precondition(
+                &stepped.iter().map(|(column, _)| column.residual.as_slice()).collect::<Vec<_>>(),
+            );
+            for ((column, before), z) in stepped.into_iter().zip(z) {
                 let next = dot(&column.residual, &z);
                 let turn = (next - dot(&before, &z)) / column.energy;
                 column.energy = next;

@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 
 use lunarray::pipeline::Study;
-use lunarray::sky::fits::{ReadOptions, read_whole_map};
+use lunarray::sky::fits::{ReadOptions, read_map_file, read_unit, read_whole_map};
 use serde_json::Value;
 
 use super::common::process::{signal, start};
@@ -186,6 +186,7 @@ name = "many"
 pipeline = "pipeline.toml"
 set = ["map.trace_probes=1", "products.pictures=false", "spacecraft.channels_hz=[3e6]", "map.snapshot_every_s=0"]
 realisations = 60
+covariance_at_deg = [[45.0, 85.0], [315.0, -85.0]]
 "#;
     let (study, out) = (place.file("many.toml", study.as_bytes()), place.path("many"));
     let summary = json(&["study", &study, "--out", &out]);
@@ -209,9 +210,39 @@ realisations = 60
         spread["files"].as_array().unwrap().iter().map(|file| file.as_str().unwrap()).collect();
     assert_eq!(
         files,
-        ["sigma-1-3.000MHz.fits", "covariance-noise-1-3.000MHz.csv", "covariance-map-1-3.000MHz.csv"]
+        [
+            "sigma-1-3.000MHz.fits",
+            "covariance-at-45,85-1-3.000MHz.fits",
+            "covariance-at-315,-85-1-3.000MHz.fits",
+            "covariance-noise-1-3.000MHz.csv",
+            "covariance-map-1-3.000MHz.csv"
+        ]
     );
-    let covariance = String::from_utf8(bytes(format!("{out}/{}", files[1]))).unwrap();
+    let map = |path: String| {
+        let file = read_map_file(Path::new(&path), &ReadOptions::default()).unwrap();
+        file.map.values().to_vec()
+    };
+    let sigma_k = map(format!("{out}/{}", files[0]));
+    let noises: Vec<Vec<f64>> = summary["cases"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|case| map(format!("{out}/{}/3.000MHz/noise.fits", case["folder"].as_str().unwrap())))
+        .collect();
+    // The first pixel lies at 45 deg beside the north pole, the last one at 315 deg beside the south pole.
+    for (name, pixel) in [(files[1], 0), (files[2], sigma_k.len() - 1)] {
+        let found_k2 = map(format!("{out}/{name}"));
+        assert_eq!(read_unit(Path::new(&format!("{out}/{name}"))).unwrap(), "K^2");
+        for (other, found_k2) in found_k2.iter().enumerate() {
+            let expected_k2 = noises.iter().map(|noise| noise[pixel] * noise[other]).sum::<f64>() / 60.0;
+            // Files in 32 or 64 bits.
+            assert!(
+                (found_k2 - expected_k2).abs() < 1e-6 * sigma_k[pixel] * sigma_k[other],
+                "{pixel} {other}"
+            );
+        }
+    }
+    let covariance = String::from_utf8(bytes(format!("{out}/{}", files[3]))).unwrap();
     let rows: Vec<Vec<f64>> =
         covariance.lines().map(|line| line.split(',').map(|x| x.parse().unwrap()).collect()).collect();
     assert!(rows.len() == power.len() && rows.iter().all(|row| row.len() == rows.len()));

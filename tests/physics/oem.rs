@@ -47,6 +47,12 @@ fn orbits_of_files_are_those_that_were_integrated() {
             assert!(norm(sub(sub(ahead, behind), state.velocity_m_s)) < 1e-4);
         }
     }
+    // Of each state seven numbers are kept: its time, position and velocity.
+    let states = |n: u32| {
+        let text = fs::read_to_string(folder.path().join(format!("sat{n}.oem"))).unwrap();
+        text.lines().filter(|line| line.starts_with("20")).count()
+    };
+    assert_eq!(array.table_bytes(), (1..=3).map(|n| 7 * 8 * states(n) as u64).sum::<u64>());
     // Another epoch shifts all.
     let later = ArrayConfig { oem_epoch: "2030-12-31T01:00:00".into(), ..config(folder.path()) };
     let later = Array::new(&later).unwrap();

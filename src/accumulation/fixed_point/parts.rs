@@ -17,11 +17,11 @@ const EXPONENT_MIN: i64 = -1000;
 /// all ranks there are at most `parts_max`.
 pub(in crate::accumulation) fn sum_of_parts(
     ranks: &Ranks,
-    parts: &[Vec<f64>],
+    parts: &[impl AsRef<[f64]>],
     len: usize,
     parts_max: usize,
 ) -> Vec<f64> {
-    let sizes = parts.iter().flatten().map(|x| x.abs().to_bits());
+    let sizes = parts.iter().flat_map(AsRef::as_ref).map(|x| x.abs().to_bits());
     // Sizes are ordered as their bits are.
     let mut greatest = [sizes.max().unwrap_or(0).cast_signed()];
     ranks.greatest(&mut greatest);
@@ -30,7 +30,7 @@ pub(in crate::accumulation) fn sum_of_parts(
     let (quantum, inverse) = (power_of_two(exponent), power_of_two(-exponent));
     let mut sums = vec![0_i64; len];
     for part in parts {
-        for (sum, x) in sums.iter_mut().zip(part) {
+        for (sum, x) in sums.iter_mut().zip(part.as_ref()) {
             *sum = sum.wrapping_add(above_bias(x * inverse + BIAS));
         }
     }
@@ -103,7 +103,7 @@ mod tests {
             // The least number of these is 2^-996, four quanta of the least kind and a half.
             assert!((sum[0] - expected).abs() <= 0.2 * expected.abs(), "{count} {value:e}: {}", sum[0]);
         }
-        assert_eq!(sum_of_parts(&Ranks::one(), &[], 2, 1), [0.0, 0.0]);
+        assert_eq!(sum_of_parts(&Ranks::one(), &[] as &[&[f64]], 2, 1), [0.0, 0.0]);
         for bad in [f64::NAN, f64::INFINITY] {
             assert!(
                 sum_of_parts(&Ranks::one(), &[vec![1.0, bad], vec![1.0, 1.0]], 2, 2)

@@ -48,6 +48,18 @@ pub(super) enum RightHandSide {
     Noise,
 }
 
+/// The blocks of alphas that a product is a sum over.
+struct Blocks<'a> {
+    ranks: &'a Ranks,
+    /// Which alphas hold data.
+    used: &'a [bool],
+    reach: NodeRange,
+    /// Skies at once.
+    skies: usize,
+    /// From the last to the first.
+    backwards: bool,
+}
+
 /// Points of a grid on a circle: of weights or of data.
 #[derive(Clone, Copy)]
 struct Circle {
@@ -89,9 +101,9 @@ impl Operator {
         (4 * (2 * patterns + rotation)) as u64
     }
 
-    /// Bytes of one thread's workspace.
-    pub(super) fn workspace_bytes(l_max: usize, grids: &Grids) -> u64 {
-        (4 * (l_max + 1) * 2 * ALPHAS * (2 * grids.nodes.count + l_max / 4)) as u64
+    /// Bytes of one thread's workspace for so many skies at once.
+    pub(super) fn workspace_bytes(l_max: usize, grids: &Grids, skies: usize) -> u64 {
+        (4 * (l_max + 1) * 2 * skies * ALPHAS * (2 * grids.nodes.count + l_max / 4)) as u64
     }
 
     /// Operations of the products with patterns and rotations in one application.
@@ -110,20 +122,36 @@ impl Operator {
         NodeRange { first, count: (reached.end - first).next_multiple_of(NODE_GROUP) }
     }
 
-    /// BtN^-1B of the coefficients `sky`, the gradient in terms of real and imaginary parts for m >= 0.
-    pub(super) fn apply(&self, shared: &SharedTori<'_>, sky: &Alm) -> Alm {
+    /// BtN^-1B of the coefficients of each sky, the gradients in terms of real and imaginary parts for m >= 0. Weights and patterns
+    /// are read once for all skies; each product has the bits that it has alone.
+    pub(super) fn apply(&self, shared: &SharedTori<'_>, skies: &[Alm]) -> Vec<Alm> {
+        if skies.is_empty() {
+            return Vec::new();
+        }
         let tori = shared.tori;
         let reach = self.reach(shared.reached.clone());
         let circle = Circle { points: self.grids.points };
         let used = tori.alphas(&self.grids, TorusPart::Weights);
-        self.over_blocks(shared.ranks, &used, reach, |work, alphas| {
+        let over = Blocks {
+            ranks: shared.ranks,
+            used: &used,
+            reach,
+            skies: skies.len(),
+            backwards: tori.turns_back(),
+        };
+        self.over_blocks(over, |work, alphas| {
             let rows = tori.block(&self.grids, TorusPart::Weights, alphas[0] / ALPHAS)?;
-            self.turn(sky, circle, alphas, &mut work.turned);
+            work.turned.fill(0.0);
+            for (first, sky) in (0..).step_by(ALPHAS).zip(skies) {
+                self.turn(sky, circle, alphas, first, work);
+            }
             self.multiply_patterns(work, reach);
             for (place, &alpha) in alphas.iter().enumerate() {
-                self.multiply_weights(&rows, alpha % ALPHAS, place, work, reach);
+                for first in (0..work.columns).step_by(ALPHAS) {
+                    self.multiply_weights(&rows, alpha % ALPHAS, first + place, work, reach);
+                }
             }
-            Some(self.gradient(work, reach, circle, alphas, None))
+            Some(self.gradients(work, reach, circle, alphas, None))
         })
     }
 
@@ -133,7 +161,8 @@ impl Operator {
         let reach = self.reach(shared.reached.clone());
         let circle = Circle { points: self.grids.data_points() };
         let used = tori.alphas(&self.grids, TorusPart::Right);
-        self.over_blocks(shared.ranks, &used, reach, |work, alphas| {
+        let over = Blocks { ranks: shared.ranks, used: &used, reach, skies: 1, backwards: false };
+        let mut projected = self.over_blocks(over, |work, alphas| {
             let rows = tori.block(&self.grids, TorusPart::Right, alphas[0] / ALPHAS)?;
             work.products.fill(0.0);
             for (place, &alpha) in alphas.iter().enumerate() {
@@ -152,50 +181,59 @@ impl Operator {
                     work.scatter(place, 0, group);
                 }
             }
-            Some(self.gradient(work, reach, circle, alphas, Some(&self.correction)))
-        })
+            Some(self.gradients(work, reach, circle, alphas, Some(&self.correction)))
+        });
+        projected.swap_remove(0)
     }
 
-    /// Sums `block` over blocks of alphas: of each fixed range of them those in use. The sum has the same bits in any order,
-    /// so that it does not depend on who computes which block. It is NaN if `block` has none for one of them.
+    /// Sums `block`, which has a vector for each sky, over blocks of alphas: of each fixed range of them those in use. The sums have the
+    /// same bits in any order, so that they do not depend on who computes which block, and when. They are NaN if `block` has none for
+    /// one of them.
     fn over_blocks(
         &self,
-        ranks: &Ranks,
-        used: &[bool],
-        reach: NodeRange,
-        block: impl Fn(&mut Workspace, &[usize]) -> Option<Vec<f64>> + Sync,
-    ) -> Alm {
+        over: Blocks<'_>,
+        block: impl Fn(&mut Workspace, &[usize]) -> Option<Vec<Vec<f64>>> + Sync,
+    ) -> Vec<Alm> {
+        let Blocks { ranks, used, reach, skies, backwards } = over;
         let points = used.len();
         let of_range = |first: usize| -> Vec<usize> {
             (first..points.min(first + ALPHAS)).filter(|&alpha| used[alpha]).collect()
         };
-        let blocks: Vec<Vec<usize>> =
+        let mut blocks: Vec<Vec<usize>> =
             (0..points).step_by(ALPHAS).map(of_range).filter(|alphas| !alphas.is_empty()).collect();
-        let parts: Vec<Vec<f64>> = blocks
+        if backwards {
+            blocks.reverse();
+        }
+        let parts: Vec<Vec<Vec<f64>>> = blocks
             .par_iter()
             .map_init(
-                || Workspace::new(self.l_max, points, reach),
-                |work, alphas| block(work, alphas).unwrap_or_else(|| vec![f64::NAN]),
+                || Workspace::new(self.l_max, points, reach, skies),
+                |work, alphas| block(work, alphas).unwrap_or_else(|| vec![vec![f64::NAN]; skies]),
             )
             .collect();
-        let mut sum = Alm::zeros(self.l_max);
-        let sums = sum_of_parts(ranks, &parts, 2 * sum.values().len(), points.div_ceil(ALPHAS));
-        for (value, sums) in sum.values_mut().iter_mut().zip(sums.as_chunks::<2>().0) {
-            *value = Complex64::new(sums[0], sums[1]);
-        }
-        sum
+        let sum = |sky: usize| {
+            let mut sum = Alm::zeros(self.l_max);
+            let parts: Vec<&[f64]> = parts.iter().map(|part| part[sky].as_slice()).collect();
+            let sums = sum_of_parts(ranks, &parts, 2 * sum.values().len(), points.div_ceil(ALPHAS));
+            for (value, sums) in sum.values_mut().iter_mut().zip(sums.as_chunks::<2>().0) {
+                *value = Complex64::new(sums[0], sums[1]);
+            }
+            sum
+        };
+        (0..skies).map(sum).collect()
     }
 
-    /// Where order mu of the turned sky starts.
-    fn turned_start(&self, mu: usize) -> usize {
-        (0..mu).map(|mu| 2 * ALPHAS * degrees(self.l_max, mu)).sum()
+    /// Where each order mu of so many columns of turned skies starts.
+    fn turned_starts(&self, columns: usize) -> Vec<usize> {
+        let lengths = (0..=self.l_max).map(|mu| 2 * columns * degrees(self.l_max, mu));
+        lengths.scan(0, |end, length| Some(std::mem::replace(end, *end + length))).collect()
     }
 
-    /// The sky in the plane of the orbit at each alpha: `t_{l mu} = sum_m d+ Re z + i d- Im z`,
+    /// The sky in the plane of the orbit at each alpha, in the columns from `first` on: `t_{l mu} = sum_m d+ Re z + i d- Im z`,
     /// `z = conj(T_lm) exp(-i m alpha)`.
-    fn turn(&self, sky: &Alm, circle: Circle, alphas: &[usize], turned: &mut [f32]) {
-        turned.fill(0.0);
-        let starts: Vec<usize> = (0..=self.l_max).map(|mu| self.turned_start(mu)).collect();
+    fn turn(&self, sky: &Alm, circle: Circle, alphas: &[usize], first: usize, work: &mut Workspace) {
+        let Workspace { columns, turned, .. } = work;
+        let starts = self.turned_starts(*columns);
         let count = alphas.len();
         let turns = self.turns(circle, alphas);
         let mut z = [vec![0.0_f32; (self.l_max + 1) * ALPHAS], vec![0.0_f32; (self.l_max + 1) * ALPHAS]];
@@ -209,7 +247,7 @@ impl Operator {
                     for (order, value) in column.iter().enumerate() {
                         let mu = l % 2 + 2 * order;
                         let rows = degrees(self.l_max, mu);
-                        turned[starts[mu] + (part * ALPHAS + k) * rows + (l - mu) / 2] = *value;
+                        turned[starts[mu] + (part * *columns + first + k) * rows + (l - mu) / 2] = *value;
                     }
                 }
             }
@@ -227,24 +265,24 @@ impl Operator {
         MatRef::from_column_major_slice_with_stride(rows, 2 * reach.count, degrees(self.l_max, mu), stride)
     }
 
-    /// The turned sky times the patterns of every node.
+    /// The turned skies times the patterns of every node.
     fn multiply_patterns(&self, work: &mut Workspace, reach: NodeRange) {
-        let len = 2 * ALPHAS * 2 * reach.count;
-        for (mu, products) in work.products.chunks_exact_mut(len).enumerate() {
-            let (start, rows) = (self.turned_start(mu), degrees(self.l_max, mu));
-            let turned = &work.turned[start..start + 2 * ALPHAS * rows];
+        let (starts, columns) = (self.turned_starts(work.columns), 2 * work.columns);
+        for (mu, products) in work.products.chunks_exact_mut(columns * 2 * reach.count).enumerate() {
+            let rows = degrees(self.l_max, mu);
+            let turned = &work.turned[starts[mu]..starts[mu] + columns * rows];
             faer::linalg::matmul::matmul(
-                MatMut::from_column_major_slice_mut(products, 2 * reach.count, 2 * ALPHAS),
+                MatMut::from_column_major_slice_mut(products, 2 * reach.count, columns),
                 Accum::Replace,
                 self.pattern(mu, reach),
-                MatRef::from_column_major_slice(turned, rows, 2 * ALPHAS),
+                MatRef::from_column_major_slice(turned, rows, columns),
                 1.0,
                 Par::Seq,
             );
         }
     }
 
-    /// For one alpha, which is `alpha` in its block and `place` among those in use: from orders mu to gamma, times the weights of neighbouring
+    /// For one alpha, which is `alpha` in its block, in the column `place`: from orders mu to gamma, times the weights of neighbouring
     /// nodes, and back.
     fn multiply_weights(
         &self,
@@ -293,40 +331,42 @@ impl Operator {
         }
     }
 
-    /// Products with the patterns, transposed, turned back from the orbit's plane and summed over alpha.
-    fn gradient(
+    /// Products with the patterns, transposed, turned back from the orbit's plane and summed over alpha, sky by sky.
+    fn gradients(
         &self,
         work: &mut Workspace,
         reach: NodeRange,
         circle: Circle,
         alphas: &[usize],
         factor: Option<&[f64]>,
-    ) -> Vec<f64> {
-        let len = 2 * ALPHAS * 2 * reach.count;
-        for (mu, products) in work.products.chunks_exact(len).enumerate() {
-            let (start, rows) = (self.turned_start(mu), degrees(self.l_max, mu));
-            let turned = &mut work.turned[start..start + 2 * ALPHAS * rows];
+    ) -> Vec<Vec<f64>> {
+        let (starts, columns) = (self.turned_starts(work.columns), 2 * work.columns);
+        for (mu, products) in work.products.chunks_exact(columns * 2 * reach.count).enumerate() {
+            let rows = degrees(self.l_max, mu);
+            let turned = &mut work.turned[starts[mu]..starts[mu] + columns * rows];
             faer::linalg::matmul::matmul(
-                MatMut::from_column_major_slice_mut(turned, rows, 2 * ALPHAS),
+                MatMut::from_column_major_slice_mut(turned, rows, columns),
                 Accum::Replace,
                 self.pattern(mu, reach).transpose(),
-                MatRef::from_column_major_slice(products, 2 * reach.count, 2 * ALPHAS),
+                MatRef::from_column_major_slice(products, 2 * reach.count, columns),
                 1.0,
                 Par::Seq,
             );
         }
-        self.turn_back(&work.turned, circle, alphas, factor)
+        let firsts = (0..work.columns).step_by(ALPHAS);
+        firsts.map(|first| self.turn_back(work, circle, alphas, first, factor)).collect()
     }
 
     /// The transpose of [`Operator::turn`], each order m times its factor.
     fn turn_back(
         &self,
-        turned: &[f32],
+        work: &Workspace,
         circle: Circle,
         alphas: &[usize],
+        first: usize,
         factor: Option<&[f64]>,
     ) -> Vec<f64> {
-        let starts: Vec<usize> = (0..=self.l_max).map(|mu| self.turned_start(mu)).collect();
+        let starts = self.turned_starts(work.columns);
         let count = alphas.len();
         let turns = self.turns(circle, alphas);
         let mut sum = Alm::zeros(self.l_max);
@@ -340,7 +380,8 @@ impl Operator {
                     for (order, value) in column.iter_mut().enumerate() {
                         let mu = l % 2 + 2 * order;
                         let rows = degrees(self.l_max, mu);
-                        *value = turned[starts[mu] + (part * ALPHAS + k) * rows + (l - mu) / 2];
+                        *value =
+                            work.turned[starts[mu] + (part * work.columns + first + k) * rows + (l - mu) / 2];
                     }
                 }
                 faer::linalg::matmul::matmul(

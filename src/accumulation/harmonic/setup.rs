@@ -123,7 +123,8 @@ pub fn memory(l_max: usize, u_max: f64, threads: usize) -> HarmonicMemory {
     HarmonicMemory {
         sums: grids.nodes.count as u64 * grids.node_bytes(),
         tables: Operator::table_bytes(l_max, &grids),
-        workspace: threads as u64 * Operator::workspace_bytes(l_max, &grids),
+        // A map and its noise map are solved together.
+        workspace: threads as u64 * Operator::workspace_bytes(l_max, &grids, 2),
     }
 }
 

@@ -4,7 +4,8 @@ use std::fs::File;
 use std::io;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, OnceLock};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use super::grid::{Grids, NODES};
 use crate::files::{nameless_file, read_at};
@@ -35,19 +36,26 @@ impl TorusPart {
 }
 
 /// The rows of a block of alphas as they were read.
-pub(super) struct ReadRows {
+pub(super) struct ReadRows<'a> {
+    from: &'a StoredTori,
     values: Vec<f32>,
     /// Where each node begins, of those that have data.
     nodes: Vec<Option<usize>>,
     row: usize,
 }
 
-impl ReadRows {
+impl ReadRows<'_> {
     /// The row of a node at the alpha `place` of the block, if it has data.
     #[inline]
     pub(super) fn row(&self, node: usize, place: usize) -> Option<&[f32]> {
         let first = (*self.nodes.get(node)?)? + place * self.row;
         self.values.get(first..first + self.row)
+    }
+}
+
+impl Drop for ReadRows<'_> {
+    fn drop(&mut self) {
+        self.from.buffers().push(std::mem::take(&mut self.values));
     }
 }
 
@@ -63,6 +71,10 @@ pub(super) struct StoredTori {
     pub(super) parts: [StoredPart; 2],
     /// Nodes of the grid that have data.
     pub(super) reached: Range<usize>,
+    /// Memory of blocks that were read: new memory costs as much as reading into it.
+    unused: Mutex<Vec<Vec<f32>>>,
+    /// Whether the last product took the blocks from the first to the last.
+    forth: AtomicBool,
     /// Why a block could not be read.
     failure: OnceLock<String>,
 }
@@ -97,12 +109,19 @@ impl StoredTori {
             end: 0,
             parts: Default::default(),
             reached: 0..0,
+            unused: Mutex::default(),
+            forth: AtomicBool::new(false),
             failure: OnceLock::new(),
         })
     }
 
     pub(super) fn reached(&self) -> Range<usize> {
         self.reached.clone()
+    }
+
+    /// Whether the next product is to take the blocks from the last to the first: the other way than the one before.
+    pub(super) fn turns_back(&self) -> bool {
+        self.forth.fetch_not(Ordering::Relaxed)
     }
 
     pub(super) fn alphas(&self, part: TorusPart) -> &[bool] {
@@ -126,14 +145,19 @@ impl StoredTori {
         self.failure.get().map(String::as_str)
     }
 
+    fn buffers(&self) -> MutexGuard<'_, Vec<Vec<f32>>> {
+        self.unused.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// The rows of a block, with `row` floats each; `None` if they cannot be read.
-    pub(super) fn block(&self, part: TorusPart, block: usize, row: usize) -> Option<ReadRows> {
+    pub(super) fn block(&self, part: TorusPart, block: usize, row: usize) -> Option<ReadRows<'_>> {
         if self.failure.get().is_some() {
             return None;
         }
         let block = self.parts[part as usize].blocks.get(block)?;
         let floats = block.alphas * row;
-        let mut values = vec![0.0_f32; block.nodes.len() * floats];
+        let mut values = self.buffers().pop().unwrap_or_default();
+        values.resize(block.nodes.len() * floats, 0.0);
         if let Err(error) = read_at(&self.file, bytemuck::cast_slice_mut(&mut values), block.offset) {
             let reason = format!(
                 "sums on disk in {}: {error}; expected to read what was written",
@@ -146,6 +170,6 @@ impl StoredTori {
         for (place, &node) in block.nodes.iter().enumerate() {
             nodes[node] = Some(place * floats);
         }
-        Some(ReadRows { values, nodes, row })
+        Some(ReadRows { from: self, values, nodes, row })
     }
 }

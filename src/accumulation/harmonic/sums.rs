@@ -87,8 +87,14 @@ impl NormalSums for HarmonicSums {
     }
 
     fn apply(&self, x: &[f64], y: &mut [f64]) {
-        let sky = coefficients(x, self.setup.l_max);
-        y.copy_from_slice(&unknowns_of_gradient(&self.operator().apply(&self.shared(), &sky)));
+        for product in self.apply_all(&[x]) {
+            y.copy_from_slice(&product);
+        }
+    }
+
+    fn apply_all(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
+        let skies: Vec<Alm> = x.iter().map(|x| coefficients(x, self.setup.l_max)).collect();
+        self.operator().apply(&self.shared(), &skies).iter().map(unknowns_of_gradient).collect()
     }
 
     fn right_hand_side(&self) -> &[f64] {

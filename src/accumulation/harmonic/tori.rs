@@ -36,7 +36,7 @@ pub(super) enum BlockRows<'a> {
         first: usize,
         row: usize,
     },
-    Read(ReadRows),
+    Read(ReadRows<'a>),
 }
 
 impl NodeSums {
@@ -114,6 +114,12 @@ impl Tori {
                 Some(BlockRows::Held { tori: self, part, first: first * row, row })
             }
         }
+    }
+
+    /// Whether the next product takes the blocks from the last to the first. Of sums on disk every second one does: what memory has kept
+    /// of the file is what was read last.
+    pub(super) fn turns_back(&self) -> bool {
+        self.stored.as_ref().is_some_and(|stored| stored.turns_back())
     }
 
     /// Bytes of the weights that a product reads.

@@ -1,4 +1,4 @@
-//! Memory in which a thread applies the operator to a block of alphas.
+//! Memory in which a thread applies the operator to a block of alphas, of one sky or several.
 
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use rustfft::{Fft, FftPlanner};
 use super::grid::NODE_GROUP;
 use crate::response::harmonic::degrees;
 
-/// Alphas of a block: columns of its matrix products, halved.
+/// Alphas of a block. Each of them is a column of the matrix products for every sky.
 pub(super) const ALPHAS: usize = 16;
 
 /// Whole groups of nodes that hold all sums.
@@ -29,9 +29,11 @@ pub(super) struct Transforms {
 pub(super) struct Workspace {
     l_max: usize,
     range: NodeRange,
-    /// By mu: the turned sky, `[re of alphas, im of alphas][l]`.
+    /// Alphas of every sky, one sky after another.
+    pub(super) columns: usize,
+    /// By mu: the turned skies, `[re of columns, im of columns][l]`.
     pub(super) turned: Vec<f32>,
-    /// By mu: `[re of alphas, im of alphas][node][mu, -mu]`.
+    /// By mu: `[re of columns, im of columns][node][mu, -mu]`.
     pub(super) products: Vec<f32>,
     /// Two groups of nodes on the grid in gamma.
     pub(super) ring: Vec<Vec<Complex32>>,
@@ -41,22 +43,23 @@ pub(super) struct Workspace {
 }
 
 impl Workspace {
-    pub(super) fn new(l_max: usize, points: usize, range: NodeRange) -> Self {
+    pub(super) fn new(l_max: usize, points: usize, range: NodeRange, skies: usize) -> Self {
+        let columns = skies * ALPHAS;
         let line = || vec![Complex32::ZERO; points];
         let turned: usize = (0..=l_max).map(|mu| degrees(l_max, mu)).sum();
         Self {
             l_max,
             range,
-            turned: vec![0.0; 2 * ALPHAS * turned],
-            products: vec![0.0; (l_max + 1) * 2 * ALPHAS * 2 * range.count],
+            columns,
+            turned: vec![0.0; 2 * columns * turned],
+            products: vec![0.0; (l_max + 1) * 2 * columns * 2 * range.count],
             ring: (0..2 * NODE_GROUP).map(|_| line()).collect(),
             group: (0..NODE_GROUP).map(|_| line()).collect(),
             transforms: Transforms::new(points),
         }
     }
 
-    /// Copies the nodes from `group` on, at the alpha `place` of the block, from the products onto circles of orders:
-    /// into one half of the ring, which is transformed to gamma.
+    /// Copies the nodes from `group` on, of the column `place`, from the products onto circles of orders: into one half of the ring, which is transformed to gamma.
     pub(super) fn gather(&mut self, place: usize, group: usize) {
         let half = group % (2 * NODE_GROUP);
         let lines = &mut self.ring[half..half + NODE_GROUP];
@@ -69,8 +72,8 @@ impl Workspace {
         for line in lines.iter_mut() {
             line[self.l_max + 1..points - self.l_max].fill(Complex32::ZERO);
         }
-        for (mu, products) in self.products.chunks_exact(2 * ALPHAS * column).enumerate() {
-            let (re, im) = products.split_at(ALPHAS * column);
+        for (mu, products) in self.products.chunks_exact(2 * self.columns * column).enumerate() {
+            let (re, im) = products.split_at(self.columns * column);
             let [re, im] = [re, im].map(|part| &part[place * column + 2 * group..][..2 * NODE_GROUP]);
             for (k, line) in lines.iter_mut().enumerate() {
                 line[mu] = Complex32::new(re[2 * k], im[2 * k]);
@@ -89,8 +92,8 @@ impl Workspace {
         let lines = &self.group[skipped..];
         let points = self.group[0].len();
         let count = lines.len().min(self.range.count.saturating_sub(first));
-        for (mu, products) in self.products.chunks_exact_mut(2 * ALPHAS * column).enumerate() {
-            let (re, im) = products.split_at_mut(ALPHAS * column);
+        for (mu, products) in self.products.chunks_exact_mut(2 * self.columns * column).enumerate() {
+            let (re, im) = products.split_at_mut(self.columns * column);
             for (k, line) in lines[..count].iter().enumerate() {
                 let minus = if mu > 0 { line[points - mu] } else { Complex32::ZERO };
                 let at = place * column + 2 * (first + k);

@@ -193,6 +193,12 @@ impl TableOrbit {
         self.file.segments.iter().map(stretch).collect()
     }
 
+    /// Memory of the states, bytes; clones share it.
+    pub(in crate::array) fn table_bytes(&self) -> u64 {
+        let states: usize = self.file.segments.iter().map(|segment| segment.time_s.len()).sum();
+        (states * (size_of::<f64>() + 2 * size_of::<Vec3>())) as u64
+    }
+
     /// First and last time, s since the mission's epoch.
     pub(in crate::array) fn span_s(&self) -> [f64; 2] {
         self.file.span_s().map(|t_s| t_s - self.epoch_s)
