@@ -12,6 +12,7 @@
 //! | `fit` | whether a solution explains the data |
 //! | `positions` | positions that are off by a good part of a wavelength |
 //! | `global` | positions that are off by radians: a search over all offsets |
+//! | `reach` | how far they are searched |
 //! | `moments` | a pair at any offset |
 //! | `expansion` | a plane wave of an offset by spherical harmonics |
 //! | `passes` | a pass from packets to its solutions |
@@ -34,6 +35,7 @@ mod passes;
 #[cfg(test)]
 mod position_tests;
 mod positions;
+mod reach;
 mod robust;
 mod solution;
 mod start;
