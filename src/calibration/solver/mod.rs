@@ -10,6 +10,7 @@
 //! | `robust` | outliers, and pairs whose model is not as good as their noise |
 //! | `solution` | robust rounds, and the solution of a pass |
 //! | `fit` | whether a solution explains the data |
+//! | `agree` | whether daughters contradict one another |
 //! | `positions` | positions that are off by a good part of a wavelength |
 //! | `global` | positions that are off by radians: a search over all offsets |
 //! | `reach` | how far they are searched |
@@ -19,6 +20,7 @@
 //! | `monitor` | what happened to the instrument |
 //! | `table` | tables, and the file of gains |
 
+mod agree;
 mod config;
 #[cfg(test)]
 mod cramer_rao;
