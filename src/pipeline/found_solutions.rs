@@ -152,7 +152,9 @@ impl FoundSolutions {
     /// What is told of them.
     pub(super) fn summary(&self, solver: &SolverConfig) -> CalibrateSummary {
         let satellites = self.instrument.as_ref().map_or(0, |instrument| usize::from(instrument.satellites));
-        let channels = self.instrument.as_ref().map_or(0, |instrument| instrument.channels.len());
+        let hz = |instrument: &Instrument| instrument.channels.iter().map(|one| one.frequency_hz).collect();
+        let frequencies_hz: Vec<f64> = self.instrument.as_ref().map_or_else(Vec::new, hz);
+        let channels = frequencies_hz.len();
         let median = |c: usize, n: usize| {
             let mut sigmas: Vec<f64> =
                 self.solutions.iter().map(|one| one.daughters[n].gains[c].phase_sigma_deg).collect();
@@ -173,7 +175,7 @@ impl FoundSolutions {
             gains_not_good: [bad, all],
             phase_sigma_deg: (0..channels).map(|c| (0..satellites).map(|n| median(c, n)).collect()).collect(),
             events: instrument_events(&self.solutions),
-            conventions: solver.conventions(),
+            conventions: solver.conventions(&frequencies_hz),
             ..CalibrateSummary::default()
         }
     }

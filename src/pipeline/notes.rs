@@ -20,7 +20,14 @@ impl Config {
     /// Notes on values that are valid and probably not meant.
     #[must_use]
     pub fn notes(&self) -> Vec<String> {
-        [self.period_note(), self.quantiser_note(), self.positions_note()].into_iter().flatten().collect()
+        let notes = [self.period_note(), self.quantiser_note(), self.positions_note(), self.reach_note()];
+        notes.into_iter().flatten().collect()
+    }
+
+    /// Positions that may be further off than they are searched while the data arrive.
+    fn reach_note(&self) -> Option<String> {
+        let solves = self.calibration.hook == CalibrationHook::Solve;
+        solves.then(|| self.calibrate.reach_note(&self.spacecraft.channels_hz)).flatten()
     }
 
     /// Positions that are corrected, and limits that refuse what is corrected.
@@ -102,6 +109,25 @@ mod tests {
         assert!(config.notes()[0].contains("calibration.quantiser_bits = 1"), "{:?}", config.notes());
         config.calibration.quantiser_bits = 1;
         assert_eq!(config.notes(), Vec::<String>::new());
+    }
+
+    #[test]
+    fn positions_beyond_the_search_are_named() {
+        let mut config = Config::default();
+        config.calibration.hook = CalibrationHook::Solve;
+        config.spacecraft.channels_hz = vec![30e6, 10e6];
+        // Fifteen radians are 15 / (2 pi) of 29.979 m: 71.57 m, three times 23.86 m.
+        config.calibrate.position_sigma_m = 23.8;
+        assert_eq!(config.reach_note(), None);
+        config.calibrate.position_sigma_m = 30.0;
+        let note = config.reach_note().unwrap();
+        // 10 MHz times 23.86 / 30.
+        for part in ["71.6 m at 10.000 MHz", "up to 90.0 m", "7.952 MHz or below", "known to 23.9 m"] {
+            assert!(note.contains(part), "{part}: {note}");
+        }
+        assert!(config.notes().contains(&note));
+        config.spacecraft.channels_hz = vec![3e6, 30e6];
+        assert_eq!(config.notes(), config.positions_note().into_iter().collect::<Vec<String>>());
     }
 
     #[test]

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use super::reach::reach_note;
 use crate::calibration::CalibrationError;
 use crate::response::beacon::Beacon;
 use crate::sky::SkyMap;
@@ -157,9 +158,16 @@ impl SolverConfig {
         checks.finish()
     }
 
-    /// What the data do not determine, and what decides it instead.
+    /// Says that positions may be further off than they are searched in channels of these frequencies, if they may be.
     #[must_use]
-    pub fn conventions(&self) -> Vec<String> {
+    pub fn reach_note(&self, frequencies_hz: &[f64]) -> Option<String> {
+        let lowest_hz = frequencies_hz.iter().copied().reduce(f64::min)?;
+        reach_note(self.position_sigma_m, lowest_hz)
+    }
+
+    /// What the data of channels of these frequencies do not determine, and what decides it instead.
+    #[must_use]
+    pub fn conventions(&self, frequencies_hz: &[f64]) -> Vec<String> {
         let mut told = vec![format!(
             "phases, clocks and positions are relative to daughter {}: a phase that all have leaves no trace, and a shift of all \
              positions only a rotation of the sky",
@@ -180,6 +188,7 @@ impl SolverConfig {
                 "a clock and the phases of its channels differ by their priors alone; their sum is what is measured".to_owned(),
             );
         }
+        told.extend(self.reach_note(frequencies_hz));
         told
     }
 

@@ -18,19 +18,11 @@ use super::expansion::{degree_for, harmonics, offset_factors, real_harmonics};
 use super::model::KnownSignal;
 use super::moments::{MomentSetup, PairMoments, fixed_axes};
 use super::positions::KEPT_COST;
+use super::reach::reach_radians;
 use crate::frames::PlacedVisibilities;
 use crate::response::model::ModelError;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, dot, norm, sub};
-
-/// Phase of one standard deviation of an offset in the lowest channel, rad, from which on all offsets are searched.
-const SEARCH_RADIANS: f64 = 0.8;
-
-/// Standard deviations within which offsets are searched.
-const REACH: f64 = 3.0;
-
-/// Longest offset that is searched, rad: 400 harmonics, and some 25,000 offsets on the grid.
-const RADIANS_MAX: f64 = 15.0;
 
 /// Steps of the grid away from the Moon, along the track and across it, rad.
 const STEP_RADIANS: Vec3 = [TAU / 6.0, TAU / 12.0, TAU / 6.0];
@@ -66,16 +58,11 @@ pub(super) struct GlobalSearch<'a> {
 }
 
 impl GlobalSearch<'_> {
-    /// Whether the offsets of a channel have to be searched.
-    pub(super) fn is_needed(position_sigma_m: f64, frequency_hz: f64) -> bool {
-        TAU * frequency_hz / SPEED_OF_LIGHT_M_S * position_sigma_m > SEARCH_RADIANS
-    }
-
     /// Offsets of all daughters, m: the best ones, best first.
     pub(super) fn find(&self, signal: &KnownSignal) -> Result<Vec<Vec<[f64; 3]>>, ModelError> {
         let (_, frequency_hz) = signal.beacon(self.channel);
         let per_m = TAU * frequency_hz / SPEED_OF_LIGHT_M_S;
-        let reach = (REACH * self.position_sigma_m * per_m).min(RADIANS_MAX);
+        let reach = reach_radians(self.position_sigma_m, frequency_hz);
         // Of the difference of two amplitudes.
         let amplitude_sigma = std::f64::consts::SQRT_2 * self.amplitude_sigma;
         let grid = Grid::new(reach, self.position_sigma_m * per_m, amplitude_sigma);

@@ -10,14 +10,17 @@
 //! | `robust` | outliers, and pairs whose model is not as good as their noise |
 //! | `solution` | robust rounds, and the solution of a pass |
 //! | `fit` | whether a solution explains the data |
+//! | `agree` | whether daughters contradict one another |
 //! | `positions` | positions that are off by a good part of a wavelength |
 //! | `global` | positions that are off by radians: a search over all offsets |
+//! | `reach` | how far they are searched |
 //! | `moments` | a pair at any offset |
 //! | `expansion` | a plane wave of an offset by spherical harmonics |
 //! | `passes` | a pass from packets to its solutions |
 //! | `monitor` | what happened to the instrument |
 //! | `table` | tables, and the file of gains |
 
+mod agree;
 mod config;
 #[cfg(test)]
 mod cramer_rao;
@@ -34,6 +37,7 @@ mod passes;
 #[cfg(test)]
 mod position_tests;
 mod positions;
+mod reach;
 mod robust;
 mod solution;
 mod start;

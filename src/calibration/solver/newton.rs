@@ -51,7 +51,7 @@ impl ParameterLayout {
     }
 
     /// Sum of squared residuals in units of their noise, with priors.
-    fn cost(&self, values: &Values, sums: &[PairSums], near: Option<&Near<'_>>) -> f64 {
+    pub(super) fn cost(&self, values: &Values, sums: &[PairSums], near: Option<&Near<'_>>) -> f64 {
         let mut cost = 0.0;
         for sums in sums {
             let (gain, u) = self.pair(values, sums.channel, sums.pair);
@@ -78,7 +78,12 @@ impl ParameterLayout {
     }
 
     /// Normal matrix (row after row) and right side of a step.
-    fn normal(&self, values: &Values, sums: &[PairSums], near: Option<&Near<'_>>) -> (Vec<f64>, Vec<f64>) {
+    pub(super) fn normal(
+        &self,
+        values: &Values,
+        sums: &[PairSums],
+        near: Option<&Near<'_>>,
+    ) -> (Vec<f64>, Vec<f64>) {
         let order = self.order();
         let (mut matrix, mut right) = (vec![0.0; order * order], vec![0.0; order]);
         for sums in sums {

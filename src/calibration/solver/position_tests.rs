@@ -191,14 +191,20 @@ impl Scene {
         KnownSignal::new(config, &self.instrument(), &maps).unwrap()
     }
 
-    /// A solution that begins with the position of one daughter off by a shift.
-    fn solve_off(&self, config: &SolverConfig, truth: &Truth, seed: u64, shift_m: Vec3) -> PassSolution {
+    /// A solution that begins with the positions of daughters 2, 3 and 4 off by shifts.
+    fn solve_off(
+        &self,
+        config: &SolverConfig,
+        truth: &Truth,
+        seed: u64,
+        shifts_m: [Vec3; 3],
+    ) -> PassSolution {
         let (placed, span_s, normal_hat) = self.pass(truth, seed);
         let mut signal = self.signal(&self.sky, config);
         let mut offset_m = relative(truth);
-        // Daughter 2, 3 or 4.
-        let offset_off_m = &mut offset_m[1 + seed as usize % 3];
-        *offset_off_m = add(*offset_off_m, shift_m);
+        for (offset_m, shift_m) in offset_m[1..].iter_mut().zip(shifts_m) {
+            *offset_m = add(*offset_m, shift_m);
+        }
         let offsets = Offsets { offset_m, normal_hat: normal_hat.clone() };
         let block = |(placed, is_on): &(PlacedVisibilities, bool)| {
             super::positions::modelled(placed, &mut signal, &offsets, *is_on).unwrap()
@@ -310,17 +316,17 @@ fn a_strong_beacon_does_not_lead_positions_astray() {
     );
 }
 
-#[test]
-fn wrong_minima_are_no_good_solutions() {
+/// Solutions that begin off by what `shifts_m` makes of a seed and a shift: wrong ones, those that are good all the same, right ones, and those that are not good.
+fn tried_off(shifts_m: impl Fn(u64, Vec3) -> [Vec3; 3]) -> [u32; 4] {
     let scene = Scene::new(&[10e6], 1.0);
-    let (mut wrong, mut missed, mut refused, mut right_ones) = (0, 0, 0, 0);
+    let (mut wrong, mut missed, mut right_ones, mut refused) = (0, 0, 0, 0);
     for seed in 0..6 {
         let truth = scene.truth(seed, ERRORS);
         // From a hundredth to a half of a wavelength away.
         for shift_m in
             [[0.3, 0.0, 0.0], [0.0, 0.3, 0.3], [9.0, -5.0, 0.0], [0.0, 9.0, 9.0], [-12.0, 0.0, 9.0]]
         {
-            let found = scene.solve_off(&config(), &truth, seed, shift_m);
+            let found = scene.solve_off(&config(), &truth, seed, shifts_m(seed, shift_m));
             for (is_good, is_near, sigmas) in right(&scene, &truth, &found) {
                 // Where they are not known better, a tenth of a wavelength may be noise.
                 let is_right = is_near || sigmas < 4.0;
@@ -331,10 +337,39 @@ fn wrong_minima_are_no_good_solutions() {
         }
     }
     eprintln!("{missed} of {wrong} wrong ones are good, {refused} of {right_ones} right ones are not");
+    [wrong, missed, right_ones, refused]
+}
+
+#[test]
+fn wrong_minima_are_no_good_solutions() {
+    // One daughter.
+    let [wrong, missed, right_ones, refused] = tried_off(|seed, shift_m| {
+        std::array::from_fn(|k| if k as u64 == seed % 3 { shift_m } else { [0.0; 3] })
+    });
     assert!(wrong >= 5 && right_ones >= 30);
     // A wrong daughter leads others astray: those that are off by less than itself leave less of their signal.
     assert!(
         missed * 4 <= wrong && refused * 4 <= right_ones,
+        "{missed} of {wrong}, {refused} of {right_ones}"
+    );
+}
+
+#[test]
+fn three_wrong_daughters_contradict_one_another() {
+    let [wrong, missed, right_ones, refused] = tried_off(|seed, shift_m| {
+        let mut stream = random_stream(seed, StreamKind::Probe, [7, (shift_m[0] * 10.0 + 500.0) as u64]);
+        let size_m = norm(shift_m) / 3.0_f64.sqrt();
+        std::array::from_fn(|_| {
+            std::array::from_fn(|_| {
+                let by: f64 = StandardNormal.sample(&mut stream);
+                size_m * by
+            })
+        })
+    });
+    assert!(wrong >= 15 && right_ones >= 30);
+    // Where daughters contradict one another, right ones are doubted, too.
+    assert!(
+        missed * 6 <= wrong && refused * 3 <= right_ones,
         "{missed} of {wrong}, {refused} of {right_ones}"
     );
 }

@@ -15,6 +15,7 @@ use super::global::GlobalSearch;
 use super::layout::{ParameterLayout, Values};
 use super::model::{KnownSignal, Offsets};
 use super::newton::{Found, Near};
+use super::reach::is_searched;
 use super::robust::{judge, misfit};
 use super::solution::sums_of;
 use super::sums::{ModelledBlock, PairSums};
@@ -110,7 +111,7 @@ impl Search<'_> {
         let Self { config, normal_hat, .. } = *self;
         let SolverConfig { position_sigma_m, amplitude_sigma, .. } = *config;
         let lowest = ladder.first().copied();
-        let lowest = lowest.filter(|c| GlobalSearch::is_needed(position_sigma_m, self.frequencies_hz[*c]));
+        let lowest = lowest.filter(|c| is_searched(position_sigma_m, self.frequencies_hz[*c]));
         let Some(channel) = lowest else { return Ok(vec![vec![[0.0; 3]; normal_hat.len()]]) };
         let thinned = self.thinned(&[channel], SEARCHED);
         let data: Vec<_> = thinned.into_iter().map(|(placed, is_on, _)| (placed, is_on)).collect();

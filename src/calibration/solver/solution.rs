@@ -4,6 +4,7 @@ use bincode::{Decode, Encode};
 use rayon::prelude::*;
 use serde::Serialize;
 
+use super::agree::is_contradicted;
 use super::config::SolverConfig;
 use super::fit::unexplained;
 use super::layout::ParameterLayout;
@@ -31,7 +32,7 @@ pub enum GainState {
     NotConverged,
     /// The solution leaves too much of the signal unexplained: a wrong minimum.
     PoorFit,
-    /// Another position explains the data as well.
+    /// Another position explains the data as well, or daughters contradict one another.
     Ambiguous,
 }
 
@@ -194,8 +195,10 @@ pub(super) fn solve_from(
         1 => vec![0.0; layout.satellites * layout.channels()],
         _ => unexplained(&layout, &found, blocks, config.unexplained_max),
     };
+    let doubted =
+        layout.terms() > 1 && config.unexplained_max < 1.0 && is_contradicted(&layout, &found, &sums);
     let told = |n: usize| daughter(config, &layout, (&found, &counts, &unexplained), n);
-    PassSolution {
+    let mut solution = PassSolution {
         pass,
         from_s: span_s[0],
         until_s: span_s[1],
@@ -208,7 +211,11 @@ pub(super) fn solve_from(
         outlier_parts: counts.parts(),
         daughters: (0..layout.satellites).map(told).collect(),
         normal_hat,
+    };
+    if doubted {
+        solution.doubt(|n, _| n != layout.reference);
     }
+    solution
 }
 
 pub(super) fn sums_of(
