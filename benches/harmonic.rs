@@ -199,7 +199,7 @@ fn engine(array: &Array, l_max: usize) {
         weight_max: 1024.0,
     })
     .expect("settings in range");
-    let memory = memory(l_max, 125.0, rayon::current_num_threads());
+    let memory = memory(l_max, 125.0, rayon::current_num_threads(), 2);
     println!(
         "engine l {l_max}: {:.2} GB of sums, {:.2} GB of tables",
         1e-9 * memory.sums as f64,

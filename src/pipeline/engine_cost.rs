@@ -15,8 +15,12 @@ use crate::response::general::row_tables_bytes;
 use crate::sky::healpix::pixel_count;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// Products with BtN^-1B in one harmonic solution: some 15 for W_max, 25 each for the map and the noise map.
+/// Products with BtN^-1B in one harmonic solution: some 15 for W_max, 25 each for the map and the noise map, which in memory take
+/// nearly twice as long together as one (benches/harmonic).
 const APPLICATIONS: f64 = 65.0;
+
+/// A map and its noise map.
+const SOLVED_TOGETHER: usize = 2;
 
 /// Products with BtN^-1B for one random probe of the traces, of at most 300: a guess for epsilon = 1e-4, not measured.
 const PROBE_APPLICATIONS: f64 = 40.0;
@@ -95,8 +99,8 @@ impl EngineCost {
         }
         let blocks = shared_size(map.degree()).blocks;
         let part = blocks.div_ceil(parts) as f64 / blocks as f64;
-        // Two blocks of each thread: one that is used, and the allocator's last.
-        let read = 2.0 * rayon::current_num_threads() as f64 / blocks as f64 * self.copy_bytes;
+        // Each thread keeps the memory of a block that it reads.
+        let read = rayon::current_num_threads() as f64 / blocks as f64 * self.copy_bytes;
         let solving = read + self.other_bytes;
         Self {
             sums_bytes: (part * self.sums_bytes).max(solving),
@@ -184,7 +188,7 @@ impl EngineCost {
     fn harmonic(map: &MapConfig, ChannelData { frequency_hz, windows, .. }: ChannelData) -> Self {
         let l_max = map.degree();
         let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
-        let memory = memory(l_max, u_max, rayon::current_num_threads());
+        let memory = memory(l_max, u_max, rayon::current_num_threads(), SOLVED_TOGETHER);
         let size = application_size(l_max, u_max);
         let points = size.points as f64;
         // A complex transform takes 5 n log2(n) operations, of which two make a multiply-add.

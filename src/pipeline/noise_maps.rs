@@ -16,7 +16,7 @@ use crate::products::ProductsError;
 use crate::runtime::{Cancel, Graph, Sink};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Frame, SkyMap};
-use crate::solve::{HarmonicRequest, SolveError, SolveWatch, SolverSetup, solve_noises};
+use crate::solve::{HarmonicRequest, NOISES_TOGETHER, SolveError, SolveWatch, SolverSetup, solve_noises};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 /// Most realisations of one reading.
@@ -72,8 +72,9 @@ impl NoiseMaps<'_> {
         let channels = &self.config.spacecraft.channels_hz;
         let sizes = channels.iter().map(|&frequency_hz| {
             let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
+            let memory = memory(map.degree(), u_max, rayon::current_num_threads(), NOISES_TOGETHER);
             // One copy waits while another is solved.
-            let sums = 2 * memory(map.degree(), u_max, 1).sums;
+            let sums = 2 * memory.sums + memory.tables + memory.workspace;
             [sums, NoiseSums::bytes_each(map.degree(), u_max)]
         });
         let [sums, each] = sizes.fold([0.0, 1.0], |[a, b], [c, d]| [a + c as f64, b + d as f64]);

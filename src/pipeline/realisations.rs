@@ -15,6 +15,7 @@ use crate::sky::harmonics::AnalysisOptions;
 use crate::sky::healpix::{pixel_count, pixel_of};
 use crate::sky::spectra::auto_cl;
 use crate::sky::{Frame, SkyMap};
+use crate::units::InvalidValue;
 
 /// Realisations of one channel of one case.
 #[derive(Clone, Debug, Serialize)]
@@ -38,8 +39,8 @@ pub struct RealisationSpread {
     pub files: Vec<PathBuf>,
 }
 
-/// Most pixels whose covariance with all others is wanted.
-pub(super) const COVARIANCES_MAX: usize = 100;
+/// Most pixels whose covariance with all others is wanted: each takes a map of memory.
+pub(super) const COVARIANCES_MAX: usize = 16;
 
 /// What a study's realisations leave.
 #[derive(Clone, Copy)]
@@ -57,6 +58,12 @@ struct PixelProducts {
     rows: Vec<(usize, Vec<f64>)>,
 }
 
+/// A direction as a part of a file's name.
+pub(super) fn direction_name([longitude_deg, latitude_deg]: [f64; 2]) -> String {
+    // Zero has no sign.
+    format!("{:.3}_{:.3}", longitude_deg + 0.0, latitude_deg + 0.0)
+}
+
 impl PixelProducts {
     fn new(nside: usize, at_deg: &[[f64; 2]]) -> Self {
         let none = vec![0.0; pixel_count(nside)];
@@ -68,14 +75,18 @@ impl PixelProducts {
         Self { count: 0.0, squares: none.clone(), rows: at_deg.iter().map(row).collect() }
     }
 
-    /// Adds a map of as many pixels.
-    fn add(&mut self, noise_k: &[f64]) {
+    /// Adds a map; `false` if it has another number of pixels.
+    fn add(&mut self, noise_k: &[f64]) -> bool {
+        if noise_k.len() != self.squares.len() {
+            return false;
+        }
         self.count += 1.0;
         self.squares.iter_mut().zip(noise_k).for_each(|(sum, value)| *sum += value * value);
         for (pixel, row) in &mut self.rows {
             let here = noise_k[*pixel];
             row.iter_mut().zip(noise_k).for_each(|(sum, value)| *sum += here * value);
         }
+        true
     }
 
     /// Standard deviation by pixel, K: noise has no mean.
@@ -167,7 +178,18 @@ fn channel_spread(
     for path in files {
         let noise = read_whole_map(&path, &ReadOptions::default())?;
         let new = || (noise.frame(), PixelProducts::new(noise.nside(), covariance_at_deg));
-        pixels.get_or_insert_with(new).1.add(noise.values());
+        let (known, pixels) = pixels.get_or_insert_with(new);
+        if *known != noise.frame() || !pixels.add(noise.values()) {
+            let expected =
+                "noise maps of one nside and frame: remove the folder of the case to make it again";
+            let found = format!("nside {}, {}", noise.nside(), noise.frame());
+            return Err(InvalidValue {
+                key: path.display().to_string(),
+                value: found,
+                expected: expected.into(),
+            }
+            .into());
+        }
         let l_max = 3 * noise.nside() - 1;
         noise_k2.push(auto_cl(&noise.harmonics(l_max, &AnalysisOptions::default())?));
     }
@@ -186,9 +208,9 @@ fn channel_spread(
         let name = PathBuf::from(format!("sigma-{number}-{mhz}.fits"));
         write_map(&out.join(&name), &SkyMap::new(frame, sigma_k)?, &WriteOptions::default())?;
         files.push(name);
-        for ([longitude_deg, latitude_deg], values) in covariance_at_deg.iter().zip(pixels.covariances_k2()) {
+        for (at_deg, values) in covariance_at_deg.iter().zip(pixels.covariances_k2()) {
             let name =
-                PathBuf::from(format!("covariance-at-{longitude_deg},{latitude_deg}-{number}-{mhz}.fits"));
+                PathBuf::from(format!("covariance-at-{}-{number}-{mhz}.fits", direction_name(*at_deg)));
             let column = Column { name: "COVARIANCE", unit: "K^2", values: &values };
             write_columns(&out.join(&name), frame, &[column], &WriteOptions::default())?;
             files.push(name);

@@ -16,7 +16,9 @@ use super::config_source::{ConfigSource, is_study};
 use super::error::PipelineError;
 use super::noise_maps::NoiseMaps;
 use super::plan::Plan;
-use super::realisations::{COVARIANCES_MAX, RealisationSpread, SpreadProducts, csv_of, spreads};
+use super::realisations::{
+    COVARIANCES_MAX, RealisationSpread, SpreadProducts, csv_of, direction_name, spreads,
+};
 use super::run::{Destination, Watched, downlink_file, replay_knowing, simulate_sky};
 use super::space_segment;
 use crate::calibration::solver::SolverConfig;
@@ -212,8 +214,10 @@ impl Study {
         let directions = &file.covariance_at_deg;
         let is_direction =
             |[longitude, latitude]: &[f64; 2]| longitude.abs() <= 360.0 && latitude.abs() <= 90.0;
-        if directions.len() > COVARIANCES_MAX || !directions.iter().all(is_direction) {
-            let expected = "at most 100 of [longitude, latitude], ecliptic, degrees";
+        let names: BTreeSet<String> = directions.iter().map(|at_deg| direction_name(*at_deg)).collect();
+        let are_few = directions.len() <= COVARIANCES_MAX && names.len() == directions.len();
+        if !are_few || !directions.iter().all(is_direction) {
+            let expected = "at most 16 of [longitude, latitude], ecliptic, degrees, each once";
             return Err(wrong(format!("covariance_at_deg = {directions:?}"), expected));
         }
         if realisations == 1 && !directions.is_empty() {

@@ -68,7 +68,7 @@ impl Iteration {
 
     /// The residual, relative to the right-hand side; 0 if that is zero.
     fn relative(&self) -> f64 {
-        if self.whole > 0.0 { (self.energy.max(0.0) / self.whole).sqrt() } else { 0.0 }
+        if self.whole <= 0.0 { 0.0 } else { (self.energy.max(0.0) / self.whole).sqrt() }
     }
 
     fn wants(&self, rule: StoppingRule) -> bool {
@@ -128,23 +128,156 @@ impl System<'_> {
                 Iteration::new(b, std::mem::take(x), product.as_deref(), self.precondition)
             })
             .collect();
-        let goes_on = |iterations: &[Iteration]| {
-            let wants = iterations.iter().any(|iteration| iteration.wants(rule));
+        loop {
+            let wants: Vec<bool> = iterations.iter().map(|iteration| iteration.wants(rule)).collect();
             let products = iterations.iter().map(|iteration| iteration.products).max().unwrap_or(0);
             let residual = iterations.iter().map(Iteration::relative).fold(0.0, f64::max);
-            task.report_wanting(wants, products, residual)
-        };
-        while goes_on(&iterations) {
-            let mut wanting: Vec<&mut Iteration> =
-                iterations.iter_mut().filter(|iteration| iteration.wants(rule)).collect();
-            let directions: Vec<&[f64]> = wanting.iter().map(|one| one.direction.as_slice()).collect();
+            let goes_on = task.report_each(&wants, products, residual);
+            let mut open: Vec<&mut Iteration> = iterations
+                .iter_mut()
+                .zip(goes_on)
+                .filter_map(|(one, goes_on)| goes_on.then_some(one))
+                .collect();
+            if open.is_empty() {
+                break;
+            }
+            let directions: Vec<&[f64]> = open.iter().map(|one| one.direction.as_slice()).collect();
             let products = self.apply(&directions);
-            for (iteration, product) in wanting.iter_mut().zip(&products) {
+            for (iteration, product) in open.iter_mut().zip(&products) {
                 iteration.step(product, self.precondition);
             }
         }
         let convergence = iterations.iter().map(|iteration| iteration.convergence(rule)).collect();
         x.iter_mut().zip(iterations).for_each(|(x, iteration)| *x = iteration.x);
         convergence
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+
+    use super::*;
+    use crate::accumulation::{Accuracy, SumCounts};
+    use crate::ranks::on_threads;
+    use crate::solve::SolveWatch;
+
+    const ORDER: usize = 40;
+
+    /// A symmetric matrix with eigenvalues from 1 to 40, which keeps how many vectors each product had.
+    #[derive(Default)]
+    struct Known {
+        products: Mutex<Vec<usize>>,
+    }
+
+    impl NormalSums for Known {
+        fn unknowns(&self) -> usize {
+            ORDER
+        }
+
+        /// With v a unit vector, `(1 - 2 v v') D (1 - 2 v v')`.
+        fn apply(&self, x: &[f64], y: &mut [f64]) {
+            let mirrored = |x: &[f64]| {
+                let twice = 2.0 * x.iter().sum::<f64>() / ORDER as f64;
+                x.iter().map(|x| x - twice).collect::<Vec<f64>>()
+            };
+            let scaled: Vec<f64> = mirrored(x).iter().enumerate().map(|(k, x)| (k + 1) as f64 * x).collect();
+            y.copy_from_slice(&mirrored(&scaled));
+        }
+
+        fn apply_all(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
+            self.products.lock().unwrap().push(x.len());
+            let product = |x: &&[f64]| {
+                let mut y = vec![0.0; ORDER];
+                self.apply(x, &mut y);
+                y
+            };
+            x.iter().map(product).collect()
+        }
+
+        fn right_hand_side(&self) -> &[f64] {
+            &[]
+        }
+
+        fn noise_right_hand_side(&self) -> &[f64] {
+            &[]
+        }
+
+        fn counts(&self) -> SumCounts {
+            SumCounts::default()
+        }
+
+        fn accuracy(&self) -> Accuracy {
+            Accuracy { relative: 0.0, absolute: 0.0 }
+        }
+    }
+
+    fn solve(
+        known: &Known,
+        b: &[&[f64]],
+        x: &mut [Vec<f64>],
+        rule: StoppingRule,
+        watch: &SolveWatch,
+    ) -> Vec<Convergence> {
+        let system = System { sums: known, regularisation: Diagonal::Uniform(0.5), precondition: &|_| () };
+        system.solve(b, x, rule, &watch.named("test").start("columns", rule.residual_max))
+    }
+
+    const RULE: StoppingRule = StoppingRule { residual_max: 1e-6, iterations_max: 100 };
+
+    #[test]
+    fn columns_of_all_kinds_have_the_bits_of_each_alone() {
+        let wave = |f: f64| (0..ORDER).map(|k| (f * k as f64).sin()).collect::<Vec<f64>>();
+        let known = Known::default();
+        let zeros = vec![0.0; ORDER];
+        let watch = SolveWatch::default();
+        let mut solved = [zeros.clone()];
+        solve(&known, &[&wave(0.3)], &mut solved, RULE, &watch);
+        let [solved] = solved;
+        // Nothing to solve; one that is solved already; one with a first guess of another; a plain one; and not a number.
+        let columns = [
+            (zeros.clone(), zeros.clone()),
+            (wave(0.3), solved.clone()),
+            (wave(0.7), solved),
+            (wave(1.1), zeros.clone()),
+            (vec![f64::NAN; ORDER], zeros),
+        ];
+        let bits = |x: &[f64]| x.iter().map(|x| x.to_bits()).collect::<Vec<u64>>();
+        let b: Vec<&[f64]> = columns.iter().map(|(b, _)| b.as_slice()).collect();
+        let mut together: Vec<Vec<f64>> = columns.iter().map(|(_, x)| x.clone()).collect();
+        let found = solve(&known, &b, &mut together, RULE, &watch);
+        for (k, (b, x)) in columns.iter().enumerate() {
+            let mut alone = [x.clone()];
+            let convergence = solve(&known, &[b], &mut alone, RULE, &watch)[0];
+            assert_eq!(bits(&together[k]), bits(&alone[0]), "{k}");
+            assert_eq!(format!("{:?}", found[k]), format!("{convergence:?}"), "{k}");
+        }
+        let products: Vec<usize> = found.iter().map(|one| one.iterations).collect();
+        assert!(products[0] == 0 && products[1] == 1 && products[2] > 5 && products[3] > 5, "{products:?}");
+        let converged: Vec<bool> = found.iter().map(|one| one.converged).collect();
+        assert_eq!(converged, [true, true, true, true, false]);
+        // The matrix is that of the right-hand side.
+        let mut again = vec![0.0; ORDER];
+        known.apply(&together[3], &mut again);
+        for (k, (y, x)) in again.iter().zip(&together[3]).enumerate() {
+            assert!((y + 0.5 * x - columns[3].0[k]).abs() < 1e-5, "{k}");
+        }
+    }
+
+    /// Processors that round in other ways find an end at other products.
+    #[test]
+    fn ranks_end_a_column_together() {
+        let wave = |f: f64| (0..ORDER).map(|k| (f * k as f64).sin()).collect::<Vec<f64>>();
+        let b = [wave(0.7), wave(1.1)];
+        let found = on_threads(3, |ranks| {
+            let known = Known::default();
+            let watch = SolveWatch::default().among(ranks);
+            let residual_max = [1e-3, 1e-6, 1e-9][ranks.share().rank];
+            let mut x = [vec![0.0; ORDER], vec![0.0; ORDER]];
+            let b: Vec<&[f64]> = b.iter().map(Vec::as_slice).collect();
+            solve(&known, &b, &mut x, StoppingRule { residual_max, ..RULE }, &watch);
+            (known.products.into_inner().unwrap(), x)
+        });
+        assert!(found[0].0.len() > 3 && found.iter().all(|one| *one == found[0]), "{:?}", found[0].0);
     }
 }

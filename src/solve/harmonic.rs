@@ -84,7 +84,9 @@ pub fn solve_regularised(
     let LargestEigenvalue { value: w_max, iterations, .. } = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
         let start = lifted(&blocks, sums.unknowns());
-        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |step, change| task.report(step, change))
+        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |wants, step, change| {
+            task.report_wanting(wants, step, change)
+        })
     };
     let regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
     let mut right = sums.right_hand_side().to_vec();

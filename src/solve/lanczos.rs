@@ -35,7 +35,8 @@ pub fn largest_eigenvalue(
     tolerance: f64,
     report: &mut dyn FnMut(usize, f64) -> bool,
 ) -> LargestEigenvalue {
-    largest_eigenvalue_from(random_vector(sums.unknowns()), sums, tolerance, report)
+    let start = random_vector(sums.unknowns());
+    largest_eigenvalue_from(start, sums, tolerance, &mut |wants, step, change| report(step, change) && wants)
 }
 
 /// A vector whose direction nothing prefers.
@@ -44,28 +45,28 @@ pub(super) fn random_vector(order: usize) -> Vec<f64> {
     (0..order).map(|_| StandardNormal.sample(&mut stream)).collect()
 }
 
-/// As [`largest_eigenvalue`], from a vector that should have parts of all vectors with large eigenvalues.
+/// As [`largest_eigenvalue`], from a vector that should have parts of all vectors with large eigenvalues. `report` also receives whether
+/// there is more to find, and decides.
 pub(super) fn largest_eigenvalue_from(
     start: Vec<f64>,
     sums: &dyn NormalSums,
     tolerance: f64,
-    report: &mut dyn FnMut(usize, f64) -> bool,
+    report: &mut dyn FnMut(bool, usize, f64) -> bool,
 ) -> LargestEigenvalue {
     let order = sums.unknowns();
     let mut krylov = Krylov::new(start);
     let mut found = LargestEigenvalue { value: 0.0, iterations: 0, change: f64::INFINITY };
-    let mut calm = 0;
-    while found.iterations < ITERATIONS_MAX.min(order) && calm < 2 {
+    let (mut calm, mut wants) = (0, order > 0);
+    while wants {
         let is_open = krylov.step(sums);
         let value = largest_of_tridiagonal(&krylov.alphas, &krylov.betas);
         found.iterations += 1;
         found.change = ((value - found.value) / value).abs();
         found.value = value;
         calm = if found.change < tolerance { calm + 1 } else { 0 };
-        // An invariant subspace: the Ritz value is exact.
-        if !is_open || !report(found.iterations, found.change) {
-            break;
-        }
+        // In an invariant subspace the Ritz value is exact.
+        wants = is_open && calm < 2 && found.iterations < ITERATIONS_MAX.min(order);
+        wants = report(wants, found.iterations, found.change);
     }
     found
 }

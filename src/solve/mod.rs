@@ -32,7 +32,7 @@ pub use error::SolveError;
 pub use fit::Fit;
 pub use harmonic::{HarmonicRequest, HarmonicSolution, solve_harmonics, solve_regularised};
 pub use lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
-pub use noises::solve_noises;
+pub use noises::{NOISES_TOGETHER, solve_noises};
 pub use probing::{effective_beam, noise_variance, regularisation};
 pub use refined::{ChiSquares, RefineRule, RefineSteps, Refinement, solve_refined};
 pub use regulariser::Regulariser;

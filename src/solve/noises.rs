@@ -12,7 +12,7 @@ use crate::accumulation::harmonic::{HarmonicSums, coefficients};
 use crate::sky::harmonics::synthesis;
 
 /// Realisations that are solved together: a thread has a workspace for each.
-const AT_ONCE: usize = 4;
+pub const NOISES_TOGETHER: usize = 4;
 
 /// The noise-only maps, K, of the further realisations that the sums hold ([`HarmonicSums::further_noises`]): each as
 /// [`crate::solve::solve_regularised`] makes it of sums with that realisation as their companion.
@@ -30,8 +30,10 @@ pub fn solve_noises(
     let w_max = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
         let start = lifted(&blocks, sums.unknowns());
-        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |step, change| task.report(step, change))
-            .value
+        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |wants, step, change| {
+            task.report_wanting(wants, step, change)
+        })
+        .value
     };
     let l_max = sums.setup().l_max;
     let regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
@@ -39,7 +41,7 @@ pub fn solve_noises(
     drop(blocks);
     let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
     let mut maps = Vec::new();
-    for rights in sums.further_noises().chunks(AT_ONCE) {
+    for rights in sums.further_noises().chunks(NOISES_TOGETHER) {
         let rights: Vec<&[f64]> = rights.iter().map(Vec::as_slice).collect();
         let mut solved = vec![vec![0.0; sums.unknowns()]; rights.len()];
         let task = watch.start("noise maps", request.rule.residual_max);

@@ -156,8 +156,9 @@ pub fn solve_refined(
     let blocks = sums.circle.order_blocks();
     let LargestEigenvalue { value: w_max, iterations, .. } = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
-        let (start, report) =
-            (lifted(&blocks, sums.circle.unknowns()), &mut |step, change| task.report(step, change));
+        let (start, report) = (lifted(&blocks, sums.circle.unknowns()), &mut |wants, step, change| {
+            task.report_wanting(wants, step, change)
+        });
         largest_eigenvalue_from(start, &sums.circle, W_MAX_TOLERANCE, report)
     };
     let regularisation = request.epsilon * w_max;

@@ -155,7 +155,15 @@ impl SolveTask<'_> {
     /// As [`SolveTask::report`], of an iteration that is to continue if it `wants` to.
     pub(super) fn report_wanting(&self, wants: bool, iteration: usize, residual: f64) -> bool {
         // One that has come to its end says so as well: where processors round in other ways, others may not have.
-        self.watch.ranks.all(wants && self.report_here(iteration, residual))
+        self.watch.ranks.all(self.report_here(iteration, residual) && wants)
+    }
+
+    /// As [`SolveTask::report_wanting`], of several iterations that are made together: which of them continue, for all ranks.
+    pub(super) fn report_each(&self, wants: &[bool], iteration: usize, residual: f64) -> Vec<bool> {
+        let goes_on = self.report_here(iteration, residual);
+        let mut ended: Vec<i64> = wants.iter().map(|wants| i64::from(!(goes_on && *wants))).collect();
+        self.watch.ranks.greatest(&mut ended);
+        ended.into_iter().map(|ended| ended == 0).collect()
     }
 
     fn report_here(&self, iteration: usize, residual: f64) -> bool {

@@ -212,8 +212,8 @@ covariance_at_deg = [[45.0, 85.0], [315.0, -85.0]]
         files,
         [
             "sigma-1-3.000MHz.fits",
-            "covariance-at-45,85-1-3.000MHz.fits",
-            "covariance-at-315,-85-1-3.000MHz.fits",
+            "covariance-at-45.000_85.000-1-3.000MHz.fits",
+            "covariance-at-315.000_-85.000-1-3.000MHz.fits",
             "covariance-noise-1-3.000MHz.csv",
             "covariance-map-1-3.000MHz.csv"
         ]

@@ -112,19 +112,20 @@ pub struct HarmonicMemory {
     pub sums: u64,
     /// Patterns and rotations, shared by an engine and its snapshots.
     pub tables: u64,
-    /// Workspaces of the threads during a solution.
+    /// Workspaces of the threads during a solution, and what each block of alphas gives to a product.
     pub workspace: u64,
 }
 
-/// Memory of an engine for maps up to `l_max` from baselines up to `u_max` wavelengths, solved by `threads` threads.
+/// Memory of an engine for maps up to `l_max` from baselines up to `u_max` wavelengths, solved by `threads` threads, `at_once` maps together.
 #[must_use]
-pub fn memory(l_max: usize, u_max: f64, threads: usize) -> HarmonicMemory {
+pub fn memory(l_max: usize, u_max: f64, threads: usize, at_once: usize) -> HarmonicMemory {
     let grids = Grids::new(l_max, u_max);
+    let SharedSize { blocks, product_bytes } = shared_size(l_max);
     HarmonicMemory {
         sums: grids.nodes.count as u64 * grids.node_bytes(),
         tables: Operator::table_bytes(l_max, &grids),
-        // A map and its noise map are solved together.
-        workspace: threads as u64 * Operator::workspace_bytes(l_max, &grids, 2),
+        workspace: threads as u64 * Operator::workspace_bytes(l_max, &grids, at_once)
+            + (blocks * at_once) as u64 * product_bytes,
     }
 }
 

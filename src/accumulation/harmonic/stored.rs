@@ -156,8 +156,13 @@ impl StoredTori {
         }
         let block = self.parts[part as usize].blocks.get(block)?;
         let floats = block.alphas * row;
-        let mut values = self.buffers().pop().unwrap_or_default();
-        values.resize(block.nodes.len() * floats, 0.0);
+        let (mut values, length) = (self.buffers().pop().unwrap_or_default(), block.nodes.len() * floats);
+        if values.capacity() < length {
+            // No copy of what is to be read over, and no more room than that.
+            values = Vec::new();
+            values.reserve_exact(length);
+        }
+        values.resize(length, 0.0);
         if let Err(error) = read_at(&self.file, bytemuck::cast_slice_mut(&mut values), block.offset) {
             let reason = format!(
                 "sums on disk in {}: {error}; expected to read what was written",

@@ -195,8 +195,10 @@ pub(super) fn solve_from(
         1 => vec![0.0; layout.satellites * layout.channels()],
         _ => unexplained(&layout, &found, blocks, config.unexplained_max),
     };
-    let doubted =
-        layout.terms() > 1 && config.unexplained_max < 1.0 && is_contradicted(&layout, &found, &sums);
+    let doubted = layout.terms() > 1
+        && found.converged
+        && config.unexplained_max < 1.0
+        && is_contradicted(&layout, &found, &sums);
     let told = |n: usize| daughter(config, &layout, (&found, &counts, &unexplained), n);
     let mut solution = PassSolution {
         pass,
