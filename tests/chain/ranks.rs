@@ -327,7 +327,7 @@ fn a_full_disk_of_one_rank_ends_the_job() {
         "if [ \"${{OMPI_COMM_WORLD_RANK:-$PMI_RANK}}\" = 1 ]; then\n\
              export LD_PRELOAD={library} FAULT_BELOW={state} FAULT_KIND=ENOSPC FAULT_AT=20 FAULT_ON=1 FAULT_LOG={library}.log\n\
          fi\n\
-         exec {} replay {downlink} --map {} --out {out} --mpi --state {state} --checkpoint-every 1000",
+         exec {} replay {downlink} --map {} --out {out} --mpi --state {state} --checkpoint-every 100",
         program.display(),
         place.pipeline
     );
