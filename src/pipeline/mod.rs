@@ -34,6 +34,7 @@ mod simulation_groups;
 pub(crate) mod space_segment;
 mod state;
 mod study;
+mod study_file;
 mod summary;
 
 pub use calibrate::{CalibrateJob, CalibrateProgress, CalibrateWatcher, calibrate, with_gains};
@@ -61,7 +62,6 @@ pub use sampling::sample_stages;
 pub use simulation_groups::{MERGE, simulate_in_groups};
 pub use space_segment::{INTEGRATE, sky_notes};
 pub use state::solve_state;
-pub use study::{
-    CaseSummary, Study, StudyCase, StudyError, StudyStep, StudySummary, StudyWatcher, run_study,
-};
+pub use study::{CaseSummary, StudyStep, StudySummary, StudyWatcher, run_study};
+pub use study_file::{Study, StudyCase, StudyError};
 pub use summary::{RunScope, RunSummary};

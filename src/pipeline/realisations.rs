@@ -8,6 +8,7 @@ use serde::Serialize;
 use super::error::PipelineError;
 use super::noise_maps::noise_file;
 use super::study::CaseSummary;
+use super::study_file::direction_name;
 use crate::files::write_atomically;
 use crate::products::{ChannelFigures, ProductsError};
 use crate::sky::fits::{Column, ReadOptions, WriteOptions, read_whole_map, write_columns, write_map};
@@ -16,6 +17,7 @@ use crate::sky::healpix::{pixel_count, pixel_of};
 use crate::sky::spectra::auto_cl;
 use crate::sky::{Frame, SkyMap};
 use crate::units::InvalidValue;
+use crate::units::vector::direction;
 
 /// Realisations of one channel of one case.
 #[derive(Clone, Debug, Serialize)]
@@ -39,9 +41,6 @@ pub struct RealisationSpread {
     pub files: Vec<PathBuf>,
 }
 
-/// Most pixels whose covariance with all others is wanted: each takes a map of memory.
-pub(super) const COVARIANCES_MAX: usize = 16;
-
 /// What a study's realisations leave.
 #[derive(Clone, Copy)]
 pub(super) struct SpreadProducts<'a> {
@@ -58,19 +57,11 @@ struct PixelProducts {
     rows: Vec<(usize, Vec<f64>)>,
 }
 
-/// A direction as a part of a file's name.
-pub(super) fn direction_name([longitude_deg, latitude_deg]: [f64; 2]) -> String {
-    // Zero has no sign.
-    format!("{:.3}_{:.3}", longitude_deg + 0.0, latitude_deg + 0.0)
-}
-
 impl PixelProducts {
     fn new(nside: usize, at_deg: &[[f64; 2]]) -> Self {
         let none = vec![0.0; pixel_count(nside)];
         let row = |&[longitude_deg, latitude_deg]: &[f64; 2]| {
-            let (sin_l, cos_l) = longitude_deg.to_radians().sin_cos();
-            let (sin_b, cos_b) = latitude_deg.to_radians().sin_cos();
-            (pixel_of(nside, [cos_l * cos_b, sin_l * cos_b, sin_b]), none.clone())
+            (pixel_of(nside, direction(longitude_deg, latitude_deg)), none.clone())
         };
         Self { count: 0.0, squares: none.clone(), rows: at_deg.iter().map(row).collect() }
     }

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::frame::{Frame, Rotation, product, rotate, transpose};
 use super::healpix::pixel_of;
 use super::map::SkyMap;
-use crate::units::vector::Vec3;
+use crate::units::vector::{Vec3, direction};
 
 /// How the sphere is laid on a plane around the centre of a piece.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -80,12 +80,6 @@ impl Cutout {
             }
         }
     }
-}
-
-fn direction(longitude_deg: f64, latitude_deg: f64) -> Vec3 {
-    let ((sin_l, cos_l), (sin_b, cos_b)) =
-        (longitude_deg.to_radians().sin_cos(), latitude_deg.to_radians().sin_cos());
-    [cos_l * cos_b, sin_l * cos_b, sin_b]
 }
 
 #[cfg(test)]

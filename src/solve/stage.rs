@@ -14,6 +14,7 @@ use crate::accumulation::{NormalSums, Snapshot, SnapshotSums, SumCounts};
 use crate::frames::Instrument;
 use crate::runtime::{Outlet, Stage, Units};
 use crate::sky::healpix::{pixel_area_sr, pixel_count, pixel_of};
+use crate::units::vector::direction;
 use crate::units::{ChannelId, PerChannel};
 
 /// A map of one channel.
@@ -80,9 +81,7 @@ impl SolverSetup {
     /// Pixels at which beams are wanted.
     fn beam_pixels(&self, nside: usize) -> Vec<usize> {
         let pixel = |&[longitude_deg, latitude_deg]: &[f64; 2]| {
-            let (sin_l, cos_l) = longitude_deg.to_radians().sin_cos();
-            let (sin_b, cos_b) = latitude_deg.to_radians().sin_cos();
-            pixel_of(nside, [cos_l * cos_b, sin_l * cos_b, sin_b])
+            pixel_of(nside, direction(longitude_deg, latitude_deg))
         };
         self.beams_deg.iter().map(pixel).collect()
     }

@@ -51,3 +51,11 @@ pub fn norm(a: Vec3) -> f64 {
 pub fn unit(a: Vec3) -> Vec3 {
     scale(1.0 / norm(a), a)
 }
+
+/// The unit vector at a longitude and latitude, degrees.
+#[must_use]
+pub fn direction(longitude_deg: f64, latitude_deg: f64) -> Vec3 {
+    let ((sin_l, cos_l), (sin_b, cos_b)) =
+        (longitude_deg.to_radians().sin_cos(), latitude_deg.to_radians().sin_cos());
+    [cos_l * cos_b, sin_l * cos_b, sin_b]
+}

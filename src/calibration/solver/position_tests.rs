@@ -316,10 +316,12 @@ fn a_strong_beacon_does_not_lead_positions_astray() {
     );
 }
 
-/// Solutions that begin off by what `shifts_m` makes of a seed and a shift: wrong ones, those that are good all the same, right ones, and those that are not good.
+/// Solutions that begin off by what `shifts_m` makes of a seed and a shift: wrong ones, those that are good all the same, right ones, and
+/// those that are not good.
 fn tried_off(shifts_m: impl Fn(u64, Vec3) -> [Vec3; 3]) -> [u32; 4] {
     let scene = Scene::new(&[10e6], 1.0);
     let (mut wrong, mut missed, mut right_ones, mut refused) = (0, 0, 0, 0);
+    let (mut undisturbed, mut undisturbed_refused) = (0, 0);
     for seed in 0..6 {
         let truth = scene.truth(seed, ERRORS);
         // From a hundredth to a half of a wavelength away.
@@ -327,16 +329,26 @@ fn tried_off(shifts_m: impl Fn(u64, Vec3) -> [Vec3; 3]) -> [u32; 4] {
             [[0.3, 0.0, 0.0], [0.0, 0.3, 0.3], [9.0, -5.0, 0.0], [0.0, 9.0, 9.0], [-12.0, 0.0, 9.0]]
         {
             let found = scene.solve_off(&config(), &truth, seed, shifts_m(seed, shift_m));
-            for (is_good, is_near, sigmas) in right(&scene, &truth, &found) {
-                // Where they are not known better, a tenth of a wavelength may be noise.
-                let is_right = is_near || sigmas < 4.0;
+            // Where they are not known better, a tenth of a wavelength may be noise.
+            let daughters: Vec<(bool, bool)> = right(&scene, &truth, &found)
+                .into_iter()
+                .map(|(is_good, is_near, sigmas)| (is_good, is_near || sigmas < 4.0))
+                .collect();
+            if daughters.iter().all(|(_, is_right)| *is_right) {
+                undisturbed += daughters.len() as u32;
+                undisturbed_refused += daughters.iter().filter(|(is_good, _)| !is_good).count() as u32;
+            }
+            for (is_good, is_right) in daughters {
                 (wrong, right_ones) = (wrong + u32::from(!is_right), right_ones + u32::from(is_right));
                 missed += u32::from(is_good && !is_right);
                 refused += u32::from(!is_good && is_right);
             }
         }
     }
-    eprintln!("{missed} of {wrong} wrong ones are good, {refused} of {right_ones} right ones are not");
+    eprintln!(
+        "{missed} of {wrong} wrong ones are good, {refused} of {right_ones} right ones are not, {undisturbed_refused} of {undisturbed} in passes \
+         without a wrong one"
+    );
     [wrong, missed, right_ones, refused]
 }
 

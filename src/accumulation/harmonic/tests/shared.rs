@@ -69,7 +69,10 @@ fn products_made_together_have_the_bits_of_each_alone() {
         bits(&product)
     });
     // Sums on disk are read from the first block to the last, and back.
-    for sums in [&whole, &in_parts(3, |_| blocks.clone()).unwrap()] {
+    let stored = in_parts(3, |_| blocks.clone()).unwrap();
+    assert_eq!([(); 4].map(|()| stored.tori.turns_back()), [false, true, false, true]);
+    assert!(!whole.tori.turns_back() && !whole.tori.turns_back());
+    for sums in [&whole, &stored] {
         for count in [4, 3, 2, 1, 0] {
             let x: Vec<&[f64]> = vectors[..count].iter().map(Vec::as_slice).collect();
             let products = sums.apply_all(&x);
