@@ -12,7 +12,7 @@ use super::plan::{Expected, Plan};
 use crate::array::Array;
 use crate::frames::ObservingWindow;
 use crate::mother::{ChannelModel, Fidelity, MoonMirror, Schedule};
-use crate::response::harmonic::RotationTable;
+use crate::response::harmonic::{GeometryLimits, RotationTable};
 use crate::response::model::{
     AntennaPatterns, AntennaSum, BandAverage, DirectSum, Emitting, GeneralSum, HarmonicSum, HarmonicSumSetup,
     Load, ModelChoice, ModelKind, ModelPlan, Reflected, SphereMirrored, VisibilityModel,
@@ -193,6 +193,7 @@ fn channel_model(
         moon_radius_m,
         baseline_wavelengths_max: choice.baseline_wavelengths_max,
         response,
+        limits: GeometryLimits::default(),
     };
     let table = || Arc::new(RotationTable::new(choice.l_max, array.inclination_rad()));
     let rotation = Arc::clone(rotations.entry(choice.l_max).or_insert_with(table));

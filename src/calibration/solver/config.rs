@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use super::circle::NSIDE_MAX;
 use super::reach::reach_note;
 use crate::calibration::CalibrationError;
 use crate::response::beacon::Beacon;
@@ -34,6 +35,23 @@ pub enum AmplitudeScale {
     /// A geometric mean of one over the daughters: the sky keeps its scale.
     UnitMean,
 }
+
+/// How the visibilities of the known sky are computed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SkyModel {
+    /// Harmonics for maps of nside 64 to 256 whose pixels are not split, without positions to solve for; else direct sums.
+    #[default]
+    Auto,
+    /// Sums over the map's pixels.
+    Direct,
+    /// Spherical harmonics to degree 5/2 nside for pairs on the circle of their pass, up to 2.5 nside wavelengths; sums over pixels
+    /// for others.
+    Harmonic,
+}
+
+/// nside from which harmonics are chosen: fewer pixels are summed fast enough.
+const HARMONIC_NSIDE_MIN: usize = 64;
 
 /// The `[calibrate]` section, for `lunarray calibrate` and `calibration.hook = "solve"`. Standard deviations are those of what is expected before the
 /// data are seen; a parameter with 0 is not solved for.
@@ -76,6 +94,8 @@ pub struct SolverConfig {
     pub model_files: Vec<PathBuf>,
     /// nside to which the model map's pixels are split; 0 for its own.
     pub model_nside: usize,
+    /// How the visibilities of the known sky are computed.
+    pub sky_model: SkyModel,
     /// Power of the artificial signal at a daughter, K sr.
     pub beacon_k_sr: f64,
     /// Ecliptic longitude and latitude that it comes from, deg.
@@ -109,6 +129,7 @@ impl Default for SolverConfig {
             dead_amplitude: 0.05,
             model_files: Vec::new(),
             model_nside: 0,
+            sky_model: SkyModel::default(),
             beacon_k_sr: 0.0,
             beacon_direction_deg: [0.0, 0.0],
             map_rounds: 0,
@@ -123,6 +144,19 @@ impl SolverConfig {
     #[must_use]
     pub fn beacon(&self) -> Beacon {
         Beacon { k_sr: self.beacon_k_sr, direction_deg: self.beacon_direction_deg }
+    }
+
+    /// Whether the sky of a map of this nside is by harmonics.
+    #[must_use]
+    pub fn is_harmonic(&self, nside: usize) -> bool {
+        match self.sky_model {
+            SkyModel::Direct => false,
+            SkyModel::Harmonic => nside <= NSIDE_MAX,
+            SkyModel::Auto => {
+                let is_alone = self.position_sigma_m == 0.0 && self.model_nside == 0;
+                is_alone && (HARMONIC_NSIDE_MIN..=NSIDE_MAX).contains(&nside)
+            }
+        }
     }
 
     /// The signal that is known with maps of the sky, or without: without a map both is the artificial signal.
@@ -242,6 +276,11 @@ impl SolverConfig {
         let nside = self.model_nside;
         let good = nside == 0 || (nside.is_power_of_two() && nside <= 1024);
         checks.require("model_nside", nside, good, "0, or a power of two up to 1024");
+        let is_harmonic = self.sky_model == SkyModel::Harmonic;
+        let expected = "0 with sky_model = \"harmonic\", which has no pixels";
+        checks.require("model_nside", nside, !is_harmonic || nside == 0, expected);
+        let expected = "\"direct\" or \"auto\" with position_sigma_m: its derivatives are sums over pixels";
+        checks.require("sky_model", "harmonic", !is_harmonic || self.position_sigma_m == 0.0, expected);
         self.beacon().check("beacon", &mut checks);
         let lit = self.mode == CalibrationMode::Sky || self.beacon_k_sr > 0.0;
         let expected = "the power of the artificial signal, K sr, for mode = \"beacon\" and \"joint\"";

@@ -3,6 +3,7 @@
 //! | file | holds |
 //! |---|---|
 //! | `model` | the known signal: a map, an artificial signal, or both |
+//! | `circle` | the sky of a map by spherical harmonics |
 //! | `sums` | what a solution needs of the data, by channel and pair |
 //! | `layout` | parameters and priors |
 //! | `start` | starting values |
@@ -21,6 +22,7 @@
 //! | `table` | tables, and the file of gains |
 
 mod agree;
+mod circle;
 mod config;
 #[cfg(test)]
 mod cramer_rao;
@@ -46,7 +48,7 @@ mod table;
 #[cfg(test)]
 mod tests;
 
-pub use config::{AmplitudeScale, CalibrationMode, SolverConfig};
+pub use config::{AmplitudeScale, CalibrationMode, SkyModel, SolverConfig};
 pub use model::{KnownSignal, Offsets};
 pub use monitor::{InstrumentEvent, instrument_events};
 pub use passes::{PassBlocks, PassSolver, SolvedPass};

@@ -4,6 +4,7 @@ use std::f64::consts::TAU;
 
 use num_complex::Complex64;
 
+use super::circle::{CircleSky, Rotations};
 use super::config::{CalibrationMode, SolverConfig};
 use super::sums::{MODEL_TERMS, ModelTerms};
 use crate::array::{track_axes, track_offset_m};
@@ -14,16 +15,25 @@ use crate::sky::{MapError, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, sub};
 
-/// Sums over a map and, where positions are solved for, over the map times each component of the direction, which
-/// give the derivatives by the baseline.
+/// Sums over a map, or its harmonics; where positions are solved for sums over the map and over the map times each component of the
+/// direction, which give the derivatives by the baseline.
 enum ChannelSky {
     Value(DirectSum),
+    Circle(Box<CircleSky>),
     Gradient(DirectMoments),
+}
+
+/// What a sky makes: visibilities, and where positions are solved for their derivatives by the baseline, per m.
+#[derive(Default)]
+struct Predicted {
+    values: Vec<Complex64>,
+    gradients: Vec<[Complex64; 3]>,
 }
 
 /// The known signal in every channel.
 pub struct KnownSignal {
     sky: Vec<ChannelSky>,
+    rotations: Rotations,
     beacon: Beacon,
     frequencies_hz: Vec<f64>,
     moves: bool,
@@ -56,12 +66,16 @@ impl KnownSignal {
                 (channel.frequency_hz, instrument.moon_radius_m, instrument.response);
             Ok(match moves {
                 true => ChannelSky::Gradient(DirectMoments::new(&map, hz, moon_m, response)),
+                false if config.is_harmonic(map.nside()) => {
+                    ChannelSky::Circle(Box::new(CircleSky::new(&map, hz, moon_m, response)?))
+                }
                 false => ChannelSky::Value(DirectSum::new(&map, hz, moon_m, response)),
             })
         };
         let skies = maps.iter().zip(&instrument.channels).filter(|_| uses_sky).map(sky);
         Ok(Self {
             sky: skies.collect::<Result<_, MapError>>()?,
+            rotations: Rotations::default(),
             beacon: config.beacon(),
             frequencies_hz: instrument.channels.iter().map(|channel| channel.frequency_hz).collect(),
             moves,
@@ -97,54 +111,96 @@ impl KnownSignal {
         (self.beacon, self.frequencies_hz[channel])
     }
 
-    /// The model of placed visibilities of a channel, about offsets of the positions; `with_beacon` says whether the
-    /// artificial signal is on in them.
+    /// The model of blocks of placed visibilities, about offsets of the positions; of each block the flag says whether the artificial
+    /// signal is on in it. Many blocks at a time are fastest.
     ///
     /// # Errors
     /// Positions that the model does not cover.
-    pub fn model(
+    pub fn models(
         &mut self,
-        placed: &PlacedVisibilities,
+        blocks: &[(&PlacedVisibilities, bool)],
         offsets: &Offsets,
-        with_beacon: bool,
-    ) -> Result<Vec<ModelTerms>, ModelError> {
-        let channel = usize::from(placed.channel.0);
+    ) -> Result<Vec<Vec<ModelTerms>>, ModelError> {
+        let positions: Vec<Vec<PairPosition>> =
+            blocks.iter().map(|(placed, _)| self.positions(placed, offsets)).collect();
+        let mut skies: Vec<Predicted> = positions.iter().map(|_| Predicted::default()).collect();
+        for channel in 0..self.frequencies_hz.len() {
+            let of_channel = |&k: &usize| usize::from(blocks[k].0.channel.0) == channel;
+            let chosen: Vec<usize> = (0..blocks.len()).filter(of_channel).collect();
+            let all: Vec<PairPosition> = chosen.iter().flat_map(|&k| positions[k].iter().copied()).collect();
+            let Predicted { values, gradients } = self.sky_of(channel, &all)?;
+            let (mut values, mut gradients) = (values.into_iter(), gradients.into_iter());
+            for k in chosen {
+                let count = positions[k].len();
+                skies[k].values = values.by_ref().take(count).collect();
+                skies[k].gradients = gradients.by_ref().take(count).collect();
+            }
+        }
+        let terms = |(k, sky): (usize, Predicted)| {
+            let (placed, is_on) = blocks[k];
+            self.terms(placed, offsets, sky, is_on.then_some(&positions[k]))
+        };
+        Ok(skies.into_iter().enumerate().map(terms).collect())
+    }
+
+    /// The positions flown.
+    fn positions(&self, placed: &PlacedVisibilities, offsets: &Offsets) -> Vec<PairPosition> {
         let [i, j] = [placed.pair.i, placed.pair.j].map(usize::from);
-        let flown =
-            |r_m: Vec3, n: usize| sub(r_m, track_offset_m(r_m, offsets.normal_hat[n], offsets.offset_m[n]));
-        let positions: Vec<PairPosition> = placed
-            .r_i_m
-            .iter()
-            .zip(&placed.r_j_m)
-            .map(|(&r_i_m, &r_j_m)| match self.moves {
-                true => {
-                    PairPosition { r_i_m: flown(r_i_m, i), r_j_m: flown(r_j_m, j), span_rad: 0.0, at: None }
-                }
-                false => PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: None },
-            })
-            .collect();
-        let frequency_hz = self.frequencies_hz[channel];
+        let flown = |r_m: Vec3, n: usize| match self.moves {
+            true => sub(r_m, track_offset_m(r_m, offsets.normal_hat[n], offsets.offset_m[n])),
+            false => r_m,
+        };
+        let position = |(&r_i_m, &r_j_m): (&Vec3, &Vec3)| PairPosition {
+            r_i_m: flown(r_i_m, i),
+            r_j_m: flown(r_j_m, j),
+            span_rad: 0.0,
+            at: None,
+        };
+        placed.r_i_m.iter().zip(&placed.r_j_m).map(position).collect()
+    }
+
+    /// What the sky of a channel makes at positions; zero without one.
+    fn sky_of(&mut self, channel: usize, positions: &[PairPosition]) -> Result<Predicted, ModelError> {
         let mut values = vec![Complex64::ZERO; positions.len()];
         let mut gradients = vec![[Complex64::ZERO; 3]; if self.moves { positions.len() } else { 0 }];
-        let per_m = Complex64::new(0.0, -TAU * frequency_hz / SPEED_OF_LIGHT_M_S);
+        let per_m = self.per_m(channel);
         match self.sky.get_mut(channel) {
-            Some(ChannelSky::Value(sum)) => sum.predict(&positions, &mut values)?,
+            Some(ChannelSky::Value(sum)) => sum.predict(positions, &mut values)?,
+            Some(ChannelSky::Circle(sky)) => values = sky.predict(positions, &mut self.rotations)?,
             Some(ChannelSky::Gradient(sum)) => {
-                for (k, [value, moments @ ..]) in sum.predict(&positions)?.into_iter().enumerate() {
+                for (k, [value, moments @ ..]) in sum.predict(positions)?.into_iter().enumerate() {
                     values[k] = value;
                     gradients[k] = moments.map(|moment| per_m * moment);
                 }
             }
             None => {}
         }
-        if with_beacon {
-            let from_hat = self.beacon.from_hat();
-            for (k, position) in positions.iter().enumerate() {
-                let wave = self.beacon.visibility_k_sr(position.r_i_m, position.r_j_m, frequency_hz);
-                values[k] += wave;
-                if let Some(gradient) = gradients.get_mut(k) {
-                    (0..3).for_each(|axis| gradient[axis] += per_m * from_hat[axis] * wave);
-                }
+        Ok(Predicted { values, gradients })
+    }
+
+    /// Derivative of a fringe by a component of its baseline, over that of the direction, per m.
+    fn per_m(&self, channel: usize) -> Complex64 {
+        Complex64::new(0.0, -TAU * self.frequencies_hz[channel] / SPEED_OF_LIGHT_M_S)
+    }
+
+    /// The terms of a block, with the artificial signal at positions where it is on.
+    fn terms(
+        &self,
+        placed: &PlacedVisibilities,
+        offsets: &Offsets,
+        sky: Predicted,
+        lit: Option<&Vec<PairPosition>>,
+    ) -> Vec<ModelTerms> {
+        let Predicted { mut values, mut gradients } = sky;
+        let [i, j] = [placed.pair.i, placed.pair.j].map(usize::from);
+        let channel = usize::from(placed.channel.0);
+        let (from_hat, per_m) = (self.beacon.from_hat(), self.per_m(channel));
+        for (k, position) in lit.into_iter().flatten().enumerate() {
+            let hz = self.frequencies_hz[channel];
+            let wave = self.beacon.visibility_k_sr(position.r_i_m, position.r_j_m, hz);
+            values[k] += wave;
+            if let Some(gradient) = gradients.get_mut(k) {
+                (0..3).for_each(|axis| gradient[axis] += per_m * from_hat[axis] * wave);
             }
         }
         let terms = |(k, &value): (usize, &Complex64)| {
@@ -163,6 +219,6 @@ impl KnownSignal {
             }
             terms
         };
-        Ok(values.iter().enumerate().map(terms).collect())
+        values.iter().enumerate().map(terms).collect()
     }
 }

@@ -8,7 +8,6 @@ use super::sums::ModelledBlock;
 use crate::array::{Ephemeris, orbit_normal_hat};
 use crate::calibration::{CalibrationError, VanVleck};
 use crate::frames::{Flags, Instrument, PlacedVisibilities, VisibilityBlock};
-use crate::response::model::ModelError;
 use crate::sky::SkyMap;
 use crate::units::InvalidValue;
 use crate::units::vector::Vec3;
@@ -151,11 +150,10 @@ impl Task<'_> {
             .as_ref()
             .map_or_else(|| vec![[0.0; 3]; normal_hat.len()], |sought| sought.position_m.clone());
         let mut offsets = Offsets { offset_m, normal_hat: normal_hat.clone() };
+        let all: Vec<(&PlacedVisibilities, bool)> = placed.iter().map(|(placed, on)| (placed, *on)).collect();
         let mut solutions = Vec::new();
         for _ in 0..if moves { config.position_rounds } else { 1 } {
-            let block =
-                |(placed, is_on): &(PlacedVisibilities, bool)| modelled(placed, signal, &offsets, *is_on);
-            let mut blocks = placed.iter().map(block).collect::<Result<Vec<ModelledBlock>, ModelError>>()?;
+            let mut blocks = modelled(&all, signal, &offsets)?;
             solutions = self.parts().map(|span_s| self.part(span_s, &mut blocks, &offsets)).collect();
             let [solution] = &solutions[..] else { break };
             let now: Vec<[f64; 3]> = solution.daughters.iter().map(|daughter| daughter.position_m).collect();

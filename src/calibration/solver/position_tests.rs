@@ -206,10 +206,9 @@ impl Scene {
             *offset_m = add(*offset_m, shift_m);
         }
         let offsets = Offsets { offset_m, normal_hat: normal_hat.clone() };
-        let block = |(placed, is_on): &(PlacedVisibilities, bool)| {
-            super::positions::modelled(placed, &mut signal, &offsets, *is_on).unwrap()
-        };
-        let mut blocks: Vec<ModelledBlock> = placed.iter().map(block).collect();
+        let placed: Vec<(&PlacedVisibilities, bool)> =
+            placed.iter().map(|(block, on)| (block, *on)).collect();
+        let mut blocks = super::positions::modelled(&placed, &mut signal, &offsets).unwrap();
         let data = PassData { pass: 0, span_s: [0.0, f64::INFINITY], blocks: &mut blocks, normal_hat };
         let _ = span_s;
         solve_from(config, &self.frequencies_hz, data, &offsets.offset_m)

@@ -18,7 +18,7 @@ use super::newton::{Found, Near};
 use super::reach::is_searched;
 use super::robust::{judge, misfit};
 use super::solution::sums_of;
-use super::sums::{ModelledBlock, PairSums};
+use super::sums::{ModelTerms, ModelledBlock, PairSums};
 use crate::frames::PlacedVisibilities;
 use crate::response::model::ModelError;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
@@ -262,10 +262,10 @@ impl<'a> Step<'a> {
         signal: &mut KnownSignal,
     ) -> Result<Vec<ModelledBlock>, ModelError> {
         let offsets = Offsets { offset_m: position_m.to_vec(), normal_hat: self.search.normal_hat.to_vec() };
-        let block = |(placed, is_on, place): &(PlacedVisibilities, bool, usize)| {
-            Ok(ModelledBlock { channel: *place, ..modelled(placed, signal, &offsets, *is_on)? })
-        };
-        self.data.iter().map(block).collect()
+        let placed: Vec<(&PlacedVisibilities, bool)> =
+            self.data.iter().map(|(placed, is_on, _)| (placed, *is_on)).collect();
+        let blocks = modelled(&placed, signal, &offsets)?.into_iter().zip(&self.data);
+        Ok(blocks.map(|(block, (_, _, place))| ModelledBlock { channel: *place, ..block }).collect())
     }
 
     fn cost(&self, blocks: &[ModelledBlock], values: &Values) -> f64 {
@@ -286,18 +286,19 @@ fn moved_m(before_m: &[[f64; 3]], after_m: &[[f64; 3]]) -> f64 {
 
 /// Visibilities with their model about offsets.
 pub(super) fn modelled(
-    placed: &PlacedVisibilities,
+    placed: &[(&PlacedVisibilities, bool)],
     signal: &mut KnownSignal,
     offsets: &Offsets,
-    is_on: bool,
-) -> Result<ModelledBlock, ModelError> {
-    Ok(ModelledBlock {
+) -> Result<Vec<ModelledBlock>, ModelError> {
+    let models = signal.models(placed, offsets)?;
+    let block = |((placed, _), model): (&(&PlacedVisibilities, bool), Vec<ModelTerms>)| ModelledBlock {
         channel: placed.channel.0.into(),
         pair: placed.pair,
         time_s: placed.time_s.clone(),
         value_k_sr: placed.value_k_sr.clone(),
         weight: placed.weight.clone(),
-        model: signal.model(placed, offsets, is_on)?,
+        model,
         is_out: vec![false; placed.len()],
-    })
+    };
+    Ok(placed.iter().zip(models).map(block).collect())
 }

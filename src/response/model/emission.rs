@@ -112,7 +112,7 @@ mod tests {
     use std::sync::Arc;
 
     use crate::array::{Array, ArrayConfig};
-    use crate::response::harmonic::RotationTable;
+    use crate::response::harmonic::{GeometryLimits, RotationTable};
     use crate::response::model::{DirectSum, GeneralSum, HarmonicSum, HarmonicSumSetup};
     use crate::sky::harmonics::Alm;
     use crate::sky::healpix::{pixel_area_sr, pixel_directions};
@@ -207,6 +207,7 @@ mod tests {
             moon_radius_m: array.moon_radius_m(),
             baseline_wavelengths_max: 60.0,
             response,
+            limits: GeometryLimits::default(),
         };
         let rotation = Arc::new(RotationTable::new(0, array.inclination_rad()));
         Box::new(HarmonicSum::new(cold_alm(), setup, rotation).unwrap())

@@ -39,6 +39,8 @@ pub struct HarmonicSumSetup {
     pub baseline_wavelengths_max: f64,
     /// Response of the daughters.
     pub response: AntennaResponse,
+    /// Departures from the circle that are taken as none.
+    pub limits: GeometryLimits,
 }
 
 /// Visibilities of a sky given by harmonic coefficients, for an array on one circular orbit.
@@ -77,7 +79,7 @@ impl HarmonicSum {
             orbit: NominalOrbit {
                 inclination_rad: setup.inclination_rad,
                 radius_m: setup.orbit_radius_m,
-                limits: GeometryLimits::default(),
+                limits: setup.limits,
             },
             powers: HarmonicModel::new(smooth, settings(0.0)).map_err(refused)?,
             model: HarmonicModel::with_rotation(sky, settings(setup.baseline_wavelengths_max), rotation)
@@ -85,18 +87,39 @@ impl HarmonicSum {
         })
     }
 
-    /// The state of each position, and whether satellite j leads.
-    fn states(&self, positions: &[PairPosition]) -> Result<Vec<(PairState, bool)>, GeometryRefusal> {
+    /// The state of a position, and whether satellite j leads.
+    fn state(&self, position: &PairPosition) -> Result<(PairState, bool), GeometryRefusal> {
         let wavelength_m = SPEED_OF_LIGHT_M_S / self.setup.frequency_hz;
-        positions
-            .par_iter()
-            .with_min_len(POSITIONS_PER_TASK)
-            .map(|position| {
-                let found = PairOrientation::of(position.r_i_m, position.r_j_m)?;
-                let pair = self.orbit.pair(&found, wavelength_m)?;
-                Ok((PairState { span_rad: position.span_rad, ..pair.state }, pair.reversed))
-            })
-            .collect()
+        let found = PairOrientation::of(position.r_i_m, position.r_j_m)?;
+        let pair = self.orbit.pair(&found, wavelength_m)?;
+        Ok((PairState { span_rad: position.span_rad, ..pair.state }, pair.reversed))
+    }
+
+    fn states(&self, positions: &[PairPosition]) -> Result<Vec<(PairState, bool)>, GeometryRefusal> {
+        positions.par_iter().with_min_len(POSITIONS_PER_TASK).map(|position| self.state(position)).collect()
+    }
+
+    /// Predicts the visibility (K sr) of each position that the model covers: on its circle within the limits, up to its longest
+    /// baseline.
+    ///
+    /// # Errors
+    /// [`ModelError::Harmonic`].
+    pub fn predict_covered(
+        &mut self,
+        positions: &[PairPosition],
+    ) -> Result<Vec<Option<Complex64>>, ModelError> {
+        let u_max = self.setup.baseline_wavelengths_max;
+        let covered = |position: &PairPosition| {
+            self.state(position).ok().filter(|(state, _)| state.baseline_wavelengths <= u_max)
+        };
+        let found: Vec<Option<(PairState, bool)>> =
+            positions.par_iter().with_min_len(POSITIONS_PER_TASK).map(covered).collect();
+        let states: Vec<PairState> = found.iter().flatten().map(|(state, _)| *state).collect();
+        let mut values = vec![Complex64::ZERO; states.len()];
+        self.model.visibilities(&states, &mut values).map_err(|source| harmonic(&self.setup, source))?;
+        let mut values = values.into_iter();
+        let turned = |(_, reversed), value: Complex64| if reversed { value.conj() } else { value };
+        Ok(found.into_iter().map(|found| Some(turned(found?, values.next()?))).collect())
     }
 }
 
@@ -182,6 +205,7 @@ mod tests {
                 moon_radius_m: array.moon_radius_m(),
                 baseline_wavelengths_max: 1.0,
                 response,
+                limits: GeometryLimits::default(),
             };
             let table = Arc::new(RotationTable::new(4, array.inclination_rad()));
             let mut harmonic = HarmonicSum::new(alm.clone(), setup, table).unwrap();
