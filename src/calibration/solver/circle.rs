@@ -261,6 +261,21 @@ mod tests {
     }
 
     #[test]
+    fn maps_that_are_too_fine_for_tables_are_refused_by_name() {
+        use crate::calibration::solver::{SkyModel, SolverConfig};
+        let fine = SkyMap::new(Frame::Ecliptic, vec![1.0; 12 * 512 * 512]).unwrap();
+        let of = |sky_model: SkyModel| SolverConfig { sky_model, ..SolverConfig::default() };
+        let refused = of(SkyModel::Harmonic).can_model(std::slice::from_ref(&fine)).unwrap_err();
+        assert_eq!(refused.key, "calibrate.sky_model");
+        assert!(refused.to_string().contains("nside 512"), "{refused}");
+        for sky_model in [SkyModel::Auto, SkyModel::Direct] {
+            of(sky_model).can_model(std::slice::from_ref(&fine)).unwrap();
+            assert!(!of(sky_model).is_harmonic(512));
+        }
+        of(SkyModel::Harmonic).can_model(&[sky(64)]).unwrap();
+    }
+
+    #[test]
     fn another_circle_before_changes_no_bit() {
         let array = array();
         let positions = pass(&array, [1, 2]);

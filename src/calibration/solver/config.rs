@@ -146,12 +146,31 @@ impl SolverConfig {
         Beacon { k_sr: self.beacon_k_sr, direction_deg: self.beacon_direction_deg }
     }
 
+    /// Requires that `sky_model` takes maps of the known sky.
+    ///
+    /// # Errors
+    /// A map that is too fine for harmonics.
+    pub(super) fn can_model(&self, maps: &[SkyMap]) -> Result<(), InvalidValue> {
+        let nside = maps.iter().map(SkyMap::nside).max().unwrap_or(0);
+        if self.sky_model != SkyModel::Harmonic || nside <= NSIDE_MAX {
+            return Ok(());
+        }
+        Err(InvalidValue {
+            key: "calibrate.sky_model".to_owned(),
+            value: "harmonic".to_owned(),
+            expected: format!(
+                "\"direct\" or \"auto\" with a map of nside {nside}: harmonics are made to nside {NSIDE_MAX}"
+            )
+            .into(),
+        })
+    }
+
     /// Whether the sky of a map of this nside is by harmonics.
     #[must_use]
     pub fn is_harmonic(&self, nside: usize) -> bool {
         match self.sky_model {
             SkyModel::Direct => false,
-            SkyModel::Harmonic => nside <= NSIDE_MAX,
+            SkyModel::Harmonic => true,
             SkyModel::Auto => {
                 let is_alone = self.position_sigma_m == 0.0 && self.model_nside == 0;
                 is_alone && (HARMONIC_NSIDE_MIN..=NSIDE_MAX).contains(&nside)

@@ -60,12 +60,14 @@ impl PassSolver {
     /// Takes the description of the instrument; later ones change nothing.
     ///
     /// # Errors
-    /// A number of maps that is not that of the channels; a reference daughter that it has not; maps with pixels without value.
+    /// A number of maps that is not that of the channels; a reference daughter that it has not; maps with pixels without value, or
+    /// finer than `sky_model` takes.
     pub fn describe(&mut self, instrument: &Instrument, model_key: &str) -> Result<(), CalibrationError> {
         if self.known.is_some() {
             return Ok(());
         }
         self.config.fits(instrument, self.maps.len(), model_key)?;
+        self.config.can_model(&self.maps)?;
         let signal = KnownSignal::new(&self.config, instrument, &self.maps)?;
         self.maps = Vec::new();
         self.known = Some((instrument.clone(), signal));
