@@ -8,6 +8,7 @@ use rayon::prelude::*;
 
 use super::CHILDREN;
 use super::exact::child_directions;
+use super::rows::PixelOrder;
 use crate::sky::healpix;
 use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
 
@@ -56,7 +57,7 @@ impl BlockGroup {
 pub(super) struct BlockSet {
     /// Children along a block's side.
     pub children: usize,
-    /// RING number of each block's pixel.
+    /// Place of each block's pixel in a row.
     pub pixels: Vec<u32>,
     /// The blocks.
     pub groups: Vec<BlockGroup>,
@@ -101,7 +102,7 @@ impl BlockSet {
 pub(super) struct BlockClass {
     /// Blocks along a pixel's side in `whole`.
     pub per_side: usize,
-    /// Blocks of all pixels in RING order, `per_side`^2 for each, with gaps.
+    /// Blocks of all pixels in the order of a row, `per_side`^2 for each, with gaps.
     pub whole: BlockSet,
     /// Smaller blocks that fill the gaps, where pixels are strongly curved (at the poles) or creased (at the boundary
     /// of the polar caps).
@@ -110,11 +111,12 @@ pub(super) struct BlockClass {
 
 impl BlockClass {
     /// Blocks valid for baselines up to `wavelengths_max`, at least `per_side` along a pixel's side.
-    pub fn new(nside: usize, per_side: usize, wavelengths_max: f64) -> Self {
+    pub fn new((nside, order): (usize, PixelOrder), per_side: usize, wavelengths_max: f64) -> Self {
         let cut: Vec<Vec<(usize, Option<FittedBlock>)>> = (0..healpix::pixel_count(nside))
             .into_par_iter()
-            .map(|pixel| {
-                let children: Vec<Vec3> = child_directions(nside, CHILDREN, pixel).collect();
+            .map(|place| {
+                let children: Vec<Vec3> =
+                    child_directions(nside, CHILDREN, order.ring(nside, place)).collect();
                 let mut blocks = Vec::new();
                 let size = CHILDREN / per_side;
                 for k in 0..per_side * per_side {
@@ -228,7 +230,7 @@ mod tests {
     #[test]
     fn blocks_fill_every_pixel() {
         for (nside, per_side) in [(8, 1), (8, 4), (16, 1)] {
-            let class = BlockClass::new(nside, per_side, 30.0);
+            let class = BlockClass::new((nside, PixelOrder::Ring), per_side, 30.0);
             assert!(class.finer.iter().all(|set| !set.pixels.is_empty()));
             let mut filled = vec![0; healpix::pixel_count(nside)];
             for set in class.finer.iter().chain([&class.whole]) {

@@ -106,7 +106,7 @@ impl Fringes {
             step[k] = fraction_of_turn(turns * comb.step);
             seen[k] = if pair.sees::<FMA>(x[k], y[k], z[k]) { sky_k[k] } else { 0.0 };
         }
-        pair.apply_antenna::<FMA>(n, &mut seen);
+        pair.apply_antenna::<FMA, _>(n, &mut seen);
         for k in 0..CHUNK {
             let (cos, sin) = cos_sin_turns::<FMA>(first[k]);
             self.re[k] = seen[k] * cos;

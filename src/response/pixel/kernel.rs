@@ -117,9 +117,13 @@ impl Prepared {
     /// Multiplies a chunk of values by the antennas' power response, 1 - (n . d)^2 for dipoles along d. Of dipoles along d and e an
     /// unpolarised wave leaves d . e - (n . d) (n . e): the product of their parts across its direction.
     #[inline(always)]
-    pub fn apply_antenna<const FMA: bool>(&self, [x, y, z]: ChunkDirections<'_>, values: &mut [f32; CHUNK]) {
+    pub fn apply_antenna<const FMA: bool, const N: usize>(
+        &self,
+        [x, y, z]: [&[f64; N]; 3],
+        values: &mut [f32; N],
+    ) {
         if let Some(dipole) = self.dipole {
-            for k in 0..CHUNK {
+            for k in 0..N {
                 let along = dot64::<FMA>(dipole, x[k], y[k], z[k]) as f32;
                 values[k] *= fused::<FMA>(-along, along, 1.0);
             }
@@ -127,7 +131,7 @@ impl Prepared {
         if let Some([a, b]) = self.antennas {
             let (both, common) = (a.is_dipole && b.is_dipole, dot(a.axis_hat, b.axis_hat));
             let distorted = |q: f64, cos: f64| 1.0 + q * (1.5 * cos * cos - 0.5);
-            for k in 0..CHUNK {
+            for k in 0..N {
                 let p = dot64::<FMA>(a.axis_hat, x[k], y[k], z[k]);
                 let q = dot64::<FMA>(b.axis_hat, x[k], y[k], z[k]);
                 let dipoles = if both { common - p * q } else { 1.0 };

@@ -7,6 +7,7 @@
 //! | entry point | computes |
 //! |---|---|
 //! | [`RowMaker`] | rows of B: at pixel centres, or averaged over pixels |
+//! | [`RowProducts`] | products with rows that are computed for each product |
 //! | [`sky_sums`], [`sky_powers`] | visibilities and auto-correlation powers of a sky |
 //! | [`antenna_sums`], [`antenna_powers`] | the same with antennas that differ |
 //! | [`four_sky_sums`] | visibilities of four skies together |
@@ -25,6 +26,7 @@ mod edge;
 pub mod exact;
 mod geometry;
 mod kernel;
+mod products;
 mod rows;
 mod sums;
 
@@ -34,6 +36,7 @@ use thiserror::Error;
 pub use combs::{Comb, comb_sums};
 pub use directions::Directions;
 pub use geometry::{PairGeometry, SatelliteAntenna, SingleGeometry};
+pub use products::RowProducts;
 pub use rows::{RowMaker, RowValue};
 pub use sums::{SkySum, antenna_powers, antenna_sums, four_sky_sums, sky_powers, sky_sums};
 

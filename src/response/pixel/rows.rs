@@ -53,6 +53,25 @@ impl RowValue for f64 {
     }
 }
 
+/// Order of the pixels in a row.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum PixelOrder {
+    /// As maps have them.
+    Ring,
+    /// Neighbours together, so that the Moon hides many of them at once.
+    Nested,
+}
+
+impl PixelOrder {
+    /// RING number of the pixel at a place of a row.
+    pub(super) fn ring(self, nside: usize, place: usize) -> usize {
+        match self {
+            Self::Ring => place,
+            Self::Nested => healpix::nested_to_ring(nside, place),
+        }
+    }
+}
+
 /// Computes rows of B for one pixelisation and method.
 ///
 /// [`PixelMethod::Average`] agrees with the mean over all children to 1e-3 rms. It builds the blocks of a class of
@@ -63,6 +82,7 @@ pub struct RowMaker {
     nside: usize,
     method: PixelMethod,
     pixel_width_rad: f64,
+    order: PixelOrder,
     centres: Vec<Vec3>,
     directions: Directions,
     classes: [OnceLock<BlockClass>; CLASSES.len()],
@@ -74,13 +94,24 @@ impl RowMaker {
     /// # Errors
     /// [`ResponseError::Nside`] unless `nside` is a power of two up to 512.
     pub fn new(nside: usize, method: PixelMethod) -> Result<Self, ResponseError> {
+        Self::in_order(nside, method, PixelOrder::Ring)
+    }
+
+    /// As [`RowMaker::new`], with pixels in some order.
+    pub(super) fn in_order(
+        nside: usize,
+        method: PixelMethod,
+        order: PixelOrder,
+    ) -> Result<Self, ResponseError> {
         if !healpix::is_valid_nside(nside) || nside > NSIDE_MAX {
             return Err(ResponseError::Nside(nside));
         }
-        let centres = healpix::pixel_directions(nside);
+        let ring = healpix::pixel_directions(nside);
+        let centres: Vec<Vec3> = (0..ring.len()).map(|place| ring[order.ring(nside, place)]).collect();
         Ok(Self {
             nside,
             method,
+            order,
             pixel_width_rad: healpix::pixel_area_sr(nside).sqrt(),
             directions: Directions::from(centres.as_slice()),
             centres,
@@ -126,10 +157,26 @@ impl RowMaker {
         }
     }
 
-    fn class(&self, class: usize) -> &BlockClass {
+    /// The class of blocks for a baseline, in wavelengths; `None` beyond the longest.
+    pub(super) fn class_of(&self, u: Vec3) -> Option<usize> {
+        let pixels_long = norm(u) * self.pixel_width_rad;
+        CLASSES.iter().position(|&(longest, _)| pixels_long <= longest)
+    }
+
+    /// Directions of the pixels' centres.
+    pub(super) fn directions(&self) -> &Directions {
+        &self.directions
+    }
+
+    /// Order of the pixels.
+    pub(super) fn order(&self) -> PixelOrder {
+        self.order
+    }
+
+    pub(super) fn class(&self, class: usize) -> &BlockClass {
         self.classes[class].get_or_init(|| {
             let (longest, per_side) = CLASSES[class];
-            BlockClass::new(self.nside, per_side, longest / self.pixel_width_rad)
+            BlockClass::new((self.nside, self.order), per_side, longest / self.pixel_width_rad)
         })
     }
 
@@ -143,7 +190,8 @@ impl RowMaker {
             PixelMethod::Centre => self.fill_centre(&Prepared::pair(pair), factor, re, im),
             PixelMethod::AverageExact => {
                 let row = exact::average_row(pair, self.nside, CHILDREN);
-                for ((re, im), value) in re.iter_mut().zip(im).zip(row) {
+                for (place, (re, im)) in re.iter_mut().zip(im).enumerate() {
+                    let value = row[self.order.ring(self.nside, place)];
                     (*re, *im) = (R::of_f64(value.re * factor), R::of_f64(value.im * factor));
                 }
             }
@@ -168,9 +216,7 @@ impl RowMaker {
 
     fn fill_average<R: RowValue>(&self, pair: &PairGeometry, factor: f64, re: &mut [R], im: &mut [R]) {
         let prepared = Prepared::pair(pair);
-        let pixels_long = norm(prepared.u) * self.pixel_width_rad;
-        let class = CLASSES.iter().position(|&(longest, _)| pixels_long <= longest);
-        let Some(class) = class else {
+        let Some(class) = self.class_of(prepared.u) else {
             return self.fill_children(&prepared, factor, re, im);
         };
         let blocks = self.class(class);
@@ -190,7 +236,8 @@ impl RowMaker {
         const { assert!(CHUNK == CHILDREN * CHILDREN, "a chunk holds the children of one pixel") };
         let mut values = [[0.0_f32; CHUNK]; 2];
         let mut n = [[0.0_f64; CHUNK]; 3];
-        for (pixel, (re, im)) in re.iter_mut().zip(im).enumerate() {
+        for (place, (re, im)) in re.iter_mut().zip(im).enumerate() {
+            let pixel = self.order.ring(self.nside, place);
             for (k, child) in child_directions(self.nside, CHILDREN, pixel).enumerate() {
                 for axis in 0..3 {
                     n[axis][k] = child[axis];
@@ -207,7 +254,7 @@ impl RowMaker {
 }
 
 /// Means over a group of blocks, whether or not the limb cuts them.
-fn means_of_group(pair: &Prepared, children: usize, group: &BlockGroup, means: &mut Means) {
+pub(super) fn means_of_group(pair: &Prepared, children: usize, group: &BlockGroup, means: &mut Means) {
     if block_means(pair, children, group, means) {
         for lane in 0..GROUP {
             if means.cut[lane] != 0.0 {
@@ -231,7 +278,7 @@ fn sum_whole(pair: &Prepared, class: &BlockClass, re: &mut [f32], im: &mut [f32]
 }
 
 /// Averages of `per_pixel` consecutive blocks.
-fn average(blocks: &[f32; GROUP], per_pixel: usize, pixels: &mut [f32]) {
+pub(super) fn average(blocks: &[f32; GROUP], per_pixel: usize, pixels: &mut [f32]) {
     if per_pixel == 1 {
         return pixels.copy_from_slice(blocks);
     }
@@ -274,7 +321,7 @@ fn fringes(pair: &Prepared, n: &[[f64; CHUNK]; 3], out: &mut [[f32; CHUNK]; 2]) 
         let (depth_i, depth_j) = pair.depths::<FMA>(x[k], y[k], z[k]);
         seen[k] = if depth_i.min(depth_j) >= 0.0 { 1.0 } else { 0.0 };
     }
-    pair.apply_antenna::<FMA>([x, y, z], &mut seen);
+    pair.apply_antenna::<FMA, _>([x, y, z], &mut seen);
     let [re, im] = out;
     for k in 0..CHUNK {
         let (cos, sin) = cos_sin_turns::<FMA>(turns[k]);

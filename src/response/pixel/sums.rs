@@ -223,7 +223,7 @@ fn chunk<const FMA: bool, const SKIES: usize>(
             seen[k] = if sees { sky_k[k] } else { 0.0 };
         }
     }
-    seen.iter_mut().for_each(|seen| pair.apply_antenna::<FMA>(n, seen));
+    seen.iter_mut().for_each(|seen| pair.apply_antenna::<FMA, _>(n, seen));
     const LANES: usize = 16;
     let mut lanes = [[[0.0_f32; LANES]; 2]; SKIES];
     let mut zero = [0.0_f32; LANES];

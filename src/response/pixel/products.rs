@@ -1,0 +1,580 @@
+//! Products with rows of B that are computed for each product and not kept.
+//!
+//! Rows are made in blocks: the tables of a chunk of pixels are read once for all rows of a block, and the block's rows stay in the
+//! cache between `B x` and `Bt`. Pixels are in NESTED order within, so that a chunk is a patch of the sky, which the Moon mostly hides
+//! as a whole or not at all: hidden chunks cost nothing, and those in sight no comparison with the limb.
+//!
+//! A product is a sum over a fixed number of parts, added in their order: its bits do not depend on threads.
+
+use multiversion::multiversion;
+use num_complex::Complex64;
+use rayon::prelude::*;
+
+use super::average::Means;
+use super::blocks::{BlockClass, GROUP};
+use super::kernel::{Prepared, dot64};
+use super::rows::{PixelOrder, average, means_of_group};
+use super::{PairGeometry, PixelMethod, ResponseError, RowMaker};
+use crate::sky::healpix::{pixel_area_sr, pixel_directions};
+use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
+use crate::units::vector::{Vec3, add, norm, scale, sub};
+
+/// Rows that are made together: their elements fit the cache of a core or what it has of a shared one, and tables are read an eighth as
+/// often.
+const ROWS: usize = 8;
+
+/// Parts of a product, each with sums of its own.
+const PARTS: usize = 32;
+
+/// Pixels of a chunk.
+const CHUNK: usize = GROUP;
+
+/// Lanes of partial sums.
+const LANES: usize = 16;
+
+/// Real and imaginary parts of a row over a chunk of pixels.
+type Piece = [[f32; CHUNK]; 2];
+
+/// A cap that holds a chunk of pixels.
+#[derive(Clone, Copy, Debug)]
+struct Cap {
+    centre: Vec3,
+    /// Greatest distance of anything in it from `centre`.
+    radius: f64,
+}
+
+/// How a pair sees a chunk of pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Sight {
+    Hidden,
+    Cut,
+    Open,
+}
+
+/// Rows of B of any pairs, in products alone. Vectors are maps in RING order; rows are times the pixels' area.
+#[derive(Debug)]
+pub struct RowProducts {
+    rows: RowMaker,
+    /// RING number of the pixel at each place.
+    ring: Vec<usize>,
+    chunks: Vec<[[f64; CHUNK]; 3]>,
+    caps: Vec<Cap>,
+}
+
+/// Vectors over pixels as kernels read them: chunks in NESTED order, scaled to at most 1.
+struct Scaled {
+    chunks: Vec<[f32; CHUNK]>,
+    scale: f64,
+}
+
+/// Rows of a block, chunk by chunk.
+struct Made {
+    pieces: Vec<[Piece; ROWS]>,
+    sights: Vec<[Sight; ROWS]>,
+}
+
+/// Rows that are made together: of one class of blocks.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Together {
+    first: usize,
+    count: usize,
+    class: Option<usize>,
+}
+
+/// What comes back from a block of rows: factors of the real and imaginary parts of each, by column.
+type Factors = Vec<[[f32; 2]; ROWS]>;
+
+impl RowProducts {
+    /// For maps of `nside`.
+    ///
+    /// # Errors
+    /// As [`RowMaker::new`].
+    pub fn new(nside: usize, method: PixelMethod) -> Result<Self, ResponseError> {
+        let order = PixelOrder::Nested;
+        let rows = RowMaker::in_order(nside, method, order)?;
+        let pixels = rows.pixels();
+        let ring: Vec<usize> = (0..pixels).map(|place| order.ring(nside, place)).collect();
+        let n = pixel_directions(nside);
+        let (mut chunks, mut caps) = (Vec::new(), Vec::new());
+        // No point of a pixel is further from its centre than the root of its area.
+        let margin = if method == PixelMethod::Centre { 1e-9 } else { rows.pixel_width_rad() };
+        for places in ring.chunks(CHUNK) {
+            let sum = places.iter().fold([0.0; 3], |sum, &pixel| add(sum, n[pixel]));
+            let centre = scale(1.0 / places.len() as f64, sum);
+            let radius = places.iter().map(|&pixel| norm(sub(n[pixel], centre))).fold(0.0, f64::max);
+            caps.push(Cap { centre, radius: radius + margin });
+            // The last one is filled with its last pixel, which then counts once.
+            let mut chunk = [[0.0; CHUNK]; 3];
+            for lane in 0..CHUNK {
+                let pixel = places[lane.min(places.len() - 1)];
+                (0..3).for_each(|axis| chunk[axis][lane] = n[pixel][axis]);
+            }
+            chunks.push(chunk);
+        }
+        Ok(Self { rows, ring, chunks, caps })
+    }
+
+    /// Number of pixels.
+    #[must_use]
+    pub fn pixels(&self) -> usize {
+        self.ring.len()
+    }
+
+    /// Memory of products of so many vectors at once on so many threads, bytes: the rows of a block for each thread, and the sums of all
+    /// parts.
+    #[must_use]
+    pub fn memory_bytes(nside: usize, columns: usize, threads: usize) -> u64 {
+        let chunks = (12 * nside * nside).div_ceil(CHUNK);
+        let made = chunks * (size_of::<[Piece; ROWS]>() + ROWS);
+        // Tables of averages: centres, slopes and radii; centres alone without.
+        let tables = chunks * CHUNK * (3 * 8 + 16 * 4 + 3 * 8 + 3 * 8 + 8);
+        (threads.min(PARTS) * made + PARTS * columns * chunks * CHUNK * 8 + tables) as u64
+    }
+
+    /// `Bt W B x` for several x, W the weights of the pairs.
+    #[must_use]
+    pub fn normal(&self, pairs: &[PairGeometry], weights: &[f64], x: &[&[f64]]) -> Vec<Vec<f64>> {
+        let scaled: Vec<Scaled> = x.iter().map(|x| self.scaled(x)).collect();
+        let largest = weights.iter().copied().fold(0.0, f64::max);
+        let mut sums = self.sums(pairs, x.len(), &|together, made| {
+            let seen = made.forward(together.count, &scaled);
+            let factors = |seen: &[[f64; 2]; ROWS]| {
+                let mut factors = [[0.0; 2]; ROWS];
+                for (row, factors) in factors.iter_mut().enumerate().take(together.count) {
+                    let weight = weights[together.first + row] / largest;
+                    *factors = seen[row].map(|seen| (weight * seen) as f32);
+                }
+                factors
+            };
+            seen.iter().map(factors).collect()
+        });
+        let area_sr = pixel_area_sr(self.rows.nside());
+        for (sums, scaled) in sums.iter_mut().zip(&scaled) {
+            let unit = area_sr * area_sr * largest * scaled.scale;
+            sums.iter_mut().for_each(|sum| *sum *= unit);
+        }
+        sums
+    }
+
+    /// `Bt v` for several v, by pair: the sum of real parts times real rows and imaginary parts times imaginary ones.
+    #[must_use]
+    pub fn adjoint(&self, pairs: &[PairGeometry], values: &[&[Complex64]]) -> Vec<Vec<f64>> {
+        let size = |values: &&[Complex64]| values.iter().map(|v| v.re.abs().max(v.im.abs())).fold(0.0, f64::max);
+        let scales: Vec<f64> = values.iter().map(size).map(|size| if size > 0.0 { size } else { 1.0 }).collect();
+        let mut sums = self.sums(pairs, values.len(), &|together, _| {
+            let factors = |(values, scale): (&&[Complex64], &f64)| {
+                let mut factors = [[0.0; 2]; ROWS];
+                for (row, factors) in factors.iter_mut().enumerate().take(together.count) {
+                    let value = values[together.first + row] / *scale;
+                    *factors = [value.re as f32, value.im as f32];
+                }
+                factors
+            };
+            values.iter().zip(&scales).map(factors).collect()
+        });
+        let area_sr = pixel_area_sr(self.rows.nside());
+        for (sums, scale) in sums.iter_mut().zip(&scales) {
+            sums.iter_mut().for_each(|sum| *sum *= area_sr * scale);
+        }
+        sums
+    }
+
+    /// `B x`, by pair.
+    #[must_use]
+    pub fn forward(&self, pairs: &[PairGeometry], x: &[f64]) -> Vec<Complex64> {
+        let scaled = [self.scaled(x)];
+        let unit = pixel_area_sr(self.rows.nside()) * scaled[0].scale;
+        let of_block = |made: &mut Made, together: &Together| -> Vec<Complex64> {
+            self.make(pairs, together, made);
+            let seen = made.forward(together.count, &scaled);
+            seen[0][..together.count].iter().map(|[re, im]| Complex64::new(re * unit, im * unit)).collect()
+        };
+        let blocks = self.blocks(pairs);
+        blocks
+            .par_iter()
+            .map_init(|| Made::new(self.chunks.len()), of_block)
+            .flatten_iter()
+            .collect()
+    }
+
+    /// Chunks of a map, scaled.
+    fn scaled(&self, x: &[f64]) -> Scaled {
+        let largest = x.iter().map(|x| x.abs()).fold(0.0, f64::max);
+        let scale = if largest > 0.0 { largest } else { 1.0 };
+        let chunk = |places: &[usize]| {
+            let mut chunk = [0.0; CHUNK];
+            for (value, &pixel) in chunk.iter_mut().zip(places) {
+                *value = (x[pixel] / scale) as f32;
+            }
+            chunk
+        };
+        Scaled { chunks: self.ring.chunks(CHUNK).map(chunk).collect(), scale }
+    }
+
+    /// Pairs in blocks, each of neighbours of one class. Tables that they need are made.
+    fn blocks(&self, pairs: &[PairGeometry]) -> Vec<Together> {
+        let is_average = self.rows.method() == PixelMethod::Average;
+        let mut blocks: Vec<Together> = Vec::new();
+        for (k, pair) in pairs.iter().enumerate() {
+            let class = self.rows.class_of(pair.baseline_wavelengths()).filter(|_| is_average);
+            match blocks.last_mut() {
+                Some(last) if last.class == class && last.count < ROWS => last.count += 1,
+                _ => blocks.push(Together { first: k, count: 1, class }),
+            }
+        }
+        for class in blocks.iter().filter_map(|block| block.class) {
+            self.rows.class(class);
+        }
+        blocks
+    }
+
+    /// Sums of rows times factors, by column, in RING order; `factors` gets each block of rows.
+    fn sums(
+        &self,
+        pairs: &[PairGeometry],
+        columns: usize,
+        factors: &(dyn Fn(&Together, &Made) -> Factors + Sync),
+    ) -> Vec<Vec<f64>> {
+        let blocks = self.blocks(pairs);
+        let part = |blocks: &[Together]| -> Vec<Vec<[f64; CHUNK]>> {
+            let mut sums = vec![vec![[0.0; CHUNK]; self.chunks.len()]; columns];
+            let mut made = Made::new(self.chunks.len());
+            for together in blocks {
+                self.make(pairs, together, &mut made);
+                let factors = factors(together, &made);
+                made.add_to(together.count, &factors, &mut sums);
+            }
+            sums
+        };
+        let parts: Vec<_> = blocks.par_chunks(blocks.len().div_ceil(PARTS).max(1)).map(part).collect();
+        (0..columns)
+            .map(|column| {
+                let mut sums = vec![0.0; self.pixels()];
+                for part in &parts {
+                    let values = part[column].as_flattened();
+                    self.ring.iter().zip(values).for_each(|(&pixel, value)| sums[pixel] += value);
+                }
+                sums
+            })
+            .collect()
+    }
+
+    /// Makes the rows of a block.
+    fn make(&self, pairs: &[PairGeometry], together: &Together, made: &mut Made) {
+        let pairs = &pairs[together.first..][..together.count];
+        let prepared: Vec<Prepared> = pairs.iter().map(Prepared::pair).collect();
+        for (cap, sights) in self.caps.iter().zip(&mut made.sights) {
+            for (pair, sight) in prepared.iter().zip(sights) {
+                *sight = cap.seen_by(pair);
+            }
+        }
+        match (self.rows.method(), together.class) {
+            (PixelMethod::Centre, _) => {
+                let chunks = self.chunks.iter().zip(&made.sights).zip(&mut made.pieces);
+                chunks.for_each(|((n, sights), pieces)| fringes(&prepared, sights, n, pieces));
+            }
+            (PixelMethod::Average, Some(class)) => {
+                averages(&prepared, self.rows.class(class), made);
+            }
+            // For verification, and baselines of no use: one by one.
+            _ => self.fill(pairs, made),
+        }
+    }
+
+    fn fill(&self, pairs: &[PairGeometry], made: &mut Made) {
+        let mut row = [vec![0.0_f32; self.pixels()], vec![0.0_f32; self.pixels()]];
+        for (k, pair) in pairs.iter().enumerate() {
+            let [re, im] = &mut row;
+            self.rows.fill(pair, 1.0, re, im);
+            for (part, values) in row.iter().enumerate() {
+                for (pieces, values) in made.pieces.iter_mut().zip(values.chunks(CHUNK)) {
+                    pieces[k][part] = [0.0; CHUNK];
+                    pieces[k][part][..values.len()].copy_from_slice(values);
+                }
+            }
+        }
+    }
+}
+
+impl Cap {
+    fn seen_by(&self, pair: &Prepared) -> Sight {
+        let [x, y, z] = self.centre;
+        let (depth_i, depth_j) = pair.depths::<false>(x, y, z);
+        match depth_i.min(depth_j) {
+            depth if depth < -self.radius => Sight::Hidden,
+            depth if depth > self.radius => Sight::Open,
+            _ => Sight::Cut,
+        }
+    }
+}
+
+impl Made {
+    fn new(chunks: usize) -> Self {
+        Self {
+            pieces: vec![[[[0.0; CHUNK]; 2]; ROWS]; chunks],
+            sights: vec![[Sight::Hidden; ROWS]; chunks],
+        }
+    }
+
+    /// The first `count` rows times vectors.
+    fn forward(&self, count: usize, x: &[Scaled]) -> Vec<[[f64; 2]; ROWS]> {
+        let column = |x: &Scaled| {
+            let mut lanes = [[[0.0_f64; LANES]; 2]; ROWS];
+            for ((pieces, sights), x) in self.pieces.iter().zip(&self.sights).zip(&x.chunks) {
+                multiply((&pieces[..count], sights), x, &mut lanes);
+            }
+            lanes.map(|parts| parts.map(|lanes| lanes.iter().sum()))
+        };
+        x.iter().map(column).collect()
+    }
+
+    /// Adds the first `count` rows times their factors.
+    fn add_to(&self, count: usize, factors: &Factors, sums: &mut [Vec<[f64; CHUNK]>]) {
+        for (k, (pieces, sights)) in self.pieces.iter().zip(&self.sights).enumerate() {
+            for (sums, factors) in sums.iter_mut().zip(factors) {
+                accumulate((&pieces[..count], sights), factors, &mut sums[k]);
+            }
+        }
+    }
+}
+
+/// A S_i S_j exp(-2 pi i u . n) at the centres of a chunk, for each pair that sees some of it.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn fringes(pairs: &[Prepared], sights: &[Sight; ROWS], n: &[[f64; CHUNK]; 3], out: &mut [Piece; ROWS]) {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
+    let [x, y, z] = n;
+    for ((pair, sight), [re, im]) in pairs.iter().zip(sights).zip(out) {
+        if *sight == Sight::Hidden {
+            continue;
+        }
+        let mut turns = [0.0_f32; CHUNK];
+        for k in 0..CHUNK {
+            turns[k] = fraction_of_turn(dot64::<FMA>(pair.u, x[k], y[k], z[k]));
+        }
+        for k in 0..CHUNK {
+            let (cos, sin) = cos_sin_turns::<FMA>(turns[k]);
+            (re[k], im[k]) = (cos, -sin);
+        }
+        if *sight == Sight::Cut || pair.dipole.is_some() {
+            let mut seen = [1.0_f32; CHUNK];
+            for k in 0..CHUNK {
+                seen[k] = if pair.sees::<FMA>(x[k], y[k], z[k]) { 1.0 } else { 0.0 };
+            }
+            pair.apply_antenna::<FMA, _>([x, y, z], &mut seen);
+            for k in 0..CHUNK {
+                (re[k], im[k]) = (re[k] * seen[k], im[k] * seen[k]);
+            }
+        }
+    }
+}
+
+/// Averages over the pixels of all chunks that each pair sees some of.
+fn averages(pairs: &[Prepared], class: &BlockClass, made: &mut Made) {
+    let mut means = Means::default();
+    let per_pixel = class.per_side * class.per_side;
+    let pixels = GROUP / per_pixel;
+    let chunks = class.whole.groups.chunks(per_pixel).zip(&made.sights).zip(&mut made.pieces);
+    for ((groups, sights), pieces) in chunks {
+        for ((pair, sight), [re, im]) in pairs.iter().zip(sights).zip(pieces) {
+            if *sight == Sight::Hidden {
+                continue;
+            }
+            let parts = re.chunks_exact_mut(pixels).zip(im.chunks_exact_mut(pixels));
+            for (group, (re, im)) in groups.iter().zip(parts) {
+                means_of_group(pair, class.whole.children, group, &mut means);
+                average(&means.re, per_pixel, re);
+                average(&means.im, per_pixel, im);
+            }
+        }
+    }
+    for set in &class.finer {
+        let share = (set.children * set.children) as f32 / (super::CHILDREN * super::CHILDREN) as f32;
+        for (group, places) in set.groups.iter().zip(set.pixels.chunks(GROUP)) {
+            for (row, pair) in pairs.iter().enumerate() {
+                means_of_group(pair, set.children, group, &mut means);
+                for (lane, &place) in places.iter().enumerate() {
+                    let (chunk, k) = (place as usize / CHUNK, place as usize % CHUNK);
+                    let [re, im] = &mut made.pieces[chunk][row];
+                    re[k] += share * means.re[lane];
+                    im[k] += share * means.im[lane];
+                }
+            }
+        }
+    }
+}
+
+/// Adds a chunk of rows times a chunk of a vector to lanes of partial sums: in f32 within a chunk, in f64 beyond.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn multiply(
+    (pieces, sights): (&[Piece], &[Sight; ROWS]),
+    x: &[f32; CHUNK],
+    lanes: &mut [[[f64; LANES]; 2]; ROWS],
+) {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
+    for ((piece, sight), lanes) in pieces.iter().zip(sights).zip(lanes) {
+        if *sight == Sight::Hidden {
+            continue;
+        }
+        for (values, lanes) in piece.iter().zip(lanes) {
+            let mut sums = [0.0_f32; LANES];
+            for (values, x) in values.as_chunks::<LANES>().0.iter().zip(x.as_chunks::<LANES>().0) {
+                for k in 0..LANES {
+                    sums[k] = fused::<FMA>(values[k], x[k], sums[k]);
+                }
+            }
+            for k in 0..LANES {
+                lanes[k] += f64::from(sums[k]);
+            }
+        }
+    }
+}
+
+/// Adds a chunk of rows times factors to sums: in f32 within a block of rows, in f64 beyond.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn accumulate(
+    (pieces, sights): (&[Piece], &[Sight; ROWS]),
+    factors: &[[f32; 2]; ROWS],
+    sums: &mut [f64; CHUNK],
+) {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
+    let mut block = [0.0_f32; CHUNK];
+    for (([re, im], sight), [a, b]) in pieces.iter().zip(sights).zip(factors) {
+        if *sight == Sight::Hidden {
+            continue;
+        }
+        for k in 0..CHUNK {
+            block[k] = fused::<FMA>(re[k], *a, fused::<FMA>(im[k], *b, block[k]));
+        }
+    }
+    for k in 0..CHUNK {
+        sums[k] += f64::from(block[k]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frames::AntennaResponse;
+    use crate::response::pixel::exact;
+    use crate::sky::healpix::pixel_count;
+    use crate::units::vector::{cross, unit};
+
+    const MOON_M: f64 = 1.7371e6;
+
+    /// Pairs all around the Moon, of baselines up to `longest` wavelengths in turn.
+    fn pairs(count: usize, longest: f64, response: AntennaResponse) -> Vec<PairGeometry> {
+        let frequency_hz = 1e7;
+        (0..count)
+            .map(|k| {
+                let k = k as f64;
+                let r_hat = unit([(1.3 * k).sin(), (0.7 * k + 1.0).cos(), (2.1 * k + 0.4).sin()]);
+                let along = unit(cross(r_hat, [0.3, (0.9 * k).cos(), 0.6]));
+                let apart_m = 29.98 * longest * (0.05 + 0.95 * (0.37 * k).fract());
+                let r_i_m = scale(2.0371e6, r_hat);
+                let r_j_m = add(r_i_m, scale(apart_m, along));
+                PairGeometry { r_i_m, r_j_m, frequency_hz, moon_radius_m: MOON_M, response }
+            })
+            .collect()
+    }
+
+    /// Rows in f64 by other code of this folder, and all products with them.
+    fn exact_rows(pairs: &[PairGeometry], nside: usize, method: PixelMethod) -> Vec<Vec<Complex64>> {
+        let n = pixel_directions(nside);
+        let area_sr = pixel_area_sr(nside);
+        let row = |pair| match method {
+            PixelMethod::Centre => exact::centre_row(pair, &n),
+            _ => exact::average_row(pair, nside, super::super::CHILDREN),
+        };
+        pairs.iter().map(|pair| row(pair).into_iter().map(|value| value * area_sr).collect()).collect()
+    }
+
+    fn difference(found: &[f64], expected: &[f64]) -> f64 {
+        let rms = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>().sqrt();
+        rms(&mut found.iter().zip(expected).map(|(a, b)| a - b)) / rms(&mut expected.iter().copied())
+    }
+
+    #[test]
+    fn products_are_those_of_exact_rows() {
+        for (method, nside, longest, tolerance) in [
+            // Fringes are good to 1e-6, sums in f32 to some 1e-7 of their greatest terms.
+            (PixelMethod::Centre, 4, 30.0, 3e-6),
+            (PixelMethod::Centre, 1, 2.0, 3e-6),
+            // Averages in closed form are good to 1e-3 rms (`RowMaker`): all classes of blocks, and beyond the last.
+            (PixelMethod::Average, 4, 1.9 / 0.256, 1e-3),
+            (PixelMethod::Average, 8, 9.0 / 0.128, 1e-3),
+            (PixelMethod::Average, 1, 2.0, 1e-3),
+            // f32 alone.
+            (PixelMethod::AverageExact, 2, 4.0, 1e-6),
+        ] {
+            for response in [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal] {
+                let pairs = pairs(41, longest, response);
+                let pixels = pixel_count(nside);
+                let rows = exact_rows(&pairs, nside, method);
+                let weights: Vec<f64> = (0..pairs.len()).map(|k| 1e-9 * (1.0 + (k % 5) as f64)).collect();
+                let x: [Vec<f64>; 2] = [0.7, 1.9].map(|f: f64| {
+                    (0..pixels).map(|p| 3e4 * ((f * p as f64).sin() + 0.3)).collect()
+                });
+                let products = RowProducts::new(nside, method).unwrap();
+                assert_eq!(products.pixels(), pixels);
+                let found = products.normal(&pairs, &weights, &[&x[0], &x[1]]);
+                let what = format!("{method:?} {nside} {response:?}");
+                for (x, found) in x.iter().zip(&found) {
+                    let mut expected = vec![0.0; pixels];
+                    let mut seen = Vec::new();
+                    for (row, weight) in rows.iter().zip(&weights) {
+                        let value: Complex64 = row.iter().zip(x).map(|(row, x)| row * x).sum();
+                        for (sum, row) in expected.iter_mut().zip(row) {
+                            *sum += weight * (row.re * value.re + row.im * value.im);
+                        }
+                        seen.extend([value.re, value.im]);
+                    }
+                    let error = difference(found, &expected);
+                    assert!(error < tolerance, "{what}: {error:e}");
+                    let forward: Vec<f64> =
+                        products.forward(&pairs, x).iter().flat_map(|value| [value.re, value.im]).collect();
+                    let error = difference(&forward, &seen);
+                    assert!(error < tolerance, "{what}, forward: {error:e}");
+                }
+                let values: Vec<Complex64> =
+                    (0..pairs.len()).map(|k| Complex64::cis(0.8 * k as f64) * 1e-7).collect();
+                let mut expected = vec![0.0; pixels];
+                for (row, value) in rows.iter().zip(&values) {
+                    for (sum, row) in expected.iter_mut().zip(row) {
+                        *sum += row.re * value.re + row.im * value.im;
+                    }
+                }
+                let error = difference(&products.adjoint(&pairs, &[&values])[0], &expected);
+                assert!(error < tolerance, "{what}, adjoint: {error:e}");
+                // A column has the bits that it has alone.
+                assert!(products.normal(&pairs, &weights, &[&x[1]])[0] == found[1], "{what}");
+            }
+        }
+    }
+
+    #[test]
+    fn bits_do_not_depend_on_threads() {
+        let pairs = pairs(531, 20.0, AntennaResponse::Isotropic);
+        let weights = vec![1.0; pairs.len()];
+        for method in [PixelMethod::Centre, PixelMethod::Average] {
+            let products = RowProducts::new(8, method).unwrap();
+            let x: Vec<f64> = (0..products.pixels()).map(|p| (0.7 * p as f64).sin()).collect();
+            let on = |threads| {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                pool.install(|| products.normal(&pairs, &weights, &[&x]))
+            };
+            assert!(on(1) == on(2) && on(2) == on(5), "{method:?}");
+        }
+    }
+
+    #[test]
+    fn nothing_makes_nothing() {
+        let products = RowProducts::new(2, PixelMethod::Centre).unwrap();
+        assert_eq!(products.normal(&[], &[], &[&[1.0; 48]]), [vec![0.0; 48]]);
+        let one = pairs(1, 2.0, AntennaResponse::Isotropic);
+        assert_eq!(products.normal(&one, &[1.0], &[&[0.0; 48]]), [vec![0.0; 48]]);
+        assert_eq!(products.adjoint(&one, &[&[Complex64::ZERO]]), [vec![0.0; 48]]);
+    }
+}
