@@ -17,6 +17,9 @@ use crate::units::{ChannelId, Checks, InvalidValue, PerChannel};
 /// Greatest nside of the pixel engine: 49152 pixels, 9.7 GB of sums a channel (half of a symmetric matrix, f64).
 pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
 
+/// Greatest nside of the pixel engine without its matrix: a pass over the rows of a million visibilities takes hours.
+pub const REMADE_NSIDE_MAX: usize = 256;
+
 /// Greatest nside of maps from the harmonic engine: pixels ten times finer than its greatest degree.
 pub const HARMONIC_ENGINE_NSIDE_MAX: usize = 1024;
 
@@ -41,6 +44,18 @@ pub enum EngineKind {
     Harmonic,
 }
 
+/// What the pixel engine does with its matrix.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[non_exhaustive]
+pub enum MatrixKind {
+    /// It is summed and held, and factorised.
+    #[default]
+    Held,
+    /// Visibilities are held instead, and rows of B made again for each product of an iteration.
+    Remade,
+}
+
 /// Configuration of map making.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -57,6 +72,9 @@ pub struct MapConfig {
     pub channels: Vec<u16>,
     /// How the pixel engine computes rows of B.
     pub rows: PixelMethod,
+    /// Whether the pixel engine holds its matrix.
+    #[serde(skip_serializing_if = "is_usual")]
+    pub matrix: MatrixKind,
     /// Highest degree of a map from the harmonic engine; 0 for 2.5 nside.
     pub l_max: usize,
     /// Longest baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
@@ -91,9 +109,9 @@ pub struct MapConfig {
     pub weight_max: f64,
     /// Seed of the noise-only companion map.
     pub companion_seed: u64,
-    /// Residual at which a harmonic solution stops, relative to the right-hand side, in the preconditioner's norm.
+    /// Residual at which an iterative solution stops, relative to the right-hand side, in the preconditioner's norm.
     pub residual_max: f64,
-    /// Iteration limit of a harmonic solution.
+    /// Iteration limit of such a solution.
     pub iterations_max: usize,
     /// Random probes for the traces of the covariances of a final map; 0 for no traces. Those of up to 3072 unknowns (nside 16,
     /// or l_max 54) are exact and need none: any number above 0 will do.
@@ -116,7 +134,8 @@ pub struct RefineConfig {
     pub passes_max: usize,
     /// Residual at which it stops, relative to the right-hand side, in the preconditioner's norm.
     pub residual_max: f64,
-    /// Most visibilities of a channel that are held in memory for it; further ones are left out and counted.
+    /// Most visibilities of a channel that are held in memory for it, or without the matrix of the pixel engine; further ones are left
+    /// out and counted.
     pub visibilities_max: u64,
 }
 
@@ -142,6 +161,7 @@ impl Default for MapConfig {
             channels_max: 64,
             channels: Vec::new(),
             rows: PixelMethod::Average,
+            matrix: MatrixKind::Held,
             l_max: 0,
             baseline_bp_max: 2.0,
             epsilon: PerChannel::All(1e-4),
@@ -170,6 +190,11 @@ fn is_zero(value: &f64) -> bool {
     *value == 0.0
 }
 
+/// Likewise.
+fn is_usual(matrix: &MatrixKind) -> bool {
+    *matrix == MatrixKind::Held
+}
+
 impl MapConfig {
     /// Whether R is `epsilon W_max` times the identity.
     #[must_use]
@@ -177,12 +202,28 @@ impl MapConfig {
         is_zero(&self.regularisation_exponent) && self.regularisation_files.is_empty()
     }
 
+    /// Whether rows of B are made again for each product over pixels.
+    #[must_use]
+    pub fn is_remade(&self) -> bool {
+        self.engine == EngineKind::Pixel && self.matrix == MatrixKind::Remade
+    }
+
+    /// Whether visibilities are held one by one instead of sums.
+    #[must_use]
+    pub fn holds_visibilities(&self) -> bool {
+        self.refine.is_on() || self.is_remade()
+    }
+
     /// All invalid settings; empty if there are none.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("map");
         let is_harmonic = self.engine == EngineKind::Harmonic;
-        let most = if is_harmonic { HARMONIC_ENGINE_NSIDE_MAX } else { PIXEL_ENGINE_NSIDE_MAX };
+        let most = match self.engine {
+            EngineKind::Harmonic => HARMONIC_ENGINE_NSIDE_MAX,
+            EngineKind::Pixel if self.is_remade() => REMADE_NSIDE_MAX,
+            EngineKind::Pixel => PIXEL_ENGINE_NSIDE_MAX,
+        };
         let good = is_valid_nside(self.nside) && self.nside <= most;
         let expected = format!("a power of two from 1 to {most} for this engine");
         checks.require("nside", self.nside, good, expected);
@@ -237,6 +278,11 @@ impl MapConfig {
             "above 0 and below 1",
         );
         checks.require("refine.visibilities_max", visibilities_max, visibilities_max > 0, "at least 1");
+        if self.is_remade() {
+            let probes = self.trace_probes;
+            let expected = "0 with map.matrix = \"remade\": traces need the matrix";
+            checks.require("trace_probes", probes, probes == 0, expected);
+        }
         if self.refine.is_on() {
             let probes = self.trace_probes;
             checks.require(
@@ -260,12 +306,12 @@ impl MapConfig {
             "none with map.regularisation_exponent",
         );
         let beams = self.beams_deg.len();
-        let few = beams <= BEAMS_MAX && (beams == 0 || !self.refine.is_on());
+        let few = beams <= BEAMS_MAX && (beams == 0 || !self.holds_visibilities());
         checks.require(
             "beams_deg",
             format!("({beams} directions)"),
             few,
-            "at most 100, and none with map.refine",
+            "at most 100, and none with map.refine or map.matrix = \"remade\"",
         );
         for &[longitude_deg, latitude_deg] in &self.beams_deg {
             let good = longitude_deg.abs() <= 360.0 && latitude_deg.abs() <= 90.0;
@@ -284,20 +330,35 @@ impl MapConfig {
     /// Requires that keys of the other engine are not set.
     fn check_effects(&self, checks: &mut Checks) {
         let usual = Self::default();
+        let is_held = !self.is_remade();
+        // Those that are held are bounded likewise.
+        let refine = RefineConfig {
+            visibilities_max: if is_held { usual.refine } else { self.refine }.visibilities_max,
+            ..usual.refine
+        };
+        for (key, is_set) in [
+            ("residual_max", self.residual_max != usual.residual_max),
+            ("iterations_max", self.iterations_max != usual.iterations_max),
+        ] {
+            let good = !is_set || self.engine == EngineKind::Harmonic || !is_held;
+            let expected =
+                "no such key: it has no effect without map.engine = \"harmonic\" or map.matrix = \"remade\"";
+            checks.require(key, "(set)", good, expected);
+        }
         let (other, set) = match self.engine {
             EngineKind::Pixel => (
                 "harmonic",
                 vec![
                     ("l_max", self.l_max != usual.l_max),
-                    ("residual_max", self.residual_max != usual.residual_max),
-                    ("iterations_max", self.iterations_max != usual.iterations_max),
                     ("regularisation_exponent", self.regularisation_exponent != 0.0),
                     ("regularisation_files", !self.regularisation_files.is_empty()),
                     ("limits", self.limits != usual.limits),
-                    ("refine", self.refine != usual.refine),
+                    ("refine", self.refine != refine),
                 ],
             ),
-            EngineKind::Harmonic => ("pixel", vec![("rows", self.rows != usual.rows)]),
+            EngineKind::Harmonic => {
+                ("pixel", vec![("rows", self.rows != usual.rows), ("matrix", self.matrix != usual.matrix)])
+            }
         };
         for (key, is_set) in set {
             let expected = format!("no such key: it has no effect without map.engine = \"{other}\"");
@@ -319,6 +380,7 @@ impl MapConfig {
             nside,
             engine,
             rows,
+            matrix,
             baseline_bp_max,
             companion_seed,
             limits,
@@ -352,7 +414,12 @@ impl MapConfig {
             settings.push(("map.channels", format!("{mapped:?}")));
         }
         match engine {
-            EngineKind::Pixel => settings.push(("map.rows", format!("{rows:?}"))),
+            EngineKind::Pixel => {
+                settings.push(("map.rows", format!("{rows:?}")));
+                if self.is_remade() {
+                    settings.push(("map.matrix", format!("{matrix:?}")));
+                }
+            }
             EngineKind::Harmonic => {
                 settings.push(("map.l_max", self.degree().to_string()));
                 settings.push(("map.limits", format!("{limits:?}")));
@@ -392,8 +459,8 @@ impl MapConfig {
         group: Option<&ChannelGroup>,
     ) -> Result<(), AccumulationError> {
         let each = match self.engine {
-            EngineKind::Pixel => PixelEngine::memory_bytes(self.nside),
-            EngineKind::Harmonic => 0,
+            EngineKind::Pixel if !self.is_remade() => PixelEngine::memory_bytes(self.nside),
+            EngineKind::Pixel | EngineKind::Harmonic => 0,
         };
         let is_summed =
             |channel: &ChannelId| self.maps(*channel) && group.is_none_or(|group| group.contains(channel));

@@ -20,12 +20,14 @@ mod noise;
 mod pixel;
 mod stage;
 
-pub use config::{ChannelGroup, EngineKind, MapConfig, REFINED, RefineConfig};
+pub use config::{ChannelGroup, EngineKind, MapConfig, MatrixKind, REFINED, RefineConfig};
 pub use engine::ExactEngine;
 pub use error::AccumulationError;
 pub use fixed_point::automatic_weight_max;
 pub(crate) use pixel::add_product;
-pub use pixel::{ColumnBlock, PixelEngine, PixelSetup, PixelSums, SymmetricTiles, TILE};
+pub use pixel::{
+    ColumnBlock, PixelEngine, PixelSetup, PixelSums, RemadeSums, RemadeVisibilities, SymmetricTiles, TILE,
+};
 pub use stage::{Accumulator, AccumulatorState, Snapshot, SnapshotSums};
 
 use std::collections::BTreeMap;

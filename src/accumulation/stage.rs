@@ -11,7 +11,7 @@ use super::harmonic::{
 };
 use super::{
     AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine,
-    PixelSetup, PixelSums, SumCounts, automatic_weight_max,
+    PixelSetup, PixelSums, RemadeVisibilities, SumCounts, automatic_weight_max,
 };
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
 use crate::ranks::{RankShare, Ranks};
@@ -45,6 +45,8 @@ pub enum SnapshotSums {
     Harmonic(Box<HarmonicSums>),
     /// Visibilities one by one, for a refined map.
     Refined(Box<VisibilityArchive>),
+    /// Visibilities one by one, for a map of pixels.
+    Remade(Box<RemadeVisibilities>),
 }
 
 impl SnapshotSums {
@@ -62,15 +64,16 @@ impl SnapshotSums {
             Self::Pixel(sums) => sums.counts(),
             Self::Harmonic(sums) => sums.counts(),
             Self::Refined(archive) => archive.counts(),
+            Self::Remade(visibilities) => visibilities.counts(),
         }
     }
 }
 
-/// Either engine, or visibilities that are held for refinement.
+/// Either engine, or visibilities that are held one by one.
 enum Engine {
     Pixel(Box<PixelEngine>),
     Harmonic(Box<HarmonicEngine>),
-    Refined(Box<VisibilityArchive>),
+    Held(Box<VisibilityArchive>),
 }
 
 impl Engine {
@@ -86,7 +89,7 @@ impl Engine {
         match self {
             Self::Pixel(engine) => engine.add(placed),
             Self::Harmonic(engine) => engine.add(placed),
-            Self::Refined(archive) => archive.add(placed),
+            Self::Held(archive) => archive.add(placed),
         }
     }
 
@@ -94,7 +97,7 @@ impl Engine {
         match self {
             Self::Pixel(engine) => engine.remove(placed),
             Self::Harmonic(engine) => engine.remove(placed),
-            Self::Refined(archive) => archive.remove(placed),
+            Self::Held(archive) => archive.remove(placed),
         }
     }
 
@@ -103,27 +106,34 @@ impl Engine {
         let counts = match self {
             Self::Pixel(engine) => engine.counts(),
             Self::Harmonic(engine) => engine.counts(),
-            Self::Refined(archive) => archive.counts(),
+            Self::Held(archive) => archive.counts(),
         };
         counts.visibilities == 0
     }
 
-    /// A copy of the sums; of visibilities that are held, their sums on the nearest circle.
-    fn sums(&mut self) -> Result<SnapshotSums, AccumulationError> {
+    /// A copy of the sums; of visibilities that are held for refinement, their sums on the nearest circle.
+    fn sums(&mut self, config: &MapConfig) -> Result<SnapshotSums, AccumulationError> {
         Ok(match self {
+            Self::Held(archive) if config.is_remade() => remade(config, archive.copy()),
             Self::Pixel(engine) => SnapshotSums::Pixel(engine.sums()),
             Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.sums())),
-            Self::Refined(archive) => SnapshotSums::Harmonic(Box::new(archive.circle_sums()?)),
+            Self::Held(archive) => SnapshotSums::Harmonic(Box::new(archive.circle_sums()?)),
         })
     }
 
-    fn into_sums(self) -> SnapshotSums {
+    fn into_sums(self, config: &MapConfig) -> SnapshotSums {
         match self {
+            Self::Held(archive) if config.is_remade() => remade(config, *archive),
             Self::Pixel(engine) => SnapshotSums::Pixel(engine.into_sums()),
             Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.into_sums())),
-            Self::Refined(archive) => SnapshotSums::Refined(archive),
+            Self::Held(archive) => SnapshotSums::Refined(archive),
         }
     }
+}
+
+/// Visibilities for a map of pixels without its matrix.
+fn remade(config: &MapConfig, archive: VisibilityArchive) -> SnapshotSums {
+    SnapshotSums::Remade(Box::new(RemadeVisibilities { nside: config.nside, method: config.rows, archive }))
 }
 
 /// State of an accumulator besides its engines, spans and ledger, from which another can resume. Snapshots are numbered
@@ -264,7 +274,7 @@ impl Accumulator {
             match &mut sums.engine {
                 Engine::Pixel(engine) => engine.checkpoint(out)?,
                 Engine::Harmonic(engine) => engine.checkpoint(out)?,
-                Engine::Refined(archive) => archive.checkpoint(out, place)?,
+                Engine::Held(archive) => archive.checkpoint(out, place)?,
             }
         }
         Ok(())
@@ -273,7 +283,7 @@ impl Accumulator {
     /// The files that engines were written to or read from, besides the checkpoint.
     pub fn segments(&self) -> impl Iterator<Item = &HeldSegment> {
         self.channels.iter().flatten().flat_map(|sums| match &sums.engine {
-            Engine::Refined(archive) => archive.segments(),
+            Engine::Held(archive) => archive.segments(),
             Engine::Pixel(_) | Engine::Harmonic(_) => &[],
         })
     }
@@ -281,7 +291,7 @@ impl Accumulator {
     /// From now on another folder is meant, which has none of those files.
     pub fn leave_segments(&mut self) {
         for sums in self.channels.iter_mut().flatten() {
-            if let Engine::Refined(archive) = &mut sums.engine {
+            if let Engine::Held(archive) = &mut sums.engine {
                 archive.leave_segments();
             }
         }
@@ -321,11 +331,11 @@ impl Accumulator {
                 continue;
             }
             let engine = match self.config.engine {
-                EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
-                EngineKind::Harmonic if refine.is_on() => {
+                _ if self.config.holds_visibilities() => {
                     let most = refine.visibilities_max;
-                    Engine::Refined(Box::new(VisibilityArchive::restore(from, folder, most)?))
+                    Engine::Held(Box::new(VisibilityArchive::restore(from, folder, most)?))
                 }
+                EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
                 EngineKind::Harmonic => {
                     Engine::Harmonic(Box::new(HarmonicEngine::restore_part(from, part, &self.ranks)?))
                 }
@@ -376,7 +386,7 @@ impl Accumulator {
                     match (&mut ours.engine, theirs.engine) {
                         (Engine::Pixel(ours), Engine::Pixel(theirs)) => ours.merge(*theirs)?,
                         (Engine::Harmonic(ours), Engine::Harmonic(theirs)) => ours.merge(*theirs)?,
-                        (Engine::Refined(ours), Engine::Refined(theirs)) => ours.merge(*theirs)?,
+                        (Engine::Held(ours), Engine::Held(theirs)) => ours.merge(*theirs)?,
                         _ => return Err(AccumulationError::Mismatch { what: "kinds" }),
                     }
                     let ([first, last], [from, to]) = (ours.span_s, theirs.span_s);
@@ -534,7 +544,7 @@ impl Accumulator {
                 is_final: false,
                 span_s: channel.span_s,
                 nside: self.config.nside,
-                sums: channel.engine.sums()?,
+                sums: channel.engine.sums(&self.config)?,
             };
             out.push_unless(snapshot, &self.cancel);
         }
@@ -576,19 +586,11 @@ fn engine(
         weight_max => weight_max,
     };
     Ok(match config.engine {
-        EngineKind::Pixel => Ok(Engine::Pixel(Box::new(PixelEngine::new(PixelSetup {
-            nside: config.nside,
-            frequency_hz,
-            method: config.rows,
-            moon_radius_m,
-            response,
-            companion_seed: config.companion_seed,
-            weight_max,
-        })?))),
-        EngineKind::Harmonic if config.refine.is_on() => {
-            Ok(Engine::Refined(Box::new(VisibilityArchive::new(RefinedSetup {
+        _ if config.holds_visibilities() => {
+            Ok(Engine::Held(Box::new(VisibilityArchive::new(RefinedSetup {
                 channel: placed.channel,
-                l_max: config.degree(),
+                // Pixels have no degrees.
+                l_max: if config.is_remade() { 0 } else { config.degree() },
                 frequency_hz,
                 baseline_m_max: config.baseline_m_max(frequency_hz),
                 moon_radius_m,
@@ -599,6 +601,15 @@ fn engine(
                 visibilities_max: config.refine.visibilities_max,
             })?)))
         }
+        EngineKind::Pixel => Ok(Engine::Pixel(Box::new(PixelEngine::new(PixelSetup {
+            nside: config.nside,
+            frequency_hz,
+            method: config.rows,
+            moon_radius_m,
+            response,
+            companion_seed: config.companion_seed,
+            weight_max,
+        })?))),
         EngineKind::Harmonic => match orbit_of(placed, config.limits) {
             // Positions come from outside: what no satellite can have is refused, and later data may have others.
             Some(orbit) if orbit.radius_m <= moon_radius_m.max(config.baseline_m_max(frequency_hz)) => {
@@ -666,7 +677,7 @@ impl Stage for Accumulator {
                     Some(sums) => SnapshotSums::Harmonic(Box::new(sums)),
                     None => continue,
                 },
-                (_, engine) => engine.into_sums().with_noises(noises),
+                (_, engine) => engine.into_sums(&self.config).with_noises(noises),
             };
             out.push(Snapshot {
                 instrument: Arc::clone(&instrument),

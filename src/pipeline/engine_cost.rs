@@ -4,14 +4,16 @@ use std::f64::consts::TAU;
 
 use super::plan::Plan;
 use super::rates::{
-    CHOLESKY_MULTIPLY_ADDS_PER_S, HARMONIC_VISIBILITIES_PER_S, INTERPOLATION_S, RANK_K_MULTIPLY_ADDS_PER_S,
-    ROW_S, TRANSFORM_MULTIPLY_ADDS_PER_S, VISIBILITIES_PER_ROW, cores,
+    AVERAGE_ELEMENT_S, CENTRE_ELEMENT_S, CHOLESKY_MULTIPLY_ADDS_PER_S, EXACT_ELEMENT_S,
+    HARMONIC_VISIBILITIES_PER_S, INTERPOLATION_S, RANK_K_MULTIPLY_ADDS_PER_S, ROW_S,
+    TRANSFORM_MULTIPLY_ADDS_PER_S, VISIBILITIES_PER_ROW, cores,
 };
 use crate::accumulation::harmonic::{
     REFINED_VISIBILITY_BYTES, SPREAD_MULTIPLY_ADDS, application_size, memory, shared_size,
 };
 use crate::accumulation::{EngineKind, MapConfig, PixelEngine};
 use crate::response::general::row_tables_bytes;
+use crate::response::pixel::{PixelMethod, RowProducts};
 use crate::sky::healpix::pixel_count;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
@@ -21,6 +23,9 @@ const APPLICATIONS: f64 = 65.0;
 
 /// A map and its noise map.
 const SOLVED_TOGETHER: usize = 2;
+
+/// Products for W_max over pixels, from a random vector.
+const W_MAX_PRODUCTS: f64 = 30.0;
 
 /// Products with BtN^-1B for one random probe of the traces, of at most 300: a guess for epsilon = 1e-4, not measured.
 const PROBE_APPLICATIONS: f64 = 40.0;
@@ -132,6 +137,7 @@ impl EngineCost {
     /// The cost of the engine for a channel.
     pub(super) fn of(map: &MapConfig, data: ChannelData) -> Self {
         match map.engine {
+            EngineKind::Pixel if map.is_remade() => Self::remade(map, data),
             EngineKind::Pixel => Self::pixel(map),
             EngineKind::Harmonic if map.refine.is_on() => Self::refined(map, data),
             EngineKind::Harmonic => Self::harmonic(map, data),
@@ -155,6 +161,36 @@ impl EngineCost {
             probes_s: 0.0,
             visibility_multiply_adds,
             solution_multiply_adds,
+        }
+    }
+
+    /// Visibilities in memory, and as many products with their rows as there may be: each makes a row for each visibility, for the map
+    /// and its noise map together.
+    fn remade(map: &MapConfig, data: ChannelData) -> Self {
+        let pixels = pixel_count(map.nside) as f64;
+        let visibilities = data.visibilities.min(map.refine.visibilities_max as f64);
+        let element_s = match map.rows {
+            PixelMethod::Centre => CENTRE_ELEMENT_S,
+            PixelMethod::Average => AVERAGE_ELEMENT_S,
+            PixelMethod::AverageExact => EXACT_ELEMENT_S,
+        };
+        let products = W_MAX_PRODUCTS + map.iterations_max as f64;
+        let elements = products * visibilities * pixels;
+        let threads = rayon::current_num_threads();
+        let held = visibilities * REFINED_VISIBILITY_BYTES as f64;
+        Self {
+            sums_bytes: held,
+            // A map on the way has a copy of them.
+            copy_bytes: held,
+            copies_last: false,
+            other_bytes: RowProducts::memory_bytes(map.nside, SOLVED_TOGETHER, threads) as f64
+                + 8.0 * pixels * BASIS_VECTORS[0],
+            visibility_s: 0.0,
+            solution_s: elements * element_s / cores(),
+            probes_s: 0.0,
+            visibility_multiply_adds: 0.0,
+            // Real and imaginary part, of two vectors, there and back.
+            solution_multiply_adds: 8.0 * elements,
         }
     }
 

@@ -8,6 +8,7 @@ use super::beams::harmonic_beams;
 use super::harmonic::{HarmonicRequest, solve_regularised};
 use super::passes::PassFile;
 use super::refined::{RefineRule, RefineSteps, Refinement, solve_refined};
+use super::remade::solve_remade;
 use super::tikhonov::{PixelExtras, PointBeam, solve_pixels_with};
 use super::{Diagnostics, Regulariser, SolveError, SolveWatch, StoppingRule};
 use crate::accumulation::{NormalSums, Snapshot, SnapshotSums, SumCounts};
@@ -64,7 +65,7 @@ pub struct SolverSetup {
     pub prior_maps: Vec<Vec<f64>>,
     /// Share of the sky's power that the Moon is taken to reflect: visibilities are divided by 1 + this.
     pub moon_reflection: f64,
-    /// When the iteration of a harmonic map stops.
+    /// When the iteration of a map stops, of harmonics or of pixels without their matrix.
     pub rule: StoppingRule,
     /// When the refinement of a harmonic map stops.
     pub refine: RefineRule,
@@ -97,7 +98,7 @@ impl SolverSetup {
 pub struct Solver {
     setup: SolverSetup,
     solved: u64,
-    /// The last harmonic solution of each channel, from which the next starts.
+    /// The last iterative solution of each channel, from which the next starts.
     last: HashMap<ChannelId, [Vec<f64>; 2]>,
 }
 
@@ -184,6 +185,23 @@ impl Stage for Solver {
                 }
                 if !is_final {
                     self.last.insert(channel, solved.unknowns);
+                }
+                (solved.map_k, solved.noise_k, solved.diagnostics)
+            }
+            SnapshotSums::Remade(visibilities) => {
+                let sums = visibilities.into_sums()?;
+                let start = self.last.remove(&channel);
+                let rule = self.setup.rule;
+                let (solved, unknowns) =
+                    match solve_remade(&sums, epsilon, prior.as_deref(), start, rule, watch) {
+                        Err(SolveError::Interrupted) => return Ok(()),
+                        solved => solved?,
+                    };
+                if !watch.goes_on() && !is_final {
+                    return Ok(());
+                }
+                if !is_final {
+                    self.last.insert(channel, unknowns);
                 }
                 (solved.map_k, solved.noise_k, solved.diagnostics)
             }

@@ -11,13 +11,16 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::held::{HeldHead, HeldVisibility, RefinedSetup};
-use super::refined::{BLOCK, Departures, RefinedSums, circle_engine, nearest_circle, refined_sums};
+use super::refined::{
+    BLOCK, Departures, RefinedData, RefinedSums, circle_engine, nearest_circle, refined_sums, taken_apart,
+};
 use super::segments::{HeldSegment, SEGMENTS_MAX, SegmentPlace};
 use super::{HarmonicEngine, HarmonicSums};
 use crate::accumulation::checkpoint::{BasisKind, FrameReader, FrameWriter, refused};
 use crate::accumulation::fixed_point::{Direction, Totals, WeightScale};
 use crate::accumulation::{AccumulationError, Added, NormalEngine, Refusal, SumCounts};
 use crate::frames::PlacedVisibilities;
+use crate::response::general::PairAt;
 
 /// Memory of a visibility while it is held, sorted and refined with, bytes: the arrays' elements, and what they grow by.
 pub const REFINED_VISIBILITY_BYTES: u64 = 400;
@@ -150,6 +153,30 @@ impl VisibilityArchive {
     /// From now on another folder is meant, which has none of the segments.
     pub fn leave_segments(&mut self) {
         self.segments.clear();
+    }
+
+    /// A copy of what is held, without the files that it stands in.
+    pub(in crate::accumulation) fn copy(&mut self) -> Self {
+        self.flush();
+        Self {
+            setup: self.setup,
+            scale: self.scale,
+            totals: self.totals,
+            held: self.held.clone(),
+            is_sorted: self.is_sorted,
+            segments: Vec::new(),
+            removed: BTreeSet::new(),
+            circle: None,
+        }
+    }
+
+    /// The visibilities, sorted, and the noise of their companion.
+    pub(in crate::accumulation) fn into_data(mut self) -> (RefinedSetup, Vec<PairAt>, RefinedData) {
+        self.circle = None;
+        self.sort();
+        self.flush();
+        let (at, _, data) = taken_apart(&self.setup, self.held);
+        (self.setup, at, data)
     }
 
     /// Sorts the visibilities, plans their rows, and sums them on the nearest circle.

@@ -23,15 +23,7 @@ pub(super) fn refined_sums(
     setup: &RefinedSetup,
     held: Vec<HeldVisibility>,
 ) -> Result<RefinedSums, AccumulationError> {
-    let noise = noises(setup, &held);
-    let at: Vec<PairAt> = held.iter().map(|held| held.at).collect();
-    let data = RefinedData {
-        value_k_sr: held.iter().map(|held| held.value_k_sr).collect(),
-        weight: held.iter().map(|held| held.weight).collect(),
-        noise,
-    };
-    let bands: Vec<u16> = held.iter().map(|held| held.band).collect();
-    drop(held);
+    let (at, bands, data) = taken_apart(setup, held);
     let (orbit, departures) = nearest_circle(setup, &|k| at[k], at.len());
     let circle = circle_sums(setup, orbit, &at, &bands, &data)?;
     let rows = GeneralRows::new(RowsSetup {
@@ -43,6 +35,21 @@ pub(super) fn refined_sums(
     // Each visibility was checked when it came.
     let plan = rows.plan(&at).map_err(|error| AccumulationError::Rows(error.refusal))?;
     Ok(RefinedSums { circle, rows, plan, at, data, departures })
+}
+
+/// Positions, sub-bands and data of visibilities.
+pub(super) fn taken_apart(
+    setup: &RefinedSetup,
+    held: Vec<HeldVisibility>,
+) -> (Vec<PairAt>, Vec<u16>, RefinedData) {
+    let noise = noises(setup, &held);
+    let data = RefinedData {
+        value_k_sr: held.iter().map(|held| held.value_k_sr).collect(),
+        weight: held.iter().map(|held| held.weight).collect(),
+        noise,
+    };
+    let bands = held.iter().map(|held| held.band).collect();
+    (held.into_iter().map(|held| held.at).collect(), bands, data)
 }
 
 /// Noise of the companion, by visibility.

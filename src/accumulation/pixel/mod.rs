@@ -7,9 +7,11 @@
 
 mod checkpoint;
 mod exact;
+mod remade;
 mod sums;
 mod tiles;
 
+pub use remade::{RemadeSums, RemadeVisibilities};
 pub use sums::PixelSums;
 pub(crate) use tiles::add_product;
 pub use tiles::{ColumnBlock, SymmetricTiles, TILE};

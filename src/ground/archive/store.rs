@@ -261,7 +261,7 @@ impl Opened {
         sets_aside: bool,
         ranks: &Ranks,
     ) -> Result<Self, GroundError> {
-        if config.map.refine.is_on() && ranks.are_many() {
+        if config.map.holds_visibilities() && ranks.are_many() {
             return Err(AccumulationError::HeldByRank.into());
         }
         let mut folder = StateFolder::open_among(folder, ranks)?;

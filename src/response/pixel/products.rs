@@ -84,6 +84,9 @@ struct Together {
 /// What comes back from a block of rows: factors of the real and imaginary parts of each, by column.
 type Factors = Vec<[[f32; 2]; ROWS]>;
 
+/// Sums over a map, chunk by chunk.
+type ChunkSums = Vec<[f64; CHUNK]>;
+
 impl RowProducts {
     /// For maps of `nside`.
     ///
@@ -136,7 +139,7 @@ impl RowProducts {
     pub fn normal(&self, pairs: &[PairGeometry], weights: &[f64], x: &[&[f64]]) -> Vec<Vec<f64>> {
         let scaled: Vec<Scaled> = x.iter().map(|x| self.scaled(x)).collect();
         let largest = weights.iter().copied().fold(0.0, f64::max);
-        let mut sums = self.sums(pairs, x.len(), &|together, made| {
+        let mut sums = self.sums(pairs, x.len(), &|together, made, sums| {
             let seen = made.forward(together.count, &scaled);
             let factors = |seen: &[[f64; 2]; ROWS]| {
                 let mut factors = [[0.0; 2]; ROWS];
@@ -146,7 +149,7 @@ impl RowProducts {
                 }
                 factors
             };
-            seen.iter().map(factors).collect()
+            made.add_to(together.count, &seen.iter().map(factors).collect(), sums);
         });
         let area_sr = pixel_area_sr(self.rows.nside());
         for (sums, scaled) in sums.iter_mut().zip(&scaled) {
@@ -159,9 +162,11 @@ impl RowProducts {
     /// `Bt v` for several v, by pair: the sum of real parts times real rows and imaginary parts times imaginary ones.
     #[must_use]
     pub fn adjoint(&self, pairs: &[PairGeometry], values: &[&[Complex64]]) -> Vec<Vec<f64>> {
-        let size = |values: &&[Complex64]| values.iter().map(|v| v.re.abs().max(v.im.abs())).fold(0.0, f64::max);
-        let scales: Vec<f64> = values.iter().map(size).map(|size| if size > 0.0 { size } else { 1.0 }).collect();
-        let mut sums = self.sums(pairs, values.len(), &|together, _| {
+        let size =
+            |values: &&[Complex64]| values.iter().map(|v| v.re.abs().max(v.im.abs())).fold(0.0, f64::max);
+        let scales: Vec<f64> =
+            values.iter().map(size).map(|size| if size > 0.0 { size } else { 1.0 }).collect();
+        let mut sums = self.sums(pairs, values.len(), &|together, made, sums| {
             let factors = |(values, scale): (&&[Complex64], &f64)| {
                 let mut factors = [[0.0; 2]; ROWS];
                 for (row, factors) in factors.iter_mut().enumerate().take(together.count) {
@@ -170,13 +175,32 @@ impl RowProducts {
                 }
                 factors
             };
-            values.iter().zip(&scales).map(factors).collect()
+            made.add_to(together.count, &values.iter().zip(&scales).map(factors).collect(), sums);
         });
         let area_sr = pixel_area_sr(self.rows.nside());
         for (sums, scale) in sums.iter_mut().zip(&scales) {
             sums.iter_mut().for_each(|sum| *sum *= area_sr * scale);
         }
         sums
+    }
+
+    /// The diagonal of `Bt W B`.
+    #[must_use]
+    pub fn diagonal(&self, pairs: &[PairGeometry], weights: &[f64]) -> Vec<f64> {
+        let largest = weights.iter().copied().fold(0.0, f64::max);
+        let mut sums = self.sums(pairs, 1, &|together, made, sums| {
+            let mut factors = [0.0; ROWS];
+            for (row, factor) in factors.iter_mut().enumerate().take(together.count) {
+                *factor = (weights[together.first + row] / largest) as f32;
+            }
+            for ((pieces, sights), sum) in made.pieces.iter().zip(&made.sights).zip(&mut sums[0]) {
+                add_squares((&pieces[..together.count], sights), &factors, sum);
+            }
+        });
+        let area_sr = pixel_area_sr(self.rows.nside());
+        let mut diagonal = sums.pop().unwrap_or_default();
+        diagonal.iter_mut().for_each(|sum| *sum *= area_sr * area_sr * largest);
+        diagonal
     }
 
     /// `B x`, by pair.
@@ -190,11 +214,7 @@ impl RowProducts {
             seen[0][..together.count].iter().map(|[re, im]| Complex64::new(re * unit, im * unit)).collect()
         };
         let blocks = self.blocks(pairs);
-        blocks
-            .par_iter()
-            .map_init(|| Made::new(self.chunks.len()), of_block)
-            .flatten_iter()
-            .collect()
+        blocks.par_iter().map_init(|| Made::new(self.chunks.len()), of_block).flatten_iter().collect()
     }
 
     /// Chunks of a map, scaled.
@@ -228,21 +248,20 @@ impl RowProducts {
         blocks
     }
 
-    /// Sums of rows times factors, by column, in RING order; `factors` gets each block of rows.
+    /// Sums over blocks of rows, by column, in RING order; `add` gets each block.
     fn sums(
         &self,
         pairs: &[PairGeometry],
         columns: usize,
-        factors: &(dyn Fn(&Together, &Made) -> Factors + Sync),
+        add: &(dyn Fn(&Together, &Made, &mut [ChunkSums]) + Sync),
     ) -> Vec<Vec<f64>> {
         let blocks = self.blocks(pairs);
-        let part = |blocks: &[Together]| -> Vec<Vec<[f64; CHUNK]>> {
+        let part = |blocks: &[Together]| -> Vec<ChunkSums> {
             let mut sums = vec![vec![[0.0; CHUNK]; self.chunks.len()]; columns];
             let mut made = Made::new(self.chunks.len());
             for together in blocks {
                 self.make(pairs, together, &mut made);
-                let factors = factors(together, &made);
-                made.add_to(together.count, &factors, &mut sums);
+                add(together, &made, &mut sums);
             }
             sums
         };
@@ -310,10 +329,7 @@ impl Cap {
 
 impl Made {
     fn new(chunks: usize) -> Self {
-        Self {
-            pieces: vec![[[[0.0; CHUNK]; 2]; ROWS]; chunks],
-            sights: vec![[Sight::Hidden; ROWS]; chunks],
-        }
+        Self { pieces: vec![[[[0.0; CHUNK]; 2]; ROWS]; chunks], sights: vec![[Sight::Hidden; ROWS]; chunks] }
     }
 
     /// The first `count` rows times vectors.
@@ -329,7 +345,7 @@ impl Made {
     }
 
     /// Adds the first `count` rows times their factors.
-    fn add_to(&self, count: usize, factors: &Factors, sums: &mut [Vec<[f64; CHUNK]>]) {
+    fn add_to(&self, count: usize, factors: &Factors, sums: &mut [ChunkSums]) {
         for (k, (pieces, sights)) in self.pieces.iter().zip(&self.sights).enumerate() {
             for (sums, factors) in sums.iter_mut().zip(factors) {
                 accumulate((&pieces[..count], sights), factors, &mut sums[k]);
@@ -454,6 +470,21 @@ fn accumulate(
     }
 }
 
+/// Adds the squares of a chunk of rows times factors to sums.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn add_squares((pieces, sights): (&[Piece], &[Sight; ROWS]), factors: &[f32; ROWS], sums: &mut [f64; CHUNK]) {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
+    for (([re, im], sight), factor) in pieces.iter().zip(sights).zip(factors) {
+        if *sight == Sight::Hidden {
+            continue;
+        }
+        for k in 0..CHUNK {
+            sums[k] += f64::from(factor * fused::<FMA>(re[k], re[k], im[k] * im[k]));
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -514,9 +545,8 @@ mod tests {
                 let pixels = pixel_count(nside);
                 let rows = exact_rows(&pairs, nside, method);
                 let weights: Vec<f64> = (0..pairs.len()).map(|k| 1e-9 * (1.0 + (k % 5) as f64)).collect();
-                let x: [Vec<f64>; 2] = [0.7, 1.9].map(|f: f64| {
-                    (0..pixels).map(|p| 3e4 * ((f * p as f64).sin() + 0.3)).collect()
-                });
+                let x: [Vec<f64>; 2] = [0.7, 1.9]
+                    .map(|f: f64| (0..pixels).map(|p| 3e4 * ((f * p as f64).sin() + 0.3)).collect());
                 let products = RowProducts::new(nside, method).unwrap();
                 assert_eq!(products.pixels(), pixels);
                 let found = products.normal(&pairs, &weights, &[&x[0], &x[1]]);
@@ -548,6 +578,13 @@ mod tests {
                 }
                 let error = difference(&products.adjoint(&pairs, &[&values])[0], &expected);
                 assert!(error < tolerance, "{what}, adjoint: {error:e}");
+                let mut expected = vec![0.0; pixels];
+                for (row, weight) in rows.iter().zip(&weights) {
+                    expected.iter_mut().zip(row).for_each(|(sum, row)| *sum += weight * row.norm_sqr());
+                }
+                let error = difference(&products.diagonal(&pairs, &weights), &expected);
+                // Squares have twice the error.
+                assert!(error < 2.0 * tolerance, "{what}, diagonal: {error:e}");
                 // A column has the bits that it has alone.
                 assert!(products.normal(&pairs, &weights, &[&x[1]])[0] == found[1], "{what}");
             }

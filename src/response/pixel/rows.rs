@@ -163,16 +163,7 @@ impl RowMaker {
         CLASSES.iter().position(|&(longest, _)| pixels_long <= longest)
     }
 
-    /// Directions of the pixels' centres.
-    pub(super) fn directions(&self) -> &Directions {
-        &self.directions
-    }
-
-    /// Order of the pixels.
-    pub(super) fn order(&self) -> PixelOrder {
-        self.order
-    }
-
+    /// The blocks of a class, which are made on first use.
     pub(super) fn class(&self, class: usize) -> &BlockClass {
         self.classes[class].get_or_init(|| {
             let (longest, per_side) = CLASSES[class];
