@@ -70,6 +70,11 @@ impl Provenance {
             EngineKind::Pixel => {
                 let rows = format!("{:?}", map.rows).to_lowercase();
                 cards.push(Card::text("ROWS", &rows, "of B: average over pixels, or centre"));
+                if let Some(convergence) = solution.diagnostics.convergence {
+                    let products = i64::try_from(convergence.iterations).unwrap_or(i64::MAX);
+                    cards.push(Card::integer("PRODUCTS", products, "with rows of B made again"));
+                    cards.push(Card::real("RESIDUAL", convergence.residual, "of the equations, relative"));
+                }
             }
             EngineKind::Harmonic => {
                 let l_max = i64::try_from(map.degree()).unwrap_or(i64::MAX);

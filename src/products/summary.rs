@@ -8,7 +8,7 @@ use super::beam::EffectiveBeam;
 use super::config::PostProcessing;
 use super::latitudes::LatitudeError;
 use super::point_beams::{BeamWidths, PointBeamSummary};
-use crate::solve::{Diagnostics, Refinement};
+use crate::solve::{Convergence, Diagnostics, Refinement};
 
 /// One snapshot.
 #[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
@@ -127,6 +127,18 @@ impl fmt::Display for ChannelSummary {
         }
         if let Some(refinement) = &self.refinement {
             write!(f, "\n             {refinement}")?;
+        } else if let Diagnostics { convergence: Some(convergence), l_max: None, .. } = self.diagnostics {
+            // Pixels without their matrix; one that is held leaves no residual.
+            let Convergence { iterations, residual, converged } = convergence;
+            let ended = if converged {
+                ""
+            } else {
+                ": not converged, more products (map.iterations_max) change the map"
+            };
+            write!(
+                f,
+                "\n             {iterations} products with rows made again, residual {residual:.1e}{ended}"
+            )?;
         }
         if let Some((fwhm_deg, noise_jy)) =
             self.beam.as_ref().and_then(|beam| Some((beam.fwhm_deg?, beam.noise_rms_jy?)))

@@ -190,7 +190,8 @@ impl Stage for Solver {
             }
             SnapshotSums::Remade(visibilities) => {
                 let sums = visibilities.into_sums()?;
-                let start = self.last.remove(&channel);
+                // The final one begins at nothing: its bits are then those of the data, whatever maps there were on the way.
+                let start = self.last.remove(&channel).filter(|_| !is_final);
                 let rule = self.setup.rule;
                 let (solved, unknowns) =
                     match solve_remade(&sums, epsilon, prior.as_deref(), start, rule, watch) {

@@ -1,5 +1,5 @@
-//! Visibilities that a state holds one by one, for maps that are refined with their own positions: whatever the order, the sessions
-//! and the kills, the map is that of the packets.
+//! Visibilities that a state holds one by one, for maps that are refined with their own positions and for maps of pixels without their
+//! matrix: whatever the order, the sessions and the kills, the map is that of the packets.
 
 use std::path::{Path, PathBuf};
 
@@ -8,6 +8,9 @@ use super::{Ground, VISIBILITIES, checkpoints, identity, leave_out, packets};
 
 /// Two passes show all that more would, and an inner solution goes on to where it depends on the sums alone.
 pub const REFINED: &str = "[map]\nengine = \"harmonic\"\nresidual_max = 1e-9\nrefine = { passes_max = 2 }";
+
+/// A dozen products show all that more would: they begin at nothing.
+const REMADE: &str = "[map]\nmatrix = \"remade\"\niterations_max = 12";
 
 fn segments(folder: &str) -> Vec<PathBuf> {
     let mut found: Vec<PathBuf> =
@@ -19,7 +22,16 @@ fn segments(folder: &str) -> Vec<PathBuf> {
 
 #[test]
 fn any_order_and_any_sessions_make_the_same_refined_map() {
-    let place = Ground::with(REFINED);
+    any_order_and_any_sessions_make_the_same(REFINED);
+}
+
+#[test]
+fn any_order_and_any_sessions_make_the_same_map_of_rows_made_again() {
+    any_order_and_any_sessions_make_the_same(REMADE);
+}
+
+fn any_order_and_any_sessions_make_the_same(engine: &str) {
+    let place = Ground::with(engine);
     let file = place.downlink();
     let reach = ["--wait-bytes", "10000000"];
     let once = place.replay("once", &[&file], &reach);
@@ -92,7 +104,16 @@ fn any_order_and_any_sessions_make_the_same_refined_map() {
 
 #[test]
 fn what_is_retracted_leaves_no_trace_in_a_refined_map() {
-    let place = Ground::with(REFINED);
+    what_is_retracted_leaves_no_trace(REFINED);
+}
+
+#[test]
+fn what_is_retracted_leaves_no_trace_in_a_map_of_rows_made_again() {
+    what_is_retracted_leaves_no_trace(REMADE);
+}
+
+fn what_is_retracted_leaves_no_trace(engine: &str) {
+    let place = Ground::with(engine);
     let file = place.downlink();
     place.replay("once", &[&file], &[]);
     let never = place.file("never.ccsds", &leave_out(&file, 21..60));
@@ -112,7 +133,16 @@ fn what_is_retracted_leaves_no_trace_in_a_refined_map() {
 
 #[test]
 fn more_than_may_be_held_is_left_out_and_counted() {
-    let place = Ground::with(REFINED);
+    more_than_may_be_held_is_left_out(REFINED);
+}
+
+#[test]
+fn more_rows_than_may_be_held_are_left_out_and_counted() {
+    more_than_may_be_held_is_left_out(REMADE);
+}
+
+fn more_than_may_be_held_is_left_out(engine: &str) {
+    let place = Ground::with(engine);
     let file = place.downlink();
     let few = ["--set", "map.refine.visibilities_max=200"];
     let summary = place.replay("state", &[&file], &few);

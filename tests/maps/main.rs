@@ -10,5 +10,6 @@ mod epsilon;
 mod exact_sums;
 mod forged;
 mod refined;
+mod remade;
 mod tikhonov;
 mod traces;

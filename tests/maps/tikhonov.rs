@@ -30,10 +30,11 @@ fn difference(found: &[f64], expected: &[f64]) -> f64 {
     found.iter().zip(expected).fold(0.0_f64, |max, (x, y)| max.max((x - y).abs())) / scale
 }
 
-pub fn sums(reference: &Value) -> PixelSums {
+/// The reference's visibilities, one a block, and the setup of their sums.
+pub fn data(reference: &Value) -> (Vec<PlacedVisibilities>, PixelSetup) {
     let array = Array::new(&ArrayConfig::default()).unwrap();
     let frequency_hz = number(&reference["nu_hz"]);
-    let mut engine = PixelEngine::new(PixelSetup {
+    let setup = PixelSetup {
         nside: 4,
         frequency_hz,
         method: PixelMethod::AverageExact,
@@ -42,26 +43,31 @@ pub fn sums(reference: &Value) -> PixelSums {
         companion_seed: 1,
         // A little above the data's. The automatic one resolves sums to 1e-11 here, the solution at 1e-4 to 2e-8.
         weight_max: 3e-9,
-    })
-    .unwrap();
-    for data in reference["data"].as_array().unwrap() {
+    };
+    let block = |data: &Value| {
         let time_s = number(&data["t_s"]);
         let index = |key: &str| data[key].as_u64().unwrap() as usize;
         let pair = Pair::from_one_based(index("i"), index("j")).unwrap();
         let sigma = number(&data["sigma_k_sr"]);
-        let added = engine
-            .add(&PlacedVisibilities {
-                frequency_hz,
-                pair,
-                time_s: vec![time_s],
-                r_i_m: vec![array.position_m(pair.i.into(), time_s)],
-                r_j_m: vec![array.position_m(pair.j.into(), time_s)],
-                value_k_sr: vec![Complex64::new(number(&data["re"]), number(&data["im"]))],
-                weight: vec![sigma.powi(-2)],
-                ..PlacedVisibilities::default()
-            })
-            .unwrap();
-        assert_eq!(added.visibilities, 1);
+        PlacedVisibilities {
+            frequency_hz,
+            pair,
+            time_s: vec![time_s],
+            r_i_m: vec![array.position_m(pair.i.into(), time_s)],
+            r_j_m: vec![array.position_m(pair.j.into(), time_s)],
+            value_k_sr: vec![Complex64::new(number(&data["re"]), number(&data["im"]))],
+            weight: vec![sigma.powi(-2)],
+            ..PlacedVisibilities::default()
+        }
+    };
+    (reference["data"].as_array().unwrap().iter().map(block).collect(), setup)
+}
+
+pub fn sums(reference: &Value) -> PixelSums {
+    let (blocks, setup) = data(reference);
+    let mut engine = PixelEngine::new(setup).unwrap();
+    for block in &blocks {
+        assert_eq!(engine.add(block).unwrap().visibilities, 1);
     }
     engine.into_sums()
 }

@@ -70,14 +70,6 @@ impl RemadeVisibilities {
     }
 }
 
-impl RemadeSums {
-    /// The diagonal of `BtN^-1B`.
-    #[must_use]
-    pub fn diagonal(&self) -> Vec<f64> {
-        self.products.diagonal(&self.pairs, &self.weights)
-    }
-}
-
 impl NormalSums for RemadeSums {
     fn unknowns(&self) -> usize {
         self.products.pixels()

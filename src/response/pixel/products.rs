@@ -184,25 +184,6 @@ impl RowProducts {
         sums
     }
 
-    /// The diagonal of `Bt W B`.
-    #[must_use]
-    pub fn diagonal(&self, pairs: &[PairGeometry], weights: &[f64]) -> Vec<f64> {
-        let largest = weights.iter().copied().fold(0.0, f64::max);
-        let mut sums = self.sums(pairs, 1, &|together, made, sums| {
-            let mut factors = [0.0; ROWS];
-            for (row, factor) in factors.iter_mut().enumerate().take(together.count) {
-                *factor = (weights[together.first + row] / largest) as f32;
-            }
-            for ((pieces, sights), sum) in made.pieces.iter().zip(&made.sights).zip(&mut sums[0]) {
-                add_squares((&pieces[..together.count], sights), &factors, sum);
-            }
-        });
-        let area_sr = pixel_area_sr(self.rows.nside());
-        let mut diagonal = sums.pop().unwrap_or_default();
-        diagonal.iter_mut().for_each(|sum| *sum *= area_sr * area_sr * largest);
-        diagonal
-    }
-
     /// `B x`, by pair.
     #[must_use]
     pub fn forward(&self, pairs: &[PairGeometry], x: &[f64]) -> Vec<Complex64> {
@@ -470,21 +451,6 @@ fn accumulate(
     }
 }
 
-/// Adds the squares of a chunk of rows times factors to sums.
-#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn add_squares((pieces, sights): (&[Piece], &[Sight; ROWS]), factors: &[f32; ROWS], sums: &mut [f64; CHUNK]) {
-    const FMA: bool =
-        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
-    for (([re, im], sight), factor) in pieces.iter().zip(sights).zip(factors) {
-        if *sight == Sight::Hidden {
-            continue;
-        }
-        for k in 0..CHUNK {
-            sums[k] += f64::from(factor * fused::<FMA>(re[k], re[k], im[k] * im[k]));
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -578,13 +544,6 @@ mod tests {
                 }
                 let error = difference(&products.adjoint(&pairs, &[&values])[0], &expected);
                 assert!(error < tolerance, "{what}, adjoint: {error:e}");
-                let mut expected = vec![0.0; pixels];
-                for (row, weight) in rows.iter().zip(&weights) {
-                    expected.iter_mut().zip(row).for_each(|(sum, row)| *sum += weight * row.norm_sqr());
-                }
-                let error = difference(&products.diagonal(&pairs, &weights), &expected);
-                // Squares have twice the error.
-                assert!(error < 2.0 * tolerance, "{what}, diagonal: {error:e}");
                 // A column has the bits that it has alone.
                 assert!(products.normal(&pairs, &weights, &[&x[1]])[0] == found[1], "{what}");
             }
