@@ -69,6 +69,7 @@ pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
     };
     let summary = calibrate(job, interrupt.cancel())?;
     print_notes(&summary.conventions);
+    print_notes(&summary.warnings);
     interrupt.completion(summary.cancelled).after(if args.json {
         print_json_line(&summary)
     } else {

@@ -31,7 +31,7 @@ const MODEL: &str = "--model";
 pub struct CalibrateJob<'a> {
     /// Settings of the ground segment.
     pub config: &'a Config,
-    /// Downlink files in the order of time.
+    /// Downlink files; where they can be read twice, they are taken in the order of their first visibilities.
     pub files: &'a [PathBuf],
     /// Map of the sky for each channel, K; may be empty if an artificial signal is known.
     pub models: Vec<SkyMap>,
@@ -66,6 +66,7 @@ pub fn calibrate(job: CalibrateJob<'_>, cancel: &Cancel) -> Result<CalibrateSumm
     let CalibrateJob { config, files, models, out, watch } = job;
     let solver = &config.calibrate;
     check(config, &models)?;
+    let files = &in_order(files)?[..];
     let _lock = lock_folder(out)?;
     let first = SolverConfig { mode: solver.known_signal(!models.is_empty()), ..solver.clone() };
     let van_vleck = config.calibration.van_vleck()?;
@@ -196,10 +197,14 @@ impl Passes<'_> {
                     return Ok(found);
                 }
                 match frame {
-                    GroundFrame::Instrument(instrument) if found.instrument.is_none() => {
-                        solver.describe(&instrument, self.model_key)?;
-                        found.instrument = Some(instrument);
-                    }
+                    GroundFrame::Instrument(instrument) => match &found.instrument {
+                        None => {
+                            solver.describe(&instrument, self.model_key)?;
+                            found.instrument = Some(instrument);
+                        }
+                        Some(before) if *before == instrument => {}
+                        Some(_) => return Err(self.of_another_instrument(file)),
+                    },
                     GroundFrame::Ephemeris(segment) => {
                         ephemeris.insert(segment);
                     }
@@ -230,11 +235,55 @@ impl Passes<'_> {
         }
         open.close(&mut found, &mut solver, &ephemeris)?;
         if found.instrument.is_none() {
-            let names: Vec<String> = self.files.iter().map(|file| file.display().to_string()).collect();
-            return Err(invalid("downlink", names.join(", "), "files with a description of the instrument"));
+            return Err(invalid("downlink", self.names(), "files with a description of the instrument"));
+        }
+        if found.passes == 0 {
+            return Err(invalid(
+                "downlink",
+                self.names(),
+                "files with visibilities: there is nothing to solve",
+            ));
         }
         Ok(found)
     }
+
+    fn names(&self) -> String {
+        self.files.iter().map(|file| file.display().to_string()).collect::<Vec<_>>().join(", ")
+    }
+
+    fn of_another_instrument(&self, file: &Path) -> PipelineError {
+        let first = self.files.first().map_or_else(String::new, |first| first.display().to_string());
+        let expected =
+            format!("the instrument of {first}, its daughters and channels: one mission at a time");
+        invalid("downlink", file.display(), expected)
+    }
+}
+
+/// Files in the order of their first visibilities: solutions are found pass by pass. Those without come last; where one cannot be
+/// read twice, all stay as they are.
+fn in_order(files: &[PathBuf]) -> Result<Vec<PathBuf>, PipelineError> {
+    let is_repeatable = |file: &PathBuf| std::fs::metadata(file).is_ok_and(|found| found.is_file());
+    if files.len() < 2 || !files.iter().all(is_repeatable) {
+        return Ok(files.to_vec());
+    }
+    let mut begun = files
+        .iter()
+        .map(|file| Ok((first_s(file)?, file.clone())))
+        .collect::<Result<Vec<(f64, PathBuf)>, PipelineError>>()?;
+    begun.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+    Ok(begun.into_iter().map(|(_, file)| file).collect())
+}
+
+/// Time of the first visibilities of a file, s.
+fn first_s(file: &Path) -> Result<f64, PipelineError> {
+    let mut reader = DownlinkReader::open(file)?;
+    while let Some(frame) = reader.next_frame()? {
+        match frame {
+            GroundFrame::Visibilities(block) if !block.is_empty() => return Ok(block.middle_s(0)),
+            _ => {}
+        }
+    }
+    Ok(f64::INFINITY)
 }
 
 /// Root mean square of the relative change of gains that are good in both.

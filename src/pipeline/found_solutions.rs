@@ -60,6 +60,8 @@ pub struct CalibrateSummary {
     pub events: Vec<InstrumentEvent>,
     /// What the data do not determine, and what decides it.
     pub conventions: Vec<String>,
+    /// What may be wrong, and how to mend it.
+    pub warnings: Vec<String>,
     /// Whether it was ended early; nothing is written then.
     pub cancelled: bool,
 }
@@ -135,7 +137,8 @@ impl FoundSolutions {
         map_cl_k2: Vec<Vec<f64>>,
     ) -> CalibrateRound {
         let mean = |held_out: bool| {
-            let of = self.solutions.iter().filter(|solution| solution.is_held_out == held_out);
+            // A part of a pass may have no data.
+            let of = self.solutions.iter().filter(|one| one.is_held_out == held_out && one.visibilities > 0);
             let (sum, count) = of.fold((0.0, 0.0), |(sum, count), one| (sum + one.chi_square, count + 1.0));
             (count > 0.0).then(|| sum / count)
         };
@@ -147,6 +150,26 @@ impl FoundSolutions {
             chi_square_held_out: mean(true),
             map_cl_k2,
         }
+    }
+
+    /// What of the data is not in them, and why.
+    fn warnings(&self, solver: &SolverConfig) -> Vec<String> {
+        let mut warnings = Vec::new();
+        if self.late > 0 {
+            warnings.push(format!(
+                "{} visibilities came after later passes had been solved and are in no solution: give files whose times do not overlap",
+                self.late
+            ));
+        }
+        let gains = self.solutions.iter().flat_map(|one| &one.daughters).flat_map(|daughter| &daughter.gains);
+        if !self.solutions.is_empty() && gains.clone().all(|gain| gain.state != GainState::Good) {
+            warnings.push(format!(
+                "no gain is good, so that a replay with them maps nothing: the reference (calibrate.reference_daughter = {}) has to have \
+                 data, and the model has to be that of the data (chi-square)",
+                solver.reference_daughter
+            ));
+        }
+        warnings
     }
 
     /// What is told of them.
@@ -176,6 +199,7 @@ impl FoundSolutions {
             phase_sigma_deg: (0..channels).map(|c| (0..satellites).map(|n| median(c, n)).collect()).collect(),
             events: instrument_events(&self.solutions),
             conventions: solver.conventions(&frequencies_hz),
+            warnings: self.warnings(solver),
             ..CalibrateSummary::default()
         }
     }

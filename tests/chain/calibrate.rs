@@ -4,6 +4,7 @@ use crate::common;
 
 use std::path::Path;
 
+use common::downlink::{packets_of, pass_ends};
 use common::workplace::{Workplace, fail, json, succeed};
 
 /// Eight daughters whose data are direct sums over the map's own pixels, so that the input is a perfect model.
@@ -292,5 +293,45 @@ fn what_does_not_fit_is_refused() {
     assert!(said(&["--set", "calibrate.mode=beacon"]).contains("calibrate.beacon_k_sr = 0"));
     let zero = ["calibrate.phase_sigma_deg=0", "calibrate.amplitude_sigma=0"];
     assert!(said(&["--set", zero[0], "--set", zero[1]]).contains("something to solve for"));
+    assert!(!Path::new(&format!("{out}/gains.json")).exists());
+}
+
+#[test]
+fn files_are_of_one_instrument_and_taken_in_the_order_of_time() {
+    let place = Workplace::new(SMALL);
+    let run = command(&place, "run", "spoilt", &GAINS);
+    let bytes = std::fs::read(format!("{run}/downlink.ccsds")).unwrap();
+    let packets = packets_of(&bytes);
+    let ends = pass_ends(&packets);
+    // The first packet describes the instrument.
+    let middle = (packets.len() / 2..packets.len()).find(|&k| ends[k - 1]).unwrap();
+    let first = place.file("first.ccsds", &packets[..middle].concat());
+    let second = place.file("second.ccsds", &[&packets[..1], &packets[middle..]].concat().concat());
+    let models = inputs(&run);
+    let gains = |files: &[&str], name: &str| {
+        let out = place.path(name);
+        let mut args = vec!["calibrate"];
+        args.extend(files);
+        args.extend(["--map", &place.pipeline, "--out", &out, "--json", "--model"]);
+        args.extend(models.iter().map(String::as_str));
+        let summary: serde_json::Value = serde_json::from_str(&succeed(&args)).unwrap();
+        assert_eq!((&summary["late"], &summary["warnings"]), (&0.into(), &serde_json::json!([])));
+        std::fs::read_to_string(format!("{out}/gains.json")).unwrap()
+    };
+    let expected = gains(&[&format!("{run}/downlink.ccsds")], "one");
+    assert!(gains(&[&second, &first], "two") == expected);
+
+    let other = command(&place, "simulate", "other.ccsds", &["spacecraft.channels_hz=[3e6]"]);
+    let out = place.path("refused");
+    let said = |files: &[&str]| {
+        let models: Vec<&str> = models.iter().map(String::as_str).collect();
+        let args = [&["calibrate"], files, &["--map", &place.pipeline, "--out", &out, "--model"], &models];
+        fail(&args.concat())
+    };
+    let told = said(&[&first, &other]);
+    assert!(told.contains("one mission at a time") && told.contains("other.ccsds"), "{told}");
+    let described = place.file("described.ccsds", &packets[0]);
+    let told = said(&[&described]);
+    assert!(told.contains("there is nothing to solve"), "{told}");
     assert!(!Path::new(&format!("{out}/gains.json")).exists());
 }

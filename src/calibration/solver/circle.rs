@@ -11,6 +11,7 @@ use crate::response::model::{
     DirectSum, HarmonicSum, HarmonicSumSetup, ModelError, PairPosition, VisibilityModel,
 };
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method};
+use crate::sky::healpix::pixel_count;
 use crate::sky::{Frame, MapError, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
@@ -23,12 +24,19 @@ const WAVELENGTHS_MAX: f64 = 320.0;
 /// Greatest nside whose tables are made: 0.7 GB, and 0.4 GB a channel.
 pub(super) const NSIDE_MAX: usize = 256;
 
-/// Phase of the longest baseline's fringe by which a pair may be off its circle, rad: half a percent of a turn in a hundred.
+/// Phase by which a pair may be off its circle, rad: that of its fringe, and of what the limb of the Moon moves by.
 const PHASE_RAD_MAX: f64 = 1e-3;
 
 /// Circles are multiples of these, far less than what matters, so that a pass has the circle of the one before.
-const INCLINATION_STEP_DEG: f64 = 1e-5;
+const INCLINATION_STEP_DEG: f64 = 5e-5;
 const RADIUS_STEP_M: f64 = 1.0;
+
+/// Longest chord of a circle that is taken, radii.
+const CHORD_MAX: f64 = 1.99;
+
+/// Visibilities times pixels from which the tables of a circle are worth their making: sums over the pixels take 1 ns each, the tables
+/// a second and more for all passes of a mission on one circle.
+const PRODUCTS_MIN: usize = 50_000_000;
 
 /// A circular orbit.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -38,19 +46,41 @@ struct Circle {
 }
 
 impl Circle {
-    /// The circle of a pair, taken as prograde.
-    fn of(position: &PairPosition) -> Option<Self> {
-        let found = PairOrientation::of(position.r_i_m, position.r_j_m).ok()?;
-        let inclination_deg = found.inclination_rad.min(PI - found.inclination_rad).to_degrees();
+    /// The circle of a pass, taken as prograde: that of its longer baselines up to `baseline_m_max`, whose planes are known best.
+    fn of(pairs: &[Option<PairOrientation>], baseline_m_max: f64) -> Option<Self> {
+        let within = |pair: &&PairOrientation| pair.baseline_m <= baseline_m_max;
+        let pairs: Vec<&PairOrientation> = pairs.iter().flatten().filter(within).collect();
+        let longest_m = pairs.iter().map(|pair| pair.baseline_m).fold(0.0, f64::max);
+        let long = || pairs.iter().filter(|pair| pair.baseline_m >= 0.5 * longest_m);
+        let inclination_deg = median(long().map(|pair| prograde_rad(pair).to_degrees()).collect())?;
         Some(Self {
             inclination_deg: (inclination_deg / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG,
-            radius_m: (found.radius_m / RADIUS_STEP_M).round() * RADIUS_STEP_M,
+            radius_m: (median(long().map(|pair| pair.radius_m).collect())? / RADIUS_STEP_M).round()
+                * RADIUS_STEP_M,
         })
+    }
+
+    /// Whether a pair is on it, but for a phase that does not matter.
+    fn holds(&self, pair: &PairOrientation, wavelength_m: f64) -> bool {
+        let tilt_rad = (prograde_rad(pair) - self.inclination_rad()).abs();
+        let off_rad = tilt_rad + pair.radius_difference_m.abs() / pair.baseline_m;
+        (pair.radius_m - self.radius_m).abs() <= RADIUS_STEP_M
+            && off_rad * TAU * (pair.baseline_m / wavelength_m + 1.0) <= PHASE_RAD_MAX
     }
 
     fn inclination_rad(&self) -> f64 {
         self.inclination_deg.to_radians()
     }
+}
+
+/// Inclination of a pair's plane, rad, whichever satellite leads.
+fn prograde_rad(pair: &PairOrientation) -> f64 {
+    pair.inclination_rad.min(PI - pair.inclination_rad)
+}
+
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 /// The rotations of a circle, which channels share.
@@ -79,13 +109,15 @@ pub(super) struct CircleSky {
     frequency_hz: f64,
     moon_radius_m: f64,
     response: AntennaResponse,
+    /// Visibilities of a pass times pixels from which there are tables.
+    products_min: usize,
     /// Of the circle seen last.
     made: Option<(Circle, HarmonicSum)>,
     elsewhere: DirectSum,
 }
 
 impl CircleSky {
-    /// The sky of `map` (K) to degree 5/2 nside.
+    /// The sky of `map` (K) to degree 5/2 nside; by tables always, or where they save time.
     ///
     /// # Errors
     /// A map with pixels that have no value.
@@ -94,6 +126,7 @@ impl CircleSky {
         frequency_hz: f64,
         moon_radius_m: f64,
         response: AntennaResponse,
+        always: bool,
     ) -> Result<Self, MapError> {
         let nside = map.nside();
         let alm = map.harmonics(5 * nside / 2, &AnalysisOptions { method: Method::ACCURATE })?;
@@ -102,10 +135,11 @@ impl CircleSky {
             frame => alm.rotated(&frame.to_ecliptic()),
         };
         let elsewhere = DirectSum::new(map, frequency_hz, moon_radius_m, response);
-        Ok(Self { alm, nside, frequency_hz, moon_radius_m, response, made: None, elsewhere })
+        let products_min = if always { 0 } else { PRODUCTS_MIN };
+        Ok(Self { alm, nside, frequency_hz, moon_radius_m, response, products_min, made: None, elsewhere })
     }
 
-    /// Visibilities of positions, K sr. The circle is that of the first; what is not on it is summed over pixels.
+    /// Visibilities of the positions of a pass, K sr: those on its circle by harmonics if they are many, all others by sums over pixels.
     ///
     /// # Errors
     /// Positions that neither covers.
@@ -114,19 +148,41 @@ impl CircleSky {
         positions: &[PairPosition],
         rotations: &mut Rotations,
     ) -> Result<Vec<Complex64>, ModelError> {
-        let covered = match positions.iter().find_map(Circle::of) {
-            Some(circle) if circle.radius_m > self.moon_radius_m => {
-                self.on(circle, rotations)?.predict_covered(positions)?
+        let wavelength_m = SPEED_OF_LIGHT_M_S / self.frequency_hz;
+        let longest_m = self.wavelengths_max() * wavelength_m;
+        let pairs: Vec<Option<PairOrientation>> =
+            positions.iter().map(|at| PairOrientation::of(at.r_i_m, at.r_j_m).ok()).collect();
+        let circle = Circle::of(&pairs, longest_m).filter(|circle| circle.radius_m > self.moon_radius_m);
+        let is_on = |pair: &Option<PairOrientation>| match (circle, pair) {
+            (Some(circle), Some(pair)) => {
+                pair.baseline_m <= longest_m.min(CHORD_MAX * circle.radius_m)
+                    && circle.holds(pair, wavelength_m)
             }
-            _ => vec![None; positions.len()],
+            _ => false,
         };
-        let off =
-            |(position, found): (&PairPosition, &Option<Complex64>)| found.is_none().then_some(*position);
-        let rest: Vec<PairPosition> = positions.iter().zip(&covered).filter_map(off).collect();
-        let mut summed = vec![Complex64::ZERO; rest.len()];
-        self.elsewhere.predict(&rest, &mut summed)?;
-        let mut summed = summed.into_iter();
-        Ok(covered.into_iter().map(|found| found.or_else(|| summed.next()).unwrap_or_default()).collect())
+        let mut on: Vec<bool> = pairs.iter().map(is_on).collect();
+        let count = on.iter().filter(|on| **on).count();
+        if count * pixel_count(self.nside) < self.products_min {
+            on.fill(false);
+        }
+        let chosen = |which: bool| -> Vec<PairPosition> {
+            positions.iter().zip(&on).filter(|(_, on)| **on == which).map(|(position, _)| *position).collect()
+        };
+        let (on_it, off_it) = (chosen(true), chosen(false));
+        let [mut found, mut summed] =
+            [&on_it, &off_it].map(|positions| vec![Complex64::ZERO; positions.len()]);
+        if let (Some(circle), false) = (circle, on_it.is_empty()) {
+            self.on(circle, rotations)?.predict(&on_it, &mut found)?;
+        }
+        self.elsewhere.predict(&off_it, &mut summed)?;
+        let (mut found, mut summed) = (found.into_iter(), summed.into_iter());
+        let next = |on: bool| if on { found.next() } else { summed.next() };
+        Ok(on.into_iter().map(next).map(Option::unwrap_or_default).collect())
+    }
+
+    /// Longest baseline of the tables, wavelengths.
+    fn wavelengths_max(&self) -> f64 {
+        (WAVELENGTHS_OF_NSIDE * self.nside as f64).min(WAVELENGTHS_MAX)
     }
 
     /// The model on a circle.
@@ -140,10 +196,7 @@ impl CircleSky {
 
     fn sum(&self, circle: Circle, rotations: &mut Rotations) -> Result<HarmonicSum, ModelError> {
         let wavelength_m = SPEED_OF_LIGHT_M_S / self.frequency_hz;
-        let u_max = (WAVELENGTHS_OF_NSIDE * self.nside as f64)
-            .min(WAVELENGTHS_MAX)
-            .min(1.99 * circle.radius_m / wavelength_m);
-        let off_deg = (PHASE_RAD_MAX / (TAU * u_max)).to_degrees();
+        let u_max = self.wavelengths_max().min(CHORD_MAX * circle.radius_m / wavelength_m);
         let setup = HarmonicSumSetup {
             frequency_hz: self.frequency_hz,
             orbit_radius_m: circle.radius_m,
@@ -151,11 +204,12 @@ impl CircleSky {
             moon_radius_m: self.moon_radius_m,
             baseline_wavelengths_max: u_max,
             response: self.response,
+            // What is on the circle was decided before.
             limits: GeometryLimits {
-                out_of_track_deg_max: off_deg,
+                out_of_track_deg_max: 1.0,
                 inclination_deg_max: 0.0,
-                altitude_m_max: RADIUS_STEP_M,
-                radial_deg_max: off_deg,
+                altitude_m_max: 2.0 * RADIUS_STEP_M,
+                radial_deg_max: 1.0,
             },
         };
         HarmonicSum::new(self.alm.clone(), setup, rotations.of(circle, self.alm.l_max()))
@@ -194,6 +248,9 @@ mod tests {
         SkyMap::new(Frame::Ecliptic, values).unwrap()
     }
 
+    /// Enough visibilities for tables at nside 64.
+    const MANY: usize = 1100;
+
     /// Two daughters of an array over part of an orbit.
     fn pass(array: &Array, [i, j]: [usize; 2]) -> Vec<PairPosition> {
         let at = |t_s: f64| PairPosition {
@@ -202,36 +259,69 @@ mod tests {
             span_rad: 0.0,
             at: None,
         };
-        (0..60).map(|k| at(1000.0 + 20.0 * f64::from(k))).collect()
+        (0..MANY).map(|k| at(1000.0 + 1.1 * k as f64)).collect()
+    }
+
+    /// The same, with the first further from the Moon.
+    fn raised(array: &Array, pair: [usize; 2], by_m: f64) -> Vec<PairPosition> {
+        let raise = |position: PairPosition| {
+            let r_i_m = add(position.r_i_m, scale(by_m, unit(position.r_i_m)));
+            PairPosition { r_i_m, ..position }
+        };
+        pass(array, pair).into_iter().map(raise).collect()
+    }
+
+    fn direct(array: &Array, nside: usize, positions: &[PairPosition]) -> Vec<Complex64> {
+        let mut sum = DirectSum::new(&sky(nside), FREQUENCY_HZ, array.moon_radius_m(), ISOTROPIC);
+        let mut values = vec![Complex64::ZERO; positions.len()];
+        sum.predict(positions, &mut values).unwrap();
+        values
     }
 
     fn circle_sky(array: &Array) -> CircleSky {
-        CircleSky::new(&sky(64), FREQUENCY_HZ, array.moon_radius_m(), ISOTROPIC).unwrap()
+        CircleSky::new(&sky(64), FREQUENCY_HZ, array.moon_radius_m(), ISOTROPIC, false).unwrap()
     }
 
     fn bits(values: &[Complex64]) -> Vec<[u64; 2]> {
         values.iter().map(|value| [value.re.to_bits(), value.im.to_bits()]).collect()
     }
 
-    #[test]
-    fn pairs_on_a_circle_have_the_visibilities_of_sums_over_fine_pixels() {
+    /// Requires visibilities of the sky; one of every `step` is looked at.
+    fn assert_of_the_sky(array: &Array, positions: &[PairPosition], found: &[Complex64], step: usize) {
         const FINE: usize = 256;
-        let array = array();
-        let positions = pass(&array, [0, 1]);
-        let mut sky_of_circle = circle_sky(&array);
-        let found = sky_of_circle.predict(&positions, &mut Rotations::default()).unwrap();
-        let mut direct = DirectSum::new(&sky(FINE), FREQUENCY_HZ, array.moon_radius_m(), ISOTROPIC);
-        let mut expected = vec![Complex64::ZERO; positions.len()];
-        direct.predict(&positions, &mut expected).unwrap();
+        let some: Vec<PairPosition> = positions.iter().step_by(step).copied().collect();
+        let expected = direct(array, FINE, &some);
         // Direct sums count the 4 nside pixels on the limb whole: half a pixel each, at random, of some 12 K.
         let limb = 0.5 * (4.0 * FINE as f64).sqrt() * pixel_area_sr(FINE) * 12.0;
-        for (found, expected) in found.iter().zip(&expected) {
+        for (found, expected) in found.iter().step_by(step).zip(&expected) {
             assert!((found - expected).norm() < 4.0 * limb, "{found} {expected} {limb}");
         }
         // It is not all limb.
         let power = expected.iter().map(Complex64::norm_sqr).sum::<f64>() / expected.len() as f64;
         assert!(power.sqrt() > 20.0 * limb, "{power}");
+    }
+
+    #[test]
+    fn pairs_on_a_circle_have_the_visibilities_of_sums_over_fine_pixels() {
+        let array = array();
+        let positions = pass(&array, [0, 1]);
+        let mut sky_of_circle = circle_sky(&array);
+        let found = sky_of_circle.predict(&positions, &mut Rotations::default()).unwrap();
+        assert_of_the_sky(&array, &positions, &found, 20);
         assert!(sky_of_circle.made.is_some());
+    }
+
+    #[test]
+    fn a_phase_that_does_not_matter_leaves_a_pair_on_its_circle() {
+        let array = array();
+        // 1 mm of 100 m, 1e-5 rad: 2e-4 rad of phase at 10 MHz. A longer pair tells the plane.
+        let mut positions = pass(&array, [0, 3]);
+        positions.extend(raised(&array, [0, 1], 1e-3));
+        let mut sky_of_circle = circle_sky(&array);
+        let found = sky_of_circle.predict(&positions, &mut Rotations::default()).unwrap();
+        let summed = direct(&array, 64, &positions);
+        assert!(found.iter().zip(&summed).all(|(found, summed)| found != summed));
+        assert_of_the_sky(&array, &positions[MANY..], &found[MANY..], 50);
     }
 
     #[test]
@@ -242,22 +332,31 @@ mod tests {
         let longest = pass(&array, [0, 7]);
         assert!(norm(sub(longest[0].r_i_m, longest[0].r_j_m)) > 2.5 * 64.0 * wavelength_m);
         positions.extend(longest);
-        // A metre away from the Moon, of one.
         let moved = positions.len();
-        positions.extend(pass(&array, [0, 1]).into_iter().map(|position| {
-            let r_i_m = add(position.r_i_m, scale(1.0, unit(position.r_i_m)));
-            PairPosition { r_i_m, ..position }
-        }));
+        positions.extend(raised(&array, [0, 1], 1.0));
         let mut sky_of_circle = circle_sky(&array);
         let found = sky_of_circle.predict(&positions, &mut Rotations::default()).unwrap();
-        let mut direct = DirectSum::new(&sky(64), FREQUENCY_HZ, array.moon_radius_m(), ISOTROPIC);
-        let mut expected = vec![Complex64::ZERO; positions.len()];
-        direct.predict(&positions, &mut expected).unwrap();
-        assert_eq!(bits(&found[60..]), bits(&expected[60..]));
-        assert!(found[..60].iter().zip(&expected[..60]).all(|(found, expected)| found != expected));
-        // The last sixty by themselves: no circle fits them, not even their own.
-        let alone = sky_of_circle.predict(&positions[moved..], &mut Rotations::default()).unwrap();
-        assert_eq!(bits(&alone), bits(&expected[moved..]));
+        let expected = direct(&array, 64, &positions);
+        assert_eq!(bits(&found[MANY..]), bits(&expected[MANY..]));
+        assert!(found[..MANY].iter().zip(&expected[..MANY]).all(|(found, expected)| found != expected));
+        // The last by themselves: no circle fits them, not even their own, and none is made.
+        let mut alone = circle_sky(&array);
+        let found = alone.predict(&positions[moved..], &mut Rotations::default()).unwrap();
+        assert_eq!(bits(&found), bits(&expected[moved..]));
+        assert!(alone.made.is_none());
+    }
+
+    #[test]
+    fn few_are_summed_over_pixels_sooner_than_tables_are_made() {
+        let array = array();
+        let positions = &pass(&array, [0, 1])[..100];
+        let mut sky_of_circle = circle_sky(&array);
+        let found = sky_of_circle.predict(positions, &mut Rotations::default()).unwrap();
+        assert_eq!(bits(&found), bits(&direct(&array, 64, positions)));
+        assert!(sky_of_circle.made.is_none());
+        let mut always =
+            CircleSky::new(&sky(64), FREQUENCY_HZ, array.moon_radius_m(), ISOTROPIC, true).unwrap();
+        assert_ne!(bits(&always.predict(positions, &mut Rotations::default()).unwrap()), bits(&found));
     }
 
     #[test]

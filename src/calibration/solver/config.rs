@@ -40,7 +40,8 @@ pub enum AmplitudeScale {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum SkyModel {
-    /// Harmonics for maps of nside 64 to 256 whose pixels are not split, without positions to solve for; else direct sums.
+    /// Harmonics for maps of nside 64 to 256 whose pixels are not split, without positions to solve for, in passes with enough
+    /// visibilities on one circle (1,000 at nside 64); else direct sums.
     #[default]
     Auto,
     /// Sums over the map's pixels.

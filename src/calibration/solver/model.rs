@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use num_complex::Complex64;
 
 use super::circle::{CircleSky, Rotations};
-use super::config::{CalibrationMode, SolverConfig};
+use super::config::{CalibrationMode, SkyModel, SolverConfig};
 use super::sums::{MODEL_TERMS, ModelTerms};
 use crate::array::{track_axes, track_offset_m};
 use crate::frames::{Channel, Instrument, PlacedVisibilities};
@@ -67,7 +67,8 @@ impl KnownSignal {
             Ok(match moves {
                 true => ChannelSky::Gradient(DirectMoments::new(&map, hz, moon_m, response)),
                 false if config.is_harmonic(map.nside()) => {
-                    ChannelSky::Circle(Box::new(CircleSky::new(&map, hz, moon_m, response)?))
+                    let always = config.sky_model == SkyModel::Harmonic;
+                    ChannelSky::Circle(Box::new(CircleSky::new(&map, hz, moon_m, response, always)?))
                 }
                 false => ChannelSky::Value(DirectSum::new(&map, hz, moon_m, response)),
             })

@@ -98,29 +98,6 @@ impl HarmonicSum {
     fn states(&self, positions: &[PairPosition]) -> Result<Vec<(PairState, bool)>, GeometryRefusal> {
         positions.par_iter().with_min_len(POSITIONS_PER_TASK).map(|position| self.state(position)).collect()
     }
-
-    /// Predicts the visibility (K sr) of each position that the model covers: on its circle within the limits, up to its longest
-    /// baseline.
-    ///
-    /// # Errors
-    /// [`ModelError::Harmonic`].
-    pub fn predict_covered(
-        &mut self,
-        positions: &[PairPosition],
-    ) -> Result<Vec<Option<Complex64>>, ModelError> {
-        let u_max = self.setup.baseline_wavelengths_max;
-        let covered = |position: &PairPosition| {
-            self.state(position).ok().filter(|(state, _)| state.baseline_wavelengths <= u_max)
-        };
-        let found: Vec<Option<(PairState, bool)>> =
-            positions.par_iter().with_min_len(POSITIONS_PER_TASK).map(covered).collect();
-        let states: Vec<PairState> = found.iter().flatten().map(|(state, _)| *state).collect();
-        let mut values = vec![Complex64::ZERO; states.len()];
-        self.model.visibilities(&states, &mut values).map_err(|source| harmonic(&self.setup, source))?;
-        let mut values = values.into_iter();
-        let turned = |(_, reversed), value: Complex64| if reversed { value.conj() } else { value };
-        Ok(found.into_iter().map(|found| Some(turned(found?, values.next()?))).collect())
-    }
 }
 
 fn harmonic(setup: &HarmonicSumSetup, source: HarmonicError) -> ModelError {

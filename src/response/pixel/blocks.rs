@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::CHILDREN;
 use super::exact::child_directions;
-use super::rows::PixelOrder;
+use super::order::PixelOrder;
 use crate::sky::healpix;
 use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
 

@@ -26,6 +26,7 @@ mod edge;
 pub mod exact;
 mod geometry;
 mod kernel;
+mod order;
 mod products;
 mod rows;
 mod sums;

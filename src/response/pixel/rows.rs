@@ -9,6 +9,7 @@ use super::blocks::{BlockClass, BlockGroup, BlockSet, GROUP};
 use super::edge::cut_mean;
 use super::exact::child_directions;
 use super::kernel::{CHUNK, Prepared, dot64};
+use super::order::PixelOrder;
 use super::{CHILDREN, Directions, PairGeometry, PixelMethod, ResponseError, exact};
 use crate::sky::healpix;
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn};
@@ -50,25 +51,6 @@ impl RowValue for f64 {
     #[inline(always)]
     fn of_f64(value: f64) -> Self {
         value
-    }
-}
-
-/// Order of the pixels in a row.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum PixelOrder {
-    /// As maps have them.
-    Ring,
-    /// Neighbours together, so that the Moon hides many of them at once.
-    Nested,
-}
-
-impl PixelOrder {
-    /// RING number of the pixel at a place of a row.
-    pub(super) fn ring(self, nside: usize, place: usize) -> usize {
-        match self {
-            Self::Ring => place,
-            Self::Nested => healpix::nested_to_ring(nside, place),
-        }
     }
 }
 
