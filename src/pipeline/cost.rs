@@ -168,7 +168,8 @@ impl Plan {
             .collect();
         let simulation_memory_bytes = self.simulation_bytes(sent, &nsides)
             + channels.iter().map(|channel| channel.simulation.bytes).sum::<f64>();
-        let memory_bytes = memory_bytes(simulation_memory_bytes, &engines, solutions);
+        let memory_bytes =
+            memory_bytes(simulation_memory_bytes, &engines, solutions) + self.known_sky_bytes();
         let sampling_s = self.sampling_s();
         let simulating_s: f64 =
             sampling_s.unwrap_or_else(|| channels.iter().map(ChannelCost::simulation_s).sum());

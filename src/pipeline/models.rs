@@ -10,6 +10,8 @@ use rayon::prelude::*;
 use super::error::PipelineError;
 use super::plan::{Expected, Plan};
 use crate::array::Array;
+use crate::calibration::CalibrationHook;
+use crate::calibration::solver::{CalibrationMode, known_wavelengths_max};
 use crate::frames::ObservingWindow;
 use crate::mother::{ChannelModel, Fidelity, MoonMirror, Schedule};
 use crate::response::harmonic::{GeometryLimits, RotationTable};
@@ -19,6 +21,7 @@ use crate::response::model::{
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
+use crate::sky::healpix::pixel_count;
 use crate::sky::{Frame, MapError, SkyConfig, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, norm, sub};
@@ -82,7 +85,35 @@ impl Plan {
         };
         (0..self.schedules.len()).map(nside).collect()
     }
+
+    /// Memory of the known sky from whose visibilities gains are found while the data arrive, bytes; what cannot be read counts nothing.
+    pub(super) fn known_sky_bytes(&self) -> f64 {
+        let solver = &self.config.calibrate;
+        if self.config.calibration.hook != CalibrationHook::Solve || solver.mode == CalibrationMode::Beacon {
+            return 0.0;
+        }
+        let bytes = |nside: usize| {
+            let map = DIRECTION_BYTES * pixel_count(nside.max(solver.model_nside)) as f64;
+            let load = Load {
+                visibilities: 0.0,
+                sky_nside: nside,
+                baseline_wavelengths_max: known_wavelengths_max(nside),
+                l_max: 5 * nside / 2,
+                smeared: false,
+                circle: true,
+            };
+            map + if solver.is_harmonic(nside) {
+                ModelPlan::new(ModelChoice::Harmonic, load).bytes
+            } else {
+                0.0
+            }
+        };
+        solver.models().unwrap_or_default().iter().map(|map| bytes(map.nside())).sum()
+    }
 }
+
+/// Memory of a pixel of a direct sum, bytes: its direction, and its value twice.
+const DIRECTION_BYTES: f64 = 40.0;
 
 /// The longest baseline of a schedule, wavelengths. The limit holds at the start of an integration; until its middle a
 /// baseline moves by less than the rule allows. Without a formation satellites are `apart_m` apart at most.

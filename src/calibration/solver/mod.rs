@@ -48,6 +48,7 @@ mod table;
 #[cfg(test)]
 mod tests;
 
+pub use circle::wavelengths_max as known_wavelengths_max;
 pub use config::{AmplitudeScale, CalibrationMode, SkyModel, SolverConfig};
 pub use model::{KnownSignal, Offsets};
 pub use monitor::{InstrumentEvent, instrument_events};

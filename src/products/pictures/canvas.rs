@@ -39,7 +39,7 @@ impl Rect {
 }
 
 /// How a line is drawn.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Stroke {
     pub colour: Colour,
     /// Opacity, 0-1.

@@ -7,8 +7,8 @@ use super::png_file::Picture;
 use super::text::{Align, Style};
 use super::{labels, text};
 
-/// Colours that colour-blind readers can tell apart (Okabe & Ito 2008).
-const COLOURS: [Colour; 7] = [
+/// Colours that colour-blind readers can tell apart (Okabe & Ito 2008, and the wine of Tol 2021), one a daughter.
+const COLOURS: [Colour; 8] = [
     [0, 114, 178],
     [213, 94, 0],
     [0, 158, 115],
@@ -16,6 +16,7 @@ const COLOURS: [Colour; 7] = [
     [230, 159, 0],
     [86, 180, 233],
     [80, 80, 86],
+    [136, 34, 85],
 ];
 
 /// A curve.
@@ -92,6 +93,7 @@ pub fn draw_plots(title: &str, plots: &[Plot], columns: usize) -> Result<Picture
 }
 
 /// An axis with fixed limits.
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Range {
     pub low: f64,
     pub high: f64,
@@ -151,15 +153,34 @@ fn draw_plot(canvas: &mut Canvas, share: Rect, plot: &Plot) {
         .fold(0.0, f64::max);
     let top = if plot.title.is_empty() { 24.0 } else { 52.0 };
     let left = 3.4 * FONT + widest;
-    let frame = Rect {
+    let whole = Rect {
         x: share.x + left,
         y: share.y + top,
         width: share.width - left - 36.0,
         height: share.height - top - 78.0,
     };
-    let to_page = |x: f64, y: f64| {
-        (frame.x + x_range.place(x) * frame.width, frame.bottom() - y_range.place(y) * frame.height)
+    let on_page = |frame: Rect| {
+        move |x: f64, y: f64| {
+            (frame.x + x_range.place(x) * frame.width, frame.bottom() - y_range.place(y) * frame.height)
+        }
     };
+    let drawn_in = |frame: Rect| -> Vec<Vec<(f64, f64)>> {
+        let place = on_page(frame);
+        plot.curves.iter().map(|curve| curve.points.iter().map(|&(x, y)| place(x, y)).collect()).collect()
+    };
+    let legend = Legend::new(plot);
+    // Inside where it hides nothing, else beside the frame.
+    let (frame, corner) = match legend.size() {
+        None => (whole, None),
+        Some(size) => match free_corner(whole, size, &drawn_in(whole)) {
+            Some(corner) => (whole, Some(corner)),
+            None => {
+                let frame = Rect { width: whole.width - size.0 - LEGEND_INSET, ..whole };
+                (frame, Some((frame.right() + LEGEND_INSET, frame.y)))
+            }
+        },
+    };
+    let (to_page, drawn) = (on_page(frame), drawn_in(frame));
 
     grid(canvas, frame, &x_ticks, &y_ticks, &to_page);
     canvas.set_clip(Some(frame));
@@ -170,19 +191,24 @@ fn draw_plot(canvas: &mut Canvas, share: Rect, plot: &Plot) {
             Stroke { dash: Some((3.0, 4.0)), ..Stroke::solid(INK, 0.7, 1.2) },
         );
     }
-    let drawn: Vec<Vec<(f64, f64)>> =
-        plot.curves.iter().map(|curve| curve.points.iter().map(|&(x, y)| to_page(x, y)).collect()).collect();
     for (number, (curve, line)) in plot.curves.iter().zip(&drawn).enumerate() {
         canvas.polyline(line, stroke_of(number, curve));
     }
     canvas.set_clip(None);
     canvas.outline(frame, Stroke::solid(INK, 1.0, 1.2));
     write_axes(canvas, frame, plot, &x_ticks, &y_ticks, &to_page);
-    legend(canvas, frame, plot, &drawn);
+    if let Some(corner) = corner {
+        legend.draw(canvas, corner);
+    }
 }
 
+/// Curves beyond the number of colours are dotted, so that no two of sixteen are alike.
 fn stroke_of(number: usize, curve: &Curve) -> Stroke {
-    let dash = curve.dashed.then_some((9.0, 6.0));
+    let dash = match (curve.dashed, number / COLOURS.len() % 2) {
+        (true, _) => Some((9.0, 6.0)),
+        (false, 1) => Some((3.0, 3.0)),
+        (false, _) => None,
+    };
     Stroke { dash, ..Stroke::solid(COLOURS[number % COLOURS.len()], 1.0, 2.4) }
 }
 
@@ -248,38 +274,108 @@ pub(super) fn write_axes(
     }
 }
 
-/// Draws the legend in the corner that hides least of the curves.
-fn legend(canvas: &mut Canvas, frame: Rect, plot: &Plot, drawn: &[Vec<(f64, f64)>]) {
-    let style = Style::new(0.92 * FONT, INK);
-    let named: Vec<(usize, &Curve)> =
-        plot.curves.iter().enumerate().filter(|(_, curve)| !curve.label.is_empty()).collect();
-    if named.is_empty() {
-        return;
-    }
-    let (sample, row) = (2.2 * FONT, 1.35 * FONT);
-    let widest = named.iter().map(|(_, curve)| text::length(&curve.label, style)).fold(0.0, f64::max);
-    let (width, height) = (widest + sample + 1.5 * FONT, row * named.len() as f64 + 0.6 * FONT);
-    let inset = 0.7 * FONT;
-    let corner = |right: bool, low: bool| Rect {
-        x: if right { frame.right() - width - inset } else { frame.x + inset },
-        y: if low { frame.bottom() - height - inset } else { frame.y + inset },
-        width,
-        height,
-    };
-    let hidden = |place: &Rect| {
-        let inside = |p: &&(f64, f64)| {
-            (place.x..place.right()).contains(&p.0) && (place.y..place.bottom()).contains(&p.1)
+/// Distance of the legend from the frame, and of its rows; length of a sample.
+const LEGEND_INSET: f64 = 0.7 * FONT;
+const LEGEND_ROW: f64 = 1.35 * FONT;
+const LEGEND_SAMPLE: f64 = 2.2 * FONT;
+
+/// Points of a line between two that are looked at for what hides them.
+const BETWEEN: usize = 16;
+
+/// The names of the curves that have a name and points.
+struct Legend<'a> {
+    named: Vec<(usize, &'a Curve)>,
+}
+
+impl<'a> Legend<'a> {
+    fn new(plot: &'a Plot) -> Self {
+        let is_shown = |curve: &Curve| {
+            let positive = |v: f64, axis: &Axis| v.is_finite() && (!axis.log || v > 0.0);
+            let is_drawn = |(x, y): &(f64, f64)| positive(*x, &plot.x) && positive(*y, &plot.y);
+            !curve.label.is_empty() && curve.points.iter().any(is_drawn)
         };
-        drawn.iter().flatten().filter(inside).count()
+        Self { named: plot.curves.iter().enumerate().filter(|(_, curve)| is_shown(curve)).collect() }
+    }
+
+    fn style() -> Style {
+        Style::new(0.92 * FONT, INK)
+    }
+
+    /// Width and height; `None` if there is nothing in it.
+    fn size(&self) -> Option<(f64, f64)> {
+        let length = |(_, curve): &(usize, &Curve)| text::length(&curve.label, Self::style());
+        let widest = self.named.iter().map(length).fold(0.0, f64::max);
+        let rows = self.named.len() as f64;
+        (rows > 0.0).then_some((widest + LEGEND_SAMPLE + 1.5 * FONT, LEGEND_ROW * rows + 0.6 * FONT))
+    }
+
+    fn draw(&self, canvas: &mut Canvas, (x, y): (f64, f64)) {
+        let Some((width, height)) = self.size() else { return };
+        let place = Rect { x, y, width, height };
+        canvas.fill(place, WHITE, 0.85);
+        canvas.outline(place, Stroke::solid(FAINT, 0.5, 1.0));
+        for (line, (number, curve)) in self.named.iter().enumerate() {
+            let y = place.y + 0.3 * FONT + LEGEND_ROW * (line as f64 + 0.5);
+            let x = place.x + 0.5 * FONT;
+            canvas.polyline(&[(x, y), (x + LEGEND_SAMPLE, y)], stroke_of(*number, curve));
+            let at = (x + LEGEND_SAMPLE + 0.5 * FONT, y);
+            text::draw(canvas, &curve.label, at, Align::Start, Self::style());
+        }
+    }
+}
+
+/// Where in a frame something of a size hides no curve: the upper left end of it.
+fn free_corner(frame: Rect, (width, height): (f64, f64), drawn: &[Vec<(f64, f64)>]) -> Option<(f64, f64)> {
+    let [left, right] = [frame.x + LEGEND_INSET, frame.right() - width - LEGEND_INSET];
+    let [upper, lower] = [frame.y + LEGEND_INSET, frame.bottom() - height - LEGEND_INSET];
+    let is_free = |&(x, y): &(f64, f64)| {
+        let hides = |p: (f64, f64)| (x..x + width).contains(&p.0) && (y..y + height).contains(&p.1);
+        let crosses = |two: &[(f64, f64)]| {
+            (0..=BETWEEN).any(|k| {
+                let share = k as f64 / BETWEEN as f64;
+                hides((two[0].0 + share * (two[1].0 - two[0].0), two[0].1 + share * (two[1].1 - two[0].1)))
+            })
+        };
+        !drawn.iter().any(|line| line.iter().any(|p| hides(*p)) || line.windows(2).any(crosses))
     };
-    let corners = [corner(true, false), corner(true, true), corner(false, false), corner(false, true)];
-    let place = corners.into_iter().min_by_key(hidden).unwrap_or(corners[0]);
-    canvas.fill(place, WHITE, 0.85);
-    canvas.outline(place, Stroke::solid(FAINT, 0.5, 1.0));
-    for (line, (number, curve)) in named.into_iter().enumerate() {
-        let y = place.y + 0.3 * FONT + row * (line as f64 + 0.5);
-        let x = place.x + 0.5 * FONT;
-        canvas.polyline(&[(x, y), (x + sample, y)], stroke_of(number, curve));
-        text::draw(canvas, &curve.label, (x + sample + 0.5 * FONT, y), Align::Start, style);
+    [(right, upper), (right, lower), (left, upper), (left, lower)].into_iter().find(is_free)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn curve(label: &str, points: Vec<(f64, f64)>) -> Curve {
+        Curve { label: label.to_owned(), points, dashed: false }
+    }
+
+    #[test]
+    fn no_two_of_sixteen_curves_are_alike() {
+        let plain = Curve::default();
+        let strokes: Vec<Stroke> = (0..16).map(|number| stroke_of(number, &plain)).collect();
+        for (k, one) in strokes.iter().enumerate() {
+            assert!(strokes[..k].iter().all(|other| other != one), "{k}");
+        }
+    }
+
+    #[test]
+    fn a_legend_hides_no_curve() {
+        let frame = Rect { x: 0.0, y: 0.0, width: 900.0, height: 500.0 };
+        let size = (200.0, 150.0);
+        assert!(free_corner(frame, size, &[vec![(0.0, 250.0), (900.0, 250.0)]]).is_some());
+        // A line through all corners, whose two ends are in none.
+        let ends = |y: f64| vec![(-400.0, y), (1300.0, y)];
+        assert_eq!(free_corner(frame, size, &[ends(80.0), ends(420.0)]), None);
+        let points = vec![(0.0, 1.0), (1.0, f64::NAN)];
+        let plot = Plot {
+            curves: vec![
+                curve("drawn", points),
+                curve("", vec![(0.0, 1.0)]),
+                curve("empty", vec![(0.0, f64::NAN)]),
+            ],
+            ..Plot::default()
+        };
+        let named: Vec<usize> = Legend::new(&plot).named.iter().map(|(number, _)| *number).collect();
+        assert_eq!(named, [0]);
     }
 }
