@@ -50,6 +50,12 @@ pub enum GroundError {
         /// The folder.
         path: PathBuf,
     },
+    /// An archive that would be merged into itself.
+    #[error("{}: is one of the states to merge; expected a new folder for the merged state", path.display())]
+    MergedIntoPart {
+        /// The folder.
+        path: PathBuf,
+    },
     /// The operating system refused.
     #[error("{}: cannot {action}: {source}", path.display())]
     Io {

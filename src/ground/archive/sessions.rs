@@ -40,13 +40,17 @@ impl Ground {
     /// Merges archives into a new one, in the folder `into`; those of `parts` stay as they are.
     ///
     /// # Errors
-    /// A folder that holds an archive already; an archive that is named twice; archives of different instruments or
+    /// A folder that holds an archive already, or is one of the parts; an archive that is named twice; archives of different instruments or
     /// settings, or that hold the same visibilities.
     pub fn merge(into: &Path, parts: &[PathBuf], config: &GroundConfig) -> Result<Self, GroundError> {
         let mut whole: Option<Opened> = None;
         let mut seen = BTreeSet::new();
+        let is_into = into.canonicalize().ok();
         for path in parts {
             let real = path.canonicalize().map_err(GroundError::io(path, "find"))?;
+            if is_into.as_ref() == Some(&real) {
+                return Err(GroundError::MergedIntoPart { path: into.to_owned() });
+            }
             if !seen.insert(real) {
                 return Err(GroundError::NamedTwice { path: path.clone() });
             }
