@@ -119,7 +119,17 @@ impl ArrayArgs {
 impl StateMapArgs {
     /// The settings of the state in this folder, unless a file names them.
     pub(super) fn source(&self, state: &Path) -> Result<ConfigSource, GroundError> {
-        ConfigSource { file: self.map.clone(), overrides: self.overrides.clone(), seed: None }.of_state(state)
+        self.source_with(state, [])
+    }
+
+    /// As [`StateMapArgs::source`], with more settings.
+    pub(super) fn source_with(
+        &self,
+        state: &Path,
+        more: impl IntoIterator<Item = String>,
+    ) -> Result<ConfigSource, GroundError> {
+        let overrides = self.overrides.iter().cloned().chain(more).collect();
+        ConfigSource { file: self.map.clone(), overrides, seed: None }.of_state(state)
     }
 }
 

@@ -40,12 +40,11 @@ pub(super) struct RecalibrateArgs {
 }
 
 pub(super) fn execute(args: &RecalibrateArgs) -> CommandResult {
-    let mut source = args.map.source(&args.state)?;
-    if let Some(path) = &args.old_calibration {
-        source.overrides.push("calibration.hook=antenna-gains".to_owned());
-        source.overrides.push(format!("calibration.gains_file={:?}", path.display().to_string()));
-    }
-    let config = source.load_ground()?;
+    let old = args.old_calibration.iter().flat_map(|path| {
+        let path = path.display().to_string();
+        ["calibration.hook=antenna-gains".to_owned(), format!("calibration.gains_file={path:?}")]
+    });
+    let config = args.map.source_with(&args.state, old)?.load_ground()?;
     use_threads(&config.runtime)?;
     let new = with_gains(&config, args.calibration.clone());
     let ground = |config: &Config| config.ground(WAIT_BYTES);

@@ -28,7 +28,7 @@ use crate::downlink::transport::socket::{
 };
 use crate::downlink::{FileSource, Pace, Paced, Steps};
 use crate::frames::Instrument;
-use crate::ground::{Collector, Ground, GroundConfig, WAIT_BYTES};
+use crate::ground::{Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
 use crate::pipeline::{
     Config, ConfigSource, GroundSource, GroupSize, MemoryAdvice, MemoryLimit, PipelineError, READ,
     RunSummary, channel_groups, replay, replay_in_groups, use_threads,
@@ -179,7 +179,7 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
         overrides.push(format!("calibration.gains_file={:?}", path.display().to_string()));
     }
     let source = ConfigSource { file: args.map.clone(), overrides, seed: None };
-    let config = args.with_known_settings(source, job).load_ground()?;
+    let config = args.with_known_settings(source, job)?.load_ground()?;
     use_threads(&config.runtime)?;
     print_notes(config.positions_note());
     if let Some(size) = args.groups {
@@ -238,22 +238,26 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
 
 impl ReplayArgs {
     /// Without a map file: with the settings that belong to the state and the downlink.
-    fn with_known_settings(&self, source: ConfigSource, job: &Job) -> ConfigSource {
-        // A state that cannot be read is told when it is opened.
-        let of_state = self.state.as_deref().and_then(|folder| {
+    fn with_known_settings(&self, source: ConfigSource, job: &Job) -> Result<ConfigSource, GroundError> {
+        let of_state = self.state.as_deref().map(|folder| {
             let source = source.clone();
-            let found = match job.ranks().are_many() {
+            match job.ranks().are_many() {
                 true => source.of_state_for_ranks(folder),
                 false => source.of_state(folder),
-            };
-            found.ok()
+            }
         });
-        let (source, from) = of_state.unwrap_or(source).of_downlink(&self.files);
+        let of_state = match of_state {
+            Some(Err(error @ GroundError::FilesOfState { .. })) => return Err(error),
+            // A state that cannot be read is told when it is opened.
+            Some(Err(_)) | None => source,
+            Some(Ok(source)) => source,
+        };
+        let (source, from) = of_state.of_downlink(&self.files);
         if let Some(from) = from.filter(|_| job.is_first()) {
             let fields = json!({ "from": from });
             say("settings", &fields, format_args!("settings of the maps: those of {from}"));
         }
-        source
+        Ok(source)
     }
 
     /// Prints the summary, unless standard output holds events.

@@ -50,6 +50,16 @@ pub enum GroundError {
         /// The folder.
         path: PathBuf,
     },
+    /// A state with files that nobody has named.
+    #[error("{}: the state was accumulated with {found}; expected the same again, by {expected}", path.display())]
+    FilesOfState {
+        /// The folder.
+        path: PathBuf,
+        /// What the files are, with their checksums.
+        found: String,
+        /// How they are given.
+        expected: &'static str,
+    },
     /// An archive that would be merged into itself.
     #[error("{}: is one of the states to merge; expected a new folder for the merged state", path.display())]
     MergedIntoPart {

@@ -16,7 +16,8 @@ impl ConfigSource {
     /// naming them again. Only without a file: what a file says stands, and is compared with the state.
     ///
     /// # Errors
-    /// A folder without a usable state.
+    /// A folder without a usable state; [`GroundError::FilesOfState`] where the state was made with gains of a file, or maps of
+    /// the known sky, that no override names: it holds only their checksums.
     pub fn of_state(self, folder: &Path) -> Result<Self, GroundError> {
         self.of_settings(folder, Ground::settings_in)
     }
@@ -36,6 +37,7 @@ impl ConfigSource {
     ) -> Result<Self, GroundError> {
         if self.file.is_none() {
             let settings = settings_in(folder)?;
+            require_files(folder, &settings, &self.overrides)?;
             let overrides =
                 settings.iter().filter_map(|(key, value)| Some(format!("{key}={}", toml_of(value)?)));
             self.overrides = overrides.chain(std::mem::take(&mut self.overrides)).collect();
@@ -44,13 +46,52 @@ impl ConfigSource {
     }
 }
 
+/// Requires that the files of which a state holds the checksums are named: without them it cannot be opened.
+fn require_files(
+    folder: &Path,
+    settings: &[(String, String)],
+    overrides: &[String],
+) -> Result<(), GroundError> {
+    for (key, what, expected) in [
+        (
+            "calibration.gains_file",
+            "gains of",
+            "--old-calibration FILE (recalibrate), --calibration FILE (replay) or --set calibration.gains_file=FILE (other commands)",
+        ),
+        (
+            "calibrate.model_files",
+            "gains that were found with maps of the known sky,",
+            "--set calibrate.model_files=[FILE, ...]",
+        ),
+    ] {
+        let is_of = |(name, value): &&(String, String)| {
+            name.strip_prefix(key).is_some_and(|rest| rest.is_empty() || rest.starts_with('['))
+                && value.starts_with(A_FILE)
+        };
+        let files: Vec<&str> = settings.iter().filter(is_of).map(|(_, value)| value.as_str()).collect();
+        // A section may be set as a whole.
+        let names = |text: &String| {
+            let set = text.split_once('=').map_or("", |(set, _)| set.trim());
+            set == key || key.split_once('.').is_some_and(|(section, _)| set == section)
+        };
+        if !files.is_empty() && !overrides.iter().any(names) {
+            let (path, found) = (folder.to_owned(), format!("{what} {}", files.join(", ")));
+            return Err(GroundError::FilesOfState { path, found, expected });
+        }
+    }
+    Ok(())
+}
+
+/// How the checksum of a file begins, which stands for its path in a state.
+const A_FILE: &str = "a file of";
+
 /// Passes of a map from a state that holds visibilities one by one, if nobody says how many: `map.refine.residual_max` ends them.
 const PASSES_MAX: usize = 10;
 
 /// A setting as a checkpoint has it (Rust's debug form: `16`, `AntennaGains`, `Limits { a: 1.0, b: 2.0 }`) as a value of TOML;
 /// `None` for a file, of which only the checksum is known.
 fn toml_of(value: &str) -> Option<String> {
-    if value.starts_with("a file of") {
+    if value.starts_with(A_FILE) {
         return None;
     }
     if value == REFINED {

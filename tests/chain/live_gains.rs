@@ -519,6 +519,34 @@ fn better_gains_replace_those_of_a_state_exactly() {
         args.extend(["--old-calibration", &poor, "--calibration", gains, "--json"]);
         args.into_iter().map(str::to_owned).collect()
     };
+    // Without a map file and the old gains the state says what it needs, as it holds only their checksum.
+    let (folder, merged) = (copy("unnamed"), place.path("merged"));
+    for (args, by) in [
+        (
+            vec!["recalibrate", &mission.file, "--state", &folder, "--calibration", &good],
+            "--old-calibration FILE",
+        ),
+        (vec!["retract", &mission.file, "--state", &folder], "--set calibration.gains_file=FILE"),
+        (vec!["merge", &folder, "--out", &merged], "--set calibration.gains_file=FILE"),
+        (vec!["replay", &mission.file, "--state", &folder, "--out", &merged], "--calibration FILE"),
+    ] {
+        let said = fail(&args);
+        let expected = format!("{folder}: the state was accumulated with gains of a file of checksum ");
+        assert!(said.contains(&expected) && said.contains(by), "{args:?}: {said}");
+    }
+    assert!(!Path::new(&merged).exists());
+    let named = format!("calibration.gains_file={poor}");
+    succeed(&["merge", &folder, "--out", &merged, "--set", &named]);
+    succeed(&[
+        "recalibrate",
+        &mission.file,
+        "--state",
+        &folder,
+        "--old-calibration",
+        &poor,
+        "--calibration",
+        &good,
+    ]);
     let strs = |args: &[String]| -> Vec<String> { args.to_vec() };
     let run = |args: &[String]| -> Value {
         let args: Vec<&str> = args.iter().map(String::as_str).collect();
@@ -620,6 +648,13 @@ fn better_gains_replace_those_of_a_state_exactly() {
     let found = place.path("found");
     mission.solve(&mission.file, "found-maps", &["--state", &found]);
     let sets = mission.solving();
+    // Without the maps it says what it needs.
+    let said = fail(&["retract", &mission.file, "--state", &found]);
+    assert!(
+        said.contains("with maps of the known sky, a file of checksum ")
+            && said.contains("--set calibrate.model_files=[FILE, ...]"),
+        "{said}"
+    );
     let mut args = vec!["recalibrate", &mission.file, "--state", &found, "--map", &place.pipeline];
     sets.iter().for_each(|set| args.extend(["--set", set]));
     args.extend(["--calibration", &good]);
