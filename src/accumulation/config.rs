@@ -7,9 +7,11 @@ use serde::{Deserialize, Serialize};
 
 use super::harmonic::L_MAX;
 use super::{AccumulationError, PixelEngine};
+use crate::frames::Instrument;
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
 use crate::sky::Frame;
+use crate::sky::fits::check_frequencies;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::{ChannelId, Checks, InvalidValue, PerChannel};
@@ -472,6 +474,14 @@ impl MapConfig {
             }
             _ => Ok(()),
         }
+    }
+
+    /// Requires that prior maps are of the frequencies of the instrument's channels, as far as they say it.
+    ///
+    /// # Errors
+    /// [`AccumulationError::Prior`].
+    pub fn check_priors(&self, instrument: &Instrument) -> Result<(), AccumulationError> {
+        Ok(check_frequencies(&self.prior_files, &instrument.frequencies_hz())?)
     }
 
     /// Settings by channel that do not match an instrument of `channels` channels.

@@ -15,6 +15,9 @@ pub enum AccumulationError {
     /// Rows of B cannot be computed.
     #[error(transparent)]
     Response(#[from] ResponseError),
+    /// A prior map that cannot be used.
+    #[error("map.prior_files: {0}")]
+    Prior(#[from] crate::sky::fits::FitsError),
     /// A setup out of range.
     #[error("invalid setup of an engine: {name} = {value}: expected {expected}")]
     Setup {

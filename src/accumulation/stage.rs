@@ -455,6 +455,7 @@ impl Accumulator {
         if let Some(misfit) = self.config.misfits(channels).into_iter().next() {
             return Err(misfit.into());
         }
+        self.config.check_priors(&instrument)?;
         self.config.require_memory(channels, self.memory_max_bytes, self.group.as_ref())?;
         self.channels = (0..channels).map(|_| None).collect();
         self.instrument = Some(Arc::new(instrument));

@@ -9,7 +9,7 @@ use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_json_line, print_notes, print_text};
 use super::progress::CalibrateLines;
 use crate::pipeline::{CalibrateJob, CalibrateSummary, ConfigSource, calibrate, use_threads};
-use crate::sky::fits::read_whole_map;
+use crate::sky::fits::read_known_sky;
 
 /// Find the gains of every daughter, pass by pass, from the visibilities of a known signal.
 ///
@@ -53,9 +53,12 @@ pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
     }
     use_threads(&config.runtime)?;
     let options = args.maps.options();
-    let models = match args.model.is_empty() {
-        true => config.calibrate.models()?,
-        false => args.model.iter().map(|path| read_whole_map(path, &options)).collect::<Result<_, _>>()?,
+    let (model_files, models) = match args.model.is_empty() {
+        true => (&config.calibrate.model_files, config.calibrate.models()?),
+        false => {
+            let models = args.model.iter().map(|path| read_known_sky(path, &options));
+            (&args.model, models.collect::<Result<_, _>>()?)
+        }
     };
     let interrupt = Interrupt::default();
     interrupt.arm_or_note();
@@ -64,6 +67,7 @@ pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
         config: &config,
         files: &args.files,
         models,
+        model_files,
         out: &args.out,
         watch: &mut |at| lines.show(&at),
     };

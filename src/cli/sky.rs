@@ -11,7 +11,7 @@ use crate::files::write_atomically;
 use crate::mother::{BAND_HZ, NINTH_BAND_HZ};
 use crate::pipeline::{Config, ConfigSource};
 use crate::products::pictures::{ColourScale, MapPanel, Palette, Scaling, View, draw_map};
-use crate::sky::fits::{WriteOptions, read_whole_map, write_map};
+use crate::sky::fits::{Card, MapFile, WriteOptions, read_whole_map_file, write_map};
 use crate::sky::generated::{GeneratedSky, catalogue, generate};
 use crate::sky::{Frame, GENERATED_NSIDE_MAX, SkyMap};
 use crate::units::Dimension;
@@ -105,7 +105,7 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
     let factor = (freq_hz / made_hz).powf(args.index);
     let values = generate(&sky.generated, made_hz, nside, seed)?.into_iter().map(|value| factor * value);
     let map = SkyMap::new(Frame::Ecliptic, values.collect())?;
-    let mut made = Made::write(args, &map, &Dimension::Frequency.show(freq_hz))?;
+    let mut made = Made::write(args, &map, Some(freq_hz), &Dimension::Frequency.show(freq_hz))?;
     if let Some(path) = &args.sources {
         let count = write_sources(path, &sky.generated, freq_hz, seed)?;
         made.lines.push(format!("{}: {count} sources", path.display()));
@@ -120,9 +120,13 @@ fn resemble(args: &SkyArgs, path: &Path, correlation: f64) -> CommandResult {
     if !(0.0..=1.0).contains(&correlation) {
         return Err(format!("--correlation {correlation}: expected 0 to 1").into());
     }
-    let (other, seed) = (read_whole_map(path, &args.maps.options())?, args.seed.unwrap_or(0));
+    let MapFile { map: other, header, .. } = read_whole_map_file(path, &args.maps.options())?;
+    let seed = args.seed.unwrap_or(0);
     let map = other.correlated(correlation, seed)?;
-    let mut made = Made::write(args, &map, &format!("correlation {correlation} with {}", path.display()))?;
+    // It is of the frequency of what it resembles.
+    let freq_hz = header.real("FREQ").filter(|hz| hz.is_finite() && *hz > 0.0);
+    let what = format!("correlation {correlation} with {}", path.display());
+    let mut made = Made::write(args, &map, freq_hz, &what)?;
     let title = format!("A sky of correlation {correlation} with another");
     made.draw(args, &map, title, &format!("seed {seed}, nside {}", map.nside()))?;
     made.print(args)
@@ -137,10 +141,12 @@ struct Made {
 }
 
 impl Made {
-    /// Writes the sky.
-    fn write(args: &SkyArgs, map: &SkyMap, what: &str) -> Result<Self, CommandError> {
+    /// Writes the sky, with its frequency if that is known.
+    fn write(args: &SkyArgs, map: &SkyMap, freq_hz: Option<f64>, what: &str) -> Result<Self, CommandError> {
         let (nside, mean_k) = (map.nside(), map.values().iter().sum::<f64>() / map.values().len() as f64);
-        write_map(&args.out, map, &WriteOptions::default())?;
+        let freq = freq_hz.map(|hz| Card::real("FREQ", hz, "[Hz] centre frequency"));
+        let options = WriteOptions { cards: freq.into_iter().collect(), ..WriteOptions::default() };
+        write_map(&args.out, map, &options)?;
         let lines = vec![format!("{}: nside {nside}, {what}, mean {mean_k:.4e} K", args.out.display())];
         Ok(Self { nside, mean_k, picture: None, lines })
     }

@@ -102,6 +102,12 @@ impl Instrument {
         Some((response, code & NOISELESS != 0))
     }
 
+    /// Centre frequencies of the channels, Hz.
+    #[must_use]
+    pub fn frequencies_hz(&self) -> Vec<f64> {
+        self.channels.iter().map(|channel| channel.frequency_hz).collect()
+    }
+
     /// The channel in which `pair` measures; `None` if it has no such channel.
     #[must_use]
     pub fn channel_of(&self, channel: ChannelId, pair: Pair) -> Option<Channel> {

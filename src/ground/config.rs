@@ -10,6 +10,7 @@ use crate::calibration::solver::{PassSolver, SolverConfig};
 use crate::calibration::{CalibrationConfig, CalibrationError, CalibrationHook, Calibrator};
 use crate::frames::{Instrument, VisibilityReason};
 use crate::runtime::Ledger;
+use crate::sky::fits::check_frequencies;
 
 /// Default capacity of the hold buffer, bytes: a week of thirty channels.
 pub const WAIT_BYTES: u64 = 1 << 28;
@@ -40,14 +41,18 @@ impl GroundConfig {
     /// Whether maps can be made of an instrument, as far as its description says.
     ///
     /// # Errors
-    /// Calibration that was not made for it; settings of the map that do not fit it; too many channels, or too
+    /// Calibration that was not made for it; settings of the map that do not fit it, or files of other frequencies; too many channels, or too
     /// little memory for them.
     pub fn fits(&self, instrument: &Instrument) -> Result<(), GroundError> {
         if self.calibration.hook == CalibrationHook::Solve {
             let maps = self.calibrate.model_files.len();
             self.calibrate.fits(instrument, maps, MODEL).map_err(CalibrationError::from)?;
+            check_frequencies(&self.calibrate.model_files, &instrument.frequencies_hz())
+                .map_err(CalibrationError::from)?;
         }
-        let channels = self.described(instrument)?.channels.len();
+        let described = self.described(instrument)?;
+        self.map.check_priors(&described)?;
+        let channels = described.channels.len();
         if let Some(misfit) = self.map.misfits(channels).into_iter().next() {
             return Err(AccumulationError::from(misfit).into());
         }

@@ -10,6 +10,7 @@ use crate::calibration::solver::{PassBlocks, PassSolver};
 use crate::calibration::{CalibrationError, ClosedPass, SolvedGains};
 use crate::downlink::wire::VisibilitiesOutline;
 use crate::frames::{Instrument, VisibilityBlock};
+use crate::sky::fits::check_frequencies;
 
 /// What names the maps of the known sky.
 pub(super) const MODEL: &str = "calibrate.model_files";
@@ -70,6 +71,7 @@ impl PassGate {
 
     pub(super) fn describe(&mut self, instrument: &Instrument) -> Result<(), CalibrationError> {
         self.is_behind = true;
+        check_frequencies(&self.solver.config().model_files, &instrument.frequencies_hz())?;
         self.gains.describe(instrument);
         self.solver.describe(instrument, MODEL)
     }

@@ -19,7 +19,7 @@ use crate::frames::{GroundFrame, VisibilityBlock};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::runtime::Cancel;
 use crate::sky::SkyMap;
-use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::fits::{ReadOptions, check_frequencies, read_whole_map};
 use crate::sky::harmonics::AnalysisOptions;
 use crate::sky::spectra::auto_cl;
 use crate::units::InvalidValue;
@@ -35,6 +35,8 @@ pub struct CalibrateJob<'a> {
     pub files: &'a [PathBuf],
     /// Map of the sky for each channel, K; may be empty if an artificial signal is known.
     pub models: Vec<SkyMap>,
+    /// The files of these maps, whose frequencies have to be those of the channels; empty for maps of no files.
+    pub model_files: &'a [PathBuf],
     /// Folder for the products.
     pub out: &'a Path,
     /// Is told after each pass how far it is.
@@ -63,7 +65,7 @@ pub struct CalibrateProgress {
 /// # Errors
 /// Files that cannot be read; maps that do not fit the channels; a failed replay.
 pub fn calibrate(job: CalibrateJob<'_>, cancel: &Cancel) -> Result<CalibrateSummary, PipelineError> {
-    let CalibrateJob { config, files, models, out, watch } = job;
+    let CalibrateJob { config, files, models, model_files, out, watch } = job;
     let solver = &config.calibrate;
     check(config, &models)?;
     let files = &in_order(files)?[..];
@@ -73,7 +75,10 @@ pub fn calibrate(job: CalibrateJob<'_>, cancel: &Cancel) -> Result<CalibrateSumm
     let bytes = files.iter().map(|file| std::fs::metadata(file).map_or(0, |file| file.len())).sum::<u64>();
     let last_round = solver.map_rounds;
     let solve = |round: u32, solver: &SolverConfig, maps: &[SkyMap], watch: CalibrateWatcher<'_>| {
-        let passes = Passes { solver, files, maps, model_key: MODEL, van_vleck: van_vleck.as_ref(), cancel };
+        // Maps of later rounds are made of the data themselves.
+        let model_files = if round == 0 { model_files } else { &[] };
+        let van_vleck = van_vleck.as_ref();
+        let passes = Passes { solver, files, maps, model_files, model_key: MODEL, van_vleck, cancel };
         passes.solve(&mut |passes, read_bytes| {
             let read = read_bytes as f64 / bytes.max(1) as f64;
             watch(CalibrateProgress { round, last_round, passes: Some(passes), read });
@@ -150,6 +155,7 @@ struct Passes<'a> {
     solver: &'a SolverConfig,
     files: &'a [PathBuf],
     maps: &'a [SkyMap],
+    model_files: &'a [PathBuf],
     model_key: &'static str,
     van_vleck: Option<&'a VanVleck>,
     cancel: &'a Cancel,
@@ -199,6 +205,7 @@ impl Passes<'_> {
                 match frame {
                     GroundFrame::Instrument(instrument) => match &found.instrument {
                         None => {
+                            check_frequencies(self.model_files, &instrument.frequencies_hz())?;
                             solver.describe(&instrument, self.model_key)?;
                             found.instrument = Some(instrument);
                         }

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::plan::Plan;
 use super::problems::Problems;
 use crate::sky::AddedSky;
-use crate::sky::fits::{ReadOptions, read_sky, read_whole_map};
+use crate::sky::fits::{FitsError, FitsProblem, ReadOptions, check_frequency, read_sky, read_whole_map};
 use crate::solve::Regulariser;
 
 impl Plan {
@@ -24,6 +24,14 @@ impl Plan {
         let priors = priors.map(|path| read_whole_map(path, &options));
         for problem in skies.chain(priors).filter_map(Result::err) {
             found.push(|| problem);
+        }
+        for files in [&self.config.map.prior_files, &self.config.calibrate.model_files] {
+            let of_channels = files.iter().zip(&spacecraft.channels_hz);
+            let of_channels = of_channels.filter(|_| files.len() == spacecraft.channels_hz.len());
+            // What cannot be read is told above and below.
+            let is_other = |error: &FitsError| matches!(*error.problem, FitsProblem::Keyword { .. });
+            let checked = of_channels.filter_map(|(path, &hz)| check_frequency(path, hz).err());
+            checked.filter(is_other).for_each(|problem| found.push(|| problem));
         }
         for problem in
             self.config.map.regularisation_files.iter().filter_map(|path| Regulariser::read(path).err())

@@ -272,6 +272,7 @@ impl Making<'_> {
             config: &case.plan.config,
             files: &[file.to_owned()],
             models: self.study.models.clone(),
+            model_files: &self.study.model_files,
             out: &out,
             watch: &mut |progress| watch(number, StudyStep::Calibrate(progress)),
         };

@@ -11,7 +11,7 @@ use super::config_source::{ConfigSource, is_study};
 use super::error::PipelineError;
 use super::plan::Plan;
 use crate::sky::SkyMap;
-use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::fits::{ReadOptions, check_frequencies, read_known_sky};
 
 /// Most cases of a study.
 const CASES_MAX: usize = 1000;
@@ -108,6 +108,8 @@ pub struct Study {
     pub covariance_at_deg: Vec<[f64; 2]>,
     /// Maps of the sky to calibrate with, K; empty if none is calibrated, or if an artificial signal is enough.
     pub models: Vec<SkyMap>,
+    /// Their files.
+    pub model_files: Vec<PathBuf>,
 }
 
 /// A case of a study.
@@ -252,7 +254,8 @@ impl Study {
         if !models.is_empty() && !file.calibrated {
             return Err(wrong("model without calibration".to_owned(), "calibrated = true with a model"));
         }
-        let (models, models_hash) = read_models(&models)?;
+        let model_files = models;
+        let (models, models_hash) = read_models(&model_files)?;
         let kinds: &[bool] = if file.calibrated { &[false, true] } else { &[false] };
         // Realisations of a case stay together.
         let realised = realised.iter().enumerate().flat_map(|(number, of_case)| {
@@ -271,8 +274,13 @@ impl Study {
             let overrides = [file.set.as_slice(), sets, more].concat();
             let source = ConfigSource { file: pipeline.clone(), overrides: overrides.clone(), seed: None };
             let plan = source.load().map_err(PipelineError::from).and_then(Plan::new);
-            let plan = plan
-                .map_err(|source| StudyError::Case { label: labels.join(", "), source: Box::new(source) })?;
+            let of_case = |source| StudyError::Case { label: labels.join(", "), source: Box::new(source) };
+            let plan = plan.map_err(of_case)?;
+            if calibrated {
+                // Before anything is simulated.
+                let checked = check_frequencies(&model_files, &plan.config.spacecraft.channels_hz);
+                checked.map_err(|error| of_case(error.into()))?;
+            }
             let noise_seeds: Vec<u64> = noise_seeds.clone();
             Ok(StudyCase { labels, overrides, plan, calibrated, noise_seeds, family, models_hash })
         });
@@ -283,7 +291,7 @@ impl Study {
             return Err(wrong(found, "labels that differ in letters or digits"));
         }
         let (name, covariance_at_deg) = (file.name.unwrap_or(stem), file.covariance_at_deg);
-        Ok(Self { name, cases, realisations, covariance_at_deg, models })
+        Ok(Self { name, cases, realisations, covariance_at_deg, models, model_files })
     }
 }
 
@@ -303,7 +311,7 @@ fn read_models(paths: &[PathBuf]) -> Result<(Vec<SkyMap>, u64), StudyError> {
             found: reason,
             expected: "a map of the sky to calibrate with, HEALPix in K",
         };
-        maps.push(read_whole_map(path, &ReadOptions::default()).map_err(|error| failed(error.to_string()))?);
+        maps.push(read_known_sky(path, &ReadOptions::default()).map_err(|error| failed(error.to_string()))?);
         let bytes = fs::read(path).map_err(|error| failed(error.to_string()))?;
         sums.extend_from_slice(&crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes).to_le_bytes());
     }

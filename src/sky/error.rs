@@ -75,6 +75,14 @@ pub enum MapError {
         /// Mean of the pixels, K.
         value: f64,
     },
+    /// A known sky without power.
+    #[error(
+        "the mean of the pixels is {value:e} K, a sky of which nothing can be known; expected a mean above 0 K, to calibrate with"
+    )]
+    NothingKnown {
+        /// Mean of the pixels, K.
+        value: f64,
+    },
     /// Invalid width of a Gaussian beam.
     #[error("a beam of FWHM {fwhm_rad} rad is not allowed; expected a finite width of at least 0")]
     Width {

@@ -6,6 +6,8 @@ use std::path::Path;
 
 use common::downlink::{packets_of, pass_ends};
 use common::workplace::{Workplace, fail, json, succeed};
+use lunarray::sky::fits::{ReadOptions, WriteOptions, read_map_file, write_map};
+use lunarray::sky::{Frame, SkyMap};
 
 /// Eight daughters whose data are direct sums over the map's own pixels, so that the input is a perfect model.
 const SMALL: &str = r#"
@@ -334,4 +336,64 @@ fn files_are_of_one_instrument_and_taken_in_the_order_of_time() {
     let told = said(&[&described]);
     assert!(told.contains("there is nothing to solve"), "{told}");
     assert!(!Path::new(&format!("{out}/gains.json")).exists());
+}
+
+#[test]
+fn known_skies_and_priors_are_of_the_frequencies_of_the_channels() {
+    let place = Workplace::new(SMALL);
+    let file = command(&place, "simulate", "a.ccsds", &["spacecraft.duration_s=1e5"]);
+    let sky = |name: &str, more: &[&str]| {
+        let out = place.path(name);
+        succeed(&[&["sky", &place.pipeline, "--no-picture", "--out", &out], more].concat());
+        let options = ReadOptions::default();
+        let header = read_map_file(Path::new(&out), &options).unwrap().header;
+        (out, header.real("FREQ").unwrap())
+    };
+    let (three, three_hz) = sky("three.fits", &["--freq-hz", "3MHz", "--nside", "4"]);
+    let (five, five_hz) = sky("five.fits", &["--freq-hz", "5MHz", "--nside", "4"]);
+    // A wrong sky is of the frequency that it stands for.
+    let (_, law_hz) =
+        sky("law.fits", &["--freq-hz", "3MHz", "--extrapolate-from", "10MHz", "--nside", "4"]);
+    let (_, like_hz) = sky("like.fits", &["--like", &three, "--correlation", "0.5"]);
+    assert_eq!([three_hz, five_hz, law_hz, like_hz], [3e6, 5e6, 3e6, 3e6]);
+
+    let out = place.path("out");
+    let says = |args: &[&str]| {
+        let said = fail(args);
+        let expected = "five.fits: the keyword FREQ is 5 MHz; expected 3 MHz, the channel's: give a map of that frequency";
+        assert!(said.contains(expected) && !said.contains("sky.frequency"), "{args:?}: {said}");
+    };
+    let list = |key: &str, files: [&str; 2]| format!("{key}={files:?}");
+    let (models, priors) =
+        (list("calibrate.model_files", [&five, &three]), list("map.prior_files", [&five, &three]));
+    let calibrate = ["calibrate", &file, "--map", &place.pipeline, "--out", &out];
+    says(&[&calibrate[..], &["--model", &five, &three]].concat());
+    says(&[&calibrate[..], &["--set", &models]].concat());
+    let replay = ["replay", &file, "--map", &place.pipeline, "--out", &out];
+    says(&[&replay[..], &["--set", "calibration.hook=solve", "--set", &models]].concat());
+    says(&[&replay[..], &["--set", &priors]].concat());
+    says(&[&replay[..], &["--set", &priors, "--groups", "1"]].concat());
+    says(&["check", &place.pipeline, "--set", &models]);
+    says(&["check", &place.pipeline, "--set", &priors]);
+    // A study says so before it simulates.
+    let study = "pipeline = \"pipeline.toml\"\ncalibrated = true\nmodel = [\"five.fits\", \"three.fits\"]\n";
+    let study = place.file("study.toml", study.as_bytes());
+    let out = place.path("studied");
+    says(&["study", &study, "--out", &out]);
+    assert!(!Path::new(&out).exists());
+
+    // A map that does not say it is taken, whatever its frequency; one without power is no known sky, but may be a prior.
+    let write = |name: &str, value: f64| {
+        let path = place.path(name);
+        let map = SkyMap::new(Frame::Ecliptic, vec![value; 192]).unwrap();
+        write_map(Path::new(&path), &map, &WriteOptions::default()).unwrap();
+        path
+    };
+    let (bare, zero) = (write("bare.fits", 1e5), write("zero.fits", 0.0));
+    succeed(&["check", &place.pipeline, "--set", &list("calibrate.model_files", [&bare, &bare])]);
+    succeed(&["check", &place.pipeline, "--set", &list("map.prior_files", [&zero, &zero])]);
+    let dark = "zero.fits: the mean of the pixels is 0e0 K";
+    let said = fail(&["check", &place.pipeline, "--set", &list("calibrate.model_files", [&zero, &zero])]);
+    assert!(said.contains(dark) && !said.contains("receiver"), "{said}");
+    assert!(fail(&[&calibrate[..], &["--model", &zero, &zero]].concat()).contains(dark));
 }

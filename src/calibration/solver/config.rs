@@ -9,7 +9,7 @@ use super::reach::reach_note;
 use crate::calibration::CalibrationError;
 use crate::response::beacon::Beacon;
 use crate::sky::SkyMap;
-use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::fits::{ReadOptions, read_known_sky};
 use crate::units::{Checks, InvalidValue};
 
 /// The signal whose visibilities are known.
@@ -193,7 +193,7 @@ impl SolverConfig {
     /// # Errors
     /// A map that cannot be read.
     pub fn models(&self) -> Result<Vec<SkyMap>, CalibrationError> {
-        let read = |path: &PathBuf| Ok(read_whole_map(path, &ReadOptions::default())?);
+        let read = |path: &PathBuf| Ok(read_known_sky(path, &ReadOptions::default())?);
         self.model_files.iter().map(read).collect()
     }
 

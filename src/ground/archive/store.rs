@@ -312,6 +312,9 @@ impl Opened {
         accumulator.set_spans(&journal.spans_s());
         let instrument = collector.instrument().cloned();
         let mut gate = config.gate()?;
+        if let Some(instrument) = instrument.as_ref().filter(|_| !config.map.prior_files.is_empty()) {
+            config.map.check_priors(&config.described(instrument)?)?;
+        }
         if let (Some(gate), Some(instrument)) = (&mut gate, &instrument) {
             gate.describe(instrument)?;
             gate.resume(calibration.passes);

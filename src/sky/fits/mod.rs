@@ -18,7 +18,7 @@ mod write;
 pub use alm::write_alm;
 pub use card::{Card, CardValue};
 pub use error::{FitsError, FitsProblem};
-pub use frequency::read_sky;
+pub use frequency::{check_frequencies, check_frequency, read_known_sky, read_sky};
 pub use header::Header;
 pub use image::image_bytes;
 pub use read::{

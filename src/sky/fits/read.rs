@@ -83,13 +83,19 @@ pub fn read_whole_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile
 /// # Errors
 /// [`FitsError`] with the file and its problem.
 pub fn read_unit(path: &Path) -> Result<String, FitsError> {
+    let header = read_header(path)?;
+    let read = || unit(&header, 1 + usize::from(is_explicit(&header)?));
+    read().map_err(|problem| FitsError::new(path, problem))
+}
+
+/// The header of the first map in a file.
+pub(super) fn read_header(path: &Path) -> Result<Header, FitsError> {
     let read = || {
         let file = File::open(path).map_err(FitsProblem::io("open"))?;
         let length = file.metadata().map_err(FitsProblem::io("examine"))?.len();
         let mut reader = BufReader::new(file);
         check_start(&mut reader, length)?;
-        let (header, _) = find_table(&mut reader, length)?;
-        unit(&header, 1 + usize::from(is_explicit(&header)?))
+        Ok(find_table(&mut reader, length)?.0)
     };
     read().map_err(|problem| FitsError::new(path, problem))
 }
