@@ -95,6 +95,29 @@ struct CaseFile {
     set: Vec<String>,
 }
 
+impl StudyFile {
+    /// A key that two axes set, or an axis and the overrides `more` of all cases, in words.
+    fn set_twice(&self, more: &[String]) -> Option<String> {
+        let key = |set: &String| set.split_once('=').map_or(set.as_str(), |(key, _)| key).trim().to_owned();
+        let keys = |axis: &AxisFile| -> BTreeSet<String> {
+            let of_cases = axis.cases.iter().flatten().flat_map(|case| &case.set).map(key);
+            axis.key.iter().map(|key| key.trim().to_owned()).chain(of_cases).collect()
+        };
+        let named = self.axis.iter().zip(1..).map(|(axis, number)| (format!("axis {number}"), keys(axis)));
+        let mut named: Vec<(String, BTreeSet<String>)> = named.collect();
+        named.push(("--set".to_owned(), more.iter().map(key).collect()));
+        // A section holds all of its keys.
+        let holds =
+            |a: &str, b: &str| b.strip_prefix(a).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
+        named.iter().enumerate().find_map(|(k, (first, keys))| {
+            named[k + 1..].iter().find_map(|(second, others)| {
+                let both = |key: &&String| others.iter().any(|other| holds(key, other) || holds(other, key));
+                keys.iter().find(both).map(|key| format!("{key} is set by {first} and by {second}"))
+            })
+        })
+    }
+}
+
 /// A study: its cases, with their configurations.
 #[derive(Clone, Debug)]
 pub struct Study {
@@ -166,6 +189,12 @@ impl Study {
                 "name, pipeline, set and [[axis]] with key and values, or with cases",
             ),
         })?;
+        if let Some(found) = file.set_twice(more) {
+            return Err(wrong(
+                found,
+                "each key on one axis alone: what is set last would hold under both labels",
+            ));
+        }
         let mut combinations = vec![(Vec::new(), Vec::new())];
         for (number, axis) in file.axis.iter().enumerate() {
             let steps = steps(axis).ok_or_else(|| {

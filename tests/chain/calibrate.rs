@@ -352,8 +352,7 @@ fn known_skies_and_priors_are_of_the_frequencies_of_the_channels() {
     let (three, three_hz) = sky("three.fits", &["--freq-hz", "3MHz", "--nside", "4"]);
     let (five, five_hz) = sky("five.fits", &["--freq-hz", "5MHz", "--nside", "4"]);
     // A wrong sky is of the frequency that it stands for.
-    let (_, law_hz) =
-        sky("law.fits", &["--freq-hz", "3MHz", "--extrapolate-from", "10MHz", "--nside", "4"]);
+    let (_, law_hz) = sky("law.fits", &["--freq-hz", "3MHz", "--extrapolate-from", "10MHz", "--nside", "4"]);
     let (_, like_hz) = sky("like.fits", &["--like", &three, "--correlation", "0.5"]);
     assert_eq!([three_hz, five_hz, law_hz, like_hz], [3e6, 5e6, 3e6, 3e6]);
 

@@ -145,11 +145,25 @@ fn studies_that_cannot_be_made_say_why() {
         ("[[axis]]\nkey = \"map.epsilons\"\nvalues = [1e-4]", "map.epsilons: no such key"),
         ("pipeline = \"none.toml\"", "none.toml"),
         ("[[axis]]\nkey = \"seed\"\nvalues = [1, 1]", "two cases with products in case-seed-1"),
+        // The last would hold, under the labels of both.
+        (
+            "[[axis]]\nkey = \"seed\"\nvalues = [1, 2]\n[[axis]]\nkey = \"map.epsilon\"\nvalues = [1e-4, 1e-3]\n\
+             [[axis]]\ncases = [{ label = \"a\", set = [] }, { label = \"b\", set = [\"map.epsilon = 1e-2\"] }]",
+            "study.toml: map.epsilon is set by axis 2 and by axis 3; expected each key on one axis alone",
+        ),
+        (
+            "[[axis]]\nkey = \"map.limits\"\nvalues = [{ altitude_m_max = 1.0 }]\n\
+             [[axis]]\nkey = \"map.limits.altitude_m_max\"\nvalues = [2.0]",
+            "map.limits is set by axis 1 and by axis 2",
+        ),
     ] {
         let study = place.file("study.toml", text.as_bytes());
         let said = fail(&["study", &study, "--out", &place.path("out")]);
         assert!(said.contains(part), "{text}: {said}");
     }
+    let study = place.file("study.toml", b"[[axis]]\nkey = \"map.epsilon\"\nvalues = [1e-4, 1e-3]");
+    let said = fail(&["study", &study, "--out", &place.path("out"), "--set", "map.epsilon=1e-2"]);
+    assert!(said.contains("map.epsilon is set by axis 1 and by --set"), "{said}");
     let long = format!("[[axis]]\nkey = \"seed\"\nvalues = {:?}", (0..1001).collect::<Vec<_>>());
     let study = place.file("study.toml", long.as_bytes());
     assert!(fail(&["study", &study, "--out", &place.path("out")]).contains("more than 1000 combinations"));
