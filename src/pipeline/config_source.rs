@@ -45,10 +45,12 @@ pub enum ConfigError {
         path: PathBuf,
     },
     /// The file is a study.
-    #[error("{}: a study, with [[axis]]; expected a pipeline file: run it by `lunarray study {}`", path.display(), path.display())]
+    #[error("{}: a study, with {key}; expected a pipeline file: run it by `lunarray study {}`", path.display(), path.display())]
     Study {
         /// Path.
         path: PathBuf,
+        /// The key that no pipeline has.
+        key: &'static str,
     },
     /// The file is too long for a pipeline file.
     #[error("{}: more than {FILE_BYTES_MAX} bytes; expected a pipeline file, which has some thousand", path.display())]
@@ -173,8 +175,8 @@ impl ConfigSource {
             Ok(table) => table,
             Err(problems) => return Err(ConfigError::Values { origin, problems }),
         };
-        if let Some(path) = self.file.as_ref().filter(|_| is_study(&table)) {
-            return Err(ConfigError::Study { path: path.clone() });
+        if let Some((path, key)) = self.file.as_ref().zip(study_key(&table)) {
+            return Err(ConfigError::Study { path: path.clone(), key });
         }
         read_units(&mut table);
         let mut lines = Lines::of(text);
@@ -211,9 +213,20 @@ impl ConfigSource {
     }
 }
 
-/// Whether a table is that of a study, which has axes where a pipeline has sections.
-pub(super) fn is_study(table: &toml::Table) -> bool {
-    table.get("axis").is_some_and(toml::Value::is_array)
+/// Keys of a study that a pipeline has not.
+const STUDY_KEYS: [&str; 6] = ["realisations", "calibrated", "covariance_at_deg", "model", "pipeline", "set"];
+
+/// Whether a table has sections of a pipeline.
+pub(super) fn has_sections(table: &toml::Table) -> bool {
+    ["array", "map", "sky", "spacecraft"].iter().any(|section| table.contains_key(*section))
+}
+
+/// What tells that a table is that of a study, which has axes, or other keys of its own, where a pipeline has sections.
+pub(super) fn study_key(table: &toml::Table) -> Option<&'static str> {
+    if table.get("axis").is_some_and(toml::Value::is_array) {
+        return Some("[[axis]]");
+    }
+    STUDY_KEYS.into_iter().find(|key| table.contains_key(*key)).filter(|_| !has_sections(table))
 }
 
 fn read(path: &Path) -> Result<String, ConfigError> {

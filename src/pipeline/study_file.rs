@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use thiserror::Error;
 
-use super::config_source::{ConfigSource, is_study};
+use super::config_source::{ConfigSource, has_sections, study_key};
 use super::error::PipelineError;
 use super::plan::Plan;
 use crate::sky::SkyMap;
@@ -189,6 +189,11 @@ impl Study {
                 "name, pipeline, set and [[axis]] with key and values, or with cases",
             ),
         })?;
+        if file.axis.is_empty() && file.realisations.is_none() && !file.calibrated {
+            let expected =
+                "[[axis]] with key and values, or with cases; or realisations = N, or calibrated = true";
+            return Err(wrong("nothing that makes cases".to_owned(), expected));
+        }
         if let Some(found) = file.set_twice(more) {
             return Err(wrong(
                 found,
@@ -326,9 +331,8 @@ impl Study {
 
 /// Whether a text has sections of a pipeline, and no axis.
 fn is_pipeline(text: &str) -> bool {
-    const SECTIONS: [&str; 4] = ["array", "map", "sky", "spacecraft"];
     let table: toml::Table = toml::from_str(text).unwrap_or_default();
-    !is_study(&table) && SECTIONS.iter().any(|section| table.contains_key(*section))
+    study_key(&table).is_none() && has_sections(&table)
 }
 
 /// Maps to calibrate with, and a number that changes with their bytes.

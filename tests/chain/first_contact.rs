@@ -62,6 +62,13 @@ fn a_file_of_another_kind_is_told_with_the_command_that_takes_it() {
         let said = fail(&[command, &study]);
         assert!(said.contains("a study, with [[axis]]") && said.contains("lunarray study"), "{said}");
     }
+    // Studies without axes too.
+    for name in ["noise/realisations.toml", "calibration/known-sky.toml"] {
+        let study = format!("{}/pipelines/{name}", env!("CARGO_MANIFEST_DIR"));
+        let said = fail(&["check", &study]);
+        assert!(said.contains(&format!("{name}: a study, with ")), "{said}");
+        assert!(said.contains("lunarray study") && !said.contains("no such key"), "{said}");
+    }
     let said = fail(&["study", &place.pipeline]);
     assert!(said.contains("a pipeline; expected a study") && said.contains("lunarray run"), "{said}");
     // A mistake in a study is shown as such.

@@ -143,7 +143,9 @@ fn studies_that_cannot_be_made_say_why() {
         ("[[axis]]\nkey = \"map.epsilon\"\nvalues = []", "axis 1; expected key with values"),
         ("[[axis]]\nkey = \"map.epsilon\"\nvalues = [1e-4, -1.0]", "case epsilon = -1.0: "),
         ("[[axis]]\nkey = \"map.epsilons\"\nvalues = [1e-4]", "map.epsilons: no such key"),
-        ("pipeline = \"none.toml\"", "none.toml"),
+        ("pipeline = \"none.toml\"\nrealisations = 2", "none.toml"),
+        ("", "study.toml: nothing that makes cases; expected [[axis]] with key and values"),
+        ("pipeline = \"pipeline.toml\"\nset = [\"seed=1\"]", "study.toml: nothing that makes cases"),
         ("[[axis]]\nkey = \"seed\"\nvalues = [1, 1]", "two cases with products in case-seed-1"),
         // The last would hold, under the labels of both.
         (
