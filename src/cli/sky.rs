@@ -36,7 +36,7 @@ pub(super) struct SkyArgs {
     #[arg(long, value_parser = frequency_hz, required_unless_present = "like")]
     freq_hz: Option<f64>,
     /// HEALPix nside: a power of two up to 1024.
-    #[arg(long, default_value_t = 64)]
+    #[arg(long, default_value_t = 64, conflicts_with = "like")]
     nside: usize,
     /// Map to write (FITS); its picture goes beside it with the extension .png.
     #[arg(short, long, value_name = "FILE", value_parser = output_path())]

@@ -363,3 +363,17 @@ fn a_sky_of_another_frequency_is_a_problem_of_the_file() {
     let scaled = [&check[..], &["--set", "sky.frequency={spectral_index=-2.5}"]].concat();
     lunarray().args(&scaled).assert().success();
 }
+
+#[test]
+fn a_sky_like_another_has_its_nside() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let (like, out) = (path("like.fits"), path("out.fits"));
+    let map = SkyMap::new(Frame::Ecliptic, vec![1e5; 192]).unwrap();
+    write_map(Path::new(&like), &map, &WriteOptions::default()).unwrap();
+    let args = ["sky", "--like", &like, "--correlation", "0.5", "--out", &out, "--no-picture"];
+    let told = complaint(&[&args[..], &["--nside", "8"]].concat());
+    assert!(told.contains("--nside") && told.contains("cannot be used with"), "{told}");
+    assert!(!Path::new(&out).exists());
+    assert!(said(&args).contains("nside 4"));
+}
