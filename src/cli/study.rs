@@ -119,14 +119,17 @@ fn told_power_kept(summary: &StudySummary) -> Vec<String> {
     channels
         .filter(|(_, channel)| channel.power_kept.is_some())
         .map(|(label, channel)| {
+            let of = format!("{label}, {:.3} MHz", channel.frequency_hz / 1e6);
+            let last = 120.min(2 * channel.nside);
+            if last < 20 {
+                return format!("{of}: the map ends at l = {last}, before l = 20: spectra.csv has C_l and rho_l by degree");
+            }
             let [ratio, coherent] = channel.power_kept_means();
             format!(
-                "{label}, {:.3} MHz: C_l {} of the ideal instrument's, coherent with the sky {}, rho_l {} (means, l = 20 to {})",
-                channel.frequency_hz / 1e6,
+                "{of}: C_l {} of the ideal instrument's, coherent with the sky {}, rho_l {} (means, l = 20 to {last})",
                 number(ratio),
                 number(coherent),
                 number(channel.rho_mean()),
-                120.min(2 * channel.nside)
             )
         })
         .collect()

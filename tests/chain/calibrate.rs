@@ -275,6 +275,11 @@ fn a_study_has_each_case_as_sent_and_calibrated() {
     let before = ["as-sent-large", "calibrated-large"].map(made);
     assert_eq!(serde_json::from_str::<serde_json::Value>(&succeed(&args)).unwrap(), summary);
     assert_eq!(["as-sent-large", "calibrated-large"].map(made), before);
+    // A map of nside 4 has no means of degrees from 20 on.
+    let plain: Vec<&str> = args.iter().copied().filter(|arg| *arg != "--json").collect();
+    let told = succeed(&plain);
+    assert!(told.contains("5.000 MHz: the map ends at l = 8, before l = 20"), "{told}");
+    assert!(!told.contains("l = 20 to"), "{told}");
     // The model is of the sky of both channels: one is missing.
     let model = format!("model = [\"{ideal}/{}/input.fits\"]\n{STUDY}", MHZ[0]);
     let study = place.file("modelled.toml", model.as_bytes());
