@@ -8,7 +8,7 @@ use toml::{Spanned, Table, Value};
 
 use super::config::Config;
 use super::problems::{Problem, Problems};
-use crate::units::shortened;
+use crate::units::{Dimension, shortened};
 
 /// Keys that have no default because they may be absent.
 const OPTIONAL_KEYS: [&str; 5] =
@@ -143,7 +143,8 @@ impl Walk<'_> {
                 (_, value) => match alone(&path, value.clone()).try_into::<Config>() {
                     Ok(_) => Some(value),
                     Err(error) => {
-                        self.refuse(&path, || shortened(&plain(error.message()), SHOWN_MAX));
+                        let units = units_of(&key, &value);
+                        self.refuse(&path, || with_units(&plain(error.message()), units));
                         None
                     }
                 },
@@ -216,6 +217,21 @@ fn plain(message: &str) -> String {
         .fold(message.to_owned(), |text, (name, plain)| {
             text.replace(&format!("expected {name}"), &format!("expected {plain}"))
         })
+}
+
+/// What the key of a text, or of a list with texts, takes, by the unit in its name.
+fn units_of(key: &str, value: &Value) -> Option<&'static str> {
+    let is_text = value.is_str() || value.as_array().is_some_and(|list| list.iter().any(Value::is_str));
+    Dimension::of_key(key).filter(|_| is_text).map(Dimension::expected)
+}
+
+/// A message of the parser, with the units that the key takes.
+fn with_units(message: &str, units: Option<&str>) -> String {
+    let Some(units) = units else { return shortened(message, SHOWN_MAX) };
+    match message.strip_suffix("a number") {
+        Some(message) => format!("{}{units}", shortened(message, SHOWN_MAX)),
+        None => format!("{}; a value is {units}", shortened(message, SHOWN_MAX)),
+    }
 }
 
 /// Where keys stand.

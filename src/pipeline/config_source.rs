@@ -368,6 +368,27 @@ mod tests {
         let config =
             load("", &["spacecraft.channels_hz=[3MHz, 10 MHz]", "spacecraft.window_s_max=5min"]).unwrap();
         assert_eq!((config.spacecraft.channels_hz, config.spacecraft.window_s_max), (vec![3e6, 10e6], 300.0));
+        let config = load("", &["calibrate.clock_sigma_ns=1us", "calibrate.position_sigma_m=1km"]).unwrap();
+        assert_eq!((config.calibrate.clock_sigma_ns, config.calibrate.position_sigma_m), (1e3, 1e3));
+        // What a key takes is told with what was found.
+        for (bad, part) in [
+            (
+                "array.altitude_m=300MHz",
+                "array.altitude_m: invalid type: string \"300MHz\", expected a number of metres, or one with m or km",
+            ),
+            (
+                "spacecraft.channels_hz=[3MHz, 3m]",
+                "channels_hz: invalid type: string \"3m\", expected a number of Hz, or one with Hz, kHz, MHz or GHz",
+            ),
+            (
+                "spacecraft.channels_hz=3m",
+                "string \"3m\", expected a list; a value is a number of Hz, or one with Hz",
+            ),
+            ("calibrate.clock_sigma_ns=1km", "expected a number of nanoseconds, or one with ns, us, ms or s"),
+        ] {
+            let told = load("", &[bad]).unwrap_err().to_string();
+            assert!(told.contains(part), "{bad}: {told}");
+        }
         // Other units, and keys without one, stay texts of the wrong type.
         for bad in ["spacecraft.duration_s=3MHz", "map.nside=16m", "spacecraft.channels_hz=[3MHz, 1d]"] {
             let told = load("", &[bad]).unwrap_err().to_string();

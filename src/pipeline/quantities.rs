@@ -18,12 +18,14 @@ pub(super) fn read_units(table: &mut Table) {
     }
 }
 
-/// The numbers of a text, of a list of texts, or of a text such as `[3MHz, 10MHz]`, which `--set` leaves as it is.
+/// The numbers of a text, of a list of texts, or of a text such as `[3MHz, 10MHz]`, which `--set` leaves as it is: a list in which what
+/// is no number stays a text.
 fn with_units(value: &Value, dimension: Dimension) -> Option<Value> {
     let number = |text: &str| dimension.parse(text).ok().map(Value::Float);
+    let number_or_text = |text: &str| number(text).unwrap_or_else(|| Value::String(text.trim().to_owned()));
     match value {
         Value::String(text) => match text.trim().strip_prefix('[').and_then(|text| text.strip_suffix(']')) {
-            Some(list) => list.split(',').map(number).collect::<Option<_>>().map(Value::Array),
+            Some(list) => Some(Value::Array(list.split(',').map(number_or_text).collect())),
             None => number(text),
         },
         Value::Array(list) if list.iter().any(Value::is_str) => {

@@ -9,6 +9,8 @@ pub enum Dimension {
     Frequency,
     /// s.
     Time,
+    /// Times as short as those of clocks: ns.
+    ShortTime,
     /// m.
     Length,
     /// Degrees.
@@ -29,12 +31,13 @@ const TIMES: [(&str, f64); 7] = [
     ("h", 3600.0),
     ("d", DAY_S),
 ];
+const SHORT_TIMES: [(&str, f64); 4] = [("ns", 1.0), ("us", 1e3), ("ms", 1e6), ("s", 1e9)];
 const LENGTHS: [(&str, f64); 2] = [("km", 1e3), ("m", 1.0)];
 const ANGLES: [(&str, f64); 3] = [("arcmin", 1.0 / 60.0), ("arcsec", 1.0 / 3600.0), ("deg", 1.0)];
 
 impl Dimension {
-    /// What a key measures, by the unit at the end of its name: `channels_hz`, `duration_s`, `altitude_m`, `inclination_deg`, also
-    /// before `_max` and `_min`. `None` for other units, and rates such as `_m_s`.
+    /// What a key measures, by the unit at the end of its name: `channels_hz`, `duration_s`, `clock_sigma_ns`, `altitude_m`,
+    /// `inclination_deg`, also before `_max` and `_min`. `None` for other units, and rates such as `_m_s`.
     #[must_use]
     pub fn of_key(key: &str) -> Option<Self> {
         let name = key.rsplit('.').next().unwrap_or(key);
@@ -43,6 +46,7 @@ impl Dimension {
         let dimension = match unit {
             "hz" => Self::Frequency,
             "s" => Self::Time,
+            "ns" => Self::ShortTime,
             "m" => Self::Length,
             "deg" => Self::Angle,
             _ => return None,
@@ -57,6 +61,7 @@ impl Dimension {
         match self {
             Self::Frequency => &FREQUENCIES,
             Self::Time => &TIMES,
+            Self::ShortTime => &SHORT_TIMES,
             Self::Length => &LENGTHS,
             Self::Angle => &ANGLES,
         }
@@ -68,6 +73,7 @@ impl Dimension {
         match self {
             Self::Frequency => "a number of Hz, or one with Hz, kHz, MHz or GHz, such as 3MHz",
             Self::Time => "a number of seconds, or one with us, ms, s, min, h, d or yr, such as 90s or 7d",
+            Self::ShortTime => "a number of nanoseconds, or one with ns, us, ms or s, such as 30ns",
             Self::Length => "a number of metres, or one with m or km, such as 10km",
             Self::Angle => "a number of degrees, or one with deg, arcmin or arcsec",
         }
@@ -126,6 +132,9 @@ mod tests {
             (Dimension::Time, "-90s", -90.0),
             (Dimension::Time, "2min", 120.0),
             (Dimension::Time, "5ms", 5e-3),
+            (Dimension::ShortTime, "1us", 1e3),
+            (Dimension::ShortTime, "30 ns", 30.0),
+            (Dimension::ShortTime, "2.5", 2.5),
             (Dimension::Length, "10km", 1e4),
             (Dimension::Length, "1_737_100 m", 1_737_100.0),
             (Dimension::Angle, "30arcmin", 0.5),
@@ -140,6 +149,7 @@ mod tests {
             (Dimension::Time, "infd"),
             (Dimension::Time, "nan"),
             (Dimension::Time, "7w"),
+            (Dimension::ShortTime, "1h"),
             (Dimension::Length, "1e308km"),
             (Dimension::Length, "3 feet"),
         ] {
@@ -163,6 +173,7 @@ mod tests {
             (Dimension::Length, 1e300, "1e297 km"),
             (Dimension::Angle, 0.5, "30 arcmin"),
             (Dimension::Angle, 30.0, "30 deg"),
+            (Dimension::ShortTime, 30e3, "30 us"),
         ] {
             assert_eq!(dimension.show(value), expected);
         }
@@ -177,6 +188,7 @@ mod tests {
         for (key, expected) in [
             ("spacecraft.channels_hz", Some(Dimension::Frequency)),
             ("spacecraft.window_s_max", Some(Dimension::Time)),
+            ("calibrate.clock_sigma_ns", Some(Dimension::ShortTime)),
             ("array.altitude_m", Some(Dimension::Length)),
             ("map.limits.altitude_m_max", Some(Dimension::Length)),
             ("array.inclination_deg", Some(Dimension::Angle)),
