@@ -296,15 +296,19 @@ pub struct FolderLock {
     /// The folder as it was when it was locked.
     locked: Metadata,
     removes_lock: bool,
+    /// It was not there before.
+    is_new: bool,
 }
 
 impl FolderLock {
     /// Creates the folder if needed, and locks it by a file `name` in it. Removes unfinished files that nobody holds.
-    /// If `removes_lock`, the file goes when the lock is dropped.
+    /// If `removes_lock`, the file goes when the lock is dropped, and the folder with it if it was created and is empty: whoever fails
+    /// before the first product leaves nothing behind.
     ///
     /// # Errors
     /// The system's error; [`io::ErrorKind::ResourceBusy`] if another process, or this one, has locked the folder.
     pub fn acquire(folder: &Path, name: &str, removes_lock: bool) -> io::Result<Self> {
+        let is_new = !folder.exists();
         fs::create_dir_all(folder)?;
         let lock_path = folder.join(name);
         let lock = loop {
@@ -324,7 +328,7 @@ impl FolderLock {
         for path in unfinished_files(folder) {
             remove_stale(&path);
         }
-        Ok(Self { folder: folder.to_owned(), lock_path, lock, locked, removes_lock })
+        Ok(Self { folder: folder.to_owned(), lock_path, lock, locked, removes_lock, is_new })
     }
 
     /// What has become of the folder, if it is no longer the one that was locked: moved, replaced, or without its lock.
@@ -343,6 +347,10 @@ impl Drop for FolderLock {
     fn drop(&mut self) {
         if self.removes_lock && self.lost().is_none() {
             let _ = fs::remove_file(&self.lock_path);
+            if self.is_new {
+                // Not if there is anything in it.
+                let _ = fs::remove_dir(&self.folder);
+            }
         }
     }
 }

@@ -86,7 +86,14 @@ pub enum CalibrationError {
     },
 }
 
+/// Most problems of a file that are told one by one; a mistake in one gain is often made in all of them.
+const TOLD_MAX: usize = 5;
+
 fn list(problems: &[InvalidValue]) -> String {
-    let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
-    lines.join("; ")
+    let lines: Vec<String> = problems.iter().take(TOLD_MAX).map(ToString::to_string).collect();
+    let more = match problems.len().saturating_sub(TOLD_MAX) {
+        0 => String::new(),
+        more => format!("; and {more} more"),
+    };
+    format!("{}{more}", lines.join("; "))
 }

@@ -241,6 +241,18 @@ mod tests {
         assert_eq!(keys, expected);
     }
 
+    #[test]
+    fn the_first_of_many_mistakes_are_told() {
+        let solutions: Vec<String> =
+            (0..30).map(|k| format!("{{ time_s = {k}, gains = [[1, 0]] }}")).collect();
+        let text = format!("[[channels]]\nfrequency_hz = 1e7\nsolutions = [{}]", solutions.join(", "));
+        let problems = read("a.toml", &text).unwrap().problems();
+        assert_eq!(problems.len(), 30);
+        let told = CalibrationError::Values { path: "a.toml".into(), problems }.to_string();
+        assert_eq!(told.matches("expected 2 to 64 satellites").count(), 5, "{told}");
+        assert!(told.ends_with("; and 25 more"), "{told}");
+    }
+
     proptest! {
         #[test]
         fn any_text_is_read_or_refused(text in any::<String>(), cut in 0..TOML.len()) {

@@ -1,5 +1,6 @@
 //! Checks of the files that a pipeline names.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use super::plan::Plan;
@@ -22,8 +23,12 @@ impl Plan {
         let priors = self.config.map.prior_files.iter();
         let options = ReadOptions { frame_if_missing: self.config.map.prior_frame, ..ReadOptions::default() };
         let priors = priors.map(|path| read_whole_map(path, &options));
+        // A file that stands for several channels is told once.
+        let mut told = BTreeSet::new();
         for problem in skies.chain(priors).filter_map(Result::err) {
-            found.push(|| problem);
+            if told.insert(problem.to_string()) {
+                found.push(|| problem);
+            }
         }
         for files in [&self.config.map.prior_files, &self.config.calibrate.model_files] {
             let of_channels = files.iter().zip(&spacecraft.channels_hz);

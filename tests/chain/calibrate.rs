@@ -300,7 +300,11 @@ fn what_does_not_fit_is_refused() {
     assert!(said(&["--set", "calibrate.mode=beacon"]).contains("calibrate.beacon_k_sr = 0"));
     let zero = ["calibrate.phase_sigma_deg=0", "calibrate.amplitude_sigma=0"];
     assert!(said(&["--set", zero[0], "--set", zero[1]]).contains("something to solve for"));
-    assert!(!Path::new(&format!("{out}/gains.json")).exists());
+    // Nothing is left of what came to nothing.
+    let sky = place.path("one.fits");
+    succeed(&["sky", &place.pipeline, "--no-picture", "--freq-hz", "3MHz", "--nside", "4", "--out", &sky]);
+    assert!(said(&["--model", &sky]).contains("one a channel of the downlink"));
+    assert!(!Path::new(&out).exists());
 }
 
 #[test]

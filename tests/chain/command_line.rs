@@ -301,6 +301,13 @@ fn check_reads_the_files_that_a_pipeline_names() {
 }
 
 #[test]
+fn a_file_of_several_channels_is_told_once() {
+    let complaint = complaint(&["check", "--set", "sky.file=/nowhere/sky.fits"]);
+    assert!(complaint.contains(": 1 problem(s)"), "{complaint}");
+    assert_eq!(complaint.matches("/nowhere/sky.fits").count(), 1, "{complaint}");
+}
+
+#[test]
 fn bad_files_are_named_with_what_was_expected() {
     let folder = tempfile::tempdir().unwrap();
     let empty = write(folder.path(), "empty", "");
@@ -314,6 +321,11 @@ fn bad_files_are_named_with_what_was_expected() {
             assert!(complaint.contains("expected"), "{args:?}: {complaint}");
         }
     }
+    // A command that fails before its first product leaves no folder that it made; one that was there stays.
+    assert!(!Path::new(out).exists());
+    std::fs::create_dir(out).unwrap();
+    complaint(&["replay", &empty, "--out", out]);
+    assert!(Path::new(out).is_dir() && std::fs::read_dir(out).unwrap().next().is_none());
     let at = ["--freq-hz", "1e7", "--at", "0", "--pair", "1-2"];
     for file in [&empty, &foreign, &"/nowhere/map.fits".to_owned()] {
         let complaint = complaint(&[&["predict", "--sky", file.as_str()], &at[..]].concat());
