@@ -252,3 +252,27 @@ impl EngineCost {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::accumulation::MatrixKind;
+
+    #[test]
+    fn rows_made_again_cost_products_times_rows_times_pixels() {
+        let data = ChannelData { frequency_hz: 1e7, visibilities: 25_000.0, windows: 100.0 };
+        let of = |nside, iterations_max, rows| {
+            let map =
+                MapConfig { nside, rows, matrix: MatrixKind::Remade, iterations_max, ..MapConfig::default() };
+            EngineCost::of(&map, data)
+        };
+        let (few, many) = (of(64, 70, PixelMethod::Centre), of(64, 170, PixelMethod::Centre));
+        // With those for W_max, twice as many: all is products.
+        assert!((many.solution_s / few.solution_s - 2.0).abs() < 1e-9);
+        assert!((few.solution_s / of(32, 70, PixelMethod::Centre).solution_s - 4.0).abs() < 1e-9);
+        assert!(of(64, 70, PixelMethod::Average).solution_s > few.solution_s);
+        // 9.7 GB of matrix (`PIXEL_ENGINE_NSIDE_MAX`) against 400 bytes a visibility.
+        let held = EngineCost::of(&MapConfig { nside: 64, ..MapConfig::default() }, data);
+        assert!(held.sums_bytes > 9e9 && few.sums_bytes < 2e7 && few.other_bytes < 1e9);
+    }
+}
