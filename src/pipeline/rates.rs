@@ -11,13 +11,14 @@ pub(super) const FRINGES_PER_S: f64 = 7.2e8;
 /// quicklook, which takes 75 s).
 pub(super) const RANK_K_MULTIPLY_ADDS_PER_S: f64 = 1.0e10;
 
-/// Time of an element of a row at pixel centres in a product of two vectors, s: made, and used there and back.
-pub(super) const CENTRE_ELEMENT_S: f64 = 2.1e-9;
+/// Time of an element of a row at pixel centres in a product of two vectors, s: made, and used there and back. 1.1 ns with AVX-512 (first
+/// case of `pipelines/paper/fig16-nside64.toml`, processor time), taken to be twice as much without.
+pub(super) const CENTRE_ELEMENT_S: f64 = 2.2e-9;
 
-/// The same of a row averaged over pixels.
-pub(super) const AVERAGE_ELEMENT_S: f64 = 4.4e-9;
+/// The same of a row averaged over pixels: 5.6 ns with AVX-512 beside other work; most of it is pixels that the limb cuts.
+pub(super) const AVERAGE_ELEMENT_S: f64 = 6e-9;
 
-/// The same of a row averaged child by child in f64.
+/// The same of a row averaged child by child in f64: 256 sines, not measured.
 pub(super) const EXACT_ELEMENT_S: f64 = 1e-5;
 
 /// Multiply-adds of a Cholesky factorisation in a second: its panels keep one of two cores waiting.
