@@ -529,7 +529,8 @@ mod tests {
                         seen.extend([value.re, value.im]);
                     }
                     let error = difference(found, &expected);
-                    assert!(error < tolerance, "{what}: {error:e}");
+                    // Rows are used twice.
+                    assert!(error < 2.0 * tolerance, "{what}: {error:e}");
                     let forward: Vec<f64> =
                         products.forward(&pairs, x).iter().flat_map(|value| [value.re, value.im]).collect();
                     let error = difference(&forward, &seen);
