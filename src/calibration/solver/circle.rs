@@ -315,8 +315,8 @@ mod tests {
     #[test]
     fn a_phase_that_does_not_matter_leaves_a_pair_on_its_circle() {
         let array = array();
-        // 1 mm of 100 m, 1e-5 rad: 2e-4 rad of phase at 10 MHz. A longer pair tells the plane.
-        let mut positions = pass(&array, [0, 3]);
+        // 1 mm of 600 m, 2e-6 rad: 2e-4 rad of phase at 10 MHz. A pair of 2 km tells the plane.
+        let mut positions = pass(&array, [0, 2]);
         positions.extend(raised(&array, [0, 1], 1e-3));
         let mut sky_of_circle = circle_sky(&array);
         let found = sky_of_circle.predict(&positions, &mut Rotations::default()).unwrap();
