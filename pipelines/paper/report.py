@@ -559,7 +559,11 @@ def main():
          "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("rho", "no noise", "The paper: rows at centres are well below 1 from b_p on; averaged rows are not, and "
                    "b < 2 b_p and b < 4 b_p are alike. So it is here, at nside 16; its study has what data it is from. Many windows matter more "
-                   "than many integrations of each: every 4th is half a wavelength from the last.")),
+                   "than many integrations of each: every 4th is half a wavelength from the last.")
+         + "\n### At nside 64\n\n`lunarray study pipelines/paper/fig16-nside64.toml` (`map.matrix = \"remade\"`)\n\n"
+         + correlation("fig16-nside64", "rho", (8, 12, 16, 24, 32, 48, 64, 80, 96, 128), "limit, rows",
+                       "From some 13,000 visibilities each, half as many real numbers as there are pixels, "
+                       "so that no map is complete: what the two kinds of rows differ by is theirs.")),
         ("Fig. 17: the same, SNR_l with thermal noise", "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("snr", "thermal noise", "Rows at centres are not made smaller by the pixel, so that they take long baselines for better measured "
                    "than they are: less noise, and so a greater SNR_l, of maps that Fig. 16 shows to be wrong.")),
@@ -574,7 +578,8 @@ def main():
          point_beams("beams", "At nside 16 and smoothed to 4 degrees; the paper, at nside 64 and smoothed to 1 degree: about 1.3 degrees, four "
                      "times which is 5.2. In pixels it is 4.5 to 5.0 in all directions; harmonics of equal weight to l = 40 are wider than pixels.")
          + "\n### At nside 64\n\n`lunarray study pipelines/paper/beams-nside64.toml`\n\n"
-         + point_beams("beams-nside64", "In harmonics to l = 160, from every tenth window.")),
+         + point_beams("beams-nside64", "In harmonics to l = 160, from every tenth window: the same width in all directions, 1.58 degrees by theory for a "
+                       "beam that keeps all degrees up to 160. The paper's 1.3 is of pixels.")),
         ("Fig. 20 and the appendix: N_b and Sigma_b", f"`{FIGURE.format('sub-pixel')}`", figure("sub-pixel", sub_pixel)),
     ]
     print("# The paper, figure by figure\n")
