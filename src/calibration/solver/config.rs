@@ -41,7 +41,7 @@ pub enum AmplitudeScale {
 #[serde(rename_all = "kebab-case")]
 pub enum SkyModel {
     /// Harmonics for maps of nside 64 to 256 whose pixels are not split, without positions to solve for, in passes with enough
-    /// visibilities on one circle (1,000 at nside 64); else direct sums.
+    /// visibilities on one circle (100 at nside 64); else direct sums.
     #[default]
     Auto,
     /// Sums over the map's pixels.
