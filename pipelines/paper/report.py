@@ -564,8 +564,8 @@ def main():
                    "than many integrations of each: every 4th is half a wavelength from the last.")
          + "\n### At nside 64\n\n`lunarray study pipelines/paper/fig16-nside64.toml` (`map.matrix = \"remade\"`)\n\n"
          + correlation("fig16-nside64", "rho", (8, 12, 16, 24, 32, 48, 64, 80, 96, 128), "limit, rows",
-                       "From some 13,000 visibilities each, half as many real numbers as there are pixels, "
-                       "so that no map is complete: what the two kinds of rows differ by is theirs.")),
+                       "From some 13,000 visibilities each, half as many real numbers as there are pixels: no map is complete, and beyond b_p over 2 "
+                       "most of it is not measured.")),
         ("Fig. 17: the same, SNR_l with thermal noise", "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("snr", "thermal noise", "As for rho_l: averaged rows gain with baselines up to 2 b_p and keep it up to 4 b_p (2.5, 3.2, 3.4 at l = 24), "
                    "rows at centres lose from b_p on (2.8, 1.5, 1.1). They are not made smaller by the pixel and take long baselines for better "

@@ -15,7 +15,7 @@ pub(super) const RANK_K_MULTIPLY_ADDS_PER_S: f64 = 1.0e10;
 /// case of `pipelines/paper/fig16-nside64.toml`, processor time), taken to be twice as much without.
 pub(super) const CENTRE_ELEMENT_S: f64 = 2.2e-9;
 
-/// The same of a row averaged over pixels: 5.6 ns with AVX-512 beside other work; most of it is pixels that the limb cuts.
+/// The same of a row averaged over pixels: 5.6 ns with AVX-512 beside other work.
 pub(super) const AVERAGE_ELEMENT_S: f64 = 6e-9;
 
 /// The same of a row averaged child by child in f64: 256 sines, not measured.
