@@ -157,7 +157,8 @@ impl FoundSolutions {
         let mut warnings = Vec::new();
         if self.late > 0 {
             warnings.push(format!(
-                "{} visibilities came after later passes had been solved and are in no solution: give files whose times do not overlap",
+                "{} visibilities came after their passes had been solved and are in no solution: `lunarray calibrate` uses all of files whose times do not \
+                 overlap",
                 self.late
             ));
         }

@@ -48,7 +48,7 @@ pub fn solve_remade(
     let system = System {
         sums,
         regularisation: Diagonal::Uniform(regularisation),
-        // The diagonal varies by half of itself over the sky, and saves no product.
+        // The diagonal saved no product in trials with dense matrices of random pairs at nside 16.
         precondition: &|_| (),
     };
     let mut solved = match start {

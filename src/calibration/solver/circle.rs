@@ -21,7 +21,7 @@ const WAVELENGTHS_OF_NSIDE: f64 = 2.5;
 /// Most of them; bounds the tables.
 const WAVELENGTHS_MAX: f64 = 320.0;
 
-/// Greatest nside whose tables are made: 0.7 GB, and 0.4 GB a channel.
+/// Greatest nside whose tables are made: some 2 GB a channel.
 pub(super) const NSIDE_MAX: usize = 256;
 
 /// Phase by which a pair may be off its circle, rad: that of its fringe, and of what the limb of the Moon moves by.
