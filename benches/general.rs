@@ -76,6 +76,7 @@ fn main() {
         wavelength_m: WAVELENGTH_M,
         moon_radius_m: array.moon_radius_m(),
         response: AntennaResponse::Isotropic,
+        polynomial_degree: 0,
     };
     let rows = GeneralRows::new(setup);
     let (plan_s, plan) = seconds(|| rows.plan(&at).unwrap());

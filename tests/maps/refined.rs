@@ -197,6 +197,7 @@ fn refined_maps_are_the_dense_solution_of_other_code() {
             wavelength_m: WAVELENGTH_M,
             moon_radius_m: MOON_RADIUS_M,
             response: AntennaResponse::Isotropic,
+            polynomial_degree: 0,
         });
         let alm: Alm = lunarray::accumulation::harmonic::coefficients(&sky, L_MAX);
         let seen = rows.forward(&rows.plan_direct(&at).unwrap(), &[alm]).remove(0);
@@ -235,6 +236,7 @@ fn refinement_leaves_a_map_of_a_circle_as_it_is() {
         wavelength_m: WAVELENGTH_M,
         moon_radius_m: MOON_RADIUS_M,
         response: AntennaResponse::Isotropic,
+        polynomial_degree: 0,
     });
     let mut alm = Alm::zeros(L_MAX);
     for l in 0..=L_MAX {
@@ -379,6 +381,7 @@ fn the_table_of_errors_by_pass_at_nside_16() {
         wavelength_m: WAVELENGTH_M,
         moon_radius_m: MOON_RADIUS_M,
         response: AntennaResponse::Isotropic,
+        polynomial_degree: 0,
     });
     for (altitude_m, cross) in [(20e3, 0.02), (20e3, 0.2)] {
         let at = geometry(altitude_m, cross, 12.0, 16, &baselines_m);

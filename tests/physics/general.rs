@@ -4,14 +4,14 @@
 use std::f64::consts::TAU;
 
 use lunarray::frames::AntennaResponse;
-use lunarray::response::general::{GeneralRows, PairAt, RowsSetup};
+use lunarray::response::general::{GeneralRows, Observed, PairAt, PairResponse, RowsSetup};
 use lunarray::response::harmonic::{HarmonicModel, ModelSettings, PairState, PatternGeometry};
-use lunarray::response::pixel::{Directions, PairGeometry, sky_sums};
-use lunarray::sky::harmonics::{Alm, synthesis};
+use lunarray::response::pixel::{Directions, PairGeometry, SatelliteAntenna, antenna_sums, sky_sums};
+use lunarray::sky::harmonics::{Alm, AnalysisOptions, Method, analysis, synthesis};
 use lunarray::sky::healpix::{pixel_area_sr, pixel_directions};
 use lunarray::units::Pair;
 use lunarray::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
-use lunarray::units::vector::Vec3;
+use lunarray::units::vector::{Vec3, unit};
 use num_complex::Complex64;
 
 const RADIUS_M: f64 = MOON_RADIUS_M + 300e3;
@@ -44,7 +44,13 @@ fn sky(l_max: usize) -> Alm {
 }
 
 fn setup(l_max: usize, response: AntennaResponse) -> RowsSetup {
-    RowsSetup { l_max, wavelength_m: WAVELENGTH_M, moon_radius_m: MOON_RADIUS_M, response }
+    RowsSetup {
+        l_max,
+        wavelength_m: WAVELENGTH_M,
+        moon_radius_m: MOON_RADIUS_M,
+        response,
+        polynomial_degree: 0,
+    }
 }
 
 /// Shape of an orbit: altitude +- `altitude_m`, cross-track offsets of `cross` of the baseline, inclination.
@@ -57,6 +63,27 @@ struct Shape {
 
 /// A third of each of several orbits of a pair: one trails the other by `baseline_m` and swings out of its plane.
 fn passes(shape: Shape, pair: Pair, baseline_m: f64, step_s: f64, orbits: usize) -> Vec<PairAt> {
+    let of_orbit = |orbit: usize| {
+        let node = TAU * (orbit as f64 + 0.3) / orbits as f64;
+        let start_s = PERIOD_S * (13 * orbit) as f64 + 1000.0 * orbit as f64;
+        let mut times_s = Vec::new();
+        let mut t_s = start_s;
+        while t_s < start_s + PERIOD_S / 3.0 {
+            times_s.push(t_s);
+            t_s += step_s;
+        }
+        places(shape, pair, baseline_m, node, &times_s)
+    };
+    (0..orbits).flat_map(of_orbit).collect()
+}
+
+/// Positions at some times of the first of one orbit of [`passes`].
+fn passes_at(shape: Shape, pair: Pair, baseline_m: f64, times_s: &[f64]) -> Vec<PairAt> {
+    places(shape, pair, baseline_m, TAU * 0.3, times_s)
+}
+
+/// Positions at some times of an orbit with this node.
+fn places(shape: Shape, pair: Pair, baseline_m: f64, node: f64, times_s: &[f64]) -> Vec<PairAt> {
     let axis_m = RADIUS_M;
     let eccentricity = shape.altitude_m / axis_m;
     let lag_s = baseline_m / (TAU * axis_m / PERIOD_S);
@@ -75,18 +102,13 @@ fn passes(shape: Shape, pair: Pair, baseline_m: f64, step_s: f64, orbits: usize)
         [x * co - y * so * ci, x * so + y * co * ci, y * si]
     };
     let tilt = shape.cross * baseline_m / axis_m;
-    let mut all = Vec::new();
-    for orbit in 0..orbits {
-        let node = TAU * (orbit as f64 + 0.3) / orbits as f64;
-        let start_s = PERIOD_S * (13 * orbit) as f64 + 1000.0 * orbit as f64;
-        let mut t_s = start_s;
-        while t_s < start_s + PERIOD_S / 3.0 {
-            let (r_i_m, r_j_m) = (at(t_s, node, tilt), at(t_s - lag_s, node, 0.0));
-            all.push(PairAt { pair, time_s: t_s, r_i_m, r_j_m });
-            t_s += step_s;
-        }
-    }
-    all
+    let place = |&time_s: &f64| PairAt {
+        pair,
+        time_s,
+        r_i_m: at(time_s, node, tilt),
+        r_j_m: at(time_s - lag_s, node, 0.0),
+    };
+    times_s.iter().map(place).collect()
 }
 
 fn rms(values: &[Complex64]) -> f64 {
@@ -323,4 +345,167 @@ fn results_do_not_depend_on_threads() {
         })
     };
     assert_eq!(run(1), run(3));
+}
+
+/// Antennas of a satellite that turn slowly.
+fn antenna(satellite: u8, time_s: f64) -> SatelliteAntenna {
+    let k = f64::from(satellite) + 1e-4 * time_s;
+    SatelliteAntenna {
+        axis_hat: unit([0.3 * k.sin(), -0.5 + 0.1 * k.cos(), 0.9]),
+        is_dipole: true,
+        distortion: 0.02 * f64::from(satellite),
+    }
+}
+
+fn antennas_of(at: &PairAt) -> [SatelliteAntenna; 2] {
+    [at.pair.i, at.pair.j].map(|satellite| antenna(satellite, at.time_s))
+}
+
+#[test]
+fn antennas_that_differ_see_what_direct_sums_of_them_see() {
+    const L_MAX: usize = 24;
+    const NSIDE: usize = 256;
+    let sky = sky(L_MAX);
+    let map = synthesis(&sky, NSIDE).unwrap();
+    let directions = Directions::from(pixel_directions(NSIDE).as_slice());
+    let values: Vec<f32> = map.iter().map(|v| *v as f32).collect();
+    let shape = Shape { altitude_m: 20e3, cross: 0.2, inclination_deg: 60.0 };
+    let pairs = passes(shape, Pair { i: 1, j: 4 }, 300.0, 40.0, 2);
+    let rows =
+        GeneralRows::new(RowsSetup { polynomial_degree: 6, ..setup(L_MAX, AntennaResponse::Isotropic) });
+    let response = |k: usize| {
+        let [a, b] = antennas_of(&pairs[k]);
+        PairResponse::of_antennas([&a, &b])
+    };
+    let plan = rows.plan_of(&pairs, &Observed { response: Some(&response), ..Observed::default() }).unwrap();
+    assert!(plan.computed() < pairs.len());
+    let found = rows.forward(&plan, std::slice::from_ref(&sky)).remove(0);
+    let geometries: Vec<_> = pairs
+        .iter()
+        .map(|at| {
+            let geometry = PairGeometry {
+                r_i_m: at.r_i_m,
+                r_j_m: at.r_j_m,
+                frequency_hz: SPEED_OF_LIGHT_M_S / WAVELENGTH_M,
+                moon_radius_m: MOON_RADIUS_M,
+                response: AntennaResponse::Isotropic,
+            };
+            (geometry, antennas_of(at))
+        })
+        .collect();
+    let expected: Vec<Complex64> = antenna_sums(&geometries, &directions, &values, pixel_area_sr(NSIDE))
+        .unwrap()
+        .iter()
+        .map(|sum| sum.visibility_k_sr)
+        .collect();
+    // As of isotropic antennas: pixels on the limb.
+    let error = difference(&found, &expected);
+    assert!(error < 1e-2, "{error:e}");
+
+    // A response that does not change is a factor of the sky, here of its pixels: rows of that sky, one by one.
+    let [a, b] = [antenna(1, 0.0), antenna(4, 5e3)];
+    let constant = PairResponse::of_antennas([&a, &b]);
+    let product: Vec<f64> =
+        pixel_directions(NSIDE).iter().zip(&map).map(|(n, t)| constant.at(*n) * t).collect();
+    let product = analysis(&product, L_MAX + 6, &AnalysisOptions { method: Method::ACCURATE }).unwrap().alm;
+    let same = |_: usize| constant.clone();
+    let plan = rows.plan_of(&pairs, &Observed { response: Some(&same), ..Observed::default() }).unwrap();
+    let found = rows.forward(&plan, std::slice::from_ref(&sky)).remove(0);
+    let plain = GeneralRows::new(setup(L_MAX + 6, AntennaResponse::Isotropic));
+    let expected = plain.forward(&plain.plan_direct(&pairs).unwrap(), &[product]).remove(0);
+    // Interpolation's, as below.
+    let error = difference(&found, &expected);
+    assert!(error < 1e-4, "{error:e}");
+}
+
+#[test]
+fn averages_over_integrations_are_those_of_many_instants() {
+    const L_MAX: usize = 60;
+    let skies = [sky(L_MAX)];
+    let rows = GeneralRows::new(setup(L_MAX, AntennaResponse::Isotropic));
+    for (shape, baseline_m, step_s) in [
+        // A quarter of a wavelength of motion, twice the longest of the mission's; then its longest integrations.
+        (Shape { altitude_m: 20e3, cross: 0.02, inclination_deg: 30.0 }, 900.0, 11.0),
+        (Shape { altitude_m: 40e3, cross: 0.2, inclination_deg: 85.0 }, 300.0, 16.0),
+        (Shape { altitude_m: 20e3, cross: 0.02, inclination_deg: 30.0 }, 60.0, 60.0),
+    ] {
+        const INSTANTS: usize = 32;
+        let pair = Pair { i: 0, j: 1 };
+        let pairs = passes(shape, pair, baseline_m, step_s, 1);
+        // Midpoints of as many parts of each integration, at their own positions.
+        let fine = passes_at(shape, pair, baseline_m, &{
+            let part_s = step_s / INSTANTS as f64;
+            let of = |at: &PairAt| {
+                let start_s = at.time_s - 0.5 * step_s;
+                (0..INSTANTS).map(move |k| start_s + (k as f64 + 0.5) * part_s)
+            };
+            pairs.iter().flat_map(of).collect::<Vec<f64>>()
+        });
+        let each = rows.forward(&rows.plan(&fine).unwrap(), &skies).remove(0);
+        let expected: Vec<Complex64> = each
+            .chunks(INSTANTS)
+            .map(|instants| instants.iter().sum::<Complex64>() / INSTANTS as f64)
+            .collect();
+        let duration_s = vec![step_s as f32; pairs.len()];
+        let observed = Observed { duration_s: &duration_s, ..Observed::default() };
+        let plan = rows.plan_of(&pairs, &observed).unwrap();
+        assert_eq!(plan.instants(), 0);
+        let found = rows.forward(&plan, &skies).remove(0);
+        let middle = rows.forward(&rows.plan(&pairs).unwrap(), &skies).remove(0);
+        let (error, left_out) = (difference(&found, &expected), difference(&middle, &expected));
+        assert!(error < 1e-4, "{baseline_m} {}: {error:e}, {left_out:e}", shape.altitude_m);
+        assert!(left_out > 10.0 * error, "{baseline_m}: {error:e}, {left_out:e}");
+
+        // Without others about it nobody knows how a pair moves.
+        let alone: Vec<PairAt> = pairs.iter().step_by(pairs.len() / 3).copied().collect();
+        let observed = Observed { duration_s: &duration_s[..alone.len()], ..Observed::default() };
+        assert_eq!(rows.plan_of(&alone, &observed).unwrap().instants(), alone.len());
+    }
+}
+
+#[test]
+fn adjoint_and_normal_products_of_averages_with_antennas_are_the_transposes() {
+    const L_MAX: usize = 20;
+    let shape = Shape { altitude_m: 20e3, cross: 0.2, inclination_deg: 60.0 };
+    let pairs = passes(shape, Pair { i: 1, j: 4 }, 300.0, 14.0, 2);
+    let rows =
+        GeneralRows::new(RowsSetup { polynomial_degree: 2, ..setup(L_MAX, AntennaResponse::Isotropic) });
+    let response = |k: usize| {
+        let [a, b] = antennas_of(&pairs[k]);
+        PairResponse::of_dipoles(a.axis_hat, b.axis_hat)
+    };
+    let duration_s = vec![14.0; pairs.len()];
+    let plan =
+        rows.plan_of(&pairs, &Observed { duration_s: &duration_s, response: Some(&response) }).unwrap();
+    let skies = [sky(L_MAX), {
+        let mut other = sky(L_MAX);
+        *other.get_mut(3, 2) = Complex64::new(3e5, -1e5);
+        other
+    }];
+    let seen = rows.forward(&plan, &skies);
+    let mut random = Random(3);
+    let values: Vec<Complex64> =
+        seen[0].iter().map(|_| Complex64::new(random.next(), random.next())).collect();
+    let gradient = rows.adjoint(&plan, &[&values]).remove(0);
+    assert_eq!(gradient.l_max(), L_MAX);
+    let of_data: f64 = seen[0].iter().zip(&values).map(|(a, b)| (a * b.conj()).re).sum();
+    let inner = |a: &Alm, b: &Alm| -> f64 {
+        a.values().iter().zip(b.values()).map(|(a, b)| a.re * b.re + a.im * b.im).sum()
+    };
+    let of_sky = inner(&skies[0], &gradient);
+    // As the plain operator's: patterns and turned skies are in f32.
+    assert!((of_data - of_sky).abs() < 1e-5 * of_data.abs(), "{of_data} {of_sky}");
+
+    let weight: Vec<f64> = (0..pairs.len()).map(|k| 1.0 + 0.5 * (k as f64).sin()).collect();
+    let (again, products) = rows.normal(&plan, &skies, &weight);
+    assert_eq!(again, seen);
+    for (sky, seen) in products.iter().zip(&seen) {
+        let weighted: Vec<Complex64> = seen.iter().zip(&weight).map(|(v, w)| v * w).collect();
+        let expected = rows.adjoint(&plan, &[&weighted]).remove(0);
+        let size = inner(&expected, &expected).sqrt();
+        let off: f64 =
+            sky.values().iter().zip(expected.values()).map(|(a, b)| (a - b).norm_sqr()).sum::<f64>().sqrt();
+        // The same numbers, in f32 vectors of other lengths.
+        assert!(off < 1e-5 * size, "{off:e} of {size:e}");
+    }
 }

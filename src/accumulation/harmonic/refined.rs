@@ -31,6 +31,7 @@ pub(super) fn refined_sums(
         wavelength_m: SPEED_OF_LIGHT_M_S / setup.frequency_hz,
         moon_radius_m: setup.moon_radius_m,
         response: setup.response,
+        polynomial_degree: 0,
     });
     // Each visibility was checked when it came.
     let plan = rows.plan(&at).map_err(|error| AccumulationError::Rows(error.refusal))?;

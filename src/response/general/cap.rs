@@ -528,8 +528,13 @@ mod tests {
             view([2020e3, 2020.9e3], [6e-4, -1.1e-3]),
         ];
         for response in [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal] {
-            let setup =
-                RowsSetup { l_max: L_MAX, wavelength_m: WAVELENGTH_M, moon_radius_m: MOON_M, response };
+            let setup = RowsSetup {
+                l_max: L_MAX,
+                wavelength_m: WAVELENGTH_M,
+                moon_radius_m: MOON_M,
+                response,
+                polynomial_degree: 0,
+            };
             let nodes = views.map(|view| RowNode { turns_rad: [0.0; 3], view, class: 0 });
             let patterns = Patterns::new(setup);
             let middle_rad = views[0].cap_rad();

@@ -6,12 +6,17 @@
 //! (see `plan.rs`): [`GeneralRows::plan`], [`GeneralRows::forward`], [`GeneralRows::adjoint`]. [`GeneralRows::plan_direct`]
 //! computes each row, the reference for the other.
 //!
+//! Antennas of a pair may have any response that is a polynomial in the direction ([`PairResponse`]), and visibilities may be averages over
+//! their integrations ([`GeneralRows::plan_of`]).
+//!
 //! Results do not depend on the number of threads.
 
+mod antennas;
 mod bessel;
 mod border;
 mod cap;
 mod frames;
+mod instants;
 mod lanes;
 mod operator;
 mod phases;
@@ -19,8 +24,9 @@ mod plan;
 mod turns;
 mod view;
 
+pub use antennas::{DEGREE_MAX, PairResponse};
 pub use operator::{GeneralRows, row_tables_bytes};
-pub use plan::RowPlan;
+pub use plan::{Observed, RowPlan};
 
 use thiserror::Error;
 
@@ -40,6 +46,8 @@ pub struct RowsSetup {
     pub moon_radius_m: f64,
     /// Response of the antennas.
     pub response: AntennaResponse,
+    /// Greatest degree of the polynomials that multiply it, pair by pair: even, at most [`DEGREE_MAX`]; 0 if none does.
+    pub polynomial_degree: usize,
 }
 
 /// Positions of a pair at a time.

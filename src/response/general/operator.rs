@@ -5,11 +5,13 @@ use std::ops::Range;
 use num_complex::Complex64;
 use rayon::prelude::*;
 
+use super::antennas::Products;
 use super::cap::{CapBuffers, CapClass, NodePatterns, Patterns, batch_bytes};
 use super::frames::{Frames, Turned};
+use super::instants::Instants;
 use super::lanes::{LANES, Lanes, VALUES, Value};
 use super::phases::{PaddedShares, PhaseGrid, PhaseTable};
-use super::plan::{GROUP_NODES, Pass, RowNode, RowPlan, tables_bytes};
+use super::plan::{GROUP_NODES, Observed, Pass, RowNode, RowPlan, tables_bytes};
 use super::turns::{QuarterTurns, place};
 use super::{PairAt, RowsError, RowsSetup};
 use crate::response::harmonic::degrees;
@@ -25,7 +27,10 @@ const GROUPS_AT_ONCE: usize = 32;
 /// Rows of B over harmonics, for any positions.
 #[derive(Clone, Debug)]
 pub struct GeneralRows {
+    /// With the degrees that products with the response have.
     setup: RowsSetup,
+    products: Products,
+    instants: Instants,
     turns: QuarterTurns,
     patterns: Patterns,
     phases: PhaseGrid,
@@ -35,14 +40,11 @@ impl GeneralRows {
     /// Rows for a setup.
     #[must_use]
     pub fn new(setup: RowsSetup) -> Self {
+        let products = Products::new(setup.polynomial_degree);
+        let setup = RowsSetup { l_max: setup.l_max + products.degree(), ..setup };
         let turns = QuarterTurns::new(setup.l_max);
-        Self { patterns: Patterns::new(setup), phases: PhaseGrid::new(setup.l_max), turns, setup }
-    }
-
-    /// Setup.
-    #[must_use]
-    pub fn setup(&self) -> &RowsSetup {
-        &self.setup
+        let (patterns, phases) = (Patterns::new(setup), PhaseGrid::new(setup.l_max));
+        Self { patterns, phases, turns, setup, products, instants: Instants::new() }
     }
 
     /// Plans the rows of visibilities: few of them where consecutive ones are of one pair and in the order of time.
@@ -50,7 +52,15 @@ impl GeneralRows {
     /// # Errors
     /// The first visibility whose positions have no row.
     pub fn plan(&self, pairs: &[PairAt]) -> Result<RowPlan, RowsError> {
-        RowPlan::new(&self.setup, pairs, false)
+        self.plan_of(pairs, &Observed::default())
+    }
+
+    /// As [`Self::plan`], of averages over integrations and of pairs with responses of their own.
+    ///
+    /// # Errors
+    /// As [`Self::plan`].
+    pub fn plan_of(&self, pairs: &[PairAt], observed: &Observed<'_>) -> Result<RowPlan, RowsError> {
+        RowPlan::new(&self.setup, pairs, observed, false)
     }
 
     /// As [`Self::plan`], each row computed for itself.
@@ -58,13 +68,15 @@ impl GeneralRows {
     /// # Errors
     /// As [`Self::plan`].
     pub fn plan_direct(&self, pairs: &[PairAt]) -> Result<RowPlan, RowsError> {
-        RowPlan::new(&self.setup, pairs, true)
+        RowPlan::new(&self.setup, pairs, &Observed::default(), true)
     }
 
     /// Visibilities, K sr, of skies given by coefficients up to `l_max`: `B x`, one vector a sky.
     #[must_use]
     pub fn forward(&self, plan: &RowPlan, skies: &[Alm]) -> Vec<Vec<Complex64>> {
         let tables = Tables::new(&self.setup, plan);
+        let (count, skies) = (skies.len(), self.products.of(skies));
+        let skies = skies.as_slice();
         let values = plan.groups.par_iter().map(|group| {
             let passes = &plan.passes[group.clone()];
             let mut amplitudes = self.no_amplitudes(passes, skies.len());
@@ -75,9 +87,9 @@ impl GeneralRows {
                 let Some(batch) = self.batch(plan, passes, &tables, &mut buffers, places) else { continue };
                 self.amplitudes(&batch, skies, basis.as_ref(), &mut amplitudes);
             }
-            self.interpolate(plan, passes, &amplitudes, skies.len())
+            self.interpolate(plan, passes, &amplitudes, count)
         });
-        joined(plan, skies.len(), values.collect())
+        joined(plan, count, values.collect())
     }
 
     /// `sum_t Re(conj(dV_t/dx) v_t)` with respect to `Re T_lm` and `Im T_lm`, as real and imaginary part: `Bt v` for each of
@@ -85,7 +97,8 @@ impl GeneralRows {
     #[must_use]
     pub fn adjoint(&self, plan: &RowPlan, values: &[&[Complex64]]) -> Vec<Alm> {
         let tables = Tables::new(&self.setup, plan);
-        let mut out = vec![Alm::zeros(self.setup.l_max); values.len()];
+        let skies = values.len() * self.products.count();
+        let mut out = vec![Alm::zeros(self.setup.l_max); skies];
         // The order of sums is that of the groups, whatever the threads.
         for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
             let parts = groups.par_iter().map(|group| {
@@ -93,10 +106,10 @@ impl GeneralRows {
                 let rows = rows_of(passes);
                 let values: Vec<&[Complex64]> = values.iter().map(|values| &values[rows.clone()]).collect();
                 let amplitudes = self.spread(plan, passes, &values);
-                let mut gradients = vec![Alm::zeros(self.setup.l_max); values.len()];
+                let mut gradients = vec![Alm::zeros(self.setup.l_max); skies];
                 let mut buffers = CapBuffers::default();
                 let frames = self.frames(plan, passes);
-                let mut basis = frames.as_ref().map(|frames| (frames, self.no_turned(frames, values.len())));
+                let mut basis = frames.as_ref().map(|frames| (frames, self.no_turned(frames, skies)));
                 for places in Self::batches(plan, passes) {
                     let Some(batch) = self.batch(plan, passes, &tables, &mut buffers, places) else {
                         continue;
@@ -111,7 +124,7 @@ impl GeneralRows {
             let parts: Vec<_> = parts.collect();
             parts.iter().for_each(|part| add_to(&mut out, part));
         }
-        out
+        self.products.back(out)
     }
 
     /// `B x` and `Bt W B x` for several x, W being the rows' weights: [`Self::forward`] and [`Self::adjoint`] with each row
@@ -119,6 +132,8 @@ impl GeneralRows {
     #[must_use]
     pub fn normal(&self, plan: &RowPlan, skies: &[Alm], weight: &[f64]) -> (Vec<Vec<Complex64>>, Vec<Alm>) {
         let tables = Tables::new(&self.setup, plan);
+        let (count, skies) = (skies.len(), self.products.of(skies));
+        let skies = skies.as_slice();
         let mut out = vec![Alm::zeros(self.setup.l_max); skies.len()];
         let mut seen = Vec::with_capacity(plan.groups.len());
         for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
@@ -135,7 +150,7 @@ impl GeneralRows {
                 let one = |batch: &Batch| self.amplitudes(batch, skies, basis.as_ref(), &mut amplitudes);
                 batches.iter().for_each(one);
                 drop(basis);
-                let seen = self.interpolate(plan, passes, &amplitudes, skies.len());
+                let seen = self.interpolate(plan, passes, &amplitudes, count);
                 let weight = &weight[rows_of(passes)];
                 let weighted: Vec<Vec<Complex64>> =
                     seen.iter().map(|seen| seen.iter().zip(weight).map(|(v, w)| v * *w).collect()).collect();
@@ -157,7 +172,7 @@ impl GeneralRows {
                 seen.push(values);
             }
         }
-        (joined(plan, skies.len(), seen), out)
+        (joined(plan, count, seen), self.products.back(out))
     }
 
     /// How the frames of the passes' nodes are combined of some of them, if they are.
@@ -365,7 +380,7 @@ impl GeneralRows {
         }
     }
 
-    /// Values at all rows of passes, one vector a sky.
+    /// Values at all rows of passes, one vector a sky, from the amplitudes of the skies' products.
     fn interpolate(
         &self,
         plan: &RowPlan,
@@ -374,28 +389,34 @@ impl GeneralRows {
         skies: usize,
     ) -> Vec<Vec<Complex64>> {
         let first = nodes_of(passes).start;
+        let products = skies * self.products.count();
         let width = 2 * self.orders();
         let mut out = vec![Vec::with_capacity(rows_of(passes).len()); skies];
         let (mut table, mut shares, mut padded) =
             (PhaseTable::default(), Vec::new(), PaddedShares::default());
-        let mut values = vec![Complex64::ZERO; skies];
+        let [mut values, mut at] = [0, 1].map(|_| vec![Complex64::ZERO; products]);
         for pass in passes {
-            let amplitudes = &amplitudes[(pass.nodes.start - first) * skies * width..];
-            let amplitudes = &amplitudes[..pass.nodes.len() * skies * width];
+            let amplitudes = &amplitudes[(pass.nodes.start - first) * products * width..];
+            let amplitudes = &amplitudes[..pass.nodes.len() * products * width];
             if pass.tau.is_empty() {
-                for (row, node) in pass.rows.clone().zip(amplitudes.chunks_exact(skies * width)) {
-                    for (out, g) in out.iter_mut().zip(node.chunks_exact(width)) {
-                        out.push(self.at_phase(g, plan.gamma_rad[row]));
+                for (row, node) in pass.rows.clone().zip(amplitudes.chunks_exact(products * width)) {
+                    for (value, g) in values.iter_mut().zip(node.chunks_exact(width)) {
+                        *value = self.at_phase(g, plan.gamma_rad[row]);
                     }
+                    plan.combine(row, &values, &mut out);
                 }
                 continue;
             }
-            self.phases.fill(amplitudes, width / 2, [pass.nodes.len(), skies], &mut table);
+            self.phases.fill(amplitudes, width / 2, [pass.nodes.len(), products], &mut table);
             for row in pass.rows.clone() {
-                plan.shares(pass, row, &mut shares);
-                padded.set(&table, &shares);
-                self.phases.at(&table, plan.gamma_rad[row], &padded, &mut values);
-                out.iter_mut().zip(&values).for_each(|(out, value)| out.push(*value));
+                values.fill(Complex64::ZERO);
+                for instant in self.instants.of(plan, pass, row) {
+                    let gamma_rad = plan.shares(pass, row, instant, &mut shares);
+                    padded.set(&table, &shares);
+                    self.phases.at(&table, gamma_rad, &padded, &mut at);
+                    values.iter_mut().zip(&at).for_each(|(value, at)| *value += instant.weight * at);
+                }
+                plan.combine(row, &values, &mut out);
             }
         }
         out
@@ -410,31 +431,35 @@ impl GeneralRows {
     /// The transpose of [`Self::interpolate`], for several vectors over the rows of the passes.
     fn spread(&self, plan: &RowPlan, passes: &[Pass], values: &[&[Complex64]]) -> Vec<f64> {
         let (first, first_row) = (nodes_of(passes).start, rows_of(passes).start);
-        let (width, skies) = (2 * self.orders(), values.len());
+        let (width, skies) = (2 * self.orders(), values.len() * self.products.count());
         let mut out = self.no_amplitudes(passes, skies);
         let (mut table, mut shares, mut padded) =
             (PhaseTable::default(), Vec::new(), PaddedShares::default());
-        let mut of_row = vec![Complex64::ZERO; skies];
+        let [mut of_row, mut at] = [0, 1].map(|_| vec![Complex64::ZERO; skies]);
         for pass in passes {
             let out = &mut out[(pass.nodes.start - first) * skies * width..];
             let out = &mut out[..pass.nodes.len() * skies * width];
             if pass.tau.is_empty() {
                 for (row, to) in pass.rows.clone().zip(out.chunks_exact_mut(skies * width)) {
                     let gamma_rad = plan.gamma_rad[row];
-                    for (values, to) in values.iter().zip(to.chunks_exact_mut(width)) {
+                    plan.divide(row, values.iter().map(|values| values[row - first_row]), &mut of_row);
+                    for (value, to) in of_row.iter().zip(to.chunks_exact_mut(width)) {
                         let turn = Complex64::cis(-(self.setup.l_max as f64) * gamma_rad);
                         let (re, im) = to.split_at_mut(width / 2);
-                        phase_terms(values[row - first_row] * turn, gamma_rad, re, im);
+                        phase_terms(value * turn, gamma_rad, re, im);
                     }
                 }
                 continue;
             }
             self.phases.clear(&mut table, [pass.nodes.len(), skies]);
             for row in pass.rows.clone() {
-                plan.shares(pass, row, &mut shares);
-                padded.set(&table, &shares);
-                of_row.iter_mut().zip(values).for_each(|(to, values)| *to = values[row - first_row]);
-                self.phases.add(&mut table, plan.gamma_rad[row], &padded, &of_row);
+                plan.divide(row, values.iter().map(|values| values[row - first_row]), &mut of_row);
+                for instant in self.instants.of(plan, pass, row) {
+                    let gamma_rad = plan.shares(pass, row, instant, &mut shares);
+                    padded.set(&table, &shares);
+                    at.iter_mut().zip(&of_row).for_each(|(at, value)| *at = instant.weight * value);
+                    self.phases.add(&mut table, gamma_rad, &padded, &at);
+                }
             }
             self.phases.collect(&mut table, width / 2, out);
         }

@@ -15,9 +15,12 @@
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use std::ops::Range;
 
+use num_complex::Complex64;
 use rayon::prelude::*;
 
+use super::antennas::PairResponse;
 use super::cap::rings_for;
+use super::instants::Instant;
 use super::view::{Axes, PairView, euler, transported};
 use super::{PairAt, RowsError, RowsSetup};
 use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
@@ -49,6 +52,9 @@ const CLASSES_BYTES: f64 = 8e8;
 
 /// Most classes of limbs.
 const CLASSES_MAX: f64 = 64.0;
+
+/// Error of the angles gamma of rows as those of a pass's nodes tell them, rad, above which these do not tell how rows move.
+const GAMMA_ERROR_RAD: f64 = 1e-4;
 
 /// Rows that a task computes together, and whose patterns a product with `Bt W B` holds: 0.3 MB each at l = 191.
 pub(super) const GROUP_NODES: usize = 256;
@@ -82,6 +88,19 @@ pub(super) struct Pass {
     /// Times of the nodes, -1 to 1, and their barycentric weights; empty if each row has its node.
     pub(super) tau: Vec<f64>,
     pub(super) weights: Vec<f64>,
+    /// Angles gamma of the nodes, rad, without jumps; empty where rows are of instants.
+    pub(super) gamma_rad: Vec<f64>,
+    /// How far phases move in a unit of tau, rad: of the fringe, and of the limb's highest degree. `None` where rows are of instants.
+    pub(super) rate_rad: Option<[f64; 2]>,
+}
+
+/// What visibilities are of besides positions.
+#[derive(Clone, Copy, Default)]
+pub struct Observed<'a> {
+    /// Length of each integration, s, about the time of its positions; empty for instants.
+    pub duration_s: &'a [f32],
+    /// Response of the pair of each visibility, times that of the rows' setup: of a degree up to the setup's.
+    pub response: Option<&'a (dyn Fn(usize) -> PairResponse + Sync)>,
 }
 
 /// How to compute the rows of a list of visibilities.
@@ -95,6 +114,12 @@ pub struct RowPlan {
     pub(super) gamma_rad: Vec<f64>,
     /// By row: its time within the pass, -1 to 1.
     pub(super) tau: Vec<f64>,
+    /// By row: half of its integration in units of tau; empty for instants.
+    pub(super) reach: Vec<f32>,
+    /// By row: coefficients of its response; empty if it is that of the setup.
+    pub(super) coefficients: Vec<f32>,
+    /// Averages that are taken for instants in their middle, as the motion of their pair is not known.
+    instants: usize,
     pub(super) classes: Vec<NodeClass>,
     /// Whether each row is computed for itself, with nothing in common with others.
     pub(super) direct: bool,
@@ -106,7 +131,12 @@ impl RowPlan {
     ///
     /// # Errors
     /// The first visibility whose positions have no row.
-    pub(super) fn new(setup: &RowsSetup, pairs: &[PairAt], direct: bool) -> Result<Self, RowsError> {
+    pub(super) fn new(
+        setup: &RowsSetup,
+        pairs: &[PairAt],
+        observed: &Observed<'_>,
+        direct: bool,
+    ) -> Result<Self, RowsError> {
         let views: Vec<PairView> = pairs
             .par_iter()
             .enumerate()
@@ -123,6 +153,9 @@ impl RowPlan {
             groups: Vec::new(),
             gamma_rad: vec![0.0; pairs.len()],
             tau: vec![0.0; pairs.len()],
+            reach: vec![0.0; observed.duration_s.len()],
+            coefficients: coefficients(setup.polynomial_degree, pairs.len(), observed),
+            instants: observed.duration_s.iter().filter(|length_s| !is_known((**length_s).into())).count(),
             classes: classes.all(),
             direct,
         };
@@ -133,7 +166,8 @@ impl RowPlan {
                 pairs[*k].pair == pairs[first].pair && (0.0..=GAP_S).contains(&step_s)
             };
             let end = (first + 1..pairs.len()).take_while(together).last().map_or(first + 1, |k| k + 1);
-            let pass = PassBuilder { setup, pairs, views: &views, classes: &classes, direct };
+            let duration_s = observed.duration_s;
+            let pass = PassBuilder { setup, pairs, duration_s, views: &views, classes: &classes, direct };
             if direct {
                 pass.each(first..end, &mut plan);
             } else {
@@ -157,6 +191,13 @@ impl RowPlan {
         self.nodes.len()
     }
 
+    /// Averages over integrations that are taken for instants in their middle: those without enough others of their pair about them to tell
+    /// how it moves.
+    #[must_use]
+    pub fn instants(&self) -> usize {
+        self.instants
+    }
+
     fn group(&mut self) {
         let mut start = 0;
         let mut nodes = 0;
@@ -169,15 +210,79 @@ impl RowPlan {
         }
     }
 
-    /// The share of each node of a pass in a row.
-    pub(super) fn shares(&self, pass: &Pass, row: usize, shares: &mut Vec<f64>) {
+    /// The share of each node of a pass in a row at an instant; returns the angle gamma.
+    pub(super) fn shares(&self, pass: &Pass, row: usize, instant: &Instant, shares: &mut Vec<f64>) -> f64 {
+        let (tau, gamma_rad) = (self.tau[row], self.gamma_rad[row]);
+        if instant.offset == 0.0 {
+            pass.shares(tau, shares);
+            return gamma_rad;
+        }
+        let interpolated =
+            |shares: &[f64]| -> f64 { shares.iter().zip(&pass.gamma_rad).map(|(a, b)| a * b).sum() };
+        pass.shares(tau, shares);
+        let middle_rad = interpolated(shares);
+        pass.shares(tau + f64::from(self.reach[row]) * instant.offset, shares);
+        gamma_rad + interpolated(shares) - middle_rad
+    }
+
+    /// Adds a row's values of skies to lists of them, from those of the skies' products.
+    pub(super) fn combine(&self, row: usize, products: &[Complex64], out: &mut [Vec<Complex64>]) {
+        let count = products.len() / out.len().max(1);
+        for (out, products) in out.iter_mut().zip(products.chunks_exact(count.max(1))) {
+            out.push(match self.coefficients.is_empty() {
+                true => products[0],
+                false => self.of_row(row, count).zip(products).map(|(a, value)| a * value).sum(),
+            });
+        }
+    }
+
+    /// The transpose of [`Self::combine`].
+    pub(super) fn divide(
+        &self,
+        row: usize,
+        values: impl ExactSizeIterator<Item = Complex64>,
+        out: &mut [Complex64],
+    ) {
+        let count = out.len() / values.len().max(1);
+        for (out, value) in out.chunks_exact_mut(count.max(1)).zip(values) {
+            match self.coefficients.is_empty() {
+                true => out[0] = value,
+                false => out.iter_mut().zip(self.of_row(row, count)).for_each(|(out, a)| *out = a * value),
+            }
+        }
+    }
+
+    fn of_row(&self, row: usize, count: usize) -> impl Iterator<Item = f64> {
+        self.coefficients[row * count..][..count].iter().map(|a| f64::from(*a))
+    }
+}
+
+/// Whether positions are known throughout an integration of this length, s: as between visibilities.
+fn is_known(duration_s: f64) -> bool {
+    (0.0..=POSITION_STEP_S_MAX).contains(&duration_s)
+}
+
+/// Coefficients of the responses of rows; none if rows have that of the setup.
+fn coefficients(degree: usize, rows: usize, observed: &Observed<'_>) -> Vec<f32> {
+    let of_row = |row: usize| {
+        let response = observed.response.map_or_else(PairResponse::isotropic, |of| of(row));
+        response.coefficients_of(degree)
+    };
+    match degree {
+        0 => Vec::new(),
+        _ => (0..rows).into_par_iter().flat_map_iter(of_row).map(|a| a as f32).collect(),
+    }
+}
+
+impl Pass {
+    /// The share of each node at a time.
+    fn shares(&self, tau: f64, shares: &mut Vec<f64>) {
         shares.clear();
-        let tau = self.tau[row];
-        if let Some(at) = pass.tau.iter().position(|node| *node == tau) {
-            shares.extend((0..pass.tau.len()).map(|k| f64::from(u8::from(k == at))));
+        if let Some(at) = self.tau.iter().position(|node| *node == tau) {
+            shares.extend((0..self.tau.len()).map(|k| f64::from(u8::from(k == at))));
             return;
         }
-        shares.extend(pass.tau.iter().zip(&pass.weights).map(|(node, weight)| weight / (tau - node)));
+        shares.extend(self.tau.iter().zip(&self.weights).map(|(node, weight)| weight / (tau - node)));
         let sum: f64 = shares.iter().sum();
         shares.iter_mut().for_each(|share| *share /= sum);
     }
@@ -250,6 +355,7 @@ impl Classes {
 struct PassBuilder<'a> {
     setup: &'a RowsSetup,
     pairs: &'a [PairAt],
+    duration_s: &'a [f32],
     views: &'a [PairView],
     classes: &'a Classes,
     direct: bool,
@@ -374,6 +480,12 @@ impl PassBuilder<'_> {
         }
     }
 
+    /// Half of the integration of a row, s; 0 for an instant, and for what is too long to know the positions of.
+    fn half_s(&self, row: usize) -> f64 {
+        let duration_s = self.duration_s.get(row).map_or(0.0, |duration_s| f64::from(*duration_s));
+        if is_known(duration_s) { 0.5 * duration_s } else { 0.0 }
+    }
+
     /// A node for each row.
     fn each(&self, rows: Range<usize>, plan: &mut RowPlan) {
         let first = plan.nodes.len();
@@ -384,13 +496,47 @@ impl PassBuilder<'_> {
             plan.nodes.push(self.node(&axes, view));
         }
         let nodes = first..plan.nodes.len();
-        plan.passes.push(Pass { rows, nodes, tau: Vec::new(), weights: Vec::new() });
+        plan.instants += rows.clone().filter(|row| self.half_s(*row) > 0.0).count();
+        let [tau, weights, gamma_rad] = [const { Vec::new() }; 3];
+        plan.passes.push(Pass { rows, nodes, tau, weights, gamma_rad, rate_rad: None });
+    }
+
+    /// Tells a pass how its rows move within their integrations, unless its nodes do not tell the angles of its rows: then these are of
+    /// instants.
+    fn move_through(&self, pass: &mut Pass, length_s: f64, plan: &mut RowPlan) {
+        for k in 1..pass.gamma_rad.len() {
+            let turns = ((pass.gamma_rad[k] - pass.gamma_rad[k - 1]) / TAU).round();
+            pass.gamma_rad[k] -= turns * TAU;
+        }
+        let mut shares = Vec::new();
+        let is_told = |row: usize| {
+            pass.shares(plan.tau[row], &mut shares);
+            let told: f64 = shares.iter().zip(&pass.gamma_rad).map(|(a, b)| a * b).sum();
+            let off = (told - plan.gamma_rad[row]) / TAU;
+            (off - off.round()).abs() * TAU < GAMMA_ERROR_RAD
+        };
+        if !pass.rows.clone().all(is_told) {
+            plan.instants += pass.rows.clone().filter(|row| self.half_s(*row) > 0.0).count();
+            return;
+        }
+        for row in pass.rows.clone() {
+            plan.reach[row] = (2.0 * self.half_s(row) / length_s) as f32;
+        }
+        let steps = pass.tau.windows(2).zip(pass.gamma_rad.windows(2));
+        let turn =
+            steps.map(|(tau, gamma)| ((gamma[1] - gamma[0]) / (tau[1] - tau[0])).abs()).fold(0.0, f64::max);
+        let lengths = pass.rows.clone().map(|row| self.wavelengths(&self.views[row]));
+        let (low, high) = lengths.fold((f64::INFINITY, 0.0_f64), |(a, b), u| (a.min(u), b.max(u)));
+        pass.rate_rad = Some([TAU * (high * turn + 0.5 * (high - low)), self.setup.l_max as f64 * turn]);
     }
 
     /// `count` nodes for all rows, at Chebyshev's points. Returns whether the positions allow it.
     fn interpolated(&self, rows: Range<usize>, count: usize, plan: &mut RowPlan) -> bool {
         let times = &self.pairs[rows.clone()];
-        let (from_s, to_s) = (times[0].time_s, times[times.len() - 1].time_s);
+        let (first_s, last_s) = (times[0].time_s, times[times.len() - 1].time_s);
+        // Integrations begin before the middle of the first, and end after that of the last.
+        let half_s = rows.clone().map(|row| self.half_s(row)).fold(0.0, f64::max);
+        let (from_s, to_s) = (first_s - half_s, last_s + half_s);
         // Rows of equal times have equal positions.
         let is_new =
             |row: &usize| *row == rows.start || self.pairs[*row].time_s > self.pairs[*row - 1].time_s;
@@ -401,15 +547,17 @@ impl PassBuilder<'_> {
         }
         let reference = Self::upright(self.views[rows.start + rows.len() / 2].axes[2]);
         let tau: Vec<f64> = (0..count).map(|k| -(PI * k as f64 / (count - 1) as f64).cos()).collect();
-        let nodes: Option<Vec<RowNode>> = tau
+        let nodes: Option<Vec<(RowNode, f64)>> = tau
             .iter()
             .map(|tau| {
                 let [r_i_m, r_j_m] = positions(&distinct, from_s + 0.5 * (tau + 1.0) * (to_s - from_s));
                 let view = PairView::of(r_i_m, r_j_m, self.setup.moon_radius_m).ok()?;
-                Some(self.node(&Self::place(&reference, &view).0, view))
+                let (axes, gamma_rad) = Self::place(&reference, &view);
+                Some((self.node(&axes, view), gamma_rad))
             })
             .collect();
         let Some(nodes) = nodes else { return false };
+        let (nodes, gamma_rad): (Vec<RowNode>, Vec<f64>) = nodes.into_iter().unzip();
         for row in rows.clone() {
             plan.gamma_rad[row] = Self::place(&reference, &self.views[row]).1;
             plan.tau[row] = 2.0 * (self.pairs[row].time_s - from_s) / (to_s - from_s) - 1.0;
@@ -424,7 +572,12 @@ impl PassBuilder<'_> {
                 1.0 / others.map(|(_, b)| 2.0 * (a - b)).product::<f64>()
             })
             .collect();
-        plan.passes.push(Pass { rows, nodes: first..plan.nodes.len(), tau, weights });
+        let nodes = first..plan.nodes.len();
+        let mut pass = Pass { rows, nodes, tau, weights, gamma_rad, rate_rad: None };
+        if half_s > 0.0 {
+            self.move_through(&mut pass, to_s - from_s, plan);
+        }
+        plan.passes.push(pass);
         true
     }
 }

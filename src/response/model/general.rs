@@ -39,6 +39,7 @@ impl GeneralSum {
             wavelength_m: SPEED_OF_LIGHT_M_S / frequency_hz,
             moon_radius_m,
             response,
+            polynomial_degree: 0,
         };
         let coarse = map.degrade(map.nside().min(POWERS_NSIDE))?;
         Ok(Self {

@@ -5,12 +5,14 @@
 //! | [`Transform`] | synthesis of HEALPix maps and its transpose, after libsharp |
 //! | [`analysis`] | coefficients of a map |
 //! | [`Alm`] | coefficients of a real field; [`Alm::rotated`] takes them to another frame |
+//! | [`times_direction`] | a field times a component of the direction |
 //! | [`WignerTable`] | Wigner's d-functions |
 //!
 //! Uses [`super::healpix`]. Results do not depend on the number of threads.
 
 mod analysis;
 mod coefficients;
+mod directions;
 mod error;
 mod kernel;
 mod lanes;
@@ -23,6 +25,7 @@ mod wigner;
 
 pub use analysis::{Analysis, AnalysisOptions, Method, analysis, synthesis};
 pub use coefficients::Alm;
+pub use directions::{Component, times_direction, times_direction_transposed};
 pub use error::HarmonicsError;
 pub use transform::{L_MAX, Transform};
 pub use wigner::{WignerRows, WignerTable, wigner_d};
