@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::harmonic::L_MAX;
+use super::harmonic::{AntennaBelief, L_MAX, RowBelief};
 use super::{AccumulationError, PixelEngine};
 use crate::frames::Instrument;
 use crate::response::harmonic::GeometryLimits;
@@ -122,6 +122,58 @@ pub struct MapConfig {
     pub limits: GeometryLimits,
     /// Refinement of a harmonic map with the positions as they are.
     pub refine: RefineConfig,
+    /// Antennas of the daughters as a refined map takes them to be.
+    #[serde(skip_serializing_if = "AntennasConfig::is_ideal")]
+    pub antennas: AntennasConfig,
+}
+
+/// Antennas by daughter; those beyond a list are ideal.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AntennasConfig {
+    /// Tilt of the axis from the orbit's normal towards the track's direction, degrees.
+    pub tilt_along_deg: Vec<f64>,
+    /// Tilt away from the Moon, degrees.
+    pub tilt_radial_deg: Vec<f64>,
+    /// q of a factor 1 + q (3 cos^2 - 1) / 2 of the voltage pattern, with the angle from the axis.
+    pub pattern: Vec<f64>,
+}
+
+impl AntennasConfig {
+    fn lists(&self) -> [(&'static str, &[f64]); 3] {
+        let Self { tilt_along_deg, tilt_radial_deg, pattern } = self;
+        [("tilt_along_deg", tilt_along_deg), ("tilt_radial_deg", tilt_radial_deg), ("pattern", pattern)]
+    }
+
+    /// Whether all antennas are ideal.
+    #[must_use]
+    pub fn is_ideal(&self) -> bool {
+        self.lists().iter().all(|(_, values)| values.iter().all(|value| *value == 0.0))
+    }
+
+    /// Degree of pairs' responses as polynomials in the direction, at most: of two dipoles, and of a pattern of each.
+    #[must_use]
+    pub fn degree(&self) -> usize {
+        let is_set = |values: &[f64]| values.iter().any(|value| *value != 0.0);
+        2 * usize::from(!self.is_ideal()) + 4 * usize::from(is_set(&self.pattern))
+    }
+
+    fn check(&self, checks: &mut Checks) {
+        for (key, values) in self.lists() {
+            let expected = format!("at most {}, one a daughter", u8::MAX);
+            checks.require(
+                format!("antennas.{key}"),
+                format!("({} values)", values.len()),
+                values.len() <= usize::from(u8::MAX),
+                expected,
+            );
+            let (most, expected) = match key {
+                "pattern" => (2.0, "-2 to 2"),
+                _ => (80.0, "-80 to 80 degrees"),
+            };
+            checks.numbers(format!("antennas.{key}"), values, |value| value.abs() <= most, expected);
+        }
+    }
 }
 
 /// Value of `map.refine.passes_max` among the settings of sums that hold visibilities one by one.
@@ -139,11 +191,14 @@ pub struct RefineConfig {
     /// Most visibilities of a channel that are held in memory for it, or without the matrix of the pixel engine; further ones are left
     /// out and counted.
     pub visibilities_max: u64,
+    /// Whether visibilities are averages over their integrations, or instants in their middle.
+    #[serde(skip_serializing_if = "is_off")]
+    pub smear_integrations: bool,
 }
 
 impl Default for RefineConfig {
     fn default() -> Self {
-        Self { passes_max: 0, residual_max: 1e-3, visibilities_max: 30_000_000 }
+        Self { passes_max: 0, residual_max: 1e-3, visibilities_max: 30_000_000, smear_integrations: false }
     }
 }
 
@@ -183,6 +238,7 @@ impl Default for MapConfig {
             trace_probes: 0,
             limits: GeometryLimits::default(),
             refine: RefineConfig::default(),
+            antennas: AntennasConfig::default(),
         }
     }
 }
@@ -190,6 +246,12 @@ impl Default for MapConfig {
 /// So that what is not set changes no hash of a configuration.
 fn is_zero(value: &f64) -> bool {
     *value == 0.0
+}
+
+/// Likewise.
+#[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
+fn is_off(value: &bool) -> bool {
+    !*value
 }
 
 /// Likewise.
@@ -280,6 +342,12 @@ impl MapConfig {
             "above 0 and below 1",
         );
         checks.require("refine.visibilities_max", visibilities_max, visibilities_max > 0, "at least 1");
+        self.antennas.check(checks);
+        let refined = "none without map.refine.passes_max above 0";
+        checks.require("antennas", "(set)", self.antennas.is_ideal() || self.refine.is_on(), refined);
+        let smeared = self.refine.smear_integrations;
+        let expected = "false without map.refine.passes_max above 0";
+        checks.require("refine.smear_integrations", smeared, !smeared || self.refine.is_on(), expected);
         if self.is_remade() {
             let probes = self.trace_probes;
             let expected = "0 with map.matrix = \"remade\": traces need the matrix";
@@ -403,6 +471,7 @@ impl MapConfig {
             iterations_max: _,
             trace_probes: _,
             l_max: _, // As `degree`.
+            antennas: _,
             refine,
         } = self;
         let mut settings = vec![
@@ -432,6 +501,20 @@ impl MapConfig {
             }
         }
         settings
+    }
+
+    /// What the rows of a refined map are made with.
+    #[must_use]
+    pub fn belief(&self) -> RowBelief {
+        let AntennasConfig { tilt_along_deg, tilt_radial_deg, pattern } = &self.antennas;
+        let count = self.antennas.lists().map(|(_, values)| values.len()).into_iter().max().unwrap_or(0);
+        let of = |values: &[f64], k: usize| values.get(k).copied().unwrap_or(0.0);
+        let antenna = |k: usize| AntennaBelief {
+            tilt_deg: [of(tilt_along_deg, k), of(tilt_radial_deg, k)],
+            distortion: of(pattern, k),
+        };
+        let antennas = if self.antennas.is_ideal() { Vec::new() } else { (0..count).map(antenna).collect() };
+        RowBelief { smear_integrations: self.refine.smear_integrations, antennas }
     }
 
     /// Longest baseline used at a frequency, m.

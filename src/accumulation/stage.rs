@@ -648,6 +648,7 @@ fn within(placed: &PlacedVisibilities, baseline_m_max: f64) -> PlacedVisibilitie
         r_j_m: pick(&placed.r_j_m, &kept),
         value_k_sr: pick(&placed.value_k_sr, &kept),
         weight: pick(&placed.weight, &kept),
+        duration_s: if placed.duration_s.is_empty() { Vec::new() } else { pick(&placed.duration_s, &kept) },
     }
 }
 

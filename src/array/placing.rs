@@ -39,6 +39,7 @@ impl Ephemeris {
             r_j_m: Vec::with_capacity(block.len()),
             value_k_sr: Vec::with_capacity(block.len()),
             weight: Vec::with_capacity(block.len()),
+            duration_s: Vec::with_capacity(block.len()),
         };
         let counts = self.runs(block, &mut |range, piece| extend(&mut out, block, range, piece));
         (out, counts)
@@ -126,9 +127,11 @@ fn extend(out: &mut PlacedVisibilities, block: &VisibilityBlock, range: Range<us
     for (wide, value) in out.value_k_sr[from..].iter_mut().zip(&block.value_k_sr[range.clone()]) {
         *wide = Complex64::new(f64::from(value.re), f64::from(value.im));
     }
-    for (wide, weight) in out.weight[from..].iter_mut().zip(&block.weight[range]) {
+    for (wide, weight) in out.weight[from..].iter_mut().zip(&block.weight[range.clone()]) {
         *wide = f64::from(*weight);
     }
+    // Exact to a microsecond up to 16 s, to 1e-7 of itself beyond.
+    out.duration_s.extend(block.duration_ticks[range].iter().map(|&ticks| (f64::from(ticks) * 1e-6) as f32));
 }
 
 /// Middle of integration `k` after the mission epoch, half ticks, exact.

@@ -17,6 +17,15 @@ pub fn track_offset_m(r_m: Vec3, normal_hat: Vec3, offset_m: [f64; 3]) -> Vec3 {
     add(add(parts[0], parts[1]), parts[2])
 }
 
+/// Axis of an antenna that leans from the orbit's normal by an angle (deg) towards the track's direction, and by one away from the
+/// Moon.
+#[must_use]
+pub fn tilted_axis(r_m: Vec3, normal_hat: Vec3, [along_deg, radial_deg]: [f64; 2]) -> Vec3 {
+    let [along, normal, up] = track_axes(r_m, normal_hat);
+    let [a, b] = [along_deg, radial_deg].map(|deg| deg.to_radians().tan());
+    unit(add(normal, add(scale(a, along), scale(b, up))))
+}
+
 /// Normal of an orbit from two positions a short time apart; `None` if they are in line with the Moon's centre.
 #[must_use]
 pub fn orbit_normal_hat(r_before_m: Vec3, r_after_m: Vec3) -> Option<Vec3> {

@@ -220,6 +220,9 @@ impl Calibration for AntennaGains {
             block.time_s[kept] = block.time_s[k];
             block.r_i_m[kept] = block.r_i_m[k];
             block.r_j_m[kept] = block.r_j_m[k];
+            if !block.duration_s.is_empty() {
+                block.duration_s[kept] = block.duration_s[k];
+            }
             kept += 1;
         }
         block.truncate(kept);

@@ -245,6 +245,7 @@ impl Calibrator {
             r_j_m: vec![[0.0; 3]; good.len()],
             value_k_sr: good.iter().map(|&k| Complex64::new(block.value_k_sr[k].re.into(), 0.0)).collect(),
             weight: good.iter().map(|&k| f64::from(block.weight[k])).collect(),
+            duration_s: Vec::new(),
         };
         // The spectrometer is not one of the antennas whose gains are known.
         if !self.is_spectrum(block.pair) {

@@ -123,6 +123,7 @@ mod tests {
                 r_j_m: vec![r_j_m],
                 value_k_sr: vec![num_complex::Complex64::ONE],
                 weight: vec![1.0],
+                duration_s: Vec::new(),
             };
             assert_eq!(bands.apply(&mut block).unwrap().kept, 1);
             assert_eq!((block.channel, block.frequency_hz), (ChannelId(1), whole.channels[1].frequency_hz));

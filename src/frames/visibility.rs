@@ -109,6 +109,8 @@ pub struct PlacedVisibilities {
     pub value_k_sr: Vec<Complex64>,
     /// Inverse variance of the real part, (K sr)^-2; positive.
     pub weight: Vec<f64>,
+    /// Length of each integration, s; empty if they are instants.
+    pub duration_s: Vec<f32>,
 }
 
 impl PlacedVisibilities {
@@ -138,15 +140,17 @@ impl PlacedVisibilities {
         self.r_j_m.push(other.r_j_m[k]);
         self.value_k_sr.push(other.value_k_sr[k]);
         self.weight.push(other.weight[k]);
+        self.duration_s.extend(other.duration_s.get(k));
     }
 
     /// Keeps the first `len` visibilities.
     pub fn truncate(&mut self, len: usize) {
-        let Self { time_s, r_i_m, r_j_m, value_k_sr, weight, .. } = self;
+        let Self { time_s, r_i_m, r_j_m, value_k_sr, weight, duration_s, .. } = self;
         time_s.truncate(len);
         r_i_m.truncate(len);
         r_j_m.truncate(len);
         value_k_sr.truncate(len);
         weight.truncate(len);
+        duration_s.truncate(len);
     }
 }

@@ -336,12 +336,6 @@ impl SpacecraftConfig {
             "spacecraft.model = \"auto\" or \"direct\", and spacecraft.smear_integrations = false, as samples are direct \
              sums of instants; smear_bandwidth = false too, as they are of the whole channel",
         );
-        checks.require(
-            "smear_integrations",
-            true,
-            !self.smear_integrations || matches!(self.model, ModelChoice::Auto | ModelChoice::Harmonic),
-            "spacecraft.model = \"harmonic\" or \"auto\" with it, as all others are of instants",
-        );
         let good = match self.delay_centre_deg[..] {
             [] => true,
             [longitude_deg, latitude_deg] => {

@@ -149,8 +149,24 @@ impl Config {
             ),
             ("spacecraft.fidelity", "\"samples\"", visibilities, "\"visibilities\""),
             ("spacecraft.model", "\"harmonic\"", anywhere, "\"auto\", \"general\" or \"direct\""),
-            ("spacecraft.smear_integrations", "true", !spacecraft.smear_integrations, "false"),
-            ("spacecraft.antenna", "\"dipole-normal\"", isotropic, "\"isotropic\""),
+            (
+                "spacecraft.antenna",
+                "\"dipole-normal\"",
+                isotropic || map.refine.is_on(),
+                "\"isotropic\", or map.refine,",
+            ),
+            (
+                "spacecraft.moon_temperature_k",
+                "(above 0, with dipoles)",
+                isotropic || spacecraft.moon_temperature_k == 0.0,
+                "0",
+            ),
+            (
+                "spacecraft.moon_reflection",
+                "(above 0, with dipoles)",
+                isotropic || spacecraft.moon_reflection == 0.0,
+                "0",
+            ),
             ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
         ] {
             let expected = format!(
@@ -167,10 +183,11 @@ impl Config {
             return;
         }
         let spacecraft = &self.spacecraft;
-        let direct = spacecraft.fidelity == Fidelity::Samples || spacecraft.model == ModelChoice::Direct;
+        let direct = spacecraft.fidelity == Fidelity::Samples
+            || matches!(spacecraft.model, ModelChoice::Direct | ModelChoice::General);
         let mirror = spacecraft.moon_reflection == 0.0 || spacecraft.moon_mirror == MoonMirror::Flat;
         for (key, value, good, expected) in [
-            ("spacecraft.model", "(other)", direct, "\"direct\""),
+            ("spacecraft.model", "(other)", direct, "\"direct\" or \"general\""),
             ("spacecraft.moon_temperature_k", "(above 0)", spacecraft.moon_temperature_k == 0.0, "0"),
             ("spacecraft.moon_mirror", "\"sphere\"", mirror, "\"flat\""),
         ] {

@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use super::plan::Plan;
 use super::rates::{
-    AVERAGE_ELEMENT_S, CENTRE_ELEMENT_S, CHOLESKY_MULTIPLY_ADDS_PER_S, EXACT_ELEMENT_S,
+    AVERAGE_ELEMENT_S, AVERAGE_INSTANTS, CENTRE_ELEMENT_S, CHOLESKY_MULTIPLY_ADDS_PER_S, EXACT_ELEMENT_S,
     HARMONIC_VISIBILITIES_PER_S, INTERPOLATION_S, RANK_K_MULTIPLY_ADDS_PER_S, ROW_S,
     TRANSFORM_MULTIPLY_ADDS_PER_S, VISIBILITIES_PER_ROW, cores,
 };
@@ -203,8 +203,15 @@ impl EngineCost {
         let passes = map.refine.passes_max as f64;
         let l_max = map.degree() as f64;
         let row_s = ROW_S * l_max * (l_max + TAU * u_max);
-        let pass_s = visibilities * (row_s / VISIBILITIES_PER_ROW + INTERPOLATION_S) / cores();
-        let rows = row_tables_bytes(map.degree(), u_max, rayon::current_num_threads()) as f64;
+        // Skies that are seen for each: times the monomials of the antennas' responses; instants of averages.
+        let degree = map.antennas.degree();
+        let skies = ((degree + 1) * (degree + 2) / 2) as f64;
+        let instants = if map.refine.smear_integrations { AVERAGE_INSTANTS } else { 1.0 };
+        let interpolation_s = INTERPOLATION_S * skies * instants;
+        let pass_s = visibilities * (row_s / VISIBILITIES_PER_ROW + interpolation_s) / cores();
+        let coefficients = if degree > 0 { 4.0 * skies } else { 0.0 };
+        let held = held + visibilities * coefficients;
+        let rows = row_tables_bytes(map.degree(), u_max, rayon::current_num_threads(), degree) as f64;
         // Maps on the way are made from sums on a circle, and a copy of them.
         let is_watched = map.snapshot_every_s > 0.0;
         let on_the_way = if is_watched { circle.sums_bytes + circle.copy_bytes } else { 0.0 };

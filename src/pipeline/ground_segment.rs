@@ -51,6 +51,7 @@ impl Config {
             prior_maps: prior_maps(self)?,
             rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
             refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
+            belief: map.belief(),
             passes: None,
             trace_probes: map.trace_probes,
             watch,

@@ -12,12 +12,13 @@ use super::plan::{Expected, Plan};
 use crate::array::Array;
 use crate::calibration::CalibrationHook;
 use crate::calibration::solver::{CalibrationMode, known_wavelengths_max};
-use crate::frames::ObservingWindow;
+use crate::daughters::OrbitDipoles;
+use crate::frames::{AntennaResponse, ObservingWindow};
 use crate::mother::{ChannelModel, Fidelity, MoonMirror, Schedule};
 use crate::response::harmonic::{GeometryLimits, RotationTable};
 use crate::response::model::{
     AntennaPatterns, AntennaSum, BandAverage, DirectSum, Emitting, GeneralSum, HarmonicSum, HarmonicSumSetup,
-    Load, ModelChoice, ModelKind, ModelPlan, Reflected, SphereMirrored, VisibilityModel,
+    Load, ModelChoice, ModelKind, ModelPlan, Reflected, SphereMirrored, TimeAverage, VisibilityModel,
 };
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
@@ -199,6 +200,9 @@ fn channel_model(
     let array = &plan.array;
     let (frequency_hz, response) = (schedule.frequency_hz, plan.instrument.response);
     if choice.kind == ModelKind::Direct {
+        // On a common circle all dipoles are normal to one plane, and to that of each pair.
+        let own = own_dipoles(plan).filter(|_| array.formation().is_none());
+        let antennas = antennas.or(own.as_ref());
         let direct = |moon_m, less_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
             let sky = less(sky, less_k)?;
             let sum = DirectSum::new(&sky, frequency_hz, moon_m, response);
@@ -207,15 +211,21 @@ fn channel_model(
                 None => Box::new(sum),
             })
         };
-        return Ok(averaged(plan, with_moon(plan, direct, sky, frequency_hz)?, frequency_hz));
+        // Pixels hold twice nside degrees.
+        let model = with_moon(plan, direct, sky, frequency_hz)?;
+        return Ok(in_time(plan, averaged(plan, model, frequency_hz), frequency_hz, 2 * sky.nside()));
     }
     let alm = coefficients(sky, choice.l_max)?;
     if choice.kind == ModelKind::General {
+        let own = own_dipoles(plan);
+        let antennas = antennas.or(own.as_ref());
         let general = |moon_m, less_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
             let (sky, alm) = (less(sky, less_k)?, less_alm(&alm, less_k));
-            Ok(Box::new(GeneralSum::new(&sky, alm, frequency_hz, moon_m)?))
+            let antennas = antennas.map(Arc::clone);
+            Ok(Box::new(GeneralSum::new(&sky, alm, frequency_hz, moon_m, antennas)?))
         };
-        return Ok(averaged(plan, with_moon(plan, general, sky, frequency_hz)?, frequency_hz));
+        let model = with_moon(plan, general, sky, frequency_hz)?;
+        return Ok(in_time(plan, averaged(plan, model, frequency_hz), frequency_hz, choice.l_max));
     }
     let setup = |moon_radius_m| HarmonicSumSetup {
         frequency_hz,
@@ -232,6 +242,12 @@ fn channel_model(
         Ok(Box::new(HarmonicSum::new(less_alm(&alm, less_k), setup(moon_m), Arc::clone(&rotation))?))
     };
     Ok(averaged(plan, with_moon(plan, harmonic, sky, frequency_hz)?, frequency_hz))
+}
+
+/// Dipoles along the normals of the daughters' own orbits, if they have dipoles.
+fn own_dipoles(plan: &Plan) -> Option<Arc<dyn AntennaPatterns>> {
+    let is_dipole = plan.instrument.response == AntennaResponse::DipoleNormal;
+    is_dipole.then(|| Arc::new(OrbitDipoles::new(Arc::clone(&plan.array))) as Arc<dyn AntennaPatterns>)
 }
 
 /// The sky less a temperature in all directions.
@@ -282,6 +298,22 @@ fn averaged(plan: &Plan, model: Box<dyn VisibilityModel>, frequency_hz: f64) -> 
     let spacecraft = &plan.config.spacecraft;
     match spacecraft.smear_bandwidth {
         true => Box::new(BandAverage::new(model, frequency_hz, spacecraft.channel_width_hz)),
+        false => model,
+    }
+}
+
+/// A model of instants, averaged over its integrations if the configuration asks for it.
+fn in_time(
+    plan: &Plan,
+    model: Box<dyn VisibilityModel>,
+    frequency_hz: f64,
+    l_max: usize,
+) -> Box<dyn VisibilityModel> {
+    match plan.config.spacecraft.smear_integrations {
+        true => {
+            let wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz;
+            Box::new(TimeAverage::new(model, Arc::clone(&plan.array), wavelength_m, l_max))
+        }
         false => model,
     }
 }

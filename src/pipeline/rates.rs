@@ -38,6 +38,9 @@ pub(super) const VISIBILITIES_PER_ROW: f64 = 25.0;
 /// Time of the interpolation of a visibility, s (bench `general`).
 pub(super) const INTERPOLATION_S: f64 = 1e-5;
 
+/// Instants of an average over an integration, on average: two for an eighth of a wavelength of motion, more where baselines are short.
+pub(super) const AVERAGE_INSTANTS: f64 = 2.5;
+
 /// Multiply-adds of Fourier transforms of lines of 300 to 900 points in a second (bench `harmonic`: products with
 /// BtN^-1B, which are four transforms a line).
 pub(super) const TRANSFORM_MULTIPLY_ADDS_PER_S: f64 = 6e9;

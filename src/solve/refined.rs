@@ -58,6 +58,8 @@ pub struct Refinement {
     pub departures: Departures,
     /// Rows of B that were computed; the others were interpolated between them.
     pub rows_computed: u64,
+    /// Averages over integrations that were taken for instants in their middle, as too few others of their pair are near.
+    pub taken_as_instants: u64,
     /// Mean squares of what the map leaves of the data, in units of their noise.
     pub chi_square: ChiSquares,
 }
@@ -120,7 +122,13 @@ impl fmt::Display for Refinement {
             departures.tilt_deg_max,
             departures.radial_deg_max,
             chi_square.all,
-        )
+        )?;
+        match self.taken_as_instants {
+            0 => Ok(()),
+            count => {
+                write!(f, "; {count} averages over integrations taken for instants: too few others near them")
+            }
+        }
     }
 }
 
@@ -202,6 +210,7 @@ pub fn solve_refined(
         residuals: map.residuals.clone(),
         departures: sums.departures,
         rows_computed: sums.plan.computed() as u64,
+        taken_as_instants: sums.plan.instants() as u64,
         chi_square: chi_squares(sums, &map.data),
     };
     let solution = HarmonicSolution {

@@ -11,6 +11,7 @@ use super::refined::{RefineRule, RefineSteps, Refinement, solve_refined};
 use super::remade::solve_remade;
 use super::tikhonov::{PixelExtras, PointBeam, solve_pixels_with};
 use super::{Diagnostics, Regulariser, SolveError, SolveWatch, StoppingRule};
+use crate::accumulation::harmonic::RowBelief;
 use crate::accumulation::{NormalSums, Snapshot, SnapshotSums, SumCounts};
 use crate::frames::Instrument;
 use crate::runtime::{Outlet, Stage, Units};
@@ -69,6 +70,8 @@ pub struct SolverSetup {
     pub rule: StoppingRule,
     /// When the refinement of a harmonic map stops.
     pub refine: RefineRule,
+    /// What rows are made with in it.
+    pub belief: RowBelief,
     /// Folder in which the passes of a refinement leave their solution, so that one that was interrupted can go on; `None` for
     /// nowhere.
     pub passes: Option<PathBuf>,
@@ -208,7 +211,7 @@ impl Stage for Solver {
             }
             SnapshotSums::Refined(archive) => {
                 let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes: 0 };
-                let sums = archive.into_sums()?;
+                let sums = archive.into_sums(&self.setup.belief)?;
                 let rule = self.setup.refine;
                 let of = [which.as_slice(), &data, &[epsilon.to_bits().cast_signed()]].concat();
                 let file = self.setup.passes.as_ref().map(|folder| PassFile::new(folder, channel, &of));

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use lunarray::accumulation::harmonic::RowBelief;
 use lunarray::accumulation::{
     Accumulator, EngineKind, MapConfig, NormalEngine, PixelEngine, PixelSetup, RefineConfig, Snapshot,
     SnapshotSums, SumCounts,
@@ -149,6 +150,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             moon_reflection: 0.0,
             rule: StoppingRule { residual_max: 1e-4, iterations_max: 100 },
             refine: RefineRule { passes_max: 0, residual_max: 1e-4 },
+            belief: RowBelief::default(),
             passes: None,
             trace_probes: 0,
             watch: SolveWatch::default(),

@@ -9,7 +9,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use lunarray::accumulation::Refusal;
-use lunarray::accumulation::harmonic::{RefinedSetup, RefinedSums, VisibilityArchive};
+use lunarray::accumulation::harmonic::{RefinedSetup, RefinedSums, RowBelief, VisibilityArchive};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
 use lunarray::response::general::{GeneralRows, PairAt, RowsSetup};
 use lunarray::response::harmonic::{GeometryLimits, GeometryRefusal};
@@ -112,7 +112,7 @@ fn sums(l_max: usize, blocks: &[PlacedVisibilities]) -> RefinedSums {
         let added = archive.add(block).unwrap();
         assert!(added.refused.is_empty() && added.visibilities == block.len() as u64);
     }
-    archive.into_sums().unwrap()
+    archive.into_sums(&RowBelief::default()).unwrap()
 }
 
 fn request(nside: usize) -> HarmonicRequest {

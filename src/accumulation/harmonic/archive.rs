@@ -10,6 +10,7 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
+use super::belief::RowBelief;
 use super::held::{HeldHead, HeldVisibility, RefinedSetup};
 use super::refined::{
     BLOCK, Departures, RefinedData, RefinedSums, circle_engine, nearest_circle, refined_sums, taken_apart,
@@ -175,19 +176,19 @@ impl VisibilityArchive {
         self.circle = None;
         self.sort();
         self.flush();
-        let (at, _, data) = taken_apart(&self.setup, self.held);
-        (self.setup, at, data)
+        let parts = taken_apart(&self.setup, self.held);
+        (self.setup, parts.at, parts.data)
     }
 
-    /// Sorts the visibilities, plans their rows, and sums them on the nearest circle.
+    /// Sorts the visibilities, plans their rows as `belief` has them, and sums them on the nearest circle.
     ///
     /// # Errors
     /// A setup that an engine does not take; no data.
-    pub fn into_sums(mut self) -> Result<RefinedSums, AccumulationError> {
+    pub fn into_sums(mut self, belief: &RowBelief) -> Result<RefinedSums, AccumulationError> {
         self.circle = None;
         self.sort();
         self.flush();
-        refined_sums(&self.setup, self.held)
+        refined_sums(&self.setup, self.held, belief)
     }
 
     /// Sums on the circle that was nearest when this was first called, for a map on the way: it costs no pass, and has the errors of
@@ -377,5 +378,6 @@ fn placed(setup: &RefinedSetup, block: &[HeldVisibility]) -> PlacedVisibilities 
         r_j_m: block.iter().map(|held| held.at.r_j_m).collect(),
         value_k_sr: block.iter().map(|held| held.value_k_sr).collect(),
         weight: block.iter().map(|held| held.weight).collect(),
+        duration_s: block.iter().map(|held| held.duration_s).collect(),
     }
 }

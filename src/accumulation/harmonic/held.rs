@@ -101,10 +101,12 @@ pub(super) struct HeldVisibility {
     pub(super) band: u16,
     pub(super) value_k_sr: Complex64,
     pub(super) weight: f64,
+    /// Length of the integration, s; 0 for an instant.
+    pub(super) duration_s: f32,
 }
 
 /// What visibilities are sorted by.
-type HeldOrder = (u8, u8, f64, u16, f64, f64, f64, Vec3, Vec3);
+type HeldOrder = (u8, u8, f64, u16, f64, f64, f64, Vec3, Vec3, f32);
 
 impl HeldVisibility {
     /// Visibility `k`; refused if it has no row of B.
@@ -113,12 +115,15 @@ impl HeldVisibility {
         check_positions(r_i_m, r_j_m, moon_radius_m)?;
         let at = PairAt { pair: placed.pair, time_s: placed.time_s[k], r_i_m, r_j_m };
         let (value_k_sr, weight) = (placed.value_k_sr[k], placed.weight[k]);
-        Ok(Self { at, band: placed.band, value_k_sr, weight })
+        // What is no length is that of an instant.
+        let length_s = placed.duration_s.get(k).copied().filter(|length_s| *length_s > 0.0);
+        Ok(Self { at, band: placed.band, value_k_sr, weight, duration_s: length_s.unwrap_or(0.0) })
     }
 
     /// What visibilities are sorted by: all that they are, and nothing of how they arrived.
     pub(super) fn order(&self) -> HeldOrder {
-        let Self { at, band, value_k_sr: value, weight } = self;
-        (at.pair.i, at.pair.j, at.time_s, *band, value.re, value.im, *weight, at.r_i_m, at.r_j_m)
+        let Self { at, band, value_k_sr: value, weight, duration_s } = self;
+        let PairAt { pair, time_s, r_i_m, r_j_m } = *at;
+        (pair.i, pair.j, time_s, *band, value.re, value.im, *weight, r_i_m, r_j_m, *duration_s)
     }
 }

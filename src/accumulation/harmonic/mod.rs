@@ -18,6 +18,7 @@
 //! `2^32 M`.
 
 mod archive;
+mod belief;
 mod blocks;
 mod checkpoint;
 mod coverage;
@@ -43,6 +44,7 @@ use std::io::Read;
 use std::sync::{Arc, OnceLock};
 
 pub use archive::{REFINED_VISIBILITY_BYTES, VisibilityArchive};
+pub use belief::{AntennaBelief, RowBelief};
 pub use blocks::{OrderBlocks, OrderFactors};
 pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;

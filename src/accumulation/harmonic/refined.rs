@@ -7,13 +7,14 @@ use num_complex::Complex64;
 use rayon::prelude::*;
 use serde::Serialize;
 
+use super::belief::{PairAntennas, RowBelief};
 use super::held::{HeldVisibility, RefinedSetup};
 use super::setup::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
 use super::{HarmonicEngine, HarmonicSetup, HarmonicSums};
 use crate::accumulation::noise::companion_noise;
 use crate::accumulation::{AccumulationError, NormalEngine};
-use crate::frames::PlacedVisibilities;
-use crate::response::general::{GeneralRows, PairAt, RowPlan, RowsSetup};
+use crate::frames::{AntennaResponse, PlacedVisibilities};
+use crate::response::general::{GeneralRows, Observed, PairAt, PairResponse, RowPlan, RowsSetup};
 use crate::response::harmonic::{GeometryLimits, NominalOrbit, PairOrientation};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, cross, dot};
@@ -22,27 +23,39 @@ use crate::units::vector::{Vec3, cross, dot};
 pub(super) fn refined_sums(
     setup: &RefinedSetup,
     held: Vec<HeldVisibility>,
+    belief: &RowBelief,
 ) -> Result<RefinedSums, AccumulationError> {
-    let (at, bands, data) = taken_apart(setup, held);
+    let Apart { at, bands, data, duration_s } = taken_apart(setup, held);
     let (orbit, departures) = nearest_circle(setup, &|k| at[k], at.len());
     let circle = circle_sums(setup, orbit, &at, &bands, &data)?;
+    let antennas = belief.antennas_of(setup.response, &at);
     let rows = GeneralRows::new(RowsSetup {
         l_max: setup.l_max,
         wavelength_m: SPEED_OF_LIGHT_M_S / setup.frequency_hz,
         moon_radius_m: setup.moon_radius_m,
-        response: setup.response,
-        polynomial_degree: 0,
+        response: if antennas.is_some() { AntennaResponse::Isotropic } else { setup.response },
+        polynomial_degree: antennas.as_ref().map_or(0, PairAntennas::degree),
     });
+    let response = antennas.as_ref().map(|antennas| |k: usize| antennas.response(&at, k));
+    let observed = Observed {
+        duration_s: if belief.smear_integrations { &duration_s } else { &[] },
+        response: response.as_ref().map(|of| of as &(dyn Fn(usize) -> PairResponse + Sync)),
+    };
     // Each visibility was checked when it came.
-    let plan = rows.plan(&at).map_err(|error| AccumulationError::Rows(error.refusal))?;
+    let plan = rows.plan_of(&at, &observed).map_err(|error| AccumulationError::Rows(error.refusal))?;
     Ok(RefinedSums { circle, rows, plan, at, data, departures })
 }
 
-/// Positions, sub-bands and data of visibilities.
-pub(super) fn taken_apart(
-    setup: &RefinedSetup,
-    held: Vec<HeldVisibility>,
-) -> (Vec<PairAt>, Vec<u16>, RefinedData) {
+/// Visibilities as lists.
+pub(super) struct Apart {
+    pub(super) at: Vec<PairAt>,
+    bands: Vec<u16>,
+    pub(super) data: RefinedData,
+    duration_s: Vec<f32>,
+}
+
+/// Positions, sub-bands, data and lengths of visibilities.
+pub(super) fn taken_apart(setup: &RefinedSetup, held: Vec<HeldVisibility>) -> Apart {
     let noise = noises(setup, &held);
     let data = RefinedData {
         value_k_sr: held.iter().map(|held| held.value_k_sr).collect(),
@@ -50,7 +63,8 @@ pub(super) fn taken_apart(
         noise,
     };
     let bands = held.iter().map(|held| held.band).collect();
-    (held.into_iter().map(|held| held.at).collect(), bands, data)
+    let duration_s = held.iter().map(|held| held.duration_s).collect();
+    Apart { at: held.into_iter().map(|held| held.at).collect(), bands, data, duration_s }
 }
 
 /// Noise of the companion, by visibility.
@@ -94,9 +108,13 @@ const SAME_PASS_S: f64 = 1500.0;
 /// The normal of the orbit, m^2 and as the satellite turns, from where it moves to until the next visibility of the pair; `None` if
 /// the next is another pair's or another pass's. The planes of pairs lie across the orbit's if satellites do not follow each other.
 fn orbit_normal(before: &PairAt, after: &PairAt) -> Option<Vec3> {
+    is_same_pass(before, after).then(|| cross(before.r_i_m, after.r_i_m))
+}
+
+/// Whether one visibility follows another of the same pair soon after.
+pub(super) fn is_same_pass(before: &PairAt, after: &PairAt) -> bool {
     let apart_s = after.time_s - before.time_s;
-    let is_near = before.pair == after.pair && apart_s > 0.0 && apart_s < SAME_PASS_S;
-    is_near.then(|| cross(before.r_i_m, after.r_i_m))
+    before.pair == after.pair && apart_s > 0.0 && apart_s < SAME_PASS_S
 }
 
 /// Mean inclination of the orbits' planes; `None` if each visibility stands alone.
@@ -223,6 +241,7 @@ fn circle_sums(
             r_j_m: block.iter().map(|at| at.r_j_m).collect(),
             value_k_sr: data.value_k_sr[first..end].to_vec(),
             weight: data.weight[first..end].to_vec(),
+            duration_s: Vec::new(),
         })?;
         first = end;
     }

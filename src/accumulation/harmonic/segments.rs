@@ -2,9 +2,9 @@
 //!
 //! | field of a segment | bytes |
 //! |---|---|
-//! | magic, `LNRHELD1` | 8 |
+//! | magic, `LNRHELD2` | 8 |
 //! | visibilities, u64 | 8 |
-//! | each: pair i and j (u8), sub-band (u16), time (s), positions of i and j (m), value (K sr) and weight ((K sr)^-2), f64 | 84 |
+//! | each: pair i and j (u8), sub-band (u16), time (s), positions of i and j (m), value (K sr) and weight ((K sr)^-2), f64; length of the integration (s), f32 | 88 |
 //! | CRC-64/NVME of all before | 8 |
 //!
 //! All numbers are little-endian. A segment is written once and never changed: a checkpoint that keeps gigabytes of visibilities
@@ -25,9 +25,9 @@ use crate::response::general::PairAt;
 use crate::units::{ChannelId, Pair};
 
 /// Bytes of a held visibility on disk.
-pub const HELD_BYTES: u64 = 84;
+pub const HELD_BYTES: u64 = 88;
 
-const MAGIC: &[u8; 8] = b"LNRHELD1";
+const MAGIC: &[u8; 8] = b"LNRHELD2";
 /// Bytes of magic, count and checksum.
 const FIXED_BYTES: u64 = 24;
 /// Visibilities that are written or read at a time.
@@ -158,7 +158,7 @@ impl HeldSegment {
 }
 
 fn record(held: &HeldVisibility) -> [u8; HELD_BYTES as usize] {
-    let HeldVisibility { at, band, value_k_sr: value, weight } = held;
+    let HeldVisibility { at, band, value_k_sr: value, weight, duration_s } = held;
     let ([a, b, c], [d, e, f]) = (at.r_i_m, at.r_j_m);
     let mut bytes = [0; HELD_BYTES as usize];
     (bytes[0], bytes[1]) = (at.pair.i, at.pair.j);
@@ -167,6 +167,7 @@ fn record(held: &HeldVisibility) -> [u8; HELD_BYTES as usize] {
     for (place, number) in bytes[4..].as_chunks_mut::<8>().0.iter_mut().zip(numbers) {
         *place = number.to_le_bytes();
     }
+    bytes[84..].copy_from_slice(&duration_s.to_le_bytes());
     bytes
 }
 
@@ -182,6 +183,7 @@ fn held(bytes: &[u8; HELD_BYTES as usize]) -> HeldVisibility {
         band: u16::from_le_bytes([bytes[2], bytes[3]]),
         value_k_sr: Complex64::new(re, im),
         weight,
+        duration_s: f32::from_le_bytes([bytes[84], bytes[85], bytes[86], bytes[87]]),
     }
 }
 
@@ -202,6 +204,7 @@ mod tests {
                 band: k as u16,
                 value_k_sr: Complex64::new(-x, 1.0 / x),
                 weight: 1e-8 / x,
+                duration_s: k as f32,
             }
         };
         (0..count).map(one).collect()

@@ -34,6 +34,7 @@ fn block(time_s: Vec<f64>) -> PlacedVisibilities {
         r_j_m: time_s.iter().map(|&t| [t, 2.0, 0.0]).collect(),
         value_k_sr: time_s.iter().map(|&t| Complex64::new(1e5 + t, -3e4)).collect(),
         weight: by_time(|t| 1e-4 * (1.0 + t.abs())),
+        duration_s: Vec::new(),
         time_s,
     }
 }

@@ -4,24 +4,40 @@ use std::sync::Arc;
 
 use super::series::Series;
 use super::{InstrumentErrors, PassErrors};
-use crate::array::{Array, track_axes};
+use crate::array::{Array, tilted_axis};
 use crate::frames::ObservingWindow;
 use crate::response::model::AntennaPatterns;
 use crate::response::pixel::SatelliteAntenna;
-use crate::units::vector::{Vec3, add, scale, unit};
 
-/// Axis of a dipole that leans from the orbit's normal by an angle (deg) towards the track's direction, and by one away
-/// from the Moon.
-pub(super) fn tilted_axis(r_m: Vec3, normal_hat: Vec3, [along_deg, radial_deg]: [f64; 2]) -> Vec3 {
-    let [along, normal, up] = track_axes(r_m, normal_hat);
-    let [a, b] = [along_deg, radial_deg].map(|deg| deg.to_radians().tan());
-    unit(add(normal, add(scale(a, along), scale(b, up))))
+/// Dipoles along the normal of each daughter's own orbit.
+pub struct OrbitDipoles {
+    array: Arc<Array>,
+}
+
+impl OrbitDipoles {
+    /// Those of an array.
+    #[must_use]
+    pub fn new(array: Arc<Array>) -> Self {
+        Self { array }
+    }
+}
+
+impl AntennaPatterns for OrbitDipoles {
+    fn antenna(&self, daughter: u8, t_s: f64) -> SatelliteAntenna {
+        let axis_hat = self.array.normal_hat(daughter.into(), t_s);
+        SatelliteAntenna { axis_hat, is_dipole: true, distortion: 0.0 }
+    }
+
+    fn degree(&self) -> usize {
+        2
+    }
 }
 
 /// The antennas of an instrument over its passes.
 pub struct AntennaErrors {
     array: Arc<Array>,
     is_dipole: bool,
+    has_patterns: bool,
     /// Start and end, s, and by daughter: tilt along the track, tilt away from the Moon, distortion.
     passes: Vec<([f64; 2], Vec<[Series; 3]>)>,
 }
@@ -41,6 +57,7 @@ impl AntennaErrors {
         errors.config.has_own_antennas().then(|| Self {
             array,
             is_dipole,
+            has_patterns: !errors.config.pattern.is_none(),
             passes: windows.iter().map(pass).collect(),
         })
     }
@@ -68,6 +85,11 @@ impl AntennaPatterns for AntennaErrors {
         let (r_m, normal_hat) = (self.array.position_m(number, t_s), self.array.normal_hat(number, t_s));
         let axis_hat = tilted_axis(r_m, normal_hat, [along_deg, radial_deg]);
         SatelliteAntenna { axis_hat, is_dipole: self.is_dipole, distortion }
+    }
+
+    fn degree(&self) -> usize {
+        // Two dipoles; a factor of each pattern.
+        2 * usize::from(self.is_dipole) + 4 * usize::from(self.has_patterns)
     }
 }
 

@@ -18,16 +18,16 @@ const INSTANTS_MAX: usize = 24;
 
 /// An instant of an integration.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Instant {
+pub struct Instant {
     /// After the middle, in units of half of the integration.
-    pub(super) offset: f64,
+    pub offset: f64,
     /// Its weight in the mean.
-    pub(super) weight: f64,
+    pub weight: f64,
 }
 
 /// The instants of a mean, by their number less 1.
 #[derive(Clone, Debug)]
-pub(super) struct Instants {
+pub struct Instants {
     rules: Vec<Vec<Instant>>,
 }
 
@@ -45,8 +45,16 @@ fn points(h: f64, error_max: f64) -> usize {
     INSTANTS_MAX
 }
 
+impl Default for Instants {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 impl Instants {
-    pub(super) fn new() -> Self {
+    /// All rules.
+    #[must_use]
+    pub fn new() -> Self {
         let rule = |n: usize| {
             let rule = GaussLegendre::new(n);
             let instants = rule.abscissae.iter().zip(&rule.weights);
@@ -59,8 +67,14 @@ impl Instants {
     pub(super) fn of(&self, plan: &RowPlan, pass: &Pass, row: usize) -> &[Instant] {
         let reach = plan.reach.get(row).map_or(0.0, |reach| f64::from(*reach));
         let Some([fringe_rad, limb_rad]) = pass.rate_rad else { return &self.rules[0] };
-        let count = points(fringe_rad * reach, FRINGE_ERROR).max(points(limb_rad * reach, LIMB_ERROR));
-        &self.rules[count - 1]
+        self.for_phases([fringe_rad * reach, limb_rad * reach])
+    }
+
+    /// The instants of an integration in half of which phases move by so much, rad: those of the fringe, and those of the limb's highest
+    /// degree.
+    #[must_use]
+    pub fn for_phases(&self, [fringe_rad, limb_rad]: [f64; 2]) -> &[Instant] {
+        &self.rules[points(fringe_rad, FRINGE_ERROR).max(points(limb_rad, LIMB_ERROR)) - 1]
     }
 }
 

@@ -25,6 +25,7 @@ mod turns;
 mod view;
 
 pub use antennas::{DEGREE_MAX, PairResponse};
+pub use instants::{Instant, Instants};
 pub use operator::{GeneralRows, row_tables_bytes};
 pub use plan::{Observed, RowPlan};
 

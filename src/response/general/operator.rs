@@ -645,14 +645,18 @@ impl Phases {
     }
 }
 
-/// Memory of rows up to `l_max` and `u_max` wavelengths besides the visibilities', bytes: Legendre functions by class, and what each thread works with.
+/// Memory of rows up to `l_max` and `u_max` wavelengths besides the visibilities', bytes: Legendre functions by class, and what each thread
+/// works with. Responses that are polynomials of a degree multiply the skies by the number of its monomials.
 #[must_use]
-pub fn row_tables_bytes(l_max: usize, u_max: f64, threads: usize) -> u64 {
+pub fn row_tables_bytes(l_max: usize, u_max: f64, threads: usize, polynomial_degree: usize) -> u64 {
+    let products = Products::new(polynomial_degree).count() as f64;
+    let l_max = l_max + polynomial_degree;
     let coefficients = 0.25 * ((l_max + 2) as f64).powi(2);
     let turns = ((l_max + 2) as f64).powi(3) / 3.0;
-    let gradients = (2 * GROUPS_AT_ONCE) as f64 * 16.0 * 2.0 * coefficients;
+    let gradients = (2 * GROUPS_AT_ONCE) as f64 * 16.0 * 2.0 * coefficients * products;
     // Amplitudes of two skies before and after the weights, and the patterns.
-    let group = 1.5 * GROUP_NODES as f64 * (4.0 * 16.0 * (2 * l_max + 1) as f64 + 16.0 * coefficients);
+    let group =
+        1.5 * GROUP_NODES as f64 * (4.0 * 16.0 * (2 * l_max + 1) as f64 * products + 16.0 * coefficients);
     let batch = BATCH as f64 * 80.0 * coefficients + batch_bytes(l_max, u_max, BATCH);
     let classes = tables_bytes(l_max, u_max);
     (classes + 4.0 * turns + gradients + threads as f64 * (group + batch)) as u64

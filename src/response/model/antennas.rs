@@ -6,12 +6,18 @@ use num_complex::Complex64;
 
 use super::direct::DirectSum;
 use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
+use crate::response::general::DEGREE_MAX;
 use crate::response::pixel::{SatelliteAntenna, antenna_powers, antenna_sums};
 
 /// The antenna of each daughter at any time.
 pub trait AntennaPatterns: Send + Sync {
     /// That of a daughter, from 0, at a mission time, s.
     fn antenna(&self, daughter: u8, t_s: f64) -> SatelliteAntenna;
+
+    /// Greatest degree of a pair's response as a polynomial in the direction.
+    fn degree(&self) -> usize {
+        DEGREE_MAX
+    }
 }
 
 /// A direct sum in which every daughter has its own antenna: of two dipoles along d and e an unpolarised wave from n leaves

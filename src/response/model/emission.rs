@@ -219,7 +219,7 @@ mod tests {
         let array = array();
         let moon_m = array.moon_radius_m();
         let isotropic = AntennaResponse::Isotropic;
-        let general = GeneralSum::new(&cold(64), cold_alm(), FREQUENCY_HZ, moon_m).unwrap();
+        let general = GeneralSum::new(&cold(64), cold_alm(), FREQUENCY_HZ, moon_m, None).unwrap();
         let mut models: Vec<(&str, AntennaResponse, Box<dyn VisibilityModel>)> = vec![
             ("harmonic", isotropic, harmonic(&array, isotropic)),
             ("general", isotropic, Box::new(general)),

@@ -1,10 +1,14 @@
 //! Visibilities of a band-limited sky for satellites at any positions.
 
+use std::sync::Arc;
+
 use num_complex::Complex64;
 
-use super::{DaughterPosition, DirectSum, ModelError, PairPosition, VisibilityModel};
+use super::{
+    AntennaPatterns, AntennaSum, DaughterPosition, DirectSum, ModelError, PairPosition, VisibilityModel,
+};
 use crate::frames::AntennaResponse;
-use crate::response::general::{GeneralRows, PairAt, RowsError, RowsSetup};
+use crate::response::general::{GeneralRows, Observed, PairAt, PairResponse, RowsError, RowsSetup};
 use crate::sky::harmonics::Alm;
 use crate::sky::{MapError, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
@@ -16,7 +20,7 @@ pub(super) const BATCH: usize = 250_000;
 /// random is 1e-4 of a power.
 const POWERS_NSIDE: usize = 64;
 
-/// Visibilities of a sky given by harmonic coefficients, for satellites at any positions; isotropic antennas.
+/// Visibilities of a sky given by harmonic coefficients, for satellites at any positions; isotropic antennas, or any that differ.
 ///
 /// Rms error below 1e-4 of the rms visibility of the same coefficients. Rows of B are computed at some times of a pair's
 /// track ([`PairPosition::at`]) and interpolated between them.
@@ -24,7 +28,8 @@ pub struct GeneralSum {
     frequency_hz: f64,
     rows: GeneralRows,
     sky: [Alm; 1],
-    powers: DirectSum,
+    powers: Box<dyn VisibilityModel>,
+    antennas: Option<Arc<dyn AntennaPatterns>>,
 }
 
 impl GeneralSum {
@@ -32,22 +37,28 @@ impl GeneralSum {
     ///
     /// # Errors
     /// A map that cannot be averaged over larger pixels.
-    pub fn new(map: &SkyMap, alm: Alm, frequency_hz: f64, moon_radius_m: f64) -> Result<Self, MapError> {
+    pub fn new(
+        map: &SkyMap,
+        alm: Alm,
+        frequency_hz: f64,
+        moon_radius_m: f64,
+        antennas: Option<Arc<dyn AntennaPatterns>>,
+    ) -> Result<Self, MapError> {
         let response = AntennaResponse::Isotropic;
         let setup = RowsSetup {
             l_max: alm.l_max(),
             wavelength_m: SPEED_OF_LIGHT_M_S / frequency_hz,
             moon_radius_m,
             response,
-            polynomial_degree: 0,
+            polynomial_degree: antennas.as_ref().map_or(0, |antennas| antennas.degree()),
         };
         let coarse = map.degrade(map.nside().min(POWERS_NSIDE))?;
-        Ok(Self {
-            frequency_hz,
-            rows: GeneralRows::new(setup),
-            sky: [alm],
-            powers: DirectSum::new(&coarse, frequency_hz, moon_radius_m, response),
-        })
+        let powers = DirectSum::new(&coarse, frequency_hz, moon_radius_m, response);
+        let powers: Box<dyn VisibilityModel> = match &antennas {
+            Some(antennas) => Box::new(AntennaSum::new(powers, Arc::clone(antennas))),
+            None => Box::new(powers),
+        };
+        Ok(Self { frequency_hz, rows: GeneralRows::new(setup), sky: [alm], powers, antennas })
     }
 }
 
@@ -68,7 +79,20 @@ impl VisibilityModel for GeneralSum {
         });
         let pairs: Vec<PairAt> = pairs.collect();
         let refused = |error: RowsError| ModelError::Geometry { frequency_hz, refusal: error.refusal };
-        let plan = self.rows.plan(&pairs).map_err(refused)?;
+        let response = self.antennas.as_ref().map(|antennas| {
+            move |k: usize| match positions[k].at {
+                Some((pair, t_s)) => {
+                    let [a, b] = [pair.i, pair.j].map(|daughter| antennas.antenna(daughter, t_s));
+                    PairResponse::of_antennas([&a, &b])
+                }
+                None => PairResponse::isotropic(),
+            }
+        });
+        let observed = Observed {
+            response: response.as_ref().map(|of| of as &(dyn Fn(usize) -> PairResponse + Sync)),
+            ..Observed::default()
+        };
+        let plan = self.rows.plan_of(&pairs, &observed).map_err(refused)?;
         for values in self.rows.forward(&plan, &self.sky) {
             out.copy_from_slice(&values);
         }
@@ -77,6 +101,10 @@ impl VisibilityModel for GeneralSum {
 
     fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
         self.powers.predict_powers(daughters, out)
+    }
+
+    fn has_own_antennas(&self) -> bool {
+        self.antennas.is_some()
     }
 }
 
@@ -137,7 +165,7 @@ mod tests {
         let (map, alm) = sky();
         let (frequency_hz, moon_m) = (3e6, array.moon_radius_m());
         let places = positions(&array, 120);
-        let mut general = GeneralSum::new(&map, alm, frequency_hz, moon_m).unwrap();
+        let mut general = GeneralSum::new(&map, alm, frequency_hz, moon_m, None).unwrap();
         let mut direct = DirectSum::new(&map, frequency_hz, moon_m, AntennaResponse::Isotropic);
         let mut found = vec![Complex64::ZERO; places.len()];
         let mut expected = found.clone();
@@ -166,7 +194,7 @@ mod tests {
         let sky = SkyMap::constant(256, Frame::Ecliptic, 50.0).unwrap();
         let mut alm = Alm::zeros(4);
         alm.order_mut(0)[0] = Complex64::new(50.0 * (2.0 * TAU).sqrt(), 0.0);
-        let mut model = GeneralSum::new(&sky, alm, 3e6, array.moon_radius_m()).unwrap();
+        let mut model = GeneralSum::new(&sky, alm, 3e6, array.moon_radius_m(), None).unwrap();
         let r_m = array.position_m(3, 4e3);
         let mut power = [0.0];
         model
@@ -189,7 +217,7 @@ mod tests {
     fn averages_and_buried_satellites_are_refused() {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         let (map, alm) = sky();
-        let mut model = GeneralSum::new(&map, alm, 3e6, array.moon_radius_m()).unwrap();
+        let mut model = GeneralSum::new(&map, alm, 3e6, array.moon_radius_m(), None).unwrap();
         let place = positions(&array, 1)[0];
         let mut out = [Complex64::ZERO];
         let smeared = PairPosition { span_rad: 0.01, ..place };

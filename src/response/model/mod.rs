@@ -2,8 +2,8 @@
 //!
 //! [`VisibilityModel`] is the interface, for one sky at one frequency. [`DirectSum`] sums over the sky's pixels,
 //! [`HarmonicSum`] uses spherical harmonics on a common circle, [`GeneralSum`] anywhere; [`Reflected`] adds the image of the sky in
-//! a flat Moon, [`SphereMirrored`] in a round one, [`AntennaSum`] antennas that differ, [`Emitting`] the Moon's own emission, [`BandAverage`] averages over a channel, and
-//! [`ModelPlan`] chooses by cost. Equal arguments give equal results, whatever the threads.
+//! a flat Moon, [`SphereMirrored`] in a round one, [`AntennaSum`] antennas that differ, [`Emitting`] the Moon's own emission, [`BandAverage`] averages over a channel,
+//! [`TimeAverage`] over integrations, and [`ModelPlan`] chooses by cost. Equal arguments give equal results, whatever the threads.
 
 mod antennas;
 mod band_average;
@@ -14,6 +14,7 @@ mod general;
 mod harmonic;
 mod mirror;
 mod reflection;
+mod time_average;
 
 pub use antennas::{AntennaPatterns, AntennaSum};
 pub use band_average::BandAverage;
@@ -24,6 +25,7 @@ pub use general::GeneralSum;
 pub use harmonic::{HarmonicSum, HarmonicSumSetup};
 pub use mirror::SphereMirrored;
 pub use reflection::Reflected;
+pub use time_average::TimeAverage;
 
 use num_complex::Complex64;
 use thiserror::Error;
@@ -93,8 +95,7 @@ pub enum ModelError {
     },
     /// A model of instants was asked for an average over integrations.
     #[error(
-        "visibility model at {}: all but harmonics hold for instants only; set spacecraft.model = \"harmonic\" \
-         or spacecraft.smear_integrations = false",
+        "visibility model at {}: an average over an integration of a model of instants",
         Dimension::Frequency.show(*frequency_hz)
     )]
     Smearing {

@@ -1,0 +1,102 @@
+//! What the ground believes of visibilities besides their positions: that they are averages, and how antennas point and see.
+
+use crate::array::{orbit_normal_hat, tilted_axis};
+use crate::frames::AntennaResponse;
+use crate::response::general::{PairAt, PairResponse};
+use crate::response::pixel::SatelliteAntenna;
+use crate::units::vector::{Vec3, cross, dot, unit};
+
+use super::refined::is_same_pass;
+
+/// Angle between the normals of two satellites' orbits and that of their plane, rad, up to which dipoles along either are the same: rows
+/// err by it.
+const SAME_NORMAL_RAD: f64 = 1e-5;
+
+/// The antenna of a daughter.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct AntennaBelief {
+    /// Tilt of its axis from the orbit's normal towards the track's direction, and away from the Moon, degrees.
+    pub tilt_deg: [f64; 2],
+    /// q of a factor `1 + q P_2(cos)` of its voltage, with the angle from the axis.
+    pub distortion: f64,
+}
+
+/// What rows of the true positions are made with.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RowBelief {
+    /// Whether visibilities are averages over their integrations, or instants in their middle.
+    pub smear_integrations: bool,
+    /// Antennas by daughter; those beyond the list are ideal.
+    pub antennas: Vec<AntennaBelief>,
+}
+
+/// Antennas of pairs whose response is not that of rows.
+#[derive(Clone, Debug)]
+pub(super) struct PairAntennas {
+    antennas: Vec<AntennaBelief>,
+    is_dipole: bool,
+}
+
+impl RowBelief {
+    /// The antennas of the pairs of sorted visibilities, where rows of a response alone do not have them.
+    pub(super) fn antennas_of(&self, response: AntennaResponse, at: &[PairAt]) -> Option<PairAntennas> {
+        let is_dipole = response == AntennaResponse::DipoleNormal;
+        let found = PairAntennas { antennas: self.antennas.clone(), is_dipole };
+        let is_tilted = self.antennas.iter().any(|antenna| antenna.tilt_deg != [0.0; 2]);
+        let is_plain = !found.is_distorted() && !(is_dipole && (is_tilted || found.leave_the_plane(at)));
+        (!is_plain).then_some(found)
+    }
+}
+
+impl PairAntennas {
+    fn is_distorted(&self) -> bool {
+        self.antennas.iter().any(|antenna| antenna.distortion != 0.0)
+    }
+
+    /// Degree of their responses as polynomials.
+    pub(super) fn degree(&self) -> usize {
+        2 * usize::from(self.is_dipole) + 4 * usize::from(self.is_distorted())
+    }
+
+    /// Whether dipoles along the normals of orbits are not along those of the pairs' planes.
+    fn leave_the_plane(&self, at: &[PairAt]) -> bool {
+        at.iter().enumerate().any(|(k, pair)| {
+            let plane = unit(cross(pair.r_i_m, pair.r_j_m));
+            normals(at, k).into_iter().any(|normal| {
+                let off = cross(normal, plane);
+                dot(off, off) > SAME_NORMAL_RAD * SAME_NORMAL_RAD
+            })
+        })
+    }
+
+    /// The response of a pair.
+    pub(super) fn response(&self, at: &[PairAt], k: usize) -> PairResponse {
+        let pair = &at[k];
+        let [normal_i, normal_j] = normals(at, k);
+        let antenna = |daughter: u8, r_m: Vec3, normal_hat: Vec3| {
+            let known = self.antennas.get(usize::from(daughter)).copied().unwrap_or_default();
+            let axis_hat = tilted_axis(r_m, normal_hat, known.tilt_deg);
+            SatelliteAntenna { axis_hat, is_dipole: self.is_dipole, distortion: known.distortion }
+        };
+        let a = antenna(pair.pair.i, pair.r_i_m, normal_i);
+        let b = antenna(pair.pair.j, pair.r_j_m, normal_j);
+        PairResponse::of_antennas([&a, &b])
+    }
+}
+
+/// Normals of the orbits of satellites i and j, as they move from or to a neighbouring visibility; without one that of their plane.
+fn normals(at: &[PairAt], k: usize) -> [Vec3; 2] {
+    let here = &at[k];
+    let after = at.get(k + 1).filter(|after| is_same_pass(here, after)).map(|after| [here, after]);
+    let before = k.checked_sub(1).map(|k| &at[k]).filter(|before| is_same_pass(before, here));
+    let moves = after.or(before.map(|before| [before, here]));
+    let plane = || {
+        let normal = unit(cross(here.r_i_m, here.r_j_m));
+        // A satellite j that leads turns it upside down; orbits are prograde more often than not.
+        if normal[2] < 0.0 { normal.map(|x| -x) } else { normal }
+    };
+    let normal = |of: fn(&PairAt) -> Vec3| {
+        moves.and_then(|[from, to]| orbit_normal_hat(of(from), of(to))).unwrap_or_else(plane)
+    };
+    [normal(|at| at.r_i_m), normal(|at| at.r_j_m)]
+}

@@ -1,0 +1,148 @@
+//! Visibilities averaged over their integrations.
+
+use std::f64::consts::{PI, TAU};
+use std::sync::Arc;
+
+use num_complex::Complex64;
+
+use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
+use crate::array::Array;
+use crate::response::general::Instants;
+use crate::units::vector::{Vec3, norm, sub};
+
+/// A model of instants, averaged over integrations: by Gauss-Legendre quadrature over instants at the array's own positions.
+///
+/// The span of a position is that of an orbit of the array; positions have to say whose they are (`at`). Those that do not, and those
+/// without a span, are instants.
+pub struct TimeAverage {
+    model: Box<dyn VisibilityModel>,
+    array: Arc<Array>,
+    wavelength_m: f64,
+    /// Greatest degree of the model's sky.
+    l_max: usize,
+    instants: Instants,
+}
+
+impl TimeAverage {
+    /// Averages a model of a sky up to `l_max` at a wavelength, m.
+    #[must_use]
+    pub fn new(model: Box<dyn VisibilityModel>, array: Arc<Array>, wavelength_m: f64, l_max: usize) -> Self {
+        Self { model, array, wavelength_m, l_max, instants: Instants::new() }
+    }
+
+    /// Positions of satellites i and j at a time.
+    fn positions(&self, position: &PairPosition, t_s: f64) -> Option<[Vec3; 2]> {
+        let (pair, _) = position.at?;
+        Some([pair.i, pair.j].map(|n| self.array.position_m(n.into(), t_s)))
+    }
+
+    /// The instants of an integration, and their weights.
+    fn apart(&self, position: &PairPosition, take: &mut dyn FnMut(PairPosition, f64)) {
+        let instant = PairPosition { span_rad: 0.0, ..*position };
+        let half_s = 0.5 * position.span_rad / TAU * self.array.orbital_period_s();
+        let ends = position.at.filter(|_| half_s > 0.0).and_then(|(pair, t_s)| {
+            let [from, to] = [-half_s, half_s].map(|after_s| self.positions(position, t_s + after_s));
+            Some((pair, t_s, from?, to?))
+        });
+        let Some((pair, t_s, from, to)) = ends else { return take(instant, 1.0) };
+        let moved_m = norm(sub(sub(to[0], to[1]), sub(from[0], from[1])));
+        let turned_rad = norm(sub(to[0], from[0])) / norm(position.r_i_m);
+        let half_rad = [PI * moved_m / self.wavelength_m, 0.5 * self.l_max as f64 * turned_rad];
+        for at in self.instants.for_phases(half_rad) {
+            let time_s = t_s + half_s * at.offset;
+            if let Some([r_i_m, r_j_m]) = self.positions(position, time_s) {
+                take(PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: Some((pair, time_s)) }, at.weight);
+            }
+        }
+    }
+}
+
+impl VisibilityModel for TimeAverage {
+    fn batch(&self) -> usize {
+        self.model.batch()
+    }
+
+    fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
+        // A batch at a time, to bound memory.
+        let batch = self.model.batch().max(1024);
+        for (positions, out) in positions.chunks(batch).zip(out.chunks_mut(batch)) {
+            let (mut apart, mut parts) = (Vec::new(), Vec::new());
+            for (place, position) in positions.iter().enumerate() {
+                self.apart(position, &mut |instant, weight| {
+                    apart.push(instant);
+                    parts.push((place, weight));
+                });
+            }
+            let mut values = vec![Complex64::ZERO; apart.len()];
+            self.model.predict(&apart, &mut values)?;
+            out.fill(Complex64::ZERO);
+            for ((place, weight), value) in parts.into_iter().zip(values) {
+                out[place] += weight * value;
+            }
+        }
+        Ok(())
+    }
+
+    fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
+        self.model.predict_powers(daughters, out)
+    }
+
+    fn has_own_antennas(&self) -> bool {
+        self.model.has_own_antennas()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::array::ArrayConfig;
+    use crate::frames::AntennaResponse;
+    use crate::response::model::DirectSum;
+    use crate::sky::healpix::pixel_directions;
+    use crate::sky::{Frame, SkyMap};
+    use crate::units::Pair;
+    use crate::units::constants::SPEED_OF_LIGHT_M_S;
+
+    #[test]
+    fn averages_are_those_of_many_instants() {
+        let config = ArrayConfig { eccentricity: 0.01, cross_track_ratio: 0.1, ..ArrayConfig::default() };
+        let array = Arc::new(Array::new(&config).unwrap());
+        // Smooth, so that pixels' centres hold it.
+        let nside = 16;
+        let values = pixel_directions(nside).iter().map(|n| 300.0 + 200.0 * n[0] * n[2]).collect();
+        let sky = SkyMap::new(Frame::Ecliptic, values).unwrap();
+        let frequency_hz = 10e6;
+        let sum = DirectSum::new(&sky, frequency_hz, array.moon_radius_m(), AntennaResponse::Isotropic);
+        let mut plain = sum.clone();
+        let wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz;
+        let mut averaged = TimeAverage::new(Box::new(sum), Arc::clone(&array), wavelength_m, 2 * nside);
+        let pair = Pair { i: 0, j: 3 };
+        let place = |t_s: f64, length_s: f64| PairPosition {
+            r_i_m: array.position_m(0, t_s),
+            r_j_m: array.position_m(3, t_s),
+            span_rad: TAU * length_s / array.orbital_period_s(),
+            at: Some((pair, t_s)),
+        };
+        for (t_s, length_s) in [(1e3, 0.5), (2e3, 4.0), (3e3, 60.0)] {
+            let (mut found, mut middle) = ([Complex64::ZERO], [Complex64::ZERO]);
+            averaged.predict(&[place(t_s, length_s)], &mut found).unwrap();
+            plain.predict(&[place(t_s, 0.0)], &mut middle).unwrap();
+            const PARTS: usize = 400;
+            let part_s = length_s / PARTS as f64;
+            let instants: Vec<PairPosition> =
+                (0..PARTS).map(|k| place(t_s - 0.5 * length_s + part_s * (k as f64 + 0.5), 0.0)).collect();
+            let mut values = vec![Complex64::ZERO; PARTS];
+            plain.predict(&instants, &mut values).unwrap();
+            let expected = values.iter().sum::<Complex64>() / PARTS as f64;
+            let scale = values.iter().map(|v| v.norm()).fold(0.0, f64::max);
+            // Pixels come and go at the limb, one of 2,000 that are seen at a time.
+            assert!((found[0] - expected).norm() < 2e-3 * scale, "{length_s}: {found:?} {expected}");
+            assert!((found[0] - expected).norm() <= (middle[0] - expected).norm(), "{length_s}");
+        }
+        // Instants are left as they are.
+        let (mut found, mut expected) = ([Complex64::ZERO], [Complex64::ZERO]);
+        averaged.predict(&[place(4e3, 0.0)], &mut found).unwrap();
+        plain.predict(&[place(4e3, 0.0)], &mut expected).unwrap();
+        assert_eq!(found, expected);
+    }
+}
