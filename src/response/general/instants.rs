@@ -4,7 +4,6 @@
 //! `2^(2n) n!^4 / ((2n + 1) (2n)!^3) h^(2n)` at most. Within an integration h is half of what phases move by: those of the fringe, and
 //! those of the limb's harmonics, in which there is little power.
 
-use super::plan::{Pass, RowPlan};
 use crate::response::harmonic::quadrature::GaussLegendre;
 
 /// Error of the mean of a fringe that moves as fast as any in the sky: few directions do.
@@ -63,11 +62,10 @@ impl Instants {
         Self { rules: (1..=INSTANTS_MAX).map(rule).collect() }
     }
 
-    /// The instants of a row of a pass.
-    pub(super) fn of(&self, plan: &RowPlan, pass: &Pass, row: usize) -> &[Instant] {
-        let reach = plan.reach.get(row).map_or(0.0, |reach| f64::from(*reach));
-        let Some([fringe_rad, limb_rad]) = pass.rate_rad else { return &self.rules[0] };
-        self.for_phases([fringe_rad * reach, limb_rad * reach])
+    /// The instant in the middle alone.
+    #[must_use]
+    pub fn middle(&self) -> &[Instant] {
+        &self.rules[0]
     }
 
     /// The instants of an integration in half of which phases move by so much, rad: those of the fringe, and those of the limb's highest

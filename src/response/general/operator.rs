@@ -410,7 +410,7 @@ impl GeneralRows {
             self.phases.fill(amplitudes, width / 2, [pass.nodes.len(), products], &mut table);
             for row in pass.rows.clone() {
                 values.fill(Complex64::ZERO);
-                for instant in self.instants.of(plan, pass, row) {
+                for instant in plan.instants_of(pass, row, &self.instants) {
                     let gamma_rad = plan.shares(pass, row, instant, &mut shares);
                     padded.set(&table, &shares);
                     self.phases.at(&table, gamma_rad, &padded, &mut at);
@@ -454,7 +454,7 @@ impl GeneralRows {
             self.phases.clear(&mut table, [pass.nodes.len(), skies]);
             for row in pass.rows.clone() {
                 plan.divide(row, values.iter().map(|values| values[row - first_row]), &mut of_row);
-                for instant in self.instants.of(plan, pass, row) {
+                for instant in plan.instants_of(pass, row, &self.instants) {
                     let gamma_rad = plan.shares(pass, row, instant, &mut shares);
                     padded.set(&table, &shares);
                     at.iter_mut().zip(&of_row).for_each(|(at, value)| *at = instant.weight * value);

@@ -20,7 +20,7 @@ use rayon::prelude::*;
 
 use super::antennas::PairResponse;
 use super::cap::rings_for;
-use super::instants::Instant;
+use super::instants::{Instant, Instants};
 use super::view::{Axes, PairView, euler, transported};
 use super::{PairAt, RowsError, RowsSetup};
 use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
@@ -207,6 +207,15 @@ impl RowPlan {
                 self.groups.push(start..k + 1);
                 (start, nodes) = (k + 1, 0);
             }
+        }
+    }
+
+    /// The instants of a row of a pass.
+    pub(super) fn instants_of<'a>(&self, pass: &Pass, row: usize, all: &'a Instants) -> &'a [Instant] {
+        let reach = self.reach.get(row).map_or(0.0, |reach| f64::from(*reach));
+        match pass.rate_rad {
+            Some(rates_rad) => all.for_phases(rates_rad.map(|rate_rad| rate_rad * reach)),
+            None => all.middle(),
         }
     }
 

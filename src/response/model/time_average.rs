@@ -108,7 +108,7 @@ mod tests {
         let config = ArrayConfig { eccentricity: 0.01, cross_track_ratio: 0.1, ..ArrayConfig::default() };
         let array = Arc::new(Array::new(&config).unwrap());
         // Smooth, so that pixels' centres hold it.
-        let nside = 16;
+        let nside = 64;
         let values = pixel_directions(nside).iter().map(|n| 300.0 + 200.0 * n[0] * n[2]).collect();
         let sky = SkyMap::new(Frame::Ecliptic, values).unwrap();
         let frequency_hz = 10e6;
@@ -135,9 +135,13 @@ mod tests {
             plain.predict(&instants, &mut values).unwrap();
             let expected = values.iter().sum::<Complex64>() / PARTS as f64;
             let scale = values.iter().map(|v| v.norm()).fold(0.0, f64::max);
-            // Pixels come and go at the limb, one of 2,000 that are seen at a time.
-            assert!((found[0] - expected).norm() < 2e-3 * scale, "{length_s}: {found:?} {expected}");
-            assert!((found[0] - expected).norm() <= (middle[0] - expected).norm(), "{length_s}");
+            // Pixels come and go at the limb: 0.08 K sr each, of some 20 K sr.
+            assert!((found[0] - expected).norm() < 5e-3 * scale, "{length_s}: {found:?} {expected}");
+            let left_out = (middle[0] - expected).norm();
+            assert!(
+                length_s < 60.0 || (found[0] - expected).norm() < 0.1 * left_out,
+                "{length_s}: {left_out}"
+            );
         }
         // Instants are left as they are.
         let (mut found, mut expected) = ([Complex64::ZERO], [Complex64::ZERO]);
