@@ -125,15 +125,19 @@ fn what_needs_a_circle_is_refused_for_ellipses() {
     }
 }
 
-#[test]
-fn a_triple_on_ellipses_is_mapped_by_refinement() {
-    // Altitudes that breathe by 20 km, and satellites that follow each other with cross-track offsets and pitch.
-    let pipeline = TRIPLE
+/// The triple with altitudes that breathe by 20 km, and satellites that follow each other with cross-track offsets and pitch.
+fn followers() -> String {
+    TRIPLE
         .replace(
             "eccentricity = 0.012, inclination_deg = 60.02",
             "eccentricity = 0.01001, inclination_deg = 60.0005",
         )
-        .replace("node_longitude_deg = 0.02", "node_longitude_deg = 0.0005");
+        .replace("node_longitude_deg = 0.02", "node_longitude_deg = 0.0005")
+}
+
+#[test]
+fn a_triple_on_ellipses_is_mapped_by_refinement() {
+    let pipeline = followers();
     let place = Workplace::new(&pipeline);
     let out = place.path("out");
     let harmonic = [
@@ -178,12 +182,7 @@ fn a_triple_on_ellipses_is_mapped_by_refinement() {
 /// leaves nothing of it if it knows both, and only then. (That either is right is held against direct sums in `physics general`.)
 #[test]
 fn averages_and_antennas_that_differ_are_in_the_rows_of_a_refined_map() {
-    let pipeline = TRIPLE
-        .replace(
-            "eccentricity = 0.012, inclination_deg = 60.02",
-            "eccentricity = 0.01001, inclination_deg = 60.0005",
-        )
-        .replace("node_longitude_deg = 0.02", "node_longitude_deg = 0.0005");
+    let pipeline = followers();
     let place = Workplace::new(&pipeline);
     let downlink = place.path("flown.ccsds");
     let flown = [

@@ -28,6 +28,7 @@ use crate::units::{ChannelId, Pair};
 pub const HELD_BYTES: u64 = 88;
 
 const MAGIC: &[u8; 8] = b"LNRHELD2";
+const EARLIER: &[u8; 8] = b"LNRHELD1";
 /// Bytes of magic, count and checksum.
 const FIXED_BYTES: u64 = 24;
 /// Visibilities that are written or read at a time.
@@ -109,12 +110,18 @@ impl HeldSegment {
             _ => error.into(),
         })?;
         let (bytes, expected) = (file.metadata()?.len(), self.bytes());
+        let mut head = [0; 16];
+        if bytes >= FIXED_BYTES {
+            file.read_exact(&mut head)?;
+        }
+        if head.starts_with(EARLIER) {
+            let found = "visibilities without the length of their integrations, of an earlier version: replay their files into a new folder";
+            return Err(damaged(found.into()));
+        }
         if Some(bytes) != expected {
             return Err(damaged(format!("{bytes} bytes")));
         }
         let mut crc = Digest::new(CrcAlgorithm::Crc64Nvme);
-        let mut head = [0; 16];
-        file.read_exact(&mut head)?;
         crc.update(&head);
         if head[..8] != *MAGIC || head[8..] != self.visibilities.to_le_bytes() {
             return Err(damaged("another beginning".into()));
@@ -241,6 +248,11 @@ mod tests {
             std::fs::write(&path, &good[..at]).unwrap();
             is_told();
         }
+        let mut earlier = good.clone();
+        earlier[..8].copy_from_slice(EARLIER);
+        std::fs::write(&path, &earlier[..good.len() - 12]).unwrap();
+        let said = segment.verify(folder.path()).unwrap_err().to_string();
+        assert!(said.contains("replay their files into a new folder"), "{said}");
         // Another one of the same length, which holds in itself, is not the one that was named.
         HeldSegment::write(place, ChannelId(2), &visibilities(4)[1..]).unwrap();
         is_told();

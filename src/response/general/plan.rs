@@ -97,7 +97,7 @@ pub(super) struct Pass {
 /// What visibilities are of besides positions.
 #[derive(Clone, Copy, Default)]
 pub struct Observed<'a> {
-    /// Length of each integration, s, about the time of its positions; empty for instants.
+    /// Length of each integration, s, about the time of its positions; those beyond the list are instants.
     pub duration_s: &'a [f32],
     /// Response of the pair of each visibility, times that of the rows' setup: of a degree up to the setup's.
     pub response: Option<&'a (dyn Fn(usize) -> PairResponse + Sync)>,
@@ -153,7 +153,7 @@ impl RowPlan {
             groups: Vec::new(),
             gamma_rad: vec![0.0; pairs.len()],
             tau: vec![0.0; pairs.len()],
-            reach: vec![0.0; observed.duration_s.len()],
+            reach: vec![0.0; if observed.duration_s.is_empty() { 0 } else { pairs.len() }],
             coefficients: coefficients(setup.polynomial_degree, pairs.len(), observed),
             instants: observed.duration_s.iter().filter(|length_s| !is_known((**length_s).into())).count(),
             classes: classes.all(),
