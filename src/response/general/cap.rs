@@ -25,8 +25,9 @@ use rayon::prelude::*;
 use super::RowsSetup;
 use super::bessel::BesselOrders;
 use super::border::{Border, BorderBuffers};
+use super::classes::{NodeClass, rings_for};
 use super::lanes::{LANES, VALUES, Value};
-use super::plan::{NodeClass, RowNode};
+use super::plan::RowNode;
 use super::turns::{QuarterTurns, rows_apart_mut};
 use crate::frames::AntennaResponse;
 use crate::response::harmonic::degrees;
@@ -65,11 +66,6 @@ pub(super) struct CapClass {
 fn reach(l_max: usize, sin: f64) -> usize {
     let turning = l_max as f64 * sin;
     l_max.min((turning + 8.0 * turning.cbrt()) as usize + 8)
-}
-
-/// Rings for a cap of this radius.
-pub(super) fn rings_for(l_max: usize, limb_rad: f64, u_max: f64) -> usize {
-    GaussLegendre::points_for(0.5 * limb_rad * (l_max as f64 + TAU * u_max))
 }
 
 /// Memory of what a task works with besides patterns, bytes.

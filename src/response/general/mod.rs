@@ -15,6 +15,7 @@ mod antennas;
 mod bessel;
 mod border;
 mod cap;
+mod classes;
 mod frames;
 mod instants;
 mod lanes;

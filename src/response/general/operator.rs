@@ -7,11 +7,12 @@ use rayon::prelude::*;
 
 use super::antennas::Products;
 use super::cap::{CapBuffers, CapClass, NodePatterns, Patterns, batch_bytes};
+use super::classes::tables_bytes;
 use super::frames::{Frames, Turned};
 use super::instants::Instants;
 use super::lanes::{LANES, Lanes, VALUES, Value};
 use super::phases::{PaddedShares, PhaseGrid, PhaseTable};
-use super::plan::{GROUP_NODES, Observed, Pass, RowNode, RowPlan, tables_bytes};
+use super::plan::{GROUP_NODES, Observed, Pass, RowNode, RowPlan};
 use super::turns::{QuarterTurns, place};
 use super::{PairAt, RowsError, RowsSetup};
 use crate::response::harmonic::degrees;

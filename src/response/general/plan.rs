@@ -19,7 +19,7 @@ use num_complex::Complex64;
 use rayon::prelude::*;
 
 use super::antennas::PairResponse;
-use super::cap::rings_for;
+use super::classes::{Classes, NodeClass};
 use super::instants::{Instant, Instants};
 use super::view::{Axes, PairView, euler, transported};
 use super::{PairAt, RowsError, RowsSetup};
@@ -45,14 +45,6 @@ const KINK_STEP_S_MAX: f64 = 20.0;
 /// Most rows from which others are interpolated together: more are longer to interpolate from, not more exact.
 const NODES_MAX: usize = 40;
 
-/// Width of a class of limbs that share quadrature points, in units of a harmonic's wave length over 2 pi: what lies between
-/// a class's limb and a pair's takes a series of as many terms more. With little memory classes are wider.
-const CLASS_WIDTH: f64 = 1.5;
-const CLASSES_BYTES: f64 = 8e8;
-
-/// Most classes of limbs.
-const CLASSES_MAX: f64 = 64.0;
-
 /// Error of the angles gamma of rows as those of a pass's nodes tell them, rad, above which these do not tell how rows move.
 const GAMMA_ERROR_RAD: f64 = 1e-4;
 
@@ -67,17 +59,6 @@ pub(super) struct RowNode {
     pub(super) view: PairView,
     /// Its class.
     pub(super) class: u32,
-}
-
-/// Nodes that share quadrature points.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct NodeClass {
-    /// Angle between nadir and limb in the middle, rad.
-    pub(super) limb_rad: f64,
-    /// How far limbs lie from there at most, rad.
-    pub(super) width_rad: f64,
-    /// Longest baseline, wavelengths: shorter ones need fewer points.
-    pub(super) u_max: f64,
 }
 
 /// Consecutive visibilities of a pair, and the nodes of their rows.
@@ -294,69 +275,6 @@ impl Pass {
         shares.extend(self.tau.iter().zip(&self.weights).map(|(node, weight)| weight / (tau - node)));
         let sum: f64 = shares.iter().sum();
         shares.iter_mut().for_each(|share| *share /= sum);
-    }
-}
-
-/// Longest baselines of classes, in units of the longest: shorter ones need fewer points.
-const LENGTHS: [f64; 5] = [1.0, 0.75, 0.5, 0.3, 0.15];
-
-/// Bytes of the tables of one limb, from [`LENGTHS`]: Legendre functions at the quadrature points, of which some three quarters are
-/// not negligible.
-fn limb_bytes(l_max: usize, u_max: f64, cap_rad: f64) -> f64 {
-    let rings = |length: &f64| rings_for(l_max, cap_rad, u_max * length) as f64;
-    let rings: f64 = LENGTHS.iter().map(rings).sum();
-    4.0 * 0.75 * rings * 0.5 * ((l_max + 2) as f64).powi(2)
-}
-
-/// Bytes of all tables at most: those of two limbs as wide as they may be, a hemisphere, or what classes may take.
-pub(super) fn tables_bytes(l_max: usize, u_max: f64) -> f64 {
-    CLASSES_BYTES.max(2.0 * limb_bytes(l_max, u_max, FRAC_PI_2))
-}
-
-/// Classes by limb and length of the baseline.
-struct Classes {
-    first_rad: f64,
-    step_rad: f64,
-    count: usize,
-    width_rad: f64,
-    u_max: f64,
-}
-
-impl Classes {
-    fn new(l_max: usize, views: &[PairView], u_max: f64) -> Self {
-        let caps = views.iter().map(PairView::cap_rad);
-        let (low, high) = caps.fold((f64::INFINITY, 0.0_f64), |(a, b), cap| (a.min(cap), b.max(cap)));
-        let range_rad = (high - low).max(0.0);
-        let most = (CLASSES_BYTES / limb_bytes(l_max, u_max, high)).floor().clamp(1.0, CLASSES_MAX);
-        let step_rad = (range_rad / most).max(CLASS_WIDTH / (l_max + 1) as f64);
-        let count = (range_rad / step_rad).ceil().max(1.0) as usize;
-        let apart_rad = views.iter().map(PairView::limbs_apart_rad).fold(0.0, f64::max);
-        Self {
-            first_rad: low + 0.5 * (range_rad - step_rad * (count - 1) as f64),
-            step_rad,
-            count,
-            // Nodes lie between visibilities.
-            width_rad: 0.5 * step_rad + 1.05 * apart_rad,
-            u_max,
-        }
-    }
-
-    fn of(&self, cap_rad: f64, u: f64) -> u32 {
-        let limb = ((cap_rad - self.first_rad) / self.step_rad).round();
-        let limb = limb.clamp(0.0, (self.count - 1) as f64) as usize;
-        let length = LENGTHS.iter().rposition(|length| u <= length * self.u_max).unwrap_or(0);
-        (length * self.count + limb) as u32
-    }
-
-    fn all(&self) -> Vec<NodeClass> {
-        let class = |length: f64| {
-            (0..self.count).map(move |k| NodeClass {
-                limb_rad: self.first_rad + self.step_rad * k as f64,
-                width_rad: self.width_rad,
-                u_max: length * self.u_max,
-            })
-        };
-        LENGTHS.into_iter().flat_map(class).collect()
     }
 }
 

@@ -4,7 +4,7 @@ use std::f64::consts::{E, PI};
 
 use num_complex::Complex64;
 
-use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
+use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel, predict_means};
 use crate::response::harmonic::quadrature::GaussLegendre;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
@@ -89,13 +89,7 @@ impl BandAverage {
                 }
             }
         }
-        let mut values = vec![Complex64::ZERO; apart.len()];
-        self.model.predict(&apart, &mut values)?;
-        out.fill(Complex64::ZERO);
-        for ((place, weight), value) in parts.into_iter().zip(values) {
-            out[place] += weight * value;
-        }
-        Ok(())
+        predict_means(self.model.as_mut(), &apart, &parts, out)
     }
 }
 

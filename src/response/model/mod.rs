@@ -150,6 +150,22 @@ pub trait VisibilityModel: Send + Sync {
     }
 }
 
+/// Means of a model's predictions: each of `positions` is a part of the mean at a place of `out`, with a weight.
+fn predict_means(
+    model: &mut dyn VisibilityModel,
+    positions: &[PairPosition],
+    parts: &[(usize, f64)],
+    out: &mut [Complex64],
+) -> Result<(), ModelError> {
+    let mut values = vec![Complex64::ZERO; positions.len()];
+    model.predict(positions, &mut values)?;
+    out.fill(Complex64::ZERO);
+    for ((place, weight), value) in parts.iter().zip(values) {
+        out[*place] += weight * value;
+    }
+    Ok(())
+}
+
 impl PairPosition {
     /// The pair with its baseline scaled by `factor`, see [`scaled_baseline`].
     #[must_use]

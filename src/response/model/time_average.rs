@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use num_complex::Complex64;
 
-use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
+use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel, predict_means};
 use crate::array::Array;
 use crate::response::general::Instants;
 use crate::units::vector::{Vec3, norm, sub};
@@ -73,12 +73,7 @@ impl VisibilityModel for TimeAverage {
                     parts.push((place, weight));
                 });
             }
-            let mut values = vec![Complex64::ZERO; apart.len()];
-            self.model.predict(&apart, &mut values)?;
-            out.fill(Complex64::ZERO);
-            for ((place, weight), value) in parts.into_iter().zip(values) {
-                out[place] += weight * value;
-            }
+            predict_means(self.model.as_mut(), &apart, &parts, out)?;
         }
         Ok(())
     }
