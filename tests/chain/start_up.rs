@@ -98,6 +98,40 @@ fn what_takes_time_and_memory_by_the_million_is_in_the_estimate() {
 }
 
 #[test]
+fn a_sky_from_which_gains_are_found_is_in_the_estimate() {
+    let place = Workplace::new(SMALL);
+    let memory = |nside: &str, more: &[&str]| {
+        let sky = place.path(&format!("{nside}.fits"));
+        succeed(&[
+            "sky",
+            &place.pipeline,
+            "--no-picture",
+            "--freq-hz",
+            "3MHz",
+            "--nside",
+            nside,
+            "--out",
+            &sky,
+        ]);
+        let models = format!("calibrate.model_files={:?}", [&sky]);
+        let sets = ["spacecraft.channels_hz=[3e6]", &models, "calibrate.sky_model=direct"];
+        let sets = sets.iter().chain(more).flat_map(|set| ["--set", *set]);
+        json(&["check", &place.pipeline, "--memory-max", "1TB"].into_iter().chain(sets).collect::<Vec<_>>())
+            ["memory_bytes"]
+            .as_f64()
+            .unwrap()
+    };
+    let solve = ["calibration.hook=solve"];
+    let apart = memory("256", &solve) - memory("16", &solve);
+    // A direct sum needs three coordinates and a value of each pixel, in f64; the map itself is another 8 bytes, and there may be as much of
+    // either once more.
+    let pixels = 12.0 * (256.0_f64.powi(2) - 16.0_f64.powi(2));
+    assert!((32.0..=64.0).contains(&(apart / pixels)), "{apart}");
+    // Without the hook no map is read while data arrive.
+    assert_eq!(memory("256", &[]), memory("16", &[]));
+}
+
+#[test]
 fn errors_of_all_kinds_come_at_once_and_not_too_many() {
     let place = Workplace::new(
         "[sat]\na = 1\n[map]\nnside = \"big\"\nepsilon = 0.0\n[spacecraft]\nchannels_hz = [1e3]\n",
