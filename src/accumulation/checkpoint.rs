@@ -21,8 +21,8 @@ use super::error::AccumulationError;
 use crate::frames::AntennaResponse;
 
 const MAGIC: &[u8; 8] = b"LNRENGIN";
-const VERSION: u16 = 2;
-const CURRENT: &str = "an engine's checkpoint, version 2: sum the data again";
+const VERSION: u16 = 3;
+const CURRENT: &str = "an engine's checkpoint, version 3: sum the data again";
 /// Beginnings of the magics of earlier formats, one for each engine.
 const EARLIER: [&[u8]; 2] = [b"LNRPIX", b"LNRHRM"];
 
@@ -235,10 +235,10 @@ mod tests {
     fn other_magics_versions_and_kinds_are_refused() {
         for (bytes, expected) in [
             (frame(b"LNRSTA04", VERSION, 1), "expected an engine's checkpoint"),
-            (frame(MAGIC, VERSION + 1, 1), "expected an engine's checkpoint, version 2"),
+            (frame(MAGIC, VERSION + 1, 1), "expected an engine's checkpoint, version 3"),
             (
-                frame(MAGIC, 1, 1),
-                "found version 1 of an engine's checkpoint, expected an engine's checkpoint, version 2: sum",
+                frame(MAGIC, 2, 1),
+                "found version 2 of an engine's checkpoint, expected an engine's checkpoint, version 3: sum",
             ),
             (frame(MAGIC, VERSION, 2), "found sums of kind 2, expected sums over pixels"),
             (frame(MAGIC, VERSION, 3), "found sums of kind 3"),

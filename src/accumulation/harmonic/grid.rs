@@ -11,20 +11,20 @@ use crate::response::harmonic::kernel::{Kernel, LANES};
 use crate::response::harmonic::sizes::fft_length;
 
 /// Nodes in u per wavelength; a pattern's band of |n_y| <= 1 needs 2.
-const NODES_PER_WAVELENGTH: f64 = 3.0;
+const NODES_PER_WAVELENGTH: f64 = 3.5;
 /// Nodes in u that a visibility is spread to, and so the number of diagonals of the sums of weights.
 pub(super) const NODES: usize = 5;
 /// Nodes of a group: a cache line of patterns.
 pub(super) const NODE_GROUP: usize = 8;
 /// Nodes in alpha that a weight is spread to.
-const WEIGHT_ALPHAS: usize = 14;
-/// Kaiser parameters of the weights' kernels in alpha and gamma: ripples below 1e-3 and 3e-4 of a weight, from
-/// differences of orders up to 1.5 l_max and 1.6 l_max.
-const WEIGHT_BETAS: [f64; 2] = [6.0, 7.0];
+const WEIGHT_ALPHAS: usize = 16;
+/// Kaiser parameter of the weights' kernels: ripples below 2e-4 of a weight, from differences of orders up to 1.7 l_max.
+const WEIGHT_BETA: f64 = 7.5;
 /// Error of the data's kernels in alpha and gamma.
 const DATA_TOLERANCE: f64 = 1e-4;
-/// Points of the weights' grid per degree: products of two sky orders have differences up to 2 `l_max`.
-const POINTS_PER_DEGREE: f64 = 4.5;
+/// Points of the weights' grid per degree: products of two sky orders have differences up to 2 `l_max`. At 4.5 those at the end fall where the
+/// kernels do, and degrees from `0.9 l_max` on err by 3 to 30 %; at 4.75 by 3e-3, as all others.
+const POINTS_PER_DEGREE: f64 = 4.75;
 
 /// Multiply-adds of spreading one visibility: pairs of nodes and alphas of weights, nodes and about 11 alphas of four
 /// sums of data, each over the lanes of a kernel in gamma.
@@ -61,9 +61,9 @@ impl Grids {
         Self {
             points,
             nodes,
-            u: Kernel::semicircle(NODES, 0.5 * NODES_PER_WAVELENGTH),
-            weight_alpha: Kernel::windowed_sinc(WEIGHT_ALPHAS, WEIGHT_BETAS[0]),
-            weight_gamma: Kernel::windowed_sinc(LANES, WEIGHT_BETAS[1]),
+            u: Kernel::kaiser_bessel(NODES, 0.5 * NODES_PER_WAVELENGTH),
+            weight_alpha: Kernel::windowed_sinc(WEIGHT_ALPHAS, WEIGHT_BETA),
+            weight_gamma: Kernel::windowed_sinc(LANES, WEIGHT_BETA),
             data: Kernel::new(DATA_TOLERANCE, (points / 2) as f64 / (2 * l_max + 1) as f64),
             share: RankShare::WHOLE,
         }

@@ -122,9 +122,9 @@ fn forward_of(setup: &HarmonicSetup, unknowns: &[f64], blocks: &[PlacedVisibilit
     values
 }
 
-/// Bound on the interpolation of a row between nodes: width 5 at an oversampling of 1.5 errs by
-/// `exp(-pi 5 sqrt(1 - 1/1.5)) = 1.2e-4` of the greatest; twice, and relative to a product of two random skies.
-const INTERPOLATION: f64 = 1e-3;
+/// Bound on the interpolation of a row between nodes: at the end of the band five nodes err by 1.8e-4 in the mean over the places
+/// between nodes (3.2e-4 at most, the kernel's own test); twice, and relative to a product of two random skies.
+const INTERPOLATION: f64 = 4e-4;
 
 #[test]
 fn the_operator_is_the_sum_over_rows() {
@@ -186,8 +186,8 @@ fn the_operator_is_the_sum_over_rows_at_high_degrees() {
     sums.apply(&x, &mut y);
     let scale = (form(&vx, &vx) * form(&vz, &vz)).sqrt();
     let errors = [dot(&x, &y) / form(&vx, &vx) - 1.0, (dot(&z, &y) - form(&vz, &vx)) / scale];
-    // Five rows do not average: ripples of the weights' kernels, 1e-3 in alpha and 3e-4 in gamma, and interpolation, twice 1.2e-4.
-    assert!(errors.iter().all(|error| error.abs() < 1.6e-3), "{errors:?}");
+    // Five rows do not average: ripples of the weights' kernels, 2e-4 in alpha and in gamma, and interpolation, twice 3.2e-4 at most.
+    assert!(errors.iter().all(|error| error.abs() < 1e-3), "{errors:?}");
 }
 
 #[test]
@@ -204,8 +204,8 @@ fn the_operator_is_symmetric() {
 
 /// `<B x, N^-1 V> = <x, Bt N^-1 V>`: B by the forward operator, Bt by the engine, which share no kernel.
 ///
-/// The bound is the engine's interpolation between nodes, 1.2e-4 of the greatest row, averaged over 600 rows; the
-/// forward operator errs by 1e-5.
+/// The bound is the engine's interpolation between nodes, 8e-5 in the mean, averaged over 600 rows, and the data's kernels, 1e-4
+/// likewise; the forward operator errs by 1e-5.
 #[test]
 fn data_is_projected_by_the_adjoint() {
     let blocks = blocks(0, 60);
@@ -260,8 +260,8 @@ fn the_operator_and_the_projection_are_of_one_matrix() {
     let mut y = vec![0.0; x.len()];
     sums.apply(&x, &mut y);
     let scale = (lengths[0] * lengths[1]).sqrt();
-    // Kernels: 1e-4 on the data's side, twice, and 1e-3 at the end of the weights' band.
-    assert!((dot(&z, &y) - expected).abs() < 1e-3 * scale, "{:e}", (dot(&z, &y) - expected) / scale);
+    // Kernels: 1e-4 on the data's side, twice, and ripples of 2e-4 of the weights', twice.
+    assert!((dot(&z, &y) - expected).abs() < 6e-4 * scale, "{:e}", (dot(&z, &y) - expected) / scale);
 }
 
 /// The companion is projected as data is: equal when it is given as data.
