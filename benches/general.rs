@@ -9,12 +9,12 @@ use std::time::Instant;
 
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::AntennaResponse;
-use lunarray::response::general::{GeneralRows, PairAt, RowsSetup};
-use lunarray::response::pixel::{Directions, PairGeometry, sky_sums};
+use lunarray::response::general::{GeneralRows, Observed, PairAt, PairResponse, RowsSetup};
+use lunarray::response::pixel::{Directions, PairGeometry, SatelliteAntenna, sky_sums};
 use lunarray::sky::harmonics::Alm;
 use lunarray::sky::healpix::{pixel_area_sr, pixel_directions};
 use lunarray::units::Pair;
-use lunarray::units::vector::{Vec3, add, norm, scale, sub};
+use lunarray::units::vector::{Vec3, add, cross, norm, scale, sub, unit};
 use num_complex::Complex64;
 
 const L_MAX: usize = 160;
@@ -66,6 +66,68 @@ fn seconds<T>(run: impl FnOnce() -> T) -> (f64, T) {
 fn rms(values: impl Iterator<Item = Complex64>) -> f64 {
     let (sum, count) = values.fold((0.0, 0.0), |(sum, count), v| (sum + v.norm_sqr(), count + 1.0));
     (sum / f64::max(count, 1.0)).sqrt()
+}
+
+/// Products for a map and its noise map with averages over integrations and with antennas that differ, against those without, in turn.
+fn what_more_costs(at: &[PairAt], setup: RowsSetup, skies: &[Alm]) {
+    let duration_s: Vec<f32> = at
+        .iter()
+        .map(|at| {
+            let wavelengths = norm(sub(at.r_i_m, at.r_j_m)) / WAVELENGTH_M;
+            (0.125 * 8248.68 / TAU / wavelengths).clamp(0.5, 60.0) as f32
+        })
+        .collect();
+    // Antennas along the line of sight, turned from daughter to daughter.
+    let antenna = |elements: AntennaResponse, distortion: f64, satellite: u8, r_m: Vec3| {
+        let k = f64::from(satellite);
+        let axis = unit(add(scale(0.1 * k, unit(r_m)), [0.1, -0.2, 1.0]));
+        let axes_hat = [axis, unit(cross(axis, r_m))];
+        SatelliteAntenna { elements, axes_hat, distortion: distortion * (k + 1.0) }
+    };
+    let weight = vec![1.0; at.len()];
+    let mut plain_s = Vec::new();
+    for (what, degree, averages, elements, distortion) in [
+        ("averages", 0, true, AntennaResponse::Isotropic, 0.0),
+        ("dipoles", 2, false, AntennaResponse::DipoleNormal, 0.0),
+        ("three dipoles", 2, false, AntennaResponse::ThreeDipoles, 0.0),
+        ("patterns", 4, false, AntennaResponse::Isotropic, 0.05),
+        ("averages of dipoles with patterns", 6, true, AntennaResponse::DipoleNormal, 0.05),
+    ] {
+        let response = |k: usize| {
+            let PairAt { pair, r_i_m, r_j_m, .. } = at[k];
+            let pair = [(pair.i, r_i_m), (pair.j, r_j_m)];
+            let [a, b] = pair.map(|(satellite, r_m)| antenna(elements, distortion, satellite, r_m));
+            PairResponse::of_antennas([&a, &b])
+        };
+        let observed = Observed {
+            duration_s: if averages { &duration_s } else { &[] },
+            response: if degree > 0 { Some(&response) } else { None },
+        };
+        let rows = GeneralRows::new(setup);
+        let plan = rows.plan(at).unwrap();
+        let more = GeneralRows::new(RowsSetup { polynomial_degree: degree, ..setup });
+        let more_plan = more.plan_of(at, &observed).unwrap();
+        let mut ratios = Vec::new();
+        let mut more_s = Vec::new();
+        for _ in 0..3 {
+            let (without_s, _) = seconds(|| rows.normal(&plan, skies, &weight));
+            let (with_s, _) = seconds(|| more.normal(&more_plan, skies, &weight));
+            ratios.push(with_s / without_s);
+            plain_s.push(without_s);
+            more_s.push(with_s);
+        }
+        println!(
+            "{what}: {:.2} s, {:.2} times the products without, median of three pairs",
+            median(&mut more_s),
+            median(&mut ratios)
+        );
+    }
+    println!("without: {:.2} s, {} visibilities", median(&mut plain_s), at.len());
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
 }
 
 fn main() {
@@ -140,4 +202,5 @@ fn main() {
         "direct sums over the pixels of nside {nside}: {direct_us:.1} us a visibility; as many times forward: {:.2}",
         direct_us / per_visibility(forward_s)
     );
+    what_more_costs(&at[..at.len() / 5], setup, &two);
 }

@@ -54,8 +54,8 @@ const CODEC: Configuration<LittleEndian, Fixint, Limit<HEAD_BYTES_MAX>> =
     bincode::config::standard().with_little_endian().with_fixed_int_encoding().with_limit::<HEAD_BYTES_MAX>();
 
 /// Antenna responses by their number in checkpoints: append only.
-pub(super) const RESPONSES: [AntennaResponse; 2] =
-    [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal];
+pub(super) const RESPONSES: [AntennaResponse; 3] =
+    [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal, AntennaResponse::ThreeDipoles];
 
 pub(super) fn number_of<T: PartialEq>(variants: &[T], variant: &T) -> u8 {
     variants.iter().position(|v| v == variant).map_or(u8::MAX, |k| k as u8)

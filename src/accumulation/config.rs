@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::harmonic::{AntennaBelief, L_MAX, RowBelief};
 use super::{AccumulationError, PixelEngine};
 use crate::frames::Instrument;
+use crate::response::PatternsByFrequency;
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
 use crate::sky::Frame;
@@ -137,28 +138,35 @@ pub struct AntennasConfig {
     pub tilt_radial_deg: Vec<f64>,
     /// q of a factor 1 + q (3 cos^2 - 1) / 2 of the voltage pattern, with the angle from the axis.
     pub pattern: Vec<f64>,
+    /// The same by frequency, which is added to it: rows `[frequency_hz, q]`, or `[frequency_hz, q_1, q_2, ...]` with one q a daughter;
+    /// linear between rows, and beyond its ends that of the end.
+    #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
+    pub pattern_by_frequency: PatternsByFrequency,
 }
 
 impl AntennasConfig {
     fn lists(&self) -> [(&'static str, &[f64]); 3] {
-        let Self { tilt_along_deg, tilt_radial_deg, pattern } = self;
+        let Self { tilt_along_deg, tilt_radial_deg, pattern, .. } = self;
         [("tilt_along_deg", tilt_along_deg), ("tilt_radial_deg", tilt_radial_deg), ("pattern", pattern)]
     }
 
     /// Whether all antennas are ideal.
     #[must_use]
     pub fn is_ideal(&self) -> bool {
-        self.lists().iter().all(|(_, values)| values.iter().all(|value| *value == 0.0))
+        self.pattern_by_frequency.is_ideal()
+            && self.lists().iter().all(|(_, values)| values.iter().all(|value| *value == 0.0))
     }
 
     /// Degree of pairs' responses as polynomials in the direction, at most: of two dipoles, and of a pattern of each.
     #[must_use]
     pub fn degree(&self) -> usize {
         let is_set = |values: &[f64]| values.iter().any(|value| *value != 0.0);
-        2 * usize::from(!self.is_ideal()) + 4 * usize::from(is_set(&self.pattern))
+        let has_patterns = is_set(&self.pattern) || !self.pattern_by_frequency.is_ideal();
+        2 * usize::from(!self.is_ideal()) + 4 * usize::from(has_patterns)
     }
 
     fn check(&self, checks: &mut Checks) {
+        self.pattern_by_frequency.check("antennas.pattern_by_frequency", None, checks);
         for (key, values) in self.lists() {
             let expected = format!("at most {}, one a daughter", u8::MAX);
             checks.require(
@@ -506,7 +514,8 @@ impl MapConfig {
     /// What the rows of a refined map are made with.
     #[must_use]
     pub fn belief(&self) -> RowBelief {
-        let AntennasConfig { tilt_along_deg, tilt_radial_deg, pattern } = &self.antennas;
+        let AntennasConfig { tilt_along_deg, tilt_radial_deg, pattern, pattern_by_frequency } =
+            &self.antennas;
         let count = self.antennas.lists().map(|(_, values)| values.len()).into_iter().max().unwrap_or(0);
         let of = |values: &[f64], k: usize| values.get(k).copied().unwrap_or(0.0);
         let antenna = |k: usize| AntennaBelief {
@@ -514,7 +523,8 @@ impl MapConfig {
             distortion: of(pattern, k),
         };
         let antennas = if self.antennas.is_ideal() { Vec::new() } else { (0..count).map(antenna).collect() };
-        RowBelief { smear_integrations: self.refine.smear_integrations, antennas }
+        let patterns = pattern_by_frequency.clone();
+        RowBelief { smear_integrations: self.refine.smear_integrations, antennas, patterns }
     }
 
     /// Longest baseline used at a frequency, m.

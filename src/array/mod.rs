@@ -33,5 +33,5 @@ pub use orbit::{Array, hidden_by_moon};
 pub use placing::PlacingCounts;
 pub use propagate::{Keeping, PropagateConfig, tell_propagation};
 pub use state::SatelliteState;
-pub use track::{orbit_normal_hat, tilted_axis, track_axes, track_offset_m};
+pub use track::{orbit_normal_hat, tilted_axes, track_axes, track_offset_m};
 pub use windows::{EarthShadow, ObservingWindows, earth_in_sight_s};

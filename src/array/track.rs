@@ -1,6 +1,6 @@
 //! Axes of a satellite's motion.
 
-use crate::units::vector::{Vec3, add, cross, dot, scale, unit};
+use crate::units::vector::{Vec3, add, cross, dot, scale, sub, unit};
 
 /// Unit vectors along the track of a satellite, along its orbit's normal, and away from the Moon.
 #[must_use]
@@ -18,12 +18,13 @@ pub fn track_offset_m(r_m: Vec3, normal_hat: Vec3, offset_m: [f64; 3]) -> Vec3 {
 }
 
 /// Axis of an antenna that leans from the orbit's normal by an angle (deg) towards the track's direction, and by one away from the
-/// Moon.
+/// Moon; and the direction across it that is nearest to the track's.
 #[must_use]
-pub fn tilted_axis(r_m: Vec3, normal_hat: Vec3, [along_deg, radial_deg]: [f64; 2]) -> Vec3 {
+pub fn tilted_axes(r_m: Vec3, normal_hat: Vec3, [along_deg, radial_deg]: [f64; 2]) -> [Vec3; 2] {
     let [along, normal, up] = track_axes(r_m, normal_hat);
     let [a, b] = [along_deg, radial_deg].map(|deg| deg.to_radians().tan());
-    unit(add(normal, add(scale(a, along), scale(b, up))))
+    let axis = unit(add(normal, add(scale(a, along), scale(b, up))));
+    [axis, unit(sub(along, scale(dot(along, axis), axis)))]
 }
 
 /// Normal of an orbit from two positions a short time apart; `None` if they are in line with the Moon's centre.

@@ -27,7 +27,7 @@ mod tile;
 pub use config::{DaughtersConfig, Disturbances, DropPolicy, FLOAT_BITS};
 pub use errors::{
     AntennaErrors, BeaconSchedule, ErrorTerms, InstrumentConfig, InstrumentErrors, NavigationConfig,
-    OrbitDipoles, PassErrors, truth_csv,
+    OrbitAntennas, PassErrors, truth_csv,
 };
 pub use link::{LinkCounts, SampleLink};
 pub use repair::Repairs;

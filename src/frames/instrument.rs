@@ -25,6 +25,38 @@ pub enum AntennaResponse {
     Isotropic,
     /// A short dipole along the orbit normal: A = 1 - (n . w)^2, fixed in the body frame.
     DipoleNormal,
+    /// Three short dipoles across each other, the first along the orbit normal, each with a receiver: the mean of the correlations of
+    /// like dipoles, times 3/2. A = 1 for satellites of one attitude.
+    ThreeDipoles,
+}
+
+impl AntennaResponse {
+    /// Whether it is 1 in all directions for satellites of one attitude.
+    #[must_use]
+    pub fn is_even(self) -> bool {
+        match self {
+            Self::Isotropic | Self::ThreeDipoles => true,
+            Self::DipoleNormal => false,
+        }
+    }
+
+    /// Receivers whose correlations are averaged.
+    #[must_use]
+    pub fn receivers(self) -> u8 {
+        match self {
+            Self::Isotropic | Self::DipoleNormal => 1,
+            Self::ThreeDipoles => 3,
+        }
+    }
+
+    /// Degree of the response of two such antennas as a polynomial in the direction, whatever their attitudes.
+    #[must_use]
+    pub fn degree(self) -> usize {
+        match self {
+            Self::Isotropic => 0,
+            Self::DipoleNormal | Self::ThreeDipoles => 2,
+        }
+    }
 }
 
 /// A spectrometer: one more satellite, which measures the total power of the sky in adjacent channels.
@@ -80,13 +112,14 @@ pub struct Instrument {
 const NOISELESS: u8 = 128;
 
 impl Instrument {
-    /// Antenna response and whether there is thermal noise, in one byte of packets and of states: 0 (isotropic) or 1
-    /// (dipole), plus 128 without noise.
+    /// Antenna response and whether there is thermal noise, in one byte of packets and of states: 0 (isotropic), 1 (dipole) or 2
+    /// (three dipoles), plus 128 without noise.
     #[must_use]
     pub fn response_code(&self) -> u8 {
         let response = match self.response {
             AntennaResponse::Isotropic => 0,
             AntennaResponse::DipoleNormal => 1,
+            AntennaResponse::ThreeDipoles => 2,
         };
         response | if self.noiseless { NOISELESS } else { 0 }
     }
@@ -97,6 +130,7 @@ impl Instrument {
         let response = match code & !NOISELESS {
             0 => AntennaResponse::Isotropic,
             1 => AntennaResponse::DipoleNormal,
+            2 => AntennaResponse::ThreeDipoles,
             _ => return None,
         };
         Some((response, code & NOISELESS != 0))

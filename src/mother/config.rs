@@ -154,6 +154,8 @@ pub enum Antenna {
     Isotropic,
     /// A short dipole along the orbit normal.
     DipoleNormal,
+    /// Three short dipoles across each other.
+    ThreeDipoles,
 }
 
 impl From<Antenna> for AntennaResponse {
@@ -161,6 +163,7 @@ impl From<Antenna> for AntennaResponse {
         match antenna {
             Antenna::Isotropic => Self::Isotropic,
             Antenna::DipoleNormal => Self::DipoleNormal,
+            Antenna::ThreeDipoles => Self::ThreeDipoles,
         }
     }
 }

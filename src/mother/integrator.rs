@@ -14,7 +14,8 @@ use super::troubles::PairTroubles;
 use crate::array::{Array, EarthShadow, segments_for};
 use crate::daughters::{InstrumentErrors, PassErrors};
 use crate::frames::{
-    EphemerisSegment, Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, VisibilityBlock,
+    AntennaResponse, EphemerisSegment, Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow,
+    VisibilityBlock,
 };
 use crate::response::model::{ModelError, PairPosition, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
@@ -115,21 +116,36 @@ pub struct NoiseModel {
     pub seed: Option<u64>,
     /// Receiver noise of each channel, T_rec / zeta with all that is added to it, K sr.
     pub receiver_noise_k_sr: Vec<f64>,
+    /// The antennas, which may have several receivers.
+    pub response: AntennaResponse,
 }
 
 impl NoiseModel {
     /// Standard deviation of the real and of the imaginary part, K sr, for sky powers `Int T S A dn` at the two daughters:
     /// `sqrt(P_i P_j / (2 dnu dt))` with `P = T_rec / zeta + Int T S A dn` (the paper, Eq. 12, with each daughter's own
     /// system temperature).
+    ///
+    /// Three dipoles have three receivers. Their mean times 3/2 is half of a sum: of the sky's powers P, and of 3/2 of a receiver's
+    /// noise. Where each has a third of that, the variance is a third of that of one receiver with the same power; dipoles whose powers
+    /// differ by 10 % add 1 % to it, which is left out.
     #[must_use]
     pub fn sigma_k_sr(&self, channel: ChannelId, powers_k_sr: [f64; 2], width_hz: f64, dt_s: f64) -> f64 {
         let receiver = self.receiver_k_sr(channel);
         let [p_i, p_j] = powers_k_sr.map(|power| receiver + power);
-        (p_i * p_j / (2.0 * width_hz * dt_s)).sqrt()
+        (p_i * p_j / (2.0 * self.samples(width_hz, dt_s))).sqrt()
+    }
+
+    /// Independent samples of an integration, of all receivers of a daughter.
+    fn samples(&self, width_hz: f64, dt_s: f64) -> f64 {
+        f64::from(self.response.receivers()) * width_hz * dt_s
     }
 
     fn receiver_k_sr(&self, channel: ChannelId) -> f64 {
-        self.receiver_noise_k_sr.get(usize::from(channel.0)).copied().unwrap_or(0.0)
+        let one_k_sr = self.receiver_noise_k_sr.get(usize::from(channel.0)).copied().unwrap_or(0.0);
+        match self.response.receivers() {
+            1 => one_k_sr,
+            receivers => 0.5 * f64::from(receivers) * one_k_sr,
+        }
     }
 
     /// Random stream of the noise of a pair, or of an auto-correlation, in a channel and window.
@@ -400,7 +416,7 @@ impl Integrator {
                         flags.0 |= Flags::BEACON.0;
                     }
                 }
-                let samples = width_hz * dt_s;
+                let samples = noise_model.samples(width_hz, dt_s);
                 // The last integration may be shorter than one sample, which has no power.
                 if samples < 1.0 {
                     continue;

@@ -151,7 +151,7 @@ impl Config {
             ("spacecraft.model", "\"harmonic\"", anywhere, "\"auto\", \"general\" or \"direct\""),
             (
                 "spacecraft.antenna",
-                "\"dipole-normal\"",
+                "(dipoles)",
                 isotropic || map.refine.is_on(),
                 "\"isotropic\", or map.refine,",
             ),
@@ -179,19 +179,24 @@ impl Config {
 
     /// Requires what antennas that are not ideal can have.
     fn check_antennas(&self, checks: &mut Checks) {
+        let samples = self.spacecraft.fidelity == Fidelity::Samples;
+        let one = self.spacecraft.antenna != Antenna::ThreeDipoles;
+        let expected = "one receiver a daughter with spacecraft.fidelity = \"samples\": \"isotropic\" or \"dipole-normal\"";
+        checks.require("spacecraft.antenna", "\"three-dipoles\"", one || !samples, expected);
         if !self.instrument.has_own_antennas() {
             return;
         }
         let spacecraft = &self.spacecraft;
-        let direct = spacecraft.fidelity == Fidelity::Samples
-            || matches!(spacecraft.model, ModelChoice::Direct | ModelChoice::General);
+        let direct = samples || matches!(spacecraft.model, ModelChoice::Direct | ModelChoice::General);
         let mirror = spacecraft.moon_reflection == 0.0 || spacecraft.moon_mirror == MoonMirror::Flat;
         for (key, value, good, expected) in [
             ("spacecraft.model", "(other)", direct, "\"direct\" or \"general\""),
             ("spacecraft.moon_temperature_k", "(above 0)", spacecraft.moon_temperature_k == 0.0, "0"),
             ("spacecraft.moon_mirror", "\"sphere\"", mirror, "\"flat\""),
         ] {
-            let expected = format!("{expected} with instrument.tilt_along_deg, tilt_radial_deg or pattern");
+            let expected = format!(
+                "{expected} with instrument.tilt_along_deg, tilt_radial_deg, pattern or pattern_by_frequency"
+            );
             checks.require(key, value, good, expected);
         }
         // A flat mirror's image is seen from below, where an antenna that leans away from the Moon has another response.

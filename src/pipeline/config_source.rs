@@ -329,7 +329,7 @@ mod tests {
             "line 7: sat: no such key; a pipeline has",
             "line 1: sed: no such key; did you mean seed? a pipeline has",
             "line 14: sky.file: expected one value, or a list with one for each channel",
-            "--set spacecraft.antenna=\"dish\": spacecraft.antenna: unknown variant `dish`, expected `isotropic`",
+            "--set spacecraft.antenna=\"dish\": spacecraft.antenna: unknown variant `dish`, expected one of `isotropic`",
             "line 12: spacecraft.ninth: found one value (integer), expected a section",
             "sky.nside = 7: expected a power of two",
             "spacecraft.duration_s = -3: expected seconds",

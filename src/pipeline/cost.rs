@@ -8,7 +8,7 @@ use super::engine_cost::EngineCost;
 use super::error::PipelineError;
 use super::memory::MemoryLimit;
 use super::plan::{Expected, Plan};
-use super::rates::{FRINGES_PER_S, SAMPLES_PER_S, cores};
+use super::rates::{AVERAGE_INSTANTS, FRINGES_PER_S, SAMPLES_PER_S, cores};
 use crate::frames::ObservingWindow;
 use crate::mother::{Fidelity, VISIBILITY_BYTES};
 use crate::response::model::{ModelKind, ModelPlan};
@@ -132,6 +132,8 @@ impl Plan {
         let map = &self.config.map;
         let nsides = self.sky_nsides();
         let fringes_per_s = FRINGES_PER_S * cores();
+        // Harmonics of a circle have averages in closed form; other models see their instants.
+        let instants = if self.config.spacecraft.smear_integrations { AVERAGE_INSTANTS } else { 1.0 };
         let expected = self.visibilities();
         let frequencies = &self.config.spacecraft.channels_hz;
         let engine = |(channel, (&frequency_hz, expected)): (usize, (&f64, &Expected))| {
@@ -153,12 +155,12 @@ impl Plan {
                 visibilities_mapped: expected.mapped.round(),
                 baseline_m_max: map.baseline_m_max(frequency_hz),
                 simulation,
-                simulation_direct_s: simulation.direct_fringes / fringes_per_s,
+                simulation_direct_s: instants * simulation.direct_fringes / fringes_per_s,
                 simulation_harmonic_s: [
                     simulation.set_up_fringes / fringes_per_s,
                     simulation.visibility_fringes * expected.sent / fringes_per_s,
                 ],
-                simulation_general_s: simulation.general_fringes * expected.sent / fringes_per_s,
+                simulation_general_s: instants * simulation.general_fringes * expected.sent / fringes_per_s,
                 accumulation_multiply_adds: expected.mapped * engine.visibility_multiply_adds,
                 solution_multiply_adds: engine.solution_multiply_adds,
                 mapping_s: engine.visibility_s * expected.mapped

@@ -12,7 +12,7 @@ use super::plan::{Expected, Plan};
 use crate::array::Array;
 use crate::calibration::CalibrationHook;
 use crate::calibration::solver::{CalibrationMode, known_wavelengths_max};
-use crate::daughters::OrbitDipoles;
+use crate::daughters::OrbitAntennas;
 use crate::frames::{AntennaResponse, ObservingWindow};
 use crate::mother::{ChannelModel, Fidelity, MoonMirror, Schedule};
 use crate::response::harmonic::{GeometryLimits, RotationTable};
@@ -167,9 +167,10 @@ fn farthest_apart_m(array: &Array, windows: &[ObservingWindow]) -> f64 {
 pub(crate) fn build(plan: &Plan, skies: &[Option<&SkyMap>]) -> Result<Vec<ChannelModel>, PipelineError> {
     let nside = |(sky, usual): (&Option<&SkyMap>, usize)| sky.map_or(usual, SkyMap::nside);
     let nsides: Vec<usize> = skies.iter().zip(plan.sky_nsides()).map(nside).collect();
-    let (mut rotations, antennas) = (HashMap::new(), plan.antenna_errors());
+    let mut rotations = HashMap::new();
     let mut models = Vec::new();
     for ((choice, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {
+        let antennas = plan.antenna_errors(schedule.frequency_hz);
         let made =
             sky.map(|sky| channel_model((plan, antennas.as_ref()), choice, sky, schedule, &mut rotations));
         models.push(ChannelModel { batch: choice.kind.batch(), model: made.transpose()? });
@@ -244,10 +245,11 @@ fn channel_model(
     Ok(averaged(plan, with_moon(plan, harmonic, sky, frequency_hz)?, frequency_hz))
 }
 
-/// Dipoles along the normals of the daughters' own orbits, if they have dipoles.
+/// Dipoles along the normals of the daughters' own orbits, if they have dipoles, and along their tracks, if they have three.
 fn own_dipoles(plan: &Plan) -> Option<Arc<dyn AntennaPatterns>> {
-    let is_dipole = plan.instrument.response == AntennaResponse::DipoleNormal;
-    is_dipole.then(|| Arc::new(OrbitDipoles::new(Arc::clone(&plan.array))) as Arc<dyn AntennaPatterns>)
+    let elements = plan.instrument.response;
+    let own = || Arc::new(OrbitAntennas::new(Arc::clone(&plan.array), elements));
+    (elements != AntennaResponse::Isotropic).then(|| own() as Arc<dyn AntennaPatterns>)
 }
 
 /// The sky less a temperature in all directions.

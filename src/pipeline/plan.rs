@@ -6,7 +6,7 @@ use super::config::Config;
 use super::error::PipelineError;
 use crate::array::Array;
 use crate::daughters::{AntennaErrors, DaughtersConfig, InstrumentErrors, truth_csv};
-use crate::frames::{AntennaResponse, Instrument, ObservingWindow};
+use crate::frames::{Instrument, ObservingWindow};
 use crate::mother::{Fidelity, Observer, Schedule, SpacecraftConfig};
 use crate::response::model::AntennaPatterns;
 use crate::units::{ChannelId, MissionTime, all_pairs};
@@ -91,12 +91,12 @@ impl Plan {
         InstrumentErrors::new(instrument, navigation, *seed, &self.array, &channels).map(Arc::new)
     }
 
-    /// Antennas of the daughters that are not ideal; `None` if all are.
+    /// Antennas of the daughters that are not ideal, at a frequency; `None` if all are.
     #[must_use]
-    pub fn antenna_errors(&self) -> Option<Arc<dyn AntennaPatterns>> {
-        let is_dipole = self.instrument.response == AntennaResponse::DipoleNormal;
-        let errors = self.instrument_errors()?;
-        let found = AntennaErrors::new(&errors, Arc::clone(&self.array), &self.windows, is_dipole)?;
+    pub fn antenna_errors(&self, frequency_hz: f64) -> Option<Arc<dyn AntennaPatterns>> {
+        let (errors, elements) = (self.instrument_errors()?, self.instrument.response);
+        let array = Arc::clone(&self.array);
+        let found = AntennaErrors::new(&errors, array, &self.windows, elements, frequency_hz)?;
         Some(Arc::new(found))
     }
 

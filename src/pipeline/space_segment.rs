@@ -103,6 +103,7 @@ pub(super) fn integrate(
     let noise = NoiseModel {
         seed: config.spacecraft.thermal_noise.then_some(config.seed),
         receiver_noise_k_sr: config.spacecraft.receiver_k_sr(),
+        response: plan.instrument.response,
     };
     let options = MeasurementOptions {
         noise,

@@ -144,6 +144,7 @@ fn antenna(response: AntennaResponse) -> &'static str {
     match response {
         AntennaResponse::Isotropic => "isotropic",
         AntennaResponse::DipoleNormal => "dipole-normal",
+        AntennaResponse::ThreeDipoles => "three-dipoles",
     }
 }
 

@@ -10,6 +10,7 @@
 //! | [`general`] | the same for satellites at any positions |
 //! | [`beacon`] | an artificial signal |
 //! | [`model`] | visibilities of a given sky, by either of the two |
+//! | [`PatternsByFrequency`] | how antennas' patterns change with frequency |
 //!
 //! Uses [`crate::units`], [`crate::frames`], [`crate::sky`] and [`mod@crate::array`]. Simulation and mapping share it,
 //! so a bug here would cancel out unseen: tests compare it with reference values made by other code.
@@ -18,4 +19,7 @@ pub mod beacon;
 pub mod general;
 pub mod harmonic;
 pub mod model;
+mod patterns_by_frequency;
 pub mod pixel;
+
+pub use patterns_by_frequency::PatternsByFrequency;

@@ -5,7 +5,8 @@ use crate::common;
 use std::path::Path;
 
 use common::workplace::{Workplace, fail, json, maps, succeed};
-use lunarray::downlink::Contents;
+use lunarray::downlink::{Contents, DownlinkReader};
+use lunarray::frames::GroundFrame;
 
 /// A triple whose altitudes differ by tens of kilometres and whose planes are tilted against each other: a circle's rows
 /// would be of no use.
@@ -178,59 +179,119 @@ fn a_triple_on_ellipses_is_mapped_by_refinement() {
     }
 }
 
-/// A sky that the map's degrees hold, seen by each daughter's own dipole and averaged over instants at the array's positions: refinement
-/// leaves nothing of it if it knows both, and only then. (That either is right is held against direct sums in `physics general`.)
-#[test]
-fn averages_and_antennas_that_differ_are_in_the_rows_of_a_refined_map() {
-    let pipeline = followers();
-    let place = Workplace::new(&pipeline);
+/// Tilts of the daughters' antennas, and patterns of their voltages, as flown and as known.
+const TILTED: [&str; 2] = [
+    "instrument.tilt_along_deg.constant=[20.0, 0.0, -15.0]",
+    "instrument.tilt_radial_deg.constant=[0.0, 10.0, 0.0]",
+];
+const KNOWN_TILTED: [&str; 2] =
+    ["map.antennas.tilt_along_deg=[20.0, 0.0, -15.0]", "map.antennas.tilt_radial_deg=[0.0, 10.0]"];
+const KNOWN_PATTERN: &str = "map.antennas.pattern=[0.2, 0.0, -0.1]";
+const SMEARED: &str = "map.refine.smear_integrations=true";
+
+/// Flies the followers with these settings under a sky that the map's degrees hold, averaged over instants at the array's positions; gives what
+/// refinement leaves of the data, chi-square, knowing each of several sets of settings.
+fn left_by_refinement(flown: &[&str], known: &[&[&str]]) -> Vec<f64> {
+    let place = Workplace::new(&followers());
     let downlink = place.path("flown.ccsds");
-    let flown = [
+    let space = [
         "sky.nside=8",
         "sky.l_max=10",
         "spacecraft.model=general",
-        "spacecraft.antenna=dipole-normal",
         // Half a wavelength of motion: four times what the mission has.
         "spacecraft.motion_wavelengths_max=0.5",
         "spacecraft.smear_integrations=true",
-        "instrument.tilt_along_deg.constant=[20.0, 0.0, -15.0]",
-        "instrument.tilt_radial_deg.constant=[0.0, 10.0, 0.0]",
-        "instrument.pattern.constant=[0.2, 0.0, -0.1]",
+    ];
+    let ground = [
         "map.engine=harmonic",
         "map.rows=average",
         "map.refine.passes_max=20",
         "map.refine.residual_max=1e-6",
         "map.epsilon=1e-9",
     ];
-    let sets: Vec<&str> = flown.iter().flat_map(|set| ["--set", set]).collect();
-    succeed(&[&["simulate", &place.pipeline, "-o", &downlink], sets.as_slice()].concat());
-    let left = |name: &str, more: &[&str]| {
-        let out = place.path(name);
-        let sets = sets[18..].iter().copied().chain(more.iter().flat_map(|set| ["--set", set]));
-        let replay = ["replay", &downlink, "--map", &place.pipeline, "--out", &out].into_iter().chain(sets);
-        let summary = json(&replay.collect::<Vec<&str>>());
+    let run = |command: &[&str], sets: &[&[&str]]| -> Vec<String> {
+        let sets = sets.iter().copied().flatten().flat_map(|set| ["--set", set]);
+        command.iter().copied().chain(sets).map(str::to_owned).collect()
+    };
+    let simulate = run(&["simulate", &place.pipeline, "-o", &downlink], &[&space, &ground, flown]);
+    succeed(&simulate.iter().map(String::as_str).collect::<Vec<_>>());
+    let left = |(k, more): (usize, &&[&str])| {
+        let out = place.path(&format!("map-{k}"));
+        let replay = run(&["replay", &downlink, "--map", &place.pipeline, "--out", &out], &[&ground, more]);
+        let summary = json(&replay.iter().map(String::as_str).collect::<Vec<_>>());
         let refinement = summary["channels"][0]["refinement"].clone();
         assert_eq!(refinement["taken_as_instants"], 0, "{refinement}");
         refinement["chi_square"]["all"].as_f64().unwrap()
     };
-    let smeared = ["map.refine.smear_integrations=true"];
-    let antennas = [
-        "map.antennas.tilt_along_deg=[20.0, 0.0, -15.0]",
-        "map.antennas.tilt_radial_deg=[0.0, 10.0]",
-        "map.antennas.pattern=[0.2, 0.0, -0.1]",
-    ];
-    let neither = left("neither", &[]);
-    let instants = left("instants", &antennas);
-    let straight = left("straight", &smeared);
-    let both = left("both", &[smeared.as_slice(), &antennas].concat());
-    eprintln!(
-        "left of the data: {neither:e}, {instants:e} with antennas, {straight:e} with averages, {both:e} with both"
-    );
+    known.iter().enumerate().map(left).collect()
+}
+
+/// Each daughter has its own dipole: refinement leaves nothing of the sky if it knows antennas and averages, and only then. (That either is
+/// right is held against direct sums in `physics general`.)
+#[test]
+fn averages_and_antennas_that_differ_are_in_the_rows_of_a_refined_map() {
+    let pattern = "instrument.pattern.constant=[0.2, 0.0, -0.1]";
+    let flown = [&TILTED[..], &["spacecraft.antenna=dipole-normal", pattern]].concat();
+    let antennas = [&KNOWN_TILTED[..], &[KNOWN_PATTERN]].concat();
+    let both = [&antennas[..], &[SMEARED]].concat();
+    let left = left_by_refinement(&flown, &[&[], &antennas, &[SMEARED], &both]);
+    eprintln!("left of the data knowing neither, antennas, averages, both: {left:?}");
+    let &[neither, instants, straight, both] = &left[..] else { panic!("{left:?}") };
     // Rows are in f32, and an iteration ends: something is left of what is known in full.
-    assert!(
-        both < 0.5 * instants && both < 1e-4 * straight && both < 1e-4 * neither,
-        "{both:e} {instants:e} {straight:e} {neither:e}"
-    );
+    assert!(both < 0.5 * instants && both < 1e-4 * straight && both < 1e-4 * neither, "{left:?}");
+}
+
+/// The same of three dipoles across each other, whose patterns change with frequency: at 3 MHz, half way between the rows of the table, they are
+/// those of the list.
+#[test]
+fn three_dipoles_with_patterns_by_frequency_are_in_the_rows_of_a_refined_map() {
+    const TABLE: &str = "pattern_by_frequency=[[1e6, 0.0, 0.0, 0.0], [5e6, 0.4, 0.0, -0.2]]";
+    let table = format!("instrument.{TABLE}");
+    let flown = [&TILTED[..], &["spacecraft.antenna=three-dipoles", &table]].concat();
+    let straight = [KNOWN_PATTERN, SMEARED];
+    let list = [&KNOWN_TILTED[..], &straight].concat();
+    let table = format!("map.antennas.{TABLE}");
+    let by_frequency = [&KNOWN_TILTED[..], &[&table, SMEARED]].concat();
+    let left = left_by_refinement(&flown, &[&[SMEARED], &straight, &list, &by_frequency]);
+    eprintln!("left of the data knowing averages, patterns too, all by a list, all by a table: {left:?}");
+    let &[neither, straight, list, by_frequency] = &left[..] else { panic!("{left:?}") };
+    assert!(list < 1e-4 * straight && list < 1e-4 * neither, "{left:?}");
+    // 0.2 and -0.1 are not the interpolated numbers to the last bit.
+    assert!((by_frequency / list - 1.0).abs() < 0.1, "{left:?}");
+}
+
+/// Three dipoles see what an isotropic antenna sees, by three receivers: three times the weight, of which a receiver's noise costs half as
+/// much again as it does there.
+#[test]
+fn three_dipoles_have_the_noise_of_three_receivers() {
+    let place = Workplace::new(&TRIPLE.replace("every_nth_window = 100", "every_nth_window = 1000"));
+    let weights = |name: &str, receiver_k_sr: &str, antenna: &str| -> Vec<f64> {
+        let file = place.path(name);
+        let noise = format!("spacecraft.receiver_noise_k_sr={receiver_k_sr}");
+        let antenna = format!("spacecraft.antenna={antenna}");
+        let sets = ["--set", &noise, "--set", &antenna, "--set", "spacecraft.model=direct"];
+        let more =
+            ["--set", "map.refine.passes_max=1", "--set", "map.engine=harmonic", "--set", "map.rows=average"];
+        succeed(&[&["simulate", &place.pipeline, "-o", &file][..], &sets, &more].concat());
+        let mut reader = DownlinkReader::open(Path::new(&file)).unwrap();
+        let mut found = Vec::new();
+        while let Some(frame) = reader.next_frame().unwrap() {
+            if let GroundFrame::Visibilities(block) = frame {
+                found.extend(block.weight.iter().map(|weight| f64::from(*weight)));
+            }
+        }
+        found
+    };
+    // A receiver as noisy as the sky here, some 4e7 K sr, and one of no noise.
+    for receiver_k_sr in [0.0, 4e7] {
+        let one = weights("one.ccsds", &(1.5 * receiver_k_sr).to_string(), "isotropic");
+        let three = weights("three.ccsds", &receiver_k_sr.to_string(), "three-dipoles");
+        assert!(one.len() > 20 && one.len() == three.len(), "{} {}", one.len(), three.len());
+        for (one, three) in one.iter().zip(&three) {
+            // Sums of pixels and weights are in f32.
+            assert!((three / one / 3.0 - 1.0).abs() < 3e-6, "{one} {three}");
+        }
+    }
 }
 
 /// A day of three satellites under the Moon's oblateness, integrated by other code.

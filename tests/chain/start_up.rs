@@ -84,6 +84,11 @@ fn what_takes_time_and_memory_by_the_million_is_in_the_estimate() {
     assert!(one - none > 1.0, "{none} {one}");
     // In proportion, to the rounding of times that are printed in full.
     assert!(((two - none) / (one - none) - 2.0).abs() < 1e-6, "{none} {one} {two}");
+    // An average over an integration is of two instants at least.
+    let direct_s = |smeared: &str| number(&check(&[smeared])["channels"][0], "simulation_direct_s");
+    let [instants_s, averages_s] =
+        ["false", "true"].map(|smeared| direct_s(&format!("spacecraft.smear_integrations={smeared}")));
+    assert!((2.0..4.0).contains(&(averages_s / instants_s)), "{instants_s} {averages_s}");
     // A snapshot at every visibility at most: the summary keeps a line of each.
     let (rare, often) = (check(&["map.snapshot_every_s=1e7"]), check(&["map.snapshot_every_s=1e-3"]));
     let most = number(&often, "solutions");

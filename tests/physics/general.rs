@@ -11,7 +11,7 @@ use lunarray::sky::harmonics::{Alm, AnalysisOptions, Method, analysis, synthesis
 use lunarray::sky::healpix::{pixel_area_sr, pixel_directions};
 use lunarray::units::Pair;
 use lunarray::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
-use lunarray::units::vector::{Vec3, unit};
+use lunarray::units::vector::{Vec3, cross, unit};
 use num_complex::Complex64;
 
 const RADIUS_M: f64 = MOON_RADIUS_M + 300e3;
@@ -348,21 +348,31 @@ fn results_do_not_depend_on_threads() {
 }
 
 /// Antennas of a satellite that turn slowly.
-fn antenna(satellite: u8, time_s: f64) -> SatelliteAntenna {
+fn antenna(elements: AntennaResponse, satellite: u8, time_s: f64) -> SatelliteAntenna {
     let k = f64::from(satellite) + 1e-4 * time_s;
+    let axis_hat = unit([0.3 * k.sin(), -0.5 + 0.1 * k.cos(), 0.9]);
     SatelliteAntenna {
-        axis_hat: unit([0.3 * k.sin(), -0.5 + 0.1 * k.cos(), 0.9]),
-        is_dipole: true,
+        elements,
+        axes_hat: [axis_hat, unit(cross(axis_hat, [0.2, k.cos(), k.sin()]))],
         distortion: 0.02 * f64::from(satellite),
     }
 }
 
-fn antennas_of(at: &PairAt) -> [SatelliteAntenna; 2] {
-    [at.pair.i, at.pair.j].map(|satellite| antenna(satellite, at.time_s))
+fn antennas_of(elements: AntennaResponse, at: &PairAt) -> [SatelliteAntenna; 2] {
+    [at.pair.i, at.pair.j].map(|satellite| antenna(elements, satellite, at.time_s))
 }
 
 #[test]
 fn antennas_that_differ_see_what_direct_sums_of_them_see() {
+    antennas_that_differ(AntennaResponse::DipoleNormal);
+}
+
+#[test]
+fn three_dipoles_that_differ_see_what_direct_sums_of_them_see() {
+    antennas_that_differ(AntennaResponse::ThreeDipoles);
+}
+
+fn antennas_that_differ(elements: AntennaResponse) {
     const L_MAX: usize = 24;
     const NSIDE: usize = 256;
     let sky = sky(L_MAX);
@@ -374,7 +384,7 @@ fn antennas_that_differ_see_what_direct_sums_of_them_see() {
     let rows =
         GeneralRows::new(RowsSetup { polynomial_degree: 6, ..setup(L_MAX, AntennaResponse::Isotropic) });
     let response = |k: usize| {
-        let [a, b] = antennas_of(&pairs[k]);
+        let [a, b] = antennas_of(elements, &pairs[k]);
         PairResponse::of_antennas([&a, &b])
     };
     let plan = rows.plan_of(&pairs, &Observed { response: Some(&response), ..Observed::default() }).unwrap();
@@ -390,7 +400,7 @@ fn antennas_that_differ_see_what_direct_sums_of_them_see() {
                 moon_radius_m: MOON_RADIUS_M,
                 response: AntennaResponse::Isotropic,
             };
-            (geometry, antennas_of(at))
+            (geometry, antennas_of(elements, at))
         })
         .collect();
     let expected: Vec<Complex64> = antenna_sums(&geometries, &directions, &values, pixel_area_sr(NSIDE))
@@ -403,7 +413,7 @@ fn antennas_that_differ_see_what_direct_sums_of_them_see() {
     assert!(error < 1e-2, "{error:e}");
 
     // A response that does not change is a factor of the sky, here of its pixels: rows of that sky, one by one.
-    let [a, b] = [antenna(1, 0.0), antenna(4, 5e3)];
+    let [a, b] = [antenna(elements, 1, 0.0), antenna(elements, 4, 5e3)];
     let constant = PairResponse::of_antennas([&a, &b]);
     let product: Vec<f64> =
         pixel_directions(NSIDE).iter().zip(&map).map(|(n, t)| constant.at(*n) * t).collect();
@@ -471,8 +481,8 @@ fn adjoint_and_normal_products_of_averages_with_antennas_are_the_transposes() {
     let rows =
         GeneralRows::new(RowsSetup { polynomial_degree: 2, ..setup(L_MAX, AntennaResponse::Isotropic) });
     let response = |k: usize| {
-        let [a, b] = antennas_of(&pairs[k]);
-        PairResponse::of_dipoles(a.axis_hat, b.axis_hat)
+        let [a, b] = antennas_of(AntennaResponse::DipoleNormal, &pairs[k]);
+        PairResponse::of_dipoles(a.axes_hat[0], b.axes_hat[0])
     };
     let duration_s = vec![14.0; pairs.len()];
     let plan =

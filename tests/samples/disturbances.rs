@@ -7,7 +7,7 @@ use lunarray::calibration::{
     AntennaGains, Calibration, ChannelGains, GainSolution, GainsFile, Interpolation,
 };
 use lunarray::daughters::{DaughtersConfig, Disturbances};
-use lunarray::frames::{PlacedVisibilities, VisibilityBlock};
+use lunarray::frames::{AntennaResponse, PlacedVisibilities, VisibilityBlock};
 use lunarray::mother::correlator::Division;
 use lunarray::units::constants::SPEED_OF_LIGHT_M_S;
 use lunarray::units::vector::{dot, sub};
@@ -170,12 +170,13 @@ fn tilted_dipoles_act_on_samples_as_on_visibilities() {
     craft.instrument = errors;
     let drawn = craft.errors(24).unwrap();
     let shared = std::sync::Arc::clone(&craft.array);
+    let elements = AntennaResponse::DipoleNormal;
     let antennas: std::sync::Arc<dyn lunarray::response::model::AntennaPatterns> = std::sync::Arc::new(
-        lunarray::daughters::AntennaErrors::new(&drawn, shared, &[craft.window], true).unwrap(),
+        lunarray::daughters::AntennaErrors::new(&drawn, shared, &[craft.window], elements, 1e6).unwrap(),
     );
     let moon_m = craft.array.moon_radius_m();
     craft.sky = Box::new(move |frequency_hz| {
-        let response = lunarray::frames::AntennaResponse::DipoleNormal;
+        let response = AntennaResponse::DipoleNormal;
         let sum = lunarray::response::model::DirectSum::new(&map, frequency_hz, moon_m, response);
         Box::new(lunarray::response::model::AntennaSum::new(sum, std::sync::Arc::clone(&antennas)))
     });

@@ -1,16 +1,21 @@
 //! What the ground believes of visibilities besides their positions: that they are averages, and how antennas point and see.
 
-use crate::array::{orbit_normal_hat, tilted_axis};
+use crate::array::{orbit_normal_hat, tilted_axes};
 use crate::frames::AntennaResponse;
+use crate::response::PatternsByFrequency;
 use crate::response::general::{PairAt, PairResponse};
 use crate::response::pixel::SatelliteAntenna;
-use crate::units::vector::{Vec3, cross, dot, unit};
+use crate::units::vector::{Vec3, cross, dot, sub, unit};
 
 use super::refined::is_same_pass;
 
 /// Angle between the normals of two satellites' orbits and that of their plane, rad, up to which dipoles along either are the same: rows
 /// err by it.
 const SAME_NORMAL_RAD: f64 = 1e-5;
+
+/// Angle between the attitudes of two satellites, rad, up to which three dipoles on each are taken to see all directions alike: rows err by half
+/// its square.
+const SAME_ATTITUDE_RAD: f64 = 3e-3;
 
 /// The antenna of a daughter.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -28,45 +33,47 @@ pub struct RowBelief {
     pub smear_integrations: bool,
     /// Antennas by daughter; those beyond the list are ideal.
     pub antennas: Vec<AntennaBelief>,
+    /// Distortions of their patterns by frequency, which are added to theirs.
+    pub patterns: PatternsByFrequency,
 }
 
 /// Antennas of pairs whose response is not that of rows.
 #[derive(Clone, Debug)]
 pub(super) struct PairAntennas {
     antennas: Vec<AntennaBelief>,
-    is_dipole: bool,
+    patterns: PatternsByFrequency,
+    frequency_hz: f64,
+    elements: AntennaResponse,
 }
 
 impl RowBelief {
     /// The antennas of the pairs of sorted visibilities, where rows of a response alone do not have them.
-    pub(super) fn antennas_of(&self, response: AntennaResponse, at: &[PairAt]) -> Option<PairAntennas> {
-        let is_dipole = response == AntennaResponse::DipoleNormal;
-        let found = PairAntennas { antennas: self.antennas.clone(), is_dipole };
-        let is_tilted = self.antennas.iter().any(|antenna| antenna.tilt_deg != [0.0; 2]);
-        let is_plain = !found.is_distorted() && !(is_dipole && (is_tilted || found.leave_the_plane(at)));
-        (!is_plain).then_some(found)
+    pub(super) fn antennas_of(
+        &self,
+        elements: AntennaResponse,
+        frequency_hz: f64,
+        at: &[PairAt],
+    ) -> Option<PairAntennas> {
+        let (antennas, patterns) = (self.antennas.clone(), self.patterns.clone());
+        let found = PairAntennas { antennas, patterns, frequency_hz, elements };
+        let is_tilted = || self.antennas.iter().any(|antenna| antenna.tilt_deg != [0.0; 2]);
+        let differs = match elements {
+            AntennaResponse::Isotropic => false,
+            AntennaResponse::DipoleNormal => is_tilted() || leave_the_plane(at),
+            AntennaResponse::ThreeDipoles => is_tilted() || turn_apart(at),
+        };
+        (found.is_distorted() || differs).then_some(found)
     }
 }
 
 impl PairAntennas {
     fn is_distorted(&self) -> bool {
-        self.antennas.iter().any(|antenna| antenna.distortion != 0.0)
+        !self.patterns.is_ideal() || self.antennas.iter().any(|antenna| antenna.distortion != 0.0)
     }
 
     /// Degree of their responses as polynomials.
     pub(super) fn degree(&self) -> usize {
-        2 * usize::from(self.is_dipole) + 4 * usize::from(self.is_distorted())
-    }
-
-    /// Whether dipoles along the normals of orbits are not along those of the pairs' planes.
-    fn leave_the_plane(&self, at: &[PairAt]) -> bool {
-        at.iter().enumerate().any(|(k, pair)| {
-            let plane = unit(cross(pair.r_i_m, pair.r_j_m));
-            normals(at, k).into_iter().any(|normal| {
-                let off = cross(normal, plane);
-                dot(off, off) > SAME_NORMAL_RAD * SAME_NORMAL_RAD
-            })
-        })
+        self.elements.degree() + 4 * usize::from(self.is_distorted())
     }
 
     /// The response of a pair.
@@ -75,13 +82,36 @@ impl PairAntennas {
         let [normal_i, normal_j] = normals(at, k);
         let antenna = |daughter: u8, r_m: Vec3, normal_hat: Vec3| {
             let known = self.antennas.get(usize::from(daughter)).copied().unwrap_or_default();
-            let axis_hat = tilted_axis(r_m, normal_hat, known.tilt_deg);
-            SatelliteAntenna { axis_hat, is_dipole: self.is_dipole, distortion: known.distortion }
+            let axes_hat = tilted_axes(r_m, normal_hat, known.tilt_deg);
+            let distortion = known.distortion + self.patterns.q(daughter.into(), self.frequency_hz);
+            SatelliteAntenna { elements: self.elements, axes_hat, distortion }
         };
         let a = antenna(pair.pair.i, pair.r_i_m, normal_i);
         let b = antenna(pair.pair.j, pair.r_j_m, normal_j);
         PairResponse::of_antennas([&a, &b])
     }
+}
+
+/// Whether dipoles along the normals of orbits are not along those of the pairs' planes.
+fn leave_the_plane(at: &[PairAt]) -> bool {
+    at.iter().enumerate().any(|(k, pair)| {
+        let plane = unit(cross(pair.r_i_m, pair.r_j_m));
+        normals(at, k).into_iter().any(|normal| {
+            let off = cross(normal, plane);
+            dot(off, off) > SAME_NORMAL_RAD * SAME_NORMAL_RAD
+        })
+    })
+}
+
+/// Whether the satellites of a pair, each upright in its own orbit, have different attitudes.
+fn turn_apart(at: &[PairAt]) -> bool {
+    at.iter().enumerate().any(|(k, pair)| {
+        let [a, b] = normals(at, k);
+        let (normals, verticals) = (sub(a, b), sub(unit(pair.r_i_m), unit(pair.r_j_m)));
+        [normals, verticals]
+            .into_iter()
+            .any(|apart| dot(apart, apart) > SAME_ATTITUDE_RAD * SAME_ATTITUDE_RAD)
+    })
 }
 
 /// Normals of the orbits of satellites i and j, as they move from or to a neighbouring visibility; without one that of their plane.

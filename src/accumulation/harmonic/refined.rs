@@ -28,7 +28,7 @@ pub(super) fn refined_sums(
     let Apart { at, bands, data, duration_s } = taken_apart(setup, held);
     let (orbit, departures) = nearest_circle(setup, &|k| at[k], at.len());
     let circle = circle_sums(setup, orbit, &at, &bands, &data)?;
-    let antennas = belief.antennas_of(setup.response, &at);
+    let antennas = belief.antennas_of(setup.response, setup.frequency_hz, &at);
     let rows = GeneralRows::new(RowsSetup {
         l_max: setup.l_max,
         wavelength_m: SPEED_OF_LIGHT_M_S / setup.frequency_hz,

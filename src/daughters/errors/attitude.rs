@@ -4,60 +4,69 @@ use std::sync::Arc;
 
 use super::series::Series;
 use super::{InstrumentErrors, PassErrors};
-use crate::array::{Array, tilted_axis};
-use crate::frames::ObservingWindow;
+use crate::array::{Array, tilted_axes};
+use crate::frames::{AntennaResponse, ObservingWindow};
 use crate::response::model::AntennaPatterns;
 use crate::response::pixel::SatelliteAntenna;
 
-/// Dipoles along the normal of each daughter's own orbit.
-pub struct OrbitDipoles {
+/// Antennas along the normal and the track of each daughter's own orbit.
+pub struct OrbitAntennas {
     array: Arc<Array>,
+    elements: AntennaResponse,
 }
 
-impl OrbitDipoles {
+impl OrbitAntennas {
     /// Those of an array.
     #[must_use]
-    pub fn new(array: Arc<Array>) -> Self {
-        Self { array }
+    pub fn new(array: Arc<Array>, elements: AntennaResponse) -> Self {
+        Self { array, elements }
     }
 }
 
-impl AntennaPatterns for OrbitDipoles {
+impl AntennaPatterns for OrbitAntennas {
     fn antenna(&self, daughter: u8, t_s: f64) -> SatelliteAntenna {
-        let axis_hat = self.array.normal_hat(daughter.into(), t_s);
-        SatelliteAntenna { axis_hat, is_dipole: true, distortion: 0.0 }
+        let number = usize::from(daughter);
+        let (r_m, normal_hat) = (self.array.position_m(number, t_s), self.array.normal_hat(number, t_s));
+        let axes_hat = tilted_axes(r_m, normal_hat, [0.0; 2]);
+        SatelliteAntenna { elements: self.elements, axes_hat, distortion: 0.0 }
     }
 
     fn degree(&self) -> usize {
-        2
+        self.elements.degree()
     }
 }
 
 /// The antennas of an instrument over its passes.
 pub struct AntennaErrors {
     array: Arc<Array>,
-    is_dipole: bool,
+    elements: AntennaResponse,
+    /// Of all daughters' patterns at the channel's frequency, beside what is wrong with them.
+    patterns: Vec<f64>,
     has_patterns: bool,
     /// Start and end, s, and by daughter: tilt along the track, tilt away from the Moon, distortion.
     passes: Vec<([f64; 2], Vec<[Series; 3]>)>,
 }
 
 impl AntennaErrors {
-    /// Those of errors in these windows; `None` if all antennas are ideal. `is_dipole` says whether they are dipoles.
+    /// Those of errors in these windows; `None` if all antennas are ideal.
     #[must_use]
     pub fn new(
         errors: &InstrumentErrors,
         array: Arc<Array>,
         windows: &[ObservingWindow],
-        is_dipole: bool,
+        elements: AntennaResponse,
+        frequency_hz: f64,
     ) -> Option<Self> {
         let pass = |window: &ObservingWindow| {
             ([window.start.seconds(), window.end.seconds()], errors.antennas(*window))
         };
+        let table = &errors.config.pattern_by_frequency;
+        let patterns: Vec<f64> = (0..array.satellites()).map(|n| table.q(n, frequency_hz)).collect();
         errors.config.has_own_antennas().then(|| Self {
             array,
-            is_dipole,
-            has_patterns: !errors.config.pattern.is_none(),
+            elements,
+            has_patterns: !errors.config.pattern.is_none() || patterns.iter().any(|q| *q != 0.0),
+            patterns,
             passes: windows.iter().map(pass).collect(),
         })
     }
@@ -83,13 +92,14 @@ impl AntennaPatterns for AntennaErrors {
         let [along_deg, radial_deg, distortion] =
             errors.map_or([0.0; 3], |errors| errors.each_ref().map(|series| series.at(t_s)));
         let (r_m, normal_hat) = (self.array.position_m(number, t_s), self.array.normal_hat(number, t_s));
-        let axis_hat = tilted_axis(r_m, normal_hat, [along_deg, radial_deg]);
-        SatelliteAntenna { axis_hat, is_dipole: self.is_dipole, distortion }
+        let axes_hat = tilted_axes(r_m, normal_hat, [along_deg, radial_deg]);
+        let pattern = self.patterns.get(number).copied().unwrap_or(0.0);
+        SatelliteAntenna { elements: self.elements, axes_hat, distortion: pattern + distortion }
     }
 
     fn degree(&self) -> usize {
-        // Two dipoles; a factor of each pattern.
-        2 * usize::from(self.is_dipole) + 4 * usize::from(self.has_patterns)
+        // A factor of each pattern.
+        self.elements.degree() + 4 * usize::from(self.has_patterns)
     }
 }
 

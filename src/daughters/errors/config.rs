@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::response::PatternsByFrequency;
 use crate::response::beacon::Beacon;
 use crate::units::{Checks, InvalidValue};
 
@@ -30,6 +31,10 @@ pub struct InstrumentConfig {
     pub tilt_radial_deg: ErrorTerms,
     /// Distortion q of the voltage pattern, by daughter: a factor 1 + q (3 cos^2 - 1) / 2 with the angle from the axis.
     pub pattern: ErrorTerms,
+    /// The same by frequency, which is added to it: rows `[frequency_hz, q]`, or `[frequency_hz, q_1, q_2, ...]` with one q a daughter;
+    /// linear between rows, and beyond its ends that of the end.
+    #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
+    pub pattern_by_frequency: PatternsByFrequency,
     /// Allan deviation of every clock at 1 s; it falls as the root of time (white noise of frequency).
     pub clock_allan_deviation: f64,
     /// Time within which clocks are brought back, s: that noise is forgotten as exp(-|t| / this).
@@ -66,6 +71,7 @@ impl Default for InstrumentConfig {
             tilt_along_deg: ErrorTerms::default(),
             tilt_radial_deg: ErrorTerms::default(),
             pattern: ErrorTerms::default(),
+            pattern_by_frequency: PatternsByFrequency::default(),
             clock_allan_deviation: 0.0,
             clock_steering_s: 86_400.0,
             dead_daughters: Vec::new(),
@@ -222,6 +228,7 @@ impl InstrumentConfig {
             || self.leak_k_sr > 0.0
             || self.clock_allan_deviation > 0.0
             || self.beacon.k_sr > 0.0
+            || !self.pattern_by_frequency.is_ideal()
     }
 
     /// The same schedule of the artificial signal, and no errors.
@@ -239,7 +246,10 @@ impl InstrumentConfig {
     /// Whether antennas differ from the ideal one.
     #[must_use]
     pub fn has_own_antennas(&self) -> bool {
-        [&self.tilt_along_deg, &self.tilt_radial_deg, &self.pattern].iter().any(|terms| !terms.is_none())
+        !self.pattern_by_frequency.is_ideal()
+            || [&self.tilt_along_deg, &self.tilt_radial_deg, &self.pattern]
+                .iter()
+                .any(|terms| !terms.is_none())
     }
 
     /// Whether anything changes within a pass.
@@ -287,6 +297,7 @@ impl InstrumentConfig {
             let smooth = !["amplitude", "phase_deg", "clock_ns"].contains(&name);
             terms.check(name, (satellites, "a daughter"), smooth, &mut checks);
         }
+        self.pattern_by_frequency.check("pattern_by_frequency", Some(satellites), &mut checks);
         self.check_rest(&mut checks);
         let known = |number: u32, count: usize| (1..=count).contains(&(number as usize));
         for (index, &daughter) in self.dead_daughters.iter().enumerate() {

@@ -10,6 +10,7 @@
 //! and a visibility is a sum of isotropic ones of the skies `P_k T`, which have D degrees more than T. These do not depend on time, so
 //! that antennas may turn as they like between visibilities: rows of B are interpolated for the isotropic ones alone.
 
+use crate::frames::AntennaResponse;
 use crate::response::pixel::SatelliteAntenna;
 use crate::sky::harmonics::{Alm, Component, times_direction, times_direction_transposed};
 use crate::units::vector::{Vec3, dot};
@@ -93,13 +94,18 @@ impl PairResponse {
     /// Of the antennas of two satellites: dipoles if both are.
     #[must_use]
     pub fn of_antennas([a, b]: [&SatelliteAntenna; 2]) -> Self {
-        let ideal = match a.is_dipole && b.is_dipole {
-            true => Self::of_dipoles(a.axis_hat, b.axis_hat),
-            false => Self::isotropic(),
+        let ideal = match (a.elements, b.elements) {
+            (AntennaResponse::DipoleNormal, AntennaResponse::DipoleNormal) => {
+                Self::of_dipoles(a.axes_hat[0], b.axes_hat[0])
+            }
+            (AntennaResponse::ThreeDipoles, AntennaResponse::ThreeDipoles) => {
+                Self::of_triads(a.triad(), b.triad())
+            }
+            _ => Self::isotropic(),
         };
         let whole = |of: Self, antenna: &SatelliteAntenna| match antenna.distortion {
             0.0 => of,
-            q => of.distorted(antenna.axis_hat, q),
+            q => of.distorted(antenna.axes_hat[0], q),
         };
         whole(whole(ideal, a), b)
     }
@@ -203,7 +209,7 @@ impl Products {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::units::vector::unit;
+    use crate::units::vector::{cross, unit};
 
     #[test]
     fn monomials_have_their_places() {
@@ -228,8 +234,8 @@ mod tests {
             let dipoles = dot(across(d, n), across(e, n));
             assert!((PairResponse::of_dipoles(d, e).at(n) - dipoles).abs() < 1e-15);
             let [a, b] = [(d, 0.2), (e, -0.1)].map(|(axis_hat, distortion)| SatelliteAntenna {
-                axis_hat,
-                is_dipole: true,
+                elements: AntennaResponse::DipoleNormal,
+                axes_hat: [axis_hat, unit(cross(axis_hat, n))],
                 distortion,
             });
             let expected = dipoles * (1.0 + 0.2 * p_2(dot(d, n))) * (1.0 - 0.1 * p_2(dot(e, n)));

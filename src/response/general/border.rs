@@ -116,7 +116,7 @@ impl Border {
         let wave = TAU * view.baseline_m / self.wavelength_m;
         let (sin_pitch, cos_pitch) = pitch.sin_cos();
         let dipole = match self.response {
-            AntennaResponse::Isotropic => 0.0,
+            AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => 0.0,
             AntennaResponse::DipoleNormal => 1.0,
         };
         for sums in &mut buffers.sums {

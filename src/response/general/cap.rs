@@ -160,10 +160,7 @@ impl CapClass {
             let (sin, cos) = node.view.pitch_rad().sin_cos();
             (waves[0][k], waves[1][k]) = (wave * cos, wave * sin);
         }
-        let more = match self.response {
-            AntennaResponse::Isotropic => 0,
-            AntennaResponse::DipoleNormal => 2,
-        };
+        let more = if self.response.is_even() { 0 } else { 2 };
         for (k, ring) in self.rings.iter().enumerate() {
             let x = waves[0].map(|wave| wave * ring.sin);
             let orders = buffers.bessel.cylindrical(&x, ring.reach + more);
@@ -406,7 +403,9 @@ fn whole_sky(setup: &RowsSetup) -> Vec<Vec<[f64; 3]>> {
                 .map(|degree| {
                     let l = mu + 2 * degree;
                     match setup.response {
-                        AntennaResponse::Isotropic => [value(degree), 0.0, 0.0],
+                        AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => {
+                            [value(degree), 0.0, 0.0]
+                        }
                         AntennaResponse::DipoleNormal => {
                             let same = 1.0 - step(l + 1).powi(2) - step(l).powi(2);
                             let above = -step(l + 1) * step(l + 2) * value(degree + 1);
@@ -485,7 +484,7 @@ mod tests {
             for (t, w) in rule.abscissae.iter().zip(&rule.weights) {
                 let n = direction(seen * t);
                 let gain = match response {
-                    AntennaResponse::Isotropic => 1.0,
+                    AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => 1.0,
                     AntennaResponse::DipoleNormal => 1.0 - n[2] * n[2],
                 };
                 let size = TAU / CIRCLE as f64 * seen * w * (seen * t).sin() * gain;

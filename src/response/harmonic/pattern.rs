@@ -208,7 +208,7 @@ pub(crate) fn ring_points(
     let cos_limb = (1.0 - sin_limb * sin_limb).sqrt();
     let wave_number = l_max as f64 + std::f64::consts::TAU * u_max;
     let response = |z: f64| match geometry.response {
-        AntennaResponse::Isotropic => 1.0,
+        AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => 1.0,
         AntennaResponse::DipoleNormal => 1.0 - z * z,
     };
     let (mut rings, mut weights) = (Vec::new(), Vec::new());

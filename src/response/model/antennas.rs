@@ -80,20 +80,21 @@ mod tests {
     use crate::sky::healpix::{pixel_area_sr, pixel_directions};
     use crate::sky::{Frame, SkyMap};
     use crate::units::Pair;
-    use crate::units::vector::{Vec3, dot, scale, sub, unit};
+    use crate::units::vector::{Vec3, cross, dot, scale, sub, unit};
 
     const NSIDE: usize = 8;
 
     /// Antennas that turn with the daughter's number.
     struct Tilted {
-        is_dipole: bool,
+        elements: AntennaResponse,
     }
 
     impl AntennaPatterns for Tilted {
         fn antenna(&self, daughter: u8, t_s: f64) -> SatelliteAntenna {
             let k = f64::from(daughter) + t_s * 1e-6;
             let axis_hat = unit([0.3 * k, -0.5 + 0.1 * k, 0.9]);
-            SatelliteAntenna { axis_hat, is_dipole: self.is_dipole, distortion: 0.1 * k }
+            let across = unit(cross(axis_hat, [0.7, 0.2 * k, 0.1]));
+            SatelliteAntenna { elements: self.elements, axes_hat: [axis_hat, across], distortion: 0.1 * k }
         }
     }
 
@@ -111,10 +112,12 @@ mod tests {
     fn one_source_is_seen_through_the_projections_of_both_dipoles() {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         let (sky, n_hat) = source();
-        for is_dipole in [true, false] {
+        for elements in
+            [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal, AntennaResponse::ThreeDipoles]
+        {
             let sum = DirectSum::new(&sky, 3e6, array.moon_radius_m(), AntennaResponse::Isotropic);
             let mut plain = sum.clone();
-            let mut model = AntennaSum::new(sum, Arc::new(Tilted { is_dipole }));
+            let mut model = AntennaSum::new(sum, Arc::new(Tilted { elements }));
             for (i, j) in [(0_u8, 1_u8), (2, 5), (1, 7)] {
                 let t_s = 4e5 + f64::from(j);
                 let [r_i_m, r_j_m] = [i, j].map(|n| array.position_m(n.into(), 0.0));
@@ -123,22 +126,36 @@ mod tests {
                 model.predict(&[position], &mut found).unwrap();
                 plain.predict(&[position], &mut ideal).unwrap();
                 // Voltages of a wave of either polarisation: the parts of the dipoles across its direction.
-                let [a, b] = [i, j].map(|n| Tilted { is_dipole }.antenna(n, t_s));
+                let [a, b] = [i, j].map(|n| Tilted { elements }.antenna(n, t_s));
                 let across = |axis: Vec3| sub(axis, scale(dot(axis, n_hat), n_hat));
-                let dipoles = if is_dipole { dot(across(a.axis_hat), across(b.axis_hat)) } else { 1.0 };
+                let dipoles = |a: &SatelliteAntenna, b: &SatelliteAntenna| match elements {
+                    AntennaResponse::Isotropic => 1.0,
+                    AntennaResponse::DipoleNormal => dot(across(a.axes_hat[0]), across(b.axes_hat[0])),
+                    // Those of like dipoles, whose mean is 2/3 where attitudes are the same.
+                    AntennaResponse::ThreeDipoles => {
+                        let third =
+                            |antenna: &SatelliteAntenna| cross(antenna.axes_hat[0], antenna.axes_hat[1]);
+                        let like: [[Vec3; 2]; 3] = [
+                            [a.axes_hat[0], b.axes_hat[0]],
+                            [a.axes_hat[1], b.axes_hat[1]],
+                            [third(a), third(b)],
+                        ];
+                        like.iter().map(|[d, e]| dot(across(*d), across(*e))).sum::<f64>() / 2.0
+                    }
+                };
                 let legendre = |axis: Vec3| (3.0 * dot(axis, n_hat).powi(2) - 1.0) / 2.0;
-                let factor = dipoles
-                    * (1.0 + a.distortion * legendre(a.axis_hat))
-                    * (1.0 + b.distortion * legendre(b.axis_hat));
+                let factor = dipoles(&a, &b)
+                    * (1.0 + a.distortion * legendre(a.axes_hat[0]))
+                    * (1.0 + b.distortion * legendre(b.axes_hat[0]));
                 // Single precision of the fringe.
                 assert!((found[0] - factor * ideal[0]).norm() < 2e-6 * ideal[0].norm(), "{i} {j}: {found:?}");
                 let mut power = [0.0];
                 let daughter =
                     DaughterPosition { r_m: r_i_m, normal_hat: [0.0, 0.0, 1.0], at: Some((i, t_s)) };
                 model.predict_powers(&[daughter], &mut power).unwrap();
-                let own = if is_dipole { dot(across(a.axis_hat), across(a.axis_hat)) } else { 1.0 };
+                let own = dipoles(&a, &a);
                 let expected =
-                    1e4 * pixel_area_sr(NSIDE) * own * (1.0 + a.distortion * legendre(a.axis_hat)).powi(2);
+                    1e4 * pixel_area_sr(NSIDE) * own * (1.0 + a.distortion * legendre(a.axes_hat[0])).powi(2);
                 assert!((power[0] / expected - 1.0).abs() < 1e-6, "{} {expected}", power[0]);
             }
         }
@@ -150,7 +167,8 @@ mod tests {
         impl AntennaPatterns for Straight {
             fn antenna(&self, daughter: u8, t_s: f64) -> SatelliteAntenna {
                 let axis_hat = self.0.normal_hat(daughter.into(), t_s);
-                SatelliteAntenna { axis_hat, is_dipole: true, distortion: 0.0 }
+                let axes_hat = [axis_hat, unit(cross(axis_hat, [0.3, 0.5, 0.1]))];
+                SatelliteAntenna { elements: AntennaResponse::DipoleNormal, axes_hat, distortion: 0.0 }
             }
         }
         let array = Array::new(&ArrayConfig::default()).unwrap();

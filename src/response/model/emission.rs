@@ -68,7 +68,7 @@ fn uniform_sr(response: AntennaResponse, u: f64) -> f64 {
         false => (j0 - x.cos()) / (x * x),
     };
     match response {
-        AntennaResponse::Isotropic => 4.0 * PI * j0,
+        AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => 4.0 * PI * j0,
         AntennaResponse::DipoleNormal => 4.0 * PI * (j0 - j1_over_x),
     }
 }

@@ -18,7 +18,7 @@ pub fn envelope(pair: &PairGeometry, n_hat: Vec3) -> f64 {
         return 0.0;
     }
     match pair.response {
-        AntennaResponse::Isotropic => 1.0,
+        AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => 1.0,
         AntennaResponse::DipoleNormal => pair.antenna(n_hat),
     }
 }

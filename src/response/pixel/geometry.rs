@@ -43,7 +43,7 @@ impl PairGeometry {
     #[must_use]
     pub fn antenna(&self, n_hat: Vec3) -> f64 {
         match self.response {
-            AntennaResponse::Isotropic => 1.0,
+            AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => 1.0,
             AntennaResponse::DipoleNormal => {
                 let along = self.orbit_normal().map_or(f64::NAN, |normal| dot(n_hat, normal));
                 1.0 - along * along
@@ -52,15 +52,24 @@ impl PairGeometry {
     }
 }
 
-/// Antenna of one satellite that may be off: a short dipole, or an isotropic antenna with an axis.
+/// Antenna of one satellite that may be off: of the elements of a response, at an attitude of its own.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SatelliteAntenna {
-    /// Its axis, a unit vector.
-    pub axis_hat: Vec3,
-    /// Whether it is a dipole along the axis.
-    pub is_dipole: bool,
-    /// q in the factor `1 + q P_2(cos)` of its voltage, with the angle from the axis.
+    /// What it consists of. Dipoles are along the axes below: one along the first, or one along each.
+    pub elements: AntennaResponse,
+    /// Its axis, and a direction across it, unit vectors. The third axis is across both.
+    pub axes_hat: [Vec3; 2],
+    /// q in the factor `1 + q P_2(cos)` of its voltage, with the angle from the first axis.
     pub distortion: f64,
+}
+
+impl SatelliteAntenna {
+    /// The axes of three dipoles.
+    #[must_use]
+    pub fn triad(&self) -> [Vec3; 3] {
+        let [a, b] = self.axes_hat;
+        [a, b, cross(a, b)]
+    }
 }
 
 /// Position and antenna of one satellite.
@@ -84,7 +93,7 @@ impl SingleGeometry {
             return 0.0;
         }
         match self.response {
-            AntennaResponse::Isotropic => 1.0,
+            AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => 1.0,
             AntennaResponse::DipoleNormal => 1.0 - dot(n_hat, self.normal_hat).powi(2),
         }
     }

@@ -71,7 +71,7 @@ impl Prepared {
         let (i_hat, limb_i) = limb(pair.r_i_m, pair.moon_radius_m);
         let (j_hat, limb_j) = limb(pair.r_j_m, pair.moon_radius_m);
         let dipole = match pair.response {
-            AntennaResponse::Isotropic => None,
+            AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => None,
             // Without an orbital plane the dipoles have no direction, and the result is not a number.
             AntennaResponse::DipoleNormal => Some(pair.orbit_normal().unwrap_or([f64::NAN; 3])),
         };
@@ -93,7 +93,7 @@ impl Prepared {
     pub fn single(single: &SingleGeometry) -> Self {
         let (i_hat, limb_i) = limb(single.r_m, single.moon_radius_m);
         let dipole = match single.response {
-            AntennaResponse::Isotropic => None,
+            AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => None,
             AntennaResponse::DipoleNormal => Some(single.normal_hat),
         };
         Self { u: [0.0; 3], i_hat, limb_i, j_hat: i_hat, limb_j: limb_i, dipole, antennas: None }
@@ -115,7 +115,8 @@ impl Prepared {
     }
 
     /// Multiplies a chunk of values by the antennas' power response, 1 - (n . d)^2 for dipoles along d. Of dipoles along d and e an
-    /// unpolarised wave leaves d . e - (n . d) (n . e): the product of their parts across its direction.
+    /// unpolarised wave leaves d . e - (n . d) (n . e): the product of their parts across its direction; of three on each satellite half
+    /// the sum of that of like ones.
     #[inline(always)]
     pub fn apply_antenna<const FMA: bool, const N: usize>(
         &self,
@@ -129,13 +130,32 @@ impl Prepared {
             }
         }
         if let Some([a, b]) = self.antennas {
-            let (both, common) = (a.is_dipole && b.is_dipole, dot(a.axis_hat, b.axis_hat));
+            let ([d, _], [e, _]) = (a.axes_hat, b.axes_hat);
             let distorted = |q: f64, cos: f64| 1.0 + q * (1.5 * cos * cos - 0.5);
-            for k in 0..N {
-                let p = dot64::<FMA>(a.axis_hat, x[k], y[k], z[k]);
-                let q = dot64::<FMA>(b.axis_hat, x[k], y[k], z[k]);
-                let dipoles = if both { common - p * q } else { 1.0 };
-                values[k] *= (dipoles * distorted(a.distortion, p) * distorted(b.distortion, q)) as f32;
+            let patterns = |p: f64, q: f64| distorted(a.distortion, p) * distorted(b.distortion, q);
+            match (a.elements, b.elements) {
+                (AntennaResponse::DipoleNormal, AntennaResponse::DipoleNormal) => {
+                    let common = dot(d, e);
+                    for k in 0..N {
+                        let [p, q] = [d, e].map(|axis| dot64::<FMA>(axis, x[k], y[k], z[k]));
+                        values[k] *= ((common - p * q) * patterns(p, q)) as f32;
+                    }
+                }
+                (AntennaResponse::ThreeDipoles, AntennaResponse::ThreeDipoles) => {
+                    let (d, e) = (a.triad(), b.triad());
+                    let common: f64 = (0..3).map(|axis| dot(d[axis], e[axis])).sum();
+                    for k in 0..N {
+                        let [p, q] = [d, e].map(|axes| axes.map(|axis| dot64::<FMA>(axis, x[k], y[k], z[k])));
+                        let along = p[0] * q[0] + p[1] * q[1] + p[2] * q[2];
+                        values[k] *= (0.5 * (common - along) * patterns(p[0], q[0])) as f32;
+                    }
+                }
+                _ => {
+                    for k in 0..N {
+                        let [p, q] = [d, e].map(|axis| dot64::<FMA>(axis, x[k], y[k], z[k]));
+                        values[k] *= patterns(p, q) as f32;
+                    }
+                }
             }
         }
     }

@@ -308,6 +308,7 @@ fn instrument_summary(instrument: &Instrument) -> InstrumentSummary {
         response: match instrument.response {
             AntennaResponse::Isotropic => "isotropic".to_owned(),
             AntennaResponse::DipoleNormal => "dipole along the orbit normal".to_owned(),
+            AntennaResponse::ThreeDipoles => "three dipoles across each other".to_owned(),
         },
         seed: instrument.seed,
         configuration_hash: format!("{:016x}", instrument.configuration_hash),
