@@ -12,10 +12,10 @@ use crate::accumulation::{Accuracy, NormalSums, SumCounts};
 use crate::ranks::Ranks;
 use crate::sky::harmonics::Alm;
 
-/// Interpolation between nodes and kernels of the weights err by up to 1e-3 of an eigenvalue, and by some 1e-6 of W_max where
+/// Interpolation between nodes and kernels of the weights err by up to 4e-4 of an eigenvalue, and by some 1e-7 of W_max where
 /// large terms cancel. Against rows in f64 of other code (`tests/maps/traces.rs`), l_max 20, eigenvalues are apart by this beyond
-/// the relative part: none at 3 MHz up to 250 m, 5.6e-6 of W_max at 10 MHz up to 234 m, 1.0e-6 up to 470 m.
-const ACCURACY: Accuracy = Accuracy { relative: 2e-3, absolute: 1e-5 };
+/// the relative part: none at 3 MHz up to 250 m, 2.1e-7 of W_max at 10 MHz up to 234 m, 3e-9 up to 470 m.
+const ACCURACY: Accuracy = Accuracy { relative: 1e-3, absolute: 1e-6 };
 
 /// Normal equations of one channel over the real orthonormal harmonics up to `l_max`.
 ///
