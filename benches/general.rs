@@ -77,7 +77,7 @@ fn what_more_costs(at: &[PairAt], setup: RowsSetup, skies: &[Alm]) {
             (0.125 * 8248.68 / TAU / wavelengths).clamp(0.5, 60.0) as f32
         })
         .collect();
-    // Antennas along the line of sight, turned from daughter to daughter.
+    // Antennas that lean from daughter to daughter.
     let antenna = |elements: AntennaResponse, distortion: f64, satellite: u8, r_m: Vec3| {
         let k = f64::from(satellite);
         let axis = unit(add(scale(0.1 * k, unit(r_m)), [0.1, -0.2, 1.0]));

@@ -5,10 +5,10 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::harmonic::{AntennaBelief, L_MAX, RowBelief};
+use super::antennas::AntennasConfig;
+use super::harmonic::{L_MAX, RowBelief};
 use super::{AccumulationError, PixelEngine};
 use crate::frames::Instrument;
-use crate::response::PatternsByFrequency;
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
 use crate::sky::Frame;
@@ -126,62 +126,6 @@ pub struct MapConfig {
     /// Antennas of the daughters as a refined map takes them to be.
     #[serde(skip_serializing_if = "AntennasConfig::is_ideal")]
     pub antennas: AntennasConfig,
-}
-
-/// Antennas by daughter; those beyond a list are ideal.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct AntennasConfig {
-    /// Tilt of the axis from the orbit's normal towards the track's direction, degrees.
-    pub tilt_along_deg: Vec<f64>,
-    /// Tilt away from the Moon, degrees.
-    pub tilt_radial_deg: Vec<f64>,
-    /// q of a factor 1 + q (3 cos^2 - 1) / 2 of the voltage pattern, with the angle from the axis.
-    pub pattern: Vec<f64>,
-    /// The same by frequency, which is added to it: rows `[frequency_hz, q]`, or `[frequency_hz, q_1, q_2, ...]` with one q a daughter;
-    /// linear between rows, and beyond its ends that of the end.
-    #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
-    pub pattern_by_frequency: PatternsByFrequency,
-}
-
-impl AntennasConfig {
-    fn lists(&self) -> [(&'static str, &[f64]); 3] {
-        let Self { tilt_along_deg, tilt_radial_deg, pattern, .. } = self;
-        [("tilt_along_deg", tilt_along_deg), ("tilt_radial_deg", tilt_radial_deg), ("pattern", pattern)]
-    }
-
-    /// Whether all antennas are ideal.
-    #[must_use]
-    pub fn is_ideal(&self) -> bool {
-        self.pattern_by_frequency.is_ideal()
-            && self.lists().iter().all(|(_, values)| values.iter().all(|value| *value == 0.0))
-    }
-
-    /// Degree of pairs' responses as polynomials in the direction, at most: of two dipoles, and of a pattern of each.
-    #[must_use]
-    pub fn degree(&self) -> usize {
-        let is_set = |values: &[f64]| values.iter().any(|value| *value != 0.0);
-        let has_patterns = is_set(&self.pattern) || !self.pattern_by_frequency.is_ideal();
-        2 * usize::from(!self.is_ideal()) + 4 * usize::from(has_patterns)
-    }
-
-    fn check(&self, checks: &mut Checks) {
-        self.pattern_by_frequency.check("antennas.pattern_by_frequency", None, checks);
-        for (key, values) in self.lists() {
-            let expected = format!("at most {}, one a daughter", u8::MAX);
-            checks.require(
-                format!("antennas.{key}"),
-                format!("({} values)", values.len()),
-                values.len() <= usize::from(u8::MAX),
-                expected,
-            );
-            let (most, expected) = match key {
-                "pattern" => (2.0, "-2 to 2"),
-                _ => (80.0, "-80 to 80 degrees"),
-            };
-            checks.numbers(format!("antennas.{key}"), values, |value| value.abs() <= most, expected);
-        }
-    }
 }
 
 /// Value of `map.refine.passes_max` among the settings of sums that hold visibilities one by one.
@@ -514,17 +458,12 @@ impl MapConfig {
     /// What the rows of a refined map are made with.
     #[must_use]
     pub fn belief(&self) -> RowBelief {
-        let AntennasConfig { tilt_along_deg, tilt_radial_deg, pattern, pattern_by_frequency } =
-            &self.antennas;
-        let count = self.antennas.lists().map(|(_, values)| values.len()).into_iter().max().unwrap_or(0);
-        let of = |values: &[f64], k: usize| values.get(k).copied().unwrap_or(0.0);
-        let antenna = |k: usize| AntennaBelief {
-            tilt_deg: [of(tilt_along_deg, k), of(tilt_radial_deg, k)],
-            distortion: of(pattern, k),
-        };
-        let antennas = if self.antennas.is_ideal() { Vec::new() } else { (0..count).map(antenna).collect() };
-        let patterns = pattern_by_frequency.clone();
-        RowBelief { smear_integrations: self.refine.smear_integrations, antennas, patterns }
+        let AntennasConfig { pattern_by_frequency, .. } = &self.antennas;
+        RowBelief {
+            smear_integrations: self.refine.smear_integrations,
+            antennas: self.antennas.beliefs(),
+            patterns: pattern_by_frequency.clone(),
+        }
     }
 
     /// Longest baseline used at a frequency, m.

@@ -9,6 +9,7 @@
 //! Sums are integers: their bits depend on the visibilities in them alone. Uses [`crate::frames`],
 //! [`mod@crate::array`], [`crate::response`], [`crate::sky`].
 
+mod antennas;
 mod checkpoint;
 mod config;
 mod deferred;

@@ -26,8 +26,8 @@ mod tile;
 
 pub use config::{DaughtersConfig, Disturbances, DropPolicy, FLOAT_BITS};
 pub use errors::{
-    AntennaErrors, BeaconSchedule, ErrorTerms, InstrumentConfig, InstrumentErrors, NavigationConfig,
-    OrbitAntennas, PassErrors, truth_csv,
+    AntennaErrors, BeaconSchedule, ChannelAntennas, ErrorTerms, InstrumentConfig, InstrumentErrors,
+    NavigationConfig, OrbitAntennas, PassErrors, truth_csv,
 };
 pub use link::{LinkCounts, SampleLink};
 pub use repair::Repairs;

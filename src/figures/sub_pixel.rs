@@ -14,7 +14,7 @@ use serde::Serialize;
 
 use super::error::FigureError;
 use super::output::FigureParts;
-use crate::mother::Schedule;
+use crate::mother::{NoiseModel, Schedule};
 use crate::pipeline::Plan;
 use crate::products::pictures::{
     Axis, ColourScale, Curve, MapPanel, Palette, Plot, Scaling, Sheet, draw_plots, draw_sheet,
@@ -25,9 +25,9 @@ use crate::response::pixel::{
 use crate::sky::generated::generate;
 use crate::sky::healpix::{pixel_area_sr, pixel_directions};
 use crate::sky::{Frame, SkyMap};
-use crate::units::all_pairs;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::norm;
+use crate::units::{ChannelId, all_pairs};
 
 /// Resolutions of the maps.
 const NSIDES: [usize; 2] = [8, 16];
@@ -216,10 +216,15 @@ fn noise_k_sr(plan: &Plan, sample: &Sample, sky: &SkyMap) -> Result<Vec<f64>, Fi
     let values: Vec<f32> = sky.values().iter().map(|&value| value as f32).collect();
     let powers = sky_powers(&singles, &directions, &values, pixel_area_sr(sky.nside()))?;
     let spacecraft = &plan.config.spacecraft;
+    let noise = NoiseModel {
+        seed: None,
+        receiver_noise_k_sr: spacecraft.receiver_k_sr(),
+        response: plan.instrument.response,
+    };
     // As the baselines, of the first channel.
-    let receiver = spacecraft.receiver_k_sr().first().copied().unwrap_or(0.0);
-    let sigma =
-        |(power, dt_s): (f64, &f64)| (power + receiver) / (2.0 * spacecraft.channel_width_hz * dt_s).sqrt();
+    let sigma = |(power, dt_s): (f64, &f64)| {
+        noise.sigma_k_sr(ChannelId(0), [power; 2], spacecraft.channel_width_hz, *dt_s)
+    };
     Ok(powers.into_iter().zip(&sample.dt_s).map(sigma).collect())
 }
 

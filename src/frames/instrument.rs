@@ -31,15 +31,6 @@ pub enum AntennaResponse {
 }
 
 impl AntennaResponse {
-    /// Whether it is 1 in all directions for satellites of one attitude.
-    #[must_use]
-    pub fn is_even(self) -> bool {
-        match self {
-            Self::Isotropic | Self::ThreeDipoles => true,
-            Self::DipoleNormal => false,
-        }
-    }
-
     /// Receivers whose correlations are averaged.
     #[must_use]
     pub fn receivers(self) -> u8 {

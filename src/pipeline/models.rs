@@ -167,10 +167,11 @@ fn farthest_apart_m(array: &Array, windows: &[ObservingWindow]) -> f64 {
 pub(crate) fn build(plan: &Plan, skies: &[Option<&SkyMap>]) -> Result<Vec<ChannelModel>, PipelineError> {
     let nside = |(sky, usual): (&Option<&SkyMap>, usize)| sky.map_or(usual, SkyMap::nside);
     let nsides: Vec<usize> = skies.iter().zip(plan.sky_nsides()).map(nside).collect();
-    let mut rotations = HashMap::new();
+    let (mut rotations, antennas) = (HashMap::new(), plan.antenna_errors());
     let mut models = Vec::new();
     for ((choice, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {
-        let antennas = plan.antenna_errors(schedule.frequency_hz);
+        let own = antennas.as_ref().map(|antennas| Arc::new(antennas.at(schedule.frequency_hz)));
+        let antennas = own.map(|own| own as Arc<dyn AntennaPatterns>);
         let made =
             sky.map(|sky| channel_model((plan, antennas.as_ref()), choice, sky, schedule, &mut rotations));
         models.push(ChannelModel { batch: choice.kind.batch(), model: made.transpose()? });

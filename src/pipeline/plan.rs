@@ -8,7 +8,6 @@ use crate::array::Array;
 use crate::daughters::{AntennaErrors, DaughtersConfig, InstrumentErrors, truth_csv};
 use crate::frames::{Instrument, ObservingWindow};
 use crate::mother::{Fidelity, Observer, Schedule, SpacecraftConfig};
-use crate::response::model::AntennaPatterns;
 use crate::units::{ChannelId, MissionTime, all_pairs};
 
 /// A configuration that has been checked, with what follows from it.
@@ -91,13 +90,11 @@ impl Plan {
         InstrumentErrors::new(instrument, navigation, *seed, &self.array, &channels).map(Arc::new)
     }
 
-    /// Antennas of the daughters that are not ideal, at a frequency; `None` if all are.
+    /// Antennas of the daughters that are not ideal; `None` if all are.
     #[must_use]
-    pub fn antenna_errors(&self, frequency_hz: f64) -> Option<Arc<dyn AntennaPatterns>> {
+    pub fn antenna_errors(&self) -> Option<Arc<AntennaErrors>> {
         let (errors, elements) = (self.instrument_errors()?, self.instrument.response);
-        let array = Arc::clone(&self.array);
-        let found = AntennaErrors::new(&errors, array, &self.windows, elements, frequency_hz)?;
-        Some(Arc::new(found))
+        AntennaErrors::new(&errors, Arc::clone(&self.array), &self.windows, elements)
     }
 
     /// The true errors in every pass as a table (CSV); `None` if there are none.

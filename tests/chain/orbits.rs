@@ -7,6 +7,7 @@ use std::path::Path;
 use common::workplace::{Workplace, fail, json, maps, succeed};
 use lunarray::downlink::{Contents, DownlinkReader};
 use lunarray::frames::GroundFrame;
+use lunarray::sky::fits::{ReadOptions, read_map_file};
 
 /// A triple whose altitudes differ by tens of kilometres and whose planes are tilted against each other: a circle's rows
 /// would be of no use.
@@ -177,6 +178,57 @@ fn a_triple_on_ellipses_is_mapped_by_refinement() {
     for (path, bytes) in maps(&ground) {
         assert!(bytes == maps(&out)[&path], "{} differs", path.display());
     }
+}
+
+/// The paper's array and baselines at nside 16, from every sixth window, without noise.
+const CIRCLE: &str = r#"
+name = "circle"
+seed = 5
+[sky]
+nside = 64
+l_max = 80
+[spacecraft]
+channels_hz = [10.0e6]
+model = "harmonic"
+baseline_wavelengths_max = 31.3
+every_nth_window = 6
+thermal_noise = false
+[map]
+nside = 16
+engine = "harmonic"
+baseline_bp_max = 2.0
+epsilon = 1e-4
+[products]
+pictures = false
+"#;
+
+/// Refinement of data of a circle ends after two passes, and leaves the map as it is but for what the fast sums approximate.
+#[test]
+fn refinement_hardly_changes_the_map_of_a_circle() {
+    let place = Workplace::new(CIRCLE);
+    let downlink = place.path("circle.ccsds");
+    succeed(&["simulate", &place.pipeline, "-o", &downlink]);
+    let map = |name: &str, sets: &[&str]| {
+        let out = place.path(name);
+        let sets = sets.iter().flat_map(|set| ["--set", *set]);
+        let replay = ["replay", &downlink, "--map", &place.pipeline, "--out", &out].into_iter().chain(sets);
+        let summary = json(&replay.collect::<Vec<&str>>());
+        let file = format!("{out}/10.000MHz/map.fits");
+        let values = read_map_file(Path::new(&file), &ReadOptions::default()).unwrap().map.values().to_vec();
+        (values, summary["channels"][0]["refinement"]["convergence"]["iterations"].as_u64())
+    };
+    // Iterations left to themselves end where they differ by as much as the sums.
+    let to_the_end = ["map.residual_max=1e-7", "map.iterations_max=2000"];
+    let (fast, none) = map("fast", &to_the_end);
+    let refined = [&to_the_end[..], &["map.refine.passes_max=12", "map.refine.residual_max=1e-7"]].concat();
+    let (refined, _) = map("refined", &refined);
+    let square = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>();
+    let apart = square(&mut fast.iter().zip(&refined).map(|(a, b)| a - b));
+    let error = (apart / square(&mut refined.iter().copied())).sqrt();
+    // 8e-5 of a fringe between nodes in the mean, and some ten times as much where epsilon has little to add to what is measured.
+    assert!(error < 1e-3, "{error:e}");
+    let (_, passes) = map("usual", &["map.refine.passes_max=12"]);
+    assert!(none.is_none() && passes.unwrap() <= 2, "{passes:?}");
 }
 
 /// Tilts of the daughters' antennas, and patterns of their voltages, as flown and as known.

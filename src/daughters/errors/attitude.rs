@@ -6,6 +6,7 @@ use super::series::Series;
 use super::{InstrumentErrors, PassErrors};
 use crate::array::{Array, tilted_axes};
 use crate::frames::{AntennaResponse, ObservingWindow};
+use crate::response::PatternsByFrequency;
 use crate::response::model::AntennaPatterns;
 use crate::response::pixel::SatelliteAntenna;
 
@@ -36,15 +37,21 @@ impl AntennaPatterns for OrbitAntennas {
     }
 }
 
-/// The antennas of an instrument over its passes.
+/// The antennas of an instrument over its passes, in all channels.
 pub struct AntennaErrors {
     array: Arc<Array>,
     elements: AntennaResponse,
-    /// Of all daughters' patterns at the channel's frequency, beside what is wrong with them.
-    patterns: Vec<f64>,
+    /// Of the daughters' patterns, beside what is wrong with them.
+    patterns: PatternsByFrequency,
     has_patterns: bool,
     /// Start and end, s, and by daughter: tilt along the track, tilt away from the Moon, distortion.
     passes: Vec<([f64; 2], Vec<[Series; 3]>)>,
+}
+
+/// The antennas of an instrument at the frequency of a channel.
+pub struct ChannelAntennas {
+    antennas: Arc<AntennaErrors>,
+    frequency_hz: f64,
 }
 
 impl AntennaErrors {
@@ -55,20 +62,26 @@ impl AntennaErrors {
         array: Arc<Array>,
         windows: &[ObservingWindow],
         elements: AntennaResponse,
-        frequency_hz: f64,
-    ) -> Option<Self> {
+    ) -> Option<Arc<Self>> {
         let pass = |window: &ObservingWindow| {
             ([window.start.seconds(), window.end.seconds()], errors.antennas(*window))
         };
-        let table = &errors.config.pattern_by_frequency;
-        let patterns: Vec<f64> = (0..array.satellites()).map(|n| table.q(n, frequency_hz)).collect();
-        errors.config.has_own_antennas().then(|| Self {
-            array,
-            elements,
-            has_patterns: !errors.config.pattern.is_none() || patterns.iter().any(|q| *q != 0.0),
-            patterns,
-            passes: windows.iter().map(pass).collect(),
+        let patterns = errors.config.pattern_by_frequency.clone();
+        errors.config.has_own_antennas().then(|| {
+            Arc::new(Self {
+                array,
+                elements,
+                has_patterns: !errors.config.pattern.is_none() || !patterns.is_ideal(),
+                patterns,
+                passes: windows.iter().map(pass).collect(),
+            })
         })
+    }
+
+    /// Those of a channel.
+    #[must_use]
+    pub fn at(self: &Arc<Self>, frequency_hz: f64) -> ChannelAntennas {
+        ChannelAntennas { antennas: Arc::clone(self), frequency_hz }
     }
 
     /// The pass of a time, or the nearest one: powers are tabulated beyond a pass's ends.
@@ -85,21 +98,22 @@ impl AntennaErrors {
     }
 }
 
-impl AntennaPatterns for AntennaErrors {
+impl AntennaPatterns for ChannelAntennas {
     fn antenna(&self, daughter: u8, t_s: f64) -> SatelliteAntenna {
+        let AntennaErrors { array, elements, patterns, .. } = &*self.antennas;
         let number = usize::from(daughter);
-        let errors = self.pass(t_s).and_then(|daughters| daughters.get(number));
+        let errors = self.antennas.pass(t_s).and_then(|daughters| daughters.get(number));
         let [along_deg, radial_deg, distortion] =
             errors.map_or([0.0; 3], |errors| errors.each_ref().map(|series| series.at(t_s)));
-        let (r_m, normal_hat) = (self.array.position_m(number, t_s), self.array.normal_hat(number, t_s));
+        let (r_m, normal_hat) = (array.position_m(number, t_s), array.normal_hat(number, t_s));
         let axes_hat = tilted_axes(r_m, normal_hat, [along_deg, radial_deg]);
-        let pattern = self.patterns.get(number).copied().unwrap_or(0.0);
-        SatelliteAntenna { elements: self.elements, axes_hat, distortion: pattern + distortion }
+        let distortion = patterns.q(number, self.frequency_hz) + distortion;
+        SatelliteAntenna { elements: *elements, axes_hat, distortion }
     }
 
     fn degree(&self) -> usize {
         // A factor of each pattern.
-        self.elements.degree() + 4 * usize::from(self.has_patterns)
+        self.antennas.elements.degree() + 4 * usize::from(self.antennas.has_patterns)
     }
 }
 

@@ -12,7 +12,7 @@ mod navigation;
 mod series;
 mod truth;
 
-pub use attitude::{AntennaErrors, OrbitAntennas};
+pub use attitude::{AntennaErrors, ChannelAntennas, OrbitAntennas};
 pub use config::{BeaconSchedule, ErrorTerms, InstrumentConfig};
 pub use navigation::NavigationConfig;
 pub use truth::truth_csv;

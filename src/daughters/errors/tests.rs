@@ -167,14 +167,9 @@ fn dipoles_lean_by_the_angles_that_are_given() {
     config.pattern.constant = (0..8).map(|n| 0.01 * f64::from(n)).collect();
     let errors = errors(config);
     let windows = [window(0), window(1), window(4)];
-    let antennas = AntennaErrors::new(
-        &errors,
-        std::sync::Arc::clone(&array),
-        &windows,
-        AntennaResponse::DipoleNormal,
-        1e7,
-    )
-    .unwrap();
+    let elements = AntennaResponse::DipoleNormal;
+    let antennas =
+        AntennaErrors::new(&errors, std::sync::Arc::clone(&array), &windows, elements).unwrap().at(1e7);
     for window in windows {
         let (t_s, pass) = (window.start.seconds() + 1000.0, errors.pass(window));
         for n in 0..8_u8 {
@@ -194,7 +189,7 @@ fn dipoles_lean_by_the_angles_that_are_given() {
     }
     assert!(errors.pass(window(0)).antenna(3, 0.0)[1] != errors.pass(window(1)).antenna(3, 0.0)[1]);
     let straight = self::errors(InstrumentConfig { leak_k_sr: 1.0, ..Default::default() });
-    assert!(AntennaErrors::new(&straight, array, &windows, AntennaResponse::DipoleNormal, 1e7).is_none());
+    assert!(AntennaErrors::new(&straight, array, &windows, elements).is_none());
 }
 
 #[test]

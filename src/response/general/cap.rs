@@ -160,7 +160,10 @@ impl CapClass {
             let (sin, cos) = node.view.pitch_rad().sin_cos();
             (waves[0][k], waves[1][k]) = (wave * cos, wave * sin);
         }
-        let more = if self.response.is_even() { 0 } else { 2 };
+        let more = match self.response {
+            AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => 0,
+            AntennaResponse::DipoleNormal => 2,
+        };
         for (k, ring) in self.rings.iter().enumerate() {
             let x = waves[0].map(|wave| wave * ring.sin);
             let orders = buffers.bessel.cylindrical(&x, ring.reach + more);
