@@ -31,8 +31,16 @@ impl AntennasConfig {
     /// Whether all antennas are ideal.
     #[must_use]
     pub fn is_ideal(&self) -> bool {
-        self.pattern_by_frequency.is_ideal()
-            && self.lists().iter().all(|(_, values)| values.iter().all(|value| *value == 0.0))
+        self.keys_set().is_empty()
+    }
+
+    /// Keys by which an antenna is not ideal.
+    #[must_use]
+    pub fn keys_set(&self) -> Vec<&'static str> {
+        let is_set = |values: &[f64]| values.iter().any(|value| *value != 0.0);
+        let lists = self.lists().into_iter().filter(|(_, values)| is_set(values)).map(|(key, _)| key);
+        let by_frequency = (!self.pattern_by_frequency.is_ideal()).then_some("pattern_by_frequency");
+        lists.chain(by_frequency).collect()
     }
 
     /// Degree of pairs' responses as polynomials in the direction, at most: of two dipoles, and of a pattern of each.

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use crate::response::harmonic::GeometryRefusal;
+use crate::response::general::RowsRefusal;
 use crate::response::pixel::ResponseError;
 use crate::units::{ChannelId, Dimension, InvalidValue};
 
@@ -81,7 +81,7 @@ pub enum AccumulationError {
     Range,
     /// Positions without a row of B.
     #[error("a visibility has no row of the beam matrix: {0}")]
-    Rows(GeometryRefusal),
+    Rows(RowsRefusal),
     /// More visibilities than may be held for refinement.
     #[error(
         "channel {channel} of the merged states holds {found} visibilities for refinement; expected at most \

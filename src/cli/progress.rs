@@ -15,7 +15,7 @@ use crate::accumulation::ChannelGroup;
 use crate::downlink::transport::socket::ListenStatus;
 use crate::pipeline::{CalibrateProgress, ChannelCost, GroupStep, Plan, RunGroups, Watched};
 use crate::runtime::Cancel;
-use crate::solve::Solving;
+use crate::solve::{Solving, SolvingPart};
 use crate::units::ChannelId;
 
 /// Refresh interval on a terminal, and of looking for an interrupt.
@@ -261,7 +261,7 @@ impl ProgressView {
 
     /// The state of the solver, with the time left if the residual keeps falling at the same rate.
     fn solution(&mut self, solving: &Solving) -> String {
-        let Solving { number, what, iteration, residual, target } = solving;
+        let Solving { number, what, iteration, residual, target, part } = solving;
         let (_, since, first) = match self.solution {
             Some(seen) if seen.0 == *number => seen,
             _ => *self.solution.insert((*number, Instant::now(), *residual)),
@@ -273,7 +273,10 @@ impl ProgressView {
         } else {
             String::new()
         };
-        format!("{what}: iteration {iteration}, residual {residual:.1e} of {target:.0e}{left}")
+        let step = part.map_or_else(String::new, |SolvingPart { what, iteration, residual, target }| {
+            format!("; {what}: iteration {iteration}, residual {residual:.1e} of {target:.0e}")
+        });
+        format!("{what}: iteration {iteration}, residual {residual:.1e} of {target:.0e}{left}{step}")
     }
 
     /// The number of senders, their rate and the backlog.

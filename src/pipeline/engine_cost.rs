@@ -5,8 +5,8 @@ use std::f64::consts::TAU;
 use super::plan::Plan;
 use super::rates::{
     AVERAGE_ELEMENT_S, AVERAGE_INSTANTS, CENTRE_ELEMENT_S, CHOLESKY_MULTIPLY_ADDS_PER_S, EXACT_ELEMENT_S,
-    HARMONIC_VISIBILITIES_PER_S, INTERPOLATION_S, RANK_K_MULTIPLY_ADDS_PER_S, ROW_S,
-    TRANSFORM_MULTIPLY_ADDS_PER_S, VISIBILITIES_PER_ROW, cores,
+    HARMONIC_VISIBILITIES_PER_S, INNER_SOLUTION, INTERPOLATION_S, RANK_K_MULTIPLY_ADDS_PER_S, REFINED_PASSES,
+    ROW_S, TRANSFORM_MULTIPLY_ADDS_PER_S, VISIBILITIES_PER_ROW, cores,
 };
 use crate::accumulation::harmonic::{
     REFINED_VISIBILITY_BYTES, SPREAD_MULTIPLY_ADDS, application_size, memory, shared_size,
@@ -200,7 +200,7 @@ impl EngineCost {
         let circle = Self::harmonic(map, data);
         let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
         let held = visibilities.min(map.refine.visibilities_max as f64) * REFINED_VISIBILITY_BYTES as f64;
-        let passes = map.refine.passes_max as f64;
+        let passes = (map.refine.passes_max as f64).min(REFINED_PASSES);
         let l_max = map.degree() as f64;
         let row_s = ROW_S * l_max * (l_max + TAU * u_max);
         // Skies that are seen for each: times the monomials of the antennas' responses; instants of averages.
@@ -221,9 +221,10 @@ impl EngineCost {
             copies_last: true,
             other_bytes: circle.other_bytes + 2.0 * circle.sums_bytes + rows + on_the_way,
             // Forth and back, for the map and its noise, and an inner solution of each.
-            solution_s: (passes + 1.0) * (circle.solution_s + pass_s) + visibilities * circle.visibility_s,
+            solution_s: (passes + 1.0) * (INNER_SOLUTION * circle.solution_s + pass_s)
+                + visibilities * circle.visibility_s,
             visibility_s: if is_watched { circle.visibility_s } else { 0.0 },
-            solution_multiply_adds: (passes + 1.0) * circle.solution_multiply_adds,
+            solution_multiply_adds: (passes + 1.0) * INNER_SOLUTION * circle.solution_multiply_adds,
             ..circle
         }
     }

@@ -27,16 +27,22 @@ pub(super) const CHOLESKY_MULTIPLY_ADDS_PER_S: f64 = 0.5 * RANK_K_MULTIPLY_ADDS_
 /// Visibilities that the harmonic engine adds in a second, at any degree (bench `harmonic`).
 pub(super) const HARMONIC_VISIBILITIES_PER_S: f64 = 4e5;
 
-/// Time of a row at true positions on one core, s, in units of `l_max (l_max + 2 pi u)`, for both products of two skies (bench
-/// `general`, which has one sky: 7 ms at l = 191 and u = 125).
-pub(super) const ROW_S: f64 = 5e-8;
+/// Time of a row at true positions on one core, s, in units of `l_max (l_max + 2 pi u)`, for both products of two skies: 1.7 ms at
+/// l = 191 and u = 125 (bench `general`; half of it with AVX-512).
+pub(super) const ROW_S: f64 = 1e-8;
 
-/// Visibilities between which one row is computed, the others being interpolated (bench `general`: 45; less where integrations
-/// are left out).
-pub(super) const VISIBILITIES_PER_ROW: f64 = 25.0;
+/// Visibilities of which one row is computed, the others being interpolated (bench `general`: 49; 41 of a mission; less where
+/// integrations are left out).
+pub(super) const VISIBILITIES_PER_ROW: f64 = 40.0;
 
-/// Time of the interpolation of a visibility, s (bench `general`).
-pub(super) const INTERPOLATION_S: f64 = 1e-5;
+/// Time of the interpolation of a visibility at one instant, s (0.9 us with AVX-512: what averages cost in bench `general`).
+pub(super) const INTERPOLATION_S: f64 = 2e-6;
+
+/// Passes over the visibilities that a refined map usually takes, at most.
+pub(super) const REFINED_PASSES: f64 = 5.0;
+
+/// Time of an inner solution of a refinement, of that of a map: its residual is a hundred times as large.
+pub(super) const INNER_SOLUTION: f64 = 0.5;
 
 /// Instants of an average over an integration, on average: two for an eighth of a wavelength of motion, more where baselines are short.
 pub(super) const AVERAGE_INSTANTS: f64 = 2.5;

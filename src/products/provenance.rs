@@ -6,7 +6,7 @@ use super::config::PostProcessing;
 use crate::accumulation::{EngineKind, MapConfig};
 use crate::frames::{AntennaResponse, Instrument};
 use crate::sky::fits::Card;
-use crate::solve::Solution;
+use crate::solve::{Refinement, Solution};
 use crate::units::calendar::tai_text;
 
 /// The ground segment's share of the provenance; the rest comes with each solution.
@@ -79,6 +79,9 @@ impl Provenance {
             EngineKind::Harmonic => {
                 let l_max = i64::try_from(map.degree()).unwrap_or(i64::MAX);
                 cards.push(Card::integer("LMAX", l_max, "greatest degree of the solution"));
+                if let Some(refinement) = &solution.refinement {
+                    cards.extend(self.refinement_cards(refinement));
+                }
             }
         }
         let (limit_m, limit) = (map.baseline_m_max(frequency_hz), map.baseline_bp_max);
@@ -97,6 +100,21 @@ impl Provenance {
         }
         cards.push(Card::text("PRIOR", &self.prior(usize::from(solution.channel.0)), "prior map"));
         cards
+    }
+
+    /// How a map was refined, and with which rows.
+    fn refinement_cards(&self, refinement: &Refinement) -> Vec<Card> {
+        let passes = i64::try_from(refinement.convergence.iterations).unwrap_or(i64::MAX);
+        let antennas = match self.map.antennas.keys_set() {
+            keys if keys.is_empty() => "ideal".to_owned(),
+            keys => keys.join(", "),
+        };
+        vec![
+            Card::integer("PASSES", passes, "over visibilities, rows of true positions"),
+            Card::real("RESIDUAL", refinement.convergence.residual, "of the equations, relative"),
+            Card::logical("SMEARED", self.map.refine.smear_integrations, "rows averaged over integrations"),
+            Card::text("ANTROWS", &antennas, ""),
+        ]
     }
 
     /// The prior of a channel in words.

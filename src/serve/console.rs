@@ -263,7 +263,7 @@ impl Console {
 impl Memory {
     /// The state of the solver, with the time left.
     fn solver(&mut self, solving: Solving, now: Instant) -> SolverStatus {
-        let Solving { number, what, iteration, residual, target } = solving;
+        let Solving { number, what, iteration, residual, target, .. } = solving;
         let (_, since, first) = match self.solution {
             Some(seen) if seen.0 == number => seen,
             _ => *self.solution.insert((number, now, residual)),

@@ -41,4 +41,4 @@ pub use remade::solve_remade;
 pub use stage::{Solution, Solver, SolverSetup};
 pub use tikhonov::{Diagnostics, PixelExtras, PixelSolution, PointBeam, solve_pixels, solve_pixels_with};
 pub use traces::{Estimate, HELD_MAX, Traces, UnsupportedEpsilon, probed_traces, traces};
-pub use watch::{NamedWatch, SolveWatch, Solving};
+pub use watch::{NamedWatch, SolveWatch, Solving, SolvingPart};

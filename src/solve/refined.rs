@@ -11,6 +11,8 @@
 //! is solved by inner conjugate gradients, so that the outer ones are flexible (Notay 2000, SIAM J. Sci. Comput. 22, 1444).
 //! R is that of the circle's greatest eigenvalue. The map and the noise-only map share passes over the visibilities. An earlier
 //! solution, of less data or of an iteration that was interrupted, costs one pass as a beginning and saves those that led to it.
+//! Where all data are on the circle, within its limits, the beginning is the map of the circle's own sums: a pass says what the true rows
+//! leave of it.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -23,7 +25,7 @@ use super::conjugate_gradients::{Convergence, StoppingRule, System};
 use super::harmonic::{HarmonicRequest, HarmonicSolution, W_MAX_TOLERANCE, lifted, prior_unknowns};
 use super::lanczos::{LargestEigenvalue, largest_eigenvalue_from};
 use super::regulariser::Diagonal;
-use super::tikhonov::{Diagnostics, check_request};
+use super::tikhonov::{Diagnostics, check_request, subtract_prediction};
 use super::vectors::{add, dot, subtract};
 use super::watch::NamedWatch;
 use crate::accumulation::harmonic::{
@@ -107,11 +109,15 @@ impl ChiSquares {
 impl fmt::Display for Refinement {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { convergence, departures, chi_square, .. } = self;
+        match convergence.iterations {
+            0 => write!(f, "the map that refinement begins with has a residual of")?,
+            1 => write!(f, "refined in 1 pass to a residual of")?,
+            passes => write!(f, "refined in {passes} passes to a residual of")?,
+        }
         write!(
             f,
-            "refined in {} passes to a residual of {:.1e}{}; {} visibilities on the circle of {:.1} km and {:.2} deg, {} up to \
+            " {:.1e}{}; {} visibilities on the circle of {:.1} km and {:.2} deg, {} up to \
              {:.2} km, {:.2} deg off its plane and {:.2} deg off the horizontal; chi-square {:.4}",
-            convergence.iterations,
             convergence.residual,
             if convergence.converged { "" } else { " (not converged)" },
             departures.on_the_circle,
@@ -184,7 +190,11 @@ pub fn solve_refined(
         sums.data.noise.iter().zip(&sums.data.weight).map(|(noise, weight)| noise * weight.sqrt()).collect();
     let right = problem.adjoint(&[&weighted, &noise]);
     drop((weighted, noise));
-    let [map, noise] = problem.solve(right, data, rule, steps, watch);
+    let mut circle_data = sums.circle.right_hand_side().to_vec();
+    if let Some(prior) = &prior {
+        subtract_prediction(&sums.circle, prior, &mut circle_data);
+    }
+    let [map, noise] = problem.solve(right, circle_data, data, rule, steps, watch);
     if map.was_left() {
         return Err(SolveError::Interrupted);
     }
@@ -293,10 +303,11 @@ impl Refining<'_> {
         gradients.iter().map(unknowns_of_gradient).collect()
     }
 
-    /// Solves for two right-hand sides; `data` is what the first is made from.
+    /// Solves for two right-hand sides; `data` is what the first is made from, `circle_data` what it is by the circle's rows.
     fn solve(
         &self,
         right: Vec<Vec<f64>>,
+        circle_data: Vec<f64>,
         data: Vec<Complex64>,
         rule: RefineRule,
         steps: RefineSteps<'_>,
@@ -308,14 +319,27 @@ impl Refining<'_> {
             regularisation: Diagonal::Uniform(self.regularisation),
             precondition: &|v| self.factors.solve(v),
         };
-        let inner = StoppingRule { residual_max: INNER_RESIDUAL, ..self.inner };
-        let precondition = |residuals: &[&[f64]]| {
-            let mut z: Vec<Vec<f64>> = residuals.iter().map(|r| vec![0.0; r.len()]).collect();
-            circle.solve(residuals, &mut z, inner, &watch.part());
-            z.into_iter()
+        let on_the_circle = |right: &[&[f64]], residual_max: f64| {
+            let mut z: Vec<Vec<f64>> = right.iter().map(|b| vec![0.0; b.len()]).collect();
+            let rule = StoppingRule { residual_max, ..self.inner };
+            circle.solve(right, &mut z, rule, &watch.part("on the nearest circle", residual_max));
+            z
+        };
+        let precondition = |residuals: &[&[f64]]| on_the_circle(residuals, INNER_RESIDUAL).into_iter();
+        let start = steps.start.filter(|start| right.iter().zip(start).all(|(b, x)| b.len() == x.len()));
+        // Where all is on the circle, its map may be all that is wanted.
+        let is_circle = start.is_none() && self.sums.departures.by_refinement == 0;
+        let start = if is_circle {
+            let circle = [circle_data.as_slice(), self.sums.circle.noise_right_hand_side()];
+            on_the_circle(&circle, self.inner.residual_max).try_into().ok()
+        } else {
+            start
         };
         let mut data = Some(data);
-        let mut directions = precondition(&right.iter().map(Vec::as_slice).collect::<Vec<_>>());
+        let mut directions = match &start {
+            Some(map) if is_circle => Vec::from(map.clone()).into_iter(),
+            _ => precondition(&right.iter().map(Vec::as_slice).collect::<Vec<_>>()),
+        };
         let mut right = right.into_iter();
         let mut columns = [(); 2].map(|()| {
             let b = right.next().unwrap_or_default();
@@ -333,7 +357,7 @@ impl Refining<'_> {
                 is_stuck: false,
             }
         });
-        if let Some(start) = steps.start.filter(|start| start.iter().all(|x| x.len() == columns[0].x.len())) {
+        if let Some(start) = start {
             let skies = start.each_ref().map(|x| coefficients(x, self.l_max()));
             let (seen, products) = self.sums.rows.normal(&self.sums.plan, &skies, &self.sums.data.weight);
             let products = products.iter().map(unknowns_of_gradient);

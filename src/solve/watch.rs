@@ -19,6 +19,21 @@ pub struct Solving {
     pub residual: f64,
     /// Residual at which it ends.
     pub target: f64,
+    /// The iteration within the one in progress.
+    pub part: Option<SolvingPart>,
+}
+
+/// Progress of an iteration that is a step of another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SolvingPart {
+    /// What it solves.
+    pub what: &'static str,
+    /// Products so far.
+    pub iteration: usize,
+    /// Residual reached.
+    pub residual: f64,
+    /// Residual at which it ends.
+    pub target: f64,
 }
 
 /// Shared between a solver, the progress display and the interrupt handler.
@@ -127,14 +142,14 @@ impl<'a> NamedWatch<'a> {
         state.started += 1;
         let number = state.started;
         let what = format!("{name}: {what}");
-        state.now = Some(Solving { number, what, iteration: 0, residual: 1.0, target });
-        SolveTask { named: self, watch, was_cancelled: watch.cancel.is_cancelled(), is_part: false }
+        state.now = Some(Solving { number, what, iteration: 0, residual: 1.0, target, part: None });
+        SolveTask { named: self, watch, was_cancelled: watch.cancel.is_cancelled(), part: None }
     }
 
-    /// A part of a task in progress, which it leaves as it is shown.
-    pub(super) fn part(self) -> SolveTask<'a> {
+    /// A step of the task in progress that is an iteration of its own and ends at the residual `target`.
+    pub(super) fn part(self, what: &'static str, target: f64) -> SolveTask<'a> {
         let was_cancelled = self.watch.cancel.is_cancelled();
-        SolveTask { named: self, watch: self.watch, was_cancelled, is_part: true }
+        SolveTask { named: self, watch: self.watch, was_cancelled, part: Some((what, target)) }
     }
 }
 
@@ -143,7 +158,8 @@ pub(super) struct SolveTask<'a> {
     named: NamedWatch<'a>,
     watch: &'a SolveWatch,
     was_cancelled: bool,
-    is_part: bool,
+    /// Of a step of another task: what it solves, and the residual at which it ends.
+    part: Option<(&'static str, f64)>,
 }
 
 impl SolveTask<'_> {
@@ -167,11 +183,13 @@ impl SolveTask<'_> {
     }
 
     fn report_here(&self, iteration: usize, residual: f64) -> bool {
-        if !self.is_part
-            && let Some(solving) = &mut self.watch.state().now
-        {
-            solving.iteration = iteration;
-            solving.residual = residual;
+        if let Some(solving) = &mut self.watch.state().now {
+            match self.part {
+                Some((what, target)) => {
+                    solving.part = Some(SolvingPart { what, iteration, residual, target });
+                }
+                None => (solving.iteration, solving.residual) = (iteration, residual),
+            }
         }
         if self.was_cancelled {
             iteration < ITERATIONS_WHEN_CANCELLED && self.named.goes_on_here()
@@ -183,8 +201,10 @@ impl SolveTask<'_> {
 
 impl Drop for SolveTask<'_> {
     fn drop(&mut self) {
-        if !self.is_part {
-            self.watch.state().now = None;
+        let mut state = self.watch.state();
+        match (self.part, &mut state.now) {
+            (Some(_), Some(solving)) => solving.part = None,
+            _ => state.now = None,
         }
     }
 }

@@ -4,7 +4,7 @@
 use std::f64::consts::TAU;
 
 use lunarray::frames::AntennaResponse;
-use lunarray::response::general::{GeneralRows, Observed, PairAt, PairResponse, RowsSetup};
+use lunarray::response::general::{GeneralRows, Observed, PairAt, PairResponse, RowsRefusal, RowsSetup};
 use lunarray::response::harmonic::{HarmonicModel, ModelSettings, PairState, PatternGeometry};
 use lunarray::response::pixel::{Directions, PairGeometry, SatelliteAntenna, antenna_sums, sky_sums};
 use lunarray::sky::harmonics::{Alm, AnalysisOptions, Method, analysis, synthesis};
@@ -419,6 +419,13 @@ fn antennas_that_differ(elements: AntennaResponse) {
         pixel_directions(NSIDE).iter().zip(&map).map(|(n, t)| constant.at(*n) * t).collect();
     let product = analysis(&product, L_MAX + 6, &AnalysisOptions { method: Method::ACCURATE }).unwrap().alm;
     let same = |_: usize| constant.clone();
+    // Rows of lower degrees do not hold it.
+    let most = constant.degree() - 2;
+    let lower =
+        GeneralRows::new(RowsSetup { polynomial_degree: most, ..setup(L_MAX, AntennaResponse::Isotropic) });
+    let refused = lower.plan_of(&pairs, &Observed { response: Some(&same), ..Observed::default() });
+    let error = refused.map(|plan| plan.rows()).unwrap_err();
+    assert_eq!(error.refusal, RowsRefusal::Degree { degree: most + 2, most });
     let plan = rows.plan_of(&pairs, &Observed { response: Some(&same), ..Observed::default() }).unwrap();
     let found = rows.forward(&plan, std::slice::from_ref(&sky)).remove(0);
     let plain = GeneralRows::new(setup(L_MAX + 6, AntennaResponse::Isotropic));

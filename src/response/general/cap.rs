@@ -178,7 +178,7 @@ impl CapClass {
     fn border_coefficients(&self, nodes: &[RowNode], columns: usize, buffers: &mut CapBuffers) {
         let (terms, points) = (self.border.terms, self.border.points());
         let height = terms + self.rings.len();
-        // `[psi][term][column]`.
+        // `[term][column][psi]`.
         let width = terms * columns;
         buffers.border.resize(points * width, 0.0);
         for lane in 0..columns / 2 {
@@ -189,9 +189,9 @@ impl CapClass {
             let column = lane / LANES * COMPLEX + lane % LANES;
             for (part, sums) in buffers.pair.sums.iter().enumerate() {
                 for (term, sums) in sums.chunks_exact(points).enumerate() {
-                    let place = term * columns + column + part * LANES;
-                    let places = buffers.border[place..].iter_mut().step_by(width);
-                    places.zip(sums).for_each(|(to, from)| *to = *from as Value);
+                    let place = (term * columns + column + part * LANES) * points;
+                    let to = &mut buffers.border[place..place + points];
+                    to.iter_mut().zip(sums).for_each(|(to, from)| *to = *from as Value);
                 }
             }
         }
@@ -201,7 +201,7 @@ impl CapClass {
             MatMut::from_row_major_slice_mut(&mut buffers.waves, orders, width),
             Accum::Replace,
             MatRef::from_row_major_slice(&self.border.waves, orders, points),
-            MatRef::from_row_major_slice(&buffers.border, points, width),
+            MatRef::from_column_major_slice(&buffers.border, points, width),
             1.0,
             Par::Seq,
         );
@@ -287,45 +287,30 @@ impl Patterns {
         Self { whole: whole_sky(&setup), setup }
     }
 
-    /// Patterns of pairs of one class, by mu: for [`LANES`] of them at a time rows of l = mu, mu + 2, ..
+    /// Writes patterns of pairs of one class, by mu: for [`LANES`] of them at a time rows of l = mu, mu + 2, ..
     pub(super) fn of(
         &self,
         turns: &QuarterTurns,
         class: &CapClass,
         nodes: &[RowNode],
         buffers: &mut CapBuffers,
-    ) -> Vec<NodePatterns> {
+        out: &mut Vec<NodePatterns>,
+    ) {
         let l_max = self.setup.l_max;
         let groups = nodes.len().div_ceil(LANES);
         let columns = groups * COMPLEX;
         class.hidden(nodes, self.setup.wavelength_m, buffers);
-        let mut out: Vec<NodePatterns> =
-            (0..=l_max).map(|mu| NodePatterns::zeros(degrees(l_max, mu), groups)).collect();
+        out.resize_with(l_max + 1, NodePatterns::default);
+        // All of it will be written.
+        out.iter_mut().enumerate().for_each(|(mu, out)| out.make_room(degrees(l_max, mu), groups));
         let unhidden = self.unhidden(nodes, buffers);
         let pitches = pitch_phases(nodes, l_max);
         for l in 0..=l_max {
             let hidden = &buffers.hidden[l * (l_max + 1) * columns..][..(l + 1) * columns];
             turns.fold(l, hidden, columns, &mut buffers.turned);
-            let [even, odd] = &buffers.turned;
-            for (row, mu) in (l % 2..=l).step_by(2).enumerate() {
-                let degree = (l - mu) / 2;
-                let of = self.whole[mu][degree];
-                for group in 0..groups {
-                    let place = row * columns + group * COMPLEX;
-                    let signs = [1.0, if mu.is_multiple_of(2) { 1.0 } else { -1.0 }];
-                    assemble(
-                        [&even[place..place + COMPLEX], &odd[place..place + COMPLEX]],
-                        [0, 1].map(|part| &pitches[part][(group * (l_max + 1) + mu) * LANES..][..LANES]),
-                        &unhidden[group * (l_max + 3)..],
-                        l,
-                        &of,
-                        signs,
-                        &mut out[mu].of_mut(group)[degree * VALUES..(degree + 1) * VALUES],
-                    );
-                }
-            }
+            let turned = buffers.turned.each_ref().map(Vec::as_slice);
+            assemble(turned, &pitches, &unhidden, &self.whole, [l, l_max, groups], out);
         }
-        out
     }
 
     /// `j_l(2 pi u)`, l = 0 ..= l_max + 2, by group.
@@ -359,28 +344,39 @@ fn pitch_phases(nodes: &[RowNode], l_max: usize) -> [Vec<Value>; 2] {
     out
 }
 
-/// What is not hidden: writes `f_{l mu}` and `(-1)^mu f_{l,-mu}`.
+/// What is not hidden, of all pairs at one degree: writes `f_{l mu}` and `(-1)^mu f_{l,-mu}`.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 fn assemble(
     [even, odd]: [&[Value]; 2],
-    [cos, sin]: [&[Value]; 2],
+    [cos, sin]: &[Vec<Value>; 2],
     unhidden: &[[f64; LANES]],
-    l: usize,
-    of: &[f64; 3],
-    signs: [Value; 2],
-    out: &mut [Value],
+    whole: &[Vec<[f64; 3]>],
+    [l, l_max, groups]: [usize; 3],
+    out: &mut [NodePatterns],
 ) {
-    let ((even_re, even_im), (odd_re, odd_im)) = (even.split_at(LANES), odd.split_at(LANES));
-    let below = &unhidden[l.saturating_sub(2)];
-    let (here, above) = (&unhidden[l], &unhidden[l + 2]);
-    for k in 0..LANES {
-        let whole = (of[0] * here[k] + of[1] * above[k] + of[2] * below[k]) as Value;
-        let (re, im) = (even_re[k] + odd_re[k], even_im[k] + odd_im[k]);
-        out[k] = signs[0] * whole - (re * cos[k] - im * sin[k]);
-        out[LANES + k] = -(re * sin[k] + im * cos[k]);
-        let (re, im) = (even_re[k] - odd_re[k], even_im[k] - odd_im[k]);
-        out[2 * LANES + k] = signs[1] * whole - (re * cos[k] + im * sin[k]);
-        out[3 * LANES + k] = -(im * cos[k] - re * sin[k]);
+    let rows = even.chunks_exact(groups * COMPLEX).zip(odd.chunks_exact(groups * COMPLEX));
+    for (mu, (even, odd)) in (l % 2..=l).step_by(2).zip(rows) {
+        let (degree, out) = ((l - mu) / 2, &mut out[mu]);
+        let [of_here, of_above, of_below] = whole[mu][degree];
+        let sign: Value = if mu.is_multiple_of(2) { 1.0 } else { -1.0 };
+        let parts = even.chunks_exact(COMPLEX).zip(odd.chunks_exact(COMPLEX));
+        for (group, (even, odd)) in parts.enumerate() {
+            let place = (group * (l_max + 1) + mu) * LANES;
+            let (cos, sin) = (&cos[place..place + LANES], &sin[place..place + LANES]);
+            let spherical = &unhidden[group * (l_max + 3)..];
+            let (below, here, above) = (&spherical[l.saturating_sub(2)], &spherical[l], &spherical[l + 2]);
+            let ((even_re, even_im), (odd_re, odd_im)) = (even.split_at(LANES), odd.split_at(LANES));
+            let out = &mut out.of_mut(group)[degree * VALUES..(degree + 1) * VALUES];
+            for k in 0..LANES {
+                let whole = (of_here * here[k] + of_above * above[k] + of_below * below[k]) as Value;
+                let (re, im) = (even_re[k] + odd_re[k], even_im[k] + odd_im[k]);
+                out[k] = whole - (re * cos[k] - im * sin[k]);
+                out[LANES + k] = -(re * sin[k] + im * cos[k]);
+                let (re, im) = (even_re[k] - odd_re[k], even_im[k] - odd_im[k]);
+                out[2 * LANES + k] = sign * whole - (re * cos[k] + im * sin[k]);
+                out[3 * LANES + k] = -(im * cos[k] - re * sin[k]);
+            }
+        }
     }
 }
 
@@ -425,14 +421,16 @@ fn whole_sky(setup: &RowsSetup) -> Vec<Vec<[f64; 3]>> {
 
 /// Coefficients of the patterns of a batch at one mu: for [`LANES`] nodes at a time rows of l = mu, mu + 2, ..; in a row real and
 /// imaginary parts of `f_{l mu}`, then of `(-1)^mu f_{l,-mu}`, each by lane.
+#[derive(Default)]
 pub(super) struct NodePatterns {
     count: usize,
     coefficients: Vec<Value>,
 }
 
 impl NodePatterns {
-    fn zeros(count: usize, groups: usize) -> Self {
-        Self { count, coefficients: vec![0.0; groups * count * VALUES] }
+    fn make_room(&mut self, count: usize, groups: usize) {
+        self.count = count;
+        self.coefficients.resize(groups * count * VALUES, 0.0);
     }
 
     /// Rows of a group of nodes.
@@ -543,7 +541,8 @@ mod tests {
                 u_max: 40.0,
             };
             let class = CapClass::new(&setup, &class);
-            let found = patterns.of(&QuarterTurns::new(L_MAX), &class, &nodes, &mut CapBuffers::default());
+            let (mut buffers, mut found) = (CapBuffers::default(), Vec::new());
+            patterns.of(&QuarterTurns::new(L_MAX), &class, &nodes, &mut buffers, &mut found);
             for (lane, view) in views.iter().enumerate() {
                 for (mu, expected) in expected(view, response).iter().enumerate() {
                     for (k, expected) in expected.iter().enumerate() {

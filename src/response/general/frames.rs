@@ -16,6 +16,7 @@ use num_complex::Complex64;
 
 use super::lanes::{LANES, Value};
 use super::plan::RowNode;
+use super::skies::{Turned, make_room};
 use crate::response::harmonic::degrees;
 use crate::response::harmonic::trigonometry::sin_cos;
 use crate::units::vector::{Vec3, dot};
@@ -28,9 +29,6 @@ const ERROR: f64 = 1e-6;
 
 /// Frames that have to be turned to are at most this part of all: else combining them takes longer than turning to all.
 const PART: f64 = 0.5;
-
-/// Skies turned into frames, by mu: real and imaginary parts of `t_{l mu}`, `[l = mu, mu + 2, ..][sky][lane]`.
-pub(super) type Turned = Vec<[Vec<Value>; 2]>;
 
 /// Frames that are combined of others.
 #[derive(Clone, Debug)]
@@ -117,35 +115,39 @@ impl Frames {
         Some(Self { chosen, count: nodes.len(), weights })
     }
 
-    /// Weights of the chosen frames in some, `[chosen, and what fills the last vector][frame, and what fills the last vector]`.
-    pub(super) fn weights_of(&self, places: &[usize]) -> Vec<Value> {
+    /// Writes the weights of the chosen frames in some, `[chosen, and what fills the last vector][frame, and what fills the last vector]`.
+    pub(super) fn weights_of(&self, places: &[usize], out: &mut Vec<Value>) {
         let lanes = places.len().next_multiple_of(LANES);
-        let mut out = vec![0.0; self.chosen.len().next_multiple_of(LANES) * lanes];
+        out.clear();
+        out.resize(self.chosen.len().next_multiple_of(LANES) * lanes, 0.0);
         for (out, weights) in out.chunks_exact_mut(lanes).zip(self.weights.chunks_exact(self.count)) {
             out.iter_mut().zip(places).for_each(|(out, place)| *out = weights[*place]);
         }
-        out
     }
 
-    /// Skies in some frames from those in the chosen ones.
-    pub(super) fn combined(&self, turned: &Turned, weights: &[Value], [l_max, skies]: [usize; 2]) -> Turned {
+    /// Writes skies in some frames from those in the chosen ones.
+    pub(super) fn combined(
+        &self,
+        turned: &Turned,
+        weights: &[Value],
+        [l_max, skies]: [usize; 2],
+        out: &mut Turned,
+    ) {
         let (chosen, lanes) = self.shape(weights);
-        let of = |(mu, parts): (usize, &[Vec<Value>; 2])| {
-            parts.each_ref().map(|part| {
-                let rows = degrees(l_max, mu) * skies;
-                let mut out = vec![0.0; rows * lanes];
+        make_room(out, l_max, skies * lanes);
+        for (mu, (from, to)) in turned.iter().zip(out).enumerate() {
+            let rows = degrees(l_max, mu) * skies;
+            for (from, to) in from.iter().zip(to) {
                 faer::linalg::matmul::matmul(
-                    MatMut::from_row_major_slice_mut(&mut out, rows, lanes),
+                    MatMut::from_row_major_slice_mut(to, rows, lanes),
                     Accum::Replace,
-                    MatRef::from_row_major_slice(part, rows, chosen),
+                    MatRef::from_row_major_slice(from, rows, chosen),
                     MatRef::from_row_major_slice(weights, chosen, lanes),
                     1.0,
                     Par::Seq,
                 );
-                out
-            })
-        };
-        turned.iter().enumerate().map(of).collect()
+            }
+        }
     }
 
     /// The transpose of [`Self::combined`], added to `out`.
@@ -238,7 +240,8 @@ mod tests {
         assert!(frames.chosen.len() < nodes.len() / 3, "{}", frames.chosen.len());
         let lanes = nodes.len().next_multiple_of(LANES);
         let places: Vec<usize> = (0..nodes.len()).collect();
-        let weights = frames.weights_of(&places);
+        let mut weights = Vec::new();
+        frames.weights_of(&places, &mut weights);
         let combined = |k: usize, of: &dyn Fn(&RowNode) -> Complex64| -> Complex64 {
             let weight = |p: usize| f64::from(weights[p * lanes + k]);
             frames.chosen.iter().enumerate().map(|(p, node)| weight(p) * of(node)).sum()

@@ -22,6 +22,7 @@ mod lanes;
 mod operator;
 mod phases;
 mod plan;
+mod skies;
 mod turns;
 mod view;
 
@@ -65,14 +66,33 @@ pub struct PairAt {
     pub r_j_m: Vec3,
 }
 
-/// A visibility whose positions have no row.
+/// A visibility that has no row.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[error("visibility {index}: {refusal}")]
 pub struct RowsError {
     /// Its index.
     pub index: usize,
-    /// What is wrong with its positions.
-    pub refusal: GeometryRefusal,
+    /// What is wrong with it.
+    pub refusal: RowsRefusal,
+}
+
+/// Why a visibility has no row.
+#[derive(Clone, Copy, Debug, Error, PartialEq)]
+pub enum RowsRefusal {
+    /// Its positions.
+    #[error(transparent)]
+    Geometry(#[from] GeometryRefusal),
+    /// Its response is of a higher degree than the rows'.
+    #[error(
+        "its response is a polynomial of degree {degree} in the direction; expected at most the polynomial_degree of the rows' \
+         setup, {most}"
+    )]
+    Degree {
+        /// Of the response.
+        degree: usize,
+        /// Of the rows.
+        most: usize,
+    },
 }
 
 /// Whether a pair at these positions has a row.

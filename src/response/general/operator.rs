@@ -1,6 +1,7 @@
 //! Products with B and its transpose.
 
 use std::ops::Range;
+use std::sync::{Mutex, PoisonError};
 
 use num_complex::Complex64;
 use rayon::prelude::*;
@@ -8,15 +9,14 @@ use rayon::prelude::*;
 use super::antennas::Products;
 use super::cap::{CapBuffers, CapClass, NodePatterns, Patterns, batch_bytes};
 use super::classes::tables_bytes;
-use super::frames::{Frames, Turned};
+use super::frames::Frames;
 use super::instants::Instants;
 use super::lanes::{LANES, Lanes, VALUES, Value};
 use super::phases::{PaddedShares, PhaseGrid, PhaseTable};
 use super::plan::{GROUP_NODES, Observed, Pass, RowNode, RowPlan};
-use super::turns::{QuarterTurns, place};
+use super::skies::{TurnBuffers, Turned, lanes_of, make_room};
+use super::turns::QuarterTurns;
 use super::{PairAt, RowsError, RowsSetup};
-use crate::response::harmonic::degrees;
-use crate::response::harmonic::trigonometry::sin_cos;
 use crate::sky::harmonics::Alm;
 
 /// Rows of one class that a task computes together.
@@ -51,7 +51,7 @@ impl GeneralRows {
     /// Plans the rows of visibilities: few of them where consecutive ones are of one pair and in the order of time.
     ///
     /// # Errors
-    /// The first visibility whose positions have no row.
+    /// The first visibility that has no row.
     pub fn plan(&self, pairs: &[PairAt]) -> Result<RowPlan, RowsError> {
         self.plan_of(pairs, &Observed::default())
     }
@@ -75,20 +75,21 @@ impl GeneralRows {
     /// Visibilities, K sr, of skies given by coefficients up to `l_max`: `B x`, one vector a sky.
     #[must_use]
     pub fn forward(&self, plan: &RowPlan, skies: &[Alm]) -> Vec<Vec<Complex64>> {
-        let tables = Tables::new(&self.setup, plan);
+        let (tables, memory) = (Tables::new(&self.setup, plan), Memory::default());
         let (count, skies) = (skies.len(), self.products.of(skies));
         let skies = skies.as_slice();
         let values = plan.groups.par_iter().map(|group| {
-            let passes = &plan.passes[group.clone()];
-            let mut amplitudes = self.no_amplitudes(passes, skies.len());
-            let mut buffers = CapBuffers::default();
-            let frames = self.frames(plan, passes);
-            let basis = frames.as_ref().map(|frames| (frames, self.turned(&frames.chosen, skies)));
-            for places in Self::batches(plan, passes) {
-                let Some(batch) = self.batch(plan, passes, &tables, &mut buffers, places) else { continue };
-                self.amplitudes(&batch, skies, basis.as_ref(), &mut amplitudes);
-            }
-            self.interpolate(plan, passes, &amplitudes, count)
+            memory.lend(|of| {
+                let passes = &plan.passes[group.clone()];
+                self.no_amplitudes(passes, skies.len(), &mut of.amplitudes);
+                let frames = self.frames(plan, passes);
+                self.turn(frames.as_ref(), skies, of);
+                for places in Self::batches(plan, passes) {
+                    self.batch(plan, passes, &tables, places, 0, of);
+                    self.amplitudes(0, skies, frames.as_ref(), of);
+                }
+                self.interpolate(plan, passes, count, of)
+            })
         });
         joined(plan, count, values.collect())
     }
@@ -97,30 +98,28 @@ impl GeneralRows {
     /// several vectors of one value a row.
     #[must_use]
     pub fn adjoint(&self, plan: &RowPlan, values: &[&[Complex64]]) -> Vec<Alm> {
-        let tables = Tables::new(&self.setup, plan);
+        let (tables, memory) = (Tables::new(&self.setup, plan), Memory::default());
         let skies = values.len() * self.products.count();
         let mut out = vec![Alm::zeros(self.setup.l_max); skies];
         // The order of sums is that of the groups, whatever the threads.
         for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
             let parts = groups.par_iter().map(|group| {
-                let passes = &plan.passes[group.clone()];
-                let rows = rows_of(passes);
-                let values: Vec<&[Complex64]> = values.iter().map(|values| &values[rows.clone()]).collect();
-                let amplitudes = self.spread(plan, passes, &values);
-                let mut gradients = vec![Alm::zeros(self.setup.l_max); skies];
-                let mut buffers = CapBuffers::default();
-                let frames = self.frames(plan, passes);
-                let mut basis = frames.as_ref().map(|frames| (frames, self.no_turned(frames, skies)));
-                for places in Self::batches(plan, passes) {
-                    let Some(batch) = self.batch(plan, passes, &tables, &mut buffers, places) else {
-                        continue;
-                    };
-                    self.gradients(&batch, &amplitudes, basis.as_mut(), &mut gradients);
-                }
-                if let Some((frames, turned)) = &basis {
-                    self.turn_back(&frames.chosen, turned, &mut gradients);
-                }
-                gradients
+                memory.lend(|of| {
+                    let passes = &plan.passes[group.clone()];
+                    let rows = rows_of(passes);
+                    let values: Vec<&[Complex64]> =
+                        values.iter().map(|values| &values[rows.clone()]).collect();
+                    self.spread(plan, passes, &values, of);
+                    let mut gradients = vec![Alm::zeros(self.setup.l_max); skies];
+                    let frames = self.frames(plan, passes);
+                    self.no_gradients(frames.as_ref(), skies, of);
+                    for places in Self::batches(plan, passes) {
+                        self.batch(plan, passes, &tables, places, 0, of);
+                        self.gradients(0, frames.as_ref(), of, &mut gradients);
+                    }
+                    self.turn_back(frames.as_ref(), of, &mut gradients);
+                    gradients
+                })
             });
             let parts: Vec<_> = parts.collect();
             parts.iter().for_each(|part| add_to(&mut out, part));
@@ -132,40 +131,40 @@ impl GeneralRows {
     /// computed once for both.
     #[must_use]
     pub fn normal(&self, plan: &RowPlan, skies: &[Alm], weight: &[f64]) -> (Vec<Vec<Complex64>>, Vec<Alm>) {
-        let tables = Tables::new(&self.setup, plan);
+        let (tables, memory) = (Tables::new(&self.setup, plan), Memory::default());
         let (count, skies) = (skies.len(), self.products.of(skies));
         let skies = skies.as_slice();
         let mut out = vec![Alm::zeros(self.setup.l_max); skies.len()];
         let mut seen = Vec::with_capacity(plan.groups.len());
         for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
             let parts = groups.par_iter().map(|group| {
-                let passes = &plan.passes[group.clone()];
-                let mut amplitudes = self.no_amplitudes(passes, skies.len());
-                let mut buffers = CapBuffers::default();
-                let batches: Vec<Batch> = Self::batches(plan, passes)
-                    .into_iter()
-                    .filter_map(|places| self.batch(plan, passes, &tables, &mut buffers, places))
-                    .collect();
-                let frames = self.frames(plan, passes);
-                let basis = frames.as_ref().map(|frames| (frames, self.turned(&frames.chosen, skies)));
-                let one = |batch: &Batch| self.amplitudes(batch, skies, basis.as_ref(), &mut amplitudes);
-                batches.iter().for_each(one);
-                drop(basis);
-                let seen = self.interpolate(plan, passes, &amplitudes, count);
-                let weight = &weight[rows_of(passes)];
-                let weighted: Vec<Vec<Complex64>> =
-                    seen.iter().map(|seen| seen.iter().zip(weight).map(|(v, w)| v * *w).collect()).collect();
-                let weighted: Vec<&[Complex64]> = weighted.iter().map(Vec::as_slice).collect();
-                let amplitudes = self.spread(plan, passes, &weighted);
-                let mut gradients = vec![Alm::zeros(self.setup.l_max); skies.len()];
-                let mut basis = frames.as_ref().map(|frames| (frames, self.no_turned(frames, skies.len())));
-                for batch in &batches {
-                    self.gradients(batch, &amplitudes, basis.as_mut(), &mut gradients);
-                }
-                if let Some((frames, turned)) = &basis {
-                    self.turn_back(&frames.chosen, turned, &mut gradients);
-                }
-                (seen, gradients)
+                memory.lend(|of| {
+                    let passes = &plan.passes[group.clone()];
+                    self.no_amplitudes(passes, skies.len(), &mut of.amplitudes);
+                    let frames = self.frames(plan, passes);
+                    self.turn(frames.as_ref(), skies, of);
+                    let batches = Self::batches(plan, passes);
+                    let made = batches.len();
+                    for (number, places) in batches.into_iter().enumerate() {
+                        self.batch(plan, passes, &tables, places, number, of);
+                        self.amplitudes(number, skies, frames.as_ref(), of);
+                    }
+                    let seen = self.interpolate(plan, passes, count, of);
+                    let weight = &weight[rows_of(passes)];
+                    let weighted = |seen: &Vec<Complex64>| -> Vec<Complex64> {
+                        seen.iter().zip(weight).map(|(v, w)| v * *w).collect()
+                    };
+                    let weighted: Vec<Vec<Complex64>> = seen.iter().map(weighted).collect();
+                    let weighted: Vec<&[Complex64]> = weighted.iter().map(Vec::as_slice).collect();
+                    self.spread(plan, passes, &weighted, of);
+                    let mut gradients = vec![Alm::zeros(self.setup.l_max); skies.len()];
+                    self.no_gradients(frames.as_ref(), skies.len(), of);
+                    for number in 0..made {
+                        self.gradients(number, frames.as_ref(), of, &mut gradients);
+                    }
+                    self.turn_back(frames.as_ref(), of, &mut gradients);
+                    (seen, gradients)
+                })
             });
             let parts: Vec<_> = parts.collect();
             for (values, gradients) in parts {
@@ -181,10 +180,26 @@ impl GeneralRows {
         if plan.direct { None } else { Frames::new(&plan.nodes[nodes_of(passes)], self.setup.l_max) }
     }
 
-    /// Room for gradients of skies in the chosen frames.
-    fn no_turned(&self, frames: &Frames, skies: usize) -> Turned {
-        let (l_max, columns) = (self.setup.l_max, lanes_of(&frames.chosen) * skies);
-        (0..=l_max).map(|mu| [0, 1].map(|_| vec![0.0; columns * degrees(l_max, mu)])).collect()
+    /// Turns skies into the chosen frames, if there are any.
+    fn turn(&self, frames: Option<&Frames>, skies: &[Alm], of: &mut Workspace) {
+        if let Some(frames) = frames {
+            self.turns.turn_skies(&frames.chosen, skies, &mut of.turning, &mut of.basis);
+        }
+    }
+
+    /// Makes room for gradients of skies in the chosen frames.
+    fn no_gradients(&self, frames: Option<&Frames>, skies: usize, of: &mut Workspace) {
+        if let Some(frames) = frames {
+            make_room(&mut of.basis, self.setup.l_max, lanes_of(&frames.chosen) * skies);
+            of.basis.iter_mut().flatten().for_each(|part| part.fill(0.0));
+        }
+    }
+
+    /// Adds gradients in the chosen frames to those of skies.
+    fn turn_back(&self, frames: Option<&Frames>, of: &mut Workspace, gradients: &mut [Alm]) {
+        if let Some(frames) = frames {
+            self.turns.turn_skies_back(&frames.chosen, &of.basis, &mut of.turning, gradients);
+        }
     }
 
     /// Orders of an amplitude, mu = -l_max ..= l_max, and what fills the last vector.
@@ -192,9 +207,10 @@ impl GeneralRows {
         (2 * self.setup.l_max + 1).next_multiple_of(LANES)
     }
 
-    /// Room for the amplitudes g of the passes' nodes: `[node][sky][real or imaginary part][order]`.
-    fn no_amplitudes(&self, passes: &[Pass], skies: usize) -> Vec<f64> {
-        vec![0.0; nodes_of(passes).len() * skies * 2 * self.orders()]
+    /// Zero amplitudes g of the passes' nodes: `[node][sky][real or imaginary part][order]`.
+    fn no_amplitudes(&self, passes: &[Pass], skies: usize, out: &mut Vec<f64>) {
+        out.clear();
+        out.resize(nodes_of(passes).len() * skies * 2 * self.orders(), 0.0);
     }
 
     /// Nodes of passes, in batches of one class: places among the passes' nodes.
@@ -210,31 +226,40 @@ impl GeneralRows {
             .collect()
     }
 
-    /// The patterns of a batch; `None` if there is nothing in it.
+    /// Makes the patterns of a batch, which gets this number.
     fn batch(
         &self,
         plan: &RowPlan,
         passes: &[Pass],
         tables: &Tables,
-        buffers: &mut CapBuffers,
         places: Vec<usize>,
-    ) -> Option<Batch> {
+        number: usize,
+        of: &mut Workspace,
+    ) {
         let first = nodes_of(passes).start;
-        let nodes: Vec<RowNode> = places.iter().map(|&k| plan.nodes[first + k]).collect();
-        let class = tables.classes[nodes.first()?.class as usize].as_ref()?;
-        let patterns = self.patterns.of(&self.turns, class, &nodes, buffers);
-        Some(Batch { places, nodes, patterns })
+        if of.batches.len() <= number {
+            of.batches.resize_with(number + 1, Batch::default);
+        }
+        let batch = &mut of.batches[number];
+        batch.places = places;
+        batch.nodes.clear();
+        batch.nodes.extend(batch.places.iter().map(|&k| plan.nodes[first + k]));
+        let class = tables.class(&batch.nodes);
+        self.patterns.of(&self.turns, class, &batch.nodes, &mut of.cap, &mut batch.patterns);
     }
 
-    /// Writes the amplitudes of a batch; `basis` has the skies in the frames of which those of the batch are combined.
-    fn amplitudes(&self, batch: &Batch, skies: &[Alm], basis: Option<&(&Frames, Turned)>, out: &mut [f64]) {
+    /// Writes the amplitudes of a batch, from the skies in the frames of which its own are combined.
+    fn amplitudes(&self, number: usize, skies: &[Alm], frames: Option<&Frames>, of: &mut Workspace) {
         let (orders, l_max) = (self.orders(), self.setup.l_max);
-        let turned = match basis {
-            None => self.turned(&batch.nodes, skies),
-            Some((frames, turned)) => {
-                frames.combined(turned, &frames.weights_of(&batch.places), [l_max, skies.len()])
+        let Workspace { batches, basis, turned, weights, turning, amplitudes: out, .. } = of;
+        let batch = &batches[number];
+        match frames {
+            None => self.turns.turn_skies(&batch.nodes, skies, turning, turned),
+            Some(frames) => {
+                frames.weights_of(&batch.places, weights);
+                frames.combined(basis, weights, [l_max, skies.len()], turned);
             }
-        };
+        }
         let lanes = lanes_of(&batch.nodes);
         for (mu, [re, im]) in turned.iter().enumerate() {
             for (group, places) in batch.places.chunks(LANES).enumerate() {
@@ -255,128 +280,35 @@ impl GeneralRows {
     }
 
     /// The transpose of [`Self::amplitudes`], added to the gradients of what it is combined of, or to `out`.
-    fn gradients(
-        &self,
-        batch: &Batch,
-        amplitudes: &[f64],
-        basis: Option<&mut (&Frames, Turned)>,
-        out: &mut [Alm],
-    ) {
+    fn gradients(&self, number: usize, frames: Option<&Frames>, of: &mut Workspace, out: &mut [Alm]) {
         let (orders, l_max, skies) = (self.orders(), self.setup.l_max, out.len());
+        let Workspace { batches, basis, turned, weights, turning, amplitudes, .. } = of;
+        let batch = &batches[number];
         let lanes = lanes_of(&batch.nodes);
         let at = |place: usize| amplitudes[place] as Value;
-        let turned: Turned = (0..=l_max)
-            .map(|mu| {
-                let [mut re, mut im] = [0, 1].map(|_| vec![0.0; degrees(l_max, mu) * skies * lanes]);
-                for (group, places) in batch.places.chunks(LANES).enumerate() {
-                    let pattern = batch.patterns[mu].of(group);
-                    for sky in 0..skies {
-                        let mut values = [[0.0; LANES]; 4];
-                        for (lane, node) in places.iter().enumerate() {
-                            let place = (node * skies + sky) * 2 * orders + l_max;
-                            (values[0][lane], values[1][lane]) = (at(place + mu), at(place + orders + mu));
-                            if mu > 0 {
-                                (values[2][lane], values[3][lane]) =
-                                    (at(place - mu), at(place + orders - mu));
-                            }
+        make_room(turned, l_max, lanes * skies);
+        for (mu, [re, im]) in turned.iter_mut().enumerate() {
+            for (group, places) in batch.places.chunks(LANES).enumerate() {
+                let pattern = batch.patterns[mu].of(group);
+                for sky in 0..skies {
+                    let mut values = [[0.0; LANES]; 4];
+                    for (lane, node) in places.iter().enumerate() {
+                        let place = (node * skies + sky) * 2 * orders + l_max;
+                        (values[0][lane], values[1][lane]) = (at(place + mu), at(place + orders + mu));
+                        if mu > 0 {
+                            (values[2][lane], values[3][lane]) = (at(place - mu), at(place + orders - mu));
                         }
-                        let first = sky * lanes + group * LANES;
-                        products_back(&values, pattern, &mut re[first..], &mut im[first..], skies * lanes);
                     }
-                }
-                [re, im]
-            })
-            .collect();
-        match basis {
-            None => self.turn_back(&batch.nodes, &turned, out),
-            Some((frames, sums)) => {
-                frames.shared(&turned, &frames.weights_of(&batch.places), sums, [l_max, skies]);
-            }
-        }
-    }
-
-    /// Skies in the frames of nodes, by mu: real and imaginary parts of `t_{l mu}`, `[l = mu, mu + 2, ..][sky][lane]`.
-    fn turned(&self, nodes: &[RowNode], skies: &[Alm]) -> Turned {
-        let l_max = self.setup.l_max;
-        let lanes = lanes_of(nodes);
-        let columns = lanes * skies.len();
-        let phases = Phases::new(nodes, l_max);
-        let mut out: Turned =
-            (0..=l_max).map(|mu| [0, 1].map(|_| vec![0.0; columns * degrees(l_max, mu)])).collect();
-        let mut buffers = [0, 1].map(|_| [0, 1].map(|_| vec![0.0; columns * (l_max + 1)]));
-        for l in 0..=l_max {
-            let [mut sky, half] =
-                buffers.each_mut().map(|both| both.each_mut().map(|x| &mut x[..columns * (l + 1)]));
-            for m in 0..=l {
-                for (k, alm) in skies.iter().enumerate() {
-                    let at = place(l, m) * columns + k * lanes;
-                    let [re, im] = sky.each_mut().map(|part| &mut part[at..at + lanes]);
-                    let z = alm.get(l, m).conj();
-                    re.fill(z.re as Value);
-                    im.fill(z.im as Value);
-                    turn(re, im, phases.get(0, m), -1.0);
-                }
-            }
-            let [re, im] = half;
-            self.turns.turn(l, &[0, 1], [&*sky[0], &*sky[1]], [&mut *re, &mut *im]);
-            for k in 0..=l {
-                let at = place(l, k) * columns;
-                for (re, im) in rows_at(re, im, at..at + columns, lanes) {
-                    turn(re, im, phases.get(1, k), -1.0);
-                }
-            }
-            let [to_re, to_im] = sky;
-            self.turns.turn(l, &[l % 2], [&*re, &*im], [&mut *to_re, &mut *to_im]);
-            for mu in (l % 2..=l).step_by(2) {
-                let (from, to) = (place(l, mu) * columns, (l - mu) / 2 * columns);
-                let [re, im] = &mut out[mu];
-                re[to..to + columns].copy_from_slice(&to_re[from..from + columns]);
-                im[to..to + columns].copy_from_slice(&to_im[from..from + columns]);
-                for (re, im) in rows_at(re, im, to..to + columns, lanes) {
-                    turn(re, im, phases.get(2, mu), -1.0);
+                    let first = sky * lanes + group * LANES;
+                    products_back(&values, pattern, &mut re[first..], &mut im[first..], skies * lanes);
                 }
             }
         }
-        out
-    }
-
-    /// The transpose of [`Self::turned`], added to `out`.
-    fn turn_back(&self, nodes: &[RowNode], turned: &[[Vec<Value>; 2]], out: &mut [Alm]) {
-        let l_max = self.setup.l_max;
-        let lanes = lanes_of(nodes);
-        let columns = lanes * out.len();
-        let phases = Phases::new(nodes, l_max);
-        let mut buffers = [0, 1].map(|_| [0, 1].map(|_| vec![0.0; columns * (l_max + 1)]));
-        for l in 0..=l_max {
-            let [sky, half] =
-                buffers.each_mut().map(|both| both.each_mut().map(|x| &mut x[..columns * (l + 1)]));
-            let [sky_re, sky_im] = sky;
-            for mu in (l % 2..=l).step_by(2) {
-                let (from, to) = ((l - mu) / 2 * columns, place(l, mu) * columns);
-                sky_re[to..to + columns].copy_from_slice(&turned[mu][0][from..from + columns]);
-                sky_im[to..to + columns].copy_from_slice(&turned[mu][1][from..from + columns]);
-                for (re, im) in rows_at(sky_re, sky_im, to..to + columns, lanes) {
-                    turn(re, im, phases.get(2, mu), 1.0);
-                }
-            }
-            let [re, im] = half;
-            self.turns.turn_back(l, &[l % 2], [&*sky_re, &*sky_im], [&mut *re, &mut *im]);
-            for k in 0..=l {
-                let at = place(l, k) * columns;
-                for (re, im) in rows_at(re, im, at..at + columns, lanes) {
-                    turn(re, im, phases.get(1, k), 1.0);
-                }
-            }
-            self.turns.turn_back(l, &[0, 1], [&*re, &*im], [&mut *sky_re, &mut *sky_im]);
-            for m in 0..=l {
-                for (k, out) in out.iter_mut().enumerate() {
-                    let at = place(l, m) * columns + k * lanes;
-                    let [re, im] = [&mut sky_re[at..at + lanes], &mut sky_im[at..at + lanes]];
-                    turn(re, im, phases.get(0, m), 1.0);
-                    // z = conj(T) conj(phase): the gradient is conj(z' phase).
-                    let sum = |part: &[Value]| part.iter().map(|x| f64::from(*x)).sum::<f64>();
-                    *out.get_mut(l, m) += Complex64::new(sum(re), -sum(im));
-                }
+        match frames {
+            None => self.turns.turn_skies_back(&batch.nodes, turned, turning, out),
+            Some(frames) => {
+                frames.weights_of(&batch.places, weights);
+                frames.shared(turned, weights, basis, [l_max, skies]);
             }
         }
     }
@@ -386,15 +318,14 @@ impl GeneralRows {
         &self,
         plan: &RowPlan,
         passes: &[Pass],
-        amplitudes: &[f64],
         skies: usize,
+        of: &mut Workspace,
     ) -> Vec<Vec<Complex64>> {
         let first = nodes_of(passes).start;
         let products = skies * self.products.count();
         let width = 2 * self.orders();
         let mut out = vec![Vec::with_capacity(rows_of(passes).len()); skies];
-        let (mut table, mut shares, mut padded) =
-            (PhaseTable::default(), Vec::new(), PaddedShares::default());
+        let Workspace { amplitudes, table, shares, padded, .. } = of;
         let [mut values, mut at] = [0, 1].map(|_| vec![Complex64::ZERO; products]);
         for pass in passes {
             let amplitudes = &amplitudes[(pass.nodes.start - first) * products * width..];
@@ -408,13 +339,13 @@ impl GeneralRows {
                 }
                 continue;
             }
-            self.phases.fill(amplitudes, width / 2, [pass.nodes.len(), products], &mut table);
+            self.phases.fill(amplitudes, width / 2, [pass.nodes.len(), products], table);
             for row in pass.rows.clone() {
                 values.fill(Complex64::ZERO);
                 for instant in plan.instants_of(pass, row, &self.instants) {
-                    let gamma_rad = plan.shares(pass, row, instant, &mut shares);
-                    padded.set(&table, &shares);
-                    self.phases.at(&table, gamma_rad, &padded, &mut at);
+                    let gamma_rad = plan.shares(pass, row, instant, shares);
+                    padded.set(table, shares);
+                    self.phases.at(table, gamma_rad, padded, &mut at);
                     values.iter_mut().zip(&at).for_each(|(value, at)| *value += instant.weight * at);
                 }
                 plan.combine(row, &values, &mut out);
@@ -429,13 +360,12 @@ impl GeneralRows {
         phase_sum(re, im, gamma_rad) * Complex64::cis(self.setup.l_max as f64 * gamma_rad)
     }
 
-    /// The transpose of [`Self::interpolate`], for several vectors over the rows of the passes.
-    fn spread(&self, plan: &RowPlan, passes: &[Pass], values: &[&[Complex64]]) -> Vec<f64> {
+    /// The transpose of [`Self::interpolate`], for several vectors over the rows of the passes: writes amplitudes.
+    fn spread(&self, plan: &RowPlan, passes: &[Pass], values: &[&[Complex64]], of: &mut Workspace) {
         let (first, first_row) = (nodes_of(passes).start, rows_of(passes).start);
         let (width, skies) = (2 * self.orders(), values.len() * self.products.count());
-        let mut out = self.no_amplitudes(passes, skies);
-        let (mut table, mut shares, mut padded) =
-            (PhaseTable::default(), Vec::new(), PaddedShares::default());
+        let Workspace { amplitudes: out, table, shares, padded, .. } = of;
+        self.no_amplitudes(passes, skies, out);
         let [mut of_row, mut at] = [0, 1].map(|_| vec![Complex64::ZERO; skies]);
         for pass in passes {
             let out = &mut out[(pass.nodes.start - first) * skies * width..];
@@ -452,59 +382,44 @@ impl GeneralRows {
                 }
                 continue;
             }
-            self.phases.clear(&mut table, [pass.nodes.len(), skies]);
+            self.phases.clear(table, [pass.nodes.len(), skies]);
             for row in pass.rows.clone() {
                 plan.divide(row, values.iter().map(|values| values[row - first_row]), &mut of_row);
                 for instant in plan.instants_of(pass, row, &self.instants) {
-                    let gamma_rad = plan.shares(pass, row, instant, &mut shares);
-                    padded.set(&table, &shares);
+                    let gamma_rad = plan.shares(pass, row, instant, shares);
+                    padded.set(table, shares);
                     at.iter_mut().zip(&of_row).for_each(|(at, value)| *at = instant.weight * value);
-                    self.phases.add(&mut table, gamma_rad, &padded, &at);
+                    self.phases.add(table, gamma_rad, padded, &at);
                 }
             }
-            self.phases.collect(&mut table, width / 2, out);
+            self.phases.collect(table, width / 2, out);
         }
-        out
     }
 }
 
-/// Nodes of a batch, and what fills the last vector.
-fn lanes_of(nodes: &[RowNode]) -> usize {
-    nodes.len().next_multiple_of(LANES)
-}
-
-/// A range of two lists, in chunks of the lanes.
-fn rows_at<'a>(
-    re: &'a mut [Value],
-    im: &'a mut [Value],
-    range: Range<usize>,
-    lanes: usize,
-) -> impl Iterator<Item = (&'a mut [Value], &'a mut [Value])> {
-    re[range.clone()].chunks_exact_mut(lanes).zip(im[range].chunks_exact_mut(lanes))
-}
-
-/// Turns numbers by phases, or back.
-#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn turn(re: &mut [Value], im: &mut [Value], [cos, sin]: [&[Value]; 2], sign: Value) {
-    for (((re, im), cos), sin) in re.iter_mut().zip(im).zip(cos).zip(sin) {
-        let sin = sign * sin;
-        (*re, *im) = (*re * cos - *im * sin, *re * sin + *im * cos);
-    }
-}
+/// Degrees whose products are added in f32, before their sum is added to others in f64.
+const DEGREES: usize = 16;
 
 /// Sums over l of turned skies with patterns: for mu, and of the conjugate skies for -mu. Values of one l are `stride` apart.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 fn products(re: &[Value], im: &[Value], stride: usize, pattern: &[Value]) -> [Lanes; 4] {
     let mut sums = [[0.0; LANES]; 4];
-    for ((re, im), pattern) in re.chunks(stride).zip(im.chunks(stride)).zip(pattern.chunks_exact(VALUES)) {
-        let (re, im) = (&re[..LANES], &im[..LANES]);
-        for k in 0..LANES {
-            let [a, b, c, d] = [0, 1, 2, 3].map(|part| f64::from(pattern[part * LANES + k]));
-            let (re, im) = (f64::from(re[k]), f64::from(im[k]));
-            sums[0][k] += re * a - im * b;
-            sums[1][k] += re * b + im * a;
-            sums[2][k] += re * c + im * d;
-            sums[3][k] += re * d - im * c;
+    let (re, im) = (re.chunks(DEGREES * stride), im.chunks(DEGREES * stride));
+    for ((re, im), pattern) in re.zip(im).zip(pattern.chunks(DEGREES * VALUES)) {
+        let mut some = [[0.0; LANES]; 4];
+        for ((re, im), pattern) in re.chunks(stride).zip(im.chunks(stride)).zip(pattern.chunks_exact(VALUES))
+        {
+            let (re, im) = (&re[..LANES], &im[..LANES]);
+            for k in 0..LANES {
+                let [a, b, c, d] = [0, 1, 2, 3].map(|part| pattern[part * LANES + k]);
+                some[0][k] += re[k] * a - im[k] * b;
+                some[1][k] += re[k] * b + im[k] * a;
+                some[2][k] += re[k] * c + im[k] * d;
+                some[3][k] += re[k] * d - im[k] * c;
+            }
+        }
+        for (sums, some) in sums.iter_mut().zip(&some) {
+            sums.iter_mut().zip(some).for_each(|(sum, some)| *sum += f64::from(*some));
         }
     }
     sums
@@ -592,21 +507,31 @@ fn add_to(sums: &mut [Alm], part: &[Alm]) {
 
 /// What the rows of a plan share.
 struct Tables {
-    /// The classes that nodes are of, by number.
-    classes: Vec<Option<CapClass>>,
+    /// The classes that nodes are of.
+    classes: Vec<CapClass>,
+    /// By number of a class: its place among them.
+    places: Vec<usize>,
 }
 
 impl Tables {
     fn new(setup: &RowsSetup, plan: &RowPlan) -> Self {
-        let mut is_used = vec![false; plan.classes.len()];
-        plan.nodes.iter().for_each(|node| is_used[node.class as usize] = true);
-        let classes = plan.classes.par_iter().zip(is_used);
-        let classes = classes.map(|(class, used)| used.then(|| CapClass::new(setup, class))).collect();
-        Self { classes }
+        let mut numbers: Vec<usize> = plan.nodes.iter().map(|node| node.class as usize).collect();
+        numbers.sort_unstable();
+        numbers.dedup();
+        let mut places = vec![0; plan.classes.len()];
+        numbers.iter().enumerate().for_each(|(place, number)| places[*number] = place);
+        let classes = numbers.par_iter().map(|number| CapClass::new(setup, &plan.classes[*number])).collect();
+        Self { classes, places }
+    }
+
+    /// The class of a batch, which has at least one node.
+    fn class(&self, nodes: &[RowNode]) -> &CapClass {
+        &self.classes[self.places[nodes[0].class as usize]]
     }
 }
 
 /// Nodes of one class, and their patterns.
+#[derive(Default)]
 struct Batch {
     /// Places among the nodes of the group's passes.
     places: Vec<usize>,
@@ -615,34 +540,36 @@ struct Batch {
     patterns: Vec<NodePatterns>,
 }
 
-/// Cosines and sines of multiples of the turns of nodes; the last node fills the last vector.
-struct Phases {
-    stride: usize,
-    lanes: usize,
-    cos: Vec<Value>,
-    sin: Vec<Value>,
+/// What a task works with on one group of passes. It is kept for the next: tens of MB that come and go with each group
+/// cost a fifth of a product's time in page faults.
+#[derive(Default)]
+struct Workspace {
+    cap: CapBuffers,
+    batches: Vec<Batch>,
+    turning: TurnBuffers,
+    /// Skies in the frames of which others are combined, then gradients there.
+    basis: Turned,
+    /// Those in the frames of a batch, and its weights.
+    turned: Turned,
+    weights: Vec<Value>,
+    /// `[node][sky][real or imaginary part][order]`.
+    amplitudes: Vec<f64>,
+    table: PhaseTable,
+    shares: Vec<f64>,
+    padded: PaddedShares,
 }
 
-impl Phases {
-    fn new(nodes: &[RowNode], l_max: usize) -> Self {
-        let (stride, lanes) = (l_max + 1, lanes_of(nodes));
-        let [mut cos, mut sin] = [0, 1].map(|_| Vec::with_capacity(3 * lanes * stride));
-        for turn in 0..3 {
-            for k in 0..stride {
-                let filled = nodes.iter().chain(nodes.last().into_iter().cycle()).take(lanes);
-                for (s, c) in filled.map(|node| sin_cos(k as f64 * node.turns_rad[turn])) {
-                    cos.push(c as Value);
-                    sin.push(s as Value);
-                }
-            }
-        }
-        Self { stride, lanes, cos, sin }
-    }
+/// Workspaces that no task has.
+#[derive(Default)]
+struct Memory(Mutex<Vec<Workspace>>);
 
-    /// Of one turn and order: cosines and sines by lane.
-    fn get(&self, turn: usize, k: usize) -> [&[Value]; 2] {
-        let first = (turn * self.stride + k) * self.lanes;
-        [&self.cos[first..first + self.lanes], &self.sin[first..first + self.lanes]]
+impl Memory {
+    fn lend<T>(&self, to: impl FnOnce(&mut Workspace) -> T) -> T {
+        let free = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut workspace = free().pop().unwrap_or_default();
+        let out = to(&mut workspace);
+        free().push(workspace);
+        out
     }
 }
 

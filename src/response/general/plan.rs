@@ -22,7 +22,7 @@ use super::antennas::PairResponse;
 use super::classes::{Classes, NodeClass};
 use super::instants::{Instant, Instants};
 use super::view::{Axes, PairView, euler, transported};
-use super::{PairAt, RowsError, RowsSetup};
+use super::{PairAt, RowsError, RowsRefusal, RowsSetup};
 use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
 
 /// A gap in a pair's data that ends a pass, s: polynomials do not reach across what the array did not observe.
@@ -111,7 +111,7 @@ impl RowPlan {
     /// itself.
     ///
     /// # Errors
-    /// The first visibility whose positions have no row.
+    /// The first visibility that has no row.
     pub(super) fn new(
         setup: &RowsSetup,
         pairs: &[PairAt],
@@ -123,7 +123,7 @@ impl RowPlan {
             .enumerate()
             .map(|(index, at)| {
                 PairView::of(at.r_i_m, at.r_j_m, setup.moon_radius_m)
-                    .map_err(|refusal| RowsError { index, refusal })
+                    .map_err(|refusal| RowsError { index, refusal: refusal.into() })
             })
             .collect::<Result<_, _>>()?;
         let u_max = views.iter().map(|view| view.baseline_m / setup.wavelength_m).fold(0.0, f64::max);
@@ -135,7 +135,7 @@ impl RowPlan {
             gamma_rad: vec![0.0; pairs.len()],
             tau: vec![0.0; pairs.len()],
             reach: vec![0.0; if observed.duration_s.is_empty() { 0 } else { pairs.len() }],
-            coefficients: coefficients(setup.polynomial_degree, pairs.len(), observed),
+            coefficients: coefficients(setup.polynomial_degree, pairs.len(), observed)?,
             instants: observed.duration_s.iter().filter(|length_s| !is_known((**length_s).into())).count(),
             classes: classes.all(),
             direct,
@@ -252,16 +252,32 @@ fn is_known(duration_s: f64) -> bool {
     (0.0..=POSITION_STEP_S_MAX).contains(&duration_s)
 }
 
-/// Coefficients of the responses of rows; none if rows have that of the setup.
-fn coefficients(degree: usize, rows: usize, observed: &Observed<'_>) -> Vec<f32> {
-    let of_row = |row: usize| {
-        let response = observed.response.map_or_else(PairResponse::isotropic, |of| of(row));
-        response.coefficients_of(degree)
+/// Rows whose responses a task finds.
+const ROWS_AT_ONCE: usize = 4096;
+
+/// Coefficients of the responses of rows, as polynomials of degree `most`; none if rows have that of the setup.
+fn coefficients(most: usize, rows: usize, observed: &Observed<'_>) -> Result<Vec<f32>, RowsError> {
+    let of_row = |index: usize| {
+        let response = observed.response.map_or_else(PairResponse::isotropic, |of| of(index));
+        match response.degree() {
+            degree if degree > most => {
+                Err(RowsError { index, refusal: RowsRefusal::Degree { degree, most } })
+            }
+            _ => Ok(response.coefficients_of(most)),
+        }
     };
-    match degree {
-        0 => Vec::new(),
-        _ => (0..rows).into_par_iter().flat_map_iter(of_row).map(|a| a as f32).collect(),
+    if most == 0 && observed.response.is_none() {
+        return Ok(Vec::new());
     }
+    let of_rows = |first: usize| -> Result<Vec<f32>, RowsError> {
+        let mut out = Vec::new();
+        for row in first..rows.min(first + ROWS_AT_ONCE) {
+            out.extend(of_row(row)?.into_iter().map(|a| a as f32));
+        }
+        Ok(out)
+    };
+    let parts = (0..rows.div_ceil(ROWS_AT_ONCE)).into_par_iter().map(|k| of_rows(k * ROWS_AT_ONCE));
+    Ok(parts.collect::<Result<Vec<_>, _>>()?.concat())
 }
 
 impl Pass {

@@ -62,6 +62,11 @@ impl QuarterTurns {
         Self { degrees }
     }
 
+    /// Greatest degree.
+    pub(super) fn l_max(&self) -> usize {
+        self.degrees.len().saturating_sub(1)
+    }
+
     /// Turns vectors of degree l by a quarter, given by real and imaginary parts. Writes orders of the parities in `parities` and
     /// leaves others as they are.
     pub(super) fn turn(&self, l: usize, parities: &[usize], from: [&[Value]; 2], to: [&mut [Value]; 2]) {

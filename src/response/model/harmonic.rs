@@ -120,7 +120,9 @@ impl VisibilityModel for HarmonicSum {
     }
 
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
-        let refused = |refusal| ModelError::Geometry { frequency_hz: self.setup.frequency_hz, refusal };
+        let frequency_hz = self.setup.frequency_hz;
+        let refused =
+            |refusal: GeometryRefusal| ModelError::Geometry { frequency_hz, refusal: refusal.into() };
         let (states, reversed): (Vec<PairState>, Vec<bool>) =
             self.states(positions).map_err(refused)?.into_iter().unzip();
         self.model.visibilities(&states, out).map_err(|source| harmonic(&self.setup, source))?;
@@ -133,7 +135,9 @@ impl VisibilityModel for HarmonicSum {
     }
 
     fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
-        let refused = |refusal| ModelError::Geometry { frequency_hz: self.setup.frequency_hz, refusal };
+        let frequency_hz = self.setup.frequency_hz;
+        let refused =
+            |refusal: GeometryRefusal| ModelError::Geometry { frequency_hz, refusal: refusal.into() };
         let wavelength_m = SPEED_OF_LIGHT_M_S / self.setup.frequency_hz;
         let state = |daughter: &DaughterPosition| {
             let orientation = PairOrientation::single(daughter.r_m, daughter.normal_hat)?;

@@ -30,7 +30,8 @@ pub use time_average::TimeAverage;
 use num_complex::Complex64;
 use thiserror::Error;
 
-use super::harmonic::{GeometryRefusal, HarmonicError};
+use super::general::RowsRefusal;
+use super::harmonic::HarmonicError;
 use super::pixel::Comb;
 use crate::array::scaled_baseline;
 use crate::units::vector::Vec3;
@@ -73,7 +74,7 @@ pub enum ModelError {
         /// Frequency, Hz.
         frequency_hz: f64,
         /// What departs.
-        refusal: GeometryRefusal,
+        refusal: RowsRefusal,
     },
     /// The harmonic model failed.
     #[error("visibility model at {}: {source}", Dimension::Frequency.show(*frequency_hz))]

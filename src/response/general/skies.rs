@@ -1,0 +1,178 @@
+//! Skies in the frames of nodes: rotations of a sky to many of them at once, and back.
+
+use num_complex::Complex64;
+
+use super::lanes::{LANES, Value};
+use super::plan::RowNode;
+use super::turns::{QuarterTurns, place};
+use crate::response::harmonic::degrees;
+use crate::response::harmonic::trigonometry::sin_cos;
+use crate::sky::harmonics::Alm;
+
+/// Skies turned into frames, by mu: real and imaginary parts of `t_{l mu}`, `[l = mu, mu + 2, ..][sky][lane]`.
+pub(super) type Turned = Vec<[Vec<Value>; 2]>;
+
+/// Gives turned skies room for these columns, skies times lanes; what was in it may be there still.
+pub(super) fn make_room(turned: &mut Turned, l_max: usize, columns: usize) {
+    turned.resize_with(l_max + 1, Default::default);
+    for (mu, parts) in turned.iter_mut().enumerate() {
+        parts.iter_mut().for_each(|part| part.resize(degrees(l_max, mu) * columns, 0.0));
+    }
+}
+
+/// Nodes of a batch, and what fills the last vector.
+pub(super) fn lanes_of(nodes: &[RowNode]) -> usize {
+    nodes.len().next_multiple_of(LANES)
+}
+
+/// Room for rotations.
+#[derive(Clone, Debug, Default)]
+pub(super) struct TurnBuffers {
+    phases: Phases,
+    /// Of one degree before or after both quarter turns, and between them: real and imaginary parts.
+    sky: [Vec<Value>; 2],
+    half: [Vec<Value>; 2],
+}
+
+impl TurnBuffers {
+    fn of(&mut self, nodes: &[RowNode], l_max: usize, columns: usize) {
+        self.phases.fill(nodes, l_max);
+        let parts = self.sky.iter_mut().chain(&mut self.half);
+        parts.for_each(|part| part.resize(columns * (l_max + 1), 0.0));
+    }
+}
+
+impl QuarterTurns {
+    /// Skies in the frames of nodes.
+    pub(super) fn turn_skies(
+        &self,
+        nodes: &[RowNode],
+        skies: &[Alm],
+        buffers: &mut TurnBuffers,
+        out: &mut Turned,
+    ) {
+        let (l_max, lanes) = (self.l_max(), lanes_of(nodes));
+        let columns = lanes * skies.len();
+        make_room(out, l_max, columns);
+        buffers.of(nodes, l_max, columns);
+        let TurnBuffers { phases, sky, half } = buffers;
+        for l in 0..=l_max {
+            let [mut sky, half] =
+                [&mut *sky, &mut *half].map(|both| both.each_mut().map(|x| &mut x[..columns * (l + 1)]));
+            for m in 0..=l {
+                for (k, alm) in skies.iter().enumerate() {
+                    let at = place(l, m) * columns + k * lanes;
+                    let [re, im] = sky.each_mut().map(|part| &mut part[at..at + lanes]);
+                    let z = alm.get(l, m).conj();
+                    re.fill(z.re as Value);
+                    im.fill(z.im as Value);
+                    turn(re, im, phases.get(0, m), -1.0);
+                }
+            }
+            let [re, im] = half;
+            self.turn(l, &[0, 1], [&*sky[0], &*sky[1]], [&mut *re, &mut *im]);
+            for k in 0..=l {
+                let at = place(l, k) * columns;
+                turn_all([&mut *re, &mut *im], at, columns, phases.get(1, k), -1.0);
+            }
+            let [to_re, to_im] = sky;
+            self.turn(l, &[l % 2], [&*re, &*im], [&mut *to_re, &mut *to_im]);
+            for mu in (l % 2..=l).step_by(2) {
+                let (from, to) = (place(l, mu) * columns, (l - mu) / 2 * columns);
+                let [re, im] = &mut out[mu];
+                re[to..to + columns].copy_from_slice(&to_re[from..from + columns]);
+                im[to..to + columns].copy_from_slice(&to_im[from..from + columns]);
+                turn_all([&mut *re, &mut *im], to, columns, phases.get(2, mu), -1.0);
+            }
+        }
+    }
+
+    /// The transpose of [`Self::turn_skies`], added to `out`.
+    pub(super) fn turn_skies_back(
+        &self,
+        nodes: &[RowNode],
+        turned: &Turned,
+        buffers: &mut TurnBuffers,
+        out: &mut [Alm],
+    ) {
+        let (l_max, lanes) = (self.l_max(), lanes_of(nodes));
+        let columns = lanes * out.len();
+        buffers.of(nodes, l_max, columns);
+        let TurnBuffers { phases, sky, half } = buffers;
+        for l in 0..=l_max {
+            let [[sky_re, sky_im], [re, im]] =
+                [&mut *sky, &mut *half].map(|both| both.each_mut().map(|x| &mut x[..columns * (l + 1)]));
+            for mu in (l % 2..=l).step_by(2) {
+                let (from, to) = ((l - mu) / 2 * columns, place(l, mu) * columns);
+                sky_re[to..to + columns].copy_from_slice(&turned[mu][0][from..from + columns]);
+                sky_im[to..to + columns].copy_from_slice(&turned[mu][1][from..from + columns]);
+                turn_all([&mut *sky_re, &mut *sky_im], to, columns, phases.get(2, mu), 1.0);
+            }
+            self.turn_back(l, &[l % 2], [&*sky_re, &*sky_im], [&mut *re, &mut *im]);
+            for k in 0..=l {
+                let at = place(l, k) * columns;
+                turn_all([&mut *re, &mut *im], at, columns, phases.get(1, k), 1.0);
+            }
+            self.turn_back(l, &[0, 1], [&*re, &*im], [&mut *sky_re, &mut *sky_im]);
+            for m in 0..=l {
+                for (k, out) in out.iter_mut().enumerate() {
+                    let at = place(l, m) * columns + k * lanes;
+                    let [re, im] = [&mut sky_re[at..at + lanes], &mut sky_im[at..at + lanes]];
+                    turn(re, im, phases.get(0, m), 1.0);
+                    // z = conj(T) conj(phase): the gradient is conj(z' phase).
+                    let sum = |part: &[Value]| part.iter().map(|x| f64::from(*x)).sum::<f64>();
+                    *out.get_mut(l, m) += Complex64::new(sum(re), -sum(im));
+                }
+            }
+        }
+    }
+}
+
+/// Turns the numbers of one order, `[sky][lane]` from a place on.
+fn turn_all([re, im]: [&mut [Value]; 2], at: usize, columns: usize, [cos, sin]: [&[Value]; 2], sign: Value) {
+    let (re, im) = (&mut re[at..at + columns], &mut im[at..at + columns]);
+    for (re, im) in re.chunks_exact_mut(cos.len()).zip(im.chunks_exact_mut(cos.len())) {
+        turn(re, im, [cos, sin], sign);
+    }
+}
+
+/// Turns numbers by phases, or back.
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+fn turn(re: &mut [Value], im: &mut [Value], [cos, sin]: [&[Value]; 2], sign: Value) {
+    for (((re, im), cos), sin) in re.iter_mut().zip(im).zip(cos).zip(sin) {
+        let sin = sign * sin;
+        (*re, *im) = (*re * cos - *im * sin, *re * sin + *im * cos);
+    }
+}
+
+/// Cosines and sines of multiples of the turns of nodes; the last node fills the last vector.
+#[derive(Clone, Debug, Default)]
+struct Phases {
+    stride: usize,
+    lanes: usize,
+    cos: Vec<Value>,
+    sin: Vec<Value>,
+}
+
+impl Phases {
+    fn fill(&mut self, nodes: &[RowNode], l_max: usize) {
+        (self.stride, self.lanes) = (l_max + 1, lanes_of(nodes));
+        self.cos.clear();
+        self.sin.clear();
+        for turn in 0..3 {
+            for k in 0..self.stride {
+                let filled = nodes.iter().chain(nodes.last().into_iter().cycle()).take(self.lanes);
+                for (s, c) in filled.map(|node| sin_cos(k as f64 * node.turns_rad[turn])) {
+                    self.cos.push(c as Value);
+                    self.sin.push(s as Value);
+                }
+            }
+        }
+    }
+
+    /// Of one turn and order: cosines and sines by lane.
+    fn get(&self, turn: usize, k: usize) -> [&[Value]; 2] {
+        let first = (turn * self.stride + k) * self.lanes;
+        [&self.cos[first..first + self.lanes], &self.sin[first..first + self.lanes]]
+    }
+}
