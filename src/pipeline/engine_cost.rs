@@ -33,6 +33,9 @@ const PROBE_APPLICATIONS: f64 = 40.0;
 /// Alphas that the weights of one window reach: as many as their kernel, and those that the plane passes on its way.
 const WINDOW_ALPHAS: f64 = 16.0;
 
+/// Memory of a visibility that is summed on the circle for a refinement: position, data, noise.
+const SUMMED_VISIBILITY_BYTES: f64 = 120.0;
+
 /// Vectors of the unknowns that a solution holds: the basis for W_max, and that of a probe.
 const BASIS_VECTORS: [f64; 2] = [60.0, 120.0];
 
@@ -199,7 +202,10 @@ impl EngineCost {
         let ChannelData { frequency_hz, visibilities, .. } = data;
         let circle = Self::harmonic(map, data);
         let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
-        let held = visibilities.min(map.refine.visibilities_max as f64) * REFINED_VISIBILITY_BYTES as f64;
+        let most = visibilities.min(map.refine.visibilities_max as f64);
+        let held = most * REFINED_VISIBILITY_BYTES as f64;
+        // While they are summed on the circle, integers and numbers are there together, but not yet all that is made of each visibility.
+        let while_summed = circle.sums_bytes - (held - most * SUMMED_VISIBILITY_BYTES);
         let passes = (map.refine.passes_max as f64).min(REFINED_PASSES);
         let l_max = map.degree() as f64;
         let row_s = ROW_S * l_max * (l_max + TAU * u_max);
@@ -219,7 +225,7 @@ impl EngineCost {
             sums_bytes: held,
             copy_bytes: 0.0,
             copies_last: true,
-            other_bytes: circle.other_bytes + 2.0 * circle.sums_bytes + rows + on_the_way,
+            other_bytes: circle.other_bytes + circle.sums_bytes + while_summed.max(0.0) + rows + on_the_way,
             // Forth and back, for the map and its noise, and an inner solution of each.
             solution_s: (passes + 1.0) * (INNER_SOLUTION * circle.solution_s + pass_s)
                 + visibilities * circle.visibility_s,

@@ -373,8 +373,11 @@ impl Refining<'_> {
                 column.energy = dot(&column.residual, &column.direction);
             }
         }
+        // As far as the slower of the two has come: noise has most of its power where little is measured.
+        let passes = |columns: &[Column; 2]| columns.iter().map(|column| column.residuals.len()).max();
+        let residual = |columns: &[Column; 2]| columns.iter().map(Column::relative).fold(0.0, f64::max);
         while columns.iter().any(Column::is_open)
-            && task.report(columns[0].residuals.len(), columns[0].relative())
+            && task.report(passes(&columns).unwrap_or(0), residual(&columns))
         {
             let open = columns.iter().filter(|column| column.is_open());
             let directions: Vec<Alm> =
