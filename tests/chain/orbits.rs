@@ -202,7 +202,8 @@ epsilon = 1e-4
 pictures = false
 "#;
 
-/// Refinement of data of a circle ends after two passes, and leaves the map as it is but for what the fast sums approximate.
+/// Iterated to the end, refinement of data of a circle changes the map by what the fast sums approximate; as usual it finds that their map
+/// will do.
 #[test]
 fn refinement_hardly_changes_the_map_of_a_circle() {
     let place = Workplace::new(CIRCLE);
