@@ -27,6 +27,7 @@ mod notify;
 mod output;
 mod predict;
 mod progress;
+mod rebuild;
 mod recalibrate;
 mod replay;
 mod retract;
@@ -94,6 +95,8 @@ enum Command {
     Export(export::ExportArgs),
     Gaps(gaps::GapsArgs),
     Merge(merge::MergeArgs),
+    /// Make a new state from the raw archive of a ground.
+    Rebuild(rebuild::RebuildArgs),
     Recalibrate(recalibrate::RecalibrateArgs),
     Retract(retract::RetractArgs),
     Compare(compare::CompareArgs),
@@ -161,6 +164,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Export(args) => export::execute(&args),
         Command::Gaps(args) => gaps::execute(&args),
         Command::Merge(args) => merge::execute(&args),
+        Command::Rebuild(args) => rebuild::execute(&args),
         Command::Recalibrate(args) => recalibrate::execute(&args),
         Command::Retract(args) => retract::execute(&args),
         Command::Compare(args) => compare::execute(&args),

@@ -313,8 +313,25 @@ impl Ground {
             (&self.calibrator, self.gate.as_ref()),
             &mut self.accumulator,
         );
+        if written.is_ok() {
+            archive.mark_packets(self.promises.bytes);
+        }
         self.promises.keep(self.collector.packets(), written.is_ok());
+        self.note_unsaved();
         written
+    }
+
+    /// Tells how much no checkpoint holds.
+    fn note_unsaved(&self) {
+        if self.archive.is_some() {
+            let has_new = self.promises.has_new(self.collector.packets());
+            self.outcome.saving.note_received(self.collector.bytes(), has_new);
+        }
+    }
+
+    /// Whether what no checkpoint holds has become old; not of a rank, which writes where the others do.
+    fn is_old(&self) -> bool {
+        !self.ranks().are_many() && self.archive.is_some() && self.outcome.saving.is_old()
     }
 
     /// Writes the last checkpoint of a session. Maps are made even if it fails for good; the outcome says so. Not so with ranks: see
@@ -354,8 +371,9 @@ impl Stage for Ground {
     fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         self.collector.push(&bytes);
         self.advance(out)?;
-        self.promises.bytes = self.collector.bytes();
-        if self.promises.are_due(self.collector.packets()) {
+        self.promises.note_bytes(self.collector.bytes());
+        self.note_unsaved();
+        if self.promises.are_due(self.collector.packets()) || self.is_old() {
             // If it fails, it is tried again while anyone waits.
             let _ = self.checkpoint();
         }

@@ -23,6 +23,7 @@ mod sky_hits;
 mod uvw_density;
 
 pub use self::core::Ground;
+pub use archive::{ARCHIVE_BYTES_MAX, packets_folder};
 pub use collector::{Collector, CollectorState, CollectorStep, CollectorView, DeliveredPacket, Delivery};
 pub use config::{GroundConfig, WAIT_BYTES};
 pub use error::GroundError;

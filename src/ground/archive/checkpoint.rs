@@ -20,7 +20,7 @@ const MAGIC: &[u8; 8] = b"LNRSTA05";
 /// Beginning of the magic in every version.
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
 const VERSION: &str = "a checkpoint of the ground's state, version 05; earlier versions keep less in their journal: \
-                       replay their files into a new folder";
+                       make a new state by `lunarray rebuild`, or replay the files into a new folder";
 /// Bytes of magic, length of the head, and checksum.
 const FIXED_BYTES: u64 = 24;
 

@@ -44,6 +44,11 @@
 //! and a packet of visibilities takes some 100 bytes more, 60 in the received set, which grows with the number of creation
 //! times, and 20 to 40 in the set of blocks, which doubles when it grows.
 //!
+//! # The raw archive
+//! A ground that listens keeps every packet that it accepts in `archive/` beside its checkpoints before it answers `taken`
+//! ([`crate::downlink::transport::packet_archive`]). What came after the checkpoint is applied when the state is opened; a state of
+//! another version is made of it by [`crate::ground::Ground::rebuild`].
+//!
 //! # A checkpoint
 //! Magic `LNRSTA05`; length of the head (u64 LE); head (bincode); the channels' engines as they write
 //! themselves; CRC-64/NVME of all that (u64 LE). It is written under another name, synced and renamed; the previous one
@@ -69,6 +74,7 @@ mod journal;
 mod names;
 mod packet_order;
 mod recalibrate;
+mod recovery;
 mod retract;
 mod sessions;
 mod settings;
@@ -83,6 +89,7 @@ pub use gaps::{
 };
 pub use journal::JournalEntry;
 pub use recalibrate::Recalibrated;
+pub use recovery::{ARCHIVE_BYTES_MAX, packets_folder};
 pub use retract::{RefusedPacket, Retracted};
 pub(super) use store::Archive;
 pub use survey::CoverageSurvey;

@@ -2,7 +2,7 @@
 
 use std::io::ErrorKind;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::calibration_state::CalibrationState;
 use super::checkpoint::{self, ArchiveHead, ArchiveHeadView};
@@ -15,6 +15,7 @@ use crate::accumulation::harmonic::SegmentPlace;
 use crate::accumulation::{AccumulationError, Accumulator};
 use crate::array::Ephemeris;
 use crate::calibration::{AutoTable, Calibrator};
+use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::downlink::{DownlinkError, Kind};
 use crate::frames::{EphemerisSegment, VisibilityReason};
 use crate::ground::lookout::Spotter;
@@ -37,12 +38,12 @@ const SEGMENT: &str = "the visibilities that the checkpoint beside it names";
 pub(in crate::ground) struct Archive {
     pub(super) folder: StateFolder,
     /// Settings that shape the sums.
-    settings: Vec<(String, String)>,
+    pub(super) settings: Vec<(String, String)>,
     /// Number of the calibration that the sums were made with, from 1.
     pub(super) version: u32,
     pub(super) journal: Journal,
     /// Checkpoints that could not be used, in words.
-    notes: Vec<String>,
+    pub(super) notes: Vec<String>,
     /// What applying the current packet posts.
     posts: Ledger<VisibilityReason>,
     /// Visibilities from one checkpoint to the next.
@@ -51,6 +52,8 @@ pub(in crate::ground) struct Archive {
     wait: u64,
     since_attempt: u64,
     saving: SharedSaving,
+    /// The raw archive beside the checkpoints, if there is one.
+    pub(super) packets: Option<PacketArchive>,
 }
 
 impl Archive {
@@ -104,6 +107,14 @@ impl Archive {
         self.posts.take()
     }
 
+    /// Notes in the raw archive what the newest checkpoint holds: so many bytes of what came this session. Without that note they
+    /// are read once more after a restart.
+    pub(in crate::ground) fn mark_packets(&self, passed: u64) {
+        if let (Some(packets), Some(newest)) = (&self.packets, self.folder.newest()) {
+            let _ = packets.mark(newest, passed, &self.folder.numbers());
+        }
+    }
+
     /// Writes a checkpoint, and keeps what became of it. After a failure everything is still there to be written again.
     pub(in crate::ground) fn checkpoint(
         &mut self,
@@ -111,8 +122,9 @@ impl Archive {
         (calibrator, gate): (&Calibrator, Option<&PassGate>),
         accumulator: &mut Accumulator,
     ) -> Result<(), GroundError> {
+        let begun = Instant::now();
         let written = self.write(collector, (calibrator, gate), accumulator);
-        let failed_before = self.saving.update(written.as_ref().err());
+        let failed_before = self.saving.update(written.as_ref().err(), begun);
         self.since_attempt = 0;
         self.wait = match (&written, failed_before) {
             (Ok(()), _) => self.interval,
@@ -264,7 +276,10 @@ impl Opened {
         if config.map.holds_visibilities() && ranks.are_many() {
             return Err(AccumulationError::HeldByRank.into());
         }
-        let mut folder = StateFolder::open_among(folder, ranks)?;
+        let mut folder = match sets_aside || ranks.are_many() {
+            true => StateFolder::open_among(folder, ranks)?,
+            false => StateFolder::open_to_read(folder)?,
+        };
         let settings = settings_of(config)?;
         let posts = Ledger::new();
         let (contents, notes) = folder.load(sets_aside, |path| {
@@ -336,6 +351,7 @@ impl Opened {
             wait,
             since_attempt,
             saving,
+            packets: None,
         };
         let (cancel, linger, steps) = (Cancel::new(), Duration::ZERO, 0);
         let promises = SenderPromises::since(collector.packets());

@@ -19,6 +19,7 @@ use super::sender_intake::{InstrumentCheck, Mission};
 use super::stations::Stations;
 use super::url::TcpUrl;
 use crate::downlink::error::DownlinkError;
+use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::frames::Instrument;
 use crate::runtime::{Flow, Outlet, Source, Units};
 
@@ -35,6 +36,7 @@ pub struct SocketSource {
     running: Option<(Receiver<PacketBatch>, JoinHandle<()>)>,
     room: Arc<Semaphore>,
     held: Option<HeldAnswers>,
+    archive: Option<PacketArchive>,
     stations: Option<Arc<Stations>>,
     stop: Arc<watch::Sender<bool>>,
     listening: Listening,
@@ -66,6 +68,7 @@ impl SocketSource {
             running: None,
             room: Arc::new(Semaphore::new(ListenContext::room_bytes(config))),
             held: None,
+            archive: None,
             stations: None,
             stop: Arc::new(watch::Sender::new(false)),
             listening,
@@ -96,6 +99,13 @@ impl SocketSource {
     #[must_use]
     pub fn answering(mut self, answers: &HeldAnswers) -> Self {
         self.held = Some(answers.clone());
+        self
+    }
+
+    /// Keeps packets in `archive` before it tells a sender that they are taken.
+    #[must_use]
+    pub fn keeping(mut self, archive: &PacketArchive) -> Self {
+        self.archive = Some(archive.clone());
         self
     }
 
@@ -134,7 +144,8 @@ impl SocketSource {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_io()
             .enable_time()
-            .max_blocking_threads(self.config.connections_max)
+            // One more, as packets of a connection that ends reach the disk while another takes its place.
+            .max_blocking_threads(self.config.connections_max + 1)
             .thread_name("listen-work")
             .build()
             .map_err(failed)?;
@@ -154,6 +165,7 @@ impl SocketSource {
             batches,
             passed: Mutex::new(0),
             held: self.held.clone(),
+            archive: self.archive.clone(),
             stations: self.stations.clone(),
             stop: Arc::clone(&self.stop),
             notes: Notes::new(tell),
