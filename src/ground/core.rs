@@ -334,6 +334,12 @@ impl Ground {
         !self.ranks().are_many() && self.archive.is_some() && self.outcome.saving.is_old()
     }
 
+    /// Whether the only checkpoint in the folder is the one that would be written now.
+    pub(super) fn is_written(&self) -> Result<bool, GroundError> {
+        let Some(archive) = &self.archive else { return Ok(false) };
+        archive.is_written(&self.collector, (&self.calibrator, self.gate.as_ref()), &self.accumulator)
+    }
+
     /// Writes the last checkpoint of a session. Maps are made even if it fails for good; the outcome says so. Not so with ranks: see
     /// [`Ground::advance`]; one that was told to end is not where the others are.
     fn last_checkpoint(&mut self) -> Result<(), GroundError> {

@@ -8,7 +8,7 @@ use super::error::PipelineError;
 use super::live_gains::GainsWriter;
 use crate::accumulation::MapConfig;
 use crate::ground::{Ground, GroundConfig, GroundOutcome};
-use crate::products::{ChannelSummary, MapWatch, ProductsError, Provenance, Publisher, Truth};
+use crate::products::{ChannelSummary, MapWatch, ProductsError, ProductsWatch, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link, Sink};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::solve::{RefineRule, Regulariser, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
@@ -78,6 +78,8 @@ pub(super) struct Mapping<'a> {
     pub(super) watch: SolveWatch,
     /// Sees maps.
     pub(super) viewers: MapWatch,
+    /// Is told of products that cannot be written, which then end nothing.
+    pub(super) trouble: Option<ProductsWatch>,
 }
 
 /// Adds the ground segment to `graph`. It takes the bytes of a downlink and nothing else from space.
@@ -91,7 +93,7 @@ pub(super) fn add(
     ground: Ground,
     mapping: Mapping<'_>,
 ) -> Result<SegmentOutcome, PipelineError> {
-    let Mapping { out, truth, watch, viewers } = mapping;
+    let Mapping { out, truth, watch, viewers, trouble } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let ranks = ground.ranks().clone();
     let passes = config.map.refine.is_on().then(|| out.to_owned());
@@ -106,6 +108,7 @@ pub(super) fn add(
     let channels = Arc::clone(&outcome.channels);
     let publisher =
         Publisher::new(config.products.clone(), out, truth, provenance, channels)?.shown_to(viewers);
+    let publisher = trouble.iter().fold(publisher, Publisher::persisting);
     let mut writer = GainsWriter::new(config, out);
     let ground = ground.observed_by(Box::new(move |gains| writer.update(gains)));
     // Sums are large: one waits while another is solved.

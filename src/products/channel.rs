@@ -75,8 +75,27 @@ impl ChannelFolder {
         })
     }
 
-    /// Writes the products of one solution; the complete set if the solution is final.
+    /// Writes the products of one solution; the complete set if the solution is final. If they cannot be written, it is as if there had
+    /// been none, but for viewers, who see the map.
     pub(super) fn publish(
+        &mut self,
+        solution: &Solution,
+        provenance: &Provenance,
+        viewers: &MapWatch,
+    ) -> Result<(), ProductsError> {
+        let (snapshots, beams) = (self.snapshots.len(), self.beams.len());
+        let published = self.publish_whole(solution, provenance, viewers);
+        if published.is_err() {
+            if self.snapshots.len() > snapshots {
+                self.show(None, Origin { provenance, solution }, viewers);
+            }
+            self.snapshots.truncate(snapshots);
+            self.beams.truncate(beams);
+        }
+        published
+    }
+
+    fn publish_whole(
         &mut self,
         solution: &Solution,
         provenance: &Provenance,

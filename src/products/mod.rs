@@ -37,7 +37,7 @@ pub use hips::{Hips, HipsReport};
 pub use latitudes::LatitudeError;
 pub use point_beams::{BeamWidths, PointBeamSummary};
 pub use provenance::Provenance;
-pub use publisher::Publisher;
+pub use publisher::{ProductsReport, ProductsWatch, Publisher};
 pub use runs::{
     BeamFigures, ChannelFigures, Crossing, DiagnosticFigures, EstimateFigures, FitFigures, PowerFigures,
     RunFigures, TraceFigures, crossings, draw_runs, runs_csv, spectra_csv,

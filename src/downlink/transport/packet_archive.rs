@@ -578,3 +578,135 @@ fn is_full(error: &io::Error) -> bool {
     use io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
     matches!(error.kind(), StorageFull | QuotaExceeded | FileTooLarge)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::downlink::wire::{PacketSegment, packet_check};
+
+    /// A packet of visibilities with a payload that nobody decodes.
+    fn packet(count: u64) -> Vec<u8> {
+        let payload = [count as u8; 100];
+        let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(1 << 40));
+        let bytes = crate::downlink::wire::HEADER_BYTES + payload.len() + 4;
+        let header =
+            PacketHeader { kind, segment, count, time, version: crate::downlink::FORMAT_VERSION, bytes };
+        let mut packet = [header.to_bytes().as_slice(), &payload].concat();
+        packet.extend(packet_check(&packet));
+        packet
+    }
+
+    fn packets(counts: std::ops::Range<u64>) -> Vec<u8> {
+        counts.flat_map(packet).collect()
+    }
+
+    fn all_of(folder: &Path) -> (Vec<u8>, ArchiveReading) {
+        let mut found = Vec::new();
+        let take = |piece: Vec<u8>| -> Result<(), DownlinkError> {
+            found.extend(piece);
+            Ok(())
+        };
+        let reading = read_archive(folder, take).unwrap();
+        (found, reading)
+    }
+
+    fn behind(archive: &PacketArchive, checkpoint: u64) -> u64 {
+        let none = |_: Vec<u8>| -> Result<(), DownlinkError> { Ok(()) };
+        archive.read(archive.place_of(Some(checkpoint)), none).unwrap().packets
+    }
+
+    #[test]
+    fn every_packet_is_kept_once_and_marks_say_which_a_checkpoint_lacks() {
+        let place = tempfile::tempdir().unwrap();
+        let archive = PacketArchive::open(place.path(), u64::MAX).unwrap();
+        // The last two come again, as from a second station.
+        let first = packets(0..5);
+        let ticket = archive.append(&first, first.len() as u64).unwrap();
+        archive.append(&packets(3..8), 2 * first.len() as u64).unwrap();
+        archive.sync(ticket).unwrap();
+        assert_eq!(all_of(place.path()).0, packets(0..8));
+        // Checkpoint 7 holds the first piece, 8 both.
+        archive.mark(7, first.len() as u64, &[7]).unwrap();
+        archive.mark(8, 2 * first.len() as u64, &[7, 8]).unwrap();
+        assert_eq!([behind(&archive, 6), behind(&archive, 7), behind(&archive, 8)], [8, 3, 0]);
+        drop(archive);
+        // Another session begins a segment of its own, and goes on.
+        let archive = PacketArchive::open(place.path(), u64::MAX).unwrap();
+        assert_eq!([behind(&archive, 7), behind(&archive, 8)], [3, 0]);
+        archive.append(&packets(8..9), 130).unwrap();
+        assert_eq!([behind(&archive, 8), archive.report().segments], [1, 2]);
+        // Marks that are damaged are none: everything is read.
+        let marks = std::fs::read_to_string(place.path().join(MARKS)).unwrap();
+        std::fs::write(place.path().join(MARKS), marks.replacen('8', "9", 1)).unwrap();
+        assert_eq!(bytes_behind(place.path(), Some(8)).unwrap(), packets(0..9).len() as u64);
+    }
+
+    #[test]
+    fn a_flipped_bit_costs_a_packet_and_a_torn_end_what_was_never_answered() {
+        let place = tempfile::tempdir().unwrap();
+        let archive = PacketArchive::open(place.path(), u64::MAX).unwrap();
+        archive.append(&packets(0..4), 1).unwrap();
+        drop(archive);
+        let path = place.path().join(segment_name(1));
+        let mut bytes = std::fs::read(&path).unwrap();
+        let length = packet(0).len();
+        bytes[length + 50] ^= 4;
+        bytes.truncate(4 * length - 30);
+        std::fs::write(&path, bytes).unwrap();
+        // What follows in the next segment is not taken for the rest of the torn one.
+        let archive = PacketArchive::open(place.path(), u64::MAX).unwrap();
+        archive.append(&packets(4..6), 1).unwrap();
+        let (found, reading) = all_of(place.path());
+        assert_eq!(found, [packets(0..1), packets(2..3), packets(4..6)].concat());
+        assert_eq!((reading.packets, reading.damaged > 1), (4, true));
+    }
+
+    #[test]
+    fn retracted_packets_stay_out_until_they_come_again() {
+        let place = tempfile::tempdir().unwrap();
+        let archive = PacketArchive::open(place.path(), u64::MAX).unwrap();
+        archive.append(&packets(0..3), 1).unwrap();
+        archive.retract(&[(Kind::Visibilities, 1, CucTime(1 << 40))]).unwrap();
+        assert_eq!(all_of(place.path()).0, [packet(0), packet(2)].concat());
+        archive.append(&packets(0..3), 2).unwrap();
+        assert_eq!(all_of(place.path()).0, [packet(0), packet(2), packet(1)].concat());
+        drop(archive);
+        // A list that is damaged would bring them back without a word.
+        let list = place.path().join(RETRACTED);
+        let text = std::fs::read_to_string(&list).unwrap();
+        std::fs::write(&list, text.replacen("259", "258", 1)).unwrap();
+        assert!(PacketArchive::open(place.path(), u64::MAX).is_err());
+    }
+
+    #[test]
+    fn what_could_not_be_written_is_not_taken_and_is_written_when_it_comes_again() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("archive");
+        let archive = PacketArchive::open(&folder, u64::MAX).unwrap();
+        std::fs::rename(&folder, place.path().join("gone")).unwrap();
+        assert!(archive.append(&packets(0..3), 1).is_err());
+        assert_eq!((archive.report().failed, archive.report().unwritten.is_some()), (1, true));
+        std::fs::rename(place.path().join("gone"), &folder).unwrap();
+        let ticket = archive.append(&packets(0..3), 2).unwrap();
+        archive.sync(ticket).unwrap();
+        assert_eq!(all_of(&folder).0, packets(0..3));
+        assert_eq!(archive.report().unwritten, None);
+    }
+
+    #[test]
+    fn beyond_its_size_the_oldest_segments_go_that_all_checkpoints_hold() {
+        let place = tempfile::tempdir().unwrap();
+        // Three sessions, a segment each.
+        for count in 0..3 {
+            let archive = PacketArchive::open(place.path(), 1).unwrap();
+            archive.append(&packets(count..count + 1), 1).unwrap();
+            // A checkpoint of nothing of it, and one of the first two segments.
+            archive.mark(1 + count, 0, &[count, 1 + count]).unwrap();
+        }
+        let archive = PacketArchive::open(place.path(), 1).unwrap();
+        assert_eq!(archive.report().is_whole, false);
+        let left = all_of(place.path());
+        // Checkpoint 2 holds the first, checkpoint 3 the first two: only the first may go.
+        assert_eq!((left.0, left.1.first_segment), (packets(1..3), 2));
+    }
+}

@@ -110,6 +110,23 @@ pub(super) fn write(
     out.write_all(&crc.to_le_bytes()).map_err(failed())
 }
 
+/// Whether a checkpoint holds, and has this head.
+pub(super) fn is_of_head(path: &Path, head: &ArchiveHeadView<'_>) -> Result<bool, GroundError> {
+    let found = read(path, |head, engines| {
+        std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
+        Ok(head.checksum)
+    });
+    let crc = Digest::new(CrcAlgorithm::Crc64Nvme);
+    let mut nothing = std::io::sink();
+    let mut pieces = BufWriter::with_capacity(1 << 16, ChecksumWriter { inner: &mut nothing, crc });
+    let encoded = bincode::encode_into_std_write(head, &mut pieces, bincode::config::standard());
+    let crc = match pieces.into_inner() {
+        Ok(summed) => summed.crc,
+        Err(_) => return Ok(false),
+    };
+    Ok(encoded.is_ok() && found.is_ok_and(|found| found == crc.finalize()))
+}
+
 /// Whether a file begins as a checkpoint of any version does.
 pub(super) fn is_checkpoint(path: &Path) -> Result<bool, GroundError> {
     let mut magic = Vec::new();

@@ -169,7 +169,7 @@ impl StateFolder {
         if self.segments.len() < self.held.len() || self.check_place().is_err() || self.ranks.are_many() {
             return;
         }
-        let named = || self.segments.values().flatten().map(HeldSegment::file_name);
+        let named = || self.segments.values().flatten().flat_map(HeldSegment::file_names);
         for entry in read_folder(&self.path).into_iter().flatten().flatten() {
             let name = entry.file_name();
             let name = name.to_string_lossy();

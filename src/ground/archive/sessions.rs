@@ -49,7 +49,7 @@ impl Ground {
     /// Merges archives into a new one, in the folder `into`; those of `parts` stay as they are.
     ///
     /// # Errors
-    /// A folder that holds an archive already, or is one of the parts; an archive that is named twice; archives of different instruments or
+    /// A folder that holds another archive already, or is one of the parts; an archive that is named twice; archives of different instruments or
     /// settings, or that hold the same visibilities.
     pub fn merge(into: &Path, parts: &[PathBuf], config: &GroundConfig) -> Result<Self, GroundError> {
         let mut whole: Option<Opened> = None;
@@ -75,12 +75,15 @@ impl Ground {
         }
         let mut whole = whole.ok_or_else(|| GroundError::without_checkpoint(into))?;
         whole.move_to(StateFolder::open(into)?);
-        if !checkpoints(into)?.is_empty() {
-            return Err(GroundError::Occupied { path: into.to_owned() });
-        }
+        let is_new = checkpoints(into)?.is_empty();
         let mut ground = whole.resume(config, u64::MAX)?;
         ground.advance(&mut Outlet::collect())?;
-        ground.checkpoint()?;
+        match is_new {
+            true => ground.checkpoint()?,
+            // A merge that was ended after its checkpoint was written, and is repeated.
+            false if ground.is_written()? => {}
+            false => return Err(GroundError::Occupied { path: into.to_owned() }),
+        }
         Ok(ground)
     }
 

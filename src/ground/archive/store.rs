@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::calibration_state::CalibrationState;
 use super::checkpoint::{self, ArchiveHead, ArchiveHeadView};
 use super::draft::RecordDraft;
-use super::folder::StateFolder;
+use super::folder::{StateFolder, checkpoints};
 use super::journal::{Journal, OtherRecord};
 use super::names::parts_with;
 use super::settings::{compare, settings_of};
@@ -134,6 +134,21 @@ impl Archive {
         written
     }
 
+    /// Whether the only checkpoint of the folder is the one that would be written now: the sums follow from its journal.
+    pub(in crate::ground) fn is_written(
+        &self,
+        collector: &Collector,
+        (calibrator, gate): (&Calibrator, Option<&PassGate>),
+        accumulator: &Accumulator,
+    ) -> Result<bool, GroundError> {
+        let found = checkpoints(self.folder.path())?;
+        let [only] = &found[..] else { return Ok(false) };
+        let no_autos = AutoTable::default();
+        let of = HeadOf { settings: &self.settings, journal: &self.journal, version: self.version };
+        let head = of.view(collector, (calibrator, gate), accumulator, &no_autos);
+        checkpoint::is_of_head(only, &head)
+    }
+
     fn write(
         &mut self,
         collector: &Collector,
@@ -141,18 +156,8 @@ impl Archive {
         accumulator: &mut Accumulator,
     ) -> Result<(), GroundError> {
         let no_autos = AutoTable::default();
-        let head = ArchiveHeadView {
-            settings: &self.settings,
-            collector: collector.view(),
-            ephemeris: calibrator.ephemeris().segments().collect(),
-            autos: calibrator.autos().unwrap_or(&no_autos),
-            accumulator: accumulator.state(),
-            journal: &self.journal,
-            calibration: CalibrationState {
-                version: self.version,
-                passes: gate.map(PassGate::state).unwrap_or_default(),
-            },
-        };
+        let of = HeadOf { settings: &self.settings, journal: &self.journal, version: self.version };
+        let head = of.view(collector, (calibrator, gate), accumulator, &no_autos);
         let (folder, number) = self.folder.next();
         let place = SegmentPlace { folder: &folder, number };
         self.folder.save(|out, path| {
@@ -165,6 +170,37 @@ impl Archive {
         self.folder.names(accumulator.segments());
         self.folder.remove_unnamed();
         Ok(())
+    }
+}
+
+/// What an archive adds to the head of a checkpoint.
+struct HeadOf<'a> {
+    settings: &'a Vec<(String, String)>,
+    journal: &'a Journal,
+    version: u32,
+}
+
+impl<'a> HeadOf<'a> {
+    /// What a checkpoint has besides the sums.
+    fn view(
+        &self,
+        collector: &'a Collector,
+        (calibrator, gate): (&'a Calibrator, Option<&PassGate>),
+        accumulator: &Accumulator,
+        no_autos: &'a AutoTable,
+    ) -> ArchiveHeadView<'a> {
+        ArchiveHeadView {
+            settings: self.settings,
+            collector: collector.view(),
+            ephemeris: calibrator.ephemeris().segments().collect(),
+            autos: calibrator.autos().unwrap_or(no_autos),
+            accumulator: accumulator.state(),
+            journal: self.journal,
+            calibration: CalibrationState {
+                version: self.version,
+                passes: gate.map(PassGate::state).unwrap_or_default(),
+            },
+        }
     }
 }
 
