@@ -53,6 +53,10 @@ use serde_json::Value;
 use log::{Level, LogFormat};
 use output::{Completion, is_broken_pipe, print_error};
 
+use crate::ground::GroundError;
+use crate::pipeline::{ConfigError, PipelineError};
+use crate::units::InvalidValue;
+
 /// Simulate a lunar-orbit radio interferometer, and map the sky from its downlink.
 ///
 /// Below 30 MHz the ionosphere hides the sky. Eight small satellites in lunar orbit correlate their signals while the
@@ -121,12 +125,69 @@ fn asks_for_json(words: &[OsString]) -> bool {
     words.windows(2).any(is_option) || words.iter().any(|word| word == "--log=json")
 }
 
-/// Exit code of a failure.
+/// Exit code of a failure: of the data, or any other.
 const FAILED: u8 = 1;
+
+/// Exit code of a configuration that cannot be used, as of wrong usage: to start again is of no use.
+const MISCONFIGURED: u8 = 2;
+
+/// Exit code of what the system refused: a disk, a socket, a lock, memory.
+const SYSTEM: u8 = 3;
+
+/// The code that says of which sort a failure is.
+fn exit_code(error: &(dyn std::error::Error + 'static)) -> u8 {
+    let causes = || std::iter::successors(Some(error), |error| error.source());
+    if causes().any(is_configuration) {
+        return MISCONFIGURED;
+    }
+    match causes().any(is_of_system) {
+        true => SYSTEM,
+        false => FAILED,
+    }
+}
+
+fn is_configuration(error: &(dyn std::error::Error + 'static)) -> bool {
+    let is_of_ground = |error: &GroundError| {
+        use GroundError::{FilesOfState, MergedIntoPart, NamedTwice, Occupied, Settings};
+        matches!(
+            error,
+            Settings { .. }
+                | FilesOfState { .. }
+                | Occupied { .. }
+                | NamedTwice { .. }
+                | MergedIntoPart { .. }
+        )
+    };
+    let of_pipeline = error.downcast_ref::<PipelineError>().is_some_and(|error| match error {
+        PipelineError::Config(_) | PipelineError::Invalid(_) => true,
+        PipelineError::Ground(error) => is_of_ground(error),
+        _ => false,
+    });
+    of_pipeline
+        || error.is::<ConfigError>()
+        || error.is::<InvalidValue>()
+        || error.downcast_ref::<GroundError>().is_some_and(is_of_ground)
+}
+
+fn is_of_system(error: &(dyn std::error::Error + 'static)) -> bool {
+    let is_locked =
+        |error: &GroundError| matches!(error, GroundError::Locked { .. } | GroundError::FolderLost { .. });
+    let of_pipeline = error.downcast_ref::<PipelineError>().is_some_and(|error| match error {
+        PipelineError::Unsaved { .. } | PipelineError::Memory { .. } => true,
+        PipelineError::Ground(error) => is_locked(error),
+        _ => false,
+    });
+    of_pipeline
+        || error
+            .downcast_ref::<std::io::Error>()
+            .is_some_and(|error| error.kind() != std::io::ErrorKind::InvalidData)
+        || error.downcast_ref::<GroundError>().is_some_and(is_locked)
+}
 
 /// Runs the command on the process's command line and returns the exit code.
 ///
-/// 0: done, also if the reader of standard output has gone. 1: failed, with the reason on standard error. 2: wrong usage.
+/// 0: done, also if the reader of standard output has gone. 1: failed, with the reason on standard error. 2: wrong usage, or a
+/// configuration that cannot be used. 3: the system refused: a disk, a socket, a lock, memory.
 /// 128 and the number of the signal: ended early, by Ctrl-C with 130, by SIGTERM with 143, by SIGHUP with 129; a second
 /// signal ends the process at once with the same code. For a ground that listens or follows, SIGTERM is the regular end: 0.
 #[must_use]
@@ -188,7 +249,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Err(error) if is_broken_pipe(error.as_ref()) => 0,
         Err(error) => {
             print_error(error.as_ref());
-            FAILED
+            exit_code(error.as_ref())
         }
     }
 }

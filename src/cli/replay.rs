@@ -213,7 +213,7 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     }
     let saving = ground.outcome().saving;
     let interrupt = Interrupt::default();
-    let page = args.serve.start(&config, "ground", args.state.as_deref())?;
+    let page = args.serve.start(&config, "ground", args.state.as_deref(), Some(&args.out))?;
     let events = args.events.start(&config, "ground")?;
     let session = Session { args, config: &config, job, interrupt: &interrupt, page: &page, events: &events };
     let ended = match &args.listen {
@@ -225,6 +225,9 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     }
     let ended = page.conclude(ended, |summary| summary.cancelled);
     events.conclude(&ended, |summary| summary.cancelled);
+    if ended.is_err() && (args.listen.is_some() || args.follow) {
+        page.tell_failure(&interrupt);
+    }
     let summary = ended.inspect_err(|error| {
         let told = matches!(error.downcast_ref::<PipelineError>(), Some(PipelineError::Unsaved { .. }));
         // Another failure must not hide that nothing was saved.

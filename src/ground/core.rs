@@ -1,5 +1,6 @@
 //! The ground as one stage: bytes of a downlink to sums.
 
+use std::sync::atomic::Ordering;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
@@ -288,6 +289,14 @@ impl Ground {
         // First, so that nobody sees counters that are newer.
         self.spotter.show(occasion, &self.collector, self.calibrator.ephemeris());
         fill(&self.outcome.reception, self.collector.counters());
+        self.outcome.waiting_bytes.store(self.collector.held().waiting_bytes(), Ordering::Relaxed);
+    }
+
+    /// Shows what earlier sessions have received, before anything comes.
+    pub(super) fn show_state(&mut self, latest_s: Option<f64>) {
+        self.spotter.resume(latest_s, &self.collector, self.calibrator.ephemeris());
+        fill(&self.outcome.reception, self.collector.counters());
+        self.outcome.waiting_bytes.store(self.collector.held().waiting_bytes(), Ordering::Relaxed);
     }
 
     /// Packets of visibilities that are known to be missing.

@@ -1,6 +1,7 @@
 //! What the ground leaves behind besides its sums.
 
 use std::fmt;
+use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -26,6 +27,8 @@ pub struct GroundOutcome {
     pub autos: Arc<Mutex<Vec<AutoPower>>>,
     /// The gains that it finds, if it finds any.
     pub gains: Option<SolvedGains>,
+    /// Bytes of visibilities that wait for their positions; while the stage works, as of a few steps ago.
+    pub waiting_bytes: Arc<AtomicU64>,
     /// How its checkpoints went, at any time.
     pub saving: SharedSaving,
     /// Where visitors see it at work.

@@ -192,7 +192,8 @@ impl Screen {
         let ledger = &self.status["ledger"];
         let phase = text(&self.status["phase"]);
         let is_over = phase == "ended" || phase == "failed";
-        let rest = number(&ledger["unaccounted"]);
+        // Null while it is not known.
+        let rest = ledger["unaccounted"].as_f64().unwrap_or(0.0);
         let (verdict, style) = match (is_over, rest == 0.0) {
             (true, true) => ("closed".to_owned(), GOOD),
             (true, false) => (format!("does not close: {} unaccounted", count(rest)), BAD),
@@ -200,7 +201,10 @@ impl Screen {
         };
         let entry = |name: String, value: &Value| Line::from(format!("{:>15}  {name}", whole(value)));
         let mut lines = vec![Line::styled(verdict, style)];
-        lines.push(entry("sampled".into(), &ledger["sampled"]));
+        lines.push(match ledger["sampled"].is_null() {
+            true => Line::from(format!("{:>15}  sampled: told at the end", "\u{2013}")),
+            false => entry("sampled".into(), &ledger["sampled"]),
+        });
         lines.push(entry("accumulated".into(), &ledger["accumulated"]));
         if let Some(flagged) = ledger["flagged"].as_object() {
             lines.extend(

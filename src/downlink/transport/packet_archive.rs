@@ -77,6 +77,12 @@ pub struct ArchiveReport {
 #[derive(Clone)]
 pub struct PacketArchive(Arc<Shared>);
 
+impl std::fmt::Debug for PacketArchive {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("PacketArchive").field(&self.report()).finish()
+    }
+}
+
 struct Shared {
     writer: Mutex<Writer>,
     /// Of those who wait for the disk, one at a time asks for it, for all.

@@ -38,6 +38,8 @@ impl Ground {
         let mut ground = Opened::among(folder, config, true, ranks)?.resume(config, checkpoint_every)?;
         // One of several ranks applies what there is, and leaves the archive to grounds that listen.
         ground.recover(folder, !ranks.are_many())?;
+        let latest_s = ground.archive.as_ref().and_then(|archive| archive.journal.latest_s());
+        ground.show_state(latest_s);
         Ok(ground)
     }
 

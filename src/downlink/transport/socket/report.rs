@@ -10,6 +10,7 @@ use serde::Serialize;
 
 use crate::downlink::receive::Listing;
 use crate::downlink::receive::ReceptionCounters;
+use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::downlink::wire::Format;
 
 /// Begins an answer after which a sender may try again.
@@ -227,6 +228,11 @@ impl ListenReport {
         reception.add_stream(&self.streams);
     }
 
+    /// Stations that may send.
+    pub(super) fn know<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
+        self.stations.extend(names.map(|name| (name.to_owned(), StationCounts::default())));
+    }
+
     /// Counts bytes from a station; `is_sound` if there was a sound packet or frame among them.
     pub(super) fn hear(&mut self, station: &str, bytes: u64, is_sound: bool) {
         if !self.stations.contains_key(station) {
@@ -326,6 +332,8 @@ impl ListenStatus {
 pub struct Listening {
     /// Live status.
     pub status: Arc<ListenStatus>,
+    /// Where packets are kept before they are taken, if they are.
+    pub archive: Option<PacketArchive>,
     report: Arc<Mutex<ListenReport>>,
 }
 

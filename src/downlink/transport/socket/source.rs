@@ -106,12 +106,15 @@ impl SocketSource {
     #[must_use]
     pub fn keeping(mut self, archive: &PacketArchive) -> Self {
         self.archive = Some(archive.clone());
+        self.listening.archive = Some(archive.clone());
         self
     }
 
     /// Takes packets of these stations only.
     #[must_use]
     pub fn of_stations(mut self, stations: Stations) -> Self {
+        // Also those that never send.
+        self.listening.write().know(stations.names());
         self.stations = Some(Arc::new(stations));
         self
     }
