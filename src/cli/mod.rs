@@ -13,6 +13,7 @@ mod cutout;
 mod events;
 mod explain;
 mod export;
+mod extract;
 mod figure;
 mod gaps;
 mod geometry;
@@ -97,9 +98,9 @@ enum Command {
     Inspect(inspect::InspectArgs),
     Corrupt(corrupt::CorruptArgs),
     Export(export::ExportArgs),
+    Extract(extract::ExtractArgs),
     Gaps(gaps::GapsArgs),
     Merge(merge::MergeArgs),
-    /// Make a new state from the raw archive of a ground.
     Rebuild(rebuild::RebuildArgs),
     Recalibrate(recalibrate::RecalibrateArgs),
     Retract(retract::RetractArgs),
@@ -223,6 +224,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Inspect(args) => inspect::execute(&args),
         Command::Corrupt(args) => corrupt::execute(&args),
         Command::Export(args) => export::execute(&args),
+        Command::Extract(args) => extract::execute(&args),
         Command::Gaps(args) => gaps::execute(&args),
         Command::Merge(args) => merge::execute(&args),
         Command::Rebuild(args) => rebuild::execute(&args),

@@ -45,6 +45,8 @@ fn every_command_has_help_that_teaches() {
         "cutout",
         "gaps",
         "merge",
+        "rebuild",
+        "extract",
         "retract",
         "recalibrate",
         "bench",

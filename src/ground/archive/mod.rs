@@ -56,7 +56,7 @@
 //! that the system fails to read: that is an error, after which the folder is as it was.
 //!
 //! With `map.refine` the visibilities themselves are kept: in segment files beside the checkpoint, which names each with its checksum. A
-//! segment never changes, and goes once no checkpoint names it. One that is damaged or missing makes its checkpoint a damaged one.
+//! segment never changes, is there twice, and goes once no checkpoint names it. One of which both files are damaged or missing makes its checkpoint a damaged one.
 //!
 //! Ranks of a job (`--mpi`) write a file each, `checkpoint-00000007.2-of-4.lunarray`: the whole head, and of the sums those that the
 //! rank holds. The heads of a set are equal, or it is damaged. Any number of ranks reads a set, and so does a process alone.
