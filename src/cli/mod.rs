@@ -27,6 +27,7 @@ mod merge;
 mod notify;
 mod output;
 mod predict;
+mod printable_text;
 mod progress;
 mod rebuild;
 mod recalibrate;

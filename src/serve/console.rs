@@ -16,10 +16,10 @@ use super::subject::Subject;
 use crate::array::Array;
 use crate::downlink::transport::packet_archive::{ArchiveReport, PacketArchive};
 use crate::ground::{GroundOutcome, HitsMap, PassLine, PowerWaterfall, SavingReport, UvwDensity};
+use crate::imaging::Solving;
 use crate::pipeline::Watched;
 use crate::products::{MapViewer, ProductsReport, ProductsWatch, PublishedMap};
 use crate::runtime::{Metrics, StageProgress};
-use crate::solve::Solving;
 use crate::units::ChannelId;
 
 /// Most senders in a status; it goes out twice a second.

@@ -7,8 +7,8 @@ use super::checkpoint;
 use super::folder::{StateFolder, checkpoints};
 use super::recovery::{kept_settings, require_saved};
 use super::store::{Archive, Opened};
-use crate::accumulation::Snapshot;
 use crate::ground::{Ground, GroundConfig, GroundError};
+use crate::imaging::Snapshot;
 use crate::ranks::Ranks;
 use crate::runtime::{Outlet, Stage};
 

@@ -10,11 +10,11 @@ use super::gaps::{Gaps, PositionsPacket, ReceivedPackets, VisibilityPacket, find
 use super::journal::JournalEntry;
 use super::names::number_of;
 use super::recovery::unsaved_note;
-use crate::accumulation::{Accumulator, MapConfig};
 use crate::array::Ephemeris;
 use crate::downlink::ReceptionCounters;
 use crate::frames::GroundFrame;
 use crate::ground::{Collector, DeliveredPacket, Delivery, GroundError};
+use crate::imaging::{Accumulator, MapConfig};
 use crate::runtime::Ledger;
 
 /// Capacity of the hold buffer while a file is read.
