@@ -111,6 +111,7 @@ impl Publisher {
         if !self.channels.contains_key(&channel) {
             let truth = self.truth.channel(channel);
             let opened = ChannelFolder::open(&self.folder, &self.config, truth, solution)?;
+            let opened = if self.trouble.is_some() { opened.leaving_room() } else { opened };
             self.channels.insert(channel, opened);
         }
         if let Some(folder) = self.channels.get_mut(&channel) {

@@ -1,7 +1,7 @@
 //! The same figures for Prometheus, in the text format that it scrapes.
 
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use prometheus_client::collector::Collector;
@@ -15,6 +15,7 @@ use super::console::Console;
 use super::status::{Phase, Status};
 use crate::downlink::Kind;
 use crate::downlink::transport::socket::ConnectionEnd;
+use crate::files::disk_room;
 use crate::pipeline::MemoryLimit;
 use crate::runtime::{DurationCounts, StageProgress};
 use crate::units::Reason;
@@ -40,16 +41,6 @@ struct Scrape {
     folders: Vec<(&'static str, PathBuf)>,
     status: Status,
     progress: Vec<StageProgress>,
-}
-
-/// Room and size of the disk that a folder is on, bytes.
-fn disk_room(folder: &Path) -> Option<[u64; 2]> {
-    #[cfg(unix)]
-    return rustix::fs::statvfs(folder).ok().map(|found| {
-        [found.f_bavail.saturating_mul(found.f_frsize), found.f_blocks.saturating_mul(found.f_frsize)]
-    });
-    #[cfg(not(unix))]
-    return folder.file_name().and(None);
 }
 
 /// Memory of this process, bytes; `None` where the system does not tell.
