@@ -40,6 +40,8 @@ pub struct Ground {
     pub(super) cancel: Cancel,
     /// How long it goes on adding then, if there is no archive.
     pub(super) linger: Duration,
+    /// Whether it begins with a snapshot of what earlier sessions have summed.
+    pub(super) begins_with_maps: bool,
     /// Steps so far.
     pub(super) steps: u64,
     /// To senders that wait for a checkpoint.
@@ -67,6 +69,7 @@ impl Ground {
             archive: None,
             cancel: Cancel::new(),
             linger: Duration::ZERO,
+            begins_with_maps: false,
             steps: 0,
             promises: SenderPromises::default(),
         })
@@ -98,6 +101,13 @@ impl Ground {
     #[must_use]
     pub fn answering(self, answers: &HeldAnswers) -> Self {
         Self { promises: self.promises.answering(answers), ..self }
+    }
+
+    /// Begins with a snapshot of what earlier sessions have summed, if snapshots are wanted: a ground that was started again has maps at
+    /// once, and not when the next one is due.
+    #[must_use]
+    pub fn beginning_with_maps(self) -> Self {
+        Self { begins_with_maps: true, ..self }
     }
 
     /// Tells `observer` of each pass whose gains it has found, on its own thread.
@@ -340,7 +350,8 @@ impl Ground {
 
     /// Whether what no checkpoint holds has become old; not of a rank, which writes where the others do.
     fn is_old(&self) -> bool {
-        !self.ranks().are_many() && self.archive.is_some() && self.outcome.saving.is_old()
+        let saves = self.archive.as_ref().is_some_and(Archive::saves_on_the_way);
+        saves && !self.ranks().are_many() && self.outcome.saving.is_old()
     }
 
     /// Whether the only checkpoint in the folder is the one that would be written now.
@@ -384,6 +395,9 @@ impl Stage for Ground {
     type Error = GroundError;
 
     fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
+        if std::mem::take(&mut self.begins_with_maps) {
+            self.accumulator.emit_resumed(out)?;
+        }
         self.collector.push(&bytes);
         self.advance(out)?;
         self.promises.note_bytes(self.collector.bytes());

@@ -12,6 +12,7 @@ mod log;
 mod pace;
 mod page;
 mod panels;
+mod restart;
 mod senders;
 mod service;
 mod serving;

@@ -259,28 +259,6 @@ impl PacketArchive {
         }
     }
 
-    /// Where a checkpoint ends: what is behind it the checkpoint may lack.
-    #[must_use]
-    pub fn place_of(&self, checkpoint: Option<u64>) -> ArchivePlace {
-        place_in(&self.writer().marks, checkpoint)
-    }
-
-    /// Gives `take` the packets behind a place, in pieces of whole packets, but for retracted ones; see [`read_archive`].
-    ///
-    /// # Errors
-    /// A segment that cannot be read; the first error of `take`.
-    pub fn read<E: From<DownlinkError>>(
-        &self,
-        from: ArchivePlace,
-        take: impl FnMut(Vec<u8>) -> Result<(), E>,
-    ) -> Result<ArchiveReading, E> {
-        let (folder, retracted) = {
-            let writer = self.writer();
-            (writer.folder.clone(), writer.retracted.clone())
-        };
-        read_segments(&folder, from, &retracted, take)
-    }
-
     fn writer(&self) -> MutexGuard<'_, Writer> {
         self.0.writer.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -443,6 +421,19 @@ pub fn read_archive<E: From<DownlinkError>>(
 ) -> Result<ArchiveReading, E> {
     let retracted = read_retracted(folder)?;
     read_segments(folder, ArchivePlace::default(), &retracted, take)
+}
+
+/// As [`read_archive`], of the packets behind the place up to which a checkpoint holds the archive; all without a checkpoint.
+///
+/// # Errors
+/// Likewise.
+pub fn read_behind<E: From<DownlinkError>>(
+    folder: &Path,
+    checkpoint: Option<u64>,
+    take: impl FnMut(Vec<u8>) -> Result<(), E>,
+) -> Result<ArchiveReading, E> {
+    let retracted = read_retracted(folder)?;
+    read_segments(folder, place_in(&read_marks(folder), checkpoint), &retracted, take)
 }
 
 /// Bytes behind the place up to which a checkpoint holds the archive in a folder; nothing is locked or written.
@@ -616,9 +607,9 @@ mod tests {
         (found, reading)
     }
 
-    fn behind(archive: &PacketArchive, checkpoint: u64) -> u64 {
+    fn behind(folder: &Path, checkpoint: u64) -> u64 {
         let none = |_: Vec<u8>| -> Result<(), DownlinkError> { Ok(()) };
-        archive.read(archive.place_of(Some(checkpoint)), none).unwrap().packets
+        read_behind(folder, Some(checkpoint), none).unwrap().packets
     }
 
     #[test]
@@ -634,13 +625,13 @@ mod tests {
         // Checkpoint 7 holds the first piece, 8 both.
         archive.mark(7, first.len() as u64, &[7]).unwrap();
         archive.mark(8, 2 * first.len() as u64, &[7, 8]).unwrap();
-        assert_eq!([behind(&archive, 6), behind(&archive, 7), behind(&archive, 8)], [8, 3, 0]);
+        assert_eq!([behind(place.path(), 6), behind(place.path(), 7), behind(place.path(), 8)], [8, 3, 0]);
         drop(archive);
         // Another session begins a segment of its own, and goes on.
         let archive = PacketArchive::open(place.path(), u64::MAX).unwrap();
-        assert_eq!([behind(&archive, 7), behind(&archive, 8)], [3, 0]);
+        assert_eq!([behind(place.path(), 7), behind(place.path(), 8)], [3, 0]);
         archive.append(&packets(8..9), 130).unwrap();
-        assert_eq!([behind(&archive, 8), archive.report().segments], [1, 2]);
+        assert_eq!([behind(place.path(), 8), archive.report().segments], [1, 2]);
         // Marks that are damaged are none: everything is read.
         let marks = std::fs::read_to_string(place.path().join(MARKS)).unwrap();
         std::fs::write(place.path().join(MARKS), marks.replacen('8', "9", 1)).unwrap();

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::folder::checkpoints;
 use crate::downlink::transport::packet_archive::{
-    ArchiveReading, PacketArchive, PacketName, bytes_behind, read_archive,
+    ArchiveReading, PacketArchive, PacketName, bytes_behind, read_archive, read_behind,
 };
 use crate::files::write_atomically;
 use crate::ground::{Ground, GroundConfig, GroundError};
@@ -34,13 +34,12 @@ impl Ground {
             return Ok(());
         }
         let checkpoint = self.archive.as_ref().and_then(|archive| archive.folder.newest());
-        if bytes_behind(&folder, checkpoint)? > 0 || keeps {
-            let packets = PacketArchive::open(&folder, u64::MAX)?;
-            let reading = packets.read(packets.place_of(checkpoint), |piece| self.take_piece(piece))?;
-            self.note_recovered(&folder, reading);
-            if keeps && let Some(archive) = &mut self.archive {
-                archive.packets = Some(packets);
-            }
+        // Nobody else writes there from now on.
+        let packets = keeps.then(|| PacketArchive::open(&folder, u64::MAX)).transpose()?;
+        let reading = read_behind(&folder, checkpoint, |piece| self.take_piece(piece))?;
+        self.note_recovered(&folder, reading);
+        if let Some(archive) = &mut self.archive {
+            archive.packets = packets;
         }
         self.promises.begin(self.collector.bytes());
         Ok(())

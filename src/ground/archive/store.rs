@@ -97,6 +97,11 @@ impl Archive {
         self.notes.iter().map(String::as_str)
     }
 
+    /// Whether checkpoints are written before the end of the session.
+    pub(in crate::ground) fn saves_on_the_way(&self) -> bool {
+        self.interval < u64::MAX
+    }
+
     /// Whether a checkpoint is due.
     pub(in crate::ground) fn is_due(&self) -> bool {
         self.since_attempt >= self.wait
@@ -401,6 +406,7 @@ impl Opened {
             archive: Some(archive),
             cancel,
             linger,
+            begins_with_maps: false,
             steps,
             promises,
             spotter,

@@ -270,6 +270,28 @@ mod tests {
     }
 
     #[test]
+    fn a_delivery_that_has_ended_is_followed_by_a_checkpoint() {
+        let answers = HeldAnswers::new(Duration::ZERO);
+        answers.note_end(100);
+        // Its last bytes are on their way to the ground.
+        assert!(!answers.ask(99));
+        assert!(answers.ask(100) && answers.begin(100));
+        answers.hold(100);
+        // All is held, whoever sends it again.
+        wait_until_rested(&answers);
+        assert!(!answers.ask(100));
+        answers.note_end(100);
+        assert!(!answers.ask(100));
+    }
+
+    /// The pause after a checkpoint is over.
+    fn wait_until_rested(answers: &HeldAnswers) {
+        while answers.state().not_before.is_some_and(|instant| Instant::now() < instant) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    #[test]
     fn who_waits_longest_goes_when_too_many_wait() {
         let answers = HeldAnswers::new(Duration::ZERO);
         let (oldest, other) = (sender(100), sender(100));

@@ -204,6 +204,10 @@ impl Source for SocketSource {
     type Error = DownlinkError;
 
     fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, DownlinkError> {
+        if self.waiting.is_some() && self.held.is_some() {
+            // Nothing for the ground to take, but an occasion to show what its state holds.
+            out.push(Vec::new());
+        }
         self.start()?;
         let Some((receiver, _)) = &self.running else { return Ok(Flow::Done) };
         match receiver.recv_timeout(POLL) {
