@@ -122,9 +122,9 @@ impl Drop for Served {
 #[derive(Debug)]
 pub(super) struct Reply {
     /// 0 if there was no answer.
-    status: u16,
+    pub(super) status: u16,
     headers: BTreeMap<String, String>,
-    body: Vec<u8>,
+    pub(super) body: Vec<u8>,
 }
 
 impl Reply {
