@@ -179,10 +179,13 @@ fn is_of_system(error: &(dyn std::error::Error + 'static)) -> bool {
         PipelineError::Ground(error) => is_locked(error),
         _ => false,
     });
+    // A file that is not there, or is not what it should be, is not the system's fault.
+    let is_of_system = |error: &std::io::Error| {
+        use std::io::ErrorKind::{InvalidData, NotFound};
+        ![InvalidData, NotFound].contains(&error.kind())
+    };
     of_pipeline
-        || error
-            .downcast_ref::<std::io::Error>()
-            .is_some_and(|error| error.kind() != std::io::ErrorKind::InvalidData)
+        || error.downcast_ref::<std::io::Error>().is_some_and(is_of_system)
         || error.downcast_ref::<GroundError>().is_some_and(is_locked)
 }
 
