@@ -90,6 +90,11 @@ fn gauge(out: &mut DescriptorEncoder<'_>, about: About, value: f64) -> fmt::Resu
     value.encode(out.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?)
 }
 
+/// A gauge of which there may be no value.
+fn gauge_if(out: &mut DescriptorEncoder<'_>, about: About, value: Option<f64>) -> fmt::Result {
+    value.map_or(Ok(()), |value| gauge(out, about, value))
+}
+
 fn counter(out: &mut DescriptorEncoder<'_>, about: About, value: u64) -> fmt::Result {
     let About(name, help, unit) = about;
     let value = ConstCounter::new(value);
@@ -201,7 +206,7 @@ impl Scrape {
             let about =
                 "Visibilities without an entry at the end of a run; zero unless the ledger does not close";
             let about = About("ledger_unaccounted", about, visibilities());
-            gauges::<0>(out, about, ledger.sampled.map(|(_, rest)| ([], rest as f64)))?;
+            gauge_if(out, about, ledger.sampled.map(|(_, rest)| rest as f64))?;
         }
         if let Some(reception) = &self.status.reception {
             let packets = || Some(Unit::Other("packets".into()));
@@ -245,7 +250,7 @@ impl Scrape {
             gauge(out, About("state_unsaved_age", about, Some(Unit::Seconds)), saving.unsaved_s)?;
             let about =
                 About("checkpoint_age", "Age of the newest checkpoint of this session", Some(Unit::Seconds));
-            gauges::<0>(out, about, saving.checkpoint_s.map(|age_s| ([], age_s)))?;
+            gauge_if(out, about, saving.checkpoint_s)?;
         }
         if let Some(products) = &self.status.products {
             let about = About("products_failed", "Attempts to write maps and pictures that failed", None);
@@ -266,11 +271,11 @@ impl Scrape {
         gauges(out, About("disk_free", "Room on the disk of a folder", Some(Unit::Bytes)), free)?;
         let size = disks.iter().map(|(name, [_, size])| (label(name), *size as f64));
         gauges(out, About("disk_size", "Size of the disk of a folder", Some(Unit::Bytes)), size)?;
-        let available = MemoryLimit::of_machine().map(|limit| ([], limit.bytes as f64));
+        let available = MemoryLimit::of_machine().map(|limit| limit.bytes as f64);
         let about = "Memory that this process can still have: of the machine, or below the limit of its control group";
-        gauges::<0>(out, About("memory_available", about, Some(Unit::Bytes)), available)?;
-        let resident = resident_bytes().map(|bytes| ([], bytes as f64));
-        gauges::<0>(out, About("memory_resident", "Memory of this process", Some(Unit::Bytes)), resident)
+        gauge_if(out, About("memory_available", about, Some(Unit::Bytes)), available)?;
+        let resident = resident_bytes().map(|bytes| bytes as f64);
+        gauge_if(out, About("memory_resident", "Memory of this process", Some(Unit::Bytes)), resident)
     }
 
     fn senders(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
