@@ -4,7 +4,9 @@ use clap::Args;
 use serde::Serialize;
 
 use super::arguments::{PipelineArgs, group_size};
-use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
+use super::output::{
+    CommandResult, Completion, print_config_notes, print_json_line, print_notes, print_text,
+};
 use crate::pipeline::{ConfigError, Cost, GroupSize, Plan, RunGroups, Segment};
 
 /// Check a pipeline and estimate its cost, without running it.
@@ -44,6 +46,7 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let config = args.pipeline.load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
+    print_notes(plan.thinning_notes());
     let problems = plan.file_problems();
     if !problems.is_empty() {
         return Err(Box::new(ConfigError::Values { origin: source.origin(), problems }));

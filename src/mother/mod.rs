@@ -21,6 +21,7 @@ mod receiver;
 mod schedule;
 mod spool;
 mod store;
+mod thinning;
 mod troubles;
 
 pub use config::{
@@ -35,3 +36,4 @@ pub use receiver::ReceiverNoise;
 pub use schedule::{Integration, Schedule};
 pub use spool::{SpoolError, SpoolReader, SpoolWriter};
 pub use store::{PacedLink, Store};
+pub use thinning::{WindowThinning, largest_gap};

@@ -47,12 +47,11 @@ impl Plan {
             noiseless: !spacecraft.thermal_noise,
         };
         let schedules = spacecraft.schedules();
-        let mut windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.every_nth_window);
+        let mut windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.window_thinning());
         if windows.is_empty() {
             return Err(PipelineError::NoWindow {
                 duration_s: spacecraft.duration_s,
                 orbit_s: config.array.orbital_period_s,
-                every_nth: spacecraft.every_nth_window,
             });
         }
         if spacecraft.window_s_max > 0.0 {
