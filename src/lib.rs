@@ -8,8 +8,8 @@
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! // The pipeline `quicklook`, made small. `pipelines/reference.toml` lists all keys.
-//! let keys = ["sky.nside=8", "spacecraft.channels_hz=[3e6]", "spacecraft.every_nth_window=300",
-//!     "spacecraft.every_nth_integration=2", "spacecraft.baseline_wavelengths_max=16.0",
+//! let keys = ["sky.nside=8", "spacecraft.channels_hz=[3e6]", "spacecraft.every_nth_window=41",
+//!     "spacecraft.every_nth_integration=15", "spacecraft.baseline_wavelengths_max=16.0",
 //!     "map.nside=4", "map.epsilon=1e-4", "products.pictures=false"];
 //! let source = ConfigSource { overrides: keys.map(str::to_owned).to_vec(), ..ConfigSource::default() };
 //! let plan = Plan::new(source.load()?)?;

@@ -11,8 +11,8 @@ pub fn small_downlink(file: &Path) -> Result<Plan, Box<dyn Error>> {
     let overrides = [
         "sky.nside=8",
         "spacecraft.channels_hz=[3e6, 10e6]",
-        "spacecraft.every_nth_window=400",
-        "spacecraft.every_nth_integration=4",
+        "spacecraft.every_nth_window=41",
+        "spacecraft.every_nth_integration=40",
         "spacecraft.baseline_wavelengths_max=16.0",
         "map.nside=4",
         "map.epsilon=1e-4",

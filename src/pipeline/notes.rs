@@ -206,9 +206,11 @@ mod tests {
             Plan::new(config).unwrap().thinning_notes().join("\n")
         };
         // A month has 286.2 orbits: 300 of them are nearly one, 143 half of one, and 146 the 14 days of a breath.
-        for (every_nth, period) in
-            [(300, "month of 27.3 days"), (143, "month of 27.3 days"), (146, "breathing of the formation of 14.0 days")]
-        {
+        for (every_nth, period) in [
+            (300, "month of 27.3 days"),
+            (143, "month of 27.3 days"),
+            (146, "breathing of the formation of 14.0 days"),
+        ] {
             assert!(notes(every_nth, 1).contains(period), "{every_nth}: {}", notes(every_nth, 1));
         }
         for (every_nth, thin) in [(1, 1), (41, 1), (1, 300), (1, 600)] {
