@@ -1,15 +1,11 @@
 //! Which windows and integrations of a mission are observed when not all are.
 
-/// Steps of two numbers modulo 1, in units of 2^-64, that together fill the square evenly from any place on: the inverse of the root of
-/// g^3 = g + 1 and its square (Roberts 2018, "The unreasonable effectiveness of quasirandom sequences").
-const STEPS: [u64; 2] = [13_925_035_116_211_876_495, 10_511_698_010_929_265_436];
-
 /// Which windows are observed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WindowThinning {
     /// Every n-th. Where n windows are nearly a multiple of a period, parts of that period are never observed.
     EveryNth(u64),
-    /// One of each n, at a place that moves evenly through them, so that observed windows have all phases of any period.
+    /// One of each n, at a place of its own among them, which the number of the n decides as a die would: no period can run in step.
     Spread(u64),
 }
 
@@ -19,7 +15,7 @@ impl WindowThinning {
     pub fn keeps(self, window: u64) -> bool {
         match self {
             Self::EveryNth(n) => window.is_multiple_of(n.max(1)),
-            Self::Spread(n) => window % n.max(1) == place(window / n.max(1), STEPS[0], n),
+            Self::Spread(n) => window % n.max(1) == place(window / n.max(1), n),
         }
     }
 
@@ -29,14 +25,17 @@ impl WindowThinning {
     pub fn first_integration(self, window: u64, every_nth: u64) -> u64 {
         match self {
             Self::EveryNth(n) => window / n.max(1),
-            Self::Spread(n) => place(window / n.max(1), STEPS[1], every_nth),
+            Self::Spread(n) => place(!(window / n.max(1)), every_nth),
         }
     }
 }
 
-/// Place, 0 to `of` - 1, of the term with this number of a sequence with that step.
-fn place(number: u64, step: u64, of: u64) -> u64 {
-    ((u128::from(number.wrapping_mul(step)) * u128::from(of)) >> 64) as u64
+/// Place, 0 to `of` - 1, that a number has by chance, the same at any time: the mixing of bits of SplitMix64 (Steele et al. 2014). Of 0
+/// it is 0, so that a mission has its first window.
+fn place(number: u64, of: u64) -> u64 {
+    let mixed = (number ^ (number >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    ((u128::from(mixed ^ (mixed >> 31)) * u128::from(of)) >> 64) as u64
 }
 
 /// How to keep one visibility in `thin`: the distance of windows and that of integrations. Many windows of which each gives few
@@ -85,27 +84,24 @@ mod tests {
         }
     }
 
-    /// Kept (window, integration) of 1.3 years of the paper's array, of which each window is taken to have 100 integrations, counted in cells
-    /// of equal size over two periods; the fewest and the most over the mean.
-    fn coverage(windows: WindowThinning, every_nth: u64, periods_s: [f64; 2]) -> [f64; 2] {
+    /// Kept windows of 1.3 years of the paper's array by cells of equal size over two periods: fewest, mean and most.
+    fn coverage(windows: WindowThinning, periods_s: [f64; 2]) -> [f64; 3] {
         const SIDE: usize = 5;
         let config = ArrayConfig::default();
         let array = Array::new(&config).unwrap();
         let mut counts = [0.0; SIDE * SIDE];
-        let mut total = 0.0;
-        for window in ObservingWindows::new(&array, 0.0, config.precession_period_s) {
-            if !windows.keeps(window.index) {
-                continue;
-            }
-            let cell = |period_s: f64| ((window.start.seconds() / period_s).fract() * SIDE as f64) as usize;
-            let first = windows.first_integration(window.index, every_nth);
-            let kept = (first..first + 100).filter(|number| number.is_multiple_of(every_nth)).count() as f64;
-            counts[cell(periods_s[0]) * SIDE + cell(periods_s[1])] += kept;
-            total += kept;
+        let all = ObservingWindows::new(&array, 0.0, config.precession_period_s);
+        for window in all.filter(|window| windows.keeps(window.index)) {
+            let [row, column] =
+                periods_s.map(|s| ((window.start.seconds() / s).fract() * SIDE as f64) as usize);
+            counts[row * SIDE + column] += 1.0;
         }
-        let mean = total / counts.len() as f64;
-        [counts.iter().copied().fold(f64::INFINITY, f64::min), counts.iter().copied().fold(0.0, f64::max)]
-            .map(|n| n / mean)
+        let mean = counts.iter().sum::<f64>() / counts.len() as f64;
+        [
+            counts.iter().copied().fold(f64::INFINITY, f64::min),
+            mean,
+            counts.iter().copied().fold(0.0, f64::max),
+        ]
     }
 
     #[test]
@@ -113,19 +109,31 @@ mod tests {
         let config = ArrayConfig::default();
         let (breathing_s, precession_s) = (config.breathing.period_s, config.precession_period_s);
         // The third is a period nobody thought of.
-        let others = [SIDEREAL_MONTH_S, breathing_s, 9.3 * 86_400.0];
-        for thin in [150, 300, 600] {
-            let (windows, integrations) = shares(thin);
-            for other_s in others {
-                let [least, most] =
-                    coverage(WindowThinning::Spread(windows), integrations, [precession_s, other_s]);
-                // Some 200 to 400 windows in 25 cells: by chance a third more or less would be usual.
-                assert!(least > 0.5 && most < 1.5, "{thin}, {other_s} s: {least} {most}");
+        for other_s in [SIDEREAL_MONTH_S, breathing_s, 9.3 * 86_400.0] {
+            for thin in [150, 300, 600] {
+                let spread = WindowThinning::Spread(shares(thin).0);
+                let [least, mean, most] = coverage(spread, [precession_s, other_s]);
+                // 2.5 times the scatter of counts by chance, without the order that one of each n brings.
+                let bar = 2.5 * mean.sqrt();
+                assert!(
+                    least > mean - bar && most < mean + bar,
+                    "{thin}, {other_s} s: {least} {mean} {most}"
+                );
             }
         }
         // Every 286th window is always at the same phase of the month: cells stay empty.
-        let [least, _] = coverage(WindowThinning::EveryNth(286), 1, [precession_s, SIDEREAL_MONTH_S]);
+        let [least, ..] = coverage(WindowThinning::EveryNth(286), [precession_s, SIDEREAL_MONTH_S]);
         assert!(least < f64::EPSILON, "{least}");
+    }
+
+    #[test]
+    fn integrations_begin_at_all_places() {
+        let mut counts = [0_u32; 8];
+        for window in 0..8_000 {
+            counts[WindowThinning::Spread(10).first_integration(10 * window, 8) as usize] += 1;
+        }
+        // Five standard deviations of 1000 by chance.
+        assert!(counts.iter().all(|count| count.abs_diff(1000) < 160), "{counts:?}");
     }
 
     #[test]

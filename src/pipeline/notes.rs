@@ -5,9 +5,9 @@ use std::path::PathBuf;
 
 use super::config::Config;
 use super::plan::Plan;
-use crate::accumulation::EngineKind;
 use crate::array::ObservingWindows;
 use crate::calibration::{CalibrationHook, GainsFile, VanVleck};
+use crate::imaging::EngineKind;
 use crate::mother::{Fidelity, largest_gap};
 use crate::units::Dimension;
 use crate::units::constants::{DAY_S, MOON_GM_M3_S2, MOON_RADIUS_M, SIDEREAL_MONTH_S};
