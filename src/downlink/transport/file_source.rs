@@ -141,6 +141,14 @@ impl FileSource {
 }
 
 impl OpenFile {
+    /// At its end, a file in which no packet was found, if it is known what it is.
+    fn refuse_foreign(&self) -> Result<(), DownlinkError> {
+        match self.probe.as_ref().and_then(|probe| probe.foreign_name()) {
+            None => Ok(()),
+            name => Err(DownlinkError::Foreign { path: self.path.clone(), bytes: self.bytes, name }),
+        }
+    }
+
     /// Checks that the path still leads to the same file and that it has not shrunk. Bytes written over those that were
     /// read would go unnoticed.
     fn check_place(&self) -> Result<(), DownlinkError> {
@@ -192,6 +200,8 @@ impl Source for FileSource {
             }
         } else if self.wait(&open)? {
             self.current = Some(open);
+        } else {
+            open.refuse_foreign()?;
         }
         Ok(Flow::Continue)
     }
