@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use super::config::Config;
 use super::plan::Plan;
 use super::problems::Problems;
+use crate::imaging::Regulariser;
 use crate::sky::fits::{
     FitsError, FitsProblem, MapUnderstood, ReadOptions, check_frequency, read_prior, read_sky, sky_options,
 };
 use crate::sky::{AddedSky, SkyConfig};
-use crate::solve::Regulariser;
 use crate::units::InvalidValue;
 
 impl Plan {
