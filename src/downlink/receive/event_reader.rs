@@ -113,7 +113,7 @@ impl<R: Read> EventReader<R> {
         if self.looked || self.intake.bytes() == 0 {
             return Ok(());
         }
-        self.looked = true;
+        self.looked = self.intake.has_whole_head();
         match self.intake.foreign_frames() {
             None => Ok(()),
             name => {

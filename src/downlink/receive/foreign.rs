@@ -51,8 +51,8 @@ pub(super) fn frames_of(head: &[u8]) -> Option<String> {
              frame processor takes out of them"
         ));
     }
-    let bytes = marker_period(head)?;
-    is_chain(bytes, |at| head.get(at + SYNC_MARKER_BYTES..)).then(|| {
+    let (marked, bytes) = marker_period(head)?;
+    is_chain(bytes, |at| marked.get(at + SYNC_MARKER_BYTES..)).then(|| {
         format!(
             "CADUs of {bytes} bytes whose blocks are not randomized: expected the pseudo-randomizer of CCSDS 131.0-B, and \
              Reed-Solomon (255, 223) parity"
@@ -62,9 +62,9 @@ pub(super) fn frames_of(head: &[u8]) -> Option<String> {
 
 /// Frames behind sync markers that no code of the receiver fits.
 fn marked_frames_of(head: &[u8]) -> Option<String> {
-    let bytes = marker_period(head)?;
+    let (marked, bytes) = marker_period(head)?;
     let plain = |at: usize| {
-        let block = head.get(at + SYNC_MARKER_BYTES..)?;
+        let block = marked.get(at + SYNC_MARKER_BYTES..)?;
         let mut start = block.get(..block.len().min(8))?.to_vec();
         randomize(&mut start);
         Some(start)
@@ -103,17 +103,16 @@ fn is_chain<'a>(bytes: usize, at: impl Fn(usize) -> Option<&'a [u8]>) -> bool {
     frames >= FRAMES_MIN && counted + 1 >= FRAMES_MIN
 }
 
-/// Distance of the sync markers of a stream that begins with one and repeats it.
-fn marker_period(head: &[u8]) -> Option<usize> {
+/// The stream from its first sync marker on, and the distance at which it repeats.
+fn marker_period(head: &[u8]) -> Option<(&[u8], usize)> {
     let marker = SYNC_MARKER.to_be_bytes();
-    let is_marked = |at: usize| head.get(at..at + SYNC_MARKER_BYTES) == Some(&marker[..]);
-    if !is_marked(0) {
-        return None;
-    }
-    FRAME_BYTES.into_iter().find(|&bytes| {
-        let whole = (head.len() / bytes).max(FRAMES_MIN);
+    let marked = &head[head.windows(SYNC_MARKER_BYTES).position(|bytes| bytes == marker)?..];
+    let is_marked = |at: usize| marked.get(at..at + SYNC_MARKER_BYTES) == Some(&marker[..]);
+    let period = FRAME_BYTES.into_iter().find(|&bytes| {
+        let whole = (marked.len() / bytes).max(FRAMES_MIN);
         (1..whole).all(|k| is_marked(k * bytes))
-    })
+    })?;
+    Some((marked, period))
 }
 
 /// Space packets of other missions: headers whose lengths lead from one to the next.
@@ -209,6 +208,8 @@ mod tests {
         );
         // Frames that are randomized may be sound: they are no reason to refuse a stream.
         assert_eq!(frames_of(&marked(|frame| randomize(frame))), None);
+        // A stream may begin anywhere.
+        assert_eq!(name_of(&marked(|_| {})[500..]), Some(plain));
     }
 
     #[test]

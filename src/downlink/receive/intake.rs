@@ -127,6 +127,11 @@ impl Intake {
         frames_of(&self.head)
     }
 
+    /// Whether as much is held of the beginning as will be.
+    pub(super) fn has_whole_head(&self) -> bool {
+        self.head.len() == HEAD_BYTES
+    }
+
     fn keep_head(&mut self, bytes: &[u8]) {
         let room = HEAD_BYTES - self.head.len();
         self.head.extend_from_slice(&bytes[..room.min(bytes.len())]);

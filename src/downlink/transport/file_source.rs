@@ -100,6 +100,9 @@ impl FileSource {
     fn probe(&mut self, open: &mut OpenFile, bytes: &[u8]) -> Result<(), DownlinkError> {
         let Some(probe) = &mut open.probe else { return Ok(()) };
         probe.push(bytes);
+        if let name @ Some(_) = probe.foreign_frames() {
+            return Err(DownlinkError::Foreign { path: open.path.clone(), bytes: open.bytes, name });
+        }
         while let Some(event) = probe.next_event() {
             if matches!(event, Event::Packet(_)) {
                 let format = probe.format().unwrap_or_default();

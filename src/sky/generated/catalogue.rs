@@ -122,7 +122,10 @@ impl Reader<'_> {
     fn read(&self) -> Result<Catalogue, CatalogueError> {
         let text = self.text()?;
         let table = self.table(&text)?;
-        let columns = Columns::of(&table.names).map_err(|expected| {
+        let comments = text.lines().take_while(|line| line.trim().is_empty() || line.starts_with('#'));
+        let name = self.path.file_name().unwrap_or_default().to_string_lossy();
+        let is_vlssr = comments.chain([&*name]).any(|text| text.to_ascii_lowercase().contains("vlss"));
+        let columns = Columns::of(&table.names, is_vlssr).map_err(|expected| {
             let names: Vec<String> = table.names.iter().take(40).map(|name| shown(name)).collect();
             let first = table.rows.first().map_or(1, |(line, _)| line.saturating_sub(1).max(1));
             self.wrong(first, format!("the columns {}", names.join(", ")), expected)

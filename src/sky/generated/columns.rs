@@ -62,15 +62,16 @@ pub(super) struct Columns {
     pub index: Option<usize>,
 }
 
-/// A name without case and punctuation.
+/// A name without case and punctuation, but for the point of a number.
 pub(super) fn plain(name: &str) -> String {
     let name = name.split(['(', '[']).next().unwrap_or(name);
-    name.chars().filter(|c| c.is_ascii_alphanumeric()).collect::<String>().to_ascii_lowercase()
+    let kept: String = name.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '.').collect();
+    kept.trim_matches('.').to_ascii_lowercase()
 }
 
 impl Columns {
-    /// The columns of a catalogue by their names; else what is expected.
-    pub(super) fn of(names: &[String]) -> Result<Self, String> {
+    /// The columns of a catalogue by their names; else what is expected. Fluxes of the VLSSr name no frequency.
+    pub(super) fn of(names: &[String], is_vlssr: bool) -> Result<Self, String> {
         let plain_names: Vec<String> = names.iter().map(|name| plain(name)).collect();
         let place = |wanted: &str| plain_names.iter().position(|name| name == wanted);
         let one_of = |wanted: &[&str]| wanted.iter().find_map(|name| place(name));
@@ -106,7 +107,7 @@ impl Columns {
             };
             Some((k, unit))
         });
-        let Some((flux, flux_hz)) = flux_of(&plain_names, index.is_some(), hz.is_some()) else {
+        let Some((flux, flux_hz)) = flux_of(&plain_names, index.is_some(), hz.is_some(), is_vlssr) else {
             return Err("a column of flux densities that names its frequency, such as flux_154mhz_jy, S74, int_flux_wide or Fintwide of \
                  GLEAM, Si of VLSSr, or flux_jy with a column frequency_mhz"
                 .to_owned());
@@ -119,7 +120,7 @@ impl Columns {
 
 /// The column of fluxes and its frequency, Hz: ours, else the one that belongs to fitted indices, else that of the lowest frequency;
 /// NaN for one whose frequencies stand in another column.
-fn flux_of(names: &[String], has_index: bool, has_frequency: bool) -> Option<(usize, f64)> {
+fn flux_of(names: &[String], has_index: bool, has_frequency: bool, is_vlssr: bool) -> Option<(usize, f64)> {
     let base = |name: &String| name.trim_end_matches("mjy").trim_end_matches("jy").to_owned();
     let bases: Vec<String> = names.iter().map(base).collect();
     let at = |wanted: &[&str]| wanted.iter().find_map(|name| bases.iter().position(|found| found == name));
@@ -132,7 +133,7 @@ fn flux_of(names: &[String], has_index: bool, has_frequency: bool) -> Option<(us
     }
     let of_frequency = |(k, name): (usize, &String)| Some((k, flux_hz(name)?));
     let lowest = names.iter().enumerate().filter_map(of_frequency).min_by(|(_, a), (_, b)| a.total_cmp(b));
-    let is_vlssr = names.iter().any(|name| name.starts_with("vlss"));
+    let is_vlssr = is_vlssr || names.iter().any(|name| name.starts_with("vlss"));
     let vlssr = at(&["si", "sint", "flux", "sp"]).filter(|_| is_vlssr);
     let any = at(&["flux", "s", "sint", "intflux", "totalflux"]).filter(|_| has_frequency);
     any.map(|k| (k, f64::NAN))
@@ -141,19 +142,18 @@ fn flux_of(names: &[String], has_index: bool, has_frequency: bool) -> Option<(us
         .or(vlssr.map(|k| (k, VLSSR_HZ)))
 }
 
-/// The frequency in the name of a column of fluxes, Hz, such as of `flux_74_mhz`, `S408`, `Fint076`, `int_flux_084`.
+/// The frequency in the name of a column of fluxes, Hz, such as of `flux_74_mhz`, `S408`, `Fint076`, `int_flux_084`, `S_1.4GHz`.
 fn flux_hz(name: &str) -> Option<f64> {
+    const KINDS: [&str; 9] = ["s", "f", "si", "fint", "flux", "intflux", "sint", "totalflux", "fluxint"];
     let name = name.trim_end_matches("mjy").trim_end_matches("jy");
-    let name = name.trim_end_matches("mhz");
-    let start = name.find(|c: char| c.is_ascii_digit())?;
-    let (kind, digits) = name.split_at(start);
-    let is_flux =
-        ["s", "f", "fint", "fp", "flux", "intflux", "peakflux", "sint", "totalflux", "fluxint", "si"]
-            .contains(&kind);
-    let mhz: f64 = digits.parse().ok().filter(|_| digits.len() <= 4 && is_flux)?;
-    // Peak fluxes of GLEAM are per beam: those integrated are the sources'.
-    let is_peak = kind == "fp" || kind == "peakflux";
-    (mhz >= 1.0 && !is_peak).then_some(mhz * 1e6)
+    let stated =
+        [("mhz", 1e6), ("ghz", 1e9)].into_iter().find_map(|(unit, hz)| Some((name.strip_suffix(unit)?, hz)));
+    let (name, unit_hz) = stated.unwrap_or((name, 1e6));
+    let (kind, digits) = name.split_at(name.find(|c: char| c.is_ascii_digit())?);
+    let number: f64 = digits.parse().ok().filter(|_| digits.len() <= 6 && KINDS.contains(&kind))?;
+    // Small or broken numbers alone are of GHz, as of S1.4 and S5, or of something else.
+    let is_frequency = stated.is_some() || (number >= 8.0 && !digits.contains('.'));
+    (is_frequency && number > 0.0).then_some(number * unit_hz)
 }
 
 #[cfg(test)]
@@ -161,7 +161,7 @@ mod tests {
     use super::*;
 
     fn columns(names: &str) -> Result<Columns, String> {
-        Columns::of(&names.split(',').map(str::to_owned).collect::<Vec<_>>())
+        Columns::of(&names.split(',').map(str::to_owned).collect::<Vec<_>>(), false)
     }
 
     #[test]
@@ -188,6 +188,8 @@ mod tests {
             ("name,ra,dec,flux_74_mhz", Frame::Equatorial, 3, 74e6, None),
             ("l,b,S408,spectral_index", Frame::Galactic, 2, 408e6, Some(3)),
             ("GLON,GLAT,flux_jy,frequency_mhz", Frame::Galactic, 2, nan, None),
+            ("_RAJ2000,_DEJ2000,S1.4,S_12.6MHz", Frame::Equatorial, 3, 12.6e6, None),
+            ("ra,dec,flux_1.4_ghz_mjy", Frame::Equatorial, 2, 1.4e9, None),
         ] {
             let found = columns(names).unwrap();
             let same_hz = found.flux_hz == hz || (hz.is_nan() && found.frequency_place == Some((3, 1e6)));
@@ -202,6 +204,12 @@ mod tests {
     fn what_is_missing_is_named() {
         assert!(columns("a,b,flux_154mhz_jy").unwrap_err().contains("RAJ2000 and DEJ2000"));
         assert!(columns("RAB1950,DEB1950,S74").unwrap_err().contains("B1950"));
-        assert!(columns("ra,dec,flux").unwrap_err().contains("names its frequency"));
+        for flux in ["flux", "S1.4", "S5", "Fp076", "e_Fint076"] {
+            assert!(
+                columns(&format!("ra,dec,{flux}")).unwrap_err().contains("names its frequency"),
+                "{flux}"
+            );
+        }
+        assert_eq!(Columns::of(&["ra", "dec", "Si"].map(str::to_owned), true).unwrap().flux_hz, 73.8e6);
     }
 }
