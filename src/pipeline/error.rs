@@ -156,6 +156,17 @@ pub enum PipelineError {
     /// Visibilities cannot be put aside, or read back.
     #[error(transparent)]
     Spool(#[from] crate::mother::SpoolError),
+    /// An estimate that is no number.
+    #[error(
+        "the estimated {what} is {value}: nothing bounds this run; expected settings of which the work can be estimated: look for periods, \
+         motions and times near 0, and for very large numbers"
+    )]
+    Unbounded {
+        /// What was estimated.
+        what: String,
+        /// The estimate.
+        value: f64,
+    },
     /// More memory needed than there is.
     #[error(
         "an estimated {} of memory are needed, and {} are available ({}): expected at most that; lower map.nside, \

@@ -30,5 +30,5 @@ pub use config::{AddedSky, GENERATED_NSIDE_MAX, MapFrequency, SkyConfig};
 pub use cutout::{Cutout, PlaneProjection};
 pub use error::MapError;
 pub use frame::{Frame, Rotation, rotate};
-pub use map::{SkyMap, is_unseen};
+pub use map::{SkyMap, TEMPERATURE_K_MAX, is_unseen};
 pub use rotation::Bilinear;

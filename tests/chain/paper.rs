@@ -42,6 +42,8 @@ fn the_published_sky_comes_back_as_in_the_paper() {
             "--set",
             &format!("sky.file={:?}", sky.to_str().unwrap()),
             "--set",
+            "sky.l_max=0",
+            "--set",
             "spacecraft.every_nth_window=20",
             "--set",
             "spacecraft.thermal_noise=false",

@@ -7,6 +7,7 @@
 
 mod alm;
 mod card;
+mod claims;
 mod error;
 mod frequency;
 mod header;
@@ -18,11 +19,14 @@ mod write;
 pub use alm::write_alm;
 pub use card::{Card, CardValue};
 pub use error::{FitsError, FitsProblem};
-pub use frequency::{check_frequencies, check_frequency, read_known_sky, read_sky};
+pub use frequency::{
+    MapUnderstood, SkyChannel, check_frequencies, check_frequency, read_known_sky, read_prior, read_sky,
+    sky_options,
+};
 pub use header::Header;
 pub use image::image_bytes;
 pub use read::{
-    MapFile, ReadOptions, read_map, read_map_file, read_map_from, read_unit, read_whole_map,
+    MapFile, ReadOptions, read_map, read_map_file, read_map_from, read_notes, read_nside, read_whole_map,
     read_whole_map_file,
 };
 pub use write::{Column, Ordering, Precision, WriteOptions, map_bytes, write_columns, write_map};
