@@ -87,6 +87,8 @@ pub mod products;
 
 pub mod pipeline;
 
+pub mod prelude;
+
 pub mod figures;
 
 #[cfg(feature = "serve")]

@@ -117,7 +117,7 @@ pub trait NormalEngine: Send {
     /// Adds visibilities.
     ///
     /// # Errors
-    /// A block of another frequency. A visibility that the engine does not cover, or has no room for, is counted as
+    /// A block of another frequency, or with arrays of unequal lengths. A visibility that the engine does not cover, or has no room for, is counted as
     /// refused instead.
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 
@@ -127,7 +127,7 @@ pub trait NormalEngine: Send {
     /// others were added.
     ///
     /// # Errors
-    /// A block of another frequency; or [`AccumulationError::NothingHeld`] if the engine holds less than is to be
+    /// A block of another frequency, or with arrays of unequal lengths; or [`AccumulationError::NothingHeld`] if the engine holds less than is to be
     /// removed. Nothing changes then.
     fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 

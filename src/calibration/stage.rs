@@ -129,6 +129,7 @@ impl Calibrator {
     /// # Errors
     /// As [`Calibrator::accept`].
     pub fn calibrated(&mut self, block: VisibilityBlock) -> Result<PlacedVisibilities, CalibrationError> {
+        block.check_lengths()?;
         let ledger = std::mem::take(&mut self.ledger);
         let placed = self.place(block);
         self.ledger = ledger;
@@ -140,6 +141,7 @@ impl Calibrator {
     /// # Errors
     /// As [`Calibrator::accept`].
     pub fn remove_autos(&mut self, block: VisibilityBlock) -> Result<u64, CalibrationError> {
+        block.check_lengths()?;
         let ledger = std::mem::take(&mut self.ledger);
         let placed = self.calibrate_autos(block);
         self.ledger = ledger;
@@ -150,7 +152,7 @@ impl Calibrator {
     /// Takes the next frame; returns what is to be accumulated of it.
     ///
     /// # Errors
-    /// [`CalibrationError`] if calibration was not made for this instrument.
+    /// [`CalibrationError`] if calibration was not made for this instrument, or the arrays of a block have unequal lengths.
     pub fn accept(&mut self, frame: GroundFrame) -> Result<Option<PlacedFrame>, CalibrationError> {
         match frame {
             // The decoder reports descriptions that contradict the first.
@@ -202,6 +204,7 @@ impl Calibrator {
         &mut self,
         block: VisibilityBlock,
     ) -> Result<Option<PlacedFrame>, CalibrationError> {
+        block.check_lengths()?;
         let count = block.len() as u64;
         let Some(key) = BlockKey::of(&block) else { return Ok(None) };
         if !self.blocks.insert(key) {
@@ -314,6 +317,7 @@ impl Calibrator {
 
     fn calibrate(&mut self, placed: &mut PlacedVisibilities) -> Result<(), CalibrationError> {
         let calibrated = self.calibration.apply(placed)?;
+        placed.check_lengths()?;
         for (reason, count) in calibrated.removed() {
             self.ledger.left_out(reason, count as u64);
         }

@@ -19,7 +19,7 @@ pub use housekeeping::Housekeeping;
 pub use instrument::{AntennaResponse, Channel, Instrument, Spectrometer};
 pub use reason::{SampleReason, VisibilityReason};
 pub use samples::{SampleBlock, Samples, SpaceFrame};
-pub use visibility::{AutoPower, PlacedVisibilities, VisibilityBlock};
+pub use visibility::{AutoPower, PlacedVisibilities, UnequalLengths, VisibilityBlock};
 
 /// Frames that the ground reads from a downlink, in the order in which they were sent.
 #[derive(Clone, Debug, PartialEq)]

@@ -18,6 +18,7 @@ mod ground_segment;
 mod groups;
 mod live_gains;
 mod memory;
+mod mission;
 pub(crate) mod models;
 mod noise_maps;
 mod notes;
@@ -49,6 +50,7 @@ pub use groups::{
     channel_groups, replay_in_groups, run_in_groups,
 };
 pub use memory::{MemoryLimit, MemorySource};
+pub use mission::Mission;
 pub use plan::{Expected, Plan};
 pub use problems::{Problem, Problems};
 pub use realisations::{PowerSpread, RealisationSpread};
