@@ -11,7 +11,7 @@
 //! | [`RotationTable`] | d for real skies |
 //! | [`HarmonicModel`] | visibilities of a sky at many states of pairs |
 //!
-//! [`mod@crate::accumulation`] builds its normal equations on the same tables. Uses [`crate::sky::harmonics`]; results
+//! [`mod@crate::imaging`] builds its normal equations on the same tables. Uses [`crate::sky::harmonics`]; results
 //! do not depend on the number of threads.
 
 mod batch;
