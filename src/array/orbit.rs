@@ -90,6 +90,21 @@ impl Shape {
 }
 
 /// The array in motion: positions at any time.
+///
+/// ```
+/// use lunarray::array::{Array, ArrayConfig, IntegrationRule, integration_time_s};
+/// use lunarray::units::vector::{norm, sub};
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// let array = Array::new(&ArrayConfig::default())?;
+/// let [first, last] = [0, 7].map(|n| array.state(n, 3600.0));
+/// let baseline_m = sub(first.position_m, last.position_m);
+/// assert!(norm(baseline_m) > 1e3);
+/// let dt_s = integration_time_s(IntegrationRule::default(), 10e6, first.velocity_m_s, last.velocity_m_s);
+/// assert!(dt_s <= 25.0);
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Array {
     /// The formation on one orbit, if there is one.

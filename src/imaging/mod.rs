@@ -9,7 +9,9 @@
 //! pipeline, [`Accumulator`] and [`Solver`]. Uses [`crate::frames`], [`mod@crate::array`], [`crate::response`], [`crate::sky`].
 
 mod antennas;
+#[doc(hidden)]
 pub mod anywhere;
+#[doc(hidden)]
 pub mod circle;
 mod config;
 pub(crate) mod cost;
@@ -21,25 +23,34 @@ mod regulariser;
 mod solver;
 mod stage;
 
+#[doc(hidden)]
 pub use circle::{
     HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, harmonic_beams, solve_harmonics, solve_noises,
     solve_regularised,
 };
-pub use config::{ChannelGroup, EngineKind, MapConfig, MatrixKind, REFINED, RefineConfig};
+pub use config::MapConfig;
+#[doc(hidden)]
+pub use config::{ChannelGroup, EngineKind, MatrixKind, REFINED, RefineConfig};
 pub use error::AccumulationError;
 pub use exact::ExactEngine;
+#[doc(hidden)]
 pub use exact::automatic_weight_max;
+#[doc(hidden)]
 pub use pixel::{
-    Cholesky, ColumnBlock, Diagnostics, NotPositive, PixelEngine, PixelExtras, PixelSetup, PixelSolution,
-    PixelSums, PointBeam, RemadeSums, RemadeVisibilities, SymmetricTiles, TILE, solve_pixels,
-    solve_pixels_with, solve_remade,
+    Cholesky, ColumnBlock, NotPositive, PixelExtras, PointBeam, RemadeSums, RemadeVisibilities,
+    SymmetricTiles, TILE, solve_pixels_with, solve_remade,
 };
+pub use pixel::{Diagnostics, PixelEngine, PixelSetup, PixelSolution, PixelSums, solve_pixels};
+#[doc(hidden)]
 pub use regulariser::Regulariser;
+pub use solver::SolveError;
+#[doc(hidden)]
 pub use solver::{
-    Convergence, Estimate, Fit, HELD_MAX, LargestEigenvalue, NamedWatch, SolveError, SolveWatch, Solving,
-    SolvingPart, Spectrum, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT, effective_beam,
-    largest_eigenvalue, noise_variance, probed_traces, regularisation, spectrum, traces,
+    Convergence, Estimate, Fit, HELD_MAX, LargestEigenvalue, NamedWatch, SolveWatch, Solving, SolvingPart,
+    Spectrum, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT, effective_beam, largest_eigenvalue,
+    noise_variance, probed_traces, regularisation, spectrum, traces,
 };
+#[doc(hidden)]
 pub use stage::{Accumulator, AccumulatorState, Snapshot, SnapshotSums, Solution, Solver, SolverSetup};
 
 use std::collections::BTreeMap;

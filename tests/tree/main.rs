@@ -9,6 +9,7 @@
 #![allow(clippy::unwrap_used, clippy::panic)] // A test fails by panicking.
 
 mod book;
+mod public;
 mod rules;
 mod source;
 

@@ -10,6 +10,27 @@ use crate::downlink::receive::{Decoder, EventReader, ReceptionCounters};
 use crate::frames::GroundFrame;
 
 /// Reads ground frames from a file of either format, in bounded memory.
+///
+/// ```
+/// use lunarray::prelude::*;
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// # let folder = tempfile::tempdir()?;
+/// # let file = folder.path().join("mission.ccsds");
+/// # Mission::dsl().channels(&[3e6]).nside(4).set("spacecraft.every_nth_window", 900).simulate(&file)?;
+/// let mut reader = DownlinkReader::open(&file)?;
+/// let mut good = 0;
+/// while let Some(frame) = reader.next_frame()? {
+///     if let GroundFrame::Visibilities(block) = frame {
+///         good += block.flags.iter().filter(|flags| flags.is_good()).count();
+///     }
+/// }
+/// // What is in it as a whole, and what is wrong with it.
+/// let contents = Contents::read(&file)?;
+/// assert!(good > 0 && good as u64 <= contents.visibilities.count);
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Debug)]
 pub struct DownlinkReader<R = File> {
     events: EventReader<R>,

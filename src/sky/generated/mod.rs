@@ -23,8 +23,10 @@ mod fluctuations;
 mod galaxy;
 mod sources;
 
+#[doc(hidden)]
 pub use added::AddedSkyError;
 pub use config::{GeneratedSky, GeneratedSkyError};
+#[doc(hidden)]
 pub use sources::{CatalogueSource, catalogue};
 
 use rayon::prelude::*;
