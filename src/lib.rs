@@ -61,6 +61,9 @@
 pub mod units;
 
 #[doc(hidden)]
+pub mod numerics;
+
+#[doc(hidden)]
 pub mod files;
 
 #[doc(hidden)]

@@ -89,6 +89,7 @@ impl VisibilityBlock {
     /// # Panics
     /// If the block is shorter than that.
     #[must_use]
+    #[doc(hidden)]
     pub fn split_off(&mut self, at: usize) -> Self {
         Self {
             channel: self.channel,
@@ -187,12 +188,14 @@ impl PlacedVisibilities {
 
     /// The same channel and pair, with no visibilities.
     #[must_use]
+    #[doc(hidden)]
     pub fn without_visibilities(&self) -> Self {
         let Self { channel, band, frequency_hz, pair, .. } = *self;
         Self { channel, band, frequency_hz, pair, ..Self::default() }
     }
 
     /// Adds visibility `k` of `other`, which has one.
+    #[doc(hidden)]
     pub fn push_of(&mut self, other: &Self, k: usize) {
         self.time_s.push(other.time_s[k]);
         self.r_i_m.push(other.r_i_m[k]);
@@ -203,6 +206,7 @@ impl PlacedVisibilities {
     }
 
     /// Keeps the first `len` visibilities.
+    #[doc(hidden)]
     pub fn truncate(&mut self, len: usize) {
         let Self { time_s, r_i_m, r_j_m, value_k_sr, weight, duration_s, .. } = self;
         time_s.truncate(len);

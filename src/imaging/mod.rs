@@ -154,6 +154,7 @@ pub trait NormalEngine: Send {
     fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 
     /// Sums the pending visibilities now instead of with the next batch; the sums get the same bits either way.
+    #[doc(hidden)]
     fn flush(&mut self);
 
     /// Adds the sums of another engine of the same setup.
@@ -168,6 +169,7 @@ pub trait NormalEngine: Send {
     ///
     /// # Errors
     /// [`AccumulationError::Mismatch`] if the setups differ; [`AccumulationError::Range`] if the engine holds less.
+    #[doc(hidden)]
     fn subtract(&mut self, other: Self) -> Result<(), AccumulationError>
     where
         Self: Sized;
@@ -176,6 +178,7 @@ pub trait NormalEngine: Send {
     fn counts(&self) -> SumCounts;
 
     /// The sums of all visibilities so far, as a copy.
+    #[doc(hidden)]
     fn sums(&mut self) -> Self::Equations;
 
     /// The sums of all visibilities, without a copy.
@@ -187,12 +190,14 @@ pub trait NormalEngine: Send {
     ///
     /// # Errors
     /// The writer's.
+    #[doc(hidden)]
     fn checkpoint(&mut self, out: &mut dyn std::io::Write) -> Result<(), AccumulationError>;
 
     /// Reads an engine that [`NormalEngine::checkpoint`] wrote; it resumes to the same bits.
     ///
     /// # Errors
     /// Data that is damaged, truncated, or of another format.
+    #[doc(hidden)]
     fn restore(from: &mut dyn std::io::Read) -> Result<Self, AccumulationError>
     where
         Self: Sized;
@@ -207,6 +212,7 @@ pub trait NormalSums: Send {
     fn apply(&self, x: &[f64], y: &mut [f64]);
 
     /// `BtN^-1B x` of each x, with the bits of [`NormalSums::apply`]; cheaper than one by one where reading the sums takes time.
+    #[doc(hidden)]
     fn apply_all(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
         let product = |x: &&[f64]| {
             let mut y = vec![0.0; x.len()];
@@ -220,15 +226,18 @@ pub trait NormalSums: Send {
     fn right_hand_side(&self) -> &[f64];
 
     /// `BtN^-1n` for noise n of the data's own weights: the right-hand side of a noise-only map.
+    #[doc(hidden)]
     fn noise_right_hand_side(&self) -> &[f64];
 
     /// Number and weight of the visibilities in the sums.
     fn counts(&self) -> SumCounts;
 
     /// How well the eigenvalues of `BtN^-1B` are known.
+    #[doc(hidden)]
     fn accuracy(&self) -> Accuracy;
 
     /// Why sums on disk could not be read: products are not numbers from then on.
+    #[doc(hidden)]
     fn failure(&self) -> Option<&str> {
         None
     }
@@ -237,6 +246,7 @@ pub trait NormalSums: Send {
 /// What rounding and the approximations of an engine leave open of an eigenvalue W of `BtN^-1B`: `relative` W + `absolute`
 /// W_max. Those of the harmonic engine have been compared with rows one by one in f64; those of the other are estimates.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[doc(hidden)]
 pub struct Accuracy {
     /// Of the eigenvalue itself.
     pub relative: f64,

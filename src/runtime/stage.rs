@@ -70,6 +70,7 @@ pub trait Stage: Send {
 
     /// Called after a step when no further input waits, so that what it shows of itself need not be shown in every step to be the
     /// newest while nothing comes.
+    #[doc(hidden)]
     fn rest(&mut self) {}
 
     /// Units processed so far; the name of the unit must not change.

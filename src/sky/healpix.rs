@@ -8,6 +8,7 @@ use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};
 use crate::units::vector::Vec3;
 
 /// Greatest nside of maps.
+#[doc(hidden)]
 pub const NSIDE_MAX: usize = 8192;
 
 /// Ring of each base face's southern corner, in units of nside (Gorski et al. 2005, `jrll`).
@@ -42,6 +43,7 @@ pub fn pixel_area_sr(nside: usize) -> f64 {
 
 /// A ring of pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[doc(hidden)]
 pub struct Ring {
     /// RING number of its first pixel.
     pub first: usize,
@@ -57,6 +59,7 @@ pub struct Ring {
 
 /// Ring `k` = 1 .. 4 nside - 1, counted from the north.
 #[must_use]
+#[doc(hidden)]
 pub fn ring(nside: usize, k: usize) -> Ring {
     let n = nside as f64;
     let southern = k > 2 * nside;
@@ -98,6 +101,7 @@ pub fn pixel_directions(nside: usize) -> Vec<Vec3> {
 /// x runs north-east and y north-west, as in the NESTED scheme: pixel (ix, iy) of a face has its
 /// centre at ((ix + 1/2) / nside, (iy + 1/2) / nside). Area is uniform in (x, y).
 #[must_use]
+#[doc(hidden)]
 pub fn face_direction(face: usize, x: f64, y: f64) -> Vec3 {
     let ring = FACE_RING[face] - x - y;
     let (z, sin_theta, scale) = if ring < 1.0 {
@@ -171,6 +175,7 @@ pub fn pixel_of(nside: usize, direction: Vec3) -> usize {
 
 /// Base face and integer position (ix, iy) of a NESTED pixel.
 #[must_use]
+#[doc(hidden)]
 pub fn nested_to_face(nside: usize, pixel: usize) -> (usize, usize, usize) {
     let in_face = pixel % (nside * nside);
     let deinterleave =

@@ -70,6 +70,7 @@ impl SkyMap {
     }
 
     /// Mutable values in RING order.
+    #[doc(hidden)]
     pub fn values_mut(&mut self) -> &mut [f64] {
         &mut self.values
     }
@@ -137,6 +138,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::Nside`]; [`MapError::Direction`] if `nside` is below the map's own.
+    #[doc(hidden)]
     pub fn upgrade(&self, nside: usize) -> Result<Self, MapError> {
         check_nside(nside)?;
         if nside < self.nside {
@@ -162,6 +164,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::NoTemperature`] with the number and the first of the others.
+    #[doc(hidden)]
     pub fn check_temperatures(&self) -> Result<(), MapError> {
         let bad = |&(_, value): &(usize, &f64)| !(-TEMPERATURE_K_MAX..=TEMPERATURE_K_MAX).contains(value);
         let mut pixels = self.values.iter().enumerate().filter(bad);
@@ -178,6 +181,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::BadPixels`] with the number and the first of the pixels that are NaN, infinite or UNSEEN.
+    #[doc(hidden)]
     pub fn check_whole(&self) -> Result<(), MapError> {
         let bad = |&(_, &value): &(usize, &f64)| !value.is_finite() || is_unseen(value);
         let mut pixels = self.values.iter().enumerate().filter(bad);

@@ -21,6 +21,7 @@ use source::{File, ModulePath, parse};
 /// Folders (and files) directly below `src/`, each after all that it may use.
 const ORDER: [&str; 22] = [
     "units",
+    "numerics",
     "files",
     "ranks",
     "frames",

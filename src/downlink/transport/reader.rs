@@ -56,12 +56,14 @@ impl<R: Read> DownlinkReader<R> {
 
     /// Continues with the decoder of an earlier file: its instrument description and its counters.
     #[must_use]
+    #[doc(hidden)]
     pub fn with_decoder(self, decoder: Decoder) -> Self {
         Self { decoder, ..self }
     }
 
     /// The decoder, for the next file.
     #[must_use]
+    #[doc(hidden)]
     pub fn into_decoder(self) -> Decoder {
         self.decoder
     }
@@ -93,6 +95,7 @@ impl<R: Read> DownlinkReader<R> {
 
     /// The counters of the coded frames, if the file holds any.
     #[must_use]
+    #[doc(hidden)]
     pub fn frames(&self) -> Option<FrameCounters> {
         self.events.intake().frames()
     }

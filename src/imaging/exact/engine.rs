@@ -166,6 +166,7 @@ impl<B: SkyBasis> ExactEngine<B> {
 
     /// Setup.
     #[must_use]
+    #[doc(hidden)]
     pub fn setup(&self) -> &B::Setup {
         &self.setup
     }

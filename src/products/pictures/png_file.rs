@@ -65,6 +65,7 @@ impl Picture {
 
     /// The pixels, three bytes each, row by row from the top.
     #[must_use]
+    #[doc(hidden)]
     pub fn rgb(&self) -> &[u8] {
         &self.rgb
     }

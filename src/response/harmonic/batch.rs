@@ -5,6 +5,7 @@ use std::f64::consts::{FRAC_PI_2, TAU};
 use num_complex::{Complex32, Complex64};
 use rayon::prelude::*;
 
+use super::PairState;
 use super::blocked::{BLOCK_NODES, PATTERN_LANES};
 use super::forward::{
     ALPHAS_MAX, AlphaPart, ORDER_LANES, OrderBlock, Projection, RunGroup, RunPlan, project,
@@ -13,7 +14,7 @@ use super::kernel::LANES;
 use super::model::{ALPHA_TOLERANCE, HarmonicModel, TERMS};
 use super::rotation::orders;
 use super::runs::Run;
-use super::{PairState, chebyshev};
+use crate::numerics::chebyshev;
 use crate::units::arithmetic::sinc;
 
 /// Alphas of the grid for which the sky is rotated together.

@@ -13,8 +13,9 @@ use super::forward::ALPHAS_MAX;
 use super::kernel::{Kernel, LANES};
 use super::rotation::{RotatedSky, RotationTable};
 use super::runs::{RunLimits, split};
-use super::sizes::fft_length;
-use super::{HarmonicError, NodeGrid, PairState, PatternGeometry, PatternTable, chebyshev};
+use super::{HarmonicError, NodeGrid, PairState, PatternGeometry, PatternTable};
+use crate::numerics::chebyshev;
+use crate::numerics::fft_length;
 use crate::sky::harmonics::Alm;
 
 /// Nodes a wavelength of u: 2.25 times the Nyquist density of the band |n_y| <= 1, so that a kernel of six nodes

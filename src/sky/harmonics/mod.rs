@@ -19,10 +19,10 @@ mod lanes;
 mod recurrence;
 mod rings;
 mod rotated;
-pub(crate) mod scaled;
 mod transform;
-mod wigner;
 
+#[doc(hidden)]
+pub use crate::numerics::wigner::{WignerRows, WignerTable, wigner_d};
 #[doc(hidden)]
 pub use analysis::Method;
 pub use analysis::{Analysis, AnalysisOptions, analysis, synthesis};
@@ -32,5 +32,3 @@ pub use directions::{Component, times_direction, times_direction_transposed};
 pub use error::HarmonicsError;
 #[doc(hidden)]
 pub use transform::{L_MAX, Transform};
-#[doc(hidden)]
-pub use wigner::{WignerRows, WignerTable, wigner_d};
