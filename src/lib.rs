@@ -91,7 +91,6 @@ pub mod calibration;
 
 pub mod imaging;
 
-#[doc(hidden)]
 pub mod ground;
 
 pub mod products;

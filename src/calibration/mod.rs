@@ -31,9 +31,8 @@ pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
 #[doc(hidden)]
 pub use gains::AntennaGains;
-pub use gains_file::GainsFile;
 #[doc(hidden)]
-pub use gains_file::{ChannelGains, GainSolution, Interpolation, PositionSolution};
+pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation, PositionSolution};
 #[doc(hidden)]
 pub use solved::{ClosedPass, SolvedGains};
 pub use stage::Calibrator;
@@ -119,6 +118,7 @@ pub struct CalibrationReport {
 impl CalibrationReport {
     /// Reason and number of those removed, for a ledger; zeros included.
     #[must_use]
+    #[doc(hidden)]
     pub fn removed(&self) -> [(VisibilityReason, usize); 1] {
         [(VisibilityReason::UnusableGain, self.unusable_gain)]
     }

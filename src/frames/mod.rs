@@ -45,6 +45,7 @@ pub enum GroundFrame {
 
 /// An observing window: an interval in which the Moon hides the Earth from the first daughter.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[doc(hidden)]
 pub struct ObservingWindow {
     /// Number of the window since the mission epoch; one an orbit.
     pub index: u64,

@@ -93,6 +93,7 @@ pub struct ConfigSource {
 impl ConfigSource {
     /// Name of this source in messages.
     #[must_use]
+    #[doc(hidden)]
     pub fn origin(&self) -> String {
         self.file.as_deref().map_or_else(|| QUICKLOOK_NAME.into(), |path| path.display().to_string())
     }

@@ -68,6 +68,7 @@ impl<T> Outlet<T> {
 
     /// Whether pushed items are discarded, as the run has failed or was cut short.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_closed(&self) -> bool {
         match &self.0 {
             Target::Queue(queue) => queue.closed || queue.halt.is_set(),

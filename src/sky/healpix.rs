@@ -18,6 +18,7 @@ const FACE_LONGITUDE: [f64; 12] = [1., 3., 5., 7., 0., 2., 4., 6., 1., 3., 5., 7
 
 /// Whether `nside` is a power of two between 1 and [`NSIDE_MAX`].
 #[must_use]
+#[doc(hidden)]
 pub fn is_valid_nside(nside: usize) -> bool {
     nside.is_power_of_two() && nside <= NSIDE_MAX
 }

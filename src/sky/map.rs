@@ -105,6 +105,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::Nside`]; [`MapError::Direction`] if `nside` is above the map's own.
+    #[doc(hidden)]
     pub fn degrade(&self, nside: usize) -> Result<Self, MapError> {
         check_nside(nside)?;
         if nside > self.nside {

@@ -46,6 +46,7 @@ pub fn rho(a: &Alm, b: &Alm) -> Vec<f64> {
 /// Factors of a_lm for a Gaussian beam of a FWHM (rad), l = 0 .. `l_max`:
 /// exp(-l (l + 1) sigma^2 / 2), sigma = FWHM / sqrt(8 ln 2).
 #[must_use]
+#[doc(hidden)]
 pub fn gaussian_beam(fwhm_rad: f64, l_max: usize) -> Vec<f64> {
     let variance = fwhm_rad * fwhm_rad / (8.0 * LN_2);
     (0..=l_max).map(|l| (-0.5 * variance * (l * (l + 1)) as f64).exp()).collect()

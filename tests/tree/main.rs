@@ -19,7 +19,7 @@ use std::path::Path;
 use source::{File, ModulePath, parse};
 
 /// Folders (and files) directly below `src/`, each after all that it may use.
-const ORDER: [&str; 22] = [
+const ORDER: [&str; 23] = [
     "units",
     "numerics",
     "files",

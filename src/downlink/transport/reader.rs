@@ -50,6 +50,7 @@ impl DownlinkReader<File> {
 impl<R: Read> DownlinkReader<R> {
     /// Reads from any source; `path` names it in errors.
     #[must_use]
+    #[doc(hidden)]
     pub fn new(source: R, path: &Path) -> Self {
         Self { events: EventReader::new(source, path), decoder: Decoder::new() }
     }

@@ -53,12 +53,14 @@ impl Picture {
 
     /// Width, pixels.
     #[must_use]
+    #[doc(hidden)]
     pub fn width(&self) -> usize {
         self.width
     }
 
     /// Height, pixels.
     #[must_use]
+    #[doc(hidden)]
     pub fn height(&self) -> usize {
         self.height
     }

@@ -23,6 +23,7 @@ mod blocks;
 mod combs;
 mod directions;
 mod edge;
+#[doc(hidden)]
 pub mod exact;
 mod geometry;
 mod kernel;
@@ -50,6 +51,7 @@ pub use sums::{antenna_powers, antenna_sums, four_sky_sums, sky_powers};
 
 /// Sample points along each side of a pixel in pixel averages: the paper evaluates at nside 1024 and averages down to
 /// nside 64.
+#[doc(hidden)]
 pub const CHILDREN: usize = 16;
 
 /// How a row of B represents a pixel.
