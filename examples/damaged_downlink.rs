@@ -5,7 +5,6 @@ mod common;
 use std::error::Error;
 
 use lunarray::downlink::link::{LinkConfig, corrupt};
-use lunarray::prelude::*;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let folder = tempfile::tempdir()?;

@@ -12,7 +12,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (t_s, frequency_hz) = (86_400.0, 10e6);
     println!("a day after the epoch the array {}", if array.observing(t_s) { "observes" } else { "waits" });
     let mut longest = (0.0, Pair::default());
-    for pair in all_pairs(array.satellites() as u8) {
+    for pair in all_pairs(array.satellites()) {
         let [i, j] = [pair.i, pair.j].map(|n| array.state(usize::from(n), t_s));
         let length_m = norm(sub(i.position_m, j.position_m));
         if length_m > longest.0 {
