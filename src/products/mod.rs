@@ -3,7 +3,7 @@
 //! [`Publisher`] is the sink that writes every [`crate::imaging::Solution`]; [`write_autos`] writes the
 //! auto-correlations. [`pictures`] draws. A [`MapViewer`] sees maps as they are published.
 //!
-//! May use [`crate::imaging::solver`], [`crate::ground`], [`crate::downlink`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
+//! May use [`crate::imaging`], [`crate::ground`], [`crate::downlink`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
 //! equal bytes, and every map carries its provenance: configuration hashes, seed, program version and data span.
 
 mod autos;
