@@ -25,6 +25,7 @@ const PERIOD_PART: f64 = 0.01;
 impl Config {
     /// Notes on values that are valid and probably not meant.
     #[must_use]
+    #[doc(hidden)]
     pub fn notes(&self) -> Vec<String> {
         let notes = [self.period_note(), self.quantiser_note(), self.positions_note(), self.reach_note()];
         notes.into_iter().flatten().collect()
@@ -38,6 +39,7 @@ impl Config {
 
     /// Positions that are corrected, and limits that refuse what is corrected.
     #[must_use]
+    #[doc(hidden)]
     pub fn positions_note(&self) -> Option<String> {
         let (map, calibration) = (&self.map, &self.calibration);
         let limits = &map.limits;

@@ -9,6 +9,7 @@ use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};
 use crate::units::vector::Vec3;
 
 /// Greatest nside of maps.
+#[doc(hidden)]
 pub const NSIDE_MAX: usize = 8192;
 
 /// Ring of each base face's southern corner, in units of nside (Gorski et al. 2005, `jrll`).
@@ -18,6 +19,7 @@ const FACE_LONGITUDE: [u8; 12] = [1, 3, 5, 7, 0, 2, 4, 6, 1, 3, 5, 7];
 
 /// Whether `nside` is a power of two between 1 and [`NSIDE_MAX`].
 #[must_use]
+#[doc(hidden)]
 pub fn is_valid_nside(nside: usize) -> bool {
     nside.is_power_of_two() && nside <= NSIDE_MAX
 }
@@ -43,6 +45,7 @@ pub fn pixel_area_sr(nside: usize) -> f64 {
 
 /// A ring of pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[doc(hidden)]
 pub struct Ring {
     /// RING number of its first pixel.
     pub first: usize,
@@ -58,6 +61,7 @@ pub struct Ring {
 
 /// Ring `k` = 1 .. 4 nside - 1, counted from the north.
 #[must_use]
+#[doc(hidden)]
 pub fn ring(nside: usize, k: usize) -> Ring {
     let n = nside as f64;
     let southern = k > 2 * nside;
@@ -115,6 +119,7 @@ pub fn pixel_directions(nside: usize) -> Vec<Vec3> {
 /// x runs north-east and y north-west, as in the NESTED scheme: pixel (ix, iy) of a face has its
 /// centre at ((ix + 1/2) / nside, (iy + 1/2) / nside). Area is uniform in (x, y).
 #[must_use]
+#[doc(hidden)]
 pub fn face_direction(face: usize, x: f64, y: f64) -> Vec3 {
     let ring = f64::from(FACE_RING[face]) - x - y;
     let (z, sin_theta, scale) = if ring < 1.0 {
@@ -236,6 +241,7 @@ pub fn pixel_of(nside: usize, direction: Vec3) -> usize {
 
 /// Base face and integer position (ix, iy) of a NESTED pixel.
 #[must_use]
+#[doc(hidden)]
 pub fn nested_to_face(nside: usize, pixel: usize) -> (usize, usize, usize) {
     let in_face = pixel % (nside * nside);
     (pixel / (nside * nside), even_bits(in_face), even_bits(in_face >> 1))

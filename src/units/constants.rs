@@ -21,4 +21,5 @@ pub const YEAR_S: f64 = 365.25 * DAY_S;
 pub const SIDEREAL_MONTH_S: f64 = 27.321_661 * DAY_S;
 
 /// HEALPix value of a pixel without data, K.
+#[doc(hidden)]
 pub const HEALPIX_UNSEEN: f64 = -1.637_5e30;
