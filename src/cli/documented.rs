@@ -19,8 +19,22 @@ fn pages(folder: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
+/// A command line with 3, which is a number, a frequency and a name, for each of the shell's variables.
+fn without_variables(command: &str) -> String {
+    let mut parts = command.split('$');
+    let mut found = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let end = part.strip_prefix('{').and_then(|_| Some(part.find('}')? + 1));
+        let name = part.find(|c: char| !c.is_alphanumeric() && c != '_');
+        found.push('3');
+        found.push_str(&part[end.or(name).unwrap_or(part.len())..]);
+    }
+    found
+}
+
 /// Words of a command line: up to what belongs to the shell, with quotes taken off.
 fn words(command: &str) -> Vec<String> {
+    let command = without_variables(command);
     let mut words = vec![String::new()];
     let (mut quote, mut before) = (None, ' ');
     for c in command.chars() {
@@ -114,4 +128,8 @@ fn commands_are_found_in_pages() {
         ]
     );
     assert_eq!(words("lunarray run --set 'a=[1, 2]' 2> y &"), ["lunarray", "run", "--set", "a=[1, 2]"]);
+    assert_eq!(
+        words("lunarray sky --freq-hz ${mhz}e6 -o x-$mhz.fits"),
+        ["lunarray", "sky", "--freq-hz", "3e6", "-o", "x-3.fits"]
+    );
 }

@@ -31,9 +31,10 @@ fn drive(python: &Path, script: &str, args: &[&str]) {
 }
 
 #[test]
-#[ignore = "needs LUNARRAY_PYTHON"]
+#[ignore = "needs LUNARRAY_PYTHON and chromium"]
 fn a_browser_shows_what_the_interface_and_the_files_say() {
-    let python = python().filter(|_| has_browser());
+    let python = python();
+    require_browser();
     let place = Place::new();
     let file = place.downlink("packets");
     let pictures = pictures();
@@ -43,9 +44,10 @@ fn a_browser_shows_what_the_interface_and_the_files_say() {
 /// A mission of 1.3 years, of which every tenth window is kept, in half a minute; LUNARRAY_PAGE_S and LUNARRAY_PAGE_WINDOWS say
 /// otherwise, 600 and 2 for a long look.
 #[test]
-#[ignore = "needs LUNARRAY_PYTHON"]
+#[ignore = "needs LUNARRAY_PYTHON and chromium"]
 fn a_page_that_stays_open_takes_no_more_memory() {
-    let python = python().filter(|_| has_browser());
+    let python = python();
+    require_browser();
     let place = Place::new();
     let of = |name: &str, default: &str| std::env::var(name).unwrap_or_else(|_| default.to_owned());
     let windows = format!("spacecraft.every_nth_window={}", of("LUNARRAY_PAGE_WINDOWS", "10"));
