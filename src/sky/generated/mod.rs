@@ -27,6 +27,7 @@ mod sources;
 
 #[doc(hidden)]
 pub use added::AddedSkyError;
+#[doc(hidden)]
 pub use catalogue::CatalogueError;
 pub use config::{GeneratedSky, GeneratedSkyError};
 #[doc(hidden)]
