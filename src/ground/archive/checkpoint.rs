@@ -16,10 +16,10 @@ use crate::calibration::AutoTable;
 use crate::frames::EphemerisSegment;
 use crate::ground::{CollectorState, CollectorView, GroundError};
 
-const MAGIC: &[u8; 8] = b"LNRSTA05";
+const MAGIC: &[u8; 8] = b"LNRSTA06";
 /// Beginning of the magic in every version.
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of the ground's state, version 05; earlier versions keep less in their journal: \
+const VERSION: &str = "a checkpoint of the ground's state, version 06; earlier versions keep less: \
                        replay their files into a new folder";
 /// Bytes of magic, length of the head, and checksum.
 const FIXED_BYTES: u64 = 24;
