@@ -442,13 +442,13 @@ mod tests {
     fn an_earlier_version_is_refused_and_says_what_to_do() {
         with_head(|head| {
             let mut old = written(head);
-            old[..8].copy_from_slice(b"LNRSTA04");
+            old[..8].copy_from_slice(b"LNRSTA05");
             let body = old.len() - 8;
             let crc = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &old[..body]);
             old[body..].copy_from_slice(&crc.to_le_bytes());
             let said = read_back(&old).unwrap_err().to_string();
             assert!(
-                said.contains("version 05") && said.contains("replay their files into a new folder"),
+                said.contains("version 06") && said.contains("replay their files into a new folder"),
                 "{said}"
             );
         });
