@@ -2,6 +2,7 @@
 //!
 //! The only place where space and ground meet, and where concrete stages are connected. Uses every folder before it.
 
+mod bound;
 mod calibrate;
 mod calibrate_products;
 mod channel_lists;
@@ -36,6 +37,7 @@ mod study;
 mod study_file;
 mod summary;
 
+pub use bound::{BoundSummary, bound};
 pub use calibrate::{CalibrateJob, CalibrateProgress, CalibrateWatcher, calibrate, with_gains};
 pub use config::Config;
 pub use config_reader::ReadProblem;

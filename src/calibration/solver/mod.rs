@@ -22,10 +22,12 @@
 //! | `moments` | a pair at any offset |
 //! | `expansion` | a plane wave of an offset by spherical harmonics |
 //! | `passes` | a pass from packets to its solutions |
+//! | `bound` | what a pass can tell at best |
 //! | `monitor` | what happened to the instrument |
 //! | `table` | tables, and the file of gains |
 
 mod agree;
+mod bound;
 mod circle;
 mod config;
 #[cfg(test)]
@@ -58,6 +60,7 @@ mod table;
 mod tests;
 mod verdict;
 
+pub use bound::{DaughterBound, GainBound, bounds};
 pub use circle::wavelengths_max as known_wavelengths_max;
 pub use config::{AmplitudeScale, CalibrationMode, SkyModel, SolverConfig};
 pub use model::{KnownSignal, Offsets};
