@@ -5,6 +5,7 @@
 
 mod arguments;
 mod bench;
+mod bound;
 mod calibrate;
 mod check;
 mod compare;
@@ -112,6 +113,7 @@ enum Command {
     Figure(figure::FigureArgs),
     Cutout(cutout::CutoutArgs),
     Calibrate(calibrate::CalibrateArgs),
+    Bound(bound::BoundArgs),
     Predict(predict::PredictArgs),
     Check(check::CheckArgs),
     Bench(bench::BenchArgs),
@@ -241,6 +243,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Figure(args) => figure::execute(&args),
         Command::Cutout(args) => cutout::execute(&args),
         Command::Calibrate(args) => calibrate::execute(&args),
+        Command::Bound(args) => bound::execute(&args),
         Command::Predict(args) => predict::execute(&args),
         Command::Check(args) => check::execute(&args),
         Command::Bench(args) => bench::execute(&args),

@@ -56,6 +56,7 @@ fn every_command_has_help_that_teaches() {
         "completions",
         "man",
         "calibrate",
+        "bound",
     ] {
         let output = lunarray().args([command, "--help"]).output().unwrap();
         assert!(output.status.success());

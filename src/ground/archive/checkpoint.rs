@@ -16,11 +16,11 @@ use crate::frames::EphemerisSegment;
 use crate::ground::{CollectorState, CollectorView, GroundError};
 use crate::imaging::AccumulatorState;
 
-const MAGIC: &[u8; 8] = b"LNRSTA05";
+const MAGIC: &[u8; 8] = b"LNRSTA06";
 /// Beginning of the magic in every version.
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of the ground's state, version 05; earlier versions keep less in their journal: \
-                       make a new state by `lunarray rebuild`, or replay the files into a new folder";
+const VERSION: &str = "a checkpoint of the ground's state, version 06; earlier versions keep less: make a new state by `lunarray \
+                       rebuild`, or replay the files into a new folder";
 /// Bytes of magic, length of the head, and checksum.
 const FIXED_BYTES: u64 = 24;
 
@@ -459,13 +459,13 @@ mod tests {
     fn an_earlier_version_is_refused_and_says_what_to_do() {
         with_head(|head| {
             let mut old = written(head);
-            old[..8].copy_from_slice(b"LNRSTA04");
+            old[..8].copy_from_slice(b"LNRSTA05");
             let body = old.len() - 8;
             let crc = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &old[..body]);
             old[body..].copy_from_slice(&crc.to_le_bytes());
             let said = read_back(&old).unwrap_err().to_string();
             assert!(
-                said.contains("version 05") && said.contains("replay their files into a new folder"),
+                said.contains("version 06") && said.contains("replay their files into a new folder"),
                 "{said}"
             );
         });

@@ -50,7 +50,7 @@
 //! another version is made of it by [`crate::ground::Ground::rebuild`].
 //!
 //! # A checkpoint
-//! Magic `LNRSTA05`; length of the head (u64 LE); head (bincode); the channels' engines as they write
+//! Magic `LNRSTA06`; length of the head (u64 LE); head (bincode); the channels' engines as they write
 //! themselves; CRC-64/NVME of all that (u64 LE). It is written under another name, synced and renamed; the previous one
 //! is kept, and used, with a note, if the newest is damaged. Damaged is one whose checksum or contents are wrong, not one
 //! that the system fails to read: that is an error, after which the folder is as it was.
