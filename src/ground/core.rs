@@ -110,6 +110,7 @@ impl Ground {
     /// Begins with a snapshot of what earlier sessions have summed, if snapshots are wanted: a ground that was started again has maps at
     /// once, and not when the next one is due.
     #[must_use]
+    #[doc(hidden)]
     pub fn beginning_with_maps(self) -> Self {
         Self { begins_with_maps: true, ..self }
     }

@@ -72,6 +72,7 @@ impl FileSource {
 
     /// Whether the last file is followed as it grows.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_followed(&self) -> bool {
         self.patience.is_some()
     }

@@ -50,6 +50,7 @@ impl Ground {
     ///
     /// # Errors
     /// A folder that cannot be used; a state whose archive is at another place.
+    #[doc(hidden)]
     pub fn keep_packets(
         &mut self,
         elsewhere: Option<&Path>,
