@@ -219,12 +219,14 @@ const ORBIT_M_MAX: f64 = 1e8;
 impl ArrayConfig {
     /// Whether satellites have orbits of their own, in place of a formation on one.
     #[must_use]
+    #[doc(hidden)]
     pub fn has_own_orbits(&self) -> bool {
         !self.kepler.is_empty() || !self.oem.is_empty() || self.propagate.is_on()
     }
 
     /// Whether all satellites follow each other on one circle.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_circle(&self) -> bool {
         !self.has_own_orbits() && self.eccentricity == 0.0 && self.cross_track_ratio == 0.0
     }
@@ -236,6 +238,7 @@ impl ArrayConfig {
 
     /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
+    #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
         const POSITIVE: &str = "a positive number";
         const FINITE: &str = "a finite number";

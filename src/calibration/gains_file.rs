@@ -112,6 +112,7 @@ impl GainsFile {
 
     /// Everything that is wrong with the values; empty if they are good.
     #[must_use]
+    #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("");
         let tolerance_hz = self.frequency_tolerance_hz;
@@ -153,6 +154,7 @@ impl GainsFile {
 
     /// Number of satellites in the first solution; 0 if there is none.
     #[must_use]
+    #[doc(hidden)]
     pub fn satellites(&self) -> usize {
         let first = self.channels.iter().find_map(|channel| channel.solutions.first());
         first.map_or(0, |solution| solution.gains.len())

@@ -49,6 +49,7 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let config = args.pipeline.load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
+    print_notes(plan.thinning_notes());
     let problems = plan.file_problems();
     if !problems.is_empty() {
         return Err(Box::new(ConfigError::Values { origin: source.origin(), problems }));

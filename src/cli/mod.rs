@@ -10,6 +10,8 @@ mod check;
 mod compare;
 mod corrupt;
 mod cutout;
+#[cfg(all(test, feature = "serve"))]
+mod documented;
 mod events;
 mod explain;
 mod export;
@@ -26,6 +28,7 @@ mod merge;
 mod notify;
 mod output;
 mod predict;
+mod printable_text;
 mod progress;
 mod recalibrate;
 mod replay;

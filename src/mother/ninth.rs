@@ -6,7 +6,7 @@ use num_complex::Complex32;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::config::VISIBILITY_BYTES;
+use super::sizes::VISIBILITY_BYTES;
 use crate::array::Array;
 use crate::frames::{Flags, GroundFrame, Housekeeping, ObservingWindow, Spectrometer, VisibilityBlock};
 use crate::numerics::lagrange;

@@ -221,6 +221,7 @@ impl Config {
 
     /// Everything that is wrong with the ground segment's sections; empty if they are good.
     #[must_use]
+    #[doc(hidden)]
     pub fn ground_problems(&self) -> Problems {
         let mut found = Problems::default();
         found.extend(self.downlink.listen.problems());
@@ -239,6 +240,7 @@ impl Config {
     /// files that they name. The downlink is not part of it: the same data may arrive through two stations, or in two
     /// formats.
     #[must_use]
+    #[doc(hidden)]
     pub fn space_hash(&self) -> u64 {
         let Self { name, seed, sky, array, daughters, instrument, navigation, spacecraft, .. } = self;
         let (mut sky, mut array) = (sky.clone(), array.clone());
@@ -258,6 +260,7 @@ impl Config {
     /// A hash of the sections that shape maps from a downlink, and of the contents of the files that they name, for
     /// provenance.
     #[must_use]
+    #[doc(hidden)]
     pub fn ground_hash(&self) -> u64 {
         let (mut calibration, mut map) = (self.calibration.clone(), self.map.clone());
         calibration.gains_file = calibration.gains_file.as_deref().map(contents);

@@ -123,12 +123,14 @@ impl ChannelCost {
 impl Plan {
     /// What the pipeline will cost. Nothing is measured: times are estimates at rates measured once.
     #[must_use]
+    #[doc(hidden)]
     pub fn cost(&self) -> Cost {
         self.cost_among(1)
     }
 
     /// As [`Plan::cost`], for one of some ranks that share the sums.
     #[must_use]
+    #[doc(hidden)]
     pub fn cost_among(&self, ranks: usize) -> Cost {
         let map = &self.config.map;
         let nsides = self.sky_nsides();

@@ -104,15 +104,13 @@ pub enum PipelineError {
     /// No observing window.
     #[error(
         "spacecraft.duration_s = {duration_s}: there is no observing window in it. The first begins when the Earth sets for \
-         daughter 1, within an orbit of {orbit_s:.0} s, and only one of every_nth_window = {every_nth} is used"
+         daughter 1, within an orbit of {orbit_s:.0} s, and spacecraft.thin and every_nth_window leave out more"
     )]
     NoWindow {
         /// Length of the mission, s.
         duration_s: f64,
         /// An orbit, s.
         orbit_s: f64,
-        /// Distance between used windows, windows.
-        every_nth: u64,
     },
     /// A downlink that cannot be read more than once.
     #[error("{}: not a regular file; expected one with --groups, which reads the downlink once a group", path.display())]

@@ -16,6 +16,7 @@ use crate::units::InvalidValue;
 impl Plan {
     /// Reads every file that the configuration names; everything that is wrong with them, empty if they are good.
     #[must_use]
+    #[doc(hidden)]
     pub fn file_problems(&self) -> Problems {
         let mut found = Problems::default();
         let (sky, spacecraft) = (&self.config.sky, &self.config.spacecraft);

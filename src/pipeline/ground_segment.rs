@@ -41,6 +41,7 @@ impl Config {
     ///
     /// # Errors
     /// Prior maps and tables of power that cannot be read.
+    #[doc(hidden)]
     pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
         let map = &self.map;
         Ok(SolverSetup {

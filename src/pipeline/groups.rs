@@ -405,6 +405,7 @@ impl Plan {
     ///
     /// # Errors
     /// Samples; a channel for which alone there is too little memory.
+    #[doc(hidden)]
     pub fn run_groups(
         &self,
         size: GroupSize,

@@ -32,6 +32,7 @@ use crate::units::{Pair, all_pairs};
 impl Plan {
     /// The choice of model for each channel, with skies of these nsides, channel by channel.
     #[must_use]
+    #[doc(hidden)]
     pub fn model_plans(&self, nsides: &[usize]) -> Vec<ModelPlan> {
         self.model_plans_for(&self.visibilities(), nsides)
     }
@@ -76,6 +77,7 @@ impl Plan {
 impl Plan {
     /// nside of each channel's simulated sky; a map file that cannot be read counts as a generated sky.
     #[must_use]
+    #[doc(hidden)]
     pub fn sky_nsides(&self) -> Vec<usize> {
         let sky = &self.config.sky;
         let nside = |channel: usize| {

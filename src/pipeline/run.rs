@@ -293,6 +293,7 @@ impl Config {
     ///
     /// # Errors
     /// [`PipelineError::NotShareable`].
+    #[doc(hidden)]
     pub fn require_shareable(&self, ranks: usize) -> Result<(), PipelineError> {
         let found = match self {
             _ if ranks < 2 => None,

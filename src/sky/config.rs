@@ -90,6 +90,7 @@ impl SkyConfig {
 
     /// Highest degree that the analysis of a map of `nside` determines exactly: 9/4 nside.
     #[must_use]
+    #[doc(hidden)]
     pub fn l_max_held(nside: usize) -> usize {
         9 * nside / 4
     }

@@ -80,6 +80,7 @@ impl SkyMap {
     }
 
     /// Mutable values in RING order.
+    #[doc(hidden)]
     pub fn values_mut(&mut self) -> &mut [f64] {
         &mut self.values
     }
@@ -114,6 +115,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::Nside`]; [`MapError::Direction`] if `nside` is above the map's own.
+    #[doc(hidden)]
     pub fn degrade(&self, nside: usize) -> Result<Self, MapError> {
         check_nside(nside)?;
         if nside > self.nside {
@@ -147,6 +149,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::Nside`]; [`MapError::Direction`] if `nside` is below the map's own.
+    #[doc(hidden)]
     pub fn upgrade(&self, nside: usize) -> Result<Self, MapError> {
         check_nside(nside)?;
         if nside < self.nside {
@@ -172,6 +175,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::NoTemperature`] with the number and the first of the others.
+    #[doc(hidden)]
     pub fn check_temperatures(&self) -> Result<(), MapError> {
         let bad = |&(_, value): &(usize, &f64)| !(-TEMPERATURE_K_MAX..=TEMPERATURE_K_MAX).contains(value);
         let mut pixels = self.values.iter().enumerate().filter(bad);
@@ -188,6 +192,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::BadPixels`] with the number and the first of the pixels that are NaN, infinite or UNSEEN, in another unit too.
+    #[doc(hidden)]
     pub fn check_whole(&self) -> Result<(), MapError> {
         let bad = |&(_, &value): &(usize, &f64)| !value.is_finite() || is_scaled_unseen(value);
         let mut pixels = self.values.iter().enumerate().filter(bad);

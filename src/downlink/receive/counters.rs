@@ -177,6 +177,7 @@ pub struct ReceptionCounters {
 impl ReceptionCounters {
     /// Counts of one kind.
     #[must_use]
+    #[doc(hidden)]
     pub fn kind(&self, kind: Kind) -> &KindCounts {
         match kind {
             Kind::Instrument => &self.instrument,
@@ -256,6 +257,7 @@ impl ReceptionCounters {
 
     /// Sound packets of all kinds.
     #[must_use]
+    #[doc(hidden)]
     pub fn packets(&self) -> u64 {
         Kind::ALL.iter().map(|kind| self.kind(*kind).packets).sum()
     }

@@ -117,6 +117,7 @@ impl Intake {
 
     /// What the stream is, as far as its first bytes tell, if it is no downlink.
     #[must_use]
+    #[doc(hidden)]
     pub fn foreign_name(&self) -> Option<String> {
         name_of(&self.head)
     }

@@ -118,6 +118,7 @@ impl FileSource {
     ///
     /// # Errors
     /// Those of [`FileSource::open`] for all files but the last, which need only exist.
+    #[doc(hidden)]
     pub fn follow(paths: &[PathBuf], idle_s: f64) -> Result<Self, DownlinkError> {
         let Some((last, others)) = paths.split_last() else { return Self::open(paths) };
         let file = File::open(last).map_err(io_error(last, "open the file"))?;

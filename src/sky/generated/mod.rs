@@ -25,9 +25,12 @@ mod fluctuations;
 mod galaxy;
 mod sources;
 
+#[doc(hidden)]
 pub use added::AddedSkyError;
+#[doc(hidden)]
 pub use catalogue::CatalogueError;
 pub use config::{GeneratedSky, GeneratedSkyError};
+#[doc(hidden)]
 pub use sources::{CatalogueSource, catalogue};
 
 use rayon::prelude::*;

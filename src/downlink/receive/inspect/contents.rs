@@ -229,6 +229,7 @@ impl Contents {
     /// Visibilities in sound packets less those that the spacecraft's latest report counts as sampled and not dropped on board: 0
     /// if all that were sent are in the file. `None` without a report.
     #[must_use]
+    #[doc(hidden)]
     pub fn found_less_reported(&self) -> Option<i64> {
         let HousekeepingSummary { sampled, dropped, .. } = self.housekeeping.as_ref()?;
         let found = self.visibilities.count + self.reception.visibilities_bad_value;
@@ -247,6 +248,7 @@ impl Contents {
 
     /// Whether nothing is missing between what is there, nothing is damaged, and every payload was decoded.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_undamaged(&self) -> bool {
         let clean = self.gaps.count + self.bad_checksums.count + self.garbage.count + self.faults.count == 0;
         let frames_sound = self.reception.frames.as_ref().is_none_or(FrameCounters::is_sound);

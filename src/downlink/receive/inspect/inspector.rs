@@ -43,6 +43,7 @@ impl Contents {
     ///
     /// # Errors
     /// Those of [`Contents::read`].
+    #[doc(hidden)]
     pub fn read_with(path: &Path, see: &mut dyn FnMut(&GroundFrame)) -> Result<Self, DownlinkError> {
         Self::read_from(File::open(path).map_err(io_error(path, "open the file"))?, path, see)
     }
@@ -51,6 +52,7 @@ impl Contents {
     ///
     /// # Errors
     /// Those of [`Contents::read`].
+    #[doc(hidden)]
     pub fn read_from(
         source: impl Read,
         path: &Path,
