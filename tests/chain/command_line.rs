@@ -466,7 +466,7 @@ fn check_tells_what_it_understood_of_each_file() {
     sets.iter().for_each(|set| args.extend(["--set", set]));
     let told = said(&args);
     for part in [
-        "map.fits: 3 MHz, galactic frame, K, nside 8",
+        "map.fits: 3 MHz, Galactic frame, K, nside 8",
         "mean 2.0000e6 K",
         "gleam.csv: 1 sources, equatorial positions",
         "at 200 MHz",
