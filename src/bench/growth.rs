@@ -3,9 +3,9 @@
 use serde::Serialize;
 
 use super::{chain, median, seconds_of, timed};
-use crate::pipeline::config::Config;
-use crate::pipeline::error::PipelineError;
-use crate::pipeline::plan::Plan;
+use crate::pipeline::Config;
+use crate::pipeline::PipelineError;
+use crate::pipeline::Plan;
 use crate::sky::SkyMap;
 
 /// The chain at one size.
