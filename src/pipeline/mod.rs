@@ -9,8 +9,8 @@ pub(crate) mod graph;
 mod jobs;
 
 pub use config::{
-    Config, ConfigError, ConfigSource, Expected, KeyDescription, MemoryLimit, MemorySource, PipelineError,
-    Plan, Problem, Problems, QUICKLOOK, REFERENCE, ReadProblem, key_descriptions,
+    Config, ConfigError, ConfigSource, Expected, KeyDescription, MemoryLimit, MemorySource, NoEffect,
+    PipelineError, Plan, Problem, Problems, QUICKLOOK, ReadProblem, Shown, key_descriptions, reference,
 };
 pub use cost::{ChannelCost, Cost, GroupSize, MapGroup, MemoryAdvice, RankCost, RunGroups, Segment};
 pub use graph::{

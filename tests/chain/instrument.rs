@@ -81,11 +81,7 @@ fn blocks(path: &str) -> BTreeMap<(u16, u8, u8, i64), VisibilityBlock> {
 fn errors_that_are_off_leave_every_byte_and_seeds_decide_the_rest() {
     let place = Workplace::new(SMALL);
     let ideal = simulate(&place, "ideal.ccsds", &[]);
-    let off = [
-        "instrument.realisation=5",
-        "instrument.phase_deg={drift_time_s=100.0}",
-        "instrument.beacon={on_s=60.0}",
-    ];
+    let off = ["instrument.realisation=5", "instrument.phase_deg={rate_per_day=[0.0,0.0,0.0,0.0]}"];
     assert!(simulate(&place, "off.ccsds", &off) == ideal);
     assert!(!Path::new(&place.path("ideal.ccsds.instrument.csv")).exists());
     let on = simulate(&place, "on.ccsds", &ERRORS);

@@ -2,8 +2,10 @@
 
 mod channel_lists;
 mod downlink_settings;
+mod effects;
 mod error;
 mod file_problems;
+mod key_list;
 mod memory;
 mod notes;
 mod plan;
@@ -15,12 +17,13 @@ mod sections;
 mod source;
 
 pub(super) use downlink_settings::SETTINGS;
+pub use effects::NoEffect;
 pub use error::PipelineError;
 pub use memory::{MemoryLimit, MemorySource};
 pub use plan::{Expected, Plan};
 pub use problems::{Problem, Problems};
 pub use reader::ReadProblem;
-pub use reference::{KeyDescription, REFERENCE, key_descriptions};
+pub use reference::{KeyDescription, Shown, key_descriptions, reference};
 pub use sections::Config;
 pub use source::{ConfigError, ConfigSource, QUICKLOOK};
 pub(super) use source::{has_sections, study_key};

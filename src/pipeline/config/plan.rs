@@ -5,9 +5,9 @@ use std::sync::Arc;
 use super::error::PipelineError;
 use super::sections::Config;
 use crate::array::Array;
-use crate::daughters::{AntennaErrors, DaughtersConfig, InstrumentErrors, truth_csv};
+use crate::daughters::{AntennaErrors, InstrumentErrors, truth_csv};
 use crate::frames::{Instrument, ObservingWindow};
-use crate::mother::{Fidelity, Observer, Schedule, SpacecraftConfig};
+use crate::mother::{Fidelity, Observer, Schedule};
 use crate::units::{ChannelId, MissionTime, all_pairs};
 
 /// A configuration that has been checked, with what follows from it.
@@ -103,29 +103,6 @@ impl Plan {
         self.instrument_errors().map(|errors| truth_csv(&errors, &self.windows))
     }
 
-    /// Keys for samples that differ from their defaults while the fidelity has no samples.
-    #[must_use]
-    pub fn without_effect(&self) -> Vec<String> {
-        let Config { spacecraft, daughters, .. } = &self.config;
-        let mut found = Vec::new();
-        if spacecraft.fidelity == Fidelity::Samples {
-            return found;
-        }
-        // Both always have a TOML form: the reference file's test relies on it too.
-        let table = |section| toml::Table::try_from(section).unwrap_or_default();
-        changed_keys("daughters", &table(daughters), &table(&DaughtersConfig::default()), &mut found);
-        let usual = SpacecraftConfig::default();
-        let unused_s = !spacecraft.auto_powers && spacecraft.auto_integration_s != usual.auto_integration_s;
-        for (key, set) in
-            [("auto_integration_s", unused_s), ("wait_blocks", spacecraft.wait_blocks != usual.wait_blocks)]
-        {
-            if set {
-                found.push(format!("spacecraft.{key}"));
-            }
-        }
-        found
-    }
-
     /// Rate of the ninth daughter's spectra while the array observes, bit/s; `None` without it.
     #[must_use]
     pub fn ninth_bits_per_s(&self) -> Option<f64> {
@@ -164,18 +141,6 @@ impl Plan {
             expected
         };
         self.schedules.iter().enumerate().map(expected).collect()
-    }
-}
-
-/// Keys of a table whose values differ from the usual ones, with their sections.
-fn changed_keys(prefix: &str, table: &toml::Table, usual: &toml::Table, found: &mut Vec<String>) {
-    for (key, value) in table {
-        let path = format!("{prefix}.{key}");
-        match (value.as_table(), usual.get(key).and_then(toml::Value::as_table)) {
-            (Some(table), Some(usual)) => changed_keys(&path, table, usual, found),
-            _ if usual.get(key) != Some(value) => found.push(path),
-            _ => {}
-        }
     }
 }
 

@@ -6,19 +6,32 @@ use thiserror::Error;
 use toml::de::{DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
+use super::key_list::known_keys;
 use super::problems::{Problem, Problems};
 use super::sections::Config;
 use crate::units::{Dimension, shortened};
 
-/// Keys that have no default because they may be absent.
-const OPTIONAL_KEYS: [&str; 5] =
-    ["sky.file", "sky.frame", "sky.added", "calibration.gains_file", "map.prior_frame"];
-
-/// Keys that have another place now.
-const MOVED_KEYS: [(&str, &str); 3] = [
+/// Old names of keys, and the new ones; those of values that change their unit say so.
+const RENAMED_KEYS: [(&str, &str); 16] = [
     ("instrument.along_m", "navigation.along_m"),
     ("instrument.across_m", "navigation.across_m"),
     ("instrument.radial_m", "navigation.radial_m"),
+    ("daughters.disturbances.gain_error", "instrument.amplitude.constant (the logarithm of the amplitude)"),
+    (
+        "daughters.disturbances.gain_drift_per_s",
+        "instrument.amplitude.rate_per_day (of the logarithm, a day)",
+    ),
+    ("daughters.disturbances.phase_rad", "instrument.phase_deg.constant (degrees)"),
+    ("daughters.disturbances.phase_drift_rad_per_s", "instrument.phase_deg.rate_per_day (degrees a day)"),
+    ("daughters.disturbances.clock_offset_s", "instrument.clock_ns.constant (ns)"),
+    ("daughters.disturbances.clock_drift", "instrument.clock_ns.rate_per_day (ns a day)"),
+    ("daughters.disturbances.interference_k_sr", "daughters.tones.interference_k_sr"),
+    ("daughters.disturbances.interference_offset_hz", "daughters.tones.interference_offset_hz"),
+    ("daughters.disturbances.interference_depth_m", "daughters.tones.interference_depth_m"),
+    ("daughters.disturbances.calibration_k_sr", "daughters.tones.calibration_k_sr"),
+    ("daughters.disturbances.calibration_offset_hz", "daughters.tones.calibration_offset_hz"),
+    ("daughters.disturbances.calibration_phase_rad", "daughters.tones.calibration_phase_rad"),
+    ("daughters.disturbances", "daughters.tones, and [instrument] for gains, phases and clocks"),
 ];
 
 /// Most characters of a key, an override or the parser's message that are shown.
@@ -77,9 +90,7 @@ impl Reading {
             return Self { config, problems: Problems::default(), unread: Vec::new() };
         }
         let mut walk = Walk { lines, problems: Problems::default(), unread: Vec::new() };
-        // The default configuration always has a TOML form: the reference file's test relies on it too.
-        let known = Table::try_from(Config::default()).unwrap_or_default();
-        let good = walk.section(&[], table, &known);
+        let good = walk.section(&[], table, &known_keys(Config::KEYS));
         let Walk { mut problems, unread, .. } = walk;
         let config = good.try_into().unwrap_or_else(|error: toml::de::Error| {
             // Good keys that are bad together: there are none today.
@@ -135,7 +146,11 @@ impl Walk<'_> {
                     self.refuse(&path, || format!("found one value ({found}), expected a section"));
                     None
                 }
-                (None, _) if !OPTIONAL_KEYS.contains(&path.join(".").as_str()) => {
+                (None, Value::Table(table)) if is_renamed_below(&path) => {
+                    self.section(&path, table, &Table::new());
+                    None
+                }
+                (None, _) => {
                     let lines = self.lines;
                     self.problems.push(|| ReadProblem::Unknown {
                         place: lines.place(&path),
@@ -175,17 +190,21 @@ fn alone(path: &[&str], value: Value) -> Table {
     path.fold(innermost, |table, key| Table::from_iter([((*key).to_owned(), Value::Table(table))]))
 }
 
+/// Whether keys of the section at `path` have other names now.
+fn is_renamed_below(path: &[&str]) -> bool {
+    let inside = format!("{}.", path.join("."));
+    RENAMED_KEYS.iter().any(|(before, _)| before.starts_with(&inside))
+}
+
 /// The keys of the section in which `path` is none, for a message; first the one that is spelled most like it.
 fn keys_of(path: &[&str], known: &Table) -> String {
     let Some((wrong, path)) = path.split_last() else { return String::new() };
     let whole = [path, &[*wrong]].concat().join(".");
-    if let Some((_, now)) = MOVED_KEYS.iter().find(|(before, _)| *before == whole) {
-        return format!("it is {now} now");
+    if let Some((_, now)) = RENAMED_KEYS.iter().find(|(before, _)| *before == whole) {
+        return format!("it was renamed to {now}");
     }
     let section = path.join(".");
-    let optional = OPTIONAL_KEYS.iter().filter_map(|key| key.rsplit_once('.'));
-    let optional = optional.filter(|(of, _)| *of == section).map(|(_, key)| key);
-    let keys: Vec<&str> = known.keys().map(String::as_str).chain(optional).collect();
+    let keys: Vec<&str> = known.keys().map(String::as_str).collect();
     let section = if path.is_empty() { "a pipeline".to_owned() } else { format!("[{section}]") };
     let has = format!("{section} has {}", keys.join(", "));
     // One slip in three letters.

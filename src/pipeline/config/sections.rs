@@ -2,13 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::problems::Problems;
 use crate::array::{Array, ArrayConfig};
 use crate::calibration::solver::SolverConfig;
 use crate::calibration::{CalibrationConfig, CalibrationHook, VanVleck};
-use crate::daughters::{DaughtersConfig, InstrumentConfig, NavigationConfig};
+use crate::daughters::{DaughtersConfig, InstrumentConfig, NavigationConfig, Tones};
 use crate::downlink::DownlinkConfig;
 use crate::imaging::{EngineKind, MapConfig};
 use crate::mother::{Antenna, Fidelity, MoonMirror, SpacecraftConfig};
@@ -16,43 +16,45 @@ use crate::products::ProductsConfig;
 use crate::response::model::ModelChoice;
 use crate::runtime::RuntimeConfig;
 use crate::sky::SkyConfig;
-use crate::units::{Checks, InvalidValue};
+use crate::units::{Checks, InvalidValue, keys};
 
-/// A whole pipeline: the sky, the spacecraft and the ground.
-///
-/// Sections are in the order of the data path. A ground segment reads only `calibration`, `calibrate`, `map`, `products` and
-/// `runtime`, and `downlink.listen` when it listens.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Config {
-    /// Name; products go to `out/NAME` by default.
-    pub name: String,
-    /// Seed of everything random in the space segment.
-    pub seed: u64,
-    /// The sky.
-    pub sky: SkyConfig,
-    /// The array.
-    pub array: ArrayConfig,
-    /// The daughters' samples.
-    pub daughters: DaughtersConfig,
-    /// Errors of the instrument.
-    pub instrument: InstrumentConfig,
-    /// Errors of the positions and times in packets.
-    pub navigation: NavigationConfig,
-    /// The spacecraft.
-    pub spacecraft: SpacecraftConfig,
-    /// The downlink.
-    pub downlink: DownlinkConfig,
-    /// Calibration.
-    pub calibration: CalibrationConfig,
-    /// The solver of calibrations.
-    pub calibrate: SolverConfig,
-    /// Map making.
-    pub map: MapConfig,
-    /// Products.
-    pub products: ProductsConfig,
-    /// Queues and threads.
-    pub runtime: RuntimeConfig,
+keys! {
+    /// A whole pipeline: the sky, the spacecraft and the ground.
+    ///
+    /// Sections are in the order of the data path. A ground segment reads only `calibration`, `calibrate`, `map`, `products` and
+    /// `runtime`, and `downlink.listen` when it listens.
+    pub struct Config {
+        /// Name of the run: products go to `out/NAME`. Empty for the name of the file.
+        everyday name: String = String::new();
+        /// Seed of all random numbers of the space segment.
+        everyday seed: u64 = 0;
+        /// The simulated sky.
+        section sky: SkyConfig = SkyConfig::default();
+        /// Orbit and formation of the satellites; the defaults are the array of the paper.
+        section array: ArrayConfig = ArrayConfig::default();
+        /// Samples of the daughters, their quantisers and their links to the mother.
+        #[only_with(r#"spacecraft.fidelity = "samples""#)]
+        section daughters: DaughtersConfig = DaughtersConfig::default();
+        /// Errors of the instrument. Their true values are written beside the downlink, as FILE.instrument.csv.
+        section instrument: InstrumentConfig = InstrumentConfig::default();
+        /// Errors of the positions and times in packets: what packets say minus what is true.
+        section navigation: NavigationConfig = NavigationConfig::default();
+        /// Channels, integration and model of the visibilities.
+        section spacecraft: SpacecraftConfig = SpacecraftConfig::default();
+        /// Packets or frames, and the link to the ground.
+        section downlink: DownlinkConfig = DownlinkConfig::default();
+        /// What is corrected in visibilities before they are mapped.
+        section calibration: CalibrationConfig = CalibrationConfig::default();
+        /// The solver of gains, for `lunarray calibrate` and `calibration.hook = "solve"`. Keys with `_sigma` are what is
+        /// expected before the data are seen; what has 0 is not solved for.
+        section calibrate: SolverConfig = SolverConfig::default();
+        /// How maps are made.
+        section map: MapConfig = MapConfig::default();
+        /// Products besides the maps.
+        section products: ProductsConfig = ProductsConfig::default();
+        /// Queues and threads. None of them changes a byte of the results.
+        section runtime: RuntimeConfig = RuntimeConfig::default();
+    }
 }
 
 impl Config {
@@ -91,14 +93,15 @@ impl Config {
         }
         found.extend(array);
         let width_hz = self.spacecraft.channel_width_hz;
-        found.extend(self.daughters.problems(self.array.satellites, width_hz));
+        found.extend(self.daughters.problems(width_hz));
         let samples = self.spacecraft.fidelity == Fidelity::Samples;
         found.extend(self.instrument.problems(self.array.satellites, channels, samples));
         found.extend(self.navigation.problems(self.array.satellites));
         found.extend(spacecraft);
         found.extend(self.downlink.problems());
         found.extend(self.map.misfits(channels));
-        found.append(self.ground_problems());
+        found.append(self.ground_values());
+        found.append(self.without_effect(&[]));
         found
     }
 
@@ -224,6 +227,12 @@ impl Config {
     /// Everything that is wrong with the ground segment's sections; empty if they are good.
     #[must_use]
     pub fn ground_problems(&self) -> Problems {
+        let mut found = self.ground_values();
+        found.append(self.without_effect(&["calibration", "calibrate", "map", "products", "runtime"]));
+        found
+    }
+
+    fn ground_values(&self) -> Problems {
         let mut found = Problems::default();
         found.extend(self.downlink.listen.problems());
         found.extend(self.calibration.problems());
@@ -249,11 +258,12 @@ impl Config {
         if let Some(added) = &mut sky.added {
             added.catalogue = added.catalogue.as_deref().map(contents);
         }
+        let daughters = HashedDaughters::of(daughters);
         // Data of an ideal instrument are those of before there were errors, byte for byte.
         match (instrument.is_on(), navigation.is_on()) {
-            (false, false) => hash(&(name, seed, sky, &array, daughters, spacecraft)),
-            (true, false) => hash(&(name, seed, sky, &array, daughters, spacecraft, instrument)),
-            (_, true) => hash(&(name, seed, sky, &array, daughters, spacecraft, instrument, navigation)),
+            (false, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft)),
+            (true, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft, instrument)),
+            (_, true) => hash(&(name, seed, sky, &array, &daughters, spacecraft, instrument, navigation)),
         }
     }
 
@@ -271,6 +281,44 @@ impl Config {
         let mut calibrate = self.calibrate.clone();
         calibrate.model_files = calibrate.model_files.iter().map(|path| contents(path)).collect();
         hash(&(calibration, map, calibrate))
+    }
+}
+
+/// `[daughters]` as hashes have it: with `disturbances` in place of `tones`, as when it also had lists of gains, phases and clocks.
+/// So data keep their hashes.
+#[derive(Serialize)]
+struct HashedDaughters<'a> {
+    #[serde(flatten)]
+    others: DaughtersConfig,
+    disturbances: HashedTones<'a>,
+}
+
+#[derive(Serialize)]
+struct HashedTones<'a> {
+    gain_error: [f64; 0],
+    gain_drift_per_s: [f64; 0],
+    phase_rad: [f64; 0],
+    phase_drift_rad_per_s: [f64; 0],
+    clock_offset_s: [f64; 0],
+    clock_drift: [f64; 0],
+    #[serde(flatten)]
+    tones: &'a Tones,
+}
+
+impl<'a> HashedDaughters<'a> {
+    fn of(daughters: &'a DaughtersConfig) -> Self {
+        // Without tones of its own, which are then left out.
+        let others = DaughtersConfig { tones: Tones::default(), ..daughters.clone() };
+        let disturbances = HashedTones {
+            gain_error: [],
+            gain_drift_per_s: [],
+            phase_rad: [],
+            phase_drift_rad_per_s: [],
+            clock_offset_s: [],
+            clock_drift: [],
+            tones: &daughters.tones,
+        };
+        Self { others, disturbances }
     }
 }
 
@@ -292,8 +340,6 @@ fn hash(value: &impl Serialize) -> u64 {
 mod tests {
     use super::*;
     use crate::pipeline::ConfigSource;
-
-    const REFERENCE: &str = include_str!("../../../pipelines/reference.toml");
 
     fn with(overrides: &[&str]) -> Option<Config> {
         let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
@@ -318,6 +364,15 @@ mod tests {
             assert!(problems(bad.0, bad.1, "samples").is_some_and(|text| text.contains("daughters.bits is")));
         }
         assert!(problems(1, 1, "visibilities").is_some_and(|text| text.contains("expected 0")));
+    }
+
+    #[test]
+    fn data_of_before_keep_their_hash() {
+        // In the packets of version 0.1.0 before [daughters.disturbances] became [daughters.tones].
+        let thin = ["spacecraft.every_nth_window=1500", "sky.nside=8", "sky.l_max=8"];
+        assert_eq!(with(&thin).unwrap().space_hash(), 0x85d8_7b8e_cfbe_4d84);
+        let toned = with(&["daughters.tones.calibration_k_sr=1.0"]).unwrap();
+        assert_ne!(toned.space_hash(), with(&[]).unwrap().space_hash());
     }
 
     #[test]
@@ -356,23 +411,5 @@ mod tests {
         assert_ne!(base.space_hash(), flown.space_hash());
         assert_eq!(base.ground_hash(), flown.ground_hash());
         assert_eq!((base.space_hash(), base.ground_hash()), (queued.space_hash(), queued.ground_hash()));
-    }
-
-    #[test]
-    fn the_reference_file_holds_every_key_with_its_default() {
-        let written: toml::Table = toml::from_str(REFERENCE).unwrap();
-        let config: Config = toml::from_str(REFERENCE).unwrap();
-        assert_eq!(config, Config::default());
-        let all = toml::Table::try_from(Config::default()).unwrap();
-        fn same_keys(path: &str, all: &toml::Table, written: &toml::Table) {
-            for (key, value) in all {
-                let path = format!("{path}.{key}");
-                let found = written.get(key).unwrap_or_else(|| panic!("{path} is missing"));
-                if let (Some(all), Some(written)) = (value.as_table(), found.as_table()) {
-                    same_keys(&path, all, written);
-                }
-            }
-        }
-        same_keys("", &all, &written);
     }
 }

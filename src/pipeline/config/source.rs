@@ -297,7 +297,7 @@ mod tests {
             ("seed.more=1", "--set seed.more: `seed` is not a section"),
             (
                 "map.nsides=8",
-                "--set map.nsides=8: map.nsides: no such key; did you mean nside? [map] has baseline_bp_max, ",
+                "--set map.nsides=8: map.nsides: no such key; did you mean nside? [map] has antennas, ",
             ),
             ("a.b.c.d.e.f.g.h.i.j=1", "expected key=value"),
         ] {
@@ -346,7 +346,7 @@ mod tests {
         // As many values as the channels that cannot be read, and a quantiser that the ground would correct.
         let text = "[spacecraft]\nchannels_hz = [1e6, \"two MHz\"]\nevery_nth_integration = [1, 1]\nfidelity = \"samples\"\n\
                     [daughters]\nbits = \"two\"\n[calibration]\nquantiser_bits = 2\n[map]\nepsilon = [1e-4, 1e-4]\n\
-                    [array]\nsatellites = \"four\"\n[daughters.disturbances]\ngain_error = [0.1, 0.1, 0.1, 0.1]\n";
+                    [array]\nsatellites = \"four\"\n[instrument.amplitude]\nconstant = [0.1, 0.1, 0.1, 0.1]\n";
         let found = told(text, &[]);
         assert_eq!(found.len(), 4, "{found:#?}");
         for key in ["array.satellites: ", "daughters.bits: ", "spacecraft.channels_hz: "] {
@@ -451,7 +451,7 @@ mod tests {
         let list = |value: &str| format!("[{}]", vec![value; 100_000].join(", "));
         let text = format!(
             "[spacecraft]\nchannels_hz = {0}\nevery_nth_integration = {1}\nbaseline_wavelengths_max = {0}\ndelay_centre_deg = {0}\n\
-             [map]\nepsilon = {0}\nprior_k = {0}\n[daughters.disturbances]\ngain_error = {0}\n",
+             [map]\nepsilon = {0}\nprior_k = {0}\n[instrument.amplitude]\nconstant = {0}\n",
             list("-1.0"),
             list("0")
         );

@@ -73,8 +73,6 @@ pub struct Cost {
     /// Rate that one daughter's samples need on its link, and the greatest that the link has, bit/s; with samples and a
     /// limit alone.
     pub link_bits_per_s: Option<[f64; 2]>,
-    /// Keys that were set and have no effect with this fidelity.
-    pub without_effect: Vec<String>,
     /// Rate of the ninth daughter's spectra on the downlink while the array observes, bit/s; with it alone.
     pub ninth_bits_per_s: Option<f64>,
     /// What ranks exchange that share the sums; memory and time are then those of one of them. With several alone.
@@ -192,7 +190,6 @@ impl Plan {
             simulation_memory_bytes,
             samples_bits_per_s: self.samples_bits_per_s(),
             link_bits_per_s: self.link_bits_per_s(),
-            without_effect: self.without_effect(),
             ninth_bits_per_s: self.ninth_bits_per_s(),
             ranks: (ranks > 1).then(|| RankCost {
                 ranks,
@@ -377,10 +374,6 @@ impl fmt::Display for Cost {
             let short =
                 "; the rest waits in its buffer, and what has no room or no time after a window is dropped";
             writeln!(f, "{}", if needed > limit { short } else { "" })?;
-        }
-        if !self.without_effect.is_empty() {
-            let keys = self.without_effect.join(", ");
-            writeln!(f, "without effect   {keys}: used with spacecraft.fidelity = \"samples\" alone")?;
         }
         if let Some(rate) = self.ninth_bits_per_s {
             writeln!(f, "ninth daughter   {:.3} kbit/s of spectra while observing", rate / 1e3)?;
