@@ -55,6 +55,8 @@
 
 pub mod units;
 
+pub mod numerics;
+
 pub mod files;
 
 pub mod ranks;

@@ -2,10 +2,9 @@
 
 use serde::Serialize;
 
-use super::{chain, median, seconds_of, timed};
-use crate::pipeline::Config;
-use crate::pipeline::PipelineError;
-use crate::pipeline::Plan;
+use super::chain;
+use super::timing::{median, seconds_of, timed};
+use crate::pipeline::{Config, PipelineError, Plan};
 use crate::sky::SkyMap;
 
 /// The chain at one size.

@@ -2,16 +2,18 @@
 
 use std::sync::Arc;
 
-use super::config::VISIBILITY_BYTES;
+use num_complex::Complex32;
+use rand_distr::{Distribution, StandardNormal};
+
+use super::sizes::VISIBILITY_BYTES;
 use crate::array::Array;
 use crate::frames::{Flags, GroundFrame, Housekeeping, ObservingWindow, Spectrometer, VisibilityBlock};
+use crate::numerics::lagrange;
 use crate::response::model::{DaughterPosition, DirectSum, ModelError, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{
     ChannelId, Checks, InvalidValue, Pair, StreamKind, TICKS_PER_SECOND, keys, random_stream,
 };
-use num_complex::Complex32;
-use rand_distr::{Distribution, StandardNormal};
 
 /// Lowest and highest frequency that a ninth daughter may observe, Hz.
 pub const NINTH_BAND_HZ: [f64; 2] = [30e6, 120e6];
@@ -159,15 +161,6 @@ impl NinthSky {
             }
         }
     }
-}
-
-/// Lagrange weights of the values at `nodes` for interpolation at `x`.
-fn lagrange(nodes: &[f64], x: f64) -> Vec<f64> {
-    let weight = |k: usize| {
-        let others = nodes.iter().enumerate().filter(|(m, _)| *m != k);
-        others.map(|(_, node)| (x - node) / (nodes[k] - node)).product()
-    };
-    (0..nodes.len()).map(weight).collect()
 }
 
 /// What [`Ninth`] needs.

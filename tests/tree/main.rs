@@ -18,8 +18,9 @@ use std::path::Path;
 use source::{File, ModulePath, parse};
 
 /// Folders (and files) directly below `src/`, each after all that it may use.
-const ORDER: [&str; 21] = [
+const ORDER: [&str; 22] = [
     "units",
+    "numerics",
     "files",
     "ranks",
     "frames",
