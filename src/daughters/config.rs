@@ -45,18 +45,14 @@ keys! {
         /// Power of narrow-band leakage from the Earth at the limb, K sr; 0 for none.
         expert interference_k_sr: f64 = 0.0;
         /// Frequency of the leakage from the Earth, Hz from the channel's centre.
-        #[only_with("daughters.tones.interference_k_sr > 0")]
         expert interference_offset_hz: f64 = 0.0;
         /// Depth behind the limb over which the power of the leakage falls by a factor e, m.
-        #[only_with("daughters.tones.interference_k_sr > 0")]
         expert interference_depth_m: f64 = 0.0;
         /// Power of the calibration tone, K sr, equal and in phase at all daughters; 0 for none.
         expert calibration_k_sr: f64 = 0.0;
         /// Frequency of the calibration tone, Hz from the channel's centre.
-        #[only_with("daughters.tones.calibration_k_sr > 0")]
         expert calibration_offset_hz: f64 = 0.0;
         /// Phase of the calibration tone at the start of a window, rad.
-        #[only_with("daughters.tones.calibration_k_sr > 0")]
         expert calibration_phase_rad: f64 = 0.0;
     }
 }

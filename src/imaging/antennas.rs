@@ -11,7 +11,7 @@ keys! {
         expert tilt_along_deg: Vec<f64> = Vec::new();
         /// Tilt of an antenna's axis away from the Moon, degrees.
         expert tilt_radial_deg: Vec<f64> = Vec::new();
-        /// q of a factor 1 + q (3 cos^2 - 1) / 2 of the voltage pattern, with the angle from the axis.
+        /// Distortion q: a factor 1 + q (3 cos^2 - 1) / 2 of the voltage pattern, with the angle from the axis.
         expert pattern: Vec<f64> = Vec::new();
         /// Distortion by frequency, added to map.antennas.pattern, as instrument.pattern_by_frequency.
         #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]

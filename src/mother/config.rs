@@ -65,7 +65,6 @@ keys! {
         everyday receiver_noise_k_sr: ReceiverNoise = ReceiverNoise::default();
         /// Frequency at which the receiver's 1/f noise equals its other noise, Hz: `receiver_noise_k_sr` is multiplied by `1 +
         /// knee / frequency`; 0 for none.
-        #[only_with("spacecraft.receiver_noise_k_sr")]
         #[serde(skip_serializing_if = "is_zero")]
         expert receiver_knee_hz: f64 = 0.0;
         /// Radio interference of the spacecraft itself, added to the receiver noise of every daughter, K sr; one value, or one
@@ -75,7 +74,6 @@ keys! {
         /// Share of the power of the sky that the Moon reflects, xi_R; 0 for none. The paper has 0.07.
         everyday moon_reflection: f64 = 0.0;
         /// Form of the Moon that reflects: "flat", or "sphere" with spacecraft.model = "direct".
-        #[only_with("spacecraft.moon_reflection > 0")]
         #[serde(skip_serializing_if = "MoonMirror::is_flat")]
         expert moon_mirror: MoonMirror = MoonMirror::default();
         /// Brightness temperature of the Moon's disc, equal over it, K; physically some 250. The ground does not correct for

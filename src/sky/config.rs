@@ -35,7 +35,7 @@ keys! {
         /// scales it, T(nu) = T(FREQ) (nu / FREQ)^index.
         #[only_with("sky.file")]
         expert frequency: MapFrequency = MapFrequency::default();
-        /// nside of the generated sky, or of a map file to which something is added: a power of two up to 1024.
+        /// HEALPix nside of the generated sky, or of a map file to which something is added: a power of two up to 1024.
         everyday nside: usize = 64;
         /// Highest degree of the harmonic model; 0 for what the baselines need.
         expert l_max: usize = 0;

@@ -23,8 +23,8 @@ pub struct Key {
     pub level: Level,
     /// What it means, line by line.
     pub about: &'static [&'static str],
-    /// When it has an effect: comparisons of keys, joined by ` or `; always if empty. A name that begins with a point is of the same
-    /// section.
+    /// When it has an effect: comparisons of keys, joined by ` or `; always if empty. A strength of zero is a value like others, which a
+    /// study may go through: what belongs to it has its effect.
     pub only_with: &'static str,
     /// The default; `None` for a key that is absent by default.
     pub default: fn() -> Option<toml::Value>,

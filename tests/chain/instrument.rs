@@ -81,7 +81,11 @@ fn blocks(path: &str) -> BTreeMap<(u16, u8, u8, i64), VisibilityBlock> {
 fn errors_that_are_off_leave_every_byte_and_seeds_decide_the_rest() {
     let place = Workplace::new(SMALL);
     let ideal = simulate(&place, "ideal.ccsds", &[]);
-    let off = ["instrument.realisation=5", "instrument.phase_deg={rate_per_day=[0.0,0.0,0.0,0.0]}"];
+    let off = [
+        "instrument.realisation=5",
+        "instrument.phase_deg={drift_time_s=100.0}",
+        "instrument.beacon={on_s=60.0}",
+    ];
     assert!(simulate(&place, "off.ccsds", &off) == ideal);
     assert!(!Path::new(&place.path("ideal.ccsds.instrument.csv")).exists());
     let on = simulate(&place, "on.ccsds", &ERRORS);
@@ -163,7 +167,8 @@ fn tilted_dipoles_see_one_source_by_their_projections() {
     let options = lunarray::sky::fits::WriteOptions::default();
     lunarray::sky::fits::write_map(Path::new(&path), &map, &options).unwrap();
     let n_hat = lunarray::sky::healpix::pixel_directions(nside)[pixel];
-    let file = format!("sky.file={path}");
+    // Sky by sky, as the map says no frequency.
+    let file = format!("sky.file=[{path:?}, {path:?}]");
     let set = [
         &file,
         "spacecraft.thermal_noise=false",

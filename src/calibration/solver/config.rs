@@ -93,7 +93,7 @@ keys! {
         expert dead_amplitude: f64 = 0.05;
         /// Maps of the known sky (K, FITS), one a channel of the downlink.
         everyday model_files: Vec<PathBuf> = Vec::new();
-        /// nside to which the model map's pixels are split; 0 for its own.
+        /// HEALPix nside to which the model map's pixels are split; 0 for its own.
         expert model_nside: usize = 0;
         /// How the visibilities of the known sky are computed: "direct" sums over pixels, "harmonic" on the circle of a pass to
         /// degree 5/2 nside, "auto" by nside and visibilities of the pass.

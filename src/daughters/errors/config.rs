@@ -36,7 +36,6 @@ keys! {
         /// Allan deviation of every clock at 1 s; it falls as the root of time (white noise of frequency).
         expert clock_allan_deviation: f64 = 0.0;
         /// Time within which clocks are brought back, s: their noise is forgotten as exp(-|t| / this).
-        #[only_with("instrument.clock_allan_deviation > 0")]
         expert clock_steering_s: f64 = 86_400.0;
         /// Daughters that deliver noise and no signal, from 1.
         expert dead_daughters: Vec<u32> = Vec::new();
@@ -45,7 +44,6 @@ keys! {
         /// Probability that a visibility is an outlier.
         expert outlier_probability: f64 = 0.0;
         /// Standard deviation of either part of what is added to an outlier, in units of the thermal noise.
-        #[only_with("instrument.outlier_probability > 0")]
         expert outlier_sigma: f64 = 0.0;
         /// Mean time between bursts of interference from the Earth, s; 0 for none.
         expert burst_every_s: f64 = 0.0;
@@ -55,8 +53,7 @@ keys! {
         expert burst_k_sr: f64 = 0.0;
         /// Power of interference from the Earth at the Moon's limb at a daughter, K sr; 0 for none.
         expert leak_k_sr: f64 = 0.0;
-        /// Angle below the limb over which the power of that interference falls by a factor e, degrees.
-        #[only_with("instrument.leak_k_sr > 0")]
+        /// Angle below the limb over which the power of the leakage falls by a factor e, degrees.
         expert leak_depth_deg: f64 = 1.0;
         /// Artificial signal for calibration: a plane wave, equal at all daughters. Integrations while it is on are flagged,
         /// and stay out of maps.
@@ -81,12 +78,10 @@ keys! {
         /// Standard deviation of a Gauss-Markov process: correlation exp(-|t| / drift_time_s).
         expert drift_rms: f64 = 0.0;
         /// Correlation time of the Gauss-Markov process, s.
-        #[only_with(".drift_rms > 0")]
         expert drift_time_s: f64 = 3600.0;
         /// Standard deviation of a level that jumps.
         expert step_rms: f64 = 0.0;
         /// Time in which the level jumps once, at a random instant, s.
-        #[only_with(".step_rms > 0")]
         expert step_every_s: f64 = 86_400.0;
     }
 }
@@ -97,13 +92,10 @@ keys! {
         /// Power at a daughter, K sr, in every channel; 0 for no signal.
         expert k_sr: f64 = 0.0;
         /// Ecliptic longitude and latitude that the signal comes from, degrees.
-        #[only_with("instrument.beacon.k_sr > 0")]
         expert direction_deg: [f64; 2] = [0.0, 0.0];
         /// Time for which the signal is on, from the start of each pass, s.
-        #[only_with("instrument.beacon.k_sr > 0")]
         expert on_s: f64 = 0.0;
         /// Time after which the signal is repeated in a pass, s; 0 for once.
-        #[only_with("instrument.beacon.k_sr > 0")]
         expert every_s: f64 = 0.0;
     }
 }

@@ -17,10 +17,8 @@ keys! {
         /// channel.
         expert burst_every_bits: f64 = 0.0;
         /// Mean length of bursts, bits.
-        #[only_with("downlink.link.burst_every_bits > 0")]
         expert burst_bits: f64 = 0.0;
         /// Probability that a bit of a burst is wrong.
-        #[only_with("downlink.link.burst_every_bits > 0")]
         expert burst_bit_error_rate: f64 = 0.5;
         /// Probability that a frame does not arrive.
         everyday frame_loss: f64 = 0.0;
@@ -33,7 +31,6 @@ keys! {
         /// Probability that a frame arrives late.
         expert reorder: f64 = 0.0;
         /// Maximum delay of a late frame, frames.
-        #[only_with("downlink.link.reorder > 0")]
         expert reorder_frames: u64 = 16;
         /// Probability that a pass arrives after the one that follows it.
         expert pass_swap: f64 = 0.0;

@@ -28,13 +28,8 @@ pub(super) fn flat_keys() -> Vec<FlatKey> {
 fn collect(section: &str, keys: &'static [Key], only_with: &[String], found: &mut Vec<FlatKey>) {
     for key in keys {
         let path = joined(section, key.name);
-        let own = key.only_with.split(" or ").map(|comparison| match comparison.starts_with('.') {
-            true => format!("{section}{comparison}"),
-            false => comparison.to_owned(),
-        });
-        let own = own.collect::<Vec<String>>().join(" or ");
-        let only_with: Vec<String> =
-            only_with.iter().cloned().chain((!own.is_empty()).then_some(own)).collect();
+        let own = (!key.only_with.is_empty()).then(|| key.only_with.to_owned());
+        let only_with: Vec<String> = only_with.iter().cloned().chain(own).collect();
         let is_section = key.level == Level::Section;
         let default = if is_section { None } else { (key.default)() };
         found.push(FlatKey { path: path.clone(), key, default, only_with: only_with.clone() });
@@ -87,10 +82,7 @@ mod tests {
         for FlatKey { path, key, .. } in flat_keys() {
             let about = key.about.join(" ");
             let about = about.trim();
-            assert!(
-                about.ends_with('.') && about.starts_with(|c: char| c.is_uppercase() || c == '`'),
-                "{path}: {about}"
-            );
+            assert!(about.ends_with('.') && about.starts_with(|c: char| c.is_uppercase()), "{path}: {about}");
         }
     }
 }

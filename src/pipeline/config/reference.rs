@@ -86,7 +86,7 @@ pub fn reference(shown: Shown) -> String {
     }
     .to_owned();
     text += "# A file needs only the keys that it changes. Numbers may have units (\"30d\", \"3MHz\"). Paths are relative to the working\n\
-             # directory. Written from the declarations in the code.\n";
+             # directory. Written from the declarations in the code.\n\n";
     let (keys, mut written) = (flat_keys(), Vec::new());
     let top: Vec<&FlatKey> = keys.iter().filter(|key| !key.path.contains('.')).collect();
     for key in top.iter().filter(|key| key.key.level != Level::Section) {
@@ -127,6 +127,7 @@ fn put_section(text: &mut String, section: &FlatKey) {
     // Writing to a string cannot fail.
     let _ = write!(text, "\n[{}]\n", section.path);
     put_comment(text, &with_condition(section));
+    text.push('\n');
 }
 
 fn put_key(text: &mut String, key: &FlatKey, shown: Shown) {
@@ -206,12 +207,9 @@ mod tests {
         assert_eq!(of("map.epsilon").default.as_deref(), Some("1e-4"));
         assert!(of("map.epsilon").everyday && !of("map.l_max").everyday && of("map").everyday);
         assert_eq!(of("map.l_max").only_with, ["map.engine = \"harmonic\""]);
-        // The condition of the section, and of the key.
-        let tone = of("daughters.tones.calibration_offset_hz");
-        assert_eq!(
-            tone.only_with,
-            ["spacecraft.fidelity = \"samples\"", "daughters.tones.calibration_k_sr > 0"]
-        );
+        // The condition of the key, and of its section.
+        assert_eq!(of("array.propagate.keep").only_with, ["array.propagate.keep_every_days > 0"]);
+        assert_eq!(of("daughters.tones.calibration_k_sr").only_with, ["spacecraft.fidelity = \"samples\""]);
         // Not there by default.
         assert!(of("sky.file").default.is_none() && of("sky.file").about.starts_with("Map of the sky"));
     }
