@@ -256,7 +256,7 @@ mod tests {
     use super::*;
     use crate::array::{Array, ArrayConfig};
     use crate::response::harmonic::runs::wrap;
-    use crate::units::{all_pairs, keys};
+    use crate::units::all_pairs;
 
     const RADIUS_M: f64 = 2_037_100.0;
 
