@@ -7,6 +7,7 @@ use super::correlator::{Division, SUB_BANDS_MAX, dump_samples, shortest_integrat
 use super::ninth::NinthConfig;
 use super::receiver::{ReceiverNoise, check_channels, is_none, is_zero};
 use super::schedule::Schedule;
+use super::thinning::{self, WindowThinning};
 use crate::array::{Array, IntegrationRule};
 use crate::frames::{AntennaResponse, Channel};
 use crate::response::model::ModelChoice;
@@ -23,6 +24,12 @@ pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 /// array moves by some degrees; the cost of narrower channels grows with the third power of that time.
 const SAMPLES_WIDTH_HZ_MIN: f64 = 500.0;
 
+/// So that missions without it keep their hash.
+#[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
+fn is_one(number: &u64) -> bool {
+    *number == 1
+}
+
 keys! {
     /// The `[spacecraft]` section.
     pub struct SpacecraftConfig {
@@ -35,6 +42,10 @@ keys! {
         expert channel_width_hz: f64 = 8_000.0;
         /// Length of the mission, s.
         everyday duration_s: f64 = 1.3 * YEAR_S;
+        /// Keep one visibility in this many, from windows that have all phases of month, breathing and precession; in place of
+        /// every_nth_window and every_nth_integration.
+        #[serde(skip_serializing_if = "is_one")]
+        everyday thin: u64 = 1;
         /// Observe only in every n-th window; there is one an orbit.
         everyday every_nth_window: u64 = 1;
         /// Observe only for this time from the start of each window, s; 0 for all of it.
@@ -200,6 +211,15 @@ impl SpacecraftConfig {
         if self.auto_powers || self.fidelity == Fidelity::Samples { self.auto_integration_s } else { 0.0 }
     }
 
+    /// Which windows are observed.
+    #[must_use]
+    pub fn window_thinning(&self) -> WindowThinning {
+        match self.thin {
+            0 | 1 => WindowThinning::EveryNth(self.every_nth_window),
+            thin => WindowThinning::Spread(thinning::shares(thin).0),
+        }
+    }
+
     /// One schedule a channel.
     #[must_use]
     pub fn schedules(&self) -> Vec<Schedule> {
@@ -207,8 +227,11 @@ impl SpacecraftConfig {
             rule: self.rule(),
             frequency_hz,
             baseline_wavelengths_max: self.baseline_wavelengths_max.get(channel).unwrap_or(0.0),
-            every_nth: self.every_nth_integration.get(channel).unwrap_or(1),
-            every_nth_window: self.every_nth_window,
+            every_nth: match self.thin {
+                0 | 1 => self.every_nth_integration.get(channel).unwrap_or(1),
+                thin => thinning::shares(thin).1,
+            },
+            windows: self.window_thinning(),
         };
         self.channels_hz.iter().enumerate().map(schedule).collect()
     }
@@ -408,6 +431,11 @@ impl SpacecraftConfig {
             self.every_nth_window >= 1,
             "at least 1",
         );
+        checks.number("thin", self.thin as f64, self.thin >= 1, "at least 1");
+        let is_alone =
+            self.every_nth_window == 1 && self.every_nth_integration.values().iter().all(|&nth| nth == 1);
+        let expected = "1, or every_nth_window = 1 and every_nth_integration = 1, which it replaces";
+        checks.number("thin", self.thin as f64, self.thin <= 1 || is_alone, expected);
         let some = self.every_nth_integration.values().iter().all(|&nth| nth >= 1);
         checks.require("every_nth_integration", 0, some, "at least 1");
         let limits = self.baseline_wavelengths_max.values();

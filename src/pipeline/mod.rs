@@ -8,19 +8,27 @@ mod cost;
 pub(crate) mod graph;
 mod jobs;
 
+pub use config::{Config, ConfigError, ConfigSource, PipelineError, Plan};
+#[doc(hidden)]
 pub use config::{
-    Config, ConfigError, ConfigSource, Expected, KeyDescription, MemoryLimit, MemorySource, NoEffect,
-    PipelineError, Plan, Problem, Problems, QUICKLOOK, ReadProblem, Shown, key_descriptions, reference,
+    Expected, KeyDescription, MemoryLimit, MemorySource, NoEffect, Problem, Problems, QUICKLOOK, ReadProblem,
+    Shown, key_descriptions, reference,
 };
+#[doc(hidden)]
 pub use cost::{ChannelCost, Cost, GroupSize, MapGroup, MemoryAdvice, RankCost, RunGroups, Segment};
+#[doc(hidden)]
 pub use graph::{
-    BlockSummary, CalibrateRound, CalibrateSummary, Destination, GroundSource, INTEGRATE, READ, RunScope,
-    RunSummary, SampleCounts, SampleSummary, Watched, Watcher, downlink_file, replay, run, run_among,
-    sample_stages, simulate, sky_notes, use_threads,
+    BlockSummary, CalibrateRound, INTEGRATE, READ, RunScope, SampleCounts, SampleSummary, downlink_file,
+    run_among, sample_stages, sky_notes, use_threads,
 };
+pub use graph::{
+    CalibrateSummary, Destination, GroundSource, RunSummary, Watched, Watcher, replay, run, simulate,
+};
+pub use jobs::{CalibrateJob, Mission, calibrate};
+#[doc(hidden)]
 pub use jobs::{
-    CalibrateJob, CalibrateProgress, CalibrateWatcher, CaseSummary, GroupStep, GroupStepWatcher,
-    GroupWatcher, MERGE, MapStep, PowerSpread, RealisationSpread, Study, StudyCase, StudyError, StudyStep,
-    StudySummary, StudyWatcher, calibrate, channel_groups, replay_in_groups, run_in_groups, run_study,
-    simulate_in_groups, solve_state, with_gains,
+    CalibrateProgress, CalibrateWatcher, CaseSummary, GroupStep, GroupStepWatcher, GroupWatcher, MERGE,
+    MapStep, PowerSpread, RealisationSpread, Study, StudyCase, StudyError, StudyStep, StudySummary,
+    StudyWatcher, channel_groups, replay_in_groups, run_in_groups, run_study, simulate_in_groups,
+    solve_state, with_gains,
 };

@@ -67,6 +67,7 @@ macro_rules! keys {
 
         impl $name {
             /// Its keys.
+            #[doc(hidden)]
             pub const KEYS: &'static [$crate::units::Key] = &[$(
                 $crate::units::Key {
                     name: stringify!($field),

@@ -25,5 +25,6 @@ pub use problems::{Problem, Problems};
 pub use reader::ReadProblem;
 pub use reference::{KeyDescription, Shown, key_descriptions, reference};
 pub use sections::Config;
+pub(super) use sections::is_folder_name;
 pub use source::{ConfigError, ConfigSource, QUICKLOOK};
 pub(super) use source::{has_sections, study_key};

@@ -63,6 +63,7 @@ impl Plan {
     ///
     /// # Errors
     /// Samples; a channel for which alone there is too little memory.
+    #[doc(hidden)]
     pub fn run_groups(
         &self,
         size: GroupSize,
@@ -76,6 +77,7 @@ impl Plan {
     ///
     /// # Errors
     /// Samples, which are simulated for all channels together; a channel for which alone there is too little memory.
+    #[doc(hidden)]
     pub fn simulation_groups(
         &self,
         size: GroupSize,

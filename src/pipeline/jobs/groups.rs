@@ -16,7 +16,7 @@ use crate::imaging::ChannelGroup;
 use crate::imaging::circle::SumPart;
 use crate::pipeline::config::{Config, MemoryLimit, PipelineError, Plan};
 use crate::pipeline::cost::{GroupSize, MapGroup, RunGroups, groups_of};
-use crate::pipeline::graph::run::{finish, ground_alone, lock_folder, summarise, write_settings};
+use crate::pipeline::graph::run::{finish, ground_alone, lock_products, summarise, write_settings};
 use crate::pipeline::graph::summary::PassRecord;
 use crate::pipeline::graph::{RunScope, RunSummary, Watched, downlink_file, space_segment};
 use crate::products::{ProductsError, Truth};
@@ -70,7 +70,7 @@ pub fn replay_in_groups(
     cancel: &Cancel,
     watch: GroupWatcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    let _lock = lock_folder(out)?;
+    let _lock = lock_products(config, out)?;
     let passes = Passes { scope: RunScope::Ground, files, config, groups, out };
     let summary = passes.run(&|_| Ok(Truth::unknown()), cancel, watch)?;
     finish(summary, out)
@@ -204,7 +204,7 @@ pub fn run_in_groups(
     watch: GroupStepWatcher<'_>,
 ) -> Result<Option<RunSummary>, PipelineError> {
     let config = &plan.config;
-    let _lock = lock_folder(out)?;
+    let _lock = lock_products(config, out)?;
     write_settings(config, out)?;
     let RunGroups { simulated, mapped } = groups;
     let file = out.join(downlink_file(config.downlink.format));

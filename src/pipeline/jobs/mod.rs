@@ -4,6 +4,7 @@ mod calibrate;
 mod case;
 mod group_steps;
 mod groups;
+mod mission;
 mod noise_maps;
 mod realisations;
 mod simulation_groups;
@@ -15,6 +16,7 @@ pub use calibrate::{CalibrateJob, CalibrateProgress, CalibrateWatcher, calibrate
 pub use case::CaseSummary;
 pub use group_steps::{GroupStep, GroupStepWatcher, MapStep};
 pub use groups::{GroupWatcher, channel_groups, replay_in_groups, run_in_groups};
+pub use mission::Mission;
 pub use realisations::{PowerSpread, RealisationSpread};
 pub use simulation_groups::{MERGE, simulate_in_groups};
 pub use state::solve_state;
