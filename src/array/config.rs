@@ -9,7 +9,7 @@ use super::kepler::KeplerElements;
 use super::propagate::PropagateConfig;
 use crate::units::calendar::epoch_s;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
-use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
+use crate::units::{Checks, InvalidValue, MAX_SATELLITES, keys};
 
 /// Sense of the precession of the ascending node.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -22,79 +22,57 @@ pub enum NodeMotion {
     Advance,
 }
 
-/// Orbit and formation; the defaults are the paper's fiducial array.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ArrayConfig {
-    /// Number of daughters on the circle.
-    pub satellites: usize,
-    /// Altitude of the circular orbit, or of the semi-major axis, m.
-    pub altitude_m: f64,
-    /// Radius of the Moon, m.
-    pub moon_radius_m: f64,
-    /// Inclination to the ecliptic, degrees.
-    pub inclination_deg: f64,
-    /// Orbital period, s.
-    pub orbital_period_s: f64,
-    /// Period of the precession of the node, s.
-    pub precession_period_s: f64,
-    /// Sense of the precession.
-    pub node_motion: NodeMotion,
-    /// Orbital phase of daughter 1 at the epoch, degrees.
-    pub orbital_phase_deg: f64,
-    /// Longitude of the ascending node at the epoch, degrees.
-    pub node_longitude_deg: f64,
-    /// Eccentricity of the formation's orbit; 0 for the circle.
-    pub eccentricity: f64,
-    /// Argument of the periapsis at the epoch, degrees.
-    pub periapsis_deg: f64,
-    /// Motion of the argument of the periapsis, degrees a day.
-    pub periapsis_rate_deg_per_day: f64,
-    /// Greatest distance of each daughter from daughter 1 across the track, in units of that along it: their planes are
-    /// inclined to each other by that much.
-    pub cross_track_ratio: f64,
-    /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch, degrees.
-    pub earth_longitude_deg: f64,
-    /// Arcs by which daughter 2 and those after it trail daughter 1 at their greatest, m, in ascending order; empty for
-    /// those that `breathing` describes.
-    pub arcs_m: Vec<f64>,
-    /// Orbits of their own, one a satellite, in place of the circle and its formation; empty for the circle.
-    pub kepler: Vec<KeplerElements>,
-    /// Orbits from CCSDS OEM files (KVN), one a satellite, in place of the circle and its formation; empty for the circle.
-    pub oem: Vec<PathBuf>,
-    /// Epoch of the mission in the files' time system, such as 2030-01-31T12:00:00; empty for the latest of their first epochs.
-    pub oem_epoch: String,
-    /// Orbits by numerical integration, from the state of the formation, or of `kepler`, at the epoch.
-    #[serde(skip_serializing_if = "PropagateConfig::is_default")]
-    pub propagate: PropagateConfig,
-    /// The formation's breathing.
-    pub breathing: BreathingConfig,
-}
-
-impl Default for ArrayConfig {
-    fn default() -> Self {
-        Self {
-            satellites: 8,
-            altitude_m: 300e3,
-            moon_radius_m: MOON_RADIUS_M,
-            inclination_deg: 30.0,
-            orbital_period_s: 8_248.68,
-            precession_period_s: 1.3 * YEAR_S,
-            node_motion: NodeMotion::Regress,
-            orbital_phase_deg: 0.0,
-            node_longitude_deg: 0.0,
-            eccentricity: 0.0,
-            periapsis_deg: 0.0,
-            periapsis_rate_deg_per_day: 0.0,
-            cross_track_ratio: 0.0,
-            earth_longitude_deg: 0.0,
-            arcs_m: Vec::new(),
-            kepler: Vec::new(),
-            oem: Vec::new(),
-            oem_epoch: String::new(),
-            propagate: PropagateConfig::default(),
-            breathing: BreathingConfig::default(),
-        }
+keys! {
+    /// Orbit and formation; the defaults are the paper's fiducial array.
+    pub struct ArrayConfig {
+        /// Number of daughters on the circle.
+        everyday satellites: usize = 8;
+        /// Altitude of the circular orbit, or of the semi-major axis, m.
+        everyday altitude_m: f64 = 300e3;
+        /// Radius of the Moon, m.
+        expert moon_radius_m: f64 = MOON_RADIUS_M;
+        /// Inclination to the ecliptic, degrees.
+        everyday inclination_deg: f64 = 30.0;
+        /// Orbital period, s.
+        expert orbital_period_s: f64 = 8_248.68;
+        /// Period of the precession of the node, s.
+        expert precession_period_s: f64 = 1.3 * YEAR_S;
+        /// Sense of the precession: "regress" or "advance".
+        expert node_motion: NodeMotion = NodeMotion::Regress;
+        /// Orbital phase of daughter 1 at the epoch, degrees.
+        expert orbital_phase_deg: f64 = 0.0;
+        /// Longitude of the ascending node at the epoch, degrees.
+        expert node_longitude_deg: f64 = 0.0;
+        /// Eccentricity of the formation's orbit; 0 for the circle.
+        everyday eccentricity: f64 = 0.0;
+        /// Argument of the periapsis at the epoch, degrees.
+        expert periapsis_deg: f64 = 0.0;
+        /// Motion of the argument of the periapsis, degrees a day.
+        expert periapsis_rate_deg_per_day: f64 = 0.0;
+        /// Greatest distance of each daughter from daughter 1 across the track, in units of that along it: their planes are
+        /// inclined to each other by that much.
+        expert cross_track_ratio: f64 = 0.0;
+        /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch, degrees.
+        expert earth_longitude_deg: f64 = 0.0;
+        /// Arcs by which daughter 2 and those after it trail daughter 1 at their greatest, m, in ascending order; empty for
+        /// those that `breathing` describes.
+        expert arcs_m: Vec<f64> = Vec::new();
+        /// Orbits of their own, one a satellite, in place of the circle and its formation: `{ semi_major_axis_m = 2037.1e3,
+        /// eccentricity = 0.01, inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.0
+        /// }` at the epoch, on ecliptic axes; if they turn, `node_rate_deg_per_day` and `periapsis_rate_deg_per_day`.
+        everyday kepler: Vec<KeplerElements> = Vec::new();
+        /// Orbits from CCSDS OEM files (KVN), one a satellite, in place of the circle and its formation; empty for the circle.
+        everyday oem: Vec<PathBuf> = Vec::new();
+        /// Epoch of the mission in the files' time system, such as 2030-01-31T12:00:00; empty for the latest of their first
+        /// epochs.
+        #[only_with("array.oem")]
+        expert oem_epoch: String = String::new();
+        /// Orbits by numerical integration in the Moon's field (GRGM900C), from the formation at the epoch, whose followers go
+        /// where daughter 1 went, or from array.kepler. Periods, precession and rates are not used then.
+        #[serde(skip_serializing_if = "PropagateConfig::is_default")]
+        section propagate: PropagateConfig = PropagateConfig::default();
+        /// Contraction and expansion of the formation along the track.
+        section breathing: BreathingConfig = BreathingConfig::default();
     }
 }
 
@@ -109,38 +87,25 @@ pub enum Spacing {
     Arcs,
 }
 
-/// Contraction and expansion of the formation along the track (the paper, Sect. 2).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct BreathingConfig {
-    /// Period of contraction and expansion, s.
-    pub period_s: f64,
-    /// Smallest distance of daughters 1 and 2, m; the largest is R_2 times this.
-    pub first_spacing_m_min: f64,
-    /// Ratio R_2 of largest to smallest distance of daughters 1 and 2.
-    pub first_ratio: f64,
-    /// Smallest distance of daughters 2 and 3, m; the largest is R times this. Used for four daughters or more whose steps
-    /// grow.
-    pub second_spacing_m_min: f64,
-    /// Ratio R of largest to smallest arc of daughters 3 and later.
-    pub ratio: f64,
-    /// Longest arc from the first to the last daughter, m.
-    pub span_m_max: f64,
-    /// What grows by the same factor from daughter to daughter.
-    pub growing: Spacing,
-}
-
-impl Default for BreathingConfig {
-    fn default() -> Self {
-        Self {
-            period_s: 14.0 * DAY_S,
-            first_spacing_m_min: 100.0,
-            first_ratio: 6.0,
-            second_spacing_m_min: 500.0,
-            ratio: 3.0,
-            span_m_max: 100e3,
-            growing: Spacing::Steps,
-        }
+keys! {
+    /// Contraction and expansion of the formation along the track (the paper, Sect. 2).
+    pub struct BreathingConfig {
+        /// Period of contraction and expansion, s.
+        expert period_s: f64 = 14.0 * DAY_S;
+        /// Smallest distance of daughters 1 and 2, m; the largest is R_2 times this.
+        expert first_spacing_m_min: f64 = 100.0;
+        /// Ratio R_2 of largest to smallest distance of daughters 1 and 2.
+        expert first_ratio: f64 = 6.0;
+        /// Smallest distance of daughters 2 and 3, m; the largest is R times this. Used for four daughters or more whose steps
+        /// grow.
+        expert second_spacing_m_min: f64 = 500.0;
+        /// Ratio R of largest to smallest arc of daughters 3 and later.
+        expert ratio: f64 = 3.0;
+        /// Longest arc from the first to the last daughter, m.
+        everyday span_m_max: f64 = 100e3;
+        /// What grows by the same factor: the "steps" from daughter to daughter, or the "arcs" from daughter 1, which puts more
+        /// of many daughters close to it.
+        expert growing: Spacing = Spacing::Steps;
     }
 }
 

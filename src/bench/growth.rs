@@ -4,9 +4,7 @@ use serde::Serialize;
 
 use super::chain;
 use super::timing::{median, seconds_of, timed};
-use crate::pipeline::config::Config;
-use crate::pipeline::error::PipelineError;
-use crate::pipeline::plan::Plan;
+use crate::pipeline::{Config, PipelineError, Plan};
 use crate::sky::SkyMap;
 
 /// The chain at one size.

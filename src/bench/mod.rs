@@ -16,11 +16,11 @@ use self::timing::{Spent, median, seconds_of, timed};
 use crate::downlink::Transmitter;
 use crate::frames::{GroundFrame, Samples, SpaceFrame};
 use crate::mother::Fidelity;
-use crate::pipeline::config::Config;
-use crate::pipeline::error::PipelineError;
-use crate::pipeline::plan::Plan;
+use crate::pipeline::Config;
+use crate::pipeline::PipelineError;
+use crate::pipeline::Plan;
+use crate::pipeline::graph::{models, space_segment};
 use crate::pipeline::{SampleCounts, sample_stages};
-use crate::pipeline::{models, space_segment};
 use crate::runtime::{Flow, Outlet, Report, Source, Stage};
 use crate::sky::SkyMap;
 

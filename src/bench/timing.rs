@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use crate::pipeline::plan::Plan;
+use crate::pipeline::Plan;
 
 /// Time spent on a piece of work.
 pub(super) struct Spent {

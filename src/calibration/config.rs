@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::{AntennaGains, Calibration, CalibrationError, Identity, SolvedGains, SubBands, VanVleck};
-use crate::units::{Checks, InvalidValue};
+use crate::units::{Checks, InvalidValue, keys};
 
 /// Most sub-bands of a channel.
 const SUB_BANDS_MAX: usize = 64;
@@ -26,24 +26,20 @@ pub enum CalibrationHook {
     Solve,
 }
 
-/// The `[calibration]` section.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct CalibrationConfig {
-    /// Calibration hook.
-    pub hook: CalibrationHook,
-    /// File of gains, for `antenna-gains`; relative to the folder that [`CalibrationConfig::build`] is given.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub gains_file: Option<PathBuf>,
-    /// Bits of the samples whose correlations are corrected: 1, 2 or 4; 0 for no correction.
-    pub quantiser_bits: u32,
-    /// Number of successive channels of the downlink that are sub-bands of one channel of the map.
-    pub sub_bands: usize,
-}
-
-impl Default for CalibrationConfig {
-    fn default() -> Self {
-        Self { hook: CalibrationHook::Identity, gains_file: None, quantiser_bits: 0, sub_bands: 1 }
+keys! {
+    /// The `[calibration]` section.
+    #[derive(Eq)]
+    pub struct CalibrationConfig {
+        /// Correction of gains: "identity" for none, "antenna-gains" from a file, or "solve": they are found while the data
+        /// arrive, by [calibrate].
+        everyday hook: CalibrationHook = CalibrationHook::Identity;
+        /// File of gains for the hook "antenna-gains", such as "gains.json".
+        #[serde(skip_serializing_if = "Option::is_none")]
+        everyday gains_file: Option<PathBuf> = None;
+        /// Bits of the samples whose correlations are corrected: 1, 2 or 4; 0 for no correction.
+        expert quantiser_bits: u32 = 0;
+        /// Number of successive channels of the downlink that are sub-bands of one channel of the map.
+        expert sub_bands: usize = 1;
     }
 }
 

@@ -3,7 +3,7 @@
 use clap::{Args, ValueEnum};
 
 use super::output::{CommandResult, Completion, print_json_line, print_text};
-use crate::pipeline::{KeyDescription, QUICKLOOK, REFERENCE, key_descriptions};
+use crate::pipeline::{KeyDescription, QUICKLOOK, Shown, key_descriptions, reference};
 use crate::units::echo;
 
 /// Explain keys of pipeline files: their defaults, units and meaning.
@@ -18,7 +18,7 @@ pub(super) struct ExplainArgs {
     /// Keys, sections, or parts of names.
     #[arg(value_name = "KEY")]
     keys: Vec<String>,
-    /// Print one JSON object per line: key, default (as TOML), about.
+    /// Print one JSON object per line: key, default (as TOML), about, only_with (when it has an effect), everyday.
     #[arg(long)]
     json: bool,
     /// Print all keys as a page of Markdown, a table a section: docs/keys.md is one.
@@ -50,13 +50,17 @@ pub(super) fn explain(args: &ExplainArgs) -> CommandResult {
         if args.json {
             print_json_line(described)?;
         } else {
-            let KeyDescription { key, default, about } = described;
+            let KeyDescription { key, default, about, only_with, .. } = described;
             let head = match default {
                 Some(default) => format!("{key} = {default}"),
                 None if is_section(&all, key) => format!("[{key}]"),
                 None => format!("{key} (none)"),
             };
-            print_text(if about.is_empty() { head } else { format!("{head}\n    {about}") }.as_str())?;
+            let only = match only_with.is_empty() {
+                true => String::new(),
+                false => format!("\n    It has an effect only with {}.", only_with.join(", and ")),
+            };
+            print_text(&format!("{head}\n    {about}{only}"))?;
         }
     }
     Ok(Completion::Done)
@@ -67,30 +71,58 @@ fn is_section(all: &[KeyDescription], key: &str) -> bool {
     all.iter().any(|described| described.key.starts_with(&inside))
 }
 
-/// All keys as a page of Markdown.
+/// All keys as a page of Markdown: those for every day first, then all others, section by section.
 fn page_of(all: &[KeyDescription]) -> String {
     let mut page = "# All keys\n\nEvery key of a pipeline file with its default, as `lunarray explain` has them: a file names only those \
-                    that it changes. This page is written by `lunarray explain --markdown`.\n"
+                    that it changes. First those for every day, then all others. This page is written by `lunarray explain --markdown`.\n\n\
+                    ## For every day\n"
         .to_owned();
-    let table = "\n| key | default | |\n|---|---|---|\n";
-    page.push_str(table);
-    let mut section = String::new();
-    for KeyDescription { key, default, about } in all {
-        let about = in_a_cell(about);
-        if is_section(all, key) {
-            page.push_str(&format!("\n## {key}\n"));
-            if !about.is_empty() {
-                page.push_str(&format!("\n{about}\n"));
+    page.push_str(TABLE);
+    for described in all.iter().filter(|described| described.everyday && !is_section(all, &described.key)) {
+        put_row(&mut page, &described.key, described);
+    }
+    page.push_str("\n## For experts\n");
+    let mut told: Vec<(String, Vec<String>)> = Vec::new();
+    for section in all.iter().filter(|described| is_section(all, &described.key)) {
+        let inside = format!("{}.", section.key);
+        let rows: Vec<(&str, &KeyDescription)> = all
+            .iter()
+            .filter(|described| !described.everyday && !is_section(all, &described.key))
+            .filter_map(|described| Some((described.key.strip_prefix(&inside)?, described)))
+            .filter(|(name, _)| !name.contains('.'))
+            .collect();
+        page.push_str(&format!(
+            "\n### {}\n\n{}{}\n",
+            section.key,
+            in_a_cell(&section.about),
+            condition_of(section)
+        ));
+        let names: Vec<String> =
+            rows.iter().map(|(name, described)| format!("{name} {}", described.about)).collect();
+        match told.iter().find(|(_, others)| *others == names && names.len() > 1) {
+            Some((first, _)) => page.push_str(&format!("\nKeys as in {first}.\n")),
+            None if rows.is_empty() => {}
+            None => {
+                page.push_str(TABLE);
+                rows.iter().for_each(|(name, described)| put_row(&mut page, name, described));
+                told.push((section.key.clone(), names));
             }
-            page.push_str(table);
-            section = format!("{key}.");
-        } else {
-            let name = key.strip_prefix(&section).unwrap_or(key);
-            let default = default.as_ref().map_or_else(|| "none".to_owned(), |text| format!("`{text}`"));
-            page.push_str(&format!("| `{name}` | {default} | {about} |\n"));
         }
     }
     page
+}
+
+const TABLE: &str = "\n| key | default | |\n|---|---|---|\n";
+
+fn put_row(page: &mut String, name: &str, described: &KeyDescription) {
+    let default = described.default.as_ref().map_or_else(|| "none".to_owned(), |text| format!("`{text}`"));
+    let about = in_a_cell(&described.about);
+    page.push_str(&format!("| `{name}` | {default} | {about}{} |\n", condition_of(described)));
+}
+
+/// Its own condition, of which the last is.
+fn condition_of(described: &KeyDescription) -> String {
+    described.only_with.last().map_or_else(String::new, |only| format!(" Only with `{only}`."))
 }
 
 /// A text with what would end a cell, or begin a tag, escaped.
@@ -118,16 +150,20 @@ const SUMMARY_SCHEMA: &str = include_str!("../../docs/summary.schema.json");
 
 /// Print a pipeline file that comes with the program, to start from, or the schema of what it writes.
 ///
-/// The reference has every key with its default, unit and meaning; a pipeline file needs only the keys that it changes. The
-/// quicklook is what `lunarray run` runs without a file. The schema of summary.json (JSON Schema 2020-12) names all its
+/// Without options these are the everyday keys with their defaults, units and meanings; --all adds those for experts. A pipeline
+/// file needs only the keys that it changes. The quicklook is what `lunarray run` runs without a file. The reference has the keys for
+/// experts as comments. The schema of summary.json (JSON Schema 2020-12) names all its
 /// fields.
 ///
 /// Example: lunarray config --print quicklook > my.toml
 #[derive(Debug, Args)]
 pub(super) struct ConfigArgs {
-    /// The file to print.
-    #[arg(long, value_enum, default_value = "reference")]
-    print: Printed,
+    /// Print a file instead of the everyday keys.
+    #[arg(long, value_enum)]
+    print: Option<Printed>,
+    /// Print all keys.
+    #[arg(long, conflicts_with_all = ["print", "schema"])]
+    all: bool,
     /// Print a JSON schema instead.
     #[arg(long, value_enum, conflicts_with = "print")]
     schema: Option<Schema>,
@@ -140,7 +176,7 @@ pub(super) struct ConfigArgs {
 enum Printed {
     /// What `lunarray run` runs without a file.
     Quicklook,
-    /// Every key with its default.
+    /// Every key with its default: those for experts as comments.
     Reference,
 }
 
@@ -156,11 +192,12 @@ pub(super) fn config(args: &ConfigArgs) -> CommandResult {
         return Ok(Completion::Done);
     }
     let text = match args.print {
-        Printed::Quicklook => QUICKLOOK,
-        Printed::Reference => REFERENCE,
+        Some(Printed::Quicklook) => QUICKLOOK.to_owned(),
+        Some(Printed::Reference) => reference(Shown::Folded),
+        None => reference(if args.all { Shown::All } else { Shown::Everyday }),
     };
     if args.json {
-        print_json_line(&toml::from_str::<toml::Table>(text)?)?;
+        print_json_line(&toml::from_str::<toml::Table>(&text)?)?;
     } else {
         print_text(text.trim_end())?;
     }

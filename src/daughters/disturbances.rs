@@ -1,11 +1,11 @@
-//! Instrumental errors of the daughters, and artificial signals.
+//! Tones in the samples, and the response of a daughter with the errors of the instrument.
 
 use std::f64::consts::TAU;
 
 use num_complex::{Complex32, Complex64};
 use rand::Rng;
 
-use super::config::Disturbances;
+use super::config::Tones;
 use super::errors::PassErrors;
 use super::synthesis::Response;
 use crate::array::Array;
@@ -14,70 +14,36 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::dot;
 use crate::units::{StreamKind, random_stream};
 
-fn value_of(list: &[f64], daughter: usize) -> f64 {
-    list.get(daughter).copied().unwrap_or(0.0)
-}
-
-impl Disturbances {
-    /// Offset of a daughter's clock at `t_s`, s: it samples this much later than its time tags say.
+impl Tones {
+    /// Whether any is added.
     #[must_use]
-    pub fn clock_offset_s(&self, daughter: usize, t_s: f64) -> f64 {
-        value_of(&self.clock_offset_s, daughter) + value_of(&self.clock_drift, daughter) * t_s
-    }
-
-    /// Whether any gain, phase or clock is not ideal.
-    #[must_use]
-    pub fn changes_responses(&self) -> bool {
-        [
-            &self.gain_error,
-            &self.gain_drift_per_s,
-            &self.phase_rad,
-            &self.phase_drift_rad_per_s,
-            &self.clock_offset_s,
-            &self.clock_drift,
-        ]
-        .iter()
-        .any(|list| list.iter().any(|value| *value != 0.0))
-    }
-
-    /// A daughter's instrumental response at `t_s`.
-    #[must_use]
-    pub fn response(&self, daughter: usize, channel: Channel, t_s: f64) -> Response {
-        let amplitude =
-            1.0 + value_of(&self.gain_error, daughter) + value_of(&self.gain_drift_per_s, daughter) * t_s;
-        let phase_rad =
-            value_of(&self.phase_rad, daughter) + value_of(&self.phase_drift_rad_per_s, daughter) * t_s;
-        let late_s = self.clock_offset_s(daughter, t_s);
-        // Signals rotate as exp(-2 pi i nu t).
-        let gain = amplitude * Complex64::cis(phase_rad - TAU * (channel.frequency_hz * late_s).fract());
-        Response { gain, turns: -channel.width_hz * late_s }
-    }
-
-    /// Whether tones are added.
-    #[must_use]
-    pub fn has_tones(&self) -> bool {
+    pub fn are_on(&self) -> bool {
         self.interference_k_sr > 0.0 || self.calibration_k_sr > 0.0
+    }
+
+    /// So that what is not set changes no hash of a configuration.
+    pub(super) fn is_none(&self) -> bool {
+        *self == Self::default()
     }
 }
 
 impl Response {
     /// The response of a daughter in a channel (numbers from 0) with the errors of the instrument at a time.
-    pub(super) fn after(
-        self,
+    pub(super) fn with_errors(
         pass: &PassErrors,
         (daughter, number): (usize, usize),
         channel: Channel,
         t_s: f64,
     ) -> Self {
-        let turns = self.turns - channel.width_hz * pass.clock_s(daughter, t_s);
-        Self { gain: self.gain * pass.gain(daughter, number, t_s), turns }
+        let turns = -channel.width_hz * pass.clock_s(daughter, t_s);
+        Self { gain: pass.gain(daughter, number, t_s), turns }
     }
 }
 
 /// The tones in one block of samples of a daughter.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct BlockTones<'a> {
-    pub disturbances: &'a Disturbances,
+    pub tones: &'a Tones,
     pub array: &'a Array,
     pub daughter: usize,
     pub channel: Channel,
@@ -96,12 +62,11 @@ pub(super) struct BlockTones<'a> {
 impl BlockTones<'_> {
     /// Adds the calibration tone and the Earth's interference. The daughter's gain and clock affect both.
     pub(super) fn add_to(&self, re: &mut [f32], im: &mut [f32]) {
-        let d = self.disturbances;
+        let d = self.tones;
         let t_s = self.window_s + self.first as f64 / self.channel.width_hz;
-        let mut response = d.response(self.daughter, self.channel, t_s);
-        if let Some(pass) = self.pass {
-            response = response.after(pass, (self.daughter, self.number), self.channel, t_s);
-        }
+        let response = self.pass.map_or(Response::IDEAL, |pass| {
+            Response::with_errors(pass, (self.daughter, self.number), self.channel, t_s)
+        });
         let gain_at = |offset_hz: f64| {
             response.gain * Complex64::cis(TAU * response.turns * offset_hz / self.channel.width_hz)
         };

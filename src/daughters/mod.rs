@@ -3,7 +3,7 @@
 //! [`Sampler`] is the source. For each channel it draws complex Gaussian samples of all daughters at once, at the
 //! channel's own width (8 kHz). Their covariance is that of a [`crate::response::model::VisibilityModel`] as the array
 //! moves, plus receiver noise (`covariance`, `synthesis`). Each daughter then applies its instrumental errors
-//! ([`Disturbances`], and [`InstrumentErrors`] for either fidelity), level control and quantiser. [`SampleLink`] carries the blocks to the mother at a limited rate.
+//! ([`InstrumentErrors`], for either fidelity), [`Tones`], level control and quantiser. [`SampleLink`] carries the blocks to the mother at a limited rate.
 //!
 //! May use [`crate::frames`], [`crate::array`], [`crate::response`] and [`crate::runtime`]; never the mother.
 //! Samples depend on the seed alone, not on the number of threads or the size of queues.
@@ -24,7 +24,7 @@ mod sampler;
 mod synthesis;
 mod tile;
 
-pub use config::{DaughtersConfig, Disturbances, DropPolicy, FLOAT_BITS};
+pub use config::{DaughtersConfig, DropPolicy, FLOAT_BITS, Tones};
 pub use errors::{
     AntennaErrors, BeaconSchedule, ChannelAntennas, ErrorTerms, InstrumentConfig, InstrumentErrors,
     NavigationConfig, OrbitAntennas, PassErrors, truth_csv,

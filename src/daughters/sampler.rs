@@ -284,22 +284,15 @@ impl ChannelWork<'_> {
         draft: &mut Draft,
         out: SampleSlot<'_>,
     ) -> Repairs {
-        let Sampler { scene, config, synthesis, pass, .. } = self.sampler;
+        let Sampler { scene, synthesis, pass, .. } = self.sampler;
         let time = self.sampler.time(self.window.start, self.first + epoch * HOP);
         let key = DrawKey { seed: scene.seed, channel: self.id.0, ticks: time.0 };
         let channel = scene.channels[usize::from(self.id.0)];
-        let responses: Vec<Response> = if config.disturbances.changes_responses() || pass.is_some() {
-            let response = |n| {
-                let response = config.disturbances.response(n, channel, time.seconds());
-                match pass {
-                    Some(pass) => response.after(pass, (n, usize::from(self.id.0)), channel, time.seconds()),
-                    None => response,
-                }
-            };
+        let number = usize::from(self.id.0);
+        let responses: Vec<Response> = pass.as_ref().map_or_else(Vec::new, |pass| {
+            let response = |n| Response::with_errors(pass, (n, number), channel, time.seconds());
             (0..covariances.daughters()).map(response).collect()
-        } else {
-            Vec::new()
-        };
+        });
         synthesis.draw(covariances, epoch, key, &responses, draft, out)
     }
 
@@ -314,9 +307,9 @@ impl ChannelWork<'_> {
         let Sampler { scene, config, .. } = self.sampler;
         let first = self.first + made - re.len();
         let time = self.sampler.time(self.window.start, first);
-        if config.disturbances.has_tones() {
+        if config.tones.are_on() {
             let tones = BlockTones {
-                disturbances: &config.disturbances,
+                tones: &config.tones,
                 array: &scene.array,
                 daughter,
                 channel: scene.channels[usize::from(self.id.0)],

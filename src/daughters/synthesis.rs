@@ -47,6 +47,11 @@ pub struct Response {
     pub turns: f64,
 }
 
+impl Response {
+    /// Of a daughter without errors.
+    pub const IDEAL: Self = Self { gain: Complex64::ONE, turns: 0.0 };
+}
+
 /// Samples of one daughter: real parts, imaginary parts.
 pub type Planes = [Vec<f32>; 2];
 

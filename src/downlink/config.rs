@@ -1,14 +1,12 @@
 //! Configuration of the downlink.
 
-use serde::{Deserialize, Serialize};
-
 use super::link::LinkConfig;
 use super::transport::socket::ListenConfig;
 use super::wire::Format;
 use super::wire::cadu::{CaduEncoder, INTERLEAVES, ReedSolomon};
 use super::wire::payload::{VISIBILITY_BYTES, visibilities_in};
 use super::wire::{HEADER_BYTES, PACKET_BYTES_MAX, TRAILER_BYTES};
-use crate::units::{Checks, InvalidValue};
+use crate::units::{Checks, InvalidValue, keys};
 
 /// Smallest packet that holds headers and more than one record of any kind.
 const PACKET_BYTES_MIN: usize = 256;
@@ -16,45 +14,28 @@ const PACKET_BYTES_MIN: usize = 256;
 /// Maximum number of idle frames before a pass: a megabyte.
 const IDLE_FRAMES_MAX: u32 = 1_000;
 
-/// The `[downlink]` section.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct DownlinkConfig {
-    /// Format: packets without coding, or packets in coded frames.
-    pub format: Format,
-    /// Maximum packet length, bytes. A lost packet loses only its own visibilities (21 bytes each).
-    pub packet_bytes_max: usize,
-    /// Bytes after which the instrument description and the current ephemeris are repeated. Bounds what one damaged
-    /// packet can cost.
-    pub repeat_bytes: u64,
-    /// Reed-Solomon codewords interleaved in a block, for `cadu`: 1, 2, 3, 4, 5 or 8. Each adds 223 bytes to a frame.
-    pub interleave: usize,
-    /// Spacecraft identifier of the frames, for `cadu`.
-    pub spacecraft_id: u8,
-    /// Idle frames at the start of each pass, for `cadu`: the ground needs one to synchronise.
-    pub idle_frames: u32,
-    /// Rate of the link including coding, bit/s; 0 for no limit. Data that exceeds the passes stays on board.
-    pub rate_bits_per_s_max: f64,
-    /// Simulated faults of the link; none by default.
-    pub link: LinkConfig,
-    /// Limits for a ground that listens on a socket.
-    pub listen: ListenConfig,
-}
-
-impl Default for DownlinkConfig {
-    /// Packets of 8 KiB (about eight transfer frames of 1115 bytes), repeats once a MiB (about 1 %).
-    fn default() -> Self {
-        Self {
-            format: Format::Packets,
-            packet_bytes_max: 8_192,
-            repeat_bytes: 1 << 20,
-            interleave: 5,
-            spacecraft_id: 0x4C,
-            idle_frames: 2,
-            rate_bits_per_s_max: 0.0,
-            link: LinkConfig::default(),
-            listen: ListenConfig::default(),
-        }
+keys! {
+    /// The `[downlink]` section.
+    pub struct DownlinkConfig {
+        /// Format: "packets", or "cadu": packets in coded transfer frames.
+        everyday format: Format = Format::Packets;
+        /// Maximum packet length, bytes. A lost packet loses only its own visibilities (21 bytes each).
+        expert packet_bytes_max: usize = 8_192;
+        /// Bytes after which the instrument description and the current ephemeris are repeated. Bounds what one damaged packet
+        /// can cost.
+        expert repeat_bytes: u64 = 1 << 20;
+        /// Reed-Solomon codewords interleaved in a block, for `cadu`: 1, 2, 3, 4, 5 or 8. Each adds 223 bytes to a frame.
+        expert interleave: usize = 5;
+        /// Spacecraft identifier of the frames, for `cadu`.
+        expert spacecraft_id: u8 = 0x4C;
+        /// Idle frames at the start of each pass, for `cadu`: the ground needs one to synchronise.
+        expert idle_frames: u32 = 2;
+        /// Rate of the link including coding, bit/s; 0 for no limit. Data that exceeds the passes stays on board.
+        everyday rate_bits_per_s_max: f64 = 0.0;
+        /// Faults between spacecraft and ground. A list of them is written beside the file.
+        section link: LinkConfig = LinkConfig::default();
+        /// Limits of a ground that listens.
+        section listen: ListenConfig = ListenConfig::default();
     }
 }
 

@@ -1,25 +1,22 @@
 //! Configuration of the daughters' antennas as maps take them to be.
 
-use serde::{Deserialize, Serialize};
-
 use crate::imaging::anywhere::AntennaBelief;
 use crate::response::PatternsByFrequency;
-use crate::units::Checks;
+use crate::units::{Checks, keys};
 
-/// Antennas by daughter; those beyond a list are ideal.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct AntennasConfig {
-    /// Tilt of the axis from the orbit's normal towards the track's direction, degrees.
-    pub tilt_along_deg: Vec<f64>,
-    /// Tilt away from the Moon, degrees.
-    pub tilt_radial_deg: Vec<f64>,
-    /// q of a factor 1 + q (3 cos^2 - 1) / 2 of the voltage pattern, with the angle from the axis.
-    pub pattern: Vec<f64>,
-    /// The same by frequency, which is added to it: rows `[frequency_hz, q]`, or `[frequency_hz, q_1, q_2, ...]` with one q a daughter;
-    /// linear between rows, and beyond its ends that of the end.
-    #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
-    pub pattern_by_frequency: PatternsByFrequency,
+keys! {
+    /// Antennas by daughter; those beyond a list are ideal.
+    pub struct AntennasConfig {
+        /// Tilt of an antenna's axis from the orbit's normal towards the direction of the track, degrees.
+        expert tilt_along_deg: Vec<f64> = Vec::new();
+        /// Tilt of an antenna's axis away from the Moon, degrees.
+        expert tilt_radial_deg: Vec<f64> = Vec::new();
+        /// Distortion q: a factor 1 + q (3 cos^2 - 1) / 2 of the voltage pattern, with the angle from the axis.
+        expert pattern: Vec<f64> = Vec::new();
+        /// Distortion by frequency, added to map.antennas.pattern, as instrument.pattern_by_frequency.
+        #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
+        expert pattern_by_frequency: PatternsByFrequency = PatternsByFrequency::default();
+    }
 }
 
 impl AntennasConfig {

@@ -16,7 +16,7 @@ use crate::sky::fits::check_frequencies;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
 use crate::sky::{Frame, TEMPERATURE_K_MAX};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
-use crate::units::{ChannelId, Checks, InvalidValue, PerChannel};
+use crate::units::{ChannelId, Checks, InvalidValue, PerChannel, keys};
 
 /// Greatest nside of the pixel engine: 49152 pixels, 9.7 GB of sums a channel (half of a symmetric matrix, f64).
 pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
@@ -60,98 +60,110 @@ pub enum MatrixKind {
     Remade,
 }
 
-/// Configuration of map making.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct MapConfig {
-    /// HEALPix nside of the maps.
-    pub nside: usize,
-    /// Basis of the normal equations: `pixel` or `harmonic`.
-    pub engine: EngineKind,
-    /// Most channels of an instrument. Each takes memory for a map as soon as it has data, so a forged description of
-    /// many channels is refused.
-    pub channels_max: usize,
-    /// Numbers of the channels that are mapped, from 0; all if empty. Of many channels a machine may have memory for a few
-    /// at a time.
-    pub channels: Vec<u16>,
-    /// How the pixel engine computes rows of B.
-    pub rows: PixelMethod,
-    /// Whether the pixel engine holds its matrix.
-    #[serde(skip_serializing_if = "is_usual")]
-    pub matrix: MatrixKind,
-    /// Highest degree of a map from the harmonic engine; 0 for 2.5 nside.
-    pub l_max: usize,
-    /// Longest baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
-    pub baseline_bp_max: f64,
-    /// Regularisation epsilon: R = epsilon W_max I.
-    pub epsilon: PerChannel<f64>,
-    /// How R grows with the degree: `R_l = epsilon W_max (l + 1)^exponent`. Harmonic engine; 0 for the identity.
-    #[serde(skip_serializing_if = "is_zero")]
-    pub regularisation_exponent: f64,
-    /// Tables of l and C_l (K^2), one a channel: `R_l = epsilon / C_l`. Harmonic engine; empty for none.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub regularisation_files: Vec<PathBuf>,
-    /// Ecliptic longitudes and latitudes, degrees, at which the effective beam of a final map is solved for.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub beams_deg: Vec<[f64; 2]>,
-    /// Prior map: a uniform temperature, K; 0 for none.
-    pub prior_k: PerChannel<f64>,
-    /// Prior maps: HEALPix FITS files, one per channel, in K; empty for none.
-    pub prior_files: Vec<PathBuf>,
-    /// Frame of prior maps without COORDSYS; without it such files are refused.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub prior_frame: Option<Frame>,
-    /// FWHM to which prior maps are smoothed, degrees.
-    pub prior_fwhm_deg: f64,
-    /// Share of the power of the sky that the Moon is taken to reflect, xi_R: the map is that of visibilities divided by
-    /// 1 + this; 0 for none.
-    pub moon_reflection: f64,
-    /// Mission time between snapshot maps, s; 0 for a final map only.
-    pub snapshot_every_s: f64,
-    /// Greatest weight of a visibility that is accepted, (K sr)^-2; it sets the resolution of the sums. 0 for 1024 times
-    /// that of 25 s under the mean sky of the channel's frequency.
-    pub weight_max: f64,
-    /// Seed of the noise-only companion map.
-    pub companion_seed: u64,
-    /// Residual at which an iterative solution stops, relative to the right-hand side, in the preconditioner's norm.
-    pub residual_max: f64,
-    /// Iteration limit of such a solution.
-    pub iterations_max: usize,
-    /// Random probes for the traces of the covariances of a final map; 0 for no traces. Those of up to 3072 unknowns (nside 16,
-    /// or l_max 54) are exact and need none: any number above 0 will do.
-    pub trace_probes: usize,
-    /// Departures from the common circle that the harmonic engine accepts.
-    pub limits: GeometryLimits,
-    /// Refinement of a harmonic map with the positions as they are.
-    pub refine: RefineConfig,
-    /// Antennas of the daughters as a refined map takes them to be.
-    #[serde(skip_serializing_if = "AntennasConfig::is_ideal")]
-    pub antennas: AntennasConfig,
+keys! {
+    /// Configuration of map making.
+    pub struct MapConfig {
+        /// HEALPix nside of the maps: a power of two, up to 64 (engine "pixel"), 256 (with matrix = "remade") or 1024 (engine
+        /// "harmonic").
+        everyday nside: usize = 16;
+        /// Basis of the normal equations: "pixel", exact on any orbit, or "harmonic", far cheaper, for satellites on one circle
+        /// or with map.refine.
+        everyday engine: EngineKind = EngineKind::Pixel;
+        /// Most channels of an instrument: each with data takes memory for a map, so a forged description is refused.
+        expert channels_max: usize = 64;
+        /// Numbers of the channels to map, from 0; all if empty.
+        everyday channels: Vec<u16> = Vec::new();
+        /// Rows of B: "average" over pixels, or "centre" of pixels.
+        #[only_with(r#"map.engine = "pixel""#)]
+        expert rows: PixelMethod = PixelMethod::Average;
+        /// What the pixel engine does with its matrix: "held" in memory, or "remade": rows of B are made again for each product
+        /// of an iteration.
+        #[only_with(r#"map.engine = "pixel""#)]
+        #[serde(skip_serializing_if = "is_usual")]
+        everyday matrix: MatrixKind = MatrixKind::Held;
+        /// Highest degree of a map; 0 for 2.5 nside.
+        #[only_with(r#"map.engine = "harmonic""#)]
+        expert l_max: usize = 0;
+        /// Longest baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
+        everyday baseline_bp_max: f64 = 2.0;
+        /// Regularisation epsilon, R = epsilon W_max I; one value, or one a channel.
+        everyday epsilon: PerChannel<f64> = PerChannel::All(1e-4);
+        /// Growth of R with the degree, R_l = epsilon W_max (l + 1)^exponent; 0 for the identity.
+        #[only_with(r#"map.engine = "harmonic""#)]
+        #[serde(skip_serializing_if = "is_zero")]
+        expert regularisation_exponent: f64 = 0.0;
+        /// Tables of l and C_l (K^2), one a channel: R_l = epsilon / C_l.
+        #[only_with(r#"map.engine = "harmonic""#)]
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        expert regularisation_files: Vec<PathBuf> = Vec::new();
+        /// Ecliptic longitude and latitude of points at which the effective beam is solved for, such as `[[0.0, 90.0]]`,
+        /// degrees.
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        everyday beams_deg: Vec<[f64; 2]> = Vec::new();
+        /// Prior map: a uniform temperature, K; 0 for none; one value, or one a channel.
+        everyday prior_k: PerChannel<f64> = PerChannel::All(0.0);
+        /// Prior maps: HEALPix FITS files, one per channel, in K; empty for none.
+        everyday prior_files: Vec<PathBuf> = Vec::new();
+        /// Frame of prior maps without COORDSYS, as sky.frame. Without it such files are refused.
+        #[only_with("map.prior_files")]
+        #[serde(skip_serializing_if = "Option::is_none")]
+        expert prior_frame: Option<Frame> = None;
+        /// FWHM to which prior maps are smoothed, degrees.
+        #[only_with("map.prior_files")]
+        expert prior_fwhm_deg: f64 = 5.0;
+        /// Share of the power of the sky that the Moon is taken to reflect, xi_R: visibilities are divided by one plus this; 0
+        /// for none.
+        expert moon_reflection: f64 = 0.0;
+        /// Mission time between snapshot maps, s; 0 for a final map only.
+        everyday snapshot_every_s: f64 = 0.0;
+        /// Greatest weight of a visibility that is accepted, (K sr)^-2; it sets the resolution of the sums. 0 for 1024 times
+        /// that of 25 s under the mean sky of the channel's frequency.
+        expert weight_max: f64 = 0.0;
+        /// Seed of the noise-only companion map.
+        expert companion_seed: u64 = 1;
+        /// Residual at which an iterative solution stops, relative to the right-hand side, in the preconditioner's norm.
+        #[only_with(r#"map.engine = "harmonic" or map.matrix = "remade""#)]
+        expert residual_max: f64 = 1e-4;
+        /// Most iterations of a solution.
+        #[only_with(r#"map.engine = "harmonic" or map.matrix = "remade""#)]
+        expert iterations_max: usize = 300;
+        /// Random probes for the traces of the covariances of a final map; 0 for no traces. Those of up to 3072 unknowns (nside
+        /// 16, or l_max 54) are exact and need none: any number above 0 will do.
+        everyday trace_probes: usize = 0;
+        /// Departures from the common circle beyond which visibilities are refused.
+        #[only_with(r#"map.engine = "harmonic""#)]
+        section limits: GeometryLimits = GeometryLimits::default();
+        /// Refinement of a harmonic map with the positions as they are, on any orbit.
+        section refine: RefineConfig = RefineConfig::default();
+        /// Antennas as a refined map takes them to be, a value a daughter.
+        #[only_with("map.refine.passes_max > 0")]
+        #[serde(skip_serializing_if = "AntennasConfig::is_ideal")]
+        section antennas: AntennasConfig = AntennasConfig::default();
+    }
 }
 
 /// Value of `map.refine.passes_max` among the settings of sums that hold visibilities one by one.
 pub const REFINED: &str = "above 0";
 
-/// Refinement of a harmonic map: conjugate gradients with the rows of B of the true positions, preconditioned by the sums of the
-/// nearest circle. Nothing is refused for its geometry then.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct RefineConfig {
-    /// Most products with the true matrix; 0 for no refinement.
-    pub passes_max: usize,
-    /// Residual at which it stops, relative to the right-hand side, in the preconditioner's norm.
-    pub residual_max: f64,
-    /// Most visibilities of a channel that are held in memory for it, or without the matrix of the pixel engine; further ones are left
-    /// out and counted.
-    pub visibilities_max: u64,
-    /// Whether visibilities are averages over their integrations, or instants in their middle.
-    #[serde(skip_serializing_if = "is_off")]
-    pub smear_integrations: bool,
-}
-
-impl Default for RefineConfig {
-    fn default() -> Self {
-        Self { passes_max: 0, residual_max: 1e-3, visibilities_max: 30_000_000, smear_integrations: false }
+keys! {
+    /// Refinement of a harmonic map: conjugate gradients with the rows of B of the true positions, preconditioned by the sums of the
+    /// nearest circle. Nothing is refused for its geometry then.
+    #[derive(Copy)]
+    pub struct RefineConfig {
+        /// Most products with the true matrix; 0 for no refinement; four to ten are usual.
+        #[only_with(r#"map.engine = "harmonic""#)]
+        everyday passes_max: usize = 0;
+        /// Residual at which it stops, relative to the right-hand side, in the preconditioner's norm.
+        #[only_with("map.refine.passes_max > 0")]
+        expert residual_max: f64 = 1e-3;
+        /// Most visibilities of a channel that are held in memory for it, or without the matrix of the pixel engine; further
+        /// ones are left out and counted.
+        #[only_with(r#"map.refine.passes_max > 0 or map.matrix = "remade""#)]
+        expert visibilities_max: u64 = 30_000_000;
+        /// Whether visibilities are averages over their integrations, or instants in their middle.
+        #[only_with("map.refine.passes_max > 0")]
+        #[serde(skip_serializing_if = "is_off")]
+        everyday smear_integrations: bool = false;
     }
 }
 
@@ -160,39 +172,6 @@ impl RefineConfig {
     #[must_use]
     pub fn is_on(&self) -> bool {
         self.passes_max > 0
-    }
-}
-
-impl Default for MapConfig {
-    fn default() -> Self {
-        Self {
-            nside: 16,
-            engine: EngineKind::Pixel,
-            channels_max: 64,
-            channels: Vec::new(),
-            rows: PixelMethod::Average,
-            matrix: MatrixKind::Held,
-            l_max: 0,
-            baseline_bp_max: 2.0,
-            epsilon: PerChannel::All(1e-4),
-            regularisation_exponent: 0.0,
-            regularisation_files: Vec::new(),
-            beams_deg: Vec::new(),
-            prior_k: PerChannel::All(0.0),
-            prior_files: Vec::new(),
-            prior_frame: None,
-            prior_fwhm_deg: 5.0,
-            moon_reflection: 0.0,
-            snapshot_every_s: 0.0,
-            weight_max: 0.0,
-            companion_seed: 1,
-            residual_max: 1e-4,
-            iterations_max: 300,
-            trace_probes: 0,
-            limits: GeometryLimits::default(),
-            refine: RefineConfig::default(),
-            antennas: AntennasConfig::default(),
-        }
     }
 }
 
@@ -266,7 +245,6 @@ impl MapConfig {
             let degree = self.degree() as f64;
             checks.number("l_max", degree, self.degree() <= L_MAX, "at most 1024; 0 stands for 2.5 nside");
         }
-        self.check_effects(&mut checks);
         let residual = self.residual_max;
         checks.number("residual_max", residual, residual > 0.0 && residual < 1.0, "above 0 and below 1");
         let iterations = self.iterations_max as f64;
@@ -302,11 +280,6 @@ impl MapConfig {
         );
         checks.require("refine.visibilities_max", visibilities_max, visibilities_max > 0, "at least 1");
         self.antennas.check(checks);
-        let refined = "none without map.refine.passes_max above 0";
-        checks.require("antennas", "(set)", self.antennas.is_ideal() || self.refine.is_on(), refined);
-        let smeared = self.refine.smear_integrations;
-        let expected = "false without map.refine.passes_max above 0";
-        checks.require("refine.smear_integrations", smeared, !smeared || self.refine.is_on(), expected);
         if self.is_remade() {
             let probes = self.trace_probes;
             let expected = "0 with map.matrix = \"remade\": traces need the matrix";
@@ -353,45 +326,6 @@ impl MapConfig {
             let refined = self.refine.is_on();
             let expected = "no map.regularisation_exponent and no map.regularisation_files with it";
             checks.require("refine.passes_max", self.refine.passes_max, !refined, expected);
-        }
-    }
-
-    /// Requires that keys of the other engine are not set.
-    fn check_effects(&self, checks: &mut Checks) {
-        let usual = Self::default();
-        let is_held = !self.is_remade();
-        // Those that are held are bounded likewise.
-        let refine = RefineConfig {
-            visibilities_max: if is_held { usual.refine } else { self.refine }.visibilities_max,
-            ..usual.refine
-        };
-        for (key, is_set) in [
-            ("residual_max", self.residual_max != usual.residual_max),
-            ("iterations_max", self.iterations_max != usual.iterations_max),
-        ] {
-            let good = !is_set || self.engine == EngineKind::Harmonic || !is_held;
-            let expected =
-                "no such key: it has no effect without map.engine = \"harmonic\" or map.matrix = \"remade\"";
-            checks.require(key, "(set)", good, expected);
-        }
-        let (other, set) = match self.engine {
-            EngineKind::Pixel => (
-                "harmonic",
-                vec![
-                    ("l_max", self.l_max != usual.l_max),
-                    ("regularisation_exponent", self.regularisation_exponent != 0.0),
-                    ("regularisation_files", !self.regularisation_files.is_empty()),
-                    ("limits", self.limits != usual.limits),
-                    ("refine", self.refine != refine),
-                ],
-            ),
-            EngineKind::Harmonic => {
-                ("pixel", vec![("rows", self.rows != usual.rows), ("matrix", self.matrix != usual.matrix)])
-            }
-        };
-        for (key, is_set) in set {
-            let expected = format!("no such key: it has no effect without map.engine = \"{other}\"");
-            checks.require(key, "(set)", !is_set, expected);
         }
     }
 

@@ -12,7 +12,7 @@ use crate::array::{Array, IntegrationRule};
 use crate::frames::{AntennaResponse, Channel};
 use crate::response::model::ModelChoice;
 use crate::units::constants::YEAR_S;
-use crate::units::{Checks, Dimension, InvalidValue, PerChannel};
+use crate::units::{Checks, Dimension, InvalidValue, PerChannel, keys};
 
 /// Most channels: the mission's own number.
 pub const CHANNELS_MAX: usize = 30;
@@ -24,88 +24,97 @@ pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 /// array moves by some degrees; the cost of narrower channels grows with the third power of that time.
 const SAMPLES_WIDTH_HZ_MIN: f64 = 500.0;
 
+/// So that missions without it keep their hash.
+#[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
 fn is_one(number: &u64) -> bool {
     *number == 1
 }
 
-/// The `[spacecraft]` section.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct SpacecraftConfig {
-    /// What is simulated: integrated visibilities, or samples that are correlated.
-    pub fidelity: Fidelity,
-    /// Centre frequencies, Hz.
-    pub channels_hz: Vec<f64>,
-    /// Width of every channel, Hz.
-    pub channel_width_hz: f64,
-    /// Length of the mission, s.
-    pub duration_s: f64,
-    /// Keep one visibility in this many, from windows that have all phases of month, breathing and precession; in place of
-    /// `every_nth_window` and `every_nth_integration`.
-    #[serde(skip_serializing_if = "is_one")] // Missions without it keep their hash.
-    pub thin: u64,
-    /// Observe only in every n-th window.
-    pub every_nth_window: u64,
-    /// Observe only for this time from the start of each window, s; 0 for all of it.
-    pub window_s_max: f64,
-    /// Flag a visibility while the Earth is in sight of one of its two daughters. Windows are daughter 1's, and the others
-    /// trail her into the shadow.
-    pub flag_earth: bool,
-    /// Send only every n-th integration of a window.
-    pub every_nth_integration: PerChannel<u64>,
-    /// Longest integration, s.
-    pub integration_s_max: f64,
-    /// Longest motion of a baseline in one integration, wavelengths.
-    pub motion_wavelengths_max: f64,
-    /// Longest baseline that is correlated, wavelengths; 0 for no limit.
-    pub baseline_wavelengths_max: PerChannel<f64>,
-    /// Visibility model.
-    pub model: ModelChoice,
-    /// Whether visibilities are averages over their integrations (motion along the orbit; harmonic model only), or
-    /// values at their middle.
-    pub smear_integrations: bool,
-    /// Whether visibilities are averages over the width of their channel, as those of samples are: the integrand times
-    /// `sinc(pi n . r_ij dnu / c)`. The ground's rows of B are for the centre of the channel.
-    pub smear_bandwidth: bool,
-    /// Whether thermal noise is added. Weights describe the noise in either case.
-    pub thermal_noise: bool,
-    /// Receiver noise T_rec / zeta, referred to the sky, K sr.
-    pub receiver_noise_k_sr: ReceiverNoise,
-    /// Frequency at which the receiver's 1/f noise equals its other noise, Hz: `receiver_noise_k_sr` is multiplied by
-    /// `1 + knee / frequency`; 0 for none.
-    #[serde(skip_serializing_if = "is_zero")]
-    pub receiver_knee_hz: f64,
-    /// Radio interference of the spacecraft itself, added to the receiver noise of every daughter, K sr.
-    #[serde(skip_serializing_if = "is_none")]
-    pub interference_floor_k_sr: PerChannel<f64>,
-    /// Share of the power of the sky that the Moon reflects, xi_R; 0 for none. The paper has 0.07.
-    pub moon_reflection: f64,
-    /// The form of the Moon that reflects.
-    #[serde(skip_serializing_if = "MoonMirror::is_flat")]
-    pub moon_mirror: MoonMirror,
-    /// Brightness temperature of the Moon's disc, equal over it, K; 0 for none. Physically some 250.
-    #[serde(skip_serializing_if = "is_zero")]
-    pub moon_temperature_k: f64,
-    /// Antenna response of the daughters.
-    pub antenna: Antenna,
-    /// Sub-bands into which each channel of samples is divided before correlation: a power of two, 1 for none.
-    pub sub_bands: usize,
-    /// Delay centre of samples: ecliptic longitude and latitude, deg; empty for no delays.
-    pub delay_centre_deg: Vec<f64>,
-    /// Integration time of auto-correlations, s, in whole blocks of samples; 0 for no auto-correlations.
-    pub auto_integration_s: f64,
-    /// Whether auto-correlations are simulated with fidelity "visibilities", too; with samples they always are.
-    pub auto_powers: bool,
-    /// Blocks that the correlator reads ahead while one is missing.
-    pub wait_blocks: u64,
-    /// Capacity of the onboard store, bytes.
-    pub store_bytes_max: u64,
-    /// What a full store drops.
-    pub store_drop: StoreDrop,
-    /// Mission epoch: TAI seconds since 1958-01-01.
-    pub epoch_tai_s: f64,
-    /// The ninth daughter.
-    pub ninth: NinthConfig,
+keys! {
+    /// The `[spacecraft]` section.
+    pub struct SpacecraftConfig {
+        /// What is simulated: "visibilities", or "samples", the voltages of every daughter, which are correlated; for minutes
+        /// to hours of mission time.
+        everyday fidelity: Fidelity = Fidelity::default();
+        /// Centre frequencies of the channels, Hz: up to 30, from 0.1 to 30 MHz.
+        everyday channels_hz: Vec<f64> = vec![10e6];
+        /// Width of every channel, Hz.
+        expert channel_width_hz: f64 = 8_000.0;
+        /// Length of the mission, s.
+        everyday duration_s: f64 = 1.3 * YEAR_S;
+        /// Keep one visibility in this many, from windows that have all phases of month, breathing and precession; in place of
+        /// every_nth_window and every_nth_integration.
+        #[serde(skip_serializing_if = "is_one")]
+        everyday thin: u64 = 1;
+        /// Observe only in every n-th window; there is one an orbit.
+        everyday every_nth_window: u64 = 1;
+        /// Observe only for this time from the start of each window, s; 0 for all of it.
+        everyday window_s_max: f64 = 0.0;
+        /// Flag a visibility while the Earth is in sight of one of its two daughters. Windows are daughter 1's, and the others
+        /// trail her into the shadow.
+        expert flag_earth: bool = true;
+        /// Send only every n-th integration of a window; one value, or one a channel.
+        everyday every_nth_integration: PerChannel<u64> = PerChannel::All(1);
+        /// Longest integration, s.
+        expert integration_s_max: f64 = IntegrationRule::default().duration_s_max;
+        /// Longest motion of a baseline in one integration, wavelengths.
+        expert motion_wavelengths_max: f64 = IntegrationRule::default().motion_wavelengths_max;
+        /// Longest baseline that is correlated, wavelengths; 0 for no limit; one value, or one a channel.
+        expert baseline_wavelengths_max: PerChannel<f64> = PerChannel::All(0.0);
+        /// Model of the visibilities: "direct" sums over pixels, "harmonic" on a circle, "general" harmonics anywhere, or
+        /// "auto", by cost.
+        expert model: ModelChoice = ModelChoice::default();
+        /// Whether visibilities are averages over their integrations, or values at their middle.
+        expert smear_integrations: bool = false;
+        /// Whether visibilities are averages over the width of their channel, as those of samples are: the integrand times
+        /// `sinc(pi n . r_ij dnu / c)`. The ground's rows of B are for the centre of the channel.
+        expert smear_bandwidth: bool = false;
+        /// Whether thermal noise is added. Weights describe the noise in either case.
+        everyday thermal_noise: bool = true;
+        /// Receiver noise T_rec / zeta, added to the sky, K sr: one value, one a channel, or a table of [frequency in Hz, K sr]
+        /// at rising frequencies, linear in the logarithms of both, such as `[[1e6, 2e4], [10e6, 300.0], [30e6, 100.0]]`.
+        everyday receiver_noise_k_sr: ReceiverNoise = ReceiverNoise::default();
+        /// Frequency at which the receiver's 1/f noise equals its other noise, Hz: `receiver_noise_k_sr` is multiplied by `1 +
+        /// knee / frequency`; 0 for none.
+        #[serde(skip_serializing_if = "is_zero")]
+        expert receiver_knee_hz: f64 = 0.0;
+        /// Radio interference of the spacecraft itself, added to the receiver noise of every daughter, K sr; one value, or one
+        /// a channel.
+        #[serde(skip_serializing_if = "is_none")]
+        expert interference_floor_k_sr: PerChannel<f64> = PerChannel::All(0.0);
+        /// Share of the power of the sky that the Moon reflects, xi_R; 0 for none. The paper has 0.07.
+        everyday moon_reflection: f64 = 0.0;
+        /// Form of the Moon that reflects: "flat", or "sphere" with spacecraft.model = "direct".
+        #[serde(skip_serializing_if = "MoonMirror::is_flat")]
+        expert moon_mirror: MoonMirror = MoonMirror::default();
+        /// Brightness temperature of the Moon's disc, equal over it, K; physically some 250. The ground does not correct for
+        /// it.
+        #[serde(skip_serializing_if = "is_zero")]
+        expert moon_temperature_k: f64 = 0.0;
+        /// Antenna of the daughters: "isotropic", "dipole-normal", or "three-dipoles": three across each other, each with a
+        /// receiver, as one antenna.
+        everyday antenna: Antenna = Antenna::default();
+        /// Sub-bands into which each channel of samples is divided before correlation: a power of two, 1 for none.
+        expert sub_bands: usize = 1;
+        /// Delay centre of samples: ecliptic longitude and latitude, deg; empty for no delays.
+        expert delay_centre_deg: Vec<f64> = Vec::new();
+        /// Integration time of auto-correlations, s, in whole blocks of samples; 0 for no auto-correlations.
+        #[only_with(r#"spacecraft.auto_powers = true or spacecraft.fidelity = "samples""#)]
+        expert auto_integration_s: f64 = 1.0;
+        /// Whether auto-correlations are simulated with fidelity "visibilities", too; with samples they always are.
+        expert auto_powers: bool = false;
+        /// Blocks that the correlator reads ahead while one is missing.
+        #[only_with(r#"spacecraft.fidelity = "samples""#)]
+        expert wait_blocks: u64 = 16;
+        /// Capacity of the onboard store, bytes.
+        expert store_bytes_max: u64 = 4 << 30;
+        /// What a full store drops: the "newest" data, the "oldest", or "lowest-value", which adds least to the map.
+        expert store_drop: StoreDrop = StoreDrop::default();
+        /// Epoch of the mission, TAI seconds since 1958-01-01; by default 2027-01-01.
+        expert epoch_tai_s: f64 = (69.0 * 365.0 + 17.0) * 86_400.0;
+        /// The ninth daughter: a spectrometer of the whole sky, whose spectra are auto-correlations.
+        section ninth: NinthConfig = NinthConfig::default();
+    }
 }
 
 /// Level of detail of the simulated spacecraft; the form of the downlink does not depend on it.
@@ -170,48 +179,6 @@ impl From<Antenna> for AntennaResponse {
             Antenna::Isotropic => Self::Isotropic,
             Antenna::DipoleNormal => Self::DipoleNormal,
             Antenna::ThreeDipoles => Self::ThreeDipoles,
-        }
-    }
-}
-
-impl Default for SpacecraftConfig {
-    fn default() -> Self {
-        let rule = IntegrationRule::default();
-        Self {
-            fidelity: Fidelity::default(),
-            channels_hz: vec![10e6],
-            channel_width_hz: 8_000.0,
-            duration_s: 1.3 * YEAR_S,
-            thin: 1,
-            every_nth_window: 1,
-            window_s_max: 0.0,
-            flag_earth: true,
-            every_nth_integration: PerChannel::All(1),
-            integration_s_max: rule.duration_s_max,
-            motion_wavelengths_max: rule.motion_wavelengths_max,
-            baseline_wavelengths_max: PerChannel::All(0.0),
-            model: ModelChoice::default(),
-            smear_integrations: false,
-            smear_bandwidth: false,
-            thermal_noise: true,
-            receiver_noise_k_sr: ReceiverNoise::default(),
-            receiver_knee_hz: 0.0,
-            interference_floor_k_sr: PerChannel::All(0.0),
-            moon_reflection: 0.0,
-            moon_mirror: MoonMirror::default(),
-            moon_temperature_k: 0.0,
-            antenna: Antenna::default(),
-            sub_bands: 1,
-            delay_centre_deg: Vec::new(),
-            auto_integration_s: 1.0,
-            // One each second over years would be several times as many as the visibilities.
-            auto_powers: false,
-            wait_blocks: 16,
-            store_bytes_max: 4 << 30,
-            store_drop: StoreDrop::default(),
-            // 2027-01-01T00:00:00 TAI: 69 years of which 17 are leap years.
-            epoch_tai_s: (69.0 * 365.0 + 17.0) * 86_400.0,
-            ninth: NinthConfig::default(),
         }
     }
 }

@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use num_complex::Complex32;
 use rand_distr::{Distribution, StandardNormal};
-use serde::{Deserialize, Serialize};
 
 use super::sizes::VISIBILITY_BYTES;
 use crate::array::Array;
@@ -12,7 +11,9 @@ use crate::frames::{Flags, GroundFrame, Housekeeping, ObservingWindow, Spectrome
 use crate::numerics::lagrange;
 use crate::response::model::{DaughterPosition, DirectSum, ModelError, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
-use crate::units::{ChannelId, Checks, InvalidValue, Pair, StreamKind, TICKS_PER_SECOND, random_stream};
+use crate::units::{
+    ChannelId, Checks, InvalidValue, Pair, StreamKind, TICKS_PER_SECOND, keys, random_stream,
+};
 
 /// Lowest and highest frequency that a ninth daughter may observe, Hz.
 pub const NINTH_BAND_HZ: [f64; 2] = [30e6, 120e6];
@@ -20,37 +21,29 @@ pub const NINTH_BAND_HZ: [f64; 2] = [30e6, 120e6];
 /// Smallest number of samples of an integration (width x time): noise is treated as Gaussian, and its skewness is 2 % then.
 const SAMPLES_MIN: f64 = 1e4;
 
-/// The `[spacecraft.ninth]` section.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct NinthConfig {
-    /// Whether there is a ninth daughter.
-    pub on: bool,
-    /// Lowest and highest frequency of the spectrum, Hz.
-    pub band_hz: [f64; 2],
-    /// Number of channels in the band.
-    pub channels: usize,
-    /// Length of an integration, s.
-    pub integration_s: f64,
-    /// Receiver noise T_rec / zeta, as the antenna would see it from the sky, K sr.
-    pub receiver_noise_k_sr: f64,
-    /// Arc by which it trails the first daughter on the same circle, m.
-    pub arc_m: f64,
-    /// Spectral index of temperature with which a sky from files is extrapolated above its highest channel.
-    pub file_index: f64,
-}
-
-impl Default for NinthConfig {
-    fn default() -> Self {
-        Self {
-            on: false,
-            band_hz: NINTH_BAND_HZ,
-            channels: 90,
-            integration_s: 10.0,
-            receiver_noise_k_sr: 0.0,
-            arc_m: 110e3,
-            file_index: -2.51,
-        }
+keys! {
+    /// The `[spacecraft.ninth]` section.
+    pub struct NinthConfig {
+        /// Whether there is a ninth daughter.
+        everyday on: bool = false;
+        /// Lowest and highest frequency of the spectrum, Hz.
+        #[only_with("spacecraft.ninth.on = true")]
+        expert band_hz: [f64; 2] = NINTH_BAND_HZ;
+        /// Number of channels in the band.
+        #[only_with("spacecraft.ninth.on = true")]
+        expert channels: usize = 90;
+        /// Length of an integration, s.
+        #[only_with("spacecraft.ninth.on = true")]
+        expert integration_s: f64 = 10.0;
+        /// Receiver noise T_rec / zeta, as the antenna would see it from the sky, K sr.
+        #[only_with("spacecraft.ninth.on = true")]
+        expert receiver_noise_k_sr: f64 = 0.0;
+        /// Arc by which it trails the first daughter on the same circle, m.
+        #[only_with("spacecraft.ninth.on = true")]
+        expert arc_m: f64 = 110e3;
+        /// Spectral index of temperature with which a sky from files is extrapolated above its highest channel.
+        #[only_with("spacecraft.ninth.on = true")]
+        expert file_index: f64 = -2.51;
     }
 }
 

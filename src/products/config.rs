@@ -1,38 +1,27 @@
 //! Configuration of products.
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use crate::sky::harmonics::Alm;
 use crate::sky::spectra::{gaussian_beam, multiply_degrees};
 use crate::sky::{Frame, MapError, SkyMap};
-use crate::units::{Checks, InvalidValue};
+use crate::units::{Checks, InvalidValue, keys};
 
-/// The `[products]` section: products besides the final maps.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ProductsConfig {
-    /// Whether pictures are drawn.
-    pub pictures: bool,
-    /// Whether final pictures are written as SVG, too.
-    pub svg: bool,
-    /// Whether every snapshot is written as a FITS map, too.
-    pub snapshot_maps: bool,
-    /// Celestial frame of pictures; maps are on ecliptic axes in any case.
-    pub frame: Frame,
-    /// FWHM to which maps, noise and input, with split pixels, are smoothed before they are compared and drawn, degrees; 0
-    /// for none.
-    pub smooth_fwhm_deg: f64,
-}
-
-impl Default for ProductsConfig {
-    fn default() -> Self {
-        Self {
-            pictures: true,
-            svg: false,
-            snapshot_maps: false,
-            frame: Frame::Galactic,
-            smooth_fwhm_deg: 0.0,
-        }
+keys! {
+    /// The `[products]` section: products besides the final maps.
+    pub struct ProductsConfig {
+        /// Whether pictures are drawn.
+        everyday pictures: bool = true;
+        /// Whether final pictures are written as SVG, too.
+        #[only_with("products.pictures = true")]
+        expert svg: bool = false;
+        /// Whether every snapshot is written as a FITS map, too.
+        expert snapshot_maps: bool = false;
+        /// Frame of pictures: "galactic", "ecliptic" or "equatorial"; maps are on ecliptic axes in any case.
+        everyday frame: Frame = Frame::Galactic;
+        /// FWHM to which maps, noise and input, with split pixels, are smoothed before they are compared and drawn, degrees; 0
+        /// for none.
+        everyday smooth_fwhm_deg: f64 = 0.0;
     }
 }
 

@@ -1,30 +1,22 @@
 //! Configuration of queues and threads.
 
-use serde::{Deserialize, Serialize};
+use crate::units::{Checks, InvalidValue, keys};
 
-use crate::units::{Checks, InvalidValue};
-
-/// Queues and threads. None of this changes a byte of the results.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct RuntimeConfig {
-    /// Greatest number of items between two stages.
-    pub queue_capacity: usize,
-    /// Threads for the work inside stages; 0 for one a core.
-    pub threads: usize,
-    /// Time that stages have to end after a failure, s.
-    pub shutdown_s: f64,
-    /// Time for maps of the data so far after Ctrl-C, s; solutions that take longer are cut off. What was received is saved
-    /// first, and is not part of it.
-    pub grace_s: f64,
-    /// Longest time without progress before the run fails, s; must exceed the longest step, for example that of a
-    /// solution. 0 for no limit.
-    pub stall_s: f64,
-}
-
-impl Default for RuntimeConfig {
-    fn default() -> Self {
-        Self { queue_capacity: 64, threads: 0, shutdown_s: 10.0, grace_s: 2.5, stall_s: 0.0 }
+keys! {
+    /// Queues and threads. None of this changes a byte of the results.
+    pub struct RuntimeConfig {
+        /// Greatest number of items between two stages.
+        expert queue_capacity: usize = 64;
+        /// Threads for the work inside stages; 0 for one a core.
+        everyday threads: usize = 0;
+        /// Time that stages have to end after a failure, s.
+        expert shutdown_s: f64 = 10.0;
+        /// Time for maps of the data so far after Ctrl-C, s; solutions that take longer are cut off. What was received is saved
+        /// first, and is not part of it.
+        everyday grace_s: f64 = 2.5;
+        /// Longest time without progress before the run fails, s; must exceed the longest step, for example that of a solution.
+        /// 0 for no limit.
+        expert stall_s: f64 = 0.0;
     }
 }
 

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::frame::Frame;
 use super::generated::GeneratedSky;
 use super::healpix::is_valid_nside;
-use crate::units::{Checks, InvalidValue, PerChannel};
+use crate::units::{Checks, InvalidValue, PerChannel, keys};
 
 /// What is done with a map file of another frequency than the channel's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -21,26 +21,33 @@ pub enum MapFrequency {
     SpectralIndex(f64),
 }
 
-/// The `[sky]` section.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct SkyConfig {
-    /// HEALPix FITS maps in K, one or one a channel; without them the sky is generated.
-    pub file: Option<PerChannel<PathBuf>>,
-    /// Frame of map files without COORDSYS; without it such files are refused.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub frame: Option<Frame>,
-    /// What is done with a map file whose FREQ is not the channel's.
-    pub frequency: MapFrequency,
-    /// nside of the generated sky.
-    pub nside: usize,
-    /// Highest degree of the harmonic model, at most what the map determines; 0 for what the baselines need.
-    pub l_max: usize,
-    /// Components of the generated sky.
-    pub generated: GeneratedSky,
-    /// What is added to a map file.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub added: Option<AddedSky>,
+keys! {
+    /// The `[sky]` section.
+    pub struct SkyConfig {
+        /// Map of the sky: HEALPix FITS in K, such as "map.fits"; one for all channels, or a list with one a channel. Without
+        /// it the sky is generated.
+        everyday file: Option<PerChannel<PathBuf>> = None;
+        /// Frame of map files without COORDSYS: "ecliptic", "galactic" or "equatorial". Without it such files are refused.
+        #[only_with("sky.file")]
+        #[serde(skip_serializing_if = "Option::is_none")]
+        everyday frame: Option<Frame> = None;
+        /// What is done with a map file whose FREQ is not the channel's: "must-match" refuses it; `{ spectral_index = -2.5 }`
+        /// scales it, T(nu) = T(FREQ) (nu / FREQ)^index.
+        #[only_with("sky.file")]
+        expert frequency: MapFrequency = MapFrequency::default();
+        /// HEALPix nside of the generated sky, or of a map file to which something is added: a power of two up to 1024.
+        everyday nside: usize = 64;
+        /// Highest degree of the harmonic model; 0 for what the baselines need.
+        expert l_max: usize = 0;
+        /// Components of the generated sky.
+        section generated: GeneratedSky = GeneratedSky::default();
+        /// What is added to map files at sky.nside, such as `{ small_scales = true, sources = true }`: fluctuations and counted
+        /// sources with the numbers of [sky.generated]; `catalogue = "sources.csv"` adds those of a table, as `lunarray sky
+        /// --sources` writes it.
+        #[only_with("sky.file")]
+        #[serde(skip_serializing_if = "Option::is_none")]
+        expert added: Option<AddedSky> = None;
+    }
 }
 
 /// `sky.added`: what is added to a map file, with the numbers of `[sky.generated]` and at `sky.nside` or the map's own
@@ -55,20 +62,6 @@ pub struct AddedSky {
     /// Point sources of a table (CSV).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub catalogue: Option<PathBuf>,
-}
-
-impl Default for SkyConfig {
-    fn default() -> Self {
-        Self {
-            file: None,
-            frame: None,
-            frequency: MapFrequency::default(),
-            nside: 64,
-            l_max: 0,
-            generated: GeneratedSky::default(),
-            added: None,
-        }
-    }
 }
 
 /// Greatest nside of a generated sky.
@@ -125,13 +118,7 @@ impl SkyConfig {
         if let MapFrequency::SpectralIndex(index) = self.frequency {
             let (key, good) = ("frequency.spectral_index", (-10.0..=10.0).contains(&index));
             checks.number(key, index, good, "-10 to 10");
-            let expected =
-                "no such key without sky.file: a generated sky is made for the channel's frequency";
-            checks.require(key, index, self.file.is_some(), expected);
         }
-        let expected = "no such key without sky.file: a generated sky has its own parts, in sky.generated";
-        let good = self.file.is_some() || self.added.is_none();
-        checks.require("added", "(set)", good, expected);
         let mut found = checks.finish();
         found.extend(self.generated.problems());
         found

@@ -11,6 +11,7 @@ pub mod constants;
 mod echo;
 mod ids;
 mod interval_set;
+mod keys;
 mod per_channel;
 mod quantity;
 mod random;
@@ -28,6 +29,9 @@ pub use ids::{ChannelId, Pair, all_pairs};
 pub use ids::{MAX_SATELLITES, PairError};
 #[doc(hidden)]
 pub use interval_set::IntervalSet;
+pub(crate) use keys::keys;
+#[doc(hidden)]
+pub use keys::{Key, Level};
 #[doc(hidden)]
 pub use per_channel::PerChannel;
 #[doc(hidden)]

@@ -86,10 +86,16 @@ fn an_installed_program_explains_itself() {
 
     // What is printed is a pipeline file that holds.
     let folder = tempfile::tempdir().unwrap();
-    for name in ["quicklook", "reference"] {
-        let text = said(&["config", "--print", name]);
+    for (name, args) in [
+        ("quicklook", &["--print", "quicklook"][..]),
+        ("reference", &["--print", "reference"]),
+        ("all", &["--all"]),
+        ("everyday", &[]),
+    ] {
+        let text = said(&[&["config"], args].concat());
+        assert_eq!(text.contains("\nposition_rounds = "), name == "all", "{name}");
         let file = write(folder.path(), &format!("{name}.toml"), &text);
-        let printed: Value = serde_json::from_str(&said(&["config", "--print", name, "--json"])).unwrap();
+        let printed: Value = serde_json::from_str(&said(&[&["config"], args, &["--json"]].concat())).unwrap();
         assert!(printed["map"]["nside"].is_number());
         said(&["check", &file, "--memory-max", "1TB", "--json"]);
     }

@@ -181,5 +181,5 @@ fn navigation_that_is_off_leaves_every_byte_and_old_keys_are_told_where_they_wen
         "--set",
         "instrument.along_m.pass_rms=1.0",
     ]);
-    assert!(said.contains("instrument.along_m: no such key; it is navigation.along_m now"), "{said}");
+    assert!(said.contains("instrument.along_m: no such key; it was renamed to navigation.along_m"), "{said}");
 }

@@ -109,13 +109,14 @@ fn a_schema_is_printed_instead_of_a_pipeline() {
 #[test]
 fn the_page_of_keys_is_that_of_the_program() {
     let page = succeed(&["explain", "--markdown"]);
-    let kept = include_str!("../../docs/keys.md");
+    let kept = std::fs::read_to_string("docs/keys.md").unwrap();
     assert!(page == kept, "docs/keys.md is not current: write it anew with `lunarray explain --markdown`");
     // Every key of every section, whatever the form of the page.
     let lines = succeed(&["explain", "map", "--json"]);
     for line in lines.lines() {
         let key = serde_json::from_str::<Value>(line).unwrap()["key"].as_str().unwrap().to_owned();
         let name = key.rsplit('.').next().unwrap();
-        assert!(page.contains(&format!("| `{name}` |")) || page.contains(&format!("## {key}\n")), "{key}");
+        let forms = [format!("| `{key}` |"), format!("| `{name}` |"), format!("## {key}\n")];
+        assert!(forms.iter().any(|form| page.contains(form)), "{key}");
     }
 }

@@ -1,4 +1,4 @@
-//! Instrumental errors and artificial signals of the daughters, compared with closed forms.
+//! Instrumental errors and tones of the daughters, compared with closed forms.
 
 use std::f64::consts::TAU;
 
@@ -6,10 +6,10 @@ use lunarray::array::ArrayConfig;
 use lunarray::calibration::{
     AntennaGains, Calibration, ChannelGains, GainSolution, GainsFile, Interpolation,
 };
-use lunarray::daughters::{DaughtersConfig, Disturbances};
+use lunarray::daughters::{DaughtersConfig, ErrorTerms, Tones};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities, VisibilityBlock};
 use lunarray::mother::correlator::Division;
-use lunarray::units::constants::SPEED_OF_LIGHT_M_S;
+use lunarray::units::constants::{DAY_S, SPEED_OF_LIGHT_M_S};
 use lunarray::units::vector::{dot, sub};
 use lunarray::units::{ChannelId, all_pairs};
 use num_complex::Complex64;
@@ -49,6 +49,12 @@ fn ratio(all: &[(f64, Complex64, f64)], expected: impl Fn(f64) -> Complex64) -> 
 /// the noise of its weight, and both parts count.
 const COMMON: f64 = 1.6;
 
+/// An error that is a constant and a rate a day, by daughter.
+fn terms(constant: impl IntoIterator<Item = f64>, rate_per_day: impl IntoIterator<Item = f64>) -> ErrorTerms {
+    let (constant, rate_per_day) = (constant.into_iter().collect(), rate_per_day.into_iter().collect());
+    ErrorTerms { constant, rate_per_day, ..ErrorTerms::default() }
+}
+
 #[test]
 fn gains_and_phases_scale_visibilities_and_calibration_corrects_them() {
     let mut craft = Spacecraft::new(ArrayConfig::default(), vec![1e6], constant(0.5), 16.0);
@@ -57,19 +63,15 @@ fn gains_and_phases_scale_visibilities_and_calibration_corrects_them() {
     let drift = |n: usize| [0.25, 1.0].map(|most| most * (n as f64 - 3.5) / 3.5 / 16.0);
     let amplitude = |n: usize| 0.1 * (n as f64 - 4.0) - drift(n)[0] * start_s;
     let phase = |n: usize| 0.8 * n as f64 - drift(n)[1] * start_s;
-    craft.daughters.disturbances = Disturbances {
-        gain_error: (0..8).map(amplitude).collect(),
-        gain_drift_per_s: (0..8).map(|n| drift(n)[0]).collect(),
-        phase_rad: (0..8).map(phase).collect(),
-        phase_drift_rad_per_s: (0..8).map(|n| drift(n)[1]).collect(),
-        ..Disturbances::default()
-    };
+    craft.instrument.amplitude = terms((0..8).map(amplitude), (0..8).map(|n| DAY_S * drift(n)[0]));
+    craft.instrument.phase_deg =
+        terms((0..8).map(|n| phase(n).to_degrees()), (0..8).map(|n| DAY_S * drift(n)[1].to_degrees()));
     craft.rule.duration_s_max = 0.5;
     let blocks = craft.run(21);
     let gain = |n: u8, t_s: f64| {
         let [grown, turned] = drift(usize::from(n)).map(|rate| rate * (t_s - start_s));
         let n = f64::from(n);
-        Complex64::from_polar(1.0 + 0.1 * (n - 4.0) + grown, 0.8 * n + turned)
+        Complex64::from_polar((0.1 * (n - 4.0) + grown).exp(), 0.8 * n + turned)
     };
     let solution = |t_s: f64| GainSolution {
         time_s: t_s,
@@ -218,11 +220,10 @@ fn late_clocks_shift_each_frequency_by_its_own_phase() {
     // Offsets up to 60 us, 0.48 samples; drifts of half a turn at 1 MHz over the window.
     let late_us = [0.0, 5.0, -20.0, 60.0, 1.3, -60.0, 33.0, 0.1];
     let drift = [0.0, 3e-8, -3e-8, 0.0, 1e-8, 0.0, 2e-8, 0.0];
-    craft.daughters.disturbances = Disturbances {
-        clock_offset_s: (0..8).map(|n| late_us[n] * 1e-6 - drift[n] * start_s).collect(),
-        clock_drift: drift.to_vec(),
-        ..Disturbances::default()
-    };
+    craft.instrument.clock_ns = terms(
+        (0..8).map(|n| 1e9 * (late_us[n] * 1e-6 - drift[n] * start_s)),
+        (0..8).map(|n| 1e9 * DAY_S * drift[n]),
+    );
     craft.rule.duration_s_max = 0.25;
     craft.division = Division { sub_bands: bands, delay_centre: None };
     let blocks = craft.run(22);
@@ -246,14 +247,14 @@ fn a_calibration_tone_keeps_its_amplitude_and_phase() {
     let mut craft = Spacecraft::new(ArrayConfig::default(), vec![2e6], constant(0.0), 8.0);
     craft.rule.duration_s_max = 0.5;
     let (power, offset_hz, phase_rad) = (0.3, 1.3e3, 2.1);
-    craft.daughters.disturbances = Disturbances {
+    craft.daughters.tones = Tones {
         calibration_k_sr: power,
         calibration_offset_hz: offset_hz,
         calibration_phase_rad: phase_rad,
-        phase_rad: (0..8).map(|n| 0.5 * f64::from(n)).collect(),
-        clock_offset_s: (0..8).map(|n| 1e-5 * f64::from(n)).collect(),
-        ..Disturbances::default()
+        ..Tones::default()
     };
+    craft.instrument.phase_deg = terms((0..8).map(|n| (0.5 * f64::from(n)).to_degrees()), []);
+    craft.instrument.clock_ns = terms((0..8).map(|n| 1e4 * f64::from(n)), []);
     let frames = craft.sample(23).0;
     // Response of daughter n to the tone: its phase, and its clock at the tone's frequency.
     let turned = |n: f64| 0.5 * n - TAU * (2e6 + offset_hz) * 1e-5 * n;
@@ -280,11 +281,11 @@ fn interference_from_the_earth_is_at_the_limb_and_at_its_frequency() {
     let mut craft = Spacecraft::new(ArrayConfig::default(), vec![5e6], constant(0.0), 24.0);
     craft.rule.duration_s_max = 0.5;
     let (power, offset_hz, depth_m) = (100.0, -2.1e3, 2e3);
-    craft.daughters.disturbances = Disturbances {
+    craft.daughters.tones = Tones {
         interference_k_sr: power,
         interference_offset_hz: offset_hz,
         interference_depth_m: depth_m,
-        ..Disturbances::default()
+        ..Tones::default()
     };
     let frames = craft.sample(24).0;
     let leak =
@@ -341,15 +342,11 @@ fn interference_from_the_earth_is_at_the_limb_and_at_its_frequency() {
 fn tones_outside_the_channel_are_refused() {
     for (offset_hz, refused) in [(3999.0, false), (-4000.0, false), (4001.0, true), (-9e3, true)] {
         let tones = |calibration_offset_hz, interference_offset_hz| DaughtersConfig {
-            disturbances: Disturbances {
-                calibration_offset_hz,
-                interference_offset_hz,
-                ..Disturbances::default()
-            },
+            tones: Tones { calibration_offset_hz, interference_offset_hz, ..Tones::default() },
             ..DaughtersConfig::default()
         };
         for config in [tones(offset_hz, 0.0), tones(0.0, offset_hz)] {
-            assert_eq!(!config.problems(8, WIDTH_HZ).is_empty(), refused, "{offset_hz}");
+            assert_eq!(!config.problems(WIDTH_HZ).is_empty(), refused, "{offset_hz}");
         }
     }
 }

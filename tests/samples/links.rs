@@ -137,16 +137,3 @@ fn a_full_buffer_costs_all_channels_the_same() {
         }
     }
 }
-
-#[test]
-fn check_reports_sample_settings_that_have_no_effect() {
-    let folder = tempfile::tempdir().unwrap();
-    let samples = ["daughters.bits=2", "spacecraft.wait_blocks=4"];
-    let said = lunarray(folder.path(), "check", &samples);
-    assert!(!said.contains("without effect"), "{said}");
-    let visibilities = ["spacecraft.fidelity=visibilities", "daughters.disturbances.calibration_k_sr=2.0"];
-    let said = lunarray(folder.path(), "check", &[&samples[..], &visibilities].concat());
-    let expected = "without effect   daughters.bits, daughters.disturbances.calibration_k_sr, \
-                    daughters.link_bits_per_s_max, spacecraft.wait_blocks: used with";
-    assert!(said.contains(expected), "{said}");
-}

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::grgm900c::DEGREE_MAX;
-use crate::units::{Checks, InvalidValue};
+use crate::units::{Checks, InvalidValue, keys};
 
 /// Days of all satellites, at most: 1.6 GB of states.
 const DAYS_MAX: f64 = 40_000.0;
@@ -19,25 +19,24 @@ pub enum Keeping {
     Orbit,
 }
 
-/// Orbits by numerical integration of the forces, from the formation's state at the epoch or from `array.kepler`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct PropagateConfig {
-    /// How long, days from the epoch; 0 for orbits that are not propagated.
-    pub days: f64,
-    /// Degree and order of the Moon's field.
-    pub degree: usize,
-    /// Whether the Earth pulls, too.
-    pub earth: bool,
-    /// Days between corrections of the formation; 0 for none.
-    pub keep_every_days: f64,
-    /// What a correction restores.
-    pub keep: Keeping,
-}
-
-impl Default for PropagateConfig {
-    fn default() -> Self {
-        Self { days: 0.0, degree: 12, earth: true, keep_every_days: 0.0, keep: Keeping::Formation }
+keys! {
+    /// Orbits by numerical integration of the forces, from the formation's state at the epoch or from `array.kepler`.
+    pub struct PropagateConfig {
+        /// How long, days from the epoch; 0 for orbits that are not propagated.
+        everyday days: f64 = 0.0;
+        /// Degree and order of the Moon's field: 0, or 2 to 16.
+        #[only_with("array.propagate.days > 0")]
+        expert degree: usize = 12;
+        /// Whether the Earth pulls, too.
+        #[only_with("array.propagate.days > 0")]
+        expert earth: bool = true;
+        /// Time between corrections of station keeping, days: followers are put on daughter 1's track again when the Earth is
+        /// next high above her; 0 for none.
+        #[only_with("array.propagate.days > 0")]
+        expert keep_every_days: f64 = 0.0;
+        /// What a correction restores: the "formation", or the "orbit": daughter 1's ellipse, too, with the node of that time.
+        #[only_with("array.propagate.keep_every_days > 0")]
+        expert keep: Keeping = Keeping::Formation;
     }
 }
 

@@ -10,7 +10,7 @@ use crate::calibration::CalibrationError;
 use crate::response::beacon::Beacon;
 use crate::sky::SkyMap;
 use crate::sky::fits::{ReadOptions, read_known_sky};
-use crate::units::{Checks, InvalidValue};
+use crate::units::{Checks, InvalidValue, keys};
 
 /// The signal whose visibilities are known.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -54,89 +54,60 @@ pub enum SkyModel {
 /// nside from which harmonics are chosen: fewer pixels are summed fast enough.
 const HARMONIC_NSIDE_MIN: usize = 64;
 
-/// The `[calibrate]` section, for `lunarray calibrate` and `calibration.hook = "solve"`. Standard deviations are those of what is expected before the
-/// data are seen; a parameter with 0 is not solved for.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct SolverConfig {
-    /// The signal whose visibilities are known.
-    pub mode: CalibrationMode,
-    /// What fixes the common amplitude.
-    pub amplitude_scale: AmplitudeScale,
-    /// Daughter whose phase, clock and position are the reference, from 1.
-    pub reference_daughter: u32,
-    /// Of the natural logarithm of a gain's amplitude.
-    pub amplitude_sigma: f64,
-    /// Of a gain's phase, deg.
-    pub phase_sigma_deg: f64,
-    /// Of a clock's offset, ns.
-    pub clock_sigma_ns: f64,
-    /// Of a position along each axis, m.
-    pub position_sigma_m: f64,
-    /// Solutions of equal length in a pass.
-    pub solutions_per_pass: u32,
-    /// Time without data after which a new pass begins, s.
-    pub pass_gap_s: f64,
-    /// Residual beyond which a visibility is left out of a solution, in units of its spread.
-    pub outlier_sigma: f64,
-    /// Most rounds of leaving out outliers.
-    pub outlier_rounds: u32,
-    /// Most Gauss-Newton iterations of a round.
-    pub iterations_max: u32,
-    /// Most predictions of the model at positions found before.
-    pub position_rounds: u32,
-    /// Part of a daughter's signal that a solution may leave unexplained; with more, its data are left out of maps.
-    pub unexplained_max: f64,
-    /// Standard deviation of a phase, deg, beyond which a daughter's data are left out of maps.
-    pub phase_sigma_deg_max: f64,
-    /// Gain amplitude below which a receiver is taken to be dead.
-    pub dead_amplitude: f64,
-    /// Maps of the known sky (K, FITS), one a channel of the downlink.
-    pub model_files: Vec<PathBuf>,
-    /// nside to which the model map's pixels are split; 0 for its own.
-    pub model_nside: usize,
-    /// How the visibilities of the known sky are computed.
-    pub sky_model: SkyModel,
-    /// Power of the artificial signal at a daughter, K sr.
-    pub beacon_k_sr: f64,
-    /// Ecliptic longitude and latitude that it comes from, deg.
-    pub beacon_direction_deg: [f64; 2],
-    /// Most times that the map is made and calibrated with; 0 for the given model alone.
-    pub map_rounds: u32,
-    /// Root mean square change of the gains, relative to one, at which map and solutions are taken as settled.
-    pub settled: f64,
-    /// Every n-th pass is left out of the maps that calibrate, and tests them; 0 for none.
-    pub hold_out_every: u32,
-}
-
-impl Default for SolverConfig {
-    fn default() -> Self {
-        Self {
-            mode: CalibrationMode::default(),
-            amplitude_scale: AmplitudeScale::default(),
-            reference_daughter: 1,
-            amplitude_sigma: 0.3,
-            phase_sigma_deg: 120.0,
-            clock_sigma_ns: 0.0,
-            position_sigma_m: 0.0,
-            solutions_per_pass: 1,
-            pass_gap_s: 900.0,
-            outlier_sigma: 6.0,
-            outlier_rounds: 3,
-            iterations_max: 50,
-            position_rounds: 3,
-            unexplained_max: 0.15,
-            phase_sigma_deg_max: 15.0,
-            dead_amplitude: 0.05,
-            model_files: Vec::new(),
-            model_nside: 0,
-            sky_model: SkyModel::default(),
-            beacon_k_sr: 0.0,
-            beacon_direction_deg: [0.0, 0.0],
-            map_rounds: 0,
-            settled: 1e-3,
-            hold_out_every: 0,
-        }
+keys! {
+    /// The `[calibrate]` section, for `lunarray calibrate` and `calibration.hook = "solve"`. Standard deviations are those of what is expected before the
+    /// data are seen; a parameter with 0 is not solved for.
+    pub struct SolverConfig {
+        /// The known signal: the "sky" of a map, a "beacon", or both, "joint".
+        everyday mode: CalibrationMode = CalibrationMode::default();
+        /// What fixes the common amplitude: the "model", or "unit-mean": the sky keeps its scale.
+        expert amplitude_scale: AmplitudeScale = AmplitudeScale::default();
+        /// Daughter whose phase, clock and position are the reference, from 1.
+        expert reference_daughter: u32 = 1;
+        /// Expected deviation of the natural logarithm of a gain's amplitude.
+        everyday amplitude_sigma: f64 = 0.3;
+        /// Expected deviation of a gain's phase, degrees.
+        everyday phase_sigma_deg: f64 = 120.0;
+        /// Expected deviation of a clock, for all channels, ns.
+        everyday clock_sigma_ns: f64 = 0.0;
+        /// Expected deviation of a position along each axis, m.
+        everyday position_sigma_m: f64 = 0.0;
+        /// Solutions of equal length in a pass.
+        expert solutions_per_pass: u32 = 1;
+        /// Time without data after which a new pass begins, s.
+        expert pass_gap_s: f64 = 900.0;
+        /// Residual beyond which a visibility is left out of a solution, in units of its spread.
+        expert outlier_sigma: f64 = 6.0;
+        /// Most rounds of leaving out outliers.
+        expert outlier_rounds: u32 = 3;
+        /// Most Gauss-Newton iterations of a round.
+        expert iterations_max: u32 = 50;
+        /// Most predictions of the model at positions found before.
+        expert position_rounds: u32 = 3;
+        /// Part of a daughter's signal that a solution may leave unexplained; with more, its data are left out
+        /// of maps.
+        expert unexplained_max: f64 = 0.15;
+        /// Standard deviation of a phase, deg, beyond which a daughter's data are left out of maps.
+        expert phase_sigma_deg_max: f64 = 15.0;
+        /// Gain amplitude below which a receiver is taken to be dead.
+        expert dead_amplitude: f64 = 0.05;
+        /// Maps of the known sky (K, FITS), one a channel of the downlink.
+        everyday model_files: Vec<PathBuf> = Vec::new();
+        /// HEALPix nside to which the model map's pixels are split; 0 for its own.
+        expert model_nside: usize = 0;
+        /// How the visibilities of the known sky are computed: "direct" sums over pixels, "harmonic" on the circle of a pass to
+        /// degree 5/2 nside, "auto" by nside and visibilities of the pass.
+        expert sky_model: SkyModel = SkyModel::default();
+        /// Power of the artificial signal at a daughter, K sr.
+        expert beacon_k_sr: f64 = 0.0;
+        /// Ecliptic longitude and latitude that the artificial signal comes from, degrees.
+        expert beacon_direction_deg: [f64; 2] = [0.0, 0.0];
+        /// Most times that the map is made and calibrated with; 0 for the given model alone.
+        everyday map_rounds: u32 = 0;
+        /// Root mean square change of the gains, relative to one, at which map and solutions are taken as settled.
+        expert settled: f64 = 1e-3;
+        /// Every n-th pass is left out of the maps that calibrate, and tests them; 0 for none.
+        expert hold_out_every: u32 = 0;
     }
 }
 

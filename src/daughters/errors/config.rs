@@ -1,10 +1,8 @@
 //! Configuration of the instrument's errors.
 
-use serde::{Deserialize, Serialize};
-
 use crate::response::PatternsByFrequency;
 use crate::response::beacon::Beacon;
-use crate::units::{Checks, InvalidValue};
+use crate::units::{Checks, InvalidValue, keys};
 
 /// Shortest correlation time of a drift, s: some thousand nodes in a pass.
 const DRIFT_TIME_S_MIN: f64 = 60.0;
@@ -12,135 +10,94 @@ const DRIFT_TIME_S_MIN: f64 = 60.0;
 /// Shortest time in which clocks are steered, s.
 const STEERING_S_MIN: f64 = 600.0;
 
-/// The `[instrument]` section: what is wrong with the daughters, in either fidelity. Without any of it, data are as
-/// they are without the section. What is wrong with positions and times is in [`NavigationConfig`](super::NavigationConfig).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct InstrumentConfig {
-    /// Number of the realisation: other random errors, those of `[navigation]` included, with the same sky and noise.
-    pub realisation: u32,
-    /// Natural logarithm of the amplitude of the voltage gain, by daughter and channel.
-    pub amplitude: ErrorTerms,
-    /// Phase of the voltage gain, deg, by daughter and channel.
-    pub phase_deg: ErrorTerms,
-    /// Offset of the clock, ns; positive if samples are late. By daughter, for all channels.
-    pub clock_ns: ErrorTerms,
-    /// Tilt of the antenna's axis from the orbit's normal towards the direction of the track, deg, by daughter.
-    pub tilt_along_deg: ErrorTerms,
-    /// The same away from the Moon, deg.
-    pub tilt_radial_deg: ErrorTerms,
-    /// Distortion q of the voltage pattern, by daughter: a factor 1 + q (3 cos^2 - 1) / 2 with the angle from the axis.
-    pub pattern: ErrorTerms,
-    /// The same by frequency, which is added to it: rows `[frequency_hz, q]`, or `[frequency_hz, q_1, q_2, ...]` with one q a daughter;
-    /// linear between rows, and beyond its ends that of the end.
-    #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
-    pub pattern_by_frequency: PatternsByFrequency,
-    /// Allan deviation of every clock at 1 s; it falls as the root of time (white noise of frequency).
-    pub clock_allan_deviation: f64,
-    /// Time within which clocks are brought back, s: that noise is forgotten as exp(-|t| / this).
-    pub clock_steering_s: f64,
-    /// Daughters that deliver noise and no signal, from 1.
-    pub dead_daughters: Vec<u32>,
-    /// Daughter, from 1, and channel, from 0, of receivers that deliver noise and no signal.
-    pub dead_channels: Vec<[u32; 2]>,
-    /// Probability that a visibility is an outlier.
-    pub outlier_probability: f64,
-    /// Standard deviation of either part of what is added to an outlier, in units of the thermal noise.
-    pub outlier_sigma: f64,
-    /// Mean time between bursts of interference from the Earth, s; 0 for none.
-    pub burst_every_s: f64,
-    /// Length of a burst, s.
-    pub burst_s: f64,
-    /// Power of a burst at a daughter, K sr.
-    pub burst_k_sr: f64,
-    /// Power of interference from the Earth at the Moon's limb at a daughter, K sr; 0 for none.
-    pub leak_k_sr: f64,
-    /// Angle below the limb over which its power falls by a factor e, deg.
-    pub leak_depth_deg: f64,
-    /// Artificial signal.
-    pub beacon: BeaconSchedule,
-}
-
-impl Default for InstrumentConfig {
-    fn default() -> Self {
-        Self {
-            realisation: 0,
-            amplitude: ErrorTerms::default(),
-            phase_deg: ErrorTerms::default(),
-            clock_ns: ErrorTerms::default(),
-            tilt_along_deg: ErrorTerms::default(),
-            tilt_radial_deg: ErrorTerms::default(),
-            pattern: ErrorTerms::default(),
-            pattern_by_frequency: PatternsByFrequency::default(),
-            clock_allan_deviation: 0.0,
-            clock_steering_s: 86_400.0,
-            dead_daughters: Vec::new(),
-            dead_channels: Vec::new(),
-            outlier_probability: 0.0,
-            outlier_sigma: 0.0,
-            burst_every_s: 0.0,
-            burst_s: 0.0,
-            burst_k_sr: 0.0,
-            leak_k_sr: 0.0,
-            leak_depth_deg: 1.0,
-            beacon: BeaconSchedule::default(),
-        }
+keys! {
+    /// The `[instrument]` section: what is wrong with the daughters, in either fidelity. Without any of it, data are as
+    /// they are without the section. What is wrong with positions and times is in [`NavigationConfig`](super::NavigationConfig).
+    pub struct InstrumentConfig {
+        /// Number of the realisation: other random errors, those of `[navigation]` included, with the same sky and noise.
+        everyday realisation: u32 = 0;
+        /// Natural logarithm of the amplitude of the voltage gain, by daughter and channel.
+        section amplitude: ErrorTerms = ErrorTerms::default();
+        /// Phase of the voltage gain, deg, by daughter and channel.
+        section phase_deg: ErrorTerms = ErrorTerms::default();
+        /// Offset of the clock, ns; positive if samples are late. By daughter, for all channels.
+        section clock_ns: ErrorTerms = ErrorTerms::default();
+        /// Tilt of an antenna's axis from the orbit's normal towards the direction of the track, degrees; needs
+        /// spacecraft.model = "direct" or "general", or samples.
+        section tilt_along_deg: ErrorTerms = ErrorTerms::default();
+        /// Tilt of an antenna's axis from the orbit's normal away from the Moon, degrees.
+        section tilt_radial_deg: ErrorTerms = ErrorTerms::default();
+        /// Distortion q of the voltage pattern: a factor 1 + q (3 cos^2 - 1) / 2 with the angle from the axis.
+        section pattern: ErrorTerms = ErrorTerms::default();
+        /// Distortion of the voltage pattern by frequency, added to instrument.pattern: rows `[frequency_hz, q]`, or
+        /// `[frequency_hz, q_1, q_2, ...]` with one q a daughter; linear between rows, and beyond the ends that of the end.
+        #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
+        expert pattern_by_frequency: PatternsByFrequency = PatternsByFrequency::default();
+        /// Allan deviation of every clock at 1 s; it falls as the root of time (white noise of frequency).
+        expert clock_allan_deviation: f64 = 0.0;
+        /// Time within which clocks are brought back, s: their noise is forgotten as exp(-|t| / this).
+        expert clock_steering_s: f64 = 86_400.0;
+        /// Daughters that deliver noise and no signal, from 1.
+        expert dead_daughters: Vec<u32> = Vec::new();
+        /// Daughter, from 1, and channel, from 0, of receivers that deliver noise and no signal.
+        expert dead_channels: Vec<[u32; 2]> = Vec::new();
+        /// Probability that a visibility is an outlier.
+        expert outlier_probability: f64 = 0.0;
+        /// Standard deviation of either part of what is added to an outlier, in units of the thermal noise.
+        expert outlier_sigma: f64 = 0.0;
+        /// Mean time between bursts of interference from the Earth, s; 0 for none.
+        expert burst_every_s: f64 = 0.0;
+        /// Length of a burst, s.
+        expert burst_s: f64 = 0.0;
+        /// Power of a burst at a daughter, K sr.
+        expert burst_k_sr: f64 = 0.0;
+        /// Power of interference from the Earth at the Moon's limb at a daughter, K sr; 0 for none.
+        expert leak_k_sr: f64 = 0.0;
+        /// Angle below the limb over which the power of the leakage falls by a factor e, degrees.
+        expert leak_depth_deg: f64 = 1.0;
+        /// Artificial signal for calibration: a plane wave, equal at all daughters. Integrations while it is on are flagged,
+        /// and stay out of maps.
+        section beacon: BeaconSchedule = BeaconSchedule::default();
     }
 }
 
-/// Terms of one error, which add up. Random terms are Gaussian, zero on average, and independent from daughter to daughter
-/// (and from channel to channel, where the error is one of channels).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ErrorTerms {
-    /// Given values, one a daughter, or none.
-    pub constant: Vec<f64>,
-    /// Given rates, 1/day since the epoch, one a daughter, or none.
-    pub rate_per_day: Vec<f64>,
-    /// Standard deviation of a constant of the whole mission.
-    pub constant_rms: f64,
-    /// Standard deviation of a constant that every pass draws anew.
-    pub pass_rms: f64,
-    /// Standard deviation of an oscillation with the period of the orbit.
-    pub orbit_rms: f64,
-    /// Standard deviation of a Gauss-Markov process: correlation exp(-|t| / drift_time_s).
-    pub drift_rms: f64,
-    /// Its correlation time, s.
-    pub drift_time_s: f64,
-    /// Standard deviation of a level that jumps.
-    pub step_rms: f64,
-    /// Time in which it jumps once, at a random instant, s.
-    pub step_every_s: f64,
-}
-
-impl Default for ErrorTerms {
-    fn default() -> Self {
-        Self {
-            constant: Vec::new(),
-            rate_per_day: Vec::new(),
-            constant_rms: 0.0,
-            pass_rms: 0.0,
-            orbit_rms: 0.0,
-            drift_rms: 0.0,
-            drift_time_s: 3600.0,
-            step_rms: 0.0,
-            step_every_s: 86_400.0,
-        }
+keys! {
+    /// Terms of one error, which add up. Random terms are Gaussian, zero on average, and independent from daughter to daughter
+    /// (and from channel to channel, where the error is one of channels).
+    pub struct ErrorTerms {
+        /// Given values, one a daughter, or none.
+        expert constant: Vec<f64> = Vec::new();
+        /// Given rates, 1/day since the epoch, one a daughter, or none.
+        expert rate_per_day: Vec<f64> = Vec::new();
+        /// Standard deviation of a constant of the whole mission.
+        expert constant_rms: f64 = 0.0;
+        /// Standard deviation of a constant that every pass draws anew.
+        expert pass_rms: f64 = 0.0;
+        /// Standard deviation of an oscillation with the period of the orbit.
+        expert orbit_rms: f64 = 0.0;
+        /// Standard deviation of a Gauss-Markov process: correlation exp(-|t| / drift_time_s).
+        expert drift_rms: f64 = 0.0;
+        /// Correlation time of the Gauss-Markov process, s.
+        expert drift_time_s: f64 = 3600.0;
+        /// Standard deviation of a level that jumps.
+        expert step_rms: f64 = 0.0;
+        /// Time in which the level jumps once, at a random instant, s.
+        expert step_every_s: f64 = 86_400.0;
     }
 }
 
-/// The artificial signal and its times.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct BeaconSchedule {
-    /// Power at a daughter, K sr, in every channel; 0 for no signal.
-    pub k_sr: f64,
-    /// Ecliptic longitude and latitude that it comes from, deg.
-    pub direction_deg: [f64; 2],
-    /// Time for which it is on, s, from the start of each pass.
-    pub on_s: f64,
-    /// Time from one start to the next in a pass, s; 0 for once a pass.
-    pub every_s: f64,
+keys! {
+    /// The artificial signal and its times.
+    pub struct BeaconSchedule {
+        /// Power at a daughter, K sr, in every channel; 0 for no signal.
+        expert k_sr: f64 = 0.0;
+        /// Ecliptic longitude and latitude that the signal comes from, degrees.
+        expert direction_deg: [f64; 2] = [0.0, 0.0];
+        /// Time for which the signal is on, from the start of each pass, s.
+        expert on_s: f64 = 0.0;
+        /// Time after which the signal is repeated in a pass, s; 0 for once.
+        expert every_s: f64 = 0.0;
+    }
 }
 
 impl BeaconSchedule {
@@ -337,7 +294,7 @@ impl InstrumentConfig {
         checks.number("burst_s", burst_s, every_s == 0.0 || burst_s <= every_s, "at most burst_every_s");
         self.beacon.signal().check("beacon", &mut checks);
         // Samples have tones and interference of their own.
-        let expected = "none with spacecraft.fidelity = \"samples\", which have daughters.disturbances";
+        let expected = "none with spacecraft.fidelity = \"samples\", which have daughters.tones";
         for (key, on) in [
             ("dead_daughters", !self.dead_daughters.is_empty()),
             ("dead_channels", !self.dead_channels.is_empty()),

@@ -1,27 +1,24 @@
 //! What the packets say of positions and times, and what was flown: orbit determination and the formation's clock.
 
-use serde::{Deserialize, Serialize};
-
 use super::config::ErrorTerms;
-use crate::units::{Checks, InvalidValue};
+use crate::units::{Checks, InvalidValue, keys};
 
 /// Greatest error of a time tag, s. Ephemeris packets reach as far beyond a pass, so that tags find positions.
 pub(super) const TIME_TAG_S_MAX: f64 = 10.0;
 
-/// The `[navigation]` section: what the packets say less what is true. Without any of it, data are as they are without the
-/// section.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct NavigationConfig {
-    /// Error of the position in the packets along the track, m, by daughter: what they say less what was flown.
-    pub along_m: ErrorTerms,
-    /// The same across the track, along the orbit's normal, m.
-    pub across_m: ErrorTerms,
-    /// The same away from the Moon, m.
-    pub radial_m: ErrorTerms,
-    /// Error of the time tags of all data, ms: what they say less the time at which it was measured. Positions in packets are of
-    /// the true time, so that the ground takes each visibility for one from where the satellites are this much later.
-    pub time_tag_ms: ErrorTerms,
+keys! {
+    /// The `[navigation]` section: what the packets say less what is true. Without any of it, data are as they are without the
+    /// section.
+    pub struct NavigationConfig {
+        /// Error of the position in the packets along the track, m, by daughter: what they say less what was flown.
+        section along_m: ErrorTerms = ErrorTerms::default();
+        /// Error of the position in packets along the orbit's normal, m, by daughter.
+        section across_m: ErrorTerms = ErrorTerms::default();
+        /// Error of the position in packets away from the Moon, m, by daughter.
+        section radial_m: ErrorTerms = ErrorTerms::default();
+        /// Error of the time tags of all data, ms, one for the formation: what packets say minus the true time.
+        section time_tag_ms: ErrorTerms = ErrorTerms::default();
+    }
 }
 
 impl NavigationConfig {

@@ -1,65 +1,43 @@
 //! Configuration of a simulated link: what it does to a downlink.
 
-use serde::{Deserialize, Serialize};
-
 use crate::downlink::wire::Format;
-use crate::units::{Checks, InvalidValue};
+use crate::units::{Checks, InvalidValue, keys};
 
 /// Maximum delay of a reordered frame, and maximum number of frames that a second station repeats.
 const FRAMES_MAX: u64 = 1 << 20;
 
-/// The `[downlink.link]` section: all faults are off by default.
-///
-/// "Frame" means a coded frame (CADU), or a packet if packets are sent plain.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct LinkConfig {
-    /// Probability that a bit is wrong.
-    pub bit_error_rate: f64,
-    /// Mean distance between bursts, bits; 0 for none. Bursts and the gaps between them are the states of a
-    /// Gilbert-Elliott channel.
-    pub burst_every_bits: f64,
-    /// Mean length of bursts, bits.
-    pub burst_bits: f64,
-    /// Probability that a bit of a burst is wrong.
-    pub burst_bit_error_rate: f64,
-    /// Probability that a frame does not arrive.
-    pub frame_loss: f64,
-    /// Probability that a pass does not arrive.
-    pub pass_loss: f64,
-    /// Probability that a pass is truncated.
-    pub pass_cut: f64,
-    /// Probability that a frame arrives twice.
-    pub duplicate: f64,
-    /// Probability that a frame arrives late.
-    pub reorder: f64,
-    /// Maximum delay of a late frame, frames.
-    pub reorder_frames: u64,
-    /// Probability that a pass arrives after the one that follows it.
-    pub pass_swap: f64,
-    /// Probability that a bit is lost or added within a coded frame.
-    pub bit_slip: f64,
-    /// Frames at the end of each pass that a second station receives too, with faults of its own.
-    pub second_station_frames: u64,
-}
-
-impl Default for LinkConfig {
-    fn default() -> Self {
-        Self {
-            bit_error_rate: 0.0,
-            burst_every_bits: 0.0,
-            burst_bits: 0.0,
-            burst_bit_error_rate: 0.5,
-            frame_loss: 0.0,
-            pass_loss: 0.0,
-            pass_cut: 0.0,
-            duplicate: 0.0,
-            reorder: 0.0,
-            reorder_frames: 16,
-            pass_swap: 0.0,
-            bit_slip: 0.0,
-            second_station_frames: 0,
-        }
+keys! {
+    /// The `[downlink.link]` section: all faults are off by default.
+    ///
+    /// "Frame" means a coded frame (CADU), or a packet if packets are sent plain.
+    pub struct LinkConfig {
+        /// Probability that a bit is wrong.
+        everyday bit_error_rate: f64 = 0.0;
+        /// Mean distance between bursts, bits; 0 for none. Bursts and the gaps between them are the states of a Gilbert-Elliott
+        /// channel.
+        expert burst_every_bits: f64 = 0.0;
+        /// Mean length of bursts, bits.
+        expert burst_bits: f64 = 0.0;
+        /// Probability that a bit of a burst is wrong.
+        expert burst_bit_error_rate: f64 = 0.5;
+        /// Probability that a frame does not arrive.
+        everyday frame_loss: f64 = 0.0;
+        /// Probability that a pass does not arrive.
+        everyday pass_loss: f64 = 0.0;
+        /// Probability that a pass is truncated.
+        expert pass_cut: f64 = 0.0;
+        /// Probability that a frame arrives twice.
+        expert duplicate: f64 = 0.0;
+        /// Probability that a frame arrives late.
+        expert reorder: f64 = 0.0;
+        /// Maximum delay of a late frame, frames.
+        expert reorder_frames: u64 = 16;
+        /// Probability that a pass arrives after the one that follows it.
+        expert pass_swap: f64 = 0.0;
+        /// Probability that a bit is lost or added within a coded frame.
+        expert bit_slip: f64 = 0.0;
+        /// Frames at the end of each pass that a second station receives too, with faults of its own.
+        expert second_station_frames: u64 = 0;
     }
 }
 

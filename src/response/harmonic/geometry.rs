@@ -21,10 +21,10 @@
 //! which is greatest, `cos((i - i0)/2)`, where both differences vanish. The remaining error is a rotation by `i - i0`
 //! about the line of nodes. [`GeometryLimits`] bounds it and the altitude; pairs beyond the limits are refused.
 
-use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::PairState;
+use crate::units::keys;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
 
 /// Euler angles of a pair's own frame, and its lengths.
@@ -44,32 +44,33 @@ pub struct PairOrientation {
     pub radius_difference_m: f64,
 }
 
-/// Greatest departures from the orbit that an engine accepts.
-///
-/// Pairs within the limits are approximated. Rms error over rms visibility, for a diffuse sky with a monopole
-/// (`tests/physics/departures.rs`):
-///
-/// | u = b / wavelength | 0.1 deg, l <= 64 | l <= 191 | 5 km, l <= 64 | l <= 191 |
-/// |---|---|---|---|---|
-/// | 3 | 0.4 % | 0.4 % | 9 % | 10 % |
-/// | 10 | 0.8 % | 0.9 % | 13 % | 14 % |
-/// | 30 | 1.1 % | 3.1 % | 34 % | 39 % |
-/// | 120 | 0.9 % | 2.1 % | 57 % | 68 % |
-///
-/// A tilt of 0.1 deg costs a few per cent. 5 km of altitude cost more: they move the Moon's limb by 0.23 deg, and long
-/// baselines see a sky without small scales at the limb only. The default limit of 150 m keeps errors below 2 % at all
-/// of these u.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct GeometryLimits {
-    /// Greatest angle between a baseline and the plane of the orbit, degrees.
-    pub out_of_track_deg_max: f64,
-    /// Greatest deviation of the orbit's inclination from its nominal value, degrees.
-    pub inclination_deg_max: f64,
-    /// Greatest deviation of the altitude from its nominal value, m.
-    pub altitude_m_max: f64,
-    /// Greatest angle between a baseline and the horizontal at its mid-point, degrees, from unequal altitudes.
-    pub radial_deg_max: f64,
+keys! {
+    /// Greatest departures from the orbit that an engine accepts.
+    ///
+    /// Pairs within the limits are approximated. Rms error over rms visibility, for a diffuse sky with a monopole
+    /// (`tests/physics/departures.rs`):
+    ///
+    /// | u = b / wavelength | 0.1 deg, l <= 64 | l <= 191 | 5 km, l <= 64 | l <= 191 |
+    /// |---|---|---|---|---|
+    /// | 3 | 0.4 % | 0.4 % | 9 % | 10 % |
+    /// | 10 | 0.8 % | 0.9 % | 13 % | 14 % |
+    /// | 30 | 1.1 % | 3.1 % | 34 % | 39 % |
+    /// | 120 | 0.9 % | 2.1 % | 57 % | 68 % |
+    ///
+    /// A tilt of 0.1 deg costs a few per cent. 5 km of altitude cost more: they move the Moon's limb by 0.23 deg, and long
+    /// baselines see a sky without small scales at the limb only. The default limit of 150 m keeps errors below 2 % at all
+    /// of these u.
+    #[derive(Copy)]
+    pub struct GeometryLimits {
+        /// Greatest angle between a baseline and the plane of the orbit, degrees.
+        expert out_of_track_deg_max: f64 = 0.1;
+        /// Greatest deviation of the orbit's inclination from its nominal value, degrees.
+        expert inclination_deg_max: f64 = 0.1;
+        /// Greatest deviation of the altitude from its nominal value, m.
+        expert altitude_m_max: f64 = 150.0;
+        /// Greatest angle between a baseline and the horizontal at its mid-point, degrees, from unequal altitudes.
+        expert radial_deg_max: f64 = 0.1;
+    }
 }
 
 impl GeometryLimits {
@@ -82,18 +83,6 @@ impl GeometryLimits {
             ("limits.altitude_m_max", self.altitude_m_max),
             ("limits.radial_deg_max", self.radial_deg_max),
         ]
-    }
-}
-
-impl Default for GeometryLimits {
-    /// 0.1 deg, 0.1 deg, 150 m, 0.1 deg: errors of a few per cent of a visibility at most.
-    fn default() -> Self {
-        Self {
-            out_of_track_deg_max: 0.1,
-            inclination_deg_max: 0.1,
-            altitude_m_max: 150.0,
-            radial_deg_max: 0.1,
-        }
     }
 }
 

@@ -1,66 +1,45 @@
 //! Configuration of a generated sky.
 
-use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::sky::harmonics::HarmonicsError;
 use crate::sky::healpix::is_valid_nside;
-use crate::units::{Checks, InvalidValue};
+use crate::units::{Checks, InvalidValue, keys};
 
 /// Frequencies of generated skies, Hz.
 const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=120e6;
 /// Finest map.
 const NSIDE_MAX: usize = 1024;
 
-/// The `[sky.generated]` section: components of a generated sky and their amplitudes.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct GeneratedSky {
-    /// Whether the diffuse emission fluctuates on small scales.
-    pub small_scales: bool,
-    /// Factor on the amplitude of the small scales of Remazeilles et al. (2015).
-    pub small_scale_amplitude: f64,
-    /// Resolution of the smooth model below the small scales, FWHM, degrees.
-    pub small_scale_fwhm_deg: f64,
-    /// Greatest degree l of the small scales; a map holds at most 3 nside - 1.
-    pub small_scale_l_max: usize,
-    /// Standard deviation of the logarithm of the opacity of the gas over the sky.
-    pub cloud_log_rms: f64,
-    /// Standard deviation of the synchrotron index over the sky.
-    pub index_rms: f64,
-    /// Whether the sky has the radio loops, with the North Polar Spur.
-    pub loops: bool,
-    /// Whether the sky has opaque nebulae.
-    pub nebulae: bool,
-    /// Whether the sky has point sources.
-    pub point_sources: bool,
-    /// Flux density of the faintest source, Jy at 154 MHz; fainter ones are part of the smooth background.
-    pub source_flux_jy_min: f64,
-    /// Flux density of the brightest source, Jy at 154 MHz.
-    pub source_flux_jy_max: f64,
-    /// Spectral index of the sources' fluxes.
-    pub source_spectral_index: f64,
-    /// Whether Galactic gas absorbs the sources.
-    pub sources_absorbed: bool,
-}
-
-impl Default for GeneratedSky {
-    fn default() -> Self {
-        Self {
-            small_scales: true,
-            small_scale_amplitude: 1.0,
-            small_scale_fwhm_deg: 5.0,
-            small_scale_l_max: 3071,
-            cloud_log_rms: 0.33,
-            index_rms: 0.05,
-            loops: true,
-            nebulae: true,
-            point_sources: true,
-            source_flux_jy_min: 4.36,
-            source_flux_jy_max: 75.0,
-            source_spectral_index: -0.8,
-            sources_absorbed: true,
-        }
+keys! {
+    /// The `[sky.generated]` section: components of a generated sky and their amplitudes.
+    pub struct GeneratedSky {
+        /// Whether the diffuse emission fluctuates on small scales.
+        expert small_scales: bool = true;
+        /// Factor on the amplitude of the small scales of Remazeilles et al. (2015).
+        expert small_scale_amplitude: f64 = 1.0;
+        /// Resolution of the smooth model below the small scales, FWHM, degrees.
+        expert small_scale_fwhm_deg: f64 = 5.0;
+        /// Greatest degree l of the small scales; a map holds at most 3 nside - 1.
+        expert small_scale_l_max: usize = 3071;
+        /// Standard deviation of the logarithm of the opacity of the gas over the sky.
+        expert cloud_log_rms: f64 = 0.33;
+        /// Standard deviation of the synchrotron index over the sky.
+        expert index_rms: f64 = 0.05;
+        /// Whether the sky has the radio loops, with the North Polar Spur.
+        expert loops: bool = true;
+        /// Whether the sky has opaque nebulae.
+        expert nebulae: bool = true;
+        /// Whether the sky has point sources.
+        expert point_sources: bool = true;
+        /// Flux density of the faintest source, Jy at 154 MHz; fainter ones are part of the smooth background.
+        expert source_flux_jy_min: f64 = 4.36;
+        /// Flux density of the brightest source, Jy at 154 MHz.
+        expert source_flux_jy_max: f64 = 75.0;
+        /// Spectral index of the sources' fluxes.
+        expert source_spectral_index: f64 = -0.8;
+        /// Whether Galactic gas absorbs the sources.
+        expert sources_absorbed: bool = true;
     }
 }
 

@@ -1,44 +1,27 @@
 //! Configuration of a listening ground: limits of its senders.
 
-use serde::{Deserialize, Serialize};
+use crate::units::{Checks, InvalidValue, keys};
 
-use crate::units::{Checks, InvalidValue};
-
-/// The `[downlink.listen]` section: limits for senders. Memory for all of them stays below `connections_max` times
-/// (`memory_bytes_max` + 128 KiB), plus `backlog_bytes_max`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ListenConfig {
-    /// Maximum number of open connections. For a further one the least useful gives way; if all deliver, it is refused.
-    pub connections_max: usize,
-    /// Maximum time from connecting to the first sound packet or frame, s; 0 for no limit.
-    pub first_packet_s_max: f64,
-    /// Maximum time between sound packets or frames, s; 0 for no limit. Bytes alone are no sign of life.
-    pub idle_s_max: f64,
-    /// Maximum rate at which a connection is read, bytes/s; 0 for no limit. TCP slows the sender accordingly.
-    pub bytes_per_s_max: f64,
-    /// Maximum number of bytes between sound packets or frames.
-    pub garbage_bytes_max: u64,
-    /// Maximum memory for a connection's incomplete data, bytes.
-    pub memory_bytes_max: u64,
-    /// Maximum backlog of packets of all connections together, bytes.
-    pub backlog_bytes_max: u64,
-    /// Minimum time between two checkpoints that are written because senders wait for one, s.
-    pub held_every_s: f64,
-}
-
-impl Default for ListenConfig {
-    fn default() -> Self {
-        Self {
-            connections_max: 16,
-            first_packet_s_max: 30.0,
-            idle_s_max: 600.0,
-            bytes_per_s_max: 1e8,
-            garbage_bytes_max: 4 << 20,
-            memory_bytes_max: 32 << 20,
-            backlog_bytes_max: 8 << 20,
-            held_every_s: 10.0,
-        }
+keys! {
+    /// The `[downlink.listen]` section: limits for senders. Memory for all of them stays below `connections_max` times
+    /// (`memory_bytes_max` + 128 KiB), plus `backlog_bytes_max`.
+    pub struct ListenConfig {
+        /// Maximum number of open connections. For a further one the least useful gives way; if all deliver, it is refused.
+        expert connections_max: usize = 16;
+        /// Maximum time from connecting to the first sound packet or frame, s; 0 for no limit.
+        expert first_packet_s_max: f64 = 30.0;
+        /// Maximum time between sound packets or frames, s; 0 for no limit. Bytes alone are no sign of life.
+        expert idle_s_max: f64 = 600.0;
+        /// Maximum rate at which a connection is read, bytes/s; 0 for no limit. TCP slows the sender accordingly.
+        expert bytes_per_s_max: f64 = 1e8;
+        /// Maximum number of bytes between sound packets or frames.
+        expert garbage_bytes_max: u64 = 4 << 20;
+        /// Maximum memory for a connection's incomplete data, bytes.
+        expert memory_bytes_max: u64 = 32 << 20;
+        /// Maximum backlog of packets of all connections together, bytes.
+        expert backlog_bytes_max: u64 = 8 << 20;
+        /// Minimum time between two checkpoints that are written because senders wait for one, s.
+        expert held_every_s: f64 = 10.0;
     }
 }
 

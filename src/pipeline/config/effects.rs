@@ -1,0 +1,155 @@
+//! Keys that are set and have no effect with the other settings: an error, which says when they have one.
+
+use thiserror::Error;
+use toml::{Table, Value};
+
+use super::key_list::{FlatKey, flat_keys};
+use super::problems::Problems;
+use super::sections::Config;
+use crate::units::shortened;
+
+/// Most characters of a value that are shown.
+const SHOWN_MAX: usize = 60;
+
+/// A key that is set and has no effect.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[error("{key} = {value} has an effect only with {only_with}")]
+pub struct NoEffect {
+    /// Full key.
+    pub key: String,
+    /// Its value.
+    pub value: String,
+    /// When it has an effect.
+    pub only_with: String,
+}
+
+impl Config {
+    /// Keys of these sections (all if there are none) that differ from their defaults and have no effect.
+    pub(super) fn without_effect(&self, sections: &[&str]) -> Problems {
+        let mut found = Problems::default();
+        // A configuration always has a TOML form: the test of the reference relies on it too.
+        let set = Table::try_from(self).unwrap_or_default();
+        let keys = flat_keys();
+        let is_asked = |key: &&FlatKey| {
+            sections.is_empty() || sections.contains(&key.path.split('.').next().unwrap_or(""))
+        };
+        for key in keys.iter().filter(is_asked) {
+            let Some(value) = value_of(&set, &key.path).filter(|value| Some(*value) != key.default.as_ref())
+            else {
+                continue;
+            };
+            if let Some(only_with) = key.only_with.iter().find(|only| !holds(only, &set, &keys)) {
+                found.push(|| NoEffect {
+                    key: key.path.clone(),
+                    value: shortened(&value.to_string(), SHOWN_MAX),
+                    only_with: only_with.clone(),
+                });
+            }
+        }
+        found
+    }
+}
+
+/// What stands at a key with sections.
+fn value_of<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
+    let (first, rest) = path.split_once('.').map_or((path, None), |(first, rest)| (first, Some(rest)));
+    let value = table.get(first)?;
+    match rest {
+        Some(rest) => value_of(value.as_table()?, rest),
+        None => Some(value),
+    }
+}
+
+/// Whether any comparison of a condition holds: `key = value`, `key > number`, or a key alone, which differs from its default.
+fn holds(condition: &str, set: &Table, keys: &[FlatKey]) -> bool {
+    condition.split(" or ").any(|comparison| {
+        let mut words = comparison.splitn(3, ' ');
+        let (path, sign, wanted) = (words.next().unwrap_or(""), words.next(), words.next());
+        let usual = keys.iter().find(|key| key.path == path).and_then(|key| key.default.as_ref());
+        let value = value_of(set, path).or(usual);
+        let wanted =
+            wanted.and_then(|text| toml::from_str::<Table>(&format!("v = {text}")).ok()?.remove("v"));
+        match (sign, value, wanted) {
+            (None, value, _) => value != usual,
+            (Some("="), Some(value), Some(wanted)) => *value == wanted,
+            (Some(">"), Some(value), Some(wanted)) => is_above(value, &wanted),
+            _ => false,
+        }
+    })
+}
+
+fn is_above(value: &Value, limit: &Value) -> bool {
+    let number = |value: &Value| value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64));
+    match value {
+        Value::Array(list) => list.iter().any(|value| is_above(value, limit)),
+        value => number(value).zip(number(limit)).is_some_and(|(value, limit)| value > limit),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The problems of a pipeline, by its text.
+    fn told(text: &str) -> Vec<String> {
+        let config: Config = toml::from_str(text).unwrap();
+        config.problems().iter().map(ToString::to_string).collect()
+    }
+
+    #[test]
+    fn a_key_without_effect_is_told_with_its_value_and_when_it_has_one() {
+        for (text, expected) in [
+            ("map.l_max = 10", "map.l_max = 10 has an effect only with map.engine = \"harmonic\""),
+            (
+                "map.refine.passes_max = 3",
+                "map.refine.passes_max = 3 has an effect only with map.engine = \"harmonic\"",
+            ),
+            (
+                "map.engine = \"harmonic\"\nmap.matrix = \"remade\"",
+                "map.matrix = \"remade\" has an effect only with map.engine = \"pixel\"",
+            ),
+            (
+                "map.iterations_max = 7",
+                "map.iterations_max = 7 has an effect only with map.engine = \"harmonic\" or map.matrix = \"remade\"",
+            ),
+            (
+                "daughters.bits = 2",
+                "daughters.bits = 2 has an effect only with spacecraft.fidelity = \"samples\"",
+            ),
+            // The section's condition holds for the keys of a section in it.
+            (
+                "daughters.tones.calibration_k_sr = 2.0",
+                "daughters.tones.calibration_k_sr = 2.0 has an effect only with spacecraft.fidelity = \"samples\"",
+            ),
+            ("sky.frequency = { spectral_index = -2.5 }", "has an effect only with sky.file"),
+        ] {
+            let found = told(text);
+            assert_eq!(found.len(), 1, "{text}: {found:?}");
+            assert!(found[0].ends_with(expected), "{text}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn what_has_an_effect_or_is_the_default_is_not_told() {
+        for text in [
+            "",
+            "map.l_max = 0",
+            "map.matrix = \"remade\"\nmap.iterations_max = 7",
+            "map.engine = \"harmonic\"\nmap.l_max = 10\nmap.refine = { passes_max = 3, residual_max = 0.1 }",
+            // A strength of zero is a value like others.
+            "instrument.clock_ns = { drift_rms = 0.0, drift_time_s = 60.0 }",
+        ] {
+            assert_eq!(told(text), Vec::<String>::new(), "{text}");
+        }
+    }
+
+    #[test]
+    fn every_condition_names_keys_that_there_are() {
+        let keys = flat_keys();
+        for comparison in keys.iter().flat_map(|key| &key.only_with).flat_map(|only| only.split(" or ")) {
+            let words: Vec<&str> = comparison.split(' ').collect();
+            assert!(keys.iter().any(|key| key.path == words[0]), "{comparison}");
+            assert!(matches!(words[1..], [] | ["=" | ">", _]), "{comparison}");
+        }
+    }
+}

@@ -1,0 +1,30 @@
+//! From a pipeline file and overrides to a checked plan: keys, values with units, checks, hashes.
+
+mod channel_lists;
+mod downlink_settings;
+mod effects;
+mod error;
+mod file_problems;
+mod key_list;
+mod memory;
+mod notes;
+mod plan;
+mod problems;
+mod quantities;
+mod reader;
+mod reference;
+mod sections;
+mod source;
+
+pub(super) use downlink_settings::SETTINGS;
+pub use effects::NoEffect;
+pub use error::PipelineError;
+pub use memory::{MemoryLimit, MemorySource};
+pub use plan::{Expected, Plan};
+pub use problems::{Problem, Problems};
+pub use reader::ReadProblem;
+pub use reference::{KeyDescription, Shown, key_descriptions, reference};
+pub use sections::Config;
+pub(super) use sections::is_folder_name;
+pub use source::{ConfigError, ConfigSource, QUICKLOOK};
+pub(super) use source::{has_sections, study_key};

@@ -1,0 +1,223 @@
+//! Notes on valid configurations that are probably not meant.
+
+use std::f64::consts::TAU;
+use std::path::PathBuf;
+
+use super::plan::Plan;
+use super::sections::Config;
+use crate::array::ObservingWindows;
+use crate::calibration::{CalibrationHook, GainsFile, VanVleck};
+use crate::imaging::EngineKind;
+use crate::mother::{Fidelity, largest_gap};
+use crate::units::Dimension;
+use crate::units::constants::{DAY_S, MOON_GM_M3_S2, MOON_RADIUS_M, SIDEREAL_MONTH_S};
+
+/// Angle, deg, by which baselines that have been corrected may lie off the common circle.
+const CORRECTED_DEG: f64 = 2.0;
+
+/// Part of a period that thinning may leave without a window, beyond what the mission leaves. A map from 17 windows with gaps of 0.3 had
+/// rho_2 = 0.74 and a mean 12 % too low; one from 122 windows with gaps of 0.1 has rho_2 = 1.00 and its mean to 0.1 %.
+const GAP_MAX: f64 = 0.15;
+
+/// Relative difference of the orbital period from Kepler's that is accepted; the paper's is 2e-4.
+const PERIOD_PART: f64 = 0.01;
+
+impl Config {
+    /// Notes on values that are valid and probably not meant.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn notes(&self) -> Vec<String> {
+        let notes = [self.period_note(), self.quantiser_note(), self.positions_note(), self.reach_note()];
+        notes.into_iter().flatten().collect()
+    }
+
+    /// Positions that may be further off than they are searched while the data arrive.
+    fn reach_note(&self) -> Option<String> {
+        let solves = self.calibration.hook == CalibrationHook::Solve;
+        solves.then(|| self.calibrate.reach_note(&self.spacecraft.channels_hz)).flatten()
+    }
+
+    /// Positions that are corrected, and limits that refuse what is corrected.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn positions_note(&self) -> Option<String> {
+        let (map, calibration) = (&self.map, &self.calibration);
+        let limits = &map.limits;
+        let narrow = limits.out_of_track_deg_max.min(limits.radial_deg_max) < CORRECTED_DEG;
+        if map.engine != EngineKind::Harmonic || map.refine.is_on() || !narrow {
+            return None;
+        }
+        let has_positions =
+            |path: &PathBuf| GainsFile::read(path).is_ok_and(|file| !file.positions.is_empty());
+        let corrects = match calibration.hook {
+            CalibrationHook::AntennaGains => calibration.gains_file.as_ref().is_some_and(has_positions),
+            CalibrationHook::Solve => self.calibrate.position_sigma_m > 0.0,
+            CalibrationHook::Identity => false,
+        };
+        corrects.then(|| {
+            format!(
+                "corrected positions lie off the common circle by as much as they are not known (3.5 m are {CORRECTED_DEG} deg of \
+                 a baseline of 100 m), and the harmonic engine refuses baselines beyond map.limits.out_of_track_deg_max = {} and \
+                 map.limits.radial_deg_max = {}; {CORRECTED_DEG} for both, or map.refine.passes_max above 0, lets them in",
+                limits.out_of_track_deg_max, limits.radial_deg_max
+            )
+        })
+    }
+
+    /// An orbital period that does not fit the altitude.
+    fn period_note(&self) -> Option<String> {
+        let array = &self.array;
+        let radius_m = array.moon_radius_m + array.altitude_m;
+        let kepler_s = TAU * (radius_m.powi(3) / MOON_GM_M3_S2).sqrt();
+        let differs = (array.orbital_period_s / kepler_s - 1.0).abs() > PERIOD_PART;
+        // Another body than the Moon has another mass.
+        let is_formation = !array.has_own_orbits();
+        (differs && is_formation && array.moon_radius_m == MOON_RADIUS_M).then(|| {
+            format!(
+                "array.orbital_period_s = {}, but an orbit {} above the Moon takes {kepler_s:.2} s; \
+                 array.precession_period_s does not follow the altitude, either",
+                array.orbital_period_s,
+                Dimension::Length.show(array.altitude_m)
+            )
+        })
+    }
+
+    /// Coarse samples without a correction of their correlations.
+    fn quantiser_note(&self) -> Option<String> {
+        let bits = self.daughters.bits;
+        let coarse = self.spacecraft.fidelity == Fidelity::Samples && VanVleck::new(bits).is_ok();
+        (coarse && self.calibration.quantiser_bits == 0).then(|| {
+            format!(
+                "daughters.bits = {bits}: correlations of such samples are too small; calibration.quantiser_bits = {bits} \
+                 corrects them"
+            )
+        })
+    }
+}
+
+impl Plan {
+    /// Periods of which `spacecraft.every_nth_window` leaves parts out.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn thinning_notes(&self) -> Vec<String> {
+        let (spacecraft, array) = (&self.config.spacecraft, &self.config.array);
+        let every_nth = spacecraft.every_nth_window;
+        if every_nth == 1 {
+            return Vec::new();
+        }
+        let all: Vec<f64> = ObservingWindows::new(&self.array, 0.0, spacecraft.duration_s)
+            .map(|window| window.start.seconds())
+            .collect();
+        let mut periods = vec![("month", SIDEREAL_MONTH_S)];
+        if let Some(formation) = self.array.formation() {
+            periods.push(("breathing of the formation", formation.period_s()));
+            periods.push(("precession of the orbit", array.precession_period_s));
+        }
+        let kept = || self.windows.iter().map(|window| window.start.seconds());
+        let note = |&(name, period_s): &(&str, f64)| {
+            let gap = largest_gap(kept(), period_s);
+            (gap > largest_gap(all.iter().copied(), period_s) + GAP_MAX).then(|| {
+                format!(
+                    "spacecraft.every_nth_window = {every_nth} beats with the {name} of {:.1} days: no window lies in {:.0} % of it, \
+                     which biases large scales; spacecraft.thin in place of every_nth_window and every_nth_integration spreads \
+                     windows over all phases",
+                    period_s / DAY_S,
+                    100.0 * gap
+                )
+            })
+        };
+        periods.iter().filter_map(note).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_default_has_no_notes_and_a_low_orbit_has() {
+        let mut config = Config::default();
+        assert_eq!(config.notes(), Vec::<String>::new());
+        config.array.altitude_m = 50e3;
+        // Two pi times the root of 1787.1 km cubed over 4902.8 km^3/s^2.
+        assert!(
+            config.notes()[0].contains("an orbit 50 km above the Moon takes 6779"),
+            "{:?}",
+            config.notes()
+        );
+        config.array.orbital_period_s = 6779.0;
+        assert_eq!(config.notes(), Vec::<String>::new());
+        config.spacecraft.fidelity = Fidelity::Samples;
+        config.daughters.bits = 1;
+        assert!(config.notes()[0].contains("calibration.quantiser_bits = 1"), "{:?}", config.notes());
+        config.calibration.quantiser_bits = 1;
+        assert_eq!(config.notes(), Vec::<String>::new());
+    }
+
+    #[test]
+    fn positions_beyond_the_search_are_named() {
+        let mut config = Config::default();
+        config.calibration.hook = CalibrationHook::Solve;
+        config.spacecraft.channels_hz = vec![30e6, 10e6];
+        // Fifteen radians are 15 / (2 pi) of 29.979 m: 71.57 m, three times 23.86 m.
+        config.calibrate.position_sigma_m = 23.8;
+        assert_eq!(config.reach_note(), None);
+        config.calibrate.position_sigma_m = 30.0;
+        let note = config.reach_note().unwrap();
+        // 10 MHz times 23.86 / 30.
+        for part in ["71.6 m at 10.000 MHz", "up to 90.0 m", "7.952 MHz or below", "known to 23.9 m"] {
+            assert!(note.contains(part), "{part}: {note}");
+        }
+        assert!(config.notes().contains(&note));
+        config.spacecraft.channels_hz = vec![3e6, 30e6];
+        assert_eq!(config.notes(), config.positions_note().into_iter().collect::<Vec<String>>());
+    }
+
+    #[test]
+    fn limits_that_refuse_corrected_positions_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |positions: &str| {
+            let path = folder.path().join("gains.json");
+            let gains = r#"{"channels": [{"frequency_hz": 1e7, "solutions": [{"time_s": 0, "gains": [[1, 0], [1, 0]]}]}]"#;
+            std::fs::write(&path, format!("{gains}, \"positions\": [{positions}]}}")).unwrap();
+            path
+        };
+        let position = r#"{"from_s": 0, "until_s": 9, "normals_hat": [[0, 0, 1], [0, 0, 1]], "offsets_m": [[0, 0, 0], [1, 2, 3]]}"#;
+        let mut config = Config::default();
+        config.map.engine = EngineKind::Harmonic;
+        config.calibration.hook = CalibrationHook::AntennaGains;
+        config.calibration.gains_file = Some(file(""));
+        assert_eq!(config.positions_note(), None);
+        config.calibration.gains_file = Some(file(position));
+        let note = config.positions_note().unwrap();
+        assert!(note.contains("map.limits.out_of_track_deg_max = 0.1"), "{note}");
+        let mut wide = config.clone();
+        (wide.map.limits.out_of_track_deg_max, wide.map.limits.radial_deg_max) = (2.0, 2.0);
+        assert_eq!(wide.positions_note(), None);
+        let mut refined = config.clone();
+        refined.map.refine.passes_max = 5;
+        assert_eq!(refined.positions_note(), None);
+        config.map.engine = EngineKind::Pixel;
+        assert_eq!(config.positions_note(), None);
+    }
+
+    #[test]
+    fn thinning_that_beats_with_a_period_is_named() {
+        let notes = |every_nth: u64, thin: u64| {
+            let mut config = Config::default();
+            (config.spacecraft.every_nth_window, config.spacecraft.thin) = (every_nth, thin);
+            Plan::new(config).unwrap().thinning_notes().join("\n")
+        };
+        // A month has 286.2 orbits: 300 of them are nearly one, 143 half of one, and 146 the 14 days of a breath.
+        for (every_nth, period) in [
+            (300, "month of 27.3 days"),
+            (143, "month of 27.3 days"),
+            (146, "breathing of the formation of 14.0 days"),
+        ] {
+            assert!(notes(every_nth, 1).contains(period), "{every_nth}: {}", notes(every_nth, 1));
+        }
+        for (every_nth, thin) in [(1, 1), (41, 1), (1, 300), (1, 600)] {
+            assert_eq!(notes(every_nth, thin), "", "{every_nth} {thin}");
+        }
+    }
+}

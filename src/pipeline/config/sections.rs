@@ -1,0 +1,426 @@
+//! The configuration of a whole pipeline: its checks and its hashes.
+
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use super::problems::Problems;
+use crate::array::{Array, ArrayConfig};
+use crate::calibration::solver::SolverConfig;
+use crate::calibration::{CalibrationConfig, CalibrationHook, VanVleck};
+use crate::daughters::{DaughtersConfig, InstrumentConfig, NavigationConfig, Tones};
+use crate::downlink::DownlinkConfig;
+use crate::imaging::{EngineKind, MapConfig};
+use crate::mother::{Antenna, Fidelity, MoonMirror, SpacecraftConfig};
+use crate::products::ProductsConfig;
+use crate::response::model::ModelChoice;
+use crate::runtime::RuntimeConfig;
+use crate::sky::SkyConfig;
+use crate::units::{Checks, InvalidValue, keys};
+
+keys! {
+    /// A whole pipeline: the sky, the spacecraft and the ground.
+    ///
+    /// Sections are in the order of the data path. A ground segment reads only `calibration`, `calibrate`, `map`, `products` and
+    /// `runtime`, and `downlink.listen` when it listens.
+    pub struct Config {
+        /// Name of the run: products go to `out/NAME`. Empty for the name of the file.
+        everyday name: String = String::new();
+        /// Seed of all random numbers of the space segment.
+        everyday seed: u64 = 0;
+        /// The simulated sky.
+        section sky: SkyConfig = SkyConfig::default();
+        /// Orbit and formation of the satellites; the defaults are the array of the paper.
+        section array: ArrayConfig = ArrayConfig::default();
+        /// Samples of the daughters, their quantisers and their links to the mother.
+        #[only_with(r#"spacecraft.fidelity = "samples""#)]
+        section daughters: DaughtersConfig = DaughtersConfig::default();
+        /// Errors of the instrument. Their true values are written beside the downlink, as FILE.instrument.csv.
+        section instrument: InstrumentConfig = InstrumentConfig::default();
+        /// Errors of the positions and times in packets: what packets say minus what is true.
+        section navigation: NavigationConfig = NavigationConfig::default();
+        /// Channels, integration and model of the visibilities.
+        section spacecraft: SpacecraftConfig = SpacecraftConfig::default();
+        /// Packets or frames, and the link to the ground.
+        section downlink: DownlinkConfig = DownlinkConfig::default();
+        /// What is corrected in visibilities before they are mapped.
+        section calibration: CalibrationConfig = CalibrationConfig::default();
+        /// The solver of gains, for `lunarray calibrate` and `calibration.hook = "solve"`. Keys with `_sigma` are what is
+        /// expected before the data are seen; what has 0 is not solved for.
+        section calibrate: SolverConfig = SolverConfig::default();
+        /// How maps are made.
+        section map: MapConfig = MapConfig::default();
+        /// Products besides the maps.
+        section products: ProductsConfig = ProductsConfig::default();
+        /// Queues and threads. None of them changes a byte of the results.
+        section runtime: RuntimeConfig = RuntimeConfig::default();
+    }
+}
+
+impl Config {
+    /// Everything that is wrong with a whole pipeline; empty if it is good.
+    #[must_use]
+    pub fn problems(&self) -> Problems {
+        let channels = self.spacecraft.channels_hz.len();
+        let mut found = Problems::default();
+        found.extend(self.sky.problems(channels));
+        let mut checks = Checks::of("");
+        let is_folder = is_folder_name(&self.name);
+        let expected = "at most 60 bytes, without slashes and control characters";
+        checks.require("name", format!("{:?}", self.name), is_folder, expected);
+        let (space, ground) = (self.spacecraft.sub_bands, self.calibration.sub_bands);
+        let expected = format!("spacecraft.sub_bands, which is {space}");
+        checks.require("calibration.sub_bands", ground, space == ground, expected);
+        self.check_quantiser(&mut checks);
+        self.check_orbits(&mut checks);
+        self.check_antennas(&mut checks);
+        found.extend(checks.finish());
+        let array = self.array.problems();
+        let spacecraft = self.spacecraft.problems();
+        if array.is_empty() {
+            match Array::new(&self.array) {
+                Ok(array) if spacecraft.is_empty() => {
+                    if let Some(problem) = self.spacecraft.dump_problem(&array) {
+                        found.push(|| problem);
+                    }
+                    found.extend(self.unknown_positions(&array));
+                }
+                Ok(_) => {}
+                Err(problem) => found.push(|| problem),
+            }
+        }
+        found.extend(array);
+        let width_hz = self.spacecraft.channel_width_hz;
+        found.extend(self.daughters.problems(width_hz));
+        let samples = self.spacecraft.fidelity == Fidelity::Samples;
+        found.extend(self.instrument.problems(self.array.satellites, channels, samples));
+        found.extend(self.navigation.problems(self.array.satellites));
+        found.extend(spacecraft);
+        found.extend(self.downlink.problems());
+        found.extend(self.map.misfits(channels));
+        found.append(self.ground_values());
+        found.append(self.without_effect(&[]));
+        found
+    }
+
+    /// Whether anything differs from an ideal instrument, or from what packets say of it.
+    #[must_use]
+    pub(in crate::pipeline) fn has_errors(&self) -> bool {
+        self.instrument.is_on() || self.navigation.is_on()
+    }
+
+    /// The same without any of these errors; with the schedule of the artificial signal.
+    #[must_use]
+    pub(in crate::pipeline) fn without_errors(&self) -> Self {
+        let instrument = self.instrument.without_errors();
+        Self { instrument, navigation: NavigationConfig::default(), ..self.clone() }
+    }
+
+    /// Requires that positions are known for the whole mission.
+    fn unknown_positions(&self, array: &Array) -> Vec<InvalidValue> {
+        let Some([from_s, until_s]) = array.known_s() else { return Vec::new() };
+        let mut checks = Checks::of("spacecraft");
+        let duration_s = self.spacecraft.duration_s;
+        let good = from_s <= 0.0 && until_s >= duration_s;
+        let source = match self.array.propagate.is_on() {
+            true => "what array.propagate.days gives",
+            false => "what the files of array.oem hold",
+        };
+        let expected =
+            format!("at most {source}: from {from_s:.3} s to {until_s:.3} s after the mission's epoch");
+        checks.number("duration_s", duration_s, good, expected);
+        checks.finish()
+    }
+
+    /// Requires what satellites that do not share a circle can have.
+    fn check_orbits(&self, checks: &mut Checks) {
+        if self.array.is_circle() {
+            return;
+        }
+        let Self { spacecraft, map, .. } = self;
+        let visibilities = spacecraft.fidelity == Fidelity::Visibilities;
+        let anywhere = spacecraft.model != ModelChoice::Harmonic;
+        let isotropic = spacecraft.antenna == Antenna::Isotropic;
+        for (key, value, good, expected) in [
+            (
+                "map.engine",
+                "\"harmonic\"",
+                map.engine == EngineKind::Pixel || map.refine.is_on(),
+                "\"pixel\", or map.refine,",
+            ),
+            ("spacecraft.fidelity", "\"samples\"", visibilities, "\"visibilities\""),
+            ("spacecraft.model", "\"harmonic\"", anywhere, "\"auto\", \"general\" or \"direct\""),
+            (
+                "spacecraft.antenna",
+                "(dipoles)",
+                isotropic || map.refine.is_on(),
+                "\"isotropic\", or map.refine,",
+            ),
+            (
+                "spacecraft.moon_temperature_k",
+                "(above 0, with dipoles)",
+                isotropic || spacecraft.moon_temperature_k == 0.0,
+                "0",
+            ),
+            (
+                "spacecraft.moon_reflection",
+                "(above 0, with dipoles)",
+                isotropic || spacecraft.moon_reflection == 0.0,
+                "0",
+            ),
+            ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
+        ] {
+            let expected = format!(
+                "{expected} with array.kepler, array.oem, array.propagate, array.eccentricity or array.cross_track_ratio: the \
+                     other needs a common circle"
+            );
+            checks.require(key, value, good, expected);
+        }
+    }
+
+    /// Requires what antennas that are not ideal can have.
+    fn check_antennas(&self, checks: &mut Checks) {
+        let samples = self.spacecraft.fidelity == Fidelity::Samples;
+        let one = self.spacecraft.antenna != Antenna::ThreeDipoles;
+        let expected = "one receiver a daughter with spacecraft.fidelity = \"samples\": \"isotropic\" or \"dipole-normal\"";
+        checks.require("spacecraft.antenna", "\"three-dipoles\"", one || !samples, expected);
+        if !self.instrument.has_own_antennas() {
+            return;
+        }
+        let spacecraft = &self.spacecraft;
+        let direct = samples || matches!(spacecraft.model, ModelChoice::Direct | ModelChoice::General);
+        let mirror = spacecraft.moon_reflection == 0.0 || spacecraft.moon_mirror == MoonMirror::Flat;
+        for (key, value, good, expected) in [
+            ("spacecraft.model", "(other)", direct, "\"direct\" or \"general\""),
+            ("spacecraft.moon_temperature_k", "(above 0)", spacecraft.moon_temperature_k == 0.0, "0"),
+            ("spacecraft.moon_mirror", "\"sphere\"", mirror, "\"flat\""),
+        ] {
+            let expected = format!(
+                "{expected} with instrument.tilt_along_deg, tilt_radial_deg, pattern or pattern_by_frequency"
+            );
+            checks.require(key, value, good, expected);
+        }
+        // A flat mirror's image is seen from below, where an antenna that leans away from the Moon has another response.
+        let upright = spacecraft.moon_reflection == 0.0 || self.instrument.tilt_radial_deg.is_none();
+        let expected = "0 with instrument.tilt_radial_deg";
+        checks.require("spacecraft.moon_reflection", spacecraft.moon_reflection, upright, expected);
+    }
+
+    /// Requires that a van Vleck correction is that of the daughters' quantiser.
+    fn check_quantiser(&self, checks: &mut Checks) {
+        let (ground, bits) = (self.calibration.quantiser_bits, self.daughters.bits);
+        let (fidelity, accepted) = match self.spacecraft.fidelity {
+            Fidelity::Visibilities => ("visibilities", "0".to_owned()),
+            Fidelity::Samples if VanVleck::new(bits).is_ok() => {
+                ("samples", format!("{bits}, or 0 for no correction"))
+            }
+            Fidelity::Samples => ("samples", "0".to_owned()),
+        };
+        let good = ground == 0 || (self.spacecraft.fidelity == Fidelity::Samples && ground == bits);
+        let expected =
+            format!("{accepted}, as daughters.bits is {bits} and spacecraft.fidelity is \"{fidelity}\"");
+        checks.require("calibration.quantiser_bits", ground, good, expected);
+    }
+
+    /// Everything that is wrong with the ground segment's sections; empty if they are good.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn ground_problems(&self) -> Problems {
+        let mut found = self.ground_values();
+        found.append(self.without_effect(&["calibration", "calibrate", "map", "products", "runtime"]));
+        found
+    }
+
+    fn ground_values(&self) -> Problems {
+        let mut found = Problems::default();
+        found.extend(self.downlink.listen.problems());
+        found.extend(self.calibration.problems());
+        found.extend(self.calibrate.problems());
+        if self.calibration.hook == CalibrationHook::Solve {
+            found.extend(self.calibrate.problems_of_hook());
+        }
+        found.extend(self.map.problems());
+        found.extend(self.products.problems());
+        found.extend(self.runtime.problems());
+        found
+    }
+
+    /// A hash of what the spacecraft measures, for provenance: of the sections that shape it, and of the contents of the
+    /// files that they name. The downlink is not part of it: the same data may arrive through two stations, or in two
+    /// formats.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn space_hash(&self) -> u64 {
+        let Self { name, seed, sky, array, daughters, instrument, navigation, spacecraft, .. } = self;
+        let (mut sky, mut array) = (sky.clone(), array.clone());
+        array.oem = array.oem.iter().map(|path| contents(path)).collect();
+        sky.file = sky.file.map(|files| files.map(|path| contents(path)));
+        if let Some(added) = &mut sky.added {
+            added.catalogue = added.catalogue.as_deref().map(contents);
+        }
+        let daughters = HashedDaughters::of(daughters);
+        // Data of an ideal instrument are those of before there were errors, byte for byte.
+        match (instrument.is_on(), navigation.is_on()) {
+            (false, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft)),
+            (true, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft, instrument)),
+            (_, true) => hash(&(name, seed, sky, &array, &daughters, spacecraft, instrument, navigation)),
+        }
+    }
+
+    /// A hash of the sections that shape maps from a downlink, and of the contents of the files that they name, for
+    /// provenance.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn ground_hash(&self) -> u64 {
+        let (mut calibration, mut map) = (self.calibration.clone(), self.map.clone());
+        calibration.gains_file = calibration.gains_file.as_deref().map(contents);
+        map.prior_files = map.prior_files.iter().map(|path| contents(path)).collect();
+        map.regularisation_files = map.regularisation_files.iter().map(|path| contents(path)).collect();
+        if calibration.hook != CalibrationHook::Solve {
+            return hash(&(calibration, map));
+        }
+        let mut calibrate = self.calibrate.clone();
+        calibrate.model_files = calibrate.model_files.iter().map(|path| contents(path)).collect();
+        hash(&(calibration, map, calibrate))
+    }
+}
+
+/// `[daughters]` as hashes have it: with `disturbances` in place of `tones`, as when it also had lists of gains, phases and clocks.
+/// So data keep their hashes.
+#[derive(Serialize)]
+struct HashedDaughters<'a> {
+    #[serde(flatten)]
+    others: DaughtersConfig,
+    disturbances: HashedTones<'a>,
+}
+
+#[derive(Serialize)]
+struct HashedTones<'a> {
+    gain_error: [f64; 0],
+    gain_drift_per_s: [f64; 0],
+    phase_rad: [f64; 0],
+    phase_drift_rad_per_s: [f64; 0],
+    clock_offset_s: [f64; 0],
+    clock_drift: [f64; 0],
+    #[serde(flatten)]
+    tones: &'a Tones,
+}
+
+impl<'a> HashedDaughters<'a> {
+    fn of(daughters: &'a DaughtersConfig) -> Self {
+        // Without tones of its own, which are then left out.
+        let others = DaughtersConfig { tones: Tones::default(), ..daughters.clone() };
+        let disturbances = HashedTones {
+            gain_error: [],
+            gain_drift_per_s: [],
+            phase_rad: [],
+            phase_drift_rad_per_s: [],
+            clock_offset_s: [],
+            clock_drift: [],
+            tones: &daughters.tones,
+        };
+        Self { others, disturbances }
+    }
+}
+
+/// Whether a name stays within the folder that it is joined to; an empty one is that folder.
+pub(in crate::pipeline) fn is_folder_name(name: &str) -> bool {
+    let bad = |c: char| c.is_control() || c == '/' || c == '\\';
+    !(name.len() > 60 || name.contains(bad) || [".", ".."].contains(&name))
+}
+
+/// Replaces the path of a file in a hash: a checksum of its content, or its name if it cannot be read. Such a file ends the
+/// run when it is needed.
+fn contents(path: &Path) -> PathBuf {
+    // Devices and pipes may never end.
+    if !path.is_file() {
+        return path.to_owned();
+    }
+    let sum = crc_fast::checksum_file(crc_fast::CrcAlgorithm::Crc64Nvme, &path.to_string_lossy(), None);
+    sum.map_or_else(|_| path.to_owned(), |sum| PathBuf::from(format!("{sum:016x}")))
+}
+
+/// The first 64 bits of a CRC over the JSON form: stable over runs, machines and field order.
+fn hash(value: &impl Serialize) -> u64 {
+    // Maps with string keys and finite numbers always have a JSON form.
+    let text = serde_json::to_vec(value).unwrap_or_default();
+    crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pipeline::ConfigSource;
+
+    fn with(overrides: &[&str]) -> Option<Config> {
+        let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
+        ConfigSource { overrides, ..ConfigSource::default() }.parse().ok()
+    }
+
+    #[test]
+    fn corrections_are_of_the_quantiser_that_is_there() {
+        let problems = |bits: u32, ground: u32, fidelity: &str| {
+            let fidelity = format!("spacecraft.fidelity={fidelity}");
+            let (bits, ground) =
+                (format!("daughters.bits={bits}"), format!("calibration.quantiser_bits={ground}"));
+            let config = with(&[&bits, &ground, &fidelity]).unwrap();
+            let mut checks = Checks::of("");
+            config.check_quantiser(&mut checks);
+            checks.finish().pop().map(|problem| problem.to_string())
+        };
+        for good in [(1, 1), (2, 2), (4, 4), (2, 0), (8, 0), (32, 0)] {
+            assert_eq!(problems(good.0, good.1, "samples"), None);
+        }
+        for bad in [(1, 2), (2, 4), (8, 1), (32, 4)] {
+            assert!(problems(bad.0, bad.1, "samples").is_some_and(|text| text.contains("daughters.bits is")));
+        }
+        assert!(problems(1, 1, "visibilities").is_some_and(|text| text.contains("expected 0")));
+    }
+
+    #[test]
+    fn data_of_before_keep_their_hash() {
+        // In the packets of version 0.1.0 before [daughters.disturbances] became [daughters.tones].
+        let thin = ["spacecraft.every_nth_window=1500", "sky.nside=8", "sky.l_max=8"];
+        assert_eq!(with(&thin).unwrap().space_hash(), 0x85d8_7b8e_cfbe_4d84);
+        let toned = with(&["daughters.tones.calibration_k_sr=1.0"]).unwrap();
+        assert_ne!(toned.space_hash(), with(&[]).unwrap().space_hash());
+    }
+
+    #[test]
+    fn hashes_follow_the_contents_of_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name).display().to_string();
+        let hashes = |name: &str| {
+            let sky = format!("sky.file={:?}", path(name));
+            let (prior, gains) = (format!("map.prior_files=[{:?}]", path(name)), path("gains"));
+            let sky = with(&[&sky]).unwrap();
+            let prior = with(&[&prior]).unwrap();
+            let gains = with(&[&format!("calibration.gains_file={gains:?}")]).unwrap();
+            [sky.space_hash(), prior.ground_hash(), gains.ground_hash()]
+        };
+        for (name, text) in [("one", "a"), ("same", "a"), ("other", "b"), ("gains", "c")] {
+            std::fs::write(path(name), text).unwrap();
+        }
+        let first = hashes("one");
+        assert_eq!(first, hashes("same"));
+        let other = hashes("other");
+        assert!(first[0] != other[0] && first[1] != other[1] && first[2] == other[2]);
+        std::fs::write(path("gains"), "d").unwrap();
+        assert_ne!(first[2], hashes("one")[2]);
+        // Nothing there: the name alone.
+        assert_ne!(hashes("none"), hashes("neither"));
+    }
+
+    #[test]
+    fn hashes_follow_what_they_stand_for() {
+        let base = with(&[]).unwrap();
+        let mapped = with(&["map.nside=8"]).unwrap();
+        let flown = with(&["spacecraft.thermal_noise=false"]).unwrap();
+        let queued = with(&["runtime.queue_capacity=3"]).unwrap();
+        assert_eq!(base.space_hash(), mapped.space_hash());
+        assert_ne!(base.ground_hash(), mapped.ground_hash());
+        assert_ne!(base.space_hash(), flown.space_hash());
+        assert_eq!(base.ground_hash(), flown.ground_hash());
+        assert_eq!((base.space_hash(), base.ground_hash()), (queued.space_hash(), queued.ground_hash()));
+    }
+}

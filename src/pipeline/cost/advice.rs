@@ -1,0 +1,68 @@
+//! What a ground should know before the sums of its channels grow beyond the memory that there is.
+
+use std::fmt;
+
+use super::estimate::memory_bytes;
+use super::groups::{complete_costs, solutions_of};
+use crate::frames::Instrument;
+use crate::imaging::MapConfig;
+use crate::imaging::cost::EngineCost;
+use crate::pipeline::config::{Config, MemoryLimit};
+
+/// What a ground should know before the sums of its channels grow beyond the memory that there is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MemoryAdvice {
+    /// Channels that are mapped.
+    pub channels: usize,
+    /// nside of their maps.
+    pub nside: usize,
+    /// Estimated memory of the complete sums of all of them, bytes.
+    pub needed_bytes: f64,
+    /// What is available.
+    pub limit: MemoryLimit,
+    /// A smaller nside whose sums fit, and their memory, bytes.
+    pub fitting: Option<(usize, f64)>,
+}
+
+impl MemoryAdvice {
+    /// Advice for a ground with these settings; `None` if the complete sums fit.
+    #[must_use]
+    pub fn of(config: &Config, instrument: &Instrument, limit: MemoryLimit) -> Option<Self> {
+        let needed = |map: &MapConfig| {
+            let costs: Vec<EngineCost> = complete_costs(instrument, map).into_values().collect();
+            (costs.len(), memory_bytes(0.0, &costs, solutions_of(map)))
+        };
+        let (channels, needed_bytes) = needed(&config.map);
+        if needed_bytes <= limit.bytes as f64 {
+            return None;
+        }
+        let halves = std::iter::successors(Some(config.map.nside / 2), |nside| Some(nside / 2));
+        let fitting = halves.take_while(|nside| *nside > 0).find_map(|nside| {
+            let map = MapConfig { nside, l_max: 0, ..config.map.clone() };
+            Some((nside, needed(&map).1)).filter(|(_, bytes)| *bytes <= limit.bytes as f64)
+        });
+        Some(Self { channels, nside: config.map.nside, needed_bytes, limit, fitting })
+    }
+}
+
+impl fmt::Display for MemoryAdvice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let gigabytes = |bytes: f64| format!("{:.1} GB", bytes / 1e9);
+        write!(
+            f,
+            "the sums of {} channels at map.nside = {} grow to an estimated {} over a mission, and {} are available ({})",
+            self.channels,
+            self.nside,
+            gigabytes(self.needed_bytes),
+            gigabytes(self.limit.bytes as f64),
+            self.limit.source
+        )?;
+        if let Some((nside, bytes)) = self.fitting {
+            write!(f, "; at map.nside = {nside} they take {}", gigabytes(bytes))?;
+        }
+        write!(
+            f,
+            "; --channels maps some of them, and replay --groups auto of files as many at a time as fit"
+        )
+    }
+}

@@ -1,0 +1,417 @@
+//! What a pipeline will cost, before anything runs: counts, bytes, operations, and times estimated from them.
+
+use std::fmt;
+
+use serde::Serialize;
+
+use super::rates::{FRINGES_PER_S, SAMPLES_PER_S};
+use crate::frames::ObservingWindow;
+use crate::imaging::cost::{ChannelData, EngineCost};
+use crate::imaging::rates::{AVERAGE_INSTANTS, cores};
+use crate::mother::{Fidelity, VISIBILITY_BYTES};
+use crate::pipeline::config::{Expected, MemoryLimit, PipelineError, Plan};
+use crate::response::model::{ModelKind, ModelPlan};
+use crate::sky::healpix::pixel_count;
+use crate::units::ChannelId;
+
+/// Visibilities that wait for a batch of the model, at most, and the memory of one with its position, bytes.
+const QUEUED_VISIBILITIES_MAX: f64 = 1e6;
+const QUEUED_VISIBILITY_BYTES: f64 = 200.0;
+
+/// Memory of the program, its queues and its pictures, bytes.
+const BASE_BYTES: f64 = 5e7;
+
+/// Memory of a snapshot's line in the summary and of the names of its files, bytes.
+const SNAPSHOT_RECORD_BYTES: f64 = 500.0;
+
+/// The cost of one channel.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ChannelCost {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Visibilities sent down.
+    pub visibilities_sent: f64,
+    /// Of these, within the map's longest baseline.
+    pub visibilities_mapped: f64,
+    /// Longest baseline used in the map, m.
+    pub baseline_m_max: f64,
+    /// How the visibilities are simulated and what it costs, in fringes: of a direct sum one a pixel and
+    /// visibility (some 30 operations), of harmonics what takes as long.
+    pub simulation: ModelPlan,
+    /// Estimated time of the simulation by direct sums, s.
+    pub simulation_direct_s: f64,
+    /// Estimated time of the simulation through harmonics, s: set-up and visibilities.
+    pub simulation_harmonic_s: [f64; 2],
+    /// Estimated time of the simulation with rows of any positions, s.
+    pub simulation_general_s: f64,
+    /// Multiply-adds of the normal equations.
+    pub accumulation_multiply_adds: f64,
+    /// Multiply-adds of one solution.
+    pub solution_multiply_adds: f64,
+    /// Estimated time of the sums and of all solutions, s.
+    pub mapping_s: f64,
+}
+
+/// The cost of a whole pipeline.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Cost {
+    /// Channel by channel.
+    pub channels: Vec<ChannelCost>,
+    /// Observing windows used.
+    pub windows: usize,
+    /// Snapshot solutions of each channel, the final one included.
+    pub solutions: u64,
+    /// Size of the downlink file, bytes.
+    pub downlink_bytes: f64,
+    /// Memory for sums, snapshots, solving and the simulated sky, bytes.
+    pub memory_bytes: f64,
+    /// Of these, what the space segment takes, bytes.
+    pub simulation_memory_bytes: f64,
+    /// Rate that the daughters' samples need on their links to the mother, all together, bit/s; with
+    /// samples alone.
+    pub samples_bits_per_s: Option<f64>,
+    /// Rate that one daughter's samples need on its link, and the greatest that the link has, bit/s; with samples and a
+    /// limit alone.
+    pub link_bits_per_s: Option<[f64; 2]>,
+    /// Rate of the ninth daughter's spectra on the downlink while the array observes, bit/s; with it alone.
+    pub ninth_bits_per_s: Option<f64>,
+    /// What ranks exchange that share the sums; memory and time are then those of one of them. With several alone.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ranks: Option<RankCost>,
+    /// Estimated time to draw, quantise, send and correlate the samples, s; with samples alone.
+    pub sampling_s: Option<f64>,
+    /// Estimated time of the whole run, s, at the rates of one machine and with as many cores as this one.
+    pub predicted_s: f64,
+}
+
+/// Ranks that share the sums of each channel.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct RankCost {
+    /// Number of ranks.
+    pub ranks: usize,
+    /// Bytes that each gives to the others, and gets, in all solutions.
+    pub reduced_bytes: f64,
+    /// Memory of a node, bytes, and the number of nodes that hold all ranks, once [`Cost::on_nodes`] has been asked.
+    pub nodes: Option<(f64, usize)>,
+}
+
+/// Part of a pipeline that is to run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Segment {
+    /// All of it.
+    Whole,
+    /// Up to the downlink.
+    Space,
+}
+
+impl ChannelCost {
+    /// Estimated time of the simulation as it will be done, s.
+    #[must_use]
+    pub fn simulation_s(&self) -> f64 {
+        match self.simulation.kind {
+            ModelKind::Direct => self.simulation_direct_s,
+            ModelKind::Harmonic => self.simulation_harmonic_s.iter().sum(),
+            ModelKind::General => self.simulation_general_s,
+        }
+    }
+}
+
+impl Plan {
+    /// What the pipeline will cost. Nothing is measured: times are estimates at rates measured once.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn cost(&self) -> Cost {
+        self.cost_among(1)
+    }
+
+    /// As [`Plan::cost`], for one of some ranks that share the sums.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn cost_among(&self, ranks: usize) -> Cost {
+        let map = &self.config.map;
+        let nsides = self.sky_nsides();
+        let fringes_per_s = FRINGES_PER_S * cores();
+        // Harmonics of a circle have averages in closed form; other models see their instants.
+        let instants = if self.config.spacecraft.smear_integrations { AVERAGE_INSTANTS } else { 1.0 };
+        let expected = self.visibilities();
+        let frequencies = &self.config.spacecraft.channels_hz;
+        let engine = |(channel, (&frequency_hz, expected)): (usize, (&f64, &Expected))| {
+            let is_mapped = map.maps(ChannelId(channel as u16));
+            let data = ChannelData {
+                frequency_hz,
+                visibilities: expected.mapped,
+                windows: self.windows.len() as f64,
+            };
+            if is_mapped { EngineCost::of(map, data).among(ranks, map) } else { EngineCost::default() }
+        };
+        let engines: Vec<EngineCost> = frequencies.iter().zip(&expected).enumerate().map(engine).collect();
+        let sent: f64 = expected.iter().map(|e| e.sent).sum();
+        let solutions = self.solutions(sent);
+        let channels: Vec<ChannelCost> = frequencies
+            .iter()
+            .zip(&expected)
+            .zip(self.model_plans_for(&expected, &nsides))
+            .zip(&engines)
+            .map(|(((&frequency_hz, expected), simulation), engine)| ChannelCost {
+                frequency_hz,
+                visibilities_sent: expected.sent.round(),
+                visibilities_mapped: expected.mapped.round(),
+                baseline_m_max: map.baseline_m_max(frequency_hz),
+                simulation,
+                simulation_direct_s: instants * simulation.direct_fringes / fringes_per_s,
+                simulation_harmonic_s: [
+                    simulation.set_up_fringes / fringes_per_s,
+                    simulation.visibility_fringes * expected.sent / fringes_per_s,
+                ],
+                simulation_general_s: instants * simulation.general_fringes * expected.sent / fringes_per_s,
+                accumulation_multiply_adds: expected.mapped * engine.visibility_multiply_adds,
+                solution_multiply_adds: engine.solution_multiply_adds,
+                mapping_s: engine.visibility_s * expected.mapped
+                    + solutions as f64 * engine.solution_s
+                    + engine.probes_s,
+            })
+            .collect();
+        let simulation_memory_bytes = self.simulation_bytes(sent, &nsides)
+            + channels.iter().map(|channel| channel.simulation.bytes).sum::<f64>();
+        let memory_bytes =
+            memory_bytes(simulation_memory_bytes, &engines, solutions) + self.known_sky_bytes();
+        let sampling_s = self.sampling_s();
+        let simulating_s: f64 =
+            sampling_s.unwrap_or_else(|| channels.iter().map(ChannelCost::simulation_s).sum());
+        let predicted_s = simulating_s + channels.iter().map(|channel| channel.mapping_s).sum::<f64>();
+        Cost {
+            channels,
+            windows: self.windows.len(),
+            solutions,
+            downlink_bytes: self.config.downlink.expansion()
+                * (sent * VISIBILITY_BYTES as f64
+                    + self.windows.len() as f64 * 10_000.0
+                    + self.auto_bytes()
+                    + self.ninth_bytes()),
+            memory_bytes,
+            simulation_memory_bytes,
+            samples_bits_per_s: self.samples_bits_per_s(),
+            link_bits_per_s: self.link_bits_per_s(),
+            ninth_bits_per_s: self.ninth_bits_per_s(),
+            ranks: (ranks > 1).then(|| RankCost {
+                ranks,
+                reduced_bytes: solutions as f64 * engines.len() as f64 * EngineCost::reduced_bytes(map),
+                nodes: None,
+            }),
+            sampling_s,
+            predicted_s,
+        }
+    }
+
+    /// Mission time in which the array observes, s.
+    fn observing_s(&self) -> f64 {
+        let length_s = |window: &ObservingWindow| window.end.seconds() - window.start.seconds();
+        self.windows.iter().map(length_s).sum()
+    }
+
+    /// Estimated time to make visibilities of samples, s; none without samples.
+    fn sampling_s(&self) -> Option<f64> {
+        let width_hz = self.config.spacecraft.channel_width_hz;
+        let channels = self.config.spacecraft.channels_hz.len();
+        let samples_per_s = (self.array.satellites() * channels) as f64 * width_hz;
+        let is_sampled = self.config.spacecraft.fidelity == Fidelity::Samples;
+        is_sampled.then(|| samples_per_s * self.observing_s() / (SAMPLES_PER_S * cores()))
+    }
+
+    /// Bytes of the daughters' auto-correlations.
+    fn auto_bytes(&self) -> f64 {
+        let spacecraft = &self.config.spacecraft;
+        let streams = self.array.satellites() * spacecraft.channels_hz.len() * spacecraft.sub_bands;
+        let each_s = spacecraft.autos_s();
+        let powers = if each_s > 0.0 { self.observing_s() / each_s * streams as f64 } else { 0.0 };
+        powers * VISIBILITY_BYTES as f64
+    }
+
+    /// Bytes of the ninth daughter's spectra, with the headers of one packet for each channel and window.
+    fn ninth_bytes(&self) -> f64 {
+        const PACKET_BYTES: f64 = 42.0;
+        let Some(rate) = self.ninth_bits_per_s() else { return 0.0 };
+        let packets = self.config.spacecraft.ninth.channels * self.windows.len();
+        self.observing_s() * rate / 8.0 + PACKET_BYTES * packets as f64
+    }
+
+    /// Solutions of each channel for `sent` visibilities of all: one for each snapshot step with data in it, and the final
+    /// one.
+    fn solutions(&self, sent: f64) -> u64 {
+        let every_s = self.config.map.snapshot_every_s;
+        if every_s <= 0.0 {
+            return 1;
+        }
+        let steps = (self.config.spacecraft.duration_s / every_s).ceil();
+        let observed = (self.observing_s() / every_s).ceil() + self.windows.len() as f64;
+        steps.min(observed).min(sent.ceil()).max(1.0) as u64
+    }
+
+    /// Memory that a simulation of any channels takes, and that of each channel's sky and model, bytes.
+    pub(in crate::pipeline) fn simulation_bytes_by_channel(&self) -> (f64, Vec<f64>) {
+        let nsides = self.sky_nsides();
+        let sky = |nside: &usize| 8.0 * pixel_count(*nside) as f64;
+        let turned = 3.0 * nsides.iter().map(sky).fold(0.0, f64::max);
+        let models = self.model_plans(&nsides);
+        let each = nsides.iter().zip(&models).map(|(nside, model)| sky(nside) + model.bytes).collect();
+        let tables = self.array.table_bytes() as f64;
+        (turned + tables + QUEUED_VISIBILITIES_MAX * QUEUED_VISIBILITY_BYTES + BASE_BYTES, each)
+    }
+
+    /// Memory of the space segment besides its models, bytes.
+    fn simulation_bytes(&self, sent: f64, nsides: &[usize]) -> f64 {
+        let pixels: Vec<f64> = nsides.iter().map(|&nside| pixel_count(nside) as f64).collect();
+        // Every sky, and three copies of one that is turned and resampled.
+        let skies = pixels.iter().sum::<f64>() + 3.0 * pixels.iter().copied().fold(0.0, f64::max);
+        let tables = self.array.table_bytes() as f64;
+        8.0 * skies + tables + sent.min(QUEUED_VISIBILITIES_MAX) * QUEUED_VISIBILITY_BYTES
+    }
+}
+
+/// Memory of all, bytes, at the time when it is greatest: while the sums grow, or at the end, when the space segment is gone.
+pub(in crate::pipeline) fn memory_bytes(
+    simulation_bytes: f64,
+    engines: &[EngineCost],
+    solutions: u64,
+) -> f64 {
+    let greatest = |of: fn(&EngineCost) -> f64| engines.iter().map(of).fold(0.0, f64::max);
+    let sums = engines.iter().map(|engine| engine.sums_bytes).sum::<f64>()
+        + solutions as f64 * engines.len() as f64 * SNAPSHOT_RECORD_BYTES;
+    let copy = greatest(|engine| engine.copy_bytes);
+    // One copy is made, one waits in the queue, and one is in the solver.
+    let solving = |copies: usize| match copies {
+        0 => 0.0,
+        copies => copies.min(3) as f64 * copy + greatest(|engine| engine.other_bytes),
+    };
+    let growing = simulation_bytes + sums + solving(if solutions > 1 { 3 } else { 0 });
+    let last = if engines.iter().any(|engine| engine.copies_last) { engines.len() } else { 0 };
+    growing.max(sums + solving(last)) + BASE_BYTES
+}
+
+impl Cost {
+    /// With the number of nodes of so much memory that hold all ranks, unless not even one rank fits.
+    #[must_use]
+    pub fn on_nodes(mut self, limit: Option<MemoryLimit>) -> Self {
+        if let (Some(limit), Some(cost)) = (limit, &mut self.ranks) {
+            let bytes = limit.bytes as f64;
+            let on_one = (bytes / self.memory_bytes) as usize;
+            cost.nodes = (on_one > 0).then(|| (bytes, cost.ranks.div_ceil(on_one)));
+        }
+        self
+    }
+
+    /// Requires that all estimates are finite: what cannot be estimated may never end.
+    ///
+    /// # Errors
+    /// [`PipelineError::Unbounded`].
+    pub fn require_finite(&self) -> Result<(), PipelineError> {
+        let channels = self.channels.iter().flat_map(|channel| {
+            let of = |what| format!("{what} of the channel at {:.3} MHz", channel.frequency_hz / 1e6);
+            [
+                (of("number of visibilities"), channel.visibilities_sent),
+                (of("time of the simulation"), channel.simulation_s()),
+                (of("time of the map"), channel.mapping_s),
+            ]
+        });
+        let whole = [
+            ("size of the downlink", self.downlink_bytes),
+            ("memory", self.memory_bytes),
+            ("memory of the simulation", self.simulation_memory_bytes),
+            ("time", self.predicted_s),
+        ];
+        let all = channels.chain(whole.map(|(what, value)| (what.to_owned(), value)));
+        match all.into_iter().find(|(_, value)| !value.is_finite() || *value < 0.0) {
+            None => Ok(()),
+            Some((what, value)) => Err(PipelineError::Unbounded { what, value }),
+        }
+    }
+
+    /// Requires that the memory that a segment needs is within the limit.
+    ///
+    /// # Errors
+    /// [`PipelineError::Memory`]; those of [`Cost::require_finite`].
+    pub fn require_memory(&self, segment: Segment, limit: Option<MemoryLimit>) -> Result<(), PipelineError> {
+        self.require_finite()?;
+        let needed_bytes = match segment {
+            Segment::Whole => self.memory_bytes,
+            Segment::Space => self.simulation_memory_bytes,
+        };
+        match limit {
+            Some(limit) if needed_bytes > limit.bytes as f64 => {
+                Err(PipelineError::Memory { needed_bytes, limit })
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+impl fmt::Display for Cost {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "{:>12} {:>14} {:>14} {:>14} {:>16}",
+            "channel", "visibilities", "in the map", "b max (m)", "multiply-adds"
+        )?;
+        for channel in &self.channels {
+            writeln!(
+                f,
+                "{:>8.3} MHz {:>14.0} {:>14.0} {:>14.1} {:>16.2e}",
+                channel.frequency_hz / 1e6,
+                channel.visibilities_sent,
+                channel.visibilities_mapped,
+                channel.baseline_m_max,
+                channel.accumulation_multiply_adds + channel.solution_multiply_adds * self.solutions as f64
+            )?;
+        }
+        writeln!(f)?;
+        if let Some(sampling_s) = self.sampling_s {
+            writeln!(f, "samples: an estimated {sampling_s:.1} s to draw, send and correlate them")?;
+        }
+        for channel in self.channels.iter().filter(|_| self.sampling_s.is_none()) {
+            let ModelPlan { kind, why, l_max, .. } = channel.simulation;
+            let [set_up_s, visibilities_s] = channel.simulation_harmonic_s;
+            writeln!(
+                f,
+                "{:>8.3} MHz simulated by {kind} ({why}): estimated {:.1} s by direct sums; harmonics to l = {l_max} \
+                 {set_up_s:.1} s to set up and {visibilities_s:.1} s for visibilities, or {:.1} s by rows of any positions",
+                channel.frequency_hz / 1e6,
+                channel.simulation_direct_s,
+                channel.simulation_general_s
+            )?;
+        }
+        writeln!(f)?;
+        writeln!(f, "windows          {}", self.windows)?;
+        writeln!(f, "maps per channel {}", self.solutions)?;
+        writeln!(f, "downlink         {:.1} MB", self.downlink_bytes / 1e6)?;
+        writeln!(f, "memory           {:.2} GB", self.memory_bytes / 1e9)?;
+        if let Some(RankCost { ranks, reduced_bytes, nodes }) = self.ranks {
+            writeln!(
+                f,
+                "ranks            {ranks}: memory and time are those of one; each gives {:.2} GB to the others and gets as much",
+                reduced_bytes / 1e9
+            )?;
+            if let Some((bytes, nodes)) = nodes {
+                writeln!(f, "nodes            {nodes} of {:.2} GB hold all ranks", bytes / 1e9)?;
+            }
+        }
+        if let Some(rate) = self.samples_bits_per_s {
+            writeln!(f, "samples          {:.3} Mbit/s from all daughters", rate / 1e6)?;
+        }
+        if let Some([needed, limit]) = self.link_bits_per_s {
+            let (needed_k, limit_k) = (needed / 1e3, limit / 1e3);
+            write!(f, "links            {needed_k:.3} kbit/s needed by a daughter, {limit_k:.3} there")?;
+            let short =
+                "; the rest waits in its buffer, and what has no room or no time after a window is dropped";
+            writeln!(f, "{}", if needed > limit { short } else { "" })?;
+        }
+        if let Some(rate) = self.ninth_bits_per_s {
+            writeln!(f, "ninth daughter   {:.3} kbit/s of spectra while observing", rate / 1e3)?;
+        }
+        write!(
+            f,
+            "estimated time   {:.0} s, at rates measured on 2 cores of an AMD EPYC, with {} cores",
+            self.predicted_s,
+            cores()
+        )
+    }
+}

@@ -1,0 +1,95 @@
+//! The products of a calibration: tables, a picture, and the file of gains.
+
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::found_solutions::{CalibrateSummary, FoundSolutions};
+use crate::calibration::solver::{GainEstimate, GainState, PassSolution, solutions_csv};
+use crate::files::write_atomically;
+use crate::pipeline::config::PipelineError;
+use crate::products::ProductsError;
+use crate::products::pictures::{Axis, Curve, Plot, draw_plots};
+use crate::units::constants::DAY_S;
+
+/// Creates a folder.
+pub(in crate::pipeline) fn create(folder: &Path) -> Result<(), PipelineError> {
+    let made = std::fs::create_dir_all(folder);
+    Ok(made.map_err(|source| ProductsError::Write { path: folder.to_owned(), source })?)
+}
+
+fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), PipelineError> {
+    let written = write_atomically(path, bytes);
+    Ok(written.map_err(|source| ProductsError::Write { path: path.to_owned(), source })?)
+}
+
+/// Writes a value as JSON.
+pub(in crate::pipeline) fn write_json(path: &Path, value: &impl Serialize) -> Result<(), PipelineError> {
+    let text = serde_json::to_vec(value)
+        .map_err(|error| ProductsError::Encode { path: path.to_owned(), reason: error.to_string() })?;
+    write_bytes(path, &text)
+}
+
+/// What `solutions.json` holds.
+#[derive(Serialize)]
+struct SolutionsFile<'a> {
+    summary: &'a CalibrateSummary,
+    solutions: &'a [PassSolution],
+}
+
+/// Writes everything; the file of gains last.
+pub(in crate::pipeline) fn write(
+    out: &Path,
+    found: &FoundSolutions,
+    summary: &CalibrateSummary,
+    pictures: bool,
+) -> Result<(), PipelineError> {
+    let solutions = &found.solutions[..];
+    write_bytes(&out.join("solutions.csv"), solutions_csv(solutions).as_bytes())?;
+    write_json(&out.join("solutions.json"), &SolutionsFile { summary, solutions })?;
+    if pictures && !solutions.is_empty() {
+        let channels = found.instrument.as_ref().map_or(0, |instrument| instrument.channels.len());
+        let plots: Vec<Plot> = (0..channels).flat_map(|channel| plots(solutions, channel)).collect();
+        let picture = draw_plots("Gains by daughter and day", &plots, 2).map_err(ProductsError::from)?;
+        picture.write(&out.join("solutions.png")).map_err(ProductsError::from)?;
+    }
+    // Last: where it is, all the others are.
+    match found.gains(false) {
+        Some(gains) => write_json(&out.join("gains.json"), &gains),
+        // Those of an earlier command would be taken for this one's.
+        None => match std::fs::remove_file(out.join("gains.json")) {
+            Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
+                Err(ProductsError::Write { path: out.join("gains.json"), source }.into())
+            }
+            _ => Ok(()),
+        },
+    }
+}
+
+/// Phases and amplitudes of a channel over time.
+fn plots(solutions: &[PassSolution], channel: usize) -> [Plot; 2] {
+    let satellites = solutions.first().map_or(0, |one| one.daughters.len());
+    let frequency_hz = solutions.first().map_or(0.0, |one| one.daughters[0].gains[channel].frequency_hz);
+    let plot = |name: &str, label: &str, of: &dyn Fn(&GainEstimate) -> f64| {
+        let curve = |n: usize| {
+            let point = |one: &PassSolution| {
+                let gain = &one.daughters[n].gains[channel];
+                let value = if gain.state == GainState::Good { of(gain) } else { f64::NAN };
+                (0.5 * (one.from_s + one.until_s) / DAY_S, value)
+            };
+            let points = solutions.iter().map(point).collect();
+            Curve { label: format!("daughter {}", n + 1), points, dashed: false }
+        };
+        Plot {
+            title: format!("{name} at {:.3} MHz", frequency_hz / 1e6),
+            x: Axis { label: "day of the mission".to_owned(), ..Axis::default() },
+            y: Axis { label: label.to_owned(), ..Axis::default() },
+            curves: (0..satellites).map(curve).collect(),
+            levels: Vec::new(),
+        }
+    };
+    [
+        plot("Phase", "phase (deg)", &|gain| gain.phase_deg),
+        plot("Amplitude", "amplitude", &|gain| gain.amplitude),
+    ]
+}

@@ -1,0 +1,151 @@
+//! The ground segment as a graph: bytes, sums, maps, products.
+
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+
+use super::live_gains::GainsWriter;
+use crate::ground::{Ground, GroundConfig, GroundOutcome};
+use crate::imaging::MapConfig;
+use crate::imaging::anywhere::RefineRule;
+use crate::imaging::{Regulariser, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
+use crate::pipeline::config::{Config, PipelineError};
+use crate::products::{ChannelSummary, MapWatch, ProductsError, ProductsWatch, Provenance, Publisher, Truth};
+use crate::runtime::{Graph, Link, Sink};
+use crate::sky::fits::{ReadOptions, read_prior};
+
+/// Name of the stage that keeps the state.
+pub(in crate::pipeline) const GROUND: &str = "ground";
+
+/// Name of the stage that makes maps.
+pub(in crate::pipeline) const SOLVE: &str = "solve";
+
+impl Config {
+    /// Configuration of the ground, with a hold buffer of `wait_bytes`.
+    #[must_use]
+    pub fn ground(&self, wait_bytes: u64) -> GroundConfig {
+        let (calibration, calibrate) = (self.calibration.clone(), self.calibrate.clone());
+        let map = self.map.clone();
+        GroundConfig {
+            calibration,
+            calibrate,
+            map,
+            wait_bytes,
+            memory_max_bytes: None,
+            group: None,
+            part: None,
+        }
+    }
+
+    /// Setup of the solver, which `watch` follows.
+    ///
+    /// # Errors
+    /// Prior maps and tables of power that cannot be read.
+    #[doc(hidden)]
+    pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
+        let map = &self.map;
+        Ok(SolverSetup {
+            epsilon: map.epsilon.clone(),
+            regularisers: regularisers(map)?,
+            beams_deg: map.beams_deg.clone(),
+            moon_reflection: map.moon_reflection,
+            prior_k: map.prior_k.clone(),
+            prior_maps: prior_maps(self)?,
+            rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
+            refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
+            belief: map.belief(),
+            passes: None,
+            trace_probes: map.trace_probes,
+            watch,
+        })
+    }
+}
+
+/// What the ground segment leaves behind besides its files.
+#[derive(Clone, Debug)]
+pub(in crate::pipeline) struct SegmentOutcome {
+    /// Of the ground.
+    pub(in crate::pipeline) ground: GroundOutcome,
+    /// Final map of each channel, in figures.
+    pub(in crate::pipeline) channels: Arc<Mutex<Vec<ChannelSummary>>>,
+}
+
+/// What the ground segment makes of its sums.
+pub(in crate::pipeline) struct Mapping<'a> {
+    /// Folder for the products.
+    pub(in crate::pipeline) out: &'a Path,
+    /// The true sky, to compare the maps with.
+    pub(in crate::pipeline) truth: Truth,
+    /// Follows solutions.
+    pub(in crate::pipeline) watch: SolveWatch,
+    /// Sees maps.
+    pub(in crate::pipeline) viewers: MapWatch,
+    /// Is told of products that cannot be written, which then end nothing.
+    pub(in crate::pipeline) trouble: Option<ProductsWatch>,
+}
+
+/// Adds the ground segment to `graph`. It takes the bytes of a downlink and nothing else from space.
+///
+/// # Errors
+/// Prior maps that cannot be read.
+pub(in crate::pipeline) fn add(
+    graph: &mut Graph,
+    bytes: Link<Vec<u8>>,
+    config: &Config,
+    ground: Ground,
+    mapping: Mapping<'_>,
+) -> Result<SegmentOutcome, PipelineError> {
+    let Mapping { out, truth, watch, viewers, trouble } = mapping;
+    let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
+    let ranks = ground.ranks().clone();
+    let passes = config.map.refine.is_on().then(|| out.to_owned());
+    let setup = SolverSetup { passes, ..config.solver(watch.among(&ranks))? };
+    if !ranks.is_first() {
+        let sums = graph.stage(GROUND, 1, bytes, ground);
+        let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));
+        graph.sink("publish", maps, Bystander);
+        return Ok(outcome);
+    }
+    let provenance = Provenance { ground_hash: config.ground_hash(), map: config.map.clone() };
+    let channels = Arc::clone(&outcome.channels);
+    let publisher =
+        Publisher::new(config.products.clone(), out, truth, provenance, channels)?.shown_to(viewers);
+    let publisher = trouble.iter().fold(publisher, Publisher::persisting);
+    let mut writer = GainsWriter::new(config, out);
+    let ground = ground.observed_by(Box::new(move |gains| writer.update(gains)));
+    // Sums are large: one waits while another is solved.
+    let sums = graph.stage(GROUND, 1, bytes, ground);
+    let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));
+    graph.sink("publish", maps, publisher);
+    Ok(outcome)
+}
+
+/// Takes the maps of a rank that are those of the first rank, which publishes them.
+struct Bystander;
+
+impl Sink for Bystander {
+    type In = Solution;
+    type Error = ProductsError;
+
+    fn take(&mut self, _solution: Solution) -> Result<(), ProductsError> {
+        Ok(())
+    }
+}
+
+/// How R depends on the degree, by channel.
+fn regularisers(map: &MapConfig) -> Result<Vec<Regulariser>, PipelineError> {
+    if map.regularisation_files.is_empty() {
+        return Ok(vec![Regulariser::Power(map.regularisation_exponent)]);
+    }
+    map.regularisation_files.iter().map(|path| Ok(Regulariser::read(path)?)).collect()
+}
+
+fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {
+    let map = &config.map;
+    let options = ReadOptions { frame_if_missing: map.prior_frame, ..ReadOptions::default() };
+    let read = |path: &std::path::PathBuf| {
+        let prior = read_prior(path, &options)?.to_ecliptic();
+        let smooth = prior.smoothed(map.prior_fwhm_deg.to_radians())?;
+        Ok(smooth.resized(map.nside)?.into_values())
+    };
+    map.prior_files.iter().map(read).collect()
+}

@@ -1,0 +1,22 @@
+//! From a plan to a running graph: the stages of space and ground, and the summary of what they did.
+
+pub(super) mod calibrate_products;
+pub(super) mod found_solutions;
+pub(super) mod ground_segment;
+mod live_gains;
+pub(crate) mod models;
+pub(super) mod run;
+mod sample_summary;
+pub(crate) mod sampling;
+pub(crate) mod space_segment;
+pub(super) mod summary;
+
+pub use found_solutions::{CalibrateRound, CalibrateSummary};
+pub use run::{
+    Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, run_among, simulate,
+    use_threads,
+};
+pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
+pub use sampling::sample_stages;
+pub use space_segment::{INTEGRATE, sky_notes};
+pub use summary::{RunScope, RunSummary};

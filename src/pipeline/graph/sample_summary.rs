@@ -1,0 +1,123 @@
+//! Counters and ledger of samples, for runs with sample fidelity.
+
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use serde::Serialize;
+
+use crate::daughters::{LinkCounts, SamplerCounts};
+use crate::frames::SampleReason;
+use crate::mother::Fidelity;
+use crate::mother::correlator::CorrelatorCounts;
+use crate::pipeline::config::{PipelineError, Plan};
+use crate::runtime::{Ledger, LedgerImbalance, LedgerReport};
+
+/// What the stages of sample fidelity count while they run.
+#[derive(Clone, Default)]
+pub struct SampleCounts {
+    /// Sampling.
+    pub sampler: Arc<Mutex<SamplerCounts>>,
+    /// The links to the mother.
+    pub link: Arc<Mutex<LinkCounts>>,
+    /// The correlator.
+    pub correlator: Arc<Mutex<CorrelatorCounts>>,
+}
+
+impl SampleCounts {
+    /// The summary of the samples of a plan's run; `None` without samples.
+    pub(crate) fn close(&self, plan: &Plan) -> Result<Option<SampleSummary>, PipelineError> {
+        let sampled = plan.config.spacecraft.fidelity == Fidelity::Samples;
+        Ok(sampled.then(|| SampleSummary::close(self)).transpose()?)
+    }
+}
+
+/// A run's samples in figures; complex samples of all daughters and channels.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct SampleSummary {
+    /// Real and imaginary parts beyond a quantiser's range.
+    pub saturated: u64,
+    /// Correlations that were checked while samples were drawn.
+    pub correlations: u64,
+    /// Correlations that were reduced so that a matrix became a covariance.
+    pub repaired: u64,
+    /// Greatest change of a correlation, as a part of the two daughters' powers.
+    pub repair_max: f32,
+    /// What the links carried and dropped.
+    pub link: LinkCounts,
+    /// Blocks at the mother.
+    pub blocks: BlockSummary,
+    /// Visibilities made of the samples.
+    pub visibilities: u64,
+    /// The ledger of samples.
+    pub ledger: LedgerReport<SampleReason>,
+}
+
+/// Blocks at the mother.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct BlockSummary {
+    /// Correlated.
+    pub used: u64,
+    /// Absent when the others were correlated.
+    pub missing: u64,
+    /// Received after the others had been correlated.
+    pub late: u64,
+    /// Duplicates.
+    pub duplicate: u64,
+    /// Malformed.
+    pub malformed: u64,
+    /// Outside any window.
+    pub stray: u64,
+}
+
+impl SampleSummary {
+    /// Closes the ledger of samples: sampled = correlated + lost.
+    ///
+    /// # Errors
+    /// [`LedgerImbalance`] unless sampled = correlated + lost.
+    pub fn close(counts: &SampleCounts) -> Result<Self, LedgerImbalance<SampleReason>> {
+        fn read<T: Clone>(counts: &Mutex<T>) -> T {
+            counts.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        }
+        let (sampler, link) = (read(&counts.sampler), read(&counts.link));
+        let correlator = read(&counts.correlator);
+        let blocks = correlator.blocks;
+        let ledger = Ledger::new();
+        ledger.sampled(sampler.samples);
+        ledger.accumulated(blocks.used_samples);
+        ledger.left_out(SampleReason::LinkOverrun, link.dropped_samples);
+        ledger.left_out(SampleReason::Late, blocks.late_samples);
+        ledger.left_out(SampleReason::Malformed, blocks.malformed_samples);
+        ledger.left_out(SampleReason::OutsideWindow, correlator.stray_samples);
+        Ok(Self {
+            saturated: sampler.saturated,
+            correlations: sampler.repairs.elements,
+            repaired: sampler.repairs.changed,
+            repair_max: sampler.repairs.change_max,
+            link,
+            blocks: BlockSummary {
+                used: blocks.used,
+                missing: blocks.missing,
+                late: blocks.late,
+                duplicate: blocks.duplicate,
+                malformed: blocks.malformed,
+                stray: correlator.stray,
+            },
+            visibilities: correlator.visibilities,
+            ledger: ledger.close()?,
+        })
+    }
+}
+
+impl fmt::Display for SampleSummary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { saturated, repaired, correlations, repair_max, blocks, .. } = self;
+        writeln!(f, "{}", self.ledger)?;
+        writeln!(f, "parts out of the quantisers' range: {saturated}")?;
+        writeln!(f, "correlations repaired: {repaired} of {correlations}, by {repair_max:.1e} at most")?;
+        let BlockSummary { used, missing, late, duplicate, malformed, stray } = blocks;
+        write!(
+            f,
+            "blocks: {used} used, {missing} missing, {late} late, {duplicate} duplicates, {malformed} malformed, {stray} stray"
+        )
+    }
+}

@@ -1,0 +1,197 @@
+//! The space segment as part of a graph: windows, visibilities, the onboard store, packets.
+
+use std::sync::Arc;
+
+use super::models;
+use super::sample_summary::SampleCounts;
+use super::sampling::samples;
+use crate::downlink::Transmitter;
+use crate::frames::GroundFrame;
+use crate::mother::{
+    Fidelity, Integrator, MeasurementOptions, Ninth, NinthSetup, NinthSky, NoiseModel, Observer, PacedLink,
+    Store,
+};
+use crate::pipeline::config::{PipelineError, Plan};
+use crate::response::model::DirectSum;
+use crate::runtime::{Graph, Link};
+use crate::sky::fits::{read_notes, read_sky, sky_options};
+use crate::sky::generated::generate;
+use crate::sky::{Frame, SkyMap};
+use crate::units::ChannelId;
+
+/// Name of the stage by whose windows progress is measured.
+pub const INTEGRATE: &str = "integrate";
+
+/// The simulated sky of every channel, in its own pixels and frame.
+///
+/// # Errors
+/// A map that cannot be read, that has pixels that are no temperature of a sky, or that is of another frequency.
+pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
+    (0..).map(ChannelId).take(plan.schedules.len()).map(|channel| sky(plan, channel)).collect()
+}
+
+/// That of one channel.
+///
+/// # Errors
+/// As [`skies`].
+pub(in crate::pipeline) fn sky(plan: &Plan, channel: ChannelId) -> Result<SkyMap, PipelineError> {
+    let config = &plan.config.sky;
+    let channel = usize::from(channel.0);
+    let frequency_hz = plan.config.spacecraft.channels_hz[channel];
+    match config.file.as_ref() {
+        Some(files) => {
+            let path = files.get(channel).unwrap_or_default();
+            let map = read_sky(&path, &plan.sky_channel(channel), config)?;
+            let Some(added) = &config.added else { return Ok(map) };
+            let seed = plan.config.seed;
+            Ok(added.add_to(map, &config.generated, frequency_hz, config.nside, seed)?)
+        }
+        None => {
+            let values = generate(&config.generated, frequency_hz, config.nside, plan.config.seed)?;
+            Ok(SkyMap::new(Frame::Ecliptic, values)?)
+        }
+    }
+}
+
+/// What is assumed about the map files of the sky, such as their unit, and whether the sky is too coarse for the baselines.
+///
+/// # Errors
+/// A map whose header cannot be read.
+pub fn sky_notes(plan: &Plan) -> Result<Vec<String>, PipelineError> {
+    let (sky, mut notes) = (&plan.config.sky, Vec::new());
+    for (channel, &frequency_hz) in plan.config.spacecraft.channels_hz.iter().enumerate() {
+        let Some(path) = sky.file.as_ref().and_then(|files| files.get(channel)) else { continue };
+        for note in read_notes(&path, &sky_options(sky, frequency_hz))? {
+            let note = format!("{}: {note}", path.display());
+            // A file that stands for several channels is told once.
+            if !notes.contains(&note) {
+                notes.push(note);
+            }
+        }
+    }
+    notes.extend(plan.coarse_sky_note());
+    Ok(notes)
+}
+
+/// Adds the space segment to `graph`; its output are the bytes of the downlink. With sample fidelity its stages count in
+/// `counts`.
+///
+/// # Errors
+/// An invalid model of the visibilities or configuration of the downlink.
+pub fn add(
+    graph: &mut Graph,
+    plan: &Plan,
+    skies: &[SkyMap],
+    counts: &SampleCounts,
+) -> Result<Link<Vec<u8>>, PipelineError> {
+    if plan.config.spacecraft.fidelity == Fidelity::Samples {
+        let frames = samples(graph, plan, models::build_all(plan, skies)?, counts);
+        return send(graph, plan, frames);
+    }
+    let skies: Vec<Option<&SkyMap>> = skies.iter().map(Some).collect();
+    let frames = integrate(graph, plan, &skies)?;
+    send(graph, plan, frames)
+}
+
+/// Adds the integration of the visibilities of the channels that have skies.
+///
+/// # Errors
+/// An invalid model.
+pub(in crate::pipeline) fn integrate(
+    graph: &mut Graph,
+    plan: &Plan,
+    skies: &[Option<&SkyMap>],
+) -> Result<Link<GroundFrame>, PipelineError> {
+    let Plan { config, array, instrument, schedules, windows } = plan;
+    let models = models::build(plan, skies)?;
+    let noise = NoiseModel {
+        seed: config.spacecraft.thermal_noise.then_some(config.seed),
+        receiver_noise_k_sr: config.spacecraft.receiver_k_sr(),
+        response: plan.instrument.response,
+    };
+    let options = MeasurementOptions {
+        noise,
+        smear_integrations: config.spacecraft.smear_integrations,
+        auto_integration_s: config.spacecraft.autos_s(),
+        flag_earth: config.spacecraft.flag_earth,
+    };
+    let integrator =
+        Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options)
+            .with_errors(plan.instrument_errors());
+    // A window itself is small; its visibilities are not.
+    let windows = graph.source("observe", 1, Observer::new(windows.clone()));
+    Ok(graph.stage(INTEGRATE, config.runtime.queue_capacity, windows, integrator))
+}
+
+/// Adds what follows on the frames of all channels, to the bytes of the downlink.
+///
+/// # Errors
+/// A sky that the ninth daughter cannot take; an invalid configuration of the downlink.
+pub(in crate::pipeline) fn send(
+    graph: &mut Graph,
+    plan: &Plan,
+    frames: Link<GroundFrame>,
+) -> Result<Link<Vec<u8>>, PipelineError> {
+    let frames = add_ninth(graph, plan, frames)?;
+    transmit(graph, plan, frames)
+}
+
+/// Adds the spectra of the ninth daughter to the frames, if it is on.
+fn add_ninth(
+    graph: &mut Graph,
+    plan: &Plan,
+    frames: Link<GroundFrame>,
+) -> Result<Link<GroundFrame>, PipelineError> {
+    let Plan { config, array, windows, .. } = plan;
+    if !config.spacecraft.ninth.on {
+        return Ok(frames);
+    }
+    let setup = NinthSetup {
+        array: Arc::clone(array),
+        config: config.spacecraft.ninth.clone(),
+        sky: ninth_sky(plan)?,
+        windows: windows.clone(),
+        seed: config.spacecraft.thermal_noise.then_some(config.seed),
+    };
+    let capacity = config.runtime.queue_capacity;
+    Ok(match Ninth::new(setup) {
+        Some(ninth) => graph.stage("ninth", capacity, frames, ninth),
+        None => frames,
+    })
+}
+
+/// The sky of the ninth daughter: the generated sky at its own frequencies, or the map file of the highest channel,
+/// continued as a power of frequency.
+fn ninth_sky(plan: &Plan) -> Result<NinthSky, PipelineError> {
+    let Plan { config, array, instrument, .. } = plan;
+    let model = |sky: &SkyMap, at_hz| DirectSum::new(sky, at_hz, array.moon_radius_m(), instrument.response);
+    let ninth = &config.spacecraft.ninth;
+    let channels = (0..).map(ChannelId).zip(&config.spacecraft.channels_hz);
+    let highest = channels.max_by(|a, b| a.1.total_cmp(b.1));
+    if let (Some(_), Some((channel, &frequency_hz))) = (&config.sky.file, highest) {
+        return Ok(NinthSky::PowerLaw {
+            model: model(&sky(plan, channel)?, frequency_hz),
+            frequency_hz,
+            index: ninth.file_index,
+        });
+    }
+    let map = |at_hz: f64| -> Result<(f64, DirectSum), PipelineError> {
+        let values = generate(&config.sky.generated, at_hz, config.sky.nside, config.seed)?;
+        Ok((at_hz, model(&SkyMap::new(Frame::Ecliptic, values)?, at_hz)))
+    };
+    Ok(NinthSky::Maps(NinthSky::nodes_hz(ninth.band_hz).into_iter().map(map).collect::<Result<_, _>>()?))
+}
+
+/// Adds the onboard store and the transmitter.
+fn transmit(
+    graph: &mut Graph,
+    plan: &Plan,
+    frames: Link<GroundFrame>,
+) -> Result<Link<Vec<u8>>, PipelineError> {
+    let config = &plan.config;
+    let capacity = config.runtime.queue_capacity;
+    let paced = |bytes_per_s| PacedLink { array: Arc::clone(&plan.array), bytes_per_s };
+    let store = Store::new(&config.spacecraft, config.downlink.payload_bytes_per_s().map(paced));
+    let passes = graph.stage("store", capacity, frames, store);
+    Ok(graph.stage("transmit", capacity, passes, Transmitter::new(&config.downlink)?))
+}

@@ -1,0 +1,304 @@
+//! The summary of a run: `summary.json`, and what is printed at the end.
+
+use std::collections::BTreeSet;
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
+use serde::{Deserialize, Serialize};
+
+use super::found_solutions::CalibrateSummary;
+use super::ground_segment::SOLVE;
+use super::sample_summary::SampleSummary;
+use crate::calibration::Completeness;
+use crate::downlink::ReceptionCounters;
+use crate::downlink::transport::socket::ListenReport;
+use crate::files::write_atomically;
+use crate::frames::VisibilityReason;
+use crate::ground::SavingReport;
+use crate::pipeline::config::Config;
+use crate::products::{ChannelSummary, ProductsError};
+use crate::runtime::{LedgerReport, Report, StageReport};
+
+/// Which part of the chain ran.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum RunScope {
+    /// Space and ground in one process.
+    Whole,
+    /// The ground alone, from files.
+    Ground,
+}
+
+/// The results of a run.
+#[derive(Clone, Debug, Serialize)]
+pub struct RunSummary {
+    /// Version of the program.
+    pub version: &'static str,
+    /// Name of the pipeline.
+    pub name: String,
+    /// Which part of the chain ran.
+    pub segment: RunScope,
+    /// Whether it was cancelled.
+    pub cancelled: bool,
+    /// Seed of the space segment, as the instrument description has it.
+    pub seed: Option<u64>,
+    /// Hash of the space segment's configuration, as the instrument description has it.
+    pub space_hash: Option<String>,
+    /// Hash of the ground's configuration.
+    pub ground_hash: String,
+    /// The maps, channel by channel.
+    pub channels: Vec<ChannelSummary>,
+    /// The ledger of visibilities.
+    pub ledger: LedgerReport<VisibilityReason>,
+    /// Whether the ledger is known to be complete.
+    pub completeness: Completeness,
+    /// Statistics of samples; absent without sample fidelity.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub samples: Option<SampleSummary>,
+    /// Counters of what was received and of its faults.
+    pub reception: ReceptionCounters,
+    /// The senders, if the ground listened.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub listening: Option<ListenReport>,
+    /// Checkpoints of the ground's state, if it keeps one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub saving: Option<SavingReport>,
+    /// The gains that were found, with `calibration.hook = "solve"`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<CalibrateSummary>,
+    /// Stages: throughput, times, queues; of the last pass, if the channels were mapped in groups.
+    pub report: Report,
+    /// Of the passes before it.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub earlier_reports: Vec<Report>,
+}
+
+impl RunSummary {
+    /// A summary without samples and senders.
+    #[must_use]
+    pub(in crate::pipeline) fn new(
+        segment: RunScope,
+        config: &Config,
+        report: Report,
+        ledger: LedgerReport<VisibilityReason>,
+        reception: ReceptionCounters,
+        channels: Vec<ChannelSummary>,
+    ) -> Self {
+        Self {
+            version: env!("CARGO_PKG_VERSION"),
+            name: config.name.clone(),
+            segment,
+            cancelled: report.cancelled,
+            seed: channels.first().map(|channel| channel.seed),
+            space_hash: channels.first().map(|channel| channel.space_hash.clone()),
+            ground_hash: format!("{:016x}", config.ground_hash()),
+            channels,
+            ledger,
+            completeness: Completeness::default(),
+            samples: None,
+            reception,
+            listening: None,
+            saving: None,
+            calibration: None,
+            report,
+            earlier_reports: Vec::new(),
+        }
+    }
+
+    /// The summary of this pass and an earlier one over the same downlink, for other channels.
+    pub(in crate::pipeline) fn after(self, earlier: PassRecord) -> Self {
+        let elsewhere = VisibilityReason::ChannelNotMapped;
+        let ledger = earlier.ledger.of_two_passes(&self.ledger, VisibilityReason::is_of_sums, elsewhere);
+        Self {
+            seed: earlier.seed.or(self.seed),
+            space_hash: earlier.space_hash.or(self.space_hash),
+            channels: [earlier.channels, self.channels].concat(),
+            ledger,
+            ..self
+        }
+    }
+
+    /// Whether maps are missing because the time after cancellation did not suffice.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn lacks_maps(&self) -> bool {
+        let is_skipped = |solve: &StageReport| solve.items_out < solve.items_in;
+        self.cancelled && (!self.report.cut.is_empty() || self.report.stage(SOLVE).is_some_and(is_skipped))
+    }
+
+    /// Writes `summary.json` into `folder`. Removes maps and pictures that the summary of an earlier run there names and
+    /// that this run did not write, so that all files belong to this run.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub(in crate::pipeline) fn write(&self, folder: &Path) -> Result<PathBuf, ProductsError> {
+        let path = folder.join("summary.json");
+        let text = serde_json::to_vec_pretty(self)
+            .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
+        let before = std::fs::read(&path).unwrap_or_default();
+        write_atomically(&path, &text)
+            .map_err(|source| ProductsError::Write { path: path.clone(), source })?;
+        let ours: BTreeSet<&str> =
+            self.channels.iter().flat_map(|channel| &channel.files).map(String::as_str).collect();
+        // A run that was cut short has not made all of its maps; those of the run before stay.
+        let is_whole = !self.lacks_maps();
+        for file in files_of(&before).iter().filter(|file| is_whole && !ours.contains(file.as_str())) {
+            let file = folder.join(file);
+            // A file may be gone already, and a folder may hold other files.
+            let _ = std::fs::remove_file(&file);
+            let _ = file.parent().map(std::fs::remove_dir);
+        }
+        Ok(path)
+    }
+}
+
+/// What a summary says of a group that is mapped.
+#[derive(bincode::Encode, bincode::Decode)]
+pub(in crate::pipeline) struct PassRecord {
+    /// Checksums of its products, in the order in which its channels name them.
+    sums: Vec<u64>,
+    pub(in crate::pipeline) ledger: LedgerReport<VisibilityReason>,
+    pub(in crate::pipeline) channels: Vec<ChannelSummary>,
+    pub(in crate::pipeline) seed: Option<u64>,
+    pub(in crate::pipeline) space_hash: Option<String>,
+}
+
+/// Greatest record that is read: a channel's curves take some 100 kB.
+const RECORD_BYTES_MAX: usize = 1 << 28;
+
+const CODEC: Configuration<LittleEndian, Fixint, Limit<RECORD_BYTES_MAX>> = bincode::config::standard()
+    .with_little_endian()
+    .with_fixed_int_encoding()
+    .with_limit::<RECORD_BYTES_MAX>();
+
+impl PassRecord {
+    /// What `summary` says of a group whose products are in `out`.
+    ///
+    /// # Errors
+    /// A product that cannot be read.
+    pub(in crate::pipeline) fn of(summary: &RunSummary, out: &Path) -> Result<Self, ProductsError> {
+        let sum = |file: &String| {
+            let path = out.join(file);
+            checksum_of(&path).map_err(|source| ProductsError::Read { path, source })
+        };
+        let sums =
+            summary.channels.iter().flat_map(|channel| &channel.files).map(sum).collect::<Result<_, _>>()?;
+        Ok(Self {
+            sums,
+            ledger: summary.ledger.clone(),
+            channels: summary.channels.clone(),
+            seed: summary.seed,
+            space_hash: summary.space_hash.clone(),
+        })
+    }
+
+    /// The record of a group that is mapped by the same settings; `None` if there is none, or if its products are gone or
+    /// are no longer what they were.
+    pub(in crate::pipeline) fn read(path: &Path, key: u64, out: &Path) -> Option<Self> {
+        let bytes = fs::read(path).ok().filter(|bytes| bytes.len() <= RECORD_BYTES_MAX)?;
+        let (body, crc) = bytes.split_last_chunk::<8>()?;
+        let (found, body) = body.split_first_chunk::<8>()?;
+        let sum = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, body);
+        if u64::from_le_bytes(*found) != key || u64::from_le_bytes(*crc) != sum {
+            return None;
+        }
+        let (record, _) = bincode::decode_from_slice::<Self, _>(body, CODEC).ok()?;
+        let mut files = record.channels.iter().flat_map(|channel| &channel.files);
+        let holds = files
+            .by_ref()
+            .zip(&record.sums)
+            .all(|(file, sum)| checksum_of(&out.join(file)).is_ok_and(|found| found == *sum));
+        (holds && files.next().is_none()).then_some(record)
+    }
+
+    pub(in crate::pipeline) fn write(&self, path: &Path, key: u64) -> Result<(), ProductsError> {
+        let failed = |source| ProductsError::Write { path: path.to_owned(), source };
+        let body = bincode::encode_to_vec(self, CODEC)
+            .map_err(|error| ProductsError::Encode { path: path.to_owned(), reason: error.to_string() })?;
+        let crc = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &body);
+        let bytes = [key.to_le_bytes().as_slice(), &body, &crc.to_le_bytes()].concat();
+        write_atomically(path, &bytes).map_err(failed)
+    }
+}
+
+/// Checksum of a file, read piece by piece.
+fn checksum_of(path: &Path) -> std::io::Result<u64> {
+    let mut crc = crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc64Nvme);
+    let mut file = std::io::BufReader::with_capacity(1 << 16, fs::File::open(path)?);
+    loop {
+        let piece = std::io::BufRead::fill_buf(&mut file)?;
+        if piece.is_empty() {
+            return Ok(crc.finalize());
+        }
+        crc.update(piece);
+        let length = piece.len();
+        std::io::BufRead::consume(&mut file, length);
+    }
+}
+
+/// The maps and pictures that a summary names: files in folders of channels, and nothing outside of them.
+fn files_of(summary: &[u8]) -> Vec<String> {
+    #[derive(Default, Deserialize)]
+    #[serde(default)]
+    struct Named {
+        channels: Vec<Files>,
+    }
+    #[derive(Default, Deserialize)]
+    #[serde(default)]
+    struct Files {
+        files: Vec<String>,
+    }
+    let named: Named = serde_json::from_slice(summary).unwrap_or_default();
+    let is_product = |file: &String| {
+        let parts: Vec<&str> = file.split('/').collect();
+        let [folder, name] = parts[..] else { return false };
+        folder.ends_with("MHz") && !name.is_empty() && !folder.contains('\\') && !name.contains('\\')
+    };
+    named.channels.into_iter().flat_map(|channel| channel.files).filter(is_product).collect()
+}
+
+impl fmt::Display for RunSummary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "Stages\n{}\n", self.report)?;
+        writeln!(f, "Ledger of visibilities\n{}\n{}\n", self.ledger, self.completeness)?;
+        if let Some(samples) = &self.samples {
+            writeln!(f, "Samples\n{samples}\n")?;
+        }
+        writeln!(f, "Reception\n{}\n", self.reception)?;
+        if let Some(listening) = &self.listening {
+            writeln!(f, "Senders\n{listening}\n")?;
+        }
+        if let Some(saving) = self.saving.as_ref().filter(|saving| saving.failed > 0) {
+            writeln!(f, "State\n{saving}\n")?;
+        }
+        if let Some(gains) = &self.calibration {
+            writeln!(f, "Gains\n{gains}\n")?;
+        }
+        writeln!(f, "Maps")?;
+        for channel in &self.channels {
+            writeln!(f, "{channel}")?;
+        }
+        if self.lacks_maps() {
+            write!(f, "Ended early, and maps are missing: runtime.grace_s left no time for them.")?;
+        } else if self.cancelled {
+            write!(f, "Ended early: all products hold the data so far.")?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_products_of_channels_are_named() {
+        let summary =
+            br#"{"channels": [{"files": ["3.000MHz/map.fits", "../MHz/x", "/MHz", "3.000MHz/../../x",
+            "3.000MHz", "notes/x.txt"]}, {}], "more": 1}"#;
+        assert_eq!(files_of(summary), ["3.000MHz/map.fits"]);
+        assert!(files_of(b"").is_empty() && files_of(b"[1]").is_empty());
+    }
+}

@@ -1,0 +1,26 @@
+//! Jobs of several graphs that can be resumed: groups of channels, studies, realisations, rounds of calibration, maps of states.
+
+mod bound;
+mod calibrate;
+mod case;
+mod group_steps;
+mod groups;
+mod mission;
+mod noise_maps;
+mod realisations;
+mod simulation_groups;
+mod state;
+mod study;
+mod study_file;
+
+pub use bound::{BoundSummary, bound};
+pub use calibrate::{CalibrateJob, CalibrateProgress, CalibrateWatcher, calibrate, with_gains};
+pub use case::CaseSummary;
+pub use group_steps::{GroupStep, GroupStepWatcher, MapStep};
+pub use groups::{GroupWatcher, channel_groups, replay_in_groups, run_in_groups};
+pub use mission::Mission;
+pub use realisations::{PowerSpread, RealisationSpread};
+pub use simulation_groups::{MERGE, simulate_in_groups};
+pub use state::solve_state;
+pub use study::{StudyStep, StudySummary, StudyWatcher, run_study};
+pub use study_file::{Study, StudyCase, StudyError};

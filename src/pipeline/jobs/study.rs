@@ -1,0 +1,395 @@
+//! Studies: one simulation, many solutions.
+//!
+//! A study runs a pipeline at every combination of some settings. Cases that differ only in the ground segment share the
+//! downlink of one simulation; those that differ only in the solution (epsilon, prior) share the sums of one state.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use super::calibrate::{CalibrateJob, CalibrateProgress, calibrate, with_gains};
+use super::case::{CaseMarker, CaseSummary, MARKER};
+use super::noise_maps::NoiseMaps;
+use super::realisations::{RealisationSpread, SpreadProducts, csv_of, spreads};
+use super::study_file::{Study, StudyCase};
+use crate::calibration::solver::SolverConfig;
+use crate::downlink::{FileSource, Recorder};
+use crate::files::{FolderLock, write_atomically};
+use crate::ground::{Ground, WAIT_BYTES};
+use crate::pipeline::config::{Config, PipelineError};
+use crate::pipeline::graph::run::{replay_knowing, simulate_sky};
+use crate::pipeline::graph::{Destination, Watched, downlink_file, space_segment};
+use crate::products::{
+    Crossing, EpsilonChoices, MapShape, ProductsError, RunFigures, Truth, crossings, draw_epsilons,
+    draw_runs, epsilon_choices, epsilons_csv, runs_csv, spectra_csv,
+};
+use crate::runtime::Cancel;
+use crate::sky::SkyMap;
+
+/// Visibilities between checkpoints of a case's state: a minute's work or more.
+const CHECKPOINT_EVERY: u64 = 20_000_000;
+
+/// What a study is doing for a case.
+#[derive(Clone, Debug)]
+pub enum StudyStep {
+    /// Simulating the downlink that it shares with others, with the handles of the graph.
+    Simulate(Watched),
+    /// Finding the gains of its data.
+    Calibrate(CalibrateProgress),
+    /// Mapping it, with the handles of the graph.
+    Map(Watched),
+    /// Making further realisations of its noise-only map, with the handles of the graph.
+    Realise(Watched),
+}
+
+/// Follows a study: the number of the case, from 0, and what is done for it.
+pub type StudyWatcher<'a> = &'a mut dyn FnMut(usize, StudyStep);
+
+/// Results of a study.
+#[derive(Clone, Debug, Serialize)]
+pub struct StudySummary {
+    /// Its name.
+    pub name: String,
+    /// Whether it was ended early: repeat the command to go on.
+    pub cancelled: bool,
+    /// Its finished cases.
+    pub cases: Vec<CaseSummary>,
+    /// Where the traces cross, for cases that differ in map.epsilon alone.
+    pub crossings: Vec<Crossing>,
+    /// epsilon as several rules choose it, for the same cases, where at least three have traces.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub epsilons: Vec<EpsilonChoices>,
+    /// What realisations scatter by.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub spreads: Vec<RealisationSpread>,
+}
+
+/// What a case is mapped from: data, gains, and sums that it shares with others.
+struct Given<'a> {
+    file: &'a Path,
+    /// That file, unless the state has taken it in.
+    files: &'a [PathBuf],
+    gains: Option<&'a Path>,
+    state: Option<&'a PathBuf>,
+}
+
+/// Where a study stands.
+struct Making<'a> {
+    study: &'a Study,
+    out: &'a Path,
+    cancel: &'a Cancel,
+    watch: StudyWatcher<'a>,
+}
+
+/// Makes the cases of a study that are not in `out` yet, and tables and curves of all.
+///
+/// Leaves in `out`: a folder of products for each case, `study.json`, `study.csv`, `spectra.csv` and `study.png`. The shared
+/// downlinks and states are removed once they are used up, unless `keep`.
+///
+/// # Errors
+/// As [`crate::pipeline::run()`]; tables and pictures that cannot be written.
+pub fn run_study(
+    study: &Study,
+    out: &Path,
+    keep: bool,
+    cancel: &Cancel,
+    watch: StudyWatcher<'_>,
+) -> Result<StudySummary, PipelineError> {
+    let failed = |path: &Path| {
+        let path = path.to_owned();
+        move |source| PipelineError::from(ProductsError::Write { path, source })
+    };
+    fs::create_dir_all(out).map_err(failed(out))?;
+    let _lock = FolderLock::acquire(out, ".lock", true).map_err(failed(out))?;
+    let mut making = Making { study, out, cancel, watch };
+    let pending = |k: &usize| !is_done(&study.cases[*k], out);
+    let mut pending: Vec<usize> = (0..study.cases.len()).filter(pending).collect();
+    let mut is_cut = false;
+    // The first case that is left, and all that share its downlink.
+    while let (Some(&first), false) = (pending.first(), is_cut) {
+        let key = downlink_key(&study.cases[first].plan.config);
+        let (group, rest): (Vec<usize>, Vec<usize>) =
+            pending.iter().partition(|&&k| downlink_key(&study.cases[k].plan.config) == key);
+        let file = out.join(format!("downlink-{key:016x}.{}", extension(&study.cases[first].plan.config)));
+        is_cut = !making.make(&group, &file, keep)?;
+        if !is_cut && !keep {
+            fs::remove_file(&file).map_err(failed(&file))?;
+        }
+        pending = rest;
+    }
+    let summary = summarise(study, out, is_cut)?;
+    write_results(&summary, out)?;
+    Ok(summary)
+}
+
+fn extension(config: &Config) -> &'static str {
+    let name = downlink_file(config.downlink.format);
+    name.rsplit('.').next().unwrap_or("ccsds")
+}
+
+fn is_done(case: &StudyCase, out: &Path) -> bool {
+    let marker = fs::read(out.join(case.folder()).join(MARKER)).ok();
+    let found = marker.and_then(|bytes| serde_json::from_slice::<CaseMarker>(&bytes).ok());
+    found.is_some_and(|found| found == CaseMarker::of(case))
+}
+
+/// A number that cases of equal downlinks share.
+fn downlink_key(config: &Config) -> u64 {
+    let text = serde_json::to_vec(&(config.space_hash(), &config.downlink)).unwrap_or_default();
+    crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
+}
+
+/// A number that cases of equal sums of one downlink share.
+fn sums_key(case: &StudyCase) -> u64 {
+    let config = &case.plan.config;
+    let (map, solver) = (&config.map, case.calibrated.then_some(&config.calibrate));
+    let sums = (map.of_sums(), map.snapshot_every_s, &map.refine, &config.calibration, solver);
+    // Alternation with the map depends on how the map is solved for.
+    let solution = solver.filter(|solver| solver.map_rounds > 0).map(|_| map);
+    let text = serde_json::to_vec(&(sums, solution));
+    let text = text.unwrap_or_default();
+    crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
+}
+
+/// The truth for the last shape of maps, as neighbouring cases have the same.
+struct LastTruth {
+    shape: MapShape,
+    truth: Truth,
+}
+
+impl Making<'_> {
+    /// Makes the cases of one downlink; whether all of them were made.
+    fn make(&mut self, group: &[usize], file: &Path, keep: bool) -> Result<bool, PipelineError> {
+        let cases = &self.study.cases;
+        let plan = &cases[group[0]].plan;
+        let skies = space_segment::skies(plan)?;
+        if !file.exists() {
+            let recorder = Some(Recorder::create(file)?);
+            let watch = &mut self.watch;
+            let report = simulate_sky(
+                plan,
+                &skies,
+                (Destination::from(&file), recorder),
+                self.cancel,
+                &mut |watched| {
+                    watch(group[0], StudyStep::Simulate(watched));
+                },
+            )?;
+            if report.cancelled {
+                // What was simulated is less than the mission.
+                let _ = fs::remove_file(file);
+                return Ok(false);
+            }
+        }
+        let mut left = group.to_vec();
+        let mut last = None;
+        while let Some(&first) = left.first() {
+            let key = sums_key(&cases[first]);
+            let (same, rest): (Vec<usize>, Vec<usize>) =
+                left.iter().partition(|&&k| sums_key(&cases[k]) == key);
+            let state = self.out.join(format!("state-{key:016x}"));
+            // Snapshots need the data to arrive.
+            let map = &cases[first].plan.config.map;
+            let is_shared = same.len() > 1 && map.snapshot_every_s == 0.0;
+            let gains = if cases[first].calibrated {
+                let Some(gains) = self.calibrate(first, file)? else { return Ok(false) };
+                Some(gains)
+            } else {
+                None
+            };
+            for (number, &k) in same.iter().enumerate() {
+                // The state has taken the file in once its first case is made.
+                let files = if number == 0 || !is_shared { &[file.to_owned()][..] } else { &[] };
+                let given =
+                    Given { file, files, gains: gains.as_deref(), state: is_shared.then_some(&state) };
+                if !self.map(k, given, &skies, &mut last)? {
+                    return Ok(false);
+                }
+            }
+            if !keep && state.exists() {
+                fs::remove_dir_all(&state)
+                    .map_err(|source| ProductsError::Write { path: state.clone(), source })?;
+            }
+            left = rest;
+        }
+        Ok(true)
+    }
+
+    /// Finds the gains of a downlink with the settings of a case, in a folder within that of its products; `None` if it was
+    /// ended early.
+    fn calibrate(&mut self, number: usize, file: &Path) -> Result<Option<PathBuf>, PipelineError> {
+        let case = &self.study.cases[number];
+        let folder = self.out.join(case.folder());
+        fs::create_dir_all(&folder)
+            .map_err(|source| ProductsError::Write { path: folder.clone(), source })?;
+        let out = folder.join("calibration");
+        let watch = &mut self.watch;
+        let job = CalibrateJob {
+            config: &case.plan.config,
+            files: &[file.to_owned()],
+            models: self.study.models.clone(),
+            model_files: &self.study.model_files,
+            out: &out,
+            watch: &mut |progress| watch(number, StudyStep::Calibrate(progress)),
+        };
+        let summary = calibrate(job, self.cancel)?;
+        Ok((!summary.cancelled).then(|| out.join("gains.json")))
+    }
+
+    /// Maps a case; whether it was finished.
+    fn map(
+        &mut self,
+        number: usize,
+        given: Given<'_>,
+        skies: &[SkyMap],
+        last: &mut Option<LastTruth>,
+    ) -> Result<bool, PipelineError> {
+        let Given { file, files, gains, state } = given;
+        let case = &self.study.cases[number];
+        let with_gains = gains.map(|gains| with_gains(&case.plan.config, gains.to_owned()));
+        let config = with_gains.as_ref().unwrap_or(&case.plan.config);
+        let folder = self.out.join(case.folder());
+        let shape = config.map_shape();
+        let truth = match last.take() {
+            Some(known) if known.shape == shape => known.truth,
+            _ => Truth::new(skies, shape)?,
+        };
+        *last = Some(LastTruth { shape, truth: truth.clone() });
+        let settings = config.ground(WAIT_BYTES);
+        let ground = match state {
+            Some(state) => Ground::open(state, &settings, CHECKPOINT_EVERY)?,
+            None => Ground::new(&settings)?,
+        };
+        let source = FileSource::open(files)?;
+        let watch = &mut self.watch;
+        let summary = replay_knowing(truth, source, config, ground, &folder, self.cancel, &mut |watched| {
+            watch(number, StudyStep::Map(watched));
+        })?;
+        if summary.cancelled || !self.map_noises(number, config, file)? {
+            return Ok(false);
+        }
+        let path = folder.join(MARKER);
+        let text = serde_json::to_vec_pretty(&CaseMarker::of(case)).unwrap_or_default();
+        write_atomically(&path, &text).map_err(|source| ProductsError::Write { path, source })?;
+        Ok(true)
+    }
+}
+
+impl Making<'_> {
+    /// Makes the further realisations of a case's noise-only map; whether all of them were made.
+    fn map_noises(&mut self, number: usize, config: &Config, file: &Path) -> Result<bool, PipelineError> {
+        let case = &self.study.cases[number];
+        let out = self.out.join(case.folder());
+        let maps = NoiseMaps { config, file, out: &out, seeds: &case.noise_seeds };
+        let watch = &mut self.watch;
+        maps.make(self.cancel, &mut |watched| watch(number, StudyStep::Realise(watched)))
+    }
+}
+
+fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary, PipelineError> {
+    let mut cases = Vec::new();
+    let mut groups: Vec<(Vec<u8>, Vec<usize>)> = Vec::new();
+    let done: Vec<&StudyCase> = study.cases.iter().filter(|case| is_done(case, out)).collect();
+    for case in &done {
+        let mut figures = RunFigures::read(&out.join(case.folder()))?;
+        figures.label = case.label();
+        let mut config = case.plan.config.clone();
+        config.map.epsilon = crate::imaging::MapConfig::default().epsilon;
+        let key = serde_json::to_vec(&(config, case.calibrated)).unwrap_or_default();
+        match groups.iter_mut().find(|(found, _)| *found == key) {
+            Some((_, members)) => members.push(cases.len()),
+            None => groups.push((key, vec![cases.len()])),
+        }
+        let (folder, realisations) = (case.folder(), 1 + case.noise_seeds.len());
+        cases.push(CaseSummary { folder, overrides: case.overrides.clone(), realisations, figures });
+    }
+    let groups: Vec<Vec<&RunFigures>> = groups
+        .into_iter()
+        .map(|(_, members)| members.into_iter().map(|k| &cases[k].figures).collect())
+        .collect();
+    let (crossings, epsilons) = (crossings(&groups), epsilon_choices(&groups));
+    note_power_kept(&done, &mut cases);
+    let products = SpreadProducts { covariance_at_deg: &study.covariance_at_deg, folder: out };
+    let spreads =
+        if study.realisations > 1 { spreads(&realised(study, &cases), products)? } else { Vec::new() };
+    Ok(StudySummary { name: study.name.clone(), cancelled, cases, crossings, epsilons, spreads })
+}
+
+/// Compares each case of a study of the instrument's errors with the one that has none of them and is not calibrated.
+fn note_power_kept(done: &[&StudyCase], cases: &mut [CaseSummary]) {
+    let ideal_of = |case: &StudyCase| {
+        let mut config = case.plan.config.without_errors();
+        config.calibrate = SolverConfig::default();
+        serde_json::to_value(&config).unwrap_or_default()
+    };
+    let has_errors = |case: &StudyCase| {
+        let config = &case.plan.config;
+        let ideal = config.without_errors();
+        case.calibrated || (&config.instrument, &config.navigation) != (&ideal.instrument, &ideal.navigation)
+    };
+    if !done.iter().any(|case| has_errors(case)) {
+        return;
+    }
+    let ideals: Vec<(serde_json::Value, RunFigures)> = done
+        .iter()
+        .zip(cases.iter())
+        .filter(|(case, _)| !has_errors(case))
+        .map(|(case, summary)| (ideal_of(case), summary.figures.clone()))
+        .collect();
+    for (case, summary) in done.iter().zip(cases) {
+        let key = ideal_of(case);
+        if let Some((_, ideal)) = ideals.iter().find(|(found, _)| *found == key) {
+            summary.figures.against_ideal(ideal);
+        }
+    }
+}
+
+/// Cases that differ in their realisation alone, with what they have in common.
+fn realised<'a>(study: &Study, cases: &'a [CaseSummary]) -> Vec<(String, Vec<&'a CaseSummary>)> {
+    let families = study.cases.chunk_by(|a, b| a.family == b.family);
+    families
+        .map(|members| {
+            let folders: BTreeSet<String> = members.iter().map(StudyCase::folder).collect();
+            let label = members[0].labels.split_last().map(|(_, common)| common.join(", "));
+            let done = cases.iter().filter(|case| folders.contains(&case.folder));
+            (label.unwrap_or_default(), done.collect())
+        })
+        .collect()
+}
+
+fn write_results(summary: &StudySummary, out: &Path) -> Result<(), PipelineError> {
+    let runs: Vec<&RunFigures> = summary.cases.iter().map(|case| &case.figures).collect();
+    let json = serde_json::to_vec_pretty(summary)
+        .map_err(|error| ProductsError::Encode { path: out.join("study.json"), reason: error.to_string() })?;
+    for (name, bytes) in [
+        ("study.json", json),
+        ("study.csv", runs_csv(&runs).into_bytes()),
+        ("spectra.csv", spectra_csv(&runs).into_bytes()),
+        ("realisations.csv", if_any(&summary.spreads, csv_of)),
+        ("epsilons.csv", if_any(&summary.epsilons, epsilons_csv)),
+    ] {
+        if bytes.is_empty() {
+            continue;
+        }
+        let path = out.join(name);
+        write_atomically(&path, &bytes).map_err(|source| ProductsError::Write { path, source })?;
+    }
+    let picture = draw_runs(&summary.name, &runs).map_err(ProductsError::from)?;
+    for name in ["study.png", "study.svg"] {
+        picture.write(&out.join(name)).map_err(ProductsError::from)?;
+    }
+    if !summary.epsilons.is_empty() {
+        let picture = draw_epsilons(&summary.name, &summary.epsilons).map_err(ProductsError::from)?;
+        for name in ["epsilons.png", "epsilons.svg"] {
+            picture.write(&out.join(name)).map_err(ProductsError::from)?;
+        }
+    }
+    Ok(())
+}
+
+/// A table of something; empty of nothing.
+fn if_any<T>(of: &[T], table: impl Fn(&[T]) -> String) -> Vec<u8> {
+    if of.is_empty() { Vec::new() } else { table(of).into_bytes() }
+}
