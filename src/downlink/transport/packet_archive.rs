@@ -701,7 +701,7 @@ mod tests {
             archive.mark(1 + count, 0, &[count, 1 + count]).unwrap();
         }
         let archive = PacketArchive::open(place.path(), 1).unwrap();
-        assert_eq!(archive.report().is_whole, false);
+        assert!(!archive.report().is_whole);
         let left = all_of(place.path());
         // Checkpoint 2 holds the first, checkpoint 3 the first two: only the first may go.
         assert_eq!((left.0, left.1.first_segment), (packets(1..3), 2));

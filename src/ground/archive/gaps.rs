@@ -347,8 +347,10 @@ mod tests {
         let apart = [0..1, 1..2];
         assert_eq!(apart.each_ref().map(|gap| shares_of(gap, &apart, &(0..2), 1)), [[0.5], [0.5]]);
         // Five packets of one hole, of which nothing is between: all of it, once.
-        assert_eq!(shares_of(&(3..8), &[3..8], &(3..8), 2), [1.0, 1.0]);
-        assert!(shares_of(&(3..8), &[3..8], &(3..8), 0).is_empty());
+        let hole = 3..8;
+        let whole = std::slice::from_ref(&hole);
+        assert_eq!(shares_of(&hole, whole, &hole, 2), [1.0, 1.0]);
+        assert!(shares_of(&hole, whole, &hole, 0).is_empty());
     }
 
     /// Six passes of two channels and three pairs; channel 1 sends three packets a pass and pair, channel 0 one.
