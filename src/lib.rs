@@ -12,7 +12,7 @@
 //! let summary = Mission::dsl()
 //!     .channels(&[3e6])
 //!     .nside(4)
-//!     .set("spacecraft.every_nth_window", 300) // Seconds instead of minutes: pipelines/reference.toml has all keys.
+//!     .set("spacecraft.every_nth_integration", 15) // Seconds instead of minutes: pipelines/reference.toml has all keys.
 //!     .set("spacecraft.baseline_wavelengths_max", 16)
 //!     .out(out)
 //!     .run()?;

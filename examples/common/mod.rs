@@ -11,8 +11,8 @@ pub fn small_mission() -> Mission {
         .channels(&[3e6, 10e6])
         .nside(4)
         .set("sky.nside", 8)
-        .set("spacecraft.every_nth_window", 400)
-        .set("spacecraft.every_nth_integration", 4)
+        .set("spacecraft.every_nth_window", 41)
+        .set("spacecraft.every_nth_integration", 40)
         .set("spacecraft.baseline_wavelengths_max", 16)
         .set("map.epsilon", 1e-4)
 }

@@ -252,8 +252,6 @@ impl ArrayConfig {
             checks.number(key, value, inside, "above 0 and at most 1e8 m, beyond which the Earth takes over");
         }
         for (key, value) in [
-            ("precession_period_s", self.precession_period_s),
-            ("breathing.period_s", breathing.period_s),
             ("breathing.first_spacing_m_min", breathing.first_spacing_m_min),
             ("breathing.second_spacing_m_min", breathing.second_spacing_m_min),
         ] {
@@ -263,6 +261,11 @@ impl ArrayConfig {
             [("breathing.first_ratio", breathing.first_ratio), ("breathing.ratio", breathing.ratio)]
         {
             checks.number(key, value, value >= 1.0, "a number of at least 1");
+        }
+        for (key, period) in
+            [("precession_period_s", self.precession_period_s), ("breathing.period_s", breathing.period_s)]
+        {
+            checks.number(key, period, period >= 1e3, "at least 1000 s");
         }
         let period = self.orbital_period_s;
         // Bounds the number of windows in the longest mission to a million.

@@ -5,7 +5,11 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::CalibrationError;
+use crate::files::read_text;
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES, shortened};
+
+/// Longest file, bytes: gains of all channels in a month of passes take some megabytes.
+const BYTES_MAX: u64 = 1 << 30;
 
 /// Longest line of a message that is repeated whole, characters.
 const LINE_CHARS: usize = 300;
@@ -96,7 +100,7 @@ impl GainsFile {
     /// # Errors
     /// [`CalibrationError::Read`] and [`CalibrationError::Syntax`].
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
-        let text = std::fs::read_to_string(path)
+        let text = read_text(path, BYTES_MAX)
             .map_err(|source| CalibrationError::Read { path: path.to_owned(), source })?;
         let parsed = if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json")) {
             serde_json::from_str(&text).map_err(message)

@@ -12,9 +12,9 @@ use crate::imaging::circle::L_MAX;
 use crate::imaging::{AccumulationError, PixelEngine};
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
-use crate::sky::Frame;
 use crate::sky::fits::check_frequencies;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
+use crate::sky::{Frame, TEMPERATURE_K_MAX};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::{ChannelId, Checks, InvalidValue, PerChannel};
 
@@ -251,9 +251,11 @@ impl MapConfig {
         let channels = self.channels_max;
         checks.require("channels_max", channels, (1..=4096).contains(&channels), "1 to 4096");
         let longest = self.baseline_bp_max;
-        checks.number("baseline_bp_max", longest, longest > 0.0, "a positive number, in units of b_p");
+        let expected = "above 0 and at most 1e12, in units of b_p";
+        checks.number("baseline_bp_max", longest, longest > 0.0 && longest <= 1e12, expected);
         checks.numbers("epsilon", self.epsilon.values(), |e| e > 0.0 && e <= 1.0, "above 0 and at most 1");
-        checks.numbers("prior_k", self.prior_k.values(), |k| k >= 0.0, "K, not negative");
+        let is_temperature = |k| (0.0..=TEMPERATURE_K_MAX).contains(&k);
+        checks.numbers("prior_k", self.prior_k.values(), is_temperature, "0 to 1e16 K");
         let fwhm = self.prior_fwhm_deg;
         checks.number("prior_fwhm_deg", fwhm, (0.0..=180.0).contains(&fwhm), "0 to 180");
         let share = self.moon_reflection;

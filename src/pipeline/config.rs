@@ -63,9 +63,7 @@ impl Config {
         let mut found = Problems::default();
         found.extend(self.sky.problems(channels));
         let mut checks = Checks::of("");
-        let bad = |c: char| c.is_control() || c == '/' || c == '\\';
-        let is_folder =
-            !(self.name.len() > 60 || self.name.contains(bad) || [".", ".."].contains(&self.name.as_str()));
+        let is_folder = is_folder_name(&self.name);
         let expected = "at most 60 bytes, without slashes and control characters";
         checks.require("name", format!("{:?}", self.name), is_folder, expected);
         let (space, ground) = (self.spacecraft.sub_bands, self.calibration.sub_bands);
@@ -277,9 +275,19 @@ impl Config {
     }
 }
 
+/// Whether a name stays within the folder that it is joined to; an empty one is that folder.
+pub(super) fn is_folder_name(name: &str) -> bool {
+    let bad = |c: char| c.is_control() || c == '/' || c == '\\';
+    !(name.len() > 60 || name.contains(bad) || [".", ".."].contains(&name))
+}
+
 /// Replaces the path of a file in a hash: a checksum of its content, or its name if it cannot be read. Such a file ends the
 /// run when it is needed.
 fn contents(path: &Path) -> PathBuf {
+    // Devices and pipes may never end.
+    if !path.is_file() {
+        return path.to_owned();
+    }
     let sum = crc_fast::checksum_file(crc_fast::CrcAlgorithm::Crc64Nvme, &path.to_string_lossy(), None);
     sum.map_or_else(|_| path.to_owned(), |sum| PathBuf::from(format!("{sum:016x}")))
 }

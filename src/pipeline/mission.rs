@@ -27,7 +27,7 @@ use crate::runtime::{Cancel, Report};
 /// let summary = Mission::dsl()
 ///     .channels(&[3e6])
 ///     .nside(4)
-///     .set("spacecraft.every_nth_window", 300)
+///     .set("spacecraft.every_nth_integration", 15)
 ///     .set("spacecraft.baseline_wavelengths_max", 16)
 ///     .out(out)
 ///     .run()?;
@@ -121,7 +121,7 @@ impl Mission {
     /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
     /// # let folder = tempfile::tempdir()?;
     /// let file = folder.path().join("mission.ccsds");
-    /// let mission = Mission::dsl().channels(&[3e6]).nside(4).set("spacecraft.every_nth_window", 600).out(folder.path());
+    /// let mission = Mission::dsl().channels(&[3e6]).nside(4).set("spacecraft.every_nth_integration", 30).out(folder.path());
     /// mission.simulate(&file)?;
     /// // The ground makes the maps of the bytes alone.
     /// let summary = mission.replay(&[file])?;

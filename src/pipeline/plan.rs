@@ -8,6 +8,7 @@ use crate::array::Array;
 use crate::daughters::{AntennaErrors, DaughtersConfig, InstrumentErrors, truth_csv};
 use crate::frames::{Instrument, ObservingWindow};
 use crate::mother::{Fidelity, Observer, Schedule, SpacecraftConfig};
+use crate::sky::fits::SkyChannel;
 use crate::units::{ChannelId, MissionTime, all_pairs};
 
 /// A configuration that has been checked, with what follows from it.
@@ -47,12 +48,11 @@ impl Plan {
             noiseless: !spacecraft.thermal_noise,
         };
         let schedules = spacecraft.schedules();
-        let mut windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.every_nth_window);
+        let mut windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.window_thinning());
         if windows.is_empty() {
             return Err(PipelineError::NoWindow {
                 duration_s: spacecraft.duration_s,
                 orbit_s: config.array.orbital_period_s,
-                every_nth: spacecraft.every_nth_window,
             });
         }
         if spacecraft.window_s_max > 0.0 {
@@ -62,6 +62,18 @@ impl Plan {
             }
         }
         Ok(Self { config, array, instrument, schedules, windows })
+    }
+
+    /// The channel for which a sky is read.
+    #[must_use]
+    pub(super) fn sky_channel(&self, channel: usize) -> SkyChannel {
+        let Config { sky, spacecraft, .. } = &self.config;
+        let channels = spacecraft.channels_hz.len();
+        SkyChannel {
+            frequency_hz: spacecraft.channels_hz[channel],
+            may_be_dark: spacecraft.receiver_k_sr()[channel] > 0.0,
+            shares_file: channels > 1 && sky.file.as_ref().is_some_and(|files| files.values().len() == 1),
+        }
     }
 
     /// Rate that the daughters' samples need on their links, bit/s; `None` without samples.

@@ -38,6 +38,6 @@ pub use frame::Frame;
 pub use frame::{Rotation, rotate};
 pub use map::SkyMap;
 #[doc(hidden)]
-pub use map::is_unseen;
+pub use map::{TEMPERATURE_K_MAX, is_unseen};
 #[doc(hidden)]
 pub use rotation::Bilinear;

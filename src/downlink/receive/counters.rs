@@ -128,7 +128,7 @@ impl FaultCounts {
 pub struct ReceptionCounters {
     /// Counters of coded frames, if packets came in such. All other counters are of recovered packets.
     pub frames: Option<FrameCounters>,
-    /// Bytes received; for coded frames, recovered packet bytes.
+    /// Bytes received, without idle packets; for coded frames, recovered packet bytes.
     pub bytes: u64,
     /// Bytes that belong to no packet.
     pub bytes_garbage: u64,
