@@ -15,7 +15,7 @@ LONGER = {**SMALL, "spacecraft.every_nth_window": 4, "spacecraft.every_nth_integ
 
 RUN = f"""
 import sys, lunarray
-lunarray.run(set={LONGER!r}, out=sys.argv[1], progress={{}})
+lunarray.run(set={LONGER!r}, out=sys.argv[1], progress=PROGRESS)
 """
 
 
@@ -24,7 +24,7 @@ def shown_in_a_terminal(folder, progress):
     import pty
 
     ours, theirs = pty.openpty()
-    command = [sys.executable, "-W", "ignore", "-c", RUN.format(progress), folder]
+    command = [sys.executable, "-W", "ignore", "-c", RUN.replace("PROGRESS", str(progress)), folder]
     with subprocess.Popen(command, stderr=theirs, stdout=subprocess.DEVNULL) as process:
         os.close(theirs)
         shown = b""
@@ -52,7 +52,7 @@ def test_a_terminal_shows_a_line_and_takes_it_away(tmp_path):
 
 
 def test_what_is_no_terminal_is_shown_nothing(tmp_path):
-    command = [sys.executable, "-W", "ignore", "-c", RUN.format(None), tmp_path]
+    command = [sys.executable, "-W", "ignore", "-c", RUN.replace("PROGRESS", "None"), tmp_path]
     told = subprocess.run(command, capture_output=True, text=True)
     assert (told.returncode, told.stdout, told.stderr) == (0, "", "")
 
