@@ -54,14 +54,15 @@ class Array:
         return [(i, j) for i in range(1, self.satellites + 1) for j in range(i + 1, self.satellites + 1)]
 
     def positions(self, t: ArrayLike) -> NDArray[np.float64]:
-        """Positions at a time or times, s: shape ``t.shape + (satellites, 3)``, m; NaN where unknown."""
+        """Positions at a time or times, s: shape ``t.shape + (satellites, 3)``, m. A time at which they are not known is an error."""
         times = np.asarray(t, dtype=float)
         return self._native.positions(times.ravel()).reshape(*times.shape, self.satellites, 3)
 
     def geometry(self, t: float, frequency_hz: float | str = 10e6) -> dict[str, Any]:
         """Everything at a time, s, as ``lunarray geometry --json`` prints it: positions, baselines r_i - r_j by pair and their
-        lengths, m; and for an array of a pipeline whether it observes (the Moon hides the Earth), the direction of the Earth, and
-        the integration time of each pair at a frequency, s."""
+        lengths, m; and for an array of a pipeline whether it observes (the Moon hides the Earth), the direction of the Earth and of
+        the Sun (None where the mission's Earth is an idealised one, without dates), and the integration time of each pair at a
+        frequency, s."""
         places = self.positions(float(t))
         first, second = (np.array(part) - 1 for part in zip(*self.pairs))
         baselines = places[first] - places[second]
@@ -73,8 +74,9 @@ class Array:
             "lengths_m": np.linalg.norm(baselines, axis=1),
         }
         if isinstance(self._native, _native.NativeArray):
-            observing, earth = self._native.earth(float(t))
+            observing, earth, sun = self._native.earth(float(t))
             found["observing"], found["earth_hat"] = observing, np.array(earth)
+            found["sun_hat"] = None if sun is None else np.array(sun)
             found["dt_s"] = np.array(
                 [self._native.integration_s(float(t), i - 1, j - 1, hertz(frequency_hz)) for i, j in self.pairs]
             )

@@ -7,8 +7,8 @@ use thiserror::Error;
 
 use super::kepler::KeplerElements;
 use super::propagate::PropagateConfig;
-use crate::units::calendar::epoch_s;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
+use crate::units::time_scales::{Tai, TimeScale, utc_text};
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES};
 
 /// Sense of the precession of the ascending node.
@@ -53,16 +53,18 @@ pub struct ArrayConfig {
     /// Greatest distance of each daughter from daughter 1 across the track, in units of that along it: their planes are
     /// inclined to each other by that much.
     pub cross_track_ratio: f64,
-    /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch, degrees.
+    /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch, degrees: of the idealised Earth on a circle in the ecliptic,
+    /// which missions without `oem` have.
     pub earth_longitude_deg: f64,
     /// Arcs by which daughter 2 and those after it trail daughter 1 at their greatest, m, in ascending order; empty for
     /// those that `breathing` describes.
     pub arcs_m: Vec<f64>,
     /// Orbits of their own, one a satellite, in place of the circle and its formation; empty for the circle.
     pub kepler: Vec<KeplerElements>,
-    /// Orbits from CCSDS OEM files (KVN), one a satellite, in place of the circle and its formation; empty for the circle.
+    /// Orbits from CCSDS OEM files (KVN or XML, also compressed by gzip), one a satellite, in place of the circle and its formation;
+    /// empty for the circle. Their dates give the mission's epoch, and where the Earth is.
     pub oem: Vec<PathBuf>,
-    /// Epoch of the mission in the files' time system, such as 2030-01-31T12:00:00; empty for the latest of their first epochs.
+    /// Epoch of the mission in the files' time system, such as 2030-01-31T12:00:00; empty for the latest of their first useable times.
     pub oem_epoch: String,
     /// Orbits by numerical integration, from the state of the formation, or of `kepler`, at the epoch.
     #[serde(skip_serializing_if = "PropagateConfig::is_default")]
@@ -159,6 +161,19 @@ pub enum ArrayError {
         /// What was found there, and what was expected.
         what: String,
     },
+    /// A time at which positions are not known.
+    #[error(
+        "t = {t_s} s: expected a time at which positions are known, {:.3} s to {:.3} s after the mission's epoch{}", known_s[0],
+        known_s[1], epoch_said(*epoch_tai_s)
+    )]
+    NotKnown {
+        /// The time, s after the mission's epoch.
+        t_s: f64,
+        /// First and last that are known, s.
+        known_s: [f64; 2],
+        /// The epoch, if the orbits have dates: TAI seconds since 1958.
+        epoch_tai_s: Option<f64>,
+    },
     /// A propagated satellite that does not stay in orbit.
     #[error(
         "array.propagate: satellite {satellite} is {:.1} km from the Moon's centre after {day:.2} days; expected orbits above \
@@ -213,6 +228,11 @@ pub enum ArrayError {
     },
 }
 
+fn epoch_said(epoch_tai_s: Option<f64>) -> String {
+    let said = |tai_s| format!(", which is {} UTC", utc_text(tai_s));
+    epoch_tai_s.map(said).unwrap_or_default()
+}
+
 /// Greatest radius or altitude that is accepted, m: the Moon's sphere of influence has 6.6e7 m.
 const ORBIT_M_MAX: f64 = 1e8;
 
@@ -229,9 +249,20 @@ impl ArrayConfig {
         !self.has_own_orbits() && self.eccentricity == 0.0 && self.cross_track_ratio == 0.0
     }
 
-    /// Epoch of the mission in the seconds of OEM files, if it is given.
-    pub(super) fn oem_epoch_s(&self) -> Option<f64> {
-        epoch_s(&self.oem_epoch)
+    /// What the dates of files give, and other keys do not.
+    fn check_dates(&self, checks: &mut Checks) {
+        let epoch = &self.oem_epoch;
+        // A second 60 is for the files' time system to judge.
+        let is_date = |scale| Tai::read(epoch, scale).is_some();
+        let good = epoch.is_empty() || is_date(TimeScale::Tai) || is_date(TimeScale::Utc);
+        let expected = "an epoch such as 2030-01-31T12:00:00, or nothing";
+        checks.require("oem_epoch", format_args!("{epoch:?}"), good, expected);
+        let idle = epoch.is_empty() || !self.oem.is_empty();
+        let expected = "nothing without array.oem: it is a date of its files";
+        checks.require("oem_epoch", format_args!("{epoch:?}"), idle, expected);
+        let idle = self.oem.is_empty() || self.earth_longitude_deg == 0.0;
+        let expected = "nothing with array.oem: the dates of the files say where the Earth is";
+        checks.number("earth_longitude_deg", self.earth_longitude_deg, idle, expected);
     }
 
     /// Everything that is wrong with the configuration; empty if it is good.
@@ -316,14 +347,7 @@ impl ArrayConfig {
             one,
             "none where array.propagate.days is given",
         );
-        let epoch = &self.oem_epoch;
-        let good = epoch.is_empty() || epoch_s(epoch).is_some();
-        checks.require(
-            "oem_epoch",
-            format_args!("{epoch:?}"),
-            good,
-            "an epoch such as 2030-01-31T12:00:00, or nothing",
-        );
+        self.check_dates(&mut checks);
         for (key, value) in [
             ("orbital_phase_deg", self.orbital_phase_deg),
             ("node_longitude_deg", self.node_longitude_deg),

@@ -6,6 +6,7 @@
 //! pole.
 
 mod baseline;
+mod bodies;
 mod config;
 mod ephemeris;
 mod export;
@@ -22,9 +23,10 @@ mod track;
 mod windows;
 
 pub use baseline::scaled_baseline;
+pub use bodies::{EarthModel, earth_is_hidden_by_date};
 pub use config::{ArrayConfig, ArrayError, BreathingConfig, NodeMotion, Spacing};
 pub use ephemeris::{Ephemeris, Insertion, segments_for};
-pub use export::{OemExport, tai_s_of};
+pub use export::OemExport;
 pub use formation::{Formation, Progression};
 pub use integration::{IntegrationRule, integration_time_s};
 pub use interpolation::interpolation_error_m;

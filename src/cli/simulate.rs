@@ -74,6 +74,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let config = args.pipeline.load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
+    print_notes(plan.array.notes());
     print_notes(sky_notes(&plan)?);
     use_threads(&plan.config.runtime)?;
     if let (Some(size), Some(out)) = (args.groups, &args.out) {

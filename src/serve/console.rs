@@ -13,7 +13,7 @@ use super::pulse::{Pulse, whole_run};
 use super::shelf::Shelf;
 use super::status::{ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, stages_of};
 use super::subject::Subject;
-use crate::array::Array;
+use crate::array::EarthModel;
 use crate::ground::{GroundOutcome, HitsMap, PassLine, PowerWaterfall, SavingReport, UvwDensity};
 use crate::pipeline::Watched;
 use crate::products::{MapViewer, PublishedMap};
@@ -75,7 +75,7 @@ pub(super) struct Console {
     /// Folder of the state, if there is one.
     pub(super) state: Option<PathBuf>,
     /// Says where the Earth is.
-    model: Option<Array>,
+    earth: EarthModel,
     pub(super) started: Instant,
     pub(super) shelf: Arc<Shelf>,
     pub(super) log: Arc<EventLog>,
@@ -87,13 +87,13 @@ pub(super) struct Console {
 
 impl Console {
     pub(super) fn new(subject: Subject) -> Self {
-        let Subject { name, segment, config, state, model } = subject;
+        let Subject { name, segment, config, state, earth } = subject;
         Self {
             name,
             segment,
             config: config.into(),
             state,
-            model,
+            earth,
             started: Instant::now(),
             shelf: Arc::default(),
             log: Arc::default(),
@@ -174,7 +174,7 @@ impl Console {
     /// Where everything is; `None` before there are data with positions.
     pub(super) fn geometry(&self) -> Option<Geometry> {
         let now = self.ground()?.lookout.array()?;
-        Some(Geometry::of(&now, self.model.as_ref()))
+        Some(Geometry::of(&now, self.earth))
     }
 
     /// Baselines of a channel; `None` if it has none.

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::array::{Array, ArrayConfig};
+use crate::array::EarthModel;
 use crate::pipeline::Config;
 
 /// What the server tells about.
@@ -17,7 +17,7 @@ pub struct Subject {
     /// Folder of the state, if there is one.
     pub state: Option<PathBuf>,
     /// Says where the Earth is.
-    pub model: Option<Array>,
+    pub earth: EarthModel,
 }
 
 impl Subject {
@@ -26,9 +26,7 @@ impl Subject {
     pub fn new(config: &Config, segment: &'static str, state: Option<&Path>) -> Self {
         // A configuration that was read can be written.
         let text = serde_json::to_vec(config).unwrap_or_default();
-        // Nothing but the Earth is asked of it; the orbits come down.
-        let earth_longitude_deg = config.array.earth_longitude_deg;
-        let model = Array::new(&ArrayConfig { earth_longitude_deg, ..ArrayConfig::default() }).ok();
-        Self { name: config.name.clone(), segment, config: text, state: state.map(Path::to_owned), model }
+        let earth = EarthModel::of(&config.array);
+        Self { name: config.name.clone(), segment, config: text, state: state.map(Path::to_owned), earth }
     }
 }

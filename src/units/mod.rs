@@ -16,6 +16,7 @@ mod random;
 mod reason;
 mod text;
 mod time;
+pub mod time_scales;
 pub mod vector;
 
 pub use checks::{Checks, InvalidValue};
