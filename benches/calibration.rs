@@ -6,8 +6,6 @@
 use std::f64::consts::TAU;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use lunarray::accumulation::NormalEngine;
-use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup};
 use lunarray::array::{Array, ArrayConfig, Ephemeris, ObservingWindows, segments_for};
 use lunarray::calibration::solver::{
     CalibrationMode, GainState, KnownSignal, Offsets, PassBlocks, PassSolver, SkyModel, SolverConfig,
@@ -15,6 +13,8 @@ use lunarray::calibration::solver::{
 use lunarray::frames::{
     AntennaResponse, Channel, Flags, Instrument, ObservingWindow, PlacedVisibilities, VisibilityBlock,
 };
+use lunarray::imaging::NormalEngine;
+use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup};
 use lunarray::response::harmonic::{GeometryLimits, NominalOrbit};
 use lunarray::sky::{Frame, SkyMap};
 use lunarray::units::constants::SPEED_OF_LIGHT_M_S;

@@ -6,7 +6,7 @@
 
 use std::time::Instant;
 
-use lunarray::accumulation::{ColumnBlock, SymmetricTiles};
+use lunarray::imaging::{ColumnBlock, SymmetricTiles};
 use lunarray::pipeline::{ConfigSource, Plan, run};
 use lunarray::runtime::Cancel;
 use lunarray::sky::healpix::pixel_count;

@@ -9,11 +9,11 @@ use std::time::Instant;
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor::{cholesky_in_place, cholesky_in_place_scratch};
 use faer::{MatMut, Par};
-use lunarray::accumulation::{NormalEngine, PixelEngine, PixelSetup, SymmetricTiles};
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::imaging::Cholesky;
+use lunarray::imaging::{NormalEngine, PixelEngine, PixelSetup, SymmetricTiles};
 use lunarray::response::pixel::PixelMethod;
-use lunarray::solve::Cholesky;
 use lunarray::units::Pair;
 use num_complex::Complex64;
 

@@ -11,7 +11,6 @@ use std::marker::PhantomData;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use lunarray::accumulation::{EngineKind, MapConfig};
 use lunarray::array::{Array, ArrayConfig, Ephemeris, segments_for};
 use lunarray::calibration::{CalibrationConfig, Calibrator, MissingPackets};
 use lunarray::downlink::receive::cadu::CaduReceiver;
@@ -21,6 +20,7 @@ use lunarray::frames::{
     AntennaResponse, Channel, Flags, GroundFrame, Instrument, PlacedFrame, VisibilityBlock,
 };
 use lunarray::ground::{Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
+use lunarray::imaging::{EngineKind, MapConfig};
 use lunarray::runtime::{Cancel, Graph, Ledger, Outlet, Sink, Stage, Units};
 use lunarray::units::{ChannelId, MissionTime, Pair, StreamKind, all_pairs, random_stream};
 use num_complex::Complex32;

@@ -4,10 +4,10 @@
 use std::f64::consts::TAU;
 use std::time::Instant;
 
-use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup, memory};
-use lunarray::accumulation::{NormalEngine, NormalSums};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows};
 use lunarray::frames::{AntennaResponse, ObservingWindow, PlacedVisibilities};
+use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, memory};
+use lunarray::imaging::{NormalEngine, NormalSums};
 use lunarray::response::harmonic::{
     GeometryLimits, HarmonicModel, ModelSettings, NominalOrbit, PairState, PatternGeometry,
 };

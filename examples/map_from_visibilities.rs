@@ -3,13 +3,13 @@
 
 use std::error::Error;
 
-use lunarray::accumulation::{NormalEngine, NormalSums, PixelEngine, PixelSetup};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::imaging::solve_pixels;
+use lunarray::imaging::{NormalEngine, NormalSums, PixelEngine, PixelSetup};
 use lunarray::response::pixel::{Directions, PairGeometry, PixelMethod, sky_sums};
 use lunarray::sky::generated::{GeneratedSky, generate};
 use lunarray::sky::healpix::pixel_area_sr;
 use lunarray::sky::{Frame, SkyMap, compare};
-use lunarray::solve::solve_pixels;
 use lunarray::units::constants::MOON_RADIUS_M;
 use lunarray::units::vector::{Vec3, add, scale, unit};
 

@@ -4,8 +4,6 @@
 use std::fs;
 use std::path::Path;
 
-use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup};
-use lunarray::accumulation::{NormalEngine, PixelEngine, PixelSetup};
 use lunarray::array::{Array, ArrayConfig, segments_for};
 use lunarray::downlink::wire::cadu::{DATA_BYTES, randomize};
 use lunarray::downlink::{DownlinkConfig, Format, HEADER_BYTES, PacketHeader, TRAILER_BYTES, Transmission};
@@ -14,6 +12,8 @@ use lunarray::frames::{
     VisibilityBlock,
 };
 use lunarray::ground::Ground;
+use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup};
+use lunarray::imaging::{NormalEngine, PixelEngine, PixelSetup};
 use lunarray::pipeline::{Config, ConfigSource};
 use lunarray::response::harmonic::NominalOrbit;
 use lunarray::response::pixel::PixelMethod;

@@ -30,8 +30,8 @@
 //!
 //! Modules stand in the order in which data passes them: a [`sky`] is seen by an [`mod@array`] of satellites through
 //! the beam matrix ([`response`]), sampled by the [`daughters`], correlated and integrated by the [`mother`], sent down
-//! ([`downlink`]), calibrated ([`calibration`]), added to normal equations ([`accumulation`]) by the [`ground`], solved
-//! ([`solve`]) and written out ([`products`]). The [`runtime`] moves data between stages and knows no physics; the
+//! ([`downlink`]), calibrated ([`calibration`]), turned into maps ([`imaging`]: normal equations and
+//! their solution) by the [`ground`], and written out ([`products`]). The [`runtime`] moves data between stages and knows no physics; the
 //! [`pipeline`] turns a configuration into a running graph. A module uses only modules before it in `docs/ARCHITECTURE.md`,
 //! which also says where to add what; `tests/tree/` enforces it.
 //!
@@ -43,7 +43,7 @@
 //! | run the chain, or one segment of it | [`pipeline::run`], [`pipeline::simulate`], [`pipeline::replay`] | above |
 //! | read a downlink | [`downlink::Contents`], [`downlink::DownlinkReader`] | `examples/read_downlink.rs` |
 //! | calibrate in a way of one's own | [`calibration::Calibration`] | `examples/calibration_hook.rs` |
-//! | make a map of visibilities from elsewhere | [`accumulation::PixelEngine`], [`solve::solve_pixels`] | `examples/map_from_visibilities.rs` |
+//! | make a map of visibilities from elsewhere | [`imaging::PixelEngine`], [`imaging::solve_pixels`] | `examples/map_from_visibilities.rs` |
 //! | build a graph of stages | [`runtime::Graph`], [`runtime::Stage`] | `examples/own_stage.rs` |
 //! | know where the satellites are | [`array::Array`] | there |
 //!
@@ -54,6 +54,8 @@
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod units;
+
+pub mod numerics;
 
 pub mod files;
 
@@ -77,11 +79,9 @@ pub mod downlink;
 
 pub mod calibration;
 
-pub mod accumulation;
+pub mod imaging;
 
 pub mod ground;
-
-pub mod solve;
 
 pub mod products;
 

@@ -8,9 +8,9 @@ use std::time::Duration;
 
 use lunarray::downlink::FileSource;
 use lunarray::ground::{Ground, WAIT_BYTES};
+use lunarray::imaging::SolveWatch;
 use lunarray::pipeline::{self, Config, ConfigSource, MemoryLimit, Plan, Segment, Watched, use_threads};
 use lunarray::runtime::{Cancel, Metrics};
-use lunarray::solve::SolveWatch;
 use pyo3::exceptions::PyUserWarning;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;

@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use lunarray::accumulation::harmonic::GeometrySurvey;
 use lunarray::downlink::Contents;
+use lunarray::imaging::circle::GeometrySurvey;
 use lunarray::products::{VisibilityRow, VisibilityTable, jansky_per_k_sr};
 use lunarray::response::harmonic::GeometryLimits;
 use lunarray::runtime::Cancel;

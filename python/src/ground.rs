@@ -4,9 +4,9 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use lunarray::ground::{Ground, WAIT_BYTES};
+use lunarray::imaging::{SolveWatch, Solver};
 use lunarray::pipeline::use_threads;
 use lunarray::runtime::{Cancel, Outlet, Stage};
-use lunarray::solve::{SolveWatch, Solver};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 

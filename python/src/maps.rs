@@ -3,12 +3,12 @@
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use lunarray::imaging::Solution;
 use lunarray::products::{MapViewer, PublishedMap};
 use lunarray::runtime::Cancel;
 use lunarray::sky::fits::{ReadOptions, read_whole_map};
 use lunarray::sky::harmonics::{self, AnalysisOptions};
 use lunarray::sky::{Frame, SkyMap};
-use lunarray::solve::Solution;
 use num_complex::Complex64;
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;

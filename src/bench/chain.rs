@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use crate::accumulation::Snapshot;
 use crate::downlink::Transmitter;
 use crate::frames::GroundFrame;
 use crate::ground::{Ground, Reception, WAIT_BYTES};
+use crate::imaging::Snapshot;
 use crate::mother::Store;
 use crate::pipeline::config::Config;
 use crate::pipeline::error::PipelineError;

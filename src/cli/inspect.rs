@@ -7,8 +7,8 @@ use serde::Serialize;
 
 use super::arguments::input_path;
 use super::output::{CommandResult, Completion, print_json_line, print_text};
-use crate::accumulation::harmonic::{GeometryCoverage, GeometrySurvey};
 use crate::downlink::Contents;
+use crate::imaging::circle::{GeometryCoverage, GeometrySurvey};
 use crate::response::harmonic::GeometryLimits;
 
 /// Show the contents of a downlink file, and its defects.

@@ -26,6 +26,7 @@ mod merge;
 mod notify;
 mod output;
 mod predict;
+mod printable_text;
 mod progress;
 mod recalibrate;
 mod replay;

@@ -11,11 +11,11 @@ use serde_json::{Value, json};
 
 use super::events::progress_of;
 use super::log::{Level, is_json, print_line, say, say_entry};
-use crate::accumulation::ChannelGroup;
 use crate::downlink::transport::socket::ListenStatus;
+use crate::imaging::ChannelGroup;
+use crate::imaging::{Solving, SolvingPart};
 use crate::pipeline::{CalibrateProgress, ChannelCost, GroupStep, Plan, RunGroups, Watched};
 use crate::runtime::Cancel;
-use crate::solve::{Solving, SolvingPart};
 use crate::units::ChannelId;
 
 /// Refresh interval on a terminal, and of looking for an interrupt.

@@ -346,7 +346,7 @@ impl Session<'_> {
         let listen = &config.downlink.listen;
         let mut source = SocketSource::bind(&addresses, listen, until)
             .map_err(|error| match error {
-                SocketError::Listen { source, .. } => SocketError::Listen { url: url.clone(), source },
+                SocketError::Listen { source, .. } => SocketError::Listen { url: url.to_string(), source },
                 other => other,
             })?
             .knowing(ground.instrument().cloned())

@@ -4,11 +4,11 @@ use std::path::Path;
 
 use super::GroundError;
 use super::pass_gate::{MODEL, PassGate};
-use crate::accumulation::harmonic::SumPart;
-use crate::accumulation::{AccumulationError, Accumulator, ChannelGroup, MapConfig};
 use crate::calibration::solver::{PassSolver, SolverConfig};
 use crate::calibration::{CalibrationConfig, CalibrationError, CalibrationHook, Calibrator};
 use crate::frames::{Instrument, VisibilityReason};
+use crate::imaging::circle::SumPart;
+use crate::imaging::{AccumulationError, Accumulator, ChannelGroup, MapConfig};
 use crate::runtime::Ledger;
 use crate::sky::fits::check_frequencies;
 

@@ -8,12 +8,12 @@ use super::lookout::{Occasion, Spotter};
 use super::pass_gate::{PassGate, PassObserver};
 use super::promises::SenderPromises;
 use super::{Collector, CollectorStep, DeliveredPacket, Delivery, GroundConfig, GroundError, GroundOutcome};
-use crate::accumulation::{Accumulator, Snapshot};
 use crate::calibration::{Calibrator, MissingPackets};
 use crate::downlink::transport::socket::HeldAnswers;
 use crate::downlink::wire::VisibilitiesOutline;
 use crate::downlink::{CucTime, Kind, PacketHeader};
 use crate::frames::{GroundFrame, Instrument, PlacedFrame};
+use crate::imaging::{Accumulator, Snapshot};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Outlet, Stage, Units};
 

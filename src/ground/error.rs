@@ -180,7 +180,7 @@ pub enum GroundError {
     Calibration(#[from] crate::calibration::CalibrationError),
     /// Sums.
     #[error(transparent)]
-    Accumulation(#[from] crate::accumulation::AccumulationError),
+    Accumulation(#[from] crate::imaging::AccumulationError),
 }
 
 impl GroundError {

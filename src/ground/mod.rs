@@ -3,7 +3,7 @@
 //! [`Ground`] is one stage: the [`Collector`] finds packets and delivers each once, calibration places and corrects
 //! visibilities, the accumulator adds them up. An [`archive`] keeps all of it from one session to the next.
 //!
-//! Uses [`crate::downlink`], [`crate::calibration`] and [`crate::accumulation`]; knows nothing of the spacecraft, of
+//! Uses [`crate::downlink`], [`crate::calibration`] and [`crate::imaging`]; knows nothing of the spacecraft, of
 //! solving, or of the pipeline.
 
 pub mod archive;

@@ -19,9 +19,6 @@ pub const CHANNELS_MAX: usize = 30;
 /// Lowest and highest channel frequency, Hz: the mission's band.
 pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 
-/// Size of one visibility in the store and on the link, bytes.
-pub const VISIBILITY_BYTES: u64 = 21;
-
 /// Narrowest channel of samples, Hz. The 2^14 samples that are synthesised together then span half a minute, in which the
 /// array moves by some degrees; the cost of narrower channels grows with the third power of that time.
 const SAMPLES_WIDTH_HZ_MIN: f64 = 500.0;

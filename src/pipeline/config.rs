@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::problems::Problems;
-use crate::accumulation::{EngineKind, MapConfig};
 use crate::array::{Array, ArrayConfig};
 use crate::calibration::solver::SolverConfig;
 use crate::calibration::{CalibrationConfig, CalibrationHook, VanVleck};
 use crate::daughters::{DaughtersConfig, InstrumentConfig, NavigationConfig};
 use crate::downlink::DownlinkConfig;
+use crate::imaging::{EngineKind, MapConfig};
 use crate::mother::{Antenna, Fidelity, MoonMirror, SpacecraftConfig};
 use crate::products::ProductsConfig;
 use crate::response::model::ModelChoice;

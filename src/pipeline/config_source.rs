@@ -273,7 +273,7 @@ fn set<'a>(table: &mut toml::Table, text: &'a str) -> Result<&'a str, ConfigErro
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::accumulation::MapConfig;
+    use crate::imaging::MapConfig;
 
     fn with(overrides: &[&str]) -> Result<Config, ConfigError> {
         let overrides = overrides.iter().map(|&text| text.to_owned()).collect();

@@ -4,12 +4,13 @@ use std::fmt;
 
 use serde::Serialize;
 
-use super::engine_cost::EngineCost;
 use super::error::PipelineError;
 use super::memory::MemoryLimit;
 use super::plan::{Expected, Plan};
-use super::rates::{AVERAGE_INSTANTS, FRINGES_PER_S, SAMPLES_PER_S, cores};
+use super::rates::{FRINGES_PER_S, SAMPLES_PER_S};
 use crate::frames::ObservingWindow;
+use crate::imaging::cost::{ChannelData, EngineCost};
+use crate::imaging::rates::{AVERAGE_INSTANTS, cores};
 use crate::mother::{Fidelity, VISIBILITY_BYTES};
 use crate::response::model::{ModelKind, ModelPlan};
 use crate::sky::healpix::pixel_count;
@@ -138,8 +139,12 @@ impl Plan {
         let frequencies = &self.config.spacecraft.channels_hz;
         let engine = |(channel, (&frequency_hz, expected)): (usize, (&f64, &Expected))| {
             let is_mapped = map.maps(ChannelId(channel as u16));
-            let cost = || self.engine_cost(frequency_hz, expected.mapped).among(ranks, map);
-            if is_mapped { cost() } else { EngineCost::default() }
+            let data = ChannelData {
+                frequency_hz,
+                visibilities: expected.mapped,
+                windows: self.windows.len() as f64,
+            };
+            if is_mapped { EngineCost::of(map, data).among(ranks, map) } else { EngineCost::default() }
         };
         let engines: Vec<EngineCost> = frequencies.iter().zip(&expected).enumerate().map(engine).collect();
         let sent: f64 = expected.iter().map(|e| e.sent).sum();

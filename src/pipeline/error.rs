@@ -61,7 +61,7 @@ pub enum PipelineError {
     Products(#[from] crate::products::ProductsError),
     /// A map cannot be made of sums.
     #[error(transparent)]
-    Solve(#[from] crate::solve::SolveError),
+    Solve(#[from] crate::imaging::SolveError),
     /// The ground failed.
     #[error(transparent)]
     Ground(#[from] crate::ground::GroundError),

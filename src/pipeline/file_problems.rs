@@ -5,9 +5,9 @@ use std::path::Path;
 
 use super::plan::Plan;
 use super::problems::Problems;
+use crate::imaging::Regulariser;
 use crate::sky::AddedSky;
 use crate::sky::fits::{FitsError, FitsProblem, ReadOptions, check_frequency, read_sky, read_whole_map};
-use crate::solve::Regulariser;
 
 impl Plan {
     /// Reads every file that the configuration names; everything that is wrong with them, empty if they are good.

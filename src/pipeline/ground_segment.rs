@@ -6,12 +6,13 @@ use std::sync::{Arc, Mutex};
 use super::config::Config;
 use super::error::PipelineError;
 use super::live_gains::GainsWriter;
-use crate::accumulation::MapConfig;
 use crate::ground::{Ground, GroundConfig, GroundOutcome};
+use crate::imaging::MapConfig;
+use crate::imaging::anywhere::RefineRule;
+use crate::imaging::{Regulariser, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
 use crate::products::{ChannelSummary, MapWatch, ProductsError, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link, Sink};
 use crate::sky::fits::{ReadOptions, read_whole_map};
-use crate::solve::{RefineRule, Regulariser, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
 
 /// Name of the stage that keeps the state.
 pub(super) const GROUND: &str = "ground";

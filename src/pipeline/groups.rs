@@ -13,7 +13,6 @@ use serde::Serialize;
 
 use super::config::Config;
 use super::cost::memory_bytes;
-use super::engine_cost::{ChannelData, EngineCost};
 use super::error::PipelineError;
 use super::memory::MemoryLimit;
 use super::plan::Plan;
@@ -21,12 +20,13 @@ use super::run::{Watched, downlink_file, finish, ground_alone, lock_folder, summ
 use super::simulation_groups::simulate_in_groups;
 use super::space_segment;
 use super::summary::{PassRecord, RunScope, RunSummary};
-use crate::accumulation::harmonic::SumPart;
-use crate::accumulation::{ChannelGroup, MapConfig};
 use crate::downlink::FileSource;
 use crate::files::write_atomically;
 use crate::frames::Instrument;
 use crate::ground::{Collector, Ground, GroundConfig, WAIT_BYTES};
+use crate::imaging::circle::SumPart;
+use crate::imaging::cost::{ChannelData, EngineCost};
+use crate::imaging::{ChannelGroup, MapConfig};
 use crate::products::{ProductsError, Truth};
 use crate::runtime::Cancel;
 use crate::units::ChannelId;

@@ -10,7 +10,6 @@ mod config_reader;
 mod config_source;
 mod cost;
 mod downlink_settings;
-mod engine_cost;
 pub(crate) mod error;
 mod file_problems;
 mod found_solutions;

@@ -8,15 +8,15 @@ use super::error::PipelineError;
 use super::ground_segment::GROUND;
 use super::memory::MemoryLimit;
 use super::run::{READ, Watched, Watcher, start_alone};
-use crate::accumulation::harmonic::{NoiseSums, memory};
-use crate::accumulation::{EngineKind, Snapshot, SnapshotSums};
 use crate::downlink::FileSource;
 use crate::ground::{Ground, WAIT_BYTES};
+use crate::imaging::circle::{NoiseSums, memory};
+use crate::imaging::{EngineKind, Snapshot, SnapshotSums};
+use crate::imaging::{HarmonicRequest, NOISES_TOGETHER, SolveError, SolveWatch, SolverSetup, solve_noises};
 use crate::products::ProductsError;
 use crate::runtime::{Cancel, Graph, Sink};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Frame, SkyMap};
-use crate::solve::{HarmonicRequest, NOISES_TOGETHER, SolveError, SolveWatch, SolverSetup, solve_noises};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 /// Most realisations of one reading.

@@ -4,8 +4,8 @@ use std::f64::consts::TAU;
 use std::path::PathBuf;
 
 use super::config::Config;
-use crate::accumulation::EngineKind;
 use crate::calibration::{CalibrationHook, GainsFile, VanVleck};
+use crate::imaging::EngineKind;
 use crate::mother::Fidelity;
 use crate::units::Dimension;
 use crate::units::constants::{MOON_GM_M3_S2, MOON_RADIUS_M};

@@ -12,17 +12,17 @@ use super::plan::Plan;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
 use super::{ground_segment, space_segment};
-use crate::accumulation::EngineKind;
 use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, Paced, Recorder};
 use crate::files::{FolderLock, write_atomically};
 use crate::ground::{Ground, GroundOutcome, WAIT_BYTES};
+use crate::imaging::EngineKind;
+use crate::imaging::SolveWatch;
 use crate::products::{MapShape, MapWatch, ProductsError, Truth, write_autos};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
-use crate::solve::SolveWatch;
 
 /// Handles to watch a running graph.
 #[derive(Clone, Debug)]

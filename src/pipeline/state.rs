@@ -5,10 +5,10 @@ use std::path::Path;
 use super::config::Config;
 use super::config_source::ConfigSource;
 use super::error::PipelineError;
-use crate::accumulation::REFINED;
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
+use crate::imaging::REFINED;
+use crate::imaging::{Solution, SolveWatch, Solver, SolverSetup};
 use crate::runtime::{Outlet, Stage};
-use crate::solve::{Solution, SolveWatch, Solver, SolverSetup};
 use crate::units::PerChannel;
 
 impl ConfigSource {
@@ -145,8 +145,8 @@ pub fn solve_state(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::accumulation::{EngineKind, MapConfig, RefineConfig};
     use crate::calibration::{CalibrationConfig, CalibrationHook};
+    use crate::imaging::{EngineKind, MapConfig, RefineConfig};
     use crate::response::harmonic::GeometryLimits;
     use crate::response::pixel::PixelMethod;
 

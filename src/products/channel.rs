@@ -16,10 +16,10 @@ use super::summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 use super::truth::ChannelTruth;
 use super::viewer::{MapWatch, PublishedMap};
 use crate::files::write_atomically;
+use crate::imaging::Solution;
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::spectra::gaussian_beam;
 use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with, is_unseen};
-use crate::solve::Solution;
 use crate::units::constants::DAY_S;
 
 /// Maximum number of maps on the sheet of snapshots: the first, the last and some between.

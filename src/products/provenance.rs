@@ -3,10 +3,11 @@
 use std::path::Path;
 
 use super::config::PostProcessing;
-use crate::accumulation::{EngineKind, MapConfig};
 use crate::frames::{AntennaResponse, Instrument};
+use crate::imaging::Solution;
+use crate::imaging::anywhere::Refinement;
+use crate::imaging::{EngineKind, MapConfig};
 use crate::sky::fits::Card;
-use crate::solve::{Refinement, Solution};
 use crate::units::calendar::tai_text;
 
 /// The ground segment's share of the provenance; the rest comes with each solution.

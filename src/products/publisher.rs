@@ -11,8 +11,8 @@ use super::provenance::Provenance;
 use super::summary::ChannelSummary;
 use super::truth::Truth;
 use super::viewer::MapWatch;
+use crate::imaging::Solution;
 use crate::runtime::{Sink, Units};
-use crate::solve::Solution;
 use crate::units::ChannelId;
 
 /// Writes the solver's solutions, channel by channel.

@@ -8,7 +8,8 @@ use super::beam::EffectiveBeam;
 use super::config::PostProcessing;
 use super::latitudes::LatitudeError;
 use super::point_beams::{BeamWidths, PointBeamSummary};
-use crate::solve::{Convergence, Diagnostics, Refinement};
+use crate::imaging::anywhere::Refinement;
+use crate::imaging::{Convergence, Diagnostics};
 
 /// One snapshot.
 #[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]

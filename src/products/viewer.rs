@@ -4,9 +4,9 @@ use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use super::summary::SnapshotSummary;
+use crate::imaging::Solution;
 use crate::sky::fits::Card;
 use crate::sky::{Comparison, SkyMap};
-use crate::solve::Solution;
 
 /// A map that has just been published.
 #[derive(Clone, Copy)]

@@ -15,10 +15,10 @@ use super::status::{ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, 
 use super::subject::Subject;
 use crate::array::EarthModel;
 use crate::ground::{GroundOutcome, HitsMap, PassLine, PowerWaterfall, SavingReport, UvwDensity};
+use crate::imaging::Solving;
 use crate::pipeline::Watched;
 use crate::products::{MapViewer, PublishedMap};
 use crate::runtime::{Metrics, StageProgress};
-use crate::solve::Solving;
 use crate::units::ChannelId;
 
 /// Most senders in a status; it goes out twice a second.

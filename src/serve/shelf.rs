@@ -6,13 +6,13 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use axum::body::Bytes;
 use serde::Serialize;
 
+use crate::imaging::Diagnostics;
 use crate::products::pictures::{ColourScale, MapPanel, Palette, Sampling, Scaling, Sheet, View, draw_sheet};
 use crate::products::{PublishedMap, SnapshotSummary};
 use crate::sky::fits::{Card, WriteOptions, map_bytes};
 use crate::sky::harmonics::AnalysisOptions;
 use crate::sky::spectra::auto_cl;
 use crate::sky::{Comparison, Frame, MapError, SkyMap};
-use crate::solve::Diagnostics;
 use crate::units::ChannelId;
 
 /// Most maps held of a channel.

@@ -6,7 +6,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 
-use lunarray::accumulation::{Accumulator, MapConfig};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows, segments_for};
 use lunarray::calibration::{CalibrationConfig, Calibrator, Completeness, MissingPackets};
 use lunarray::downlink::link::{LinkConfig, LinkSimulator, LinkTruth, PacketRange};
@@ -20,6 +19,7 @@ use lunarray::frames::{
     VisibilityBlock, VisibilityReason,
 };
 use lunarray::ground::{Collector, Delivery, Ground, GroundConfig, Reception};
+use lunarray::imaging::{Accumulator, MapConfig};
 use lunarray::mother::{PacedLink, SpacecraftConfig, Store, StoreDrop};
 use lunarray::runtime::{Ledger, LedgerReport, Outlet, Stage};
 use lunarray::units::{ChannelId, MissionTime, all_pairs};

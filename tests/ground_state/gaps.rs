@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::Path;
 
-use lunarray::accumulation::MapConfig;
 use lunarray::calibration::{CalibrationConfig, Calibrator};
 use lunarray::downlink::{Decoder, Event, PacketReceiver};
 use lunarray::frames::{GroundFrame, PlacedFrame};
+use lunarray::imaging::MapConfig;
 use lunarray::runtime::{Ledger, Outlet, Stage};
 use lunarray::units::Pair;
 use serde_json::Value;

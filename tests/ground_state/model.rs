@@ -8,7 +8,6 @@ use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
 
-use lunarray::accumulation::MapConfig;
 use lunarray::array::{Array, ArrayConfig, segments_for};
 use lunarray::calibration::CalibrationConfig;
 use lunarray::downlink::transport::socket::{ListenConfig, SocketSource, Until};
@@ -18,6 +17,7 @@ use lunarray::frames::{
 };
 use lunarray::ground::archive::CoverageSurvey;
 use lunarray::ground::{Ground, GroundConfig, GroundError};
+use lunarray::imaging::MapConfig;
 use lunarray::runtime::{Flow, Outlet, Source, Stage};
 use lunarray::units::{ChannelId, MissionTime, Pair};
 use num_complex::Complex32;

@@ -7,15 +7,15 @@
 
 use crate::common;
 
-use lunarray::accumulation::{MapConfig, NormalEngine, PixelEngine, PixelSetup, automatic_weight_max};
 use lunarray::array::{Array, ArrayConfig, IntegrationRule, ObservingWindows, integration_time_s};
 use lunarray::frames::{AntennaResponse, ObservingWindow, PlacedVisibilities};
+use lunarray::imaging::solve_pixels;
+use lunarray::imaging::{MapConfig, NormalEngine, PixelEngine, PixelSetup, automatic_weight_max};
 use lunarray::response::pixel::{Directions, PairGeometry, PixelMethod, sky_sums};
 use lunarray::sky::fits::{ReadOptions, read_map};
 use lunarray::sky::generated::{GeneratedSky, generate};
 use lunarray::sky::healpix::pixel_area_sr;
 use lunarray::sky::{Frame, SkyMap, compare};
-use lunarray::solve::solve_pixels;
 use lunarray::units::constants::YEAR_S;
 use lunarray::units::vector::{norm, sub};
 use lunarray::units::{Pair, all_pairs};

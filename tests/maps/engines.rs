@@ -2,20 +2,20 @@
 //! matrix gives.
 
 use faer::{Mat, Side};
-use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
-use lunarray::accumulation::{NormalEngine, NormalSums, PixelEngine, PixelSetup};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
+use lunarray::imaging::{
+    HarmonicRequest, SolveWatch, StoppingRule, effective_beam, noise_variance, probed_traces, regularisation,
+    solve_harmonics, solve_pixels, spectrum, traces,
+};
+use lunarray::imaging::{NormalEngine, NormalSums, PixelEngine, PixelSetup};
 use lunarray::response::harmonic::GeometryLimits;
 use lunarray::response::pixel::{Directions, PairGeometry, PixelMethod, sky_sums};
 use lunarray::runtime::Cancel;
 use lunarray::sky::generated::{GeneratedSky, generate};
 use lunarray::sky::healpix::pixel_area_sr;
 use lunarray::sky::{Frame, SkyMap, compare};
-use lunarray::solve::{
-    HarmonicRequest, SolveWatch, StoppingRule, effective_beam, noise_variance, probed_traces, regularisation,
-    solve_harmonics, solve_pixels, spectrum, traces,
-};
 use lunarray::units::all_pairs;
 use lunarray::units::constants::YEAR_S;
 use lunarray::units::vector::{norm, sub};
@@ -94,7 +94,7 @@ pub fn harmonic_sums(blocks: &[PlacedVisibilities], l_max: usize, baseline_m_max
     add_all(HarmonicEngine::new(setup).unwrap(), blocks)
 }
 
-fn pixel_sums(blocks: &[PlacedVisibilities], nside: usize) -> lunarray::accumulation::PixelSums {
+fn pixel_sums(blocks: &[PlacedVisibilities], nside: usize) -> lunarray::imaging::PixelSums {
     let setup = PixelSetup {
         nside,
         frequency_hz: blocks[0].frequency_hz,
@@ -219,7 +219,7 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
         let mut map = vec![0.0; variance.len()];
         map[pixel] = 1.0 / pixel_area_sr(nside);
         // Rows of the synthesis: Y_lm at the pixel's centre.
-        let y = lunarray::accumulation::harmonic::unknowns(&transform.adjoint(&map).unwrap());
+        let y = lunarray::imaging::circle::unknowns(&transform.adjoint(&map).unwrap());
         let exact: f64 =
             apply(&|w| w.max(0.0) / (w + eps).powi(2), &y).iter().zip(&y).map(|(a, b)| a * b).sum();
         ratios.push(variance[pixel] / exact);
@@ -227,10 +227,7 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
         let area = pixel_area_sr(nside);
         let delta: Vec<f64> = y.iter().map(|y| y * area).collect();
         let exact = transform
-            .synthesis(&lunarray::accumulation::harmonic::coefficients(
-                &apply(&|w| w / (w + eps), &delta),
-                16,
-            ))
+            .synthesis(&lunarray::imaging::circle::coefficients(&apply(&|w| w / (w + eps), &delta), 16))
             .unwrap();
         for (a, b) in beam.iter().zip(&exact) {
             assert!((a - b).abs() < 2e-3 * exact[pixel], "{pixel}: {a} {b}");
@@ -276,7 +273,7 @@ fn solutions_start_warm_and_end_early() {
     let cold = solve_harmonics(&late, request, None, None, watch.named("test")).unwrap();
     let warm = solve_harmonics(&late, request, None, Some(&first.unknowns), watch.named("test")).unwrap();
     let steps =
-        |solved: &lunarray::solve::HarmonicSolution| solved.diagnostics.convergence.unwrap().iterations;
+        |solved: &lunarray::imaging::HarmonicSolution| solved.diagnostics.convergence.unwrap().iterations;
     assert!(steps(&warm) < steps(&cold), "{} {}", steps(&warm), steps(&cold));
     let distance = |a: &[f64], b: &[f64]| {
         let square: f64 = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();

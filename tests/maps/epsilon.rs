@@ -6,17 +6,17 @@ use crate::engines::{harmonic_sums, observe};
 use std::io::Write;
 use std::process::{Command, Stdio};
 
-use lunarray::accumulation::{NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums};
 use lunarray::array::ArrayConfig;
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
-use lunarray::response::pixel::PixelMethod;
-use lunarray::sky::healpix::pixel_area_sr;
-use lunarray::sky::{Frame, SkyMap};
-use lunarray::solve::{
+use lunarray::imaging::{
     Fit, HarmonicRequest, PixelExtras, Regulariser, SolveWatch, StoppingRule, Traces, W_MAX_EXACT,
     effective_beam, harmonic_beams, largest_eigenvalue, solve_harmonics, solve_pixels_with,
     solve_regularised, spectrum,
 };
+use lunarray::imaging::{NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums};
+use lunarray::response::pixel::PixelMethod;
+use lunarray::sky::healpix::pixel_area_sr;
+use lunarray::sky::{Frame, SkyMap};
 use lunarray::units::{StreamKind, random_stream};
 use num_complex::Complex64;
 use rand_distr::{Distribution, StandardNormal};

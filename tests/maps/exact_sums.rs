@@ -1,12 +1,12 @@
 //! Sums hold what was put in and nothing of how it came: in any order, in any calls, over any engines merged in any
 //! way, on any number of threads, and with anything put in and taken out again, a checkpoint has the same bytes.
 
-use lunarray::accumulation::harmonic::{HarmonicEngine, HarmonicSetup, orbit_of};
-use lunarray::accumulation::{
-    AccumulationError, NormalEngine, NormalSums, PixelEngine, PixelSetup, Refusal, automatic_weight_max,
-};
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, orbit_of};
+use lunarray::imaging::{
+    AccumulationError, NormalEngine, NormalSums, PixelEngine, PixelSetup, Refusal, automatic_weight_max,
+};
 use lunarray::response::harmonic::GeometryLimits;
 use lunarray::response::pixel::{PairGeometry, PixelMethod, RowMaker};
 use lunarray::sky::healpix::pixel_area_sr;
@@ -220,7 +220,7 @@ fn rows_widen_when_they_must_and_are_written_as_narrow_as_they_can() {
     assert!(bytes(&mut engine) == narrow);
 }
 
-fn harmonic_of(block: &PlacedVisibilities) -> lunarray::accumulation::harmonic::HarmonicSums {
+fn harmonic_of(block: &PlacedVisibilities) -> lunarray::imaging::circle::HarmonicSums {
     in_order(|| harmonic(1024.0), std::slice::from_ref(block)).into_sums()
 }
 

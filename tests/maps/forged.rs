@@ -2,18 +2,19 @@
 
 use std::sync::Arc;
 
-use lunarray::accumulation::harmonic::RowBelief;
-use lunarray::accumulation::{
-    Accumulator, EngineKind, MapConfig, NormalEngine, PixelEngine, PixelSetup, RefineConfig, Snapshot,
-    SnapshotSums, SumCounts,
-};
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{
     AntennaResponse, Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason,
 };
+use lunarray::imaging::anywhere::RefineRule;
+use lunarray::imaging::anywhere::RowBelief;
+use lunarray::imaging::{
+    Accumulator, EngineKind, MapConfig, NormalEngine, PixelEngine, PixelSetup, RefineConfig, Snapshot,
+    SnapshotSums, SumCounts,
+};
+use lunarray::imaging::{SolveError, SolveWatch, Solver, SolverSetup, StoppingRule};
 use lunarray::response::pixel::PixelMethod;
 use lunarray::runtime::{Ledger, Outlet, Stage};
-use lunarray::solve::{RefineRule, SolveError, SolveWatch, Solver, SolverSetup, StoppingRule};
 use lunarray::units::vector::{norm, scale};
 use lunarray::units::{ChannelId, Pair, PerChannel};
 use num_complex::Complex64;

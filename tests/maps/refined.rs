@@ -8,19 +8,22 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use lunarray::accumulation::Refusal;
-use lunarray::accumulation::harmonic::{RefinedSetup, RefinedSums, RowBelief, VisibilityArchive};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::imaging::Refusal;
+use lunarray::imaging::anywhere::RefineRule;
+use lunarray::imaging::anywhere::RefineSteps;
+use lunarray::imaging::anywhere::Refinement;
+use lunarray::imaging::anywhere::solve_refined;
+use lunarray::imaging::anywhere::{RefinedSetup, RefinedSums, RowBelief, VisibilityArchive};
+use lunarray::imaging::{
+    HarmonicRequest, HarmonicSolution, SolveError, SolveWatch, StoppingRule, solve_harmonics,
+};
 use lunarray::response::general::{GeneralRows, PairAt, RowsSetup};
 use lunarray::response::harmonic::{GeometryLimits, GeometryRefusal};
 use lunarray::runtime::Cancel;
 use lunarray::sky::fits::{ReadOptions, read_map};
 use lunarray::sky::harmonics::{Alm, AnalysisOptions, analysis};
 use lunarray::sky::healpix::pixel_area_sr;
-use lunarray::solve::{
-    HarmonicRequest, HarmonicSolution, RefineRule, RefineSteps, Refinement, SolveError, SolveWatch,
-    StoppingRule, solve_harmonics, solve_refined,
-};
 use lunarray::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
 use lunarray::units::vector::Vec3;
 use lunarray::units::{ChannelId, Pair};
@@ -145,7 +148,7 @@ fn difference(found: &[f64], expected: &[f64]) -> f64 {
 /// Relative difference of one degree.
 fn degree_change(found: &[f64], expected: &[f64], l: usize) -> f64 {
     let of = |x: &[f64]| {
-        let alm = lunarray::accumulation::harmonic::coefficients(x, L_MAX);
+        let alm = lunarray::imaging::circle::coefficients(x, L_MAX);
         (0..=l).flat_map(|m| [alm.get(l, m).re, alm.get(l, m).im]).collect::<Vec<f64>>()
     };
     difference(&of(found), &of(expected))
@@ -199,7 +202,7 @@ fn refined_maps_are_the_dense_solution_of_other_code() {
             response: AntennaResponse::Isotropic,
             polynomial_degree: 0,
         });
-        let alm: Alm = lunarray::accumulation::harmonic::coefficients(&sky, L_MAX);
+        let alm: Alm = lunarray::imaging::circle::coefficients(&sky, L_MAX);
         let seen = rows.forward(&rows.plan_direct(&at).unwrap(), &[alm]).remove(0);
         let parts = |v: &[Complex64]| v.iter().flat_map(|v| [v.re, v.im]).collect::<Vec<f64>>();
         let error = difference(&parts(&seen), &parts(&values));
@@ -356,7 +359,7 @@ fn interrupted_before_its_first_pass_there_is_no_map() {
 
 /// rho_l of two vectors of unknowns.
 fn rho(found: &[f64], expected: &[f64], l_max: usize, l: usize) -> f64 {
-    let of = |x: &[f64]| lunarray::accumulation::harmonic::coefficients(x, l_max);
+    let of = |x: &[f64]| lunarray::imaging::circle::coefficients(x, l_max);
     let (a, b) = (of(found), of(expected));
     let sum = |a: &Alm, b: &Alm| {
         (0..=l).map(|m| if m == 0 { 1.0 } else { 2.0 } * (a.get(l, m).conj() * b.get(l, m)).re).sum::<f64>()

@@ -2,18 +2,18 @@
 
 use crate::common;
 
-use lunarray::accumulation::harmonic::{RefinedSetup, VisibilityArchive};
-use lunarray::accumulation::{
+use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::imaging::anywhere::{RefinedSetup, VisibilityArchive};
+use lunarray::imaging::{
     EngineKind, MapConfig, MatrixKind, NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums,
     RefineConfig, RemadeSums, RemadeVisibilities,
 };
-use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::imaging::{PixelSolution, SolveError, SolveWatch, StoppingRule, solve_pixels, solve_remade};
 use lunarray::response::harmonic::GeometryLimits;
 use lunarray::response::pixel::PixelMethod;
 use lunarray::runtime::Cancel;
 use lunarray::sky::generated::{GeneratedSky, generate};
 use lunarray::sky::{Frame, SkyMap};
-use lunarray::solve::{PixelSolution, SolveError, SolveWatch, StoppingRule, solve_pixels, solve_remade};
 use lunarray::units::ChannelId;
 use lunarray::units::constants::MOON_RADIUS_M;
 use num_complex::Complex64;

@@ -2,11 +2,11 @@
 
 use crate::common;
 
-use lunarray::accumulation::{NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums};
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::imaging::{NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums};
+use lunarray::imaging::{W_MAX_EXACT, largest_eigenvalue, solve_pixels, spectrum};
 use lunarray::response::pixel::PixelMethod;
-use lunarray::solve::{W_MAX_EXACT, largest_eigenvalue, solve_pixels, spectrum};
 use lunarray::units::Pair;
 use num_complex::Complex64;
 use serde_json::Value;

@@ -8,12 +8,12 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use faer::{Mat, Side};
-use lunarray::accumulation::{Accuracy, NormalSums};
-use lunarray::runtime::Cancel;
-use lunarray::sky::{Frame, SkyMap};
-use lunarray::solve::{
+use lunarray::imaging::{Accuracy, NormalSums};
+use lunarray::imaging::{
     SolveWatch, Traces, UnsupportedEpsilon, W_MAX_EXACT, largest_eigenvalue, probed_traces, traces,
 };
+use lunarray::runtime::Cancel;
+use lunarray::sky::{Frame, SkyMap};
 use serde_json::{Value, json};
 
 /// 1e-9 to 1.

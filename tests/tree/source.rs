@@ -12,8 +12,6 @@ pub struct File {
     pub references: Vec<(ModulePath, Vec<String>)>,
     /// Names that it re-exports, and of what.
     pub exports: BTreeMap<String, (ModulePath, Vec<String>)>,
-    /// Types that others in the crate can name.
-    pub types: Vec<String>,
 }
 
 /// The file's module, what is in it, and the modules that it declares for tests alone.
@@ -24,8 +22,7 @@ pub fn parse(path: &str, text: &str) -> (ModulePath, File, Vec<ModulePath>) {
     }
     let (tokens, tests) = without_tests(&tokens(text));
     let tests = tests.into_iter().map(|name| [module.clone(), vec![name]].concat()).collect();
-    let mut file =
-        File { path: path.to_owned(), references: vec![], exports: BTreeMap::new(), types: vec![] };
+    let mut file = File { path: path.to_owned(), references: vec![], exports: BTreeMap::new() };
     // The module in which a token stands, with the depths at which inner modules end.
     let (mut base, mut ends, mut depth) = (module.clone(), vec![], 0);
     let mut k = 0;
@@ -55,11 +52,6 @@ pub fn parse(path: &str, text: &str) -> (ModulePath, File, Vec<ModulePath>) {
                     }
                 }
                 continue;
-            }
-            "struct" | "enum" | "trait" | "type" | "union" => {
-                if matches!(visibility(&tokens, k), Some("" | "crate")) {
-                    file.types.push(next(1).to_owned());
-                }
             }
             first if is_name(first) && next(1) == "::" && !(k > 0 && tokens[k - 1] == "::") => {
                 let mut path = vec![first.to_owned()];

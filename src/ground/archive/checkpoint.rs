@@ -11,10 +11,10 @@ use crc_fast::{CrcAlgorithm, Digest};
 
 use super::calibration_state::CalibrationState;
 use super::journal::Journal;
-use crate::accumulation::AccumulatorState;
 use crate::calibration::AutoTable;
 use crate::frames::EphemerisSegment;
 use crate::ground::{CollectorState, CollectorView, GroundError};
+use crate::imaging::AccumulatorState;
 
 const MAGIC: &[u8; 8] = b"LNRSTA05";
 /// Beginning of the magic in every version.
@@ -245,7 +245,6 @@ mod tests {
     use num_complex::Complex32;
 
     use super::*;
-    use crate::accumulation::Accumulator;
     use crate::calibration::{Calibrator, Identity};
     use crate::downlink::receive::PacketReading;
     use crate::downlink::{
@@ -257,6 +256,7 @@ mod tests {
     };
     use crate::ground::archive::draft::RecordDraft;
     use crate::ground::{Collector, DeliveredPacket};
+    use crate::imaging::Accumulator;
     use crate::runtime::{Ledger, Outlet, Stage};
     use crate::units::MissionTime;
 

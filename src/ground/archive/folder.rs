@@ -11,9 +11,9 @@ use std::path::{Path, PathBuf};
 
 use super::checkpoint;
 use super::names::{NUMBER_MAX, Numbered, numbered};
-use crate::accumulation::harmonic::HeldSegment;
 use crate::files::{AtomicFile, FolderLock, IfUnfinished, read_folder};
 use crate::ground::GroundError;
+use crate::imaging::anywhere::HeldSegment;
 use crate::ranks::Ranks;
 
 /// Checkpoints that are kept.

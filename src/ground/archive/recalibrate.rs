@@ -9,12 +9,12 @@ use super::draft::{RecordDraft, digest};
 use super::folder::checkpoints;
 use super::journal::{Journal, JournalRecord, Sent};
 use super::settings::settings_of;
-use crate::accumulation::EngineKind;
 use crate::calibration::{AntennaGains, AutoTable, CalibrationHook, Calibrator, ReceivedBlocks};
 use crate::downlink::receive::EventReader;
 use crate::downlink::{Event, Kind};
 use crate::frames::GroundFrame;
 use crate::ground::{DeliveredPacket, Ground, GroundConfig, GroundError, HeldPacket};
+use crate::imaging::EngineKind;
 use crate::runtime::Outlet;
 use crate::units::ChannelId;
 

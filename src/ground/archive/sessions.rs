@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use super::checkpoint;
 use super::folder::{StateFolder, checkpoints};
 use super::store::{Archive, Opened};
-use crate::accumulation::Snapshot;
 use crate::ground::{Ground, GroundConfig, GroundError};
+use crate::imaging::Snapshot;
 use crate::ranks::Ranks;
 use crate::runtime::{Outlet, Stage};
 

@@ -11,8 +11,6 @@ use super::folder::StateFolder;
 use super::journal::{Journal, OtherRecord};
 use super::names::parts_with;
 use super::settings::{compare, settings_of};
-use crate::accumulation::harmonic::SegmentPlace;
-use crate::accumulation::{AccumulationError, Accumulator};
 use crate::array::Ephemeris;
 use crate::calibration::{AutoTable, Calibrator};
 use crate::downlink::{DownlinkError, Kind};
@@ -24,6 +22,8 @@ use crate::ground::{
     Collector, CollectorState, DeliveredPacket, Ground, GroundConfig, GroundError, GroundOutcome,
     SharedSaving,
 };
+use crate::imaging::anywhere::SegmentPlace;
+use crate::imaging::{AccumulationError, Accumulator};
 use crate::ranks::{RankShare, Ranks};
 use crate::runtime::{Cancel, Ledger, LedgerReport};
 

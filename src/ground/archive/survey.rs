@@ -8,11 +8,11 @@ use super::checkpoint::ArchiveHead;
 use super::folder::{checkpoints, note};
 use super::gaps::{Gaps, PositionsPacket, ReceivedPackets, VisibilityPacket, find_gaps};
 use super::journal::JournalEntry;
-use crate::accumulation::{Accumulator, MapConfig};
 use crate::array::Ephemeris;
 use crate::downlink::ReceptionCounters;
 use crate::frames::GroundFrame;
 use crate::ground::{Collector, DeliveredPacket, Delivery, GroundError};
+use crate::imaging::{Accumulator, MapConfig};
 use crate::runtime::Ledger;
 
 /// Capacity of the hold buffer while a file is read.

@@ -107,7 +107,6 @@ mod tests {
     use num_complex::Complex32;
 
     use super::*;
-    use crate::accumulation::{EngineKind, MapConfig};
     use crate::calibration::CalibrationConfig;
     use crate::downlink::receive::PacketReading;
     use crate::downlink::{
@@ -119,6 +118,7 @@ mod tests {
     };
     use crate::ground::archive::RecordDraft;
     use crate::ground::{DeliveredPacket, Ground, GroundConfig};
+    use crate::imaging::{EngineKind, MapConfig};
     use crate::ranks::{Ranks, on_threads};
     use crate::runtime::{Outlet, Stage};
     use crate::units::Pair;

@@ -4,6 +4,7 @@
 //! libraries, so equal data give equal bytes. May use [`crate::sky`] and [`crate::files`].
 
 mod canvas;
+mod colour;
 mod curves;
 mod error;
 mod labels;

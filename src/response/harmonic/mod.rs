@@ -11,33 +11,28 @@
 //! | [`RotationTable`] | d for real skies |
 //! | [`HarmonicModel`] | visibilities of a sky at many states of pairs |
 //!
-//! [`mod@crate::accumulation`] builds its normal equations on the same tables. Uses [`crate::sky::harmonics`]; results
+//! [`mod@crate::imaging`] builds its normal equations on the same tables. Uses [`crate::sky::harmonics`]; results
 //! do not depend on the number of threads.
 
 mod batch;
 mod blocked;
-mod chebyshev;
 mod error;
 pub(crate) mod filter;
 mod forward;
 mod geometry;
 pub(crate) mod kernel;
-pub(crate) mod legendre;
 mod model;
 pub(crate) mod pattern;
-pub(crate) mod quadrature;
-pub(crate) mod real;
 mod ring;
 pub(crate) mod rotation;
 mod runs;
-pub(crate) mod sizes;
-pub(crate) mod trigonometry;
 
 pub use error::HarmonicError;
 pub use geometry::{GeometryLimits, GeometryRefusal, NominalOrbit, NominalPair, PairOrientation};
 pub use model::{HarmonicModel, ModelSettings};
 pub use pattern::{NodeGrid, PatternGeometry, PatternTable, degrees};
-pub use real::Real;
+
+pub use crate::numerics::Real;
 pub use rotation::{RotationTable, orders};
 
 /// Position and baseline length of a pair: all that a visibility depends on besides the sky.

@@ -19,13 +19,11 @@ mod lanes;
 mod recurrence;
 mod rings;
 mod rotated;
-pub(crate) mod scaled;
 mod transform;
-mod wigner;
 
+pub use crate::numerics::wigner::{WignerRows, WignerTable, wigner_d};
 pub use analysis::{Analysis, AnalysisOptions, Method, analysis, synthesis};
 pub use coefficients::Alm;
 pub use directions::{Component, times_direction, times_direction_transposed};
 pub use error::HarmonicsError;
 pub use transform::{L_MAX, Transform};
-pub use wigner::{WignerRows, WignerTable, wigner_d};

@@ -1,28 +1,22 @@
-//! The listening thread: accepts connections until its end condition holds.
+//! What all connections of the listening thread share.
 
 use std::net::SocketAddr;
 use std::pin::pin;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::Poll;
-use std::time::Duration;
 
 use crossbeam_channel::Sender;
-use tokio::net::{TcpListener, TcpStream};
+use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
-use tokio::task::JoinSet;
-use tokio::time::{Instant, sleep, timeout};
+use tokio::time::Instant;
 
 use super::config::ListenConfig;
-use super::connection::serve;
 use super::held::HeldAnswers;
 use super::report::{BUSY, ListenEvent, ListenNote, Listening};
-use super::seats::{Room, Seats};
+use super::seats::Seats;
 use super::sender_intake::Mission;
 use super::stations::Stations;
-
-/// Interval between two checks of the end condition.
-const TICK: Duration = Duration::from_millis(50);
 
 /// Number of notes allowed at once; after that one per second.
 const NOTES_AT_ONCE: f64 = 20.0;
@@ -92,7 +86,7 @@ impl ListenContext {
         let _ = self.stop.subscribe().wait_for(|stop| *stop).await;
     }
 
-    fn is_over(&self) -> bool {
+    pub(super) fn is_over(&self) -> bool {
         let status = &self.listening.status;
         let Until { idle_s, connections } = self.until;
         if connections > 0 && status.done.load(Ordering::Relaxed) >= connections {
@@ -106,54 +100,13 @@ impl ListenContext {
         idle_s > 0.0 && sign.elapsed().as_secs_f64() > idle_s
     }
 
-    fn refuse(&self, stream: &TcpStream, peer: SocketAddr) {
+    pub(super) fn refuse(&self, stream: &TcpStream, peer: SocketAddr) {
         self.listening.write().refused += 1;
         // A sender need not read the answer.
         let _ =
             stream.try_write(format!("{BUSY}there are downlink.listen.connections_max others\n").as_bytes());
         self.notes.say(ListenEvent::SenderRefused { peer: peer.to_string() });
     }
-}
-
-/// Listens until the end condition holds, then waits for all connections to end.
-pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
-    let mut connections = JoinSet::new();
-    // Accepted, and without a place yet. Others wait in the system's queue, in the order in which they came.
-    let mut newcomer: Option<(TcpStream, SocketAddr)> = None;
-    shared.note_sign();
-    while !shared.is_over() {
-        while connections.try_join_next().is_some() {}
-        if let Some((stream, peer)) = newcomer.take() {
-            if connections.len() < shared.config.connections_max {
-                connections.spawn(serve(stream, peer, Arc::clone(&shared)));
-                continue;
-            }
-            match shared.seats.make_room(peer.ip(), Instant::now()) {
-                Room::None => shared.refuse(&stream, peer),
-                Room::Soon => {
-                    newcomer = Some((stream, peer));
-                    match first(shared.stopped(), timeout(TICK, connections.join_next())).await {
-                        First::A(()) => break,
-                        First::B(_) => {}
-                    }
-                }
-            }
-            continue;
-        }
-        match first(shared.stopped(), timeout(TICK, listener.accept())).await {
-            First::A(()) => break,
-            First::B(Err(_)) => {}
-            First::B(Ok(Ok(accepted))) => newcomer = Some(accepted),
-            // Too many open files, or the peer is gone already: others may connect.
-            First::B(Ok(Err(error))) => {
-                shared.notes.say(ListenEvent::AcceptFailed { reason: error.to_string() });
-                sleep(TICK).await;
-            }
-        }
-    }
-    drop((listener, newcomer));
-    shared.stop.send_replace(true);
-    while connections.join_next().await.is_some() {}
 }
 
 /// Which of two futures completed first.

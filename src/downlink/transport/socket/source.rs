@@ -9,10 +9,11 @@ use std::time::Duration;
 use crossbeam_channel::{Receiver, RecvTimeoutError, unbounded};
 use tokio::sync::{Semaphore, watch};
 
+use super::accept::listen;
 use super::config::ListenConfig;
 use super::error::SocketError;
 use super::held::HeldAnswers;
-use super::listener::{ListenContext, Notes, PacketBatch, Teller, Until, listen};
+use super::listener::{ListenContext, Notes, PacketBatch, Teller, Until};
 use super::report::Listening;
 use super::seats::Seats;
 use super::sender_intake::{InstrumentCheck, Mission};
@@ -49,7 +50,10 @@ impl SocketSource {
     pub fn bind(addresses: &[SocketAddr], config: &ListenConfig, until: Until) -> Result<Self, SocketError> {
         let failed = |source| {
             let none = SocketAddr::from(([0, 0, 0, 0], 0));
-            SocketError::Listen { url: TcpUrl::from(addresses.first().copied().unwrap_or(none)), source }
+            SocketError::Listen {
+                url: TcpUrl::from(addresses.first().copied().unwrap_or(none)).to_string(),
+                source,
+            }
         };
         let bound = std::net::TcpListener::bind(addresses).and_then(|listener| {
             listener.set_nonblocking(true)?;

@@ -1,0 +1,85 @@
+//! Configuration of the daughters' antennas as maps take them to be.
+
+use serde::{Deserialize, Serialize};
+
+use crate::imaging::anywhere::AntennaBelief;
+use crate::response::PatternsByFrequency;
+use crate::units::Checks;
+
+/// Antennas by daughter; those beyond a list are ideal.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AntennasConfig {
+    /// Tilt of the axis from the orbit's normal towards the track's direction, degrees.
+    pub tilt_along_deg: Vec<f64>,
+    /// Tilt away from the Moon, degrees.
+    pub tilt_radial_deg: Vec<f64>,
+    /// q of a factor 1 + q (3 cos^2 - 1) / 2 of the voltage pattern, with the angle from the axis.
+    pub pattern: Vec<f64>,
+    /// The same by frequency, which is added to it: rows `[frequency_hz, q]`, or `[frequency_hz, q_1, q_2, ...]` with one q a daughter;
+    /// linear between rows, and beyond its ends that of the end.
+    #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
+    pub pattern_by_frequency: PatternsByFrequency,
+}
+
+impl AntennasConfig {
+    fn lists(&self) -> [(&'static str, &[f64]); 3] {
+        let Self { tilt_along_deg, tilt_radial_deg, pattern, .. } = self;
+        [("tilt_along_deg", tilt_along_deg), ("tilt_radial_deg", tilt_radial_deg), ("pattern", pattern)]
+    }
+
+    /// Whether all antennas are ideal.
+    #[must_use]
+    pub fn is_ideal(&self) -> bool {
+        self.keys_set().is_empty()
+    }
+
+    /// Keys by which an antenna is not ideal.
+    #[must_use]
+    pub fn keys_set(&self) -> Vec<&'static str> {
+        let is_set = |values: &[f64]| values.iter().any(|value| *value != 0.0);
+        let lists = self.lists().into_iter().filter(|(_, values)| is_set(values)).map(|(key, _)| key);
+        let by_frequency = (!self.pattern_by_frequency.is_ideal()).then_some("pattern_by_frequency");
+        lists.chain(by_frequency).collect()
+    }
+
+    /// Degree of pairs' responses as polynomials in the direction, at most: of two dipoles, and of a pattern of each.
+    #[must_use]
+    pub fn degree(&self) -> usize {
+        let is_set = |values: &[f64]| values.iter().any(|value| *value != 0.0);
+        let has_patterns = is_set(&self.pattern) || !self.pattern_by_frequency.is_ideal();
+        2 * usize::from(!self.is_ideal()) + 4 * usize::from(has_patterns)
+    }
+
+    /// What is believed of each antenna, without patterns by frequency; empty if all are ideal.
+    pub(super) fn beliefs(&self) -> Vec<AntennaBelief> {
+        if self.is_ideal() {
+            return Vec::new();
+        }
+        let count = self.lists().map(|(_, values)| values.len()).into_iter().max().unwrap_or(0);
+        let of = |values: &[f64], k: usize| values.get(k).copied().unwrap_or(0.0);
+        let antenna = |k: usize| AntennaBelief {
+            tilt_deg: [of(&self.tilt_along_deg, k), of(&self.tilt_radial_deg, k)],
+            distortion: of(&self.pattern, k),
+        };
+        (0..count).map(antenna).collect()
+    }
+
+    pub(super) fn check(&self, checks: &mut Checks) {
+        self.pattern_by_frequency.check("antennas.pattern_by_frequency", None, checks);
+        for (key, values) in self.lists() {
+            let expected = format!("at most {}, one a daughter", u8::MAX);
+            checks.require(
+                format!("antennas.{key}"),
+                format!("({} values)", values.len()),
+                values.len() <= usize::from(u8::MAX),
+                expected,
+            );
+            let (most, expected) = match key {
+                "pattern" => (2.0, "-2 to 2"),
+                _ => (80.0, "-80 to 80 degrees"),
+            };
+            checks.numbers(format!("antennas.{key}"), values, |value| value.abs() <= most, expected);
+        }
+    }
+}

@@ -1,0 +1,139 @@
+//! What the ground believes of visibilities besides their positions: that they are averages, and how antennas point and see.
+
+use crate::array::{orbit_normal_hat, tilted_axes};
+use crate::frames::AntennaResponse;
+use crate::response::PatternsByFrequency;
+use crate::response::general::{PairAt, PairResponse};
+use crate::response::pixel::SatelliteAntenna;
+use crate::units::vector::{Vec3, cross, dot, sub, unit};
+
+/// A satellite's positions further apart in time than this say nothing of its plane, s: a quarter of a low orbit.
+const SAME_PASS_S: f64 = 1500.0;
+
+/// Whether one visibility follows another of the same pair soon after.
+pub(in crate::imaging) fn is_same_pass(before: &PairAt, after: &PairAt) -> bool {
+    let apart_s = after.time_s - before.time_s;
+    before.pair == after.pair && apart_s > 0.0 && apart_s < SAME_PASS_S
+}
+
+/// Angle between the normals of two satellites' orbits and that of their plane, rad, up to which dipoles along either are the same: rows
+/// err by it.
+const SAME_NORMAL_RAD: f64 = 1e-5;
+
+/// Angle between the attitudes of two satellites, rad, up to which three dipoles on each are taken to see all directions alike: rows err by half
+/// its square.
+const SAME_ATTITUDE_RAD: f64 = 3e-3;
+
+/// The antenna of a daughter.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct AntennaBelief {
+    /// Tilt of its axis from the orbit's normal towards the track's direction, and away from the Moon, degrees.
+    pub tilt_deg: [f64; 2],
+    /// q of a factor `1 + q P_2(cos)` of its voltage, with the angle from the axis.
+    pub distortion: f64,
+}
+
+/// What rows of the true positions are made with.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RowBelief {
+    /// Whether visibilities are averages over their integrations, or instants in their middle.
+    pub smear_integrations: bool,
+    /// Antennas by daughter; those beyond the list are ideal.
+    pub antennas: Vec<AntennaBelief>,
+    /// Distortions of their patterns by frequency, which are added to theirs.
+    pub patterns: PatternsByFrequency,
+}
+
+/// Antennas of pairs whose response is not that of rows.
+#[derive(Clone, Debug)]
+pub(in crate::imaging) struct PairAntennas {
+    antennas: Vec<AntennaBelief>,
+    patterns: PatternsByFrequency,
+    frequency_hz: f64,
+    elements: AntennaResponse,
+}
+
+impl RowBelief {
+    /// The antennas of the pairs of sorted visibilities, where rows of a response alone do not have them.
+    pub(in crate::imaging) fn antennas_of(
+        &self,
+        elements: AntennaResponse,
+        frequency_hz: f64,
+        at: &[PairAt],
+    ) -> Option<PairAntennas> {
+        let (antennas, patterns) = (self.antennas.clone(), self.patterns.clone());
+        let found = PairAntennas { antennas, patterns, frequency_hz, elements };
+        let is_tilted = || self.antennas.iter().any(|antenna| antenna.tilt_deg != [0.0; 2]);
+        let differs = match elements {
+            AntennaResponse::Isotropic => false,
+            AntennaResponse::DipoleNormal => is_tilted() || leave_the_plane(at),
+            AntennaResponse::ThreeDipoles => is_tilted() || turn_apart(at),
+        };
+        (found.is_distorted() || differs).then_some(found)
+    }
+}
+
+impl PairAntennas {
+    fn is_distorted(&self) -> bool {
+        !self.patterns.is_ideal() || self.antennas.iter().any(|antenna| antenna.distortion != 0.0)
+    }
+
+    /// Degree of their responses as polynomials.
+    pub(in crate::imaging) fn degree(&self) -> usize {
+        self.elements.degree() + 4 * usize::from(self.is_distorted())
+    }
+
+    /// The response of a pair.
+    pub(in crate::imaging) fn response(&self, at: &[PairAt], k: usize) -> PairResponse {
+        let pair = &at[k];
+        let [normal_i, normal_j] = normals(at, k);
+        let antenna = |daughter: u8, r_m: Vec3, normal_hat: Vec3| {
+            let known = self.antennas.get(usize::from(daughter)).copied().unwrap_or_default();
+            let axes_hat = tilted_axes(r_m, normal_hat, known.tilt_deg);
+            let distortion = known.distortion + self.patterns.q(daughter.into(), self.frequency_hz);
+            SatelliteAntenna { elements: self.elements, axes_hat, distortion }
+        };
+        let a = antenna(pair.pair.i, pair.r_i_m, normal_i);
+        let b = antenna(pair.pair.j, pair.r_j_m, normal_j);
+        PairResponse::of_antennas([&a, &b])
+    }
+}
+
+/// Whether dipoles along the normals of orbits are not along those of the pairs' planes.
+fn leave_the_plane(at: &[PairAt]) -> bool {
+    at.iter().enumerate().any(|(k, pair)| {
+        let plane = unit(cross(pair.r_i_m, pair.r_j_m));
+        normals(at, k).into_iter().any(|normal| {
+            let off = cross(normal, plane);
+            dot(off, off) > SAME_NORMAL_RAD * SAME_NORMAL_RAD
+        })
+    })
+}
+
+/// Whether the satellites of a pair, each upright in its own orbit, have different attitudes.
+fn turn_apart(at: &[PairAt]) -> bool {
+    at.iter().enumerate().any(|(k, pair)| {
+        let [a, b] = normals(at, k);
+        let (normals, verticals) = (sub(a, b), sub(unit(pair.r_i_m), unit(pair.r_j_m)));
+        [normals, verticals]
+            .into_iter()
+            .any(|apart| dot(apart, apart) > SAME_ATTITUDE_RAD * SAME_ATTITUDE_RAD)
+    })
+}
+
+/// Normals of the orbits of satellites i and j, as they move from or to a neighbouring visibility; without one that of their plane.
+fn normals(at: &[PairAt], k: usize) -> [Vec3; 2] {
+    let here = &at[k];
+    let after = at.get(k + 1).filter(|after| is_same_pass(here, after)).map(|after| [here, after]);
+    let before = k.checked_sub(1).map(|k| &at[k]).filter(|before| is_same_pass(before, here));
+    let moves = after.or(before.map(|before| [before, here]));
+    let plane = || {
+        let normal = unit(cross(here.r_i_m, here.r_j_m));
+        // A satellite j that leads turns it upside down; orbits are prograde more often than not.
+        if normal[2] < 0.0 { normal.map(|x| -x) } else { normal }
+    };
+    let normal = |of: fn(&PairAt) -> Vec3| {
+        moves.and_then(|[from, to]| orbit_normal_hat(of(from), of(to))).unwrap_or_else(plane)
+    };
+    [normal(|at| at.r_i_m), normal(|at| at.r_j_m)]
+}

@@ -1,0 +1,133 @@
+//! A visibility that is held for a refined map, and the setup of an archive of them.
+
+use num_complex::Complex64;
+
+use crate::frames::{AntennaResponse, PlacedVisibilities};
+use crate::imaging::exact::checkpoint::{RESPONSES, number_of, refused};
+use crate::imaging::{AccumulationError, Refusal};
+use crate::response::general::{PairAt, check_positions};
+use crate::response::harmonic::GeometryLimits;
+use crate::units::ChannelId;
+use crate::units::vector::Vec3;
+
+/// Setup of an archive of visibilities.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RefinedSetup {
+    /// Channel.
+    pub channel: ChannelId,
+    /// Greatest degree of the map.
+    pub l_max: usize,
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Longest baseline that is accepted, m.
+    pub baseline_m_max: f64,
+    /// Radius of the body that hides the sky, m.
+    pub moon_radius_m: f64,
+    /// Antenna response.
+    pub response: AntennaResponse,
+    /// Seed of the noise-only companion.
+    pub companion_seed: u64,
+    /// Greatest weight that is accepted, (K sr)^-2.
+    pub weight_max: f64,
+    /// Departures from the circle up to which its sums alone would hold.
+    pub limits: GeometryLimits,
+    /// Most visibilities that are held.
+    pub visibilities_max: u64,
+}
+
+/// The setup of an archive in a checkpoint. The most visibilities are not part of it: a later session may hold more.
+#[derive(bincode::Encode, bincode::Decode)]
+pub(in crate::imaging) struct HeldHead {
+    channel: u16,
+    l_max: u32,
+    frequency_hz: f64,
+    baseline_m_max: f64,
+    moon_radius_m: f64,
+    response: u8,
+    companion_seed: u64,
+    weight_max: f64,
+    limits: [f64; 4],
+}
+
+impl HeldHead {
+    pub(in crate::imaging) fn new(setup: &RefinedSetup) -> Self {
+        let limits = setup.limits;
+        Self {
+            channel: setup.channel.0,
+            l_max: setup.l_max as u32,
+            frequency_hz: setup.frequency_hz,
+            baseline_m_max: setup.baseline_m_max,
+            moon_radius_m: setup.moon_radius_m,
+            response: number_of(&RESPONSES, &setup.response),
+            companion_seed: setup.companion_seed,
+            weight_max: setup.weight_max,
+            limits: [
+                limits.out_of_track_deg_max,
+                limits.inclination_deg_max,
+                limits.altitude_m_max,
+                limits.radial_deg_max,
+            ],
+        }
+    }
+
+    pub(in crate::imaging) fn setup(&self, visibilities_max: u64) -> Result<RefinedSetup, AccumulationError> {
+        let response = RESPONSES.get(usize::from(self.response)).copied();
+        let [out_of_track_deg_max, inclination_deg_max, altitude_m_max, radial_deg_max] = self.limits;
+        Ok(RefinedSetup {
+            channel: ChannelId(self.channel),
+            l_max: self.l_max as usize,
+            frequency_hz: self.frequency_hz,
+            baseline_m_max: self.baseline_m_max,
+            moon_radius_m: self.moon_radius_m,
+            response: response
+                .ok_or_else(|| refused(format!("response {}", self.response), "a known response"))?,
+            companion_seed: self.companion_seed,
+            weight_max: self.weight_max,
+            limits: GeometryLimits {
+                out_of_track_deg_max,
+                inclination_deg_max,
+                altitude_m_max,
+                radial_deg_max,
+            },
+            visibilities_max,
+        })
+    }
+}
+
+/// A visibility that is held.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(in crate::imaging) struct HeldVisibility {
+    pub(in crate::imaging) at: PairAt,
+    pub(in crate::imaging) band: u16,
+    pub(in crate::imaging) value_k_sr: Complex64,
+    pub(in crate::imaging) weight: f64,
+    /// Length of the integration, s; 0 for an instant.
+    pub(in crate::imaging) duration_s: f32,
+}
+
+/// What visibilities are sorted by.
+type HeldOrder = (u8, u8, f64, u16, f64, f64, f64, Vec3, Vec3, f32);
+
+impl HeldVisibility {
+    /// Visibility `k`; refused if it has no row of B.
+    pub(in crate::imaging) fn of(
+        placed: &PlacedVisibilities,
+        k: usize,
+        moon_radius_m: f64,
+    ) -> Result<Self, Refusal> {
+        let (r_i_m, r_j_m) = (placed.r_i_m[k], placed.r_j_m[k]);
+        check_positions(r_i_m, r_j_m, moon_radius_m)?;
+        let at = PairAt { pair: placed.pair, time_s: placed.time_s[k], r_i_m, r_j_m };
+        let (value_k_sr, weight) = (placed.value_k_sr[k], placed.weight[k]);
+        // What is no length is that of an instant.
+        let length_s = placed.duration_s.get(k).copied().filter(|length_s| *length_s > 0.0);
+        Ok(Self { at, band: placed.band, value_k_sr, weight, duration_s: length_s.unwrap_or(0.0) })
+    }
+
+    /// What visibilities are sorted by: all that they are, and nothing of how they arrived.
+    pub(in crate::imaging) fn order(&self) -> HeldOrder {
+        let Self { at, band, value_k_sr: value, weight, duration_s } = self;
+        let PairAt { pair, time_s, r_i_m, r_j_m } = *at;
+        (pair.i, pair.j, time_s, *band, value.re, value.im, *weight, r_i_m, r_j_m, *duration_s)
+    }
+}

@@ -1,0 +1,89 @@
+//! The solution after each pass of a refinement, on disk: a pass over all visibilities can take an hour.
+
+use std::path::{Path, PathBuf};
+
+use crc_fast::{CrcAlgorithm, checksum};
+
+use crate::files::write_atomically;
+use crate::units::ChannelId;
+
+const MAGIC: &[u8; 8] = b"LNRPASS1";
+/// Longest file that is read: two maps of harmonics to l = 1024.
+const BYTES_MAX: u64 = 64 << 20;
+
+/// Where the passes of one map leave their solution.
+///
+/// A file helps and is never needed: one that cannot be read or written is as good as none.
+pub(in crate::imaging) struct PassFile {
+    path: PathBuf,
+    /// A number that maps of the same data and settings share.
+    key: u64,
+}
+
+impl PassFile {
+    /// The file of a channel in `folder`, for what the numbers `of` tell apart.
+    pub(in crate::imaging) fn new(folder: &Path, channel: ChannelId, of: &[i64]) -> Self {
+        let bytes: Vec<u8> = of.iter().flat_map(|number| number.to_le_bytes()).collect();
+        let path = folder.join(format!(".refining-{channel}"));
+        Self { path, key: checksum(CrcAlgorithm::Crc64Nvme, &bytes) }
+    }
+
+    /// The map and the noise-only map after the last pass.
+    pub(in crate::imaging) fn read(&self) -> Option<[Vec<f64>; 2]> {
+        let length = std::fs::metadata(&self.path).ok()?.len();
+        let bytes = std::fs::read(&self.path).ok().filter(|_| length <= BYTES_MAX)?;
+        let (body, crc) = bytes.split_last_chunk::<8>()?;
+        if checksum(CrcAlgorithm::Crc64Nvme, body) != u64::from_le_bytes(*crc) {
+            return None;
+        }
+        let numbers = body.strip_prefix(MAGIC)?.strip_prefix(&self.key.to_le_bytes())?;
+        let (numbers, rest) = numbers.as_chunks::<8>();
+        let values: Vec<f64> = numbers.iter().map(|number| f64::from_le_bytes(*number)).collect();
+        let half = values.len() / 2;
+        let is_whole = rest.is_empty() && values.len() == 2 * half && values.iter().all(|x| x.is_finite());
+        is_whole.then(|| [values[..half].to_vec(), values[half..].to_vec()])
+    }
+
+    /// Keeps the solutions of a pass.
+    pub(in crate::imaging) fn write(&self, x: [&[f64]; 2]) {
+        let numbers = x.into_iter().flatten().flat_map(|x| x.to_le_bytes());
+        let mut bytes: Vec<u8> = MAGIC.iter().copied().chain(self.key.to_le_bytes()).chain(numbers).collect();
+        bytes.extend(checksum(CrcAlgorithm::Crc64Nvme, &bytes).to_le_bytes());
+        let _ = write_atomically(&self.path, &bytes);
+    }
+
+    pub(in crate::imaging) fn remove(&self) {
+        let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_solution_comes_back_for_the_same_data_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = PassFile::new(folder.path(), ChannelId(3), &[1, 2]);
+        assert_eq!(file.read(), None);
+        file.write([&[1.0, -2.5], &[1e-300, 4.0]]);
+        assert_eq!(file.read(), Some([vec![1.0, -2.5], vec![1e-300, 4.0]]));
+        assert_eq!(PassFile::new(folder.path(), ChannelId(3), &[1, 3]).read(), None);
+        assert_eq!(PassFile::new(folder.path(), ChannelId(4), &[1, 2]).read(), None);
+        let whole = std::fs::read(&file.path).unwrap();
+        for at in 0..whole.len() {
+            let mut bytes = whole.clone();
+            bytes[at] ^= 1;
+            std::fs::write(&file.path, &bytes).unwrap();
+            assert_eq!(file.read(), None, "byte {at}");
+            std::fs::write(&file.path, &whole[..at]).unwrap();
+            assert_eq!(file.read(), None, "{at} bytes");
+        }
+        std::fs::write(&file.path, &whole).unwrap();
+        assert!(file.read().is_some());
+        file.remove();
+        assert_eq!(file.read(), None);
+        // Nowhere to write is no failure.
+        PassFile::new(&folder.path().join("gone"), ChannelId(0), &[]).write([&[], &[]]);
+    }
+}

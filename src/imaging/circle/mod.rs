@@ -1,0 +1,232 @@
+//! Normal equations over spherical harmonics: sums on tori, from which BtN^-1B acts on harmonic coefficients.
+//!
+//! On a common circular orbit every row of B is one rotation of a pattern that depends on the baseline's length
+//! alone (see [`mod@crate::response::harmonic`]). A row at baseline u is interpolated from nodes u_k by a compact
+//! kernel, `B = sum_k kappa(u_k - u) B_k`, so
+//!
+//! ```text
+//! BtN^-1B = sum_{k k'} B_k^t [ sum_t w_t kappa_k kappa_k' at (alpha_t, gamma_t) ] B_k'
+//! ```
+//!
+//! and the bracket, a weight for every pair of neighbouring nodes on a torus in alpha and gamma, is all that has to be
+//! summed. On the torus it multiplies pointwise. Its grid is fine enough for the products of two
+//! functions of degree `l_max`, so the weights are spread by kernels whose spectra are flat over their band.
+//!
+//! Summing a visibility costs some thousand multiply-adds, whatever the map's size, and the size of the sums does not
+//! grow with the data. With M the power of four not below `weight_max`, weights are rounded to `2^-30 M` and data to
+//! `2^-24 sqrt(M)`, those above 2^21 of these to 21 bits (see the module `exact`); there is room for a total weight of
+//! `2^32 M`.
+
+mod beams;
+mod blocks;
+mod checkpoint;
+mod coverage;
+mod exact;
+mod grid;
+mod lines;
+mod noise_maps;
+mod noises;
+mod operator;
+mod parts;
+mod quanta;
+mod setup;
+mod solve;
+mod spread;
+mod stored;
+mod sums;
+#[cfg(test)]
+mod tests;
+mod tori;
+mod workspace;
+
+use std::io::Read;
+use std::sync::{Arc, OnceLock};
+
+pub use beams::harmonic_beams;
+pub use blocks::{OrderBlocks, OrderFactors};
+pub use coverage::{GeometryCoverage, GeometrySurvey};
+pub use grid::SPREAD_MULTIPLY_ADDS;
+pub use noise_maps::{NOISES_TOGETHER, solve_noises};
+pub use noises::NoiseSums;
+pub use parts::SumPart;
+pub use setup::{
+    ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, SharedSize, application_size, memory, orbit_of,
+    shared_size,
+};
+pub(super) use setup::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
+pub use solve::{HarmonicRequest, HarmonicSolution, solve_harmonics, solve_regularised};
+pub(super) use solve::{W_MAX_TOLERANCE, lifted, prior_unknowns};
+pub use sums::{HarmonicSums, coefficients, degrees, unknowns, unknowns_of_gradient};
+
+use self::checkpoint::HarmonicHead;
+use self::exact::{ExactTori, SCALES_MAX};
+use self::grid::Grids;
+use self::operator::Operator;
+use self::quanta::Quanta;
+use self::spread::TorusPoint;
+use self::tori::Tori;
+use crate::imaging::exact::checkpoint::{BasisKind, FrameReader, FrameWriter};
+use crate::imaging::exact::engine::{Accepted, CommonSetup, ExactEngine, SkyBasis};
+use crate::imaging::exact::fixed_point::{Direction, WeightScale};
+use crate::imaging::{AccumulationError, Refusal, SumCounts};
+use crate::ranks::{RankShare, Ranks};
+use crate::response::harmonic::PairOrientation;
+use crate::units::vector::Vec3;
+
+/// The engine that sums over spherical harmonics. Memory grows as baselines of more lengths arrive.
+pub type HarmonicEngine = ExactEngine<HarmonicBasis>;
+
+/// Spherical harmonics, of satellites on one circular orbit.
+pub struct HarmonicBasis {
+    setup: HarmonicSetup,
+    quanta: Quanta,
+    grids: Arc<Grids>,
+    tables: Arc<OnceLock<Operator>>,
+    ranks: Ranks,
+}
+
+impl HarmonicEngine {
+    /// This engine, without data yet, as one rank's of several: it takes all visibilities, and holds its part of their sums. Every
+    /// rank has such an engine of the same setup, and uses its sums as the others do.
+    #[must_use]
+    pub fn among(mut self, ranks: &Ranks) -> Self {
+        let grids = Grids { share: ranks.share(), ..Grids::clone(&self.basis.grids) };
+        let HarmonicBasis { setup, quanta, .. } = *self.basis;
+        let (grids, tables, ranks) = (Arc::new(grids), Arc::default(), ranks.clone());
+        self.basis = Arc::new(HarmonicBasis { setup, quanta, grids, tables, ranks });
+        self
+    }
+
+    /// An engine from what one rank of a job wrote of its part (`part`; all of it of a process alone), as one of `ranks`, which may be
+    /// others than those that wrote: it keeps what it holds.
+    ///
+    /// # Errors
+    /// As [`NormalEngine::restore`]; sums that the rank which wrote does not hold.
+    ///
+    /// [`NormalEngine::restore`]: crate::imaging::NormalEngine::restore
+    pub fn restore_part(
+        from: &mut dyn Read,
+        part: RankShare,
+        ranks: &Ranks,
+    ) -> Result<Self, AccumulationError> {
+        let (mut from, (head, totals)) = FrameReader::new(from, HarmonicBasis::KIND)?;
+        let kept = ranks.share();
+        let engine = Self::of(HarmonicBasis::setup_of(head)?, totals, |basis| {
+            ExactTori::read(&basis.grids, &mut from, part, kept)
+        })?;
+        from.finish()?;
+        Ok(engine.among(ranks))
+    }
+
+    /// Takes in another part of the same sums: those of the same visibilities at other alphas.
+    ///
+    /// # Errors
+    /// Parts of different sums, or of the same alphas.
+    pub fn join(&mut self, other: Self) -> Result<(), AccumulationError> {
+        let basis = Arc::clone(&self.basis);
+        let (ours, theirs) = self.halves(other)?;
+        ours.join(&basis.grids, &theirs)
+    }
+}
+
+impl HarmonicBasis {
+    /// The same of a process that holds all sums.
+    fn whole(&self) -> Self {
+        let grids = Arc::new(Grids { share: RankShare::WHOLE, ..Grids::clone(&self.grids) });
+        Self { setup: self.setup, quanta: self.quanta, grids, tables: Arc::default(), ranks: Ranks::one() }
+    }
+
+    fn sums(&self, tori: Tori, counts: SumCounts) -> HarmonicSums {
+        HarmonicSums {
+            setup: self.setup,
+            grids: Arc::clone(&self.grids),
+            tables: Arc::clone(&self.tables),
+            tori,
+            ranks: self.ranks.clone(),
+            reached: OnceLock::new(),
+            counts,
+            right: OnceLock::new(),
+            noise: OnceLock::new(),
+            further: Vec::new(),
+        }
+    }
+}
+
+impl SkyBasis for HarmonicBasis {
+    type Setup = HarmonicSetup;
+    type Place = TorusPoint;
+    type Exact = ExactTori;
+    type Equations = HarmonicSums;
+    type Head = HarmonicHead;
+
+    const KIND: BasisKind = BasisKind::Harmonic;
+    /// Enough to keep all cores busy over the nodes, in little memory.
+    const BATCH: usize = 16_384;
+    const SCALES_MAX: f64 = SCALES_MAX;
+
+    fn new(setup: &HarmonicSetup, scale: WeightScale) -> Result<Self, AccumulationError> {
+        setup.check()?;
+        Ok(Self {
+            setup: *setup,
+            quanta: Quanta::new(scale),
+            grids: Arc::new(setup.grids()),
+            tables: Arc::new(OnceLock::new()),
+            ranks: Ranks::one(),
+        })
+    }
+
+    fn common(setup: &HarmonicSetup) -> CommonSetup {
+        let &HarmonicSetup { frequency_hz, weight_max, companion_seed, .. } = setup;
+        CommonSetup { frequency_hz, weight_max, companion_seed }
+    }
+
+    fn zeros(&self) -> ExactTori {
+        ExactTori::zeros(&self.grids)
+    }
+
+    fn place(&self, r_i_m: Vec3, r_j_m: Vec3) -> Result<TorusPoint, Refusal> {
+        let orientation = PairOrientation::of(r_i_m, r_j_m)?;
+        let pair = self.setup.orbit.pair(&orientation, self.setup.wavelength_m())?;
+        if orientation.baseline_m > self.setup.baseline_m_max {
+            return Err(Refusal::TooLong);
+        }
+        Ok(TorusPoint {
+            alpha_rad: pair.state.node_rad - std::f64::consts::FRAC_PI_2,
+            gamma_rad: pair.state.phase_rad + std::f64::consts::FRAC_PI_2,
+            u: pair.state.baseline_wavelengths,
+            reversed: pair.reversed,
+        })
+    }
+
+    fn sum(&self, exact: &mut ExactTori, batch: &[Accepted<TorusPoint>], direction: Direction) {
+        exact.add(&self.grids, self.quanta, batch, direction);
+    }
+
+    fn combine(&self, exact: &mut ExactTori, other: &ExactTori, direction: Direction) {
+        exact.combine(&self.grids, other, direction);
+    }
+
+    fn equations(&self, exact: &ExactTori, counts: SumCounts) -> HarmonicSums {
+        self.sums(exact.values(&self.grids, self.quanta), counts)
+    }
+
+    fn finish(&self, exact: ExactTori, counts: SumCounts) -> HarmonicSums {
+        self.sums(exact.into_values(&self.grids, self.quanta), counts)
+    }
+
+    fn head(setup: &HarmonicSetup) -> HarmonicHead {
+        HarmonicHead::new(setup)
+    }
+
+    fn setup_of(head: HarmonicHead) -> Result<HarmonicSetup, AccumulationError> {
+        head.setup()
+    }
+
+    fn write(&self, exact: &ExactTori, out: &mut FrameWriter<'_>) -> Result<(), AccumulationError> {
+        exact.write(&self.grids, out)
+    }
+
+    fn read(&self, from: &mut FrameReader<'_>) -> Result<ExactTori, AccumulationError> {
+        ExactTori::read(&self.grids, from, RankShare::WHOLE, RankShare::WHOLE)
+    }
+}

@@ -1,0 +1,409 @@
+//! BtN^-1B as an operator on harmonic coefficients, and the projection of data onto them.
+//!
+//! For a block of alphas: the sky turned into the orbit's plane (products with d), its products with the
+//! patterns at all nodes, transforms from mu to gamma; there the weights multiply, pointwise; and back.
+
+use std::ops::Range;
+
+use faer::{Accum, MatMut, MatRef, Par};
+use num_complex::{Complex32, Complex64};
+use rayon::prelude::*;
+
+use super::grid::ALPHAS;
+use super::grid::{Grids, NODE_GROUP, NODES};
+use super::lines::multiply_line;
+use super::stored::TorusPart;
+use super::tori::{BlockRows, Tori};
+use super::workspace::{NodeRange, Workspace};
+use crate::imaging::exact::fixed_point::parts::sum_of_parts;
+use crate::ranks::Ranks;
+use crate::response::harmonic::filter::FilteredPatterns;
+use crate::response::harmonic::rotation::{RotationTable, orders};
+use crate::response::harmonic::{PatternGeometry, PatternTable, degrees};
+use crate::sky::harmonics::Alm;
+
+/// Tables of the operator.
+#[derive(Debug)]
+pub(super) struct Operator {
+    l_max: usize,
+    grids: Grids,
+    rotation: RotationTable<f32>,
+    pub(super) patterns: FilteredPatterns,
+    /// One over the transform of the data's kernel at the orders 0 ..= l_max.
+    correction: Vec<f64>,
+}
+
+/// The tori of all ranks, of which each holds a part.
+pub(super) struct SharedTori<'a> {
+    pub(super) ranks: &'a Ranks,
+    /// What this one holds.
+    pub(super) tori: &'a Tori,
+    /// The range of nodes that hold data, of any rank.
+    pub(super) reached: Range<usize>,
+}
+
+/// A right-hand side: of the data, or of the noise-only companion.
+#[derive(Clone, Copy)]
+pub(super) enum RightHandSide {
+    Data,
+    Noise,
+}
+
+/// The blocks of alphas that a product is a sum over.
+struct Blocks<'a> {
+    ranks: &'a Ranks,
+    /// Which alphas hold data.
+    used: &'a [bool],
+    reach: NodeRange,
+    /// Skies at once.
+    skies: usize,
+    /// From the last to the first.
+    backwards: bool,
+}
+
+/// Points of a grid on a circle: of weights or of data.
+#[derive(Clone, Copy)]
+struct Circle {
+    points: usize,
+}
+
+impl Circle {
+    fn turn(self, index: usize) -> (f64, f64) {
+        (std::f64::consts::TAU * (index % self.points) as f64 / self.points as f64).sin_cos()
+    }
+}
+
+impl Operator {
+    pub(super) fn new(
+        l_max: usize,
+        grids: Grids,
+        geometry: PatternGeometry,
+        inclination_rad: f64,
+        fractional_bandwidth: f64,
+    ) -> Self {
+        let table = PatternTable::new(geometry, l_max, grids.table_nodes());
+        let step = grids.nodes.step;
+        let patterns = FilteredPatterns::new(
+            table,
+            1.002 * step,
+            |f| grids.u.transforms(f).iter().map(|t| 1.0 / t).collect(),
+            |u| u * fractional_bandwidth / step,
+        );
+        let correction = grids.data_correction(l_max);
+        let rotation = RotationTable::new(l_max, inclination_rad);
+        Self { l_max, grids, rotation, patterns, correction }
+    }
+
+    /// Bytes of the tables.
+    pub(super) fn table_bytes(l_max: usize, grids: &Grids) -> u64 {
+        let patterns: usize = (0..=l_max).map(|mu| 2 * grids.table_nodes().count * degrees(l_max, mu)).sum();
+        let rotation: usize = (0..=l_max).map(|l| 2 * orders(l) * (l + 1)).sum();
+        // The patterns are filtered from a table of the same size.
+        (4 * (2 * patterns + rotation)) as u64
+    }
+
+    /// Bytes of one thread's workspace for so many skies at once.
+    pub(super) fn workspace_bytes(l_max: usize, grids: &Grids, skies: usize) -> u64 {
+        (4 * (l_max + 1) * 2 * skies * ALPHAS * (2 * grids.nodes.count + l_max / 4)) as u64
+    }
+
+    /// Operations of the products with patterns and rotations in one application.
+    pub(super) fn matrix_product_flops(&self, tori: &Tori) -> f64 {
+        let reach = self.reach(tori.reached(&Ranks::one()));
+        let used = tori.alphas(&self.grids, TorusPart::Weights);
+        let blocks = used.chunks(ALPHAS).filter(|block| block.contains(&true)).count();
+        let patterns: usize = (0..=self.l_max).map(|mu| 2 * reach.count * degrees(self.l_max, mu)).sum();
+        let rotations: usize = (0..=self.l_max).map(|l| orders(l) * (l + 1)).sum();
+        // Forth and back, real and imaginary parts, multiplications and additions.
+        (2 * 2 * 2 * ALPHAS * blocks * (patterns + rotations)) as f64
+    }
+
+    fn reach(&self, reached: Range<usize>) -> NodeRange {
+        let first = reached.start / NODE_GROUP * NODE_GROUP;
+        NodeRange { first, count: (reached.end - first).next_multiple_of(NODE_GROUP) }
+    }
+
+    /// BtN^-1B of the coefficients of each sky, the gradients in terms of real and imaginary parts for m >= 0. Weights and patterns
+    /// are read once for all skies; each product has the bits that it has alone.
+    pub(super) fn apply(&self, shared: &SharedTori<'_>, skies: &[Alm]) -> Vec<Alm> {
+        if skies.is_empty() {
+            return Vec::new();
+        }
+        let tori = shared.tori;
+        let reach = self.reach(shared.reached.clone());
+        let circle = Circle { points: self.grids.points };
+        let used = tori.alphas(&self.grids, TorusPart::Weights);
+        let over = Blocks {
+            ranks: shared.ranks,
+            used: &used,
+            reach,
+            skies: skies.len(),
+            backwards: tori.turns_back(),
+        };
+        self.over_blocks(over, |work, alphas| {
+            let rows = tori.block(&self.grids, TorusPart::Weights, alphas[0] / ALPHAS)?;
+            work.turned.fill(0.0);
+            for (first, sky) in (0..).step_by(ALPHAS).zip(skies) {
+                self.turn(sky, circle, alphas, first, work);
+            }
+            self.multiply_patterns(work, reach);
+            for (place, &alpha) in alphas.iter().enumerate() {
+                for first in (0..work.columns).step_by(ALPHAS) {
+                    self.multiply_weights(&rows, alpha % ALPHAS, first + place, work, reach);
+                }
+            }
+            Some(self.gradients(work, reach, circle, alphas, None))
+        })
+    }
+
+    /// BtN^-1 times the data, or times the companion's noise.
+    pub(super) fn project(&self, shared: &SharedTori<'_>, of: RightHandSide) -> Alm {
+        let tori = shared.tori;
+        let reach = self.reach(shared.reached.clone());
+        let circle = Circle { points: self.grids.data_points() };
+        let used = tori.alphas(&self.grids, TorusPart::Right);
+        let over = Blocks { ranks: shared.ranks, used: &used, reach, skies: 1, backwards: false };
+        let mut projected = self.over_blocks(over, |work, alphas| {
+            let rows = tori.block(&self.grids, TorusPart::Right, alphas[0] / ALPHAS)?;
+            work.products.fill(0.0);
+            for (place, &alpha) in alphas.iter().enumerate() {
+                for group in (0..reach.count).step_by(NODE_GROUP) {
+                    for (k, line) in work.group.iter_mut().enumerate() {
+                        let row = rows.row(reach.first + group + k, alpha % ALPHAS);
+                        self.read_right_hand_side(row, of, line);
+                        work.transforms.inverse(line);
+                        for (mu, factor) in self.correction.iter().enumerate() {
+                            line[mu] *= *factor as f32;
+                            if mu > 0 {
+                                line[circle.points - mu] *= *factor as f32;
+                            }
+                        }
+                    }
+                    work.scatter(place, 0, group);
+                }
+            }
+            Some(self.gradients(work, reach, circle, alphas, Some(&self.correction)))
+        });
+        projected.swap_remove(0)
+    }
+
+    /// Sums `block`, which has a vector for each sky, over blocks of alphas: of each fixed range of them those in use. The sums have the
+    /// same bits in any order, so that they do not depend on who computes which block, and when. They are NaN if `block` has none for
+    /// one of them.
+    fn over_blocks(
+        &self,
+        over: Blocks<'_>,
+        block: impl Fn(&mut Workspace, &[usize]) -> Option<Vec<Vec<f64>>> + Sync,
+    ) -> Vec<Alm> {
+        let Blocks { ranks, used, reach, skies, backwards } = over;
+        let points = used.len();
+        let of_range = |first: usize| -> Vec<usize> {
+            (first..points.min(first + ALPHAS)).filter(|&alpha| used[alpha]).collect()
+        };
+        let mut blocks: Vec<Vec<usize>> =
+            (0..points).step_by(ALPHAS).map(of_range).filter(|alphas| !alphas.is_empty()).collect();
+        if backwards {
+            blocks.reverse();
+        }
+        let parts: Vec<Vec<Vec<f64>>> = blocks
+            .par_iter()
+            .map_init(
+                || Workspace::new(self.l_max, points, reach, skies),
+                |work, alphas| block(work, alphas).unwrap_or_else(|| vec![vec![f64::NAN]; skies]),
+            )
+            .collect();
+        let sum = |sky: usize| {
+            let mut sum = Alm::zeros(self.l_max);
+            let parts: Vec<&[f64]> = parts.iter().map(|part| part[sky].as_slice()).collect();
+            let sums = sum_of_parts(ranks, &parts, 2 * sum.values().len(), points.div_ceil(ALPHAS));
+            for (value, sums) in sum.values_mut().iter_mut().zip(sums.as_chunks::<2>().0) {
+                *value = Complex64::new(sums[0], sums[1]);
+            }
+            sum
+        };
+        (0..skies).map(sum).collect()
+    }
+
+    /// Where each order mu of so many columns of turned skies starts.
+    fn turned_starts(&self, columns: usize) -> Vec<usize> {
+        let lengths = (0..=self.l_max).map(|mu| 2 * columns * degrees(self.l_max, mu));
+        lengths.scan(0, |end, length| Some(std::mem::replace(end, *end + length))).collect()
+    }
+
+    /// The sky in the plane of the orbit at each alpha, in the columns from `first` on: `t_{l mu} = sum_m d+ Re z + i d- Im z`,
+    /// `z = conj(T_lm) exp(-i m alpha)`.
+    fn turn(&self, sky: &Alm, circle: Circle, alphas: &[usize], first: usize, work: &mut Workspace) {
+        let Workspace { columns, turned, .. } = work;
+        let starts = self.turned_starts(*columns);
+        let count = alphas.len();
+        let turns = self.turns(circle, alphas);
+        let mut z = [vec![0.0_f32; (self.l_max + 1) * ALPHAS], vec![0.0_f32; (self.l_max + 1) * ALPHAS]];
+        let mut out = vec![0.0_f32; 2 * orders(self.l_max) * ALPHAS];
+        for l in 0..=self.l_max {
+            let [re, im] = &mut z;
+            let out = &mut out[..2 * orders(l) * count];
+            self.rotation.rotate_degree(l, |m| sky.get(l, m).conj(), &turns, [re, im], out);
+            for (part, out) in out.chunks_exact(orders(l) * count).enumerate() {
+                for (k, column) in out.chunks_exact(orders(l)).enumerate() {
+                    for (order, value) in column.iter().enumerate() {
+                        let mu = l % 2 + 2 * order;
+                        let rows = degrees(self.l_max, mu);
+                        turned[starts[mu] + (part * *columns + first + k) * rows + (l - mu) / 2] = *value;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Sine and cosine of m alpha: `[m][alpha]`.
+    fn turns(&self, circle: Circle, alphas: &[usize]) -> Vec<(f64, f64)> {
+        (0..=self.l_max).flat_map(|m| alphas.iter().map(move |alpha| circle.turn(m * alpha))).collect()
+    }
+
+    fn pattern(&self, mu: usize, reach: NodeRange) -> MatRef<'_, f32> {
+        let stride = 2 * self.patterns.grid.count;
+        let rows = &self.patterns.order(mu)[2 * reach.first..];
+        MatRef::from_column_major_slice_with_stride(rows, 2 * reach.count, degrees(self.l_max, mu), stride)
+    }
+
+    /// The turned skies times the patterns of every node.
+    fn multiply_patterns(&self, work: &mut Workspace, reach: NodeRange) {
+        let (starts, columns) = (self.turned_starts(work.columns), 2 * work.columns);
+        for (mu, products) in work.products.chunks_exact_mut(columns * 2 * reach.count).enumerate() {
+            let rows = degrees(self.l_max, mu);
+            let turned = &work.turned[starts[mu]..starts[mu] + columns * rows];
+            faer::linalg::matmul::matmul(
+                MatMut::from_column_major_slice_mut(products, 2 * reach.count, columns),
+                Accum::Replace,
+                self.pattern(mu, reach),
+                MatRef::from_column_major_slice(turned, rows, columns),
+                1.0,
+                Par::Seq,
+            );
+        }
+    }
+
+    /// For one alpha, which is `alpha` in its block, in the column `place`: from orders mu to gamma, times the weights of neighbouring
+    /// nodes, and back.
+    fn multiply_weights(
+        &self,
+        block: &BlockRows<'_>,
+        alpha: usize,
+        place: usize,
+        work: &mut Workspace,
+        reach: NodeRange,
+    ) {
+        const BEHIND: usize = NODES - 1;
+        let rows = |node: usize| block.row(node, alpha);
+        work.ring.iter_mut().for_each(|line| line.fill(Complex32::ZERO));
+        // Nodes come in groups, and leave in groups that lag behind by as many as weights reach.
+        for group in (0..reach.count + NODE_GROUP).step_by(NODE_GROUP) {
+            work.gather(place, group);
+            for (k, line) in work.group.iter_mut().enumerate() {
+                let node = (group + k).checked_sub(BEHIND).filter(|node| *node < reach.count);
+                let Some(node) = node else {
+                    line.fill(Complex32::ZERO);
+                    continue;
+                };
+                let weights: [Option<&[f32]>; NODES] =
+                    std::array::from_fn(|d| (reach.first + node).checked_sub(d).and_then(rows));
+                let z = |offset: isize| {
+                    let index = (node + 2 * NODE_GROUP).wrapping_add_signed(offset) % (2 * NODE_GROUP);
+                    work.ring[index].as_slice()
+                };
+                multiply_line(line, &weights, self.grids.weight_stride(), z);
+                work.transforms.inverse(line);
+            }
+            let skipped = BEHIND.saturating_sub(group);
+            work.scatter(place, skipped, group + skipped - BEHIND);
+        }
+    }
+
+    /// A node's data at one alpha.
+    fn read_right_hand_side(&self, row: Option<&[f32]>, of: RightHandSide, line: &mut [Complex32]) {
+        let stride = self.grids.data_stride();
+        let Some(row) = row else {
+            line.fill(Complex32::ZERO);
+            return;
+        };
+        let (re, im) = row[2 * of as usize * stride..][..2 * stride].split_at(stride);
+        for ((out, re), im) in line.iter_mut().zip(re).zip(im) {
+            *out = Complex32::new(*re, *im);
+        }
+    }
+
+    /// Products with the patterns, transposed, turned back from the orbit's plane and summed over alpha, sky by sky.
+    fn gradients(
+        &self,
+        work: &mut Workspace,
+        reach: NodeRange,
+        circle: Circle,
+        alphas: &[usize],
+        factor: Option<&[f64]>,
+    ) -> Vec<Vec<f64>> {
+        let (starts, columns) = (self.turned_starts(work.columns), 2 * work.columns);
+        for (mu, products) in work.products.chunks_exact(columns * 2 * reach.count).enumerate() {
+            let rows = degrees(self.l_max, mu);
+            let turned = &mut work.turned[starts[mu]..starts[mu] + columns * rows];
+            faer::linalg::matmul::matmul(
+                MatMut::from_column_major_slice_mut(turned, rows, columns),
+                Accum::Replace,
+                self.pattern(mu, reach).transpose(),
+                MatRef::from_column_major_slice(products, 2 * reach.count, columns),
+                1.0,
+                Par::Seq,
+            );
+        }
+        let firsts = (0..work.columns).step_by(ALPHAS);
+        firsts.map(|first| self.turn_back(work, circle, alphas, first, factor)).collect()
+    }
+
+    /// The transpose of [`Operator::turn`], each order m times its factor.
+    fn turn_back(
+        &self,
+        work: &Workspace,
+        circle: Circle,
+        alphas: &[usize],
+        first: usize,
+        factor: Option<&[f64]>,
+    ) -> Vec<f64> {
+        let starts = self.turned_starts(work.columns);
+        let count = alphas.len();
+        let turns = self.turns(circle, alphas);
+        let mut sum = Alm::zeros(self.l_max);
+        let mut column = vec![0.0_f32; orders(self.l_max) * ALPHAS];
+        let mut z = [vec![0.0_f32; (self.l_max + 1) * ALPHAS], vec![0.0_f32; (self.l_max + 1) * ALPHAS]];
+        for l in 0..=self.l_max {
+            let (plus, minus) = self.rotation.degree(l);
+            for (part, d) in [plus, minus].into_iter().enumerate() {
+                let column = &mut column[..orders(l) * count];
+                for (k, column) in column.chunks_exact_mut(orders(l)).enumerate() {
+                    for (order, value) in column.iter_mut().enumerate() {
+                        let mu = l % 2 + 2 * order;
+                        let rows = degrees(self.l_max, mu);
+                        *value =
+                            work.turned[starts[mu] + (part * work.columns + first + k) * rows + (l - mu) / 2];
+                    }
+                }
+                faer::linalg::matmul::matmul(
+                    MatMut::from_column_major_slice_mut(&mut z[part][..(l + 1) * count], l + 1, count),
+                    Accum::Replace,
+                    MatRef::from_row_major_slice(d, orders(l), l + 1).transpose(),
+                    MatRef::from_column_major_slice(column, orders(l), count),
+                    1.0,
+                    Par::Seq,
+                );
+            }
+            for m in 0..=l {
+                let mut total = Complex64::ZERO;
+                for (k, (sin, cos)) in turns[m * count..(m + 1) * count].iter().enumerate() {
+                    let z = [&z[0], &z[1]].map(|z| f64::from(z[k * (l + 1) + m]));
+                    // conj(z exp(i m alpha))
+                    total += Complex64::new(z[0] * cos - z[1] * sin, -(z[0] * sin + z[1] * cos));
+                }
+                *sum.get_mut(l, m) = total * factor.map_or(1.0, |factor| factor[m]);
+            }
+        }
+        sum.values().iter().flat_map(|value| [value.re, value.im]).collect()
+    }
+}

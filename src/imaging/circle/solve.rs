@@ -1,0 +1,173 @@
+//! The regularised solution over harmonic coefficients.
+
+use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
+use crate::imaging::NormalSums;
+use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
+use crate::imaging::regulariser::Regulariser;
+use crate::imaging::solver::Fitted;
+use crate::imaging::solver::NamedWatch;
+use crate::imaging::solver::SolveError;
+use crate::imaging::solver::add;
+use crate::imaging::solver::traces;
+use crate::imaging::solver::{Convergence, StoppingRule, System};
+use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from, normalised, random_vector};
+use crate::sky::harmonics::{AnalysisOptions, analysis, synthesis};
+use crate::sky::healpix::{nside_of, pixel_area_sr};
+
+/// Change of W_max from product to product, relative, at which it is found: it only scales R, and no map knows epsilon to a percent.
+pub(in crate::imaging) const W_MAX_TOLERANCE: f64 = 1e-3;
+
+/// Products with the blocks before the iteration for W_max.
+const LIFTS: usize = 6;
+
+/// Parameters of a harmonic solution.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct HarmonicRequest {
+    /// epsilon of R = epsilon W_max I.
+    pub epsilon: f64,
+    /// nside of the maps.
+    pub nside: usize,
+    /// When to stop.
+    pub rule: StoppingRule,
+    /// Random probes for the traces of the covariances where the matrix is too large to be held; 0 for no traces. Traces are those of
+    /// an R that is a multiple of the identity.
+    pub probes: usize,
+}
+
+/// A map and its noise-only companion, and their coefficients.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HarmonicSolution {
+    /// Map, K, HEALPix RING.
+    pub map_k: Vec<f64>,
+    /// Map of noise alone, K.
+    pub noise_k: Vec<f64>,
+    /// The unknowns, without the prior, and those of the noise; a warm start for more data.
+    pub unknowns: [Vec<f64>; 2],
+    /// How they were found.
+    pub diagnostics: Diagnostics,
+}
+
+/// Solves by conjugate gradients, preconditioned by the blocks of BtN^-1B that keep m.
+///
+/// As [`crate::imaging::solve_pixels`] with `T` among the functions of degree up to `l_max`; R is epsilon times the largest
+/// eigenvalue times the identity of orthonormal harmonics, which is that of equal pixels up to their area.
+/// `start` is an earlier solution's [`HarmonicSolution::unknowns`].
+///
+/// # Errors
+/// No data, or a prior whose size is not a map's.
+pub fn solve_harmonics(
+    sums: &HarmonicSums,
+    request: HarmonicRequest,
+    prior_k: Option<&[f64]>,
+    start: Option<&[Vec<f64>; 2]>,
+    watch: NamedWatch<'_>,
+) -> Result<HarmonicSolution, SolveError> {
+    solve_regularised(sums, request, &Regulariser::default(), prior_k, start, watch)
+}
+
+/// As [`solve_harmonics`], with an R that may depend on the degree.
+///
+/// # Errors
+/// Also a table of power that ends before the map's degrees.
+pub fn solve_regularised(
+    sums: &HarmonicSums,
+    request: HarmonicRequest,
+    regulariser: &Regulariser,
+    prior_k: Option<&[f64]>,
+    start: Option<&[Vec<f64>; 2]>,
+    watch: NamedWatch<'_>,
+) -> Result<HarmonicSolution, SolveError> {
+    check_request(sums, request.epsilon)?;
+    let l_max = sums.setup().l_max;
+    let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
+    let blocks = sums.order_blocks();
+    let LargestEigenvalue { value: w_max, iterations, .. } = {
+        let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
+        let start = lifted(&blocks, sums.unknowns());
+        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |wants, step, change| {
+            task.report_wanting(wants, step, change)
+        })
+    };
+    let regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
+    let mut right = sums.right_hand_side().to_vec();
+    if let Some(prior) = &prior {
+        subtract_prediction(sums, prior, &mut right);
+    }
+    let right_hand_sides = [right.as_slice(), sums.noise_right_hand_side()];
+    let factors = blocks.factors_with(&|l| regularisation.at(l));
+    // At high degrees they take as much as the factors.
+    drop(blocks);
+    let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
+    let (solved, convergence) = iterate(&system, right_hand_sides, start, request.rule, watch);
+    let area_sr = pixel_area_sr(request.nside);
+    let map = |x: &[f64]| synthesis(&coefficients(x, l_max), request.nside).map_err(SolveError::from);
+    let mut whole = solved[0].clone();
+    if let Some(prior) = prior {
+        add(&mut whole, &prior);
+    }
+    let mut diagnostics = Diagnostics {
+        epsilon: request.epsilon,
+        w_max: w_max * area_sr,
+        w_max_iterations: iterations,
+        l_max: Some(l_max),
+        convergence: convergence.first().copied(),
+        noise_convergence: convergence.get(1).copied(),
+        traces: None,
+        traces_refused: None,
+        fit: None,
+    };
+    if request.probes > 0 {
+        let mut product = vec![0.0; whole.len()];
+        sums.apply(&whole, &mut product);
+        let fitted = Fitted {
+            counts: sums.counts(),
+            accuracy: sums.accuracy(),
+            w_max,
+            right: sums.right_hand_side(),
+            whole: &whole,
+            product: &product,
+            solved: &solved[0],
+        };
+        diagnostics.fit = Some(fitted.fit(area_sr));
+        let found = traces(sums, request.epsilon, w_max, request.probes, watch);
+        diagnostics = diagnostics.with_traces(found, area_sr);
+    }
+    Ok(HarmonicSolution { map_k: map(&whole)?, noise_k: map(&solved[1])?, unknowns: solved, diagnostics })
+}
+
+/// A random vector times the blocks of BtN^-1B that keep m, several times over: a beginning near the vectors with the largest
+/// eigenvalues, at the cost of less than a product.
+pub(in crate::imaging) fn lifted(blocks: &OrderBlocks, unknowns: usize) -> Vec<f64> {
+    let mut vector = random_vector(unknowns);
+    for _ in 0..LIFTS {
+        blocks.multiply(&mut vector);
+        vector = normalised(vector);
+    }
+    vector
+}
+
+/// Solves for the map and the noise-only map, from an earlier solution of the same size if there is one.
+fn iterate(
+    system: &System<'_>,
+    right_hand_sides: [&[f64]; 2],
+    start: Option<&[Vec<f64>; 2]>,
+    rule: StoppingRule,
+    watch: NamedWatch<'_>,
+) -> ([Vec<f64>; 2], Vec<Convergence>) {
+    let unknowns = system.sums.unknowns();
+    let mut solved = [0, 1].map(|which| match start {
+        Some(start) if start[which].len() == unknowns => start[which].clone(),
+        _ => vec![0.0; unknowns],
+    });
+    let task = watch.start("map and noise map", rule.residual_max);
+    let convergence = system.solve(&right_hand_sides, &mut solved, rule, &task);
+    (solved, convergence)
+}
+
+pub(in crate::imaging) fn prior_unknowns(map: &[f64], l_max: usize) -> Result<Vec<f64>, SolveError> {
+    if nside_of(map.len()).is_none() {
+        return Err(SolveError::PriorLength { found: map.len(), expected: 12 });
+    }
+    let found = analysis(map, l_max, &AnalysisOptions::default()).map_err(SolveError::from)?;
+    Ok(unknowns(&found.alm))
+}

@@ -1,0 +1,543 @@
+//! Configuration of maps.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use crate::frames::Instrument;
+use crate::imaging::antennas::AntennasConfig;
+use crate::imaging::anywhere::RowBelief;
+use crate::imaging::circle::L_MAX;
+use crate::imaging::{AccumulationError, PixelEngine};
+use crate::response::harmonic::GeometryLimits;
+use crate::response::pixel::PixelMethod;
+use crate::sky::Frame;
+use crate::sky::fits::check_frequencies;
+use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+use crate::units::{ChannelId, Checks, InvalidValue, PerChannel};
+
+/// Greatest nside of the pixel engine: 49152 pixels, 9.7 GB of sums a channel (half of a symmetric matrix, f64).
+pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
+
+/// Greatest nside of the pixel engine without its matrix: a pass over the rows of a million visibilities takes hours.
+pub const REMADE_NSIDE_MAX: usize = 256;
+
+/// Greatest nside of maps from the harmonic engine: pixels ten times finer than its greatest degree.
+pub const HARMONIC_ENGINE_NSIDE_MAX: usize = 1024;
+
+/// Default number of degrees of a harmonic map per nside: as many as pixels represent to 1e-6.
+const DEGREES_PER_NSIDE: f64 = 2.5;
+
+/// Most directions in which beams are solved for, a solution each.
+const BEAMS_MAX: usize = 100;
+
+/// Channels whose sums are in memory at one time.
+pub type ChannelGroup = BTreeSet<ChannelId>;
+
+/// The basis of the normal equations.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[non_exhaustive]
+pub enum EngineKind {
+    /// Pixels: exact, for any orbit; N_pix^2 operations a visibility.
+    #[default]
+    Pixel,
+    /// Spherical harmonics: thousands of operations a visibility; needs satellites on one circle.
+    Harmonic,
+}
+
+/// What the pixel engine does with its matrix.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[non_exhaustive]
+pub enum MatrixKind {
+    /// It is summed and held, and factorised.
+    #[default]
+    Held,
+    /// Visibilities are held instead, and rows of B made again for each product of an iteration.
+    Remade,
+}
+
+/// Configuration of map making.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MapConfig {
+    /// HEALPix nside of the maps.
+    pub nside: usize,
+    /// Basis of the normal equations: `pixel` or `harmonic`.
+    pub engine: EngineKind,
+    /// Most channels of an instrument. Each takes memory for a map as soon as it has data, so a forged description of
+    /// many channels is refused.
+    pub channels_max: usize,
+    /// Numbers of the channels that are mapped, from 0; all if empty. Of many channels a machine may have memory for a few
+    /// at a time.
+    pub channels: Vec<u16>,
+    /// How the pixel engine computes rows of B.
+    pub rows: PixelMethod,
+    /// Whether the pixel engine holds its matrix.
+    #[serde(skip_serializing_if = "is_usual")]
+    pub matrix: MatrixKind,
+    /// Highest degree of a map from the harmonic engine; 0 for 2.5 nside.
+    pub l_max: usize,
+    /// Longest baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
+    pub baseline_bp_max: f64,
+    /// Regularisation epsilon: R = epsilon W_max I.
+    pub epsilon: PerChannel<f64>,
+    /// How R grows with the degree: `R_l = epsilon W_max (l + 1)^exponent`. Harmonic engine; 0 for the identity.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub regularisation_exponent: f64,
+    /// Tables of l and C_l (K^2), one a channel: `R_l = epsilon / C_l`. Harmonic engine; empty for none.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub regularisation_files: Vec<PathBuf>,
+    /// Ecliptic longitudes and latitudes, degrees, at which the effective beam of a final map is solved for.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub beams_deg: Vec<[f64; 2]>,
+    /// Prior map: a uniform temperature, K; 0 for none.
+    pub prior_k: PerChannel<f64>,
+    /// Prior maps: HEALPix FITS files, one per channel, in K; empty for none.
+    pub prior_files: Vec<PathBuf>,
+    /// Frame of prior maps without COORDSYS; without it such files are refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub prior_frame: Option<Frame>,
+    /// FWHM to which prior maps are smoothed, degrees.
+    pub prior_fwhm_deg: f64,
+    /// Share of the power of the sky that the Moon is taken to reflect, xi_R: the map is that of visibilities divided by
+    /// 1 + this; 0 for none.
+    pub moon_reflection: f64,
+    /// Mission time between snapshot maps, s; 0 for a final map only.
+    pub snapshot_every_s: f64,
+    /// Greatest weight of a visibility that is accepted, (K sr)^-2; it sets the resolution of the sums. 0 for 1024 times
+    /// that of 25 s under the mean sky of the channel's frequency.
+    pub weight_max: f64,
+    /// Seed of the noise-only companion map.
+    pub companion_seed: u64,
+    /// Residual at which an iterative solution stops, relative to the right-hand side, in the preconditioner's norm.
+    pub residual_max: f64,
+    /// Iteration limit of such a solution.
+    pub iterations_max: usize,
+    /// Random probes for the traces of the covariances of a final map; 0 for no traces. Those of up to 3072 unknowns (nside 16,
+    /// or l_max 54) are exact and need none: any number above 0 will do.
+    pub trace_probes: usize,
+    /// Departures from the common circle that the harmonic engine accepts.
+    pub limits: GeometryLimits,
+    /// Refinement of a harmonic map with the positions as they are.
+    pub refine: RefineConfig,
+    /// Antennas of the daughters as a refined map takes them to be.
+    #[serde(skip_serializing_if = "AntennasConfig::is_ideal")]
+    pub antennas: AntennasConfig,
+}
+
+/// Value of `map.refine.passes_max` among the settings of sums that hold visibilities one by one.
+pub const REFINED: &str = "above 0";
+
+/// Refinement of a harmonic map: conjugate gradients with the rows of B of the true positions, preconditioned by the sums of the
+/// nearest circle. Nothing is refused for its geometry then.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RefineConfig {
+    /// Most products with the true matrix; 0 for no refinement.
+    pub passes_max: usize,
+    /// Residual at which it stops, relative to the right-hand side, in the preconditioner's norm.
+    pub residual_max: f64,
+    /// Most visibilities of a channel that are held in memory for it, or without the matrix of the pixel engine; further ones are left
+    /// out and counted.
+    pub visibilities_max: u64,
+    /// Whether visibilities are averages over their integrations, or instants in their middle.
+    #[serde(skip_serializing_if = "is_off")]
+    pub smear_integrations: bool,
+}
+
+impl Default for RefineConfig {
+    fn default() -> Self {
+        Self { passes_max: 0, residual_max: 1e-3, visibilities_max: 30_000_000, smear_integrations: false }
+    }
+}
+
+impl RefineConfig {
+    /// Whether maps are refined.
+    #[must_use]
+    pub fn is_on(&self) -> bool {
+        self.passes_max > 0
+    }
+}
+
+impl Default for MapConfig {
+    fn default() -> Self {
+        Self {
+            nside: 16,
+            engine: EngineKind::Pixel,
+            channels_max: 64,
+            channels: Vec::new(),
+            rows: PixelMethod::Average,
+            matrix: MatrixKind::Held,
+            l_max: 0,
+            baseline_bp_max: 2.0,
+            epsilon: PerChannel::All(1e-4),
+            regularisation_exponent: 0.0,
+            regularisation_files: Vec::new(),
+            beams_deg: Vec::new(),
+            prior_k: PerChannel::All(0.0),
+            prior_files: Vec::new(),
+            prior_frame: None,
+            prior_fwhm_deg: 5.0,
+            moon_reflection: 0.0,
+            snapshot_every_s: 0.0,
+            weight_max: 0.0,
+            companion_seed: 1,
+            residual_max: 1e-4,
+            iterations_max: 300,
+            trace_probes: 0,
+            limits: GeometryLimits::default(),
+            refine: RefineConfig::default(),
+            antennas: AntennasConfig::default(),
+        }
+    }
+}
+
+/// So that what is not set changes no hash of a configuration.
+fn is_zero(value: &f64) -> bool {
+    *value == 0.0
+}
+
+/// Likewise.
+#[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
+fn is_off(value: &bool) -> bool {
+    !*value
+}
+
+/// Likewise.
+fn is_usual(matrix: &MatrixKind) -> bool {
+    *matrix == MatrixKind::Held
+}
+
+impl MapConfig {
+    /// Whether R is `epsilon W_max` times the identity.
+    #[must_use]
+    pub fn is_plain(&self) -> bool {
+        is_zero(&self.regularisation_exponent) && self.regularisation_files.is_empty()
+    }
+
+    /// Whether rows of B are made again for each product over pixels.
+    #[must_use]
+    pub fn is_remade(&self) -> bool {
+        self.engine == EngineKind::Pixel && self.matrix == MatrixKind::Remade
+    }
+
+    /// Whether visibilities are held one by one instead of sums.
+    #[must_use]
+    pub fn holds_visibilities(&self) -> bool {
+        self.refine.is_on() || self.is_remade()
+    }
+
+    /// All invalid settings; empty if there are none.
+    #[must_use]
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("map");
+        let is_harmonic = self.engine == EngineKind::Harmonic;
+        let most = match self.engine {
+            EngineKind::Harmonic => HARMONIC_ENGINE_NSIDE_MAX,
+            EngineKind::Pixel if self.is_remade() => REMADE_NSIDE_MAX,
+            EngineKind::Pixel => PIXEL_ENGINE_NSIDE_MAX,
+        };
+        let good = is_valid_nside(self.nside) && self.nside <= most;
+        let expected = format!("a power of two from 1 to {most} for this engine");
+        checks.require("nside", self.nside, good, expected);
+        let channels = self.channels_max;
+        checks.require("channels_max", channels, (1..=4096).contains(&channels), "1 to 4096");
+        let longest = self.baseline_bp_max;
+        checks.number("baseline_bp_max", longest, longest > 0.0, "a positive number, in units of b_p");
+        checks.numbers("epsilon", self.epsilon.values(), |e| e > 0.0 && e <= 1.0, "above 0 and at most 1");
+        checks.numbers("prior_k", self.prior_k.values(), |k| k >= 0.0, "K, not negative");
+        let fwhm = self.prior_fwhm_deg;
+        checks.number("prior_fwhm_deg", fwhm, (0.0..=180.0).contains(&fwhm), "0 to 180");
+        let share = self.moon_reflection;
+        checks.number("moon_reflection", share, (0.0..=1.0).contains(&share), "0 to 1");
+        if is_harmonic {
+            let l_max = self.l_max as f64;
+            checks.number("l_max", l_max, self.l_max < 3 * self.nside, "0, or 1 to 3 nside - 1");
+            let degree = self.degree() as f64;
+            checks.number("l_max", degree, self.degree() <= L_MAX, "at most 1024; 0 stands for 2.5 nside");
+        }
+        self.check_effects(&mut checks);
+        let residual = self.residual_max;
+        checks.number("residual_max", residual, residual > 0.0 && residual < 1.0, "above 0 and below 1");
+        let iterations = self.iterations_max as f64;
+        checks.number("iterations_max", iterations, self.iterations_max > 0, "at least 1");
+        for (key, value) in self.limits.values() {
+            checks.number(key, value, value >= 0.0, "not negative");
+        }
+        self.check_refinement(&mut checks);
+        self.check_regularisation(&mut checks);
+        let weight = self.weight_max;
+        checks.number(
+            "weight_max",
+            weight,
+            weight == 0.0 || (1e-60..=1e60).contains(&weight),
+            "0, or 1e-60 to 1e60",
+        );
+        let every = self.snapshot_every_s;
+        checks.number("snapshot_every_s", every, every >= 0.0, "seconds, or 0 for a final map only");
+        let one = self.prior_files.is_empty() || self.prior_k.values().iter().all(|&k| k == 0.0);
+        let files = self.prior_files.len();
+        checks.require("prior_files", format!("({files} files)"), one, "none where map.prior_k is given");
+        checks.finish()
+    }
+
+    /// Checks the refinement, and that nothing is asked for that it cannot do.
+    fn check_refinement(&self, checks: &mut Checks) {
+        let RefineConfig { residual_max, visibilities_max, .. } = self.refine;
+        checks.number(
+            "refine.residual_max",
+            residual_max,
+            residual_max > 0.0 && residual_max < 1.0,
+            "above 0 and below 1",
+        );
+        checks.require("refine.visibilities_max", visibilities_max, visibilities_max > 0, "at least 1");
+        self.antennas.check(checks);
+        let refined = "none without map.refine.passes_max above 0";
+        checks.require("antennas", "(set)", self.antennas.is_ideal() || self.refine.is_on(), refined);
+        let smeared = self.refine.smear_integrations;
+        let expected = "false without map.refine.passes_max above 0";
+        checks.require("refine.smear_integrations", smeared, !smeared || self.refine.is_on(), expected);
+        if self.is_remade() {
+            let probes = self.trace_probes;
+            let expected = "0 with map.matrix = \"remade\": traces need the matrix";
+            checks.require("trace_probes", probes, probes == 0, expected);
+        }
+        if self.refine.is_on() {
+            let probes = self.trace_probes;
+            checks.require(
+                "trace_probes",
+                probes,
+                probes == 0,
+                "0 with map.refine: traces would be those of the circle",
+            );
+        }
+    }
+
+    /// Checks R, and that nothing is asked for that holds for multiples of the identity alone.
+    fn check_regularisation(&self, checks: &mut Checks) {
+        let (exponent, files) = (self.regularisation_exponent, self.regularisation_files.len());
+        checks.number("regularisation_exponent", exponent, (-10.0..=10.0).contains(&exponent), "-10 to 10");
+        let one = files == 0 || exponent == 0.0;
+        checks.require(
+            "regularisation_files",
+            format!("({files} files)"),
+            one,
+            "none with map.regularisation_exponent",
+        );
+        let beams = self.beams_deg.len();
+        let few = beams <= BEAMS_MAX && (beams == 0 || !self.holds_visibilities());
+        checks.require(
+            "beams_deg",
+            format!("({beams} directions)"),
+            few,
+            "at most 100, and none with map.refine or map.matrix = \"remade\"",
+        );
+        for &[longitude_deg, latitude_deg] in &self.beams_deg {
+            let good = longitude_deg.abs() <= 360.0 && latitude_deg.abs() <= 90.0;
+            let found = format!("[{longitude_deg}, {latitude_deg}]");
+            checks.require("beams_deg", found, good, "ecliptic longitude and latitude, degrees");
+        }
+        if !self.is_plain() {
+            let expected = "0 with this R: traces are those of R = epsilon W_max I";
+            checks.require("trace_probes", self.trace_probes, self.trace_probes == 0, expected);
+            let refined = self.refine.is_on();
+            let expected = "no map.regularisation_exponent and no map.regularisation_files with it";
+            checks.require("refine.passes_max", self.refine.passes_max, !refined, expected);
+        }
+    }
+
+    /// Requires that keys of the other engine are not set.
+    fn check_effects(&self, checks: &mut Checks) {
+        let usual = Self::default();
+        let is_held = !self.is_remade();
+        // Those that are held are bounded likewise.
+        let refine = RefineConfig {
+            visibilities_max: if is_held { usual.refine } else { self.refine }.visibilities_max,
+            ..usual.refine
+        };
+        for (key, is_set) in [
+            ("residual_max", self.residual_max != usual.residual_max),
+            ("iterations_max", self.iterations_max != usual.iterations_max),
+        ] {
+            let good = !is_set || self.engine == EngineKind::Harmonic || !is_held;
+            let expected =
+                "no such key: it has no effect without map.engine = \"harmonic\" or map.matrix = \"remade\"";
+            checks.require(key, "(set)", good, expected);
+        }
+        let (other, set) = match self.engine {
+            EngineKind::Pixel => (
+                "harmonic",
+                vec![
+                    ("l_max", self.l_max != usual.l_max),
+                    ("regularisation_exponent", self.regularisation_exponent != 0.0),
+                    ("regularisation_files", !self.regularisation_files.is_empty()),
+                    ("limits", self.limits != usual.limits),
+                    ("refine", self.refine != refine),
+                ],
+            ),
+            EngineKind::Harmonic => {
+                ("pixel", vec![("rows", self.rows != usual.rows), ("matrix", self.matrix != usual.matrix)])
+            }
+        };
+        for (key, is_set) in set {
+            let expected = format!("no such key: it has no effect without map.engine = \"{other}\"");
+            checks.require(key, "(set)", !is_set, expected);
+        }
+    }
+
+    /// Greatest degree of a map from the harmonic engine.
+    #[must_use]
+    pub fn degree(&self) -> usize {
+        if self.l_max > 0 { self.l_max } else { (DEGREES_PER_NSIDE * self.nside as f64) as usize }
+    }
+
+    /// The settings that determine the sums, by key; the others determine only what is solved from them.
+    #[must_use]
+    pub fn of_sums(&self) -> Vec<(&'static str, String)> {
+        // Every field is named: whoever adds a key decides here whether a state depends on it.
+        let Self {
+            nside,
+            engine,
+            rows,
+            matrix,
+            baseline_bp_max,
+            companion_seed,
+            limits,
+            weight_max,
+            channels: mapped,
+            channels_max: _,
+            epsilon: _,
+            regularisation_exponent: _,
+            regularisation_files: _,
+            beams_deg: _,
+            prior_k: _,
+            prior_files: _,
+            prior_frame: _,
+            prior_fwhm_deg: _,
+            moon_reflection: _,
+            snapshot_every_s: _,
+            residual_max: _,
+            iterations_max: _,
+            trace_probes: _,
+            l_max: _, // As `degree`.
+            antennas: _,
+            refine,
+        } = self;
+        let mut settings = vec![
+            ("map.nside", nside.to_string()),
+            ("map.engine", format!("{engine:?}")),
+            ("map.baseline_bp_max", format!("{baseline_bp_max:?}")),
+            ("map.companion_seed", companion_seed.to_string()),
+            ("map.weight_max", format!("{weight_max:?}")),
+        ];
+        if !mapped.is_empty() {
+            settings.push(("map.channels", format!("{mapped:?}")));
+        }
+        match engine {
+            EngineKind::Pixel => {
+                settings.push(("map.rows", format!("{rows:?}")));
+                if self.is_remade() {
+                    settings.push(("map.matrix", format!("{matrix:?}")));
+                }
+            }
+            EngineKind::Harmonic => {
+                settings.push(("map.l_max", self.degree().to_string()));
+                settings.push(("map.limits", format!("{limits:?}")));
+                if refine.is_on() {
+                    // How often and how well a map is refined is no matter of the visibilities that are held for it.
+                    settings.push(("map.refine.passes_max", REFINED.to_owned()));
+                }
+            }
+        }
+        settings
+    }
+
+    /// What the rows of a refined map are made with.
+    #[must_use]
+    pub fn belief(&self) -> RowBelief {
+        let AntennasConfig { pattern_by_frequency, .. } = &self.antennas;
+        RowBelief {
+            smear_integrations: self.refine.smear_integrations,
+            antennas: self.antennas.beliefs(),
+            patterns: pattern_by_frequency.clone(),
+        }
+    }
+
+    /// Longest baseline used at a frequency, m.
+    ///
+    /// b_p = wavelength / sqrt(4 pi / N_pix) is the baseline that a pixel just resolves (the paper, Sect. 4).
+    #[must_use]
+    pub fn baseline_m_max(&self, frequency_hz: f64) -> f64 {
+        let pixel_rad = pixel_area_sr(self.nside).sqrt();
+        self.baseline_bp_max * SPEED_OF_LIGHT_M_S / frequency_hz / pixel_rad
+    }
+
+    /// Whether a channel is mapped.
+    #[must_use]
+    pub fn maps(&self, channel: ChannelId) -> bool {
+        self.channels.is_empty() || self.channels.contains(&channel.0)
+    }
+
+    /// Requires that the sums of the channels of a group, of `channels` in all, take at most `limit_bytes`. Those of the
+    /// harmonic engine grow with the data, so nothing is known of them beforehand.
+    ///
+    /// # Errors
+    /// [`AccumulationError::Memory`].
+    pub fn require_memory(
+        &self,
+        channels: usize,
+        limit_bytes: Option<u64>,
+        group: Option<&ChannelGroup>,
+    ) -> Result<(), AccumulationError> {
+        let each = match self.engine {
+            EngineKind::Pixel if !self.is_remade() => PixelEngine::memory_bytes(self.nside),
+            EngineKind::Pixel | EngineKind::Harmonic => 0,
+        };
+        let is_summed =
+            |channel: &ChannelId| self.maps(*channel) && group.is_none_or(|group| group.contains(channel));
+        let channels = (0..channels as u16).map(ChannelId).filter(is_summed).count();
+        let needed_bytes = each.saturating_mul(channels as u64);
+        match limit_bytes {
+            Some(limit_bytes) if needed_bytes > limit_bytes => {
+                Err(AccumulationError::Memory { channels, needed_bytes, limit_bytes })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Requires that prior maps are of the frequencies of the instrument's channels, as far as they say it.
+    ///
+    /// # Errors
+    /// [`AccumulationError::Prior`].
+    pub fn check_priors(&self, instrument: &Instrument) -> Result<(), AccumulationError> {
+        Ok(check_frequencies(&self.prior_files, &instrument.frequencies_hz())?)
+    }
+
+    /// Settings by channel that do not match an instrument of `channels` channels.
+    #[must_use]
+    pub fn misfits(&self, channels: usize) -> Vec<InvalidValue> {
+        let (files, tables) = (self.prior_files.len(), self.regularisation_files.len());
+        let mut checks = Checks::of("map");
+        let expected =
+            format!("at least the {channels} channels of the instrument, each of which needs memory");
+        checks.require("channels_max", self.channels_max, channels <= self.channels_max, expected);
+        for (place, &channel) in self.channels.iter().enumerate() {
+            let expected = format!("a channel of the instrument, 0 to {}", channels.saturating_sub(1));
+            checks.require(format!("channels[{place}]"), channel, usize::from(channel) < channels, expected);
+        }
+        for (key, fits, found) in [
+            ("epsilon", self.epsilon.fits(channels), self.epsilon.values().len()),
+            ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),
+            ("prior_files", files == 0 || files == channels, files),
+            ("regularisation_files", [0, channels].contains(&tables), tables),
+        ] {
+            let expected = format!("one value, or one for each of the {channels} channels");
+            checks.require(key, format!("({found} values)"), fits, expected);
+        }
+        checks.finish()
+    }
+}

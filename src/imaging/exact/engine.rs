@@ -1,0 +1,329 @@
+//! The engine without its basis.
+//!
+//! An [`ExactEngine`] checks and counts visibilities, collects them in batches, and hands each batch to its [`SkyBasis`],
+//! which rounds it to integers and adds them to the exact sums, while the next batch is collected.
+
+use std::fmt;
+use std::io::{Read, Write};
+use std::sync::Arc;
+
+use super::checkpoint::{BasisKind, FrameReader, FrameWriter};
+use super::deferred::Deferred;
+use super::fixed_point::{Direction, Totals, WeightScale};
+use super::noise::companion_noise;
+use crate::frames::PlacedVisibilities;
+use crate::imaging::{AccumulationError, Added, NormalEngine, NormalSums, Refusal, SumCounts};
+use crate::units::vector::Vec3;
+use num_complex::Complex64;
+
+/// A basis of the sky: how visibilities enter the sums, and how the sums become equations.
+pub trait SkyBasis: Sized + Send + Sync + 'static {
+    /// Everything on which the sums depend besides the data; only engines of equal setup can be merged.
+    type Setup: Copy + fmt::Debug + PartialEq + Send + Sync;
+    /// Where a visibility belongs in the sums.
+    type Place: Copy + Send + Sync + 'static;
+    /// The sums as integers.
+    type Exact: Clone + Send + Sync + 'static;
+    /// The sums as numbers, ready to be solved.
+    type Equations: NormalSums;
+    /// A setup as it stands in a checkpoint.
+    type Head: bincode::Encode + bincode::Decode<()>;
+
+    /// The basis in checkpoints.
+    const KIND: BasisKind;
+    /// Visibilities that are summed together.
+    const BATCH: usize;
+    /// Most weight that the sums have room for, in units of the scale.
+    const SCALES_MAX: f64;
+
+    /// The tables for a setup; no sums yet.
+    ///
+    /// # Errors
+    /// A setup that cannot be used.
+    fn new(setup: &Self::Setup, scale: WeightScale) -> Result<Self, AccumulationError>;
+
+    /// The settings that every engine has.
+    fn common(setup: &Self::Setup) -> CommonSetup;
+
+    /// Sums of nothing.
+    fn zeros(&self) -> Self::Exact;
+
+    /// Where a visibility of satellites at these positions belongs.
+    ///
+    /// # Errors
+    /// Positions that the basis does not cover.
+    fn place(&self, r_i_m: Vec3, r_j_m: Vec3) -> Result<Self::Place, Refusal>;
+
+    /// Adds a batch to the sums, or removes it.
+    fn sum(&self, exact: &mut Self::Exact, batch: &[Accepted<Self::Place>], direction: Direction);
+
+    /// Adds other sums, or removes them.
+    fn combine(&self, exact: &mut Self::Exact, other: &Self::Exact, direction: Direction);
+
+    /// The sums as numbers.
+    fn equations(&self, exact: &Self::Exact, counts: SumCounts) -> Self::Equations {
+        self.finish(exact.clone(), counts)
+    }
+
+    /// The sums as numbers; the integers are given up.
+    fn finish(&self, exact: Self::Exact, counts: SumCounts) -> Self::Equations;
+
+    /// The setup for a checkpoint.
+    fn head(setup: &Self::Setup) -> Self::Head;
+
+    /// The setup from a checkpoint.
+    ///
+    /// # Errors
+    /// Values out of range.
+    fn setup_of(head: Self::Head) -> Result<Self::Setup, AccumulationError>;
+
+    /// Writes the sums.
+    ///
+    /// # Errors
+    /// The writer's.
+    fn write(&self, exact: &Self::Exact, out: &mut FrameWriter<'_>) -> Result<(), AccumulationError>;
+
+    /// Reads the sums; memory follows the data that could be read.
+    ///
+    /// # Errors
+    /// The reader's, or values out of range.
+    fn read(&self, from: &mut FrameReader<'_>) -> Result<Self::Exact, AccumulationError>;
+}
+
+/// The settings that every engine has.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CommonSetup {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Greatest weight of a visibility, (K sr)^-2.
+    pub weight_max: f64,
+    /// Seed of the noise-only companion.
+    pub companion_seed: u64,
+}
+
+/// A visibility that was accepted and waits for its batch.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Accepted<P> {
+    /// Where it belongs.
+    pub place: P,
+    /// Inverse variance, (K sr)^-2.
+    pub weight: f64,
+    /// Value, K sr.
+    pub value_k_sr: Complex64,
+    /// Noise of the noise-only companion, in units of the standard deviation.
+    pub noise: Complex64,
+}
+
+/// Exact normal equations of one channel over a basis; see [`NormalEngine`].
+pub struct ExactEngine<B: SkyBasis> {
+    setup: B::Setup,
+    scale: WeightScale,
+    pub(in crate::imaging) basis: Arc<B>,
+    exact: Deferred<B::Exact>,
+    /// All that the engine holds, pending visibilities included.
+    totals: Totals,
+    pending: Vec<Accepted<B::Place>>,
+    /// Whether the pending visibilities are to be added or removed.
+    direction: Direction,
+}
+
+impl<B: SkyBasis> fmt::Debug for ExactEngine<B> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ExactEngine")
+            .field("setup", &self.setup)
+            .field("totals", &self.totals)
+            .finish_non_exhaustive()
+    }
+}
+
+impl<B: SkyBasis> ExactEngine<B> {
+    /// An empty engine.
+    ///
+    /// # Errors
+    /// A setup out of range.
+    pub fn new(setup: B::Setup) -> Result<Self, AccumulationError> {
+        Self::of(setup, Totals::default(), |basis| Ok(basis.zeros()))
+    }
+
+    /// An engine that holds the sums made by `exact`, which is called only if the setup is valid.
+    pub(in crate::imaging) fn of(
+        setup: B::Setup,
+        totals: Totals,
+        exact: impl FnOnce(&B) -> Result<B::Exact, AccumulationError>,
+    ) -> Result<Self, AccumulationError> {
+        let scale = WeightScale::new(B::common(&setup).weight_max)?;
+        let basis = B::new(&setup, scale)?;
+        Ok(Self {
+            exact: Deferred::Here(exact(&basis)?),
+            setup,
+            scale,
+            basis: Arc::new(basis),
+            totals,
+            pending: Vec::with_capacity(B::BATCH),
+            direction: Direction::In,
+        })
+    }
+
+    /// Setup.
+    #[must_use]
+    pub fn setup(&self) -> &B::Setup {
+        &self.setup
+    }
+
+    /// Visibility `k` as it enters the sums, or why it does not.
+    pub(in crate::imaging) fn accept(
+        &self,
+        placed: &PlacedVisibilities,
+        k: usize,
+    ) -> Result<Accepted<B::Place>, Refusal> {
+        let CommonSetup { weight_max, companion_seed, .. } = B::common(&self.setup);
+        let place = self.basis.place(placed.r_i_m[k], placed.r_j_m[k])?;
+        let (weight, value_k_sr) = (placed.weight[k], placed.value_k_sr[k]);
+        self.scale.check(value_k_sr, weight, weight_max)?;
+        Ok(Accepted { place, weight, value_k_sr, noise: companion_noise(companion_seed, placed, k) })
+    }
+
+    /// Adds visibilities or removes them.
+    fn take(
+        &mut self,
+        placed: &PlacedVisibilities,
+        direction: Direction,
+    ) -> Result<Added, AccumulationError> {
+        let (expected_hz, found_hz) = (B::common(&self.setup).frequency_hz, placed.frequency_hz);
+        if found_hz != expected_hz {
+            return Err(AccumulationError::Frequency { expected_hz, found_hz });
+        }
+        // Not in the pool, which sums the batch before: this is the other half of the work.
+        let found: Vec<_> = (0..placed.len()).map(|k| self.accept(placed, k)).collect();
+        let scale = self.scale;
+        let one = |accepted: &Accepted<B::Place>| Totals::one(scale, accepted.weight, accepted.value_k_sr);
+        if direction == Direction::Out {
+            let mut accepted = found.iter().flatten();
+            let left = accepted.try_fold(self.totals, |totals, removed| totals.and(one(removed), direction));
+            left.ok_or(AccumulationError::NothingHeld(placed.channel))?;
+        }
+        if self.direction != direction {
+            self.flush();
+            self.direction = direction;
+        }
+        let mut added = Added::default();
+        for found in found {
+            match found.and_then(|accepted| Ok((self.with(one(&accepted), direction)?, accepted))) {
+                Ok((totals, accepted)) => {
+                    added.visibilities += 1;
+                    self.totals = totals;
+                    self.pending.push(accepted);
+                }
+                Err(reason) => added.refuse(reason),
+            }
+            if self.pending.len() >= B::BATCH {
+                self.sum_pending();
+            }
+        }
+        Ok(added)
+    }
+
+    /// The totals with others, if the integers have room for both: no element exceeds what the weights allow.
+    fn with(&self, others: Totals, direction: Direction) -> Result<Totals, Refusal> {
+        let totals = self.totals.and(others, direction).ok_or(Refusal::Full)?;
+        let is_full = direction == Direction::In && totals.scales() > B::SCALES_MAX;
+        if is_full { Err(Refusal::Full) } else { Ok(totals) }
+    }
+
+    /// Hands the pending visibilities to the pool.
+    fn sum_pending(&mut self) {
+        if !self.pending.is_empty() {
+            let batch = std::mem::replace(&mut self.pending, Vec::with_capacity(B::BATCH));
+            let (basis, direction) = (Arc::clone(&self.basis), self.direction);
+            self.exact.change(move |exact| basis.sum(exact, &batch, direction));
+        }
+    }
+
+    /// Its basis, and all that it holds.
+    pub(in crate::imaging) fn into_exact(mut self) -> (Arc<B>, B::Exact, SumCounts) {
+        self.flush();
+        let counts = self.counts();
+        (self.basis, self.exact.here(), counts)
+    }
+
+    /// These sums and those of another part of them, which are of the same visibilities.
+    pub(in crate::imaging) fn halves(
+        &mut self,
+        other: Self,
+    ) -> Result<(&mut B::Exact, B::Exact), AccumulationError> {
+        if self.setup != other.setup || self.totals != other.totals {
+            return Err(AccumulationError::Mismatch { what: "data, of which each holds a part," });
+        }
+        self.flush();
+        Ok((self.exact.get(), other.exact.here()))
+    }
+
+    fn combine(&mut self, mut other: Self, direction: Direction) -> Result<(), AccumulationError> {
+        if self.setup != other.setup {
+            return Err(AccumulationError::Mismatch {
+                what: "map sizes, frequencies, baselines, orbits, responses, seeds or greatest weights",
+            });
+        }
+        let totals = self.with(other.totals, direction).map_err(|_| AccumulationError::Range)?;
+        self.flush();
+        other.flush();
+        self.basis.combine(self.exact.get(), other.exact.get(), direction);
+        self.totals = totals;
+        Ok(())
+    }
+}
+
+impl<B: SkyBasis> NormalEngine for ExactEngine<B> {
+    type Equations = B::Equations;
+
+    fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        self.take(placed, Direction::In)
+    }
+
+    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        self.take(placed, Direction::Out)
+    }
+
+    fn flush(&mut self) {
+        self.sum_pending();
+        self.exact.get();
+    }
+
+    fn merge(&mut self, other: Self) -> Result<(), AccumulationError> {
+        self.combine(other, Direction::In)
+    }
+
+    fn subtract(&mut self, other: Self) -> Result<(), AccumulationError> {
+        self.combine(other, Direction::Out)
+    }
+
+    fn counts(&self) -> SumCounts {
+        self.totals.counts(self.scale)
+    }
+
+    fn sums(&mut self) -> B::Equations {
+        self.flush();
+        let counts = self.counts();
+        self.basis.equations(self.exact.get(), counts)
+    }
+
+    fn into_sums(mut self) -> B::Equations {
+        self.flush();
+        let counts = self.counts();
+        self.basis.finish(self.exact.here(), counts)
+    }
+
+    fn checkpoint(&mut self, out: &mut dyn Write) -> Result<(), AccumulationError> {
+        self.flush();
+        let mut out = FrameWriter::new(out, B::KIND, (B::head(&self.setup), self.totals))?;
+        self.basis.write(self.exact.get(), &mut out)?;
+        Ok(out.finish()?)
+    }
+
+    fn restore(from: &mut dyn Read) -> Result<Self, AccumulationError> {
+        let (mut from, (head, totals)) = FrameReader::new(from, B::KIND)?;
+        let engine = Self::of(B::setup_of(head)?, totals, |basis| basis.read(&mut from))?;
+        from.finish()?;
+        Ok(engine)
+    }
+}

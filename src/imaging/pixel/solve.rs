@@ -1,0 +1,202 @@
+//! The regularised solution over pixels.
+
+use serde::Serialize;
+
+use super::cholesky::{Cholesky, NotPositive};
+use crate::imaging::solver::Convergence;
+use crate::imaging::solver::SolveError;
+use crate::imaging::solver::{Fit, Fitted};
+use crate::imaging::solver::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
+use crate::imaging::solver::{NamedWatch, SolveWatch};
+use crate::imaging::solver::{Traces, UnsupportedEpsilon, traces};
+use crate::imaging::solver::{add, subtract};
+use crate::imaging::{NormalSums, PixelSums};
+
+/// Diagnostics of a solution. Eigenvalues and traces are those of pixels, also for a map of harmonics.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
+pub struct Diagnostics {
+    /// epsilon of `R = epsilon W_max I`.
+    pub epsilon: f64,
+    /// W_max, the largest eigenvalue of `BtN^-1B`, K^-2.
+    pub w_max: f64,
+    /// Lanczos iterations for it.
+    pub w_max_iterations: usize,
+    /// Greatest degree of a map of harmonics; absent for one of pixels.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub l_max: Option<usize>,
+    /// How the iteration for the map ended; absent after a factorisation.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub convergence: Option<Convergence>,
+    /// How the iteration for the noise-only map ended.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub noise_convergence: Option<Convergence>,
+    /// Traces of the covariances, if requested and not interrupted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub traces: Option<Traces>,
+    /// Why there are no traces, if they were requested and cannot be had.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub traces_refused: Option<UnsupportedEpsilon>,
+    /// What the map leaves of the data, if traces were requested.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fit: Option<Fit>,
+}
+
+impl Diagnostics {
+    /// With the traces of pixels, whose unknowns have the area `per_area_sr` that those of the sums are without.
+    pub(in crate::imaging) fn with_traces(
+        mut self,
+        found: Result<Option<Traces>, UnsupportedEpsilon>,
+        per_area_sr: f64,
+    ) -> Self {
+        match found {
+            Ok(traces) => {
+                self.traces =
+                    traces.map(|traces| Traces { sigma_n_k2: traces.sigma_n_k2 / per_area_sr, ..traces });
+            }
+            Err(refused) => self.traces_refused = Some(refused),
+        }
+        self
+    }
+}
+
+/// The map of a sky that is 1 K in one pixel.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PointBeam {
+    /// The pixel.
+    pub pixel: usize,
+    /// Map, K, HEALPix RING; of the pixel's degrees up to the map's, if it is one of harmonics.
+    pub map_k: Vec<f64>,
+}
+
+/// A map and its noise-only companion.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PixelSolution {
+    /// Map, K, HEALPix RING.
+    pub map_k: Vec<f64>,
+    /// Map of noise alone, K.
+    pub noise_k: Vec<f64>,
+    /// Effective beams that were asked for.
+    pub beams: Vec<PointBeam>,
+    /// How they were found.
+    pub diagnostics: Diagnostics,
+}
+
+/// What is solved for besides the maps.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct PixelExtras<'a> {
+    /// Probes for traces, where the matrix is too large to be decomposed; 0 for neither traces nor fit.
+    pub probes: usize,
+    /// Pixels whose effective beams are wanted.
+    pub beams: &'a [usize],
+}
+
+/// Whether there is data, and a regularisation.
+pub(in crate::imaging) fn check_request(sums: &dyn NormalSums, epsilon: f64) -> Result<(), SolveError> {
+    if sums.counts().visibilities == 0 {
+        return Err(SolveError::NoData);
+    }
+    if epsilon.is_nan() || epsilon <= 0.0 {
+        return Err(SolveError::Epsilon(epsilon));
+    }
+    Ok(())
+}
+
+/// `right -= BtN^-1B prior`.
+pub(in crate::imaging) fn subtract_prediction(sums: &dyn NormalSums, prior: &[f64], right: &mut [f64]) {
+    let mut predicted = vec![0.0; prior.len()];
+    sums.apply(prior, &mut predicted);
+    subtract(right, 1.0, &predicted);
+}
+
+/// Solves by Cholesky factorisation, in the memory of the sums.
+///
+/// `T = (BtN^-1B + R)^-1 (BtN^-1V - BtN^-1B T_p) + T_p`; the noise-only map is the same inverse times
+/// `BtN^-1n`, without a prior.
+///
+/// # Errors
+/// No data, a prior of another size, or a matrix that is not positive definite.
+pub fn solve_pixels(
+    sums: PixelSums,
+    epsilon: f64,
+    prior_k: Option<&[f64]>,
+) -> Result<PixelSolution, SolveError> {
+    solve_pixels_with(sums, epsilon, prior_k, PixelExtras::default(), SolveWatch::default().named("map"))
+}
+
+/// As [`solve_pixels`], with more besides, as long as `watch` says so.
+///
+/// # Errors
+/// Also [`SolveError::Interrupted`], and a pixel for a beam that the map does not have.
+pub fn solve_pixels_with(
+    sums: PixelSums,
+    epsilon: f64,
+    prior_k: Option<&[f64]>,
+    extras: PixelExtras<'_>,
+    watch: NamedWatch<'_>,
+) -> Result<PixelSolution, SolveError> {
+    check_request(&sums, epsilon)?;
+    let PixelExtras { probes, beams } = extras;
+    let pixels = sums.unknowns();
+    let LargestEigenvalue { value: w_max, iterations, .. } =
+        largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| watch.goes_on());
+    // The solution takes the memory of the sums.
+    let traces = (probes > 0).then(|| traces(&sums, epsilon, w_max, probes, watch));
+    let mut map_k = sums.right.clone();
+    if let Some(prior_k) = prior_k {
+        if prior_k.len() != pixels {
+            return Err(SolveError::PriorLength { found: prior_k.len(), expected: pixels });
+        }
+        subtract_prediction(&sums, prior_k, &mut map_k);
+    }
+    let accuracy = sums.accuracy();
+    let mut beams = beams.iter().map(|&pixel| seen_point(&sums, pixel)).collect::<Result<Vec<_>, _>>()?;
+    let PixelSums { mut normal, right, noise: mut noise_k, counts, .. } = sums;
+    normal.add_to_diagonal(epsilon * w_max);
+    for step in 0..normal.along() {
+        if !watch.goes_on() {
+            return Err(SolveError::Interrupted);
+        }
+        Cholesky::advance(&mut normal, step)
+            .map_err(|NotPositive(pixel)| SolveError::NotPositive { pixel, epsilon })?;
+    }
+    let factor = Cholesky::of(normal);
+    rayon::join(|| factor.solve(&mut map_k), || factor.solve(&mut noise_k));
+    beams.iter_mut().for_each(|beam| factor.solve(&mut beam.map_k));
+    let solved = (probes > 0).then(|| map_k.clone());
+    if let Some(prior_k) = prior_k {
+        add(&mut map_k, prior_k);
+    }
+    let fit = solved.map(|solved| {
+        // (A + R) y = b - A T_p: A (y + T_p) is b - R y.
+        let mut product = right.clone();
+        subtract(&mut product, epsilon * w_max, &solved);
+        let (right, whole, product, solved) = (&right, &map_k, &product, &solved);
+        Fitted { counts, accuracy, w_max, right, whole, product, solved }.fit(1.0)
+    });
+    let diagnostics = Diagnostics {
+        epsilon,
+        w_max,
+        w_max_iterations: iterations,
+        l_max: None,
+        convergence: None,
+        noise_convergence: None,
+        traces: None,
+        traces_refused: None,
+        fit,
+    };
+    let diagnostics = match traces {
+        Some(found) => diagnostics.with_traces(found, 1.0),
+        None => diagnostics,
+    };
+    Ok(PixelSolution { map_k, noise_k, beams, diagnostics })
+}
+
+/// `BtN^-1B` times a sky that is 1 K in one pixel.
+fn seen_point(sums: &PixelSums, pixel: usize) -> Result<PointBeam, SolveError> {
+    let pixels = sums.unknowns();
+    let mut point = vec![0.0; pixels];
+    *point.get_mut(pixel).ok_or(SolveError::NoPixel { pixel, pixels })? = 1.0;
+    let mut seen = vec![0.0; pixels];
+    sums.apply(&point, &mut seen);
+    Ok(PointBeam { pixel, map_k: seen })
+}

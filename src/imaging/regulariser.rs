@@ -1,0 +1,153 @@
+//! R, diagonal over degrees: `epsilon W_max` times the identity, or growing with l; or what a known angular power asks for.
+
+use std::path::Path;
+
+use crate::imaging::circle::degrees;
+use crate::imaging::solver::SolveError;
+
+/// Longest table, bytes: more than one of the greatest degree needs.
+const FILE_BYTES_MAX: u64 = 1 << 20;
+
+/// How R depends on the degree.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Regulariser {
+    /// `R_l = epsilon W_max (l + 1)^exponent`; the identity with an exponent of 0.
+    Power(f64),
+    /// `R_l = epsilon / C_l` for a sky (without the prior) of the angular power C_l, K^2, from l = 0: with epsilon = 1 the map that is
+    /// most likely if both sky and noise are Gaussian (Wiener's).
+    Wiener(Vec<f64>),
+}
+
+impl Default for Regulariser {
+    fn default() -> Self {
+        Self::Power(0.0)
+    }
+}
+
+/// R over unknowns.
+#[derive(Clone, Debug, PartialEq)]
+pub(in crate::imaging) enum Diagonal {
+    /// The same for all.
+    Uniform(f64),
+    /// Of harmonics, by degree from l = 0.
+    ByDegree(Vec<f64>),
+}
+
+impl Diagonal {
+    /// `y += R x`.
+    pub(in crate::imaging) fn add_product(&self, x: &[f64], y: &mut [f64]) {
+        match self {
+            Self::Uniform(level) => y.iter_mut().zip(x).for_each(|(y, x)| *y += level * x),
+            Self::ByDegree(of_degree) => {
+                let levels = degrees(of_degree.len().saturating_sub(1)).map(|l| of_degree[l]);
+                y.iter_mut().zip(x).zip(levels).for_each(|((y, x), level)| *y += level * x);
+            }
+        }
+    }
+
+    /// Of degree `l`.
+    pub(in crate::imaging) fn at(&self, l: usize) -> f64 {
+        match self {
+            Self::Uniform(level) => *level,
+            Self::ByDegree(of_degree) => of_degree[l],
+        }
+    }
+}
+
+impl Regulariser {
+    /// Reads the angular power of a sky: a table of l and C_l, K^2, separated by a comma or blanks, from l = 0 on without a gap.
+    ///
+    /// # Errors
+    /// A file that cannot be read or is no such table; power that is not positive.
+    pub fn read(path: &Path) -> Result<Self, SolveError> {
+        let failed = |found: String| SolveError::Power { path: path.to_owned(), found };
+        let bytes = std::fs::metadata(path).map_err(|error| failed(error.to_string()))?.len();
+        if bytes > FILE_BYTES_MAX {
+            return Err(failed(format!("{bytes} bytes")));
+        }
+        let text = std::fs::read_to_string(path).map_err(|error| failed(error.to_string()))?;
+        power_of(&text).map(Self::Wiener).map_err(failed)
+    }
+
+    /// R of a solution up to `l_max`.
+    ///
+    /// # Errors
+    /// A table that ends before `l_max`.
+    pub(in crate::imaging) fn diagonal(
+        &self,
+        epsilon: f64,
+        w_max: f64,
+        l_max: usize,
+    ) -> Result<Diagonal, SolveError> {
+        let level = epsilon * w_max;
+        Ok(match self {
+            Self::Power(0.0) => Diagonal::Uniform(level),
+            Self::Power(exponent) => {
+                Diagonal::ByDegree((0..=l_max).map(|l| level * ((l + 1) as f64).powf(*exponent)).collect())
+            }
+            Self::Wiener(power_k2) => {
+                let power_k2 = power_k2
+                    .get(..=l_max)
+                    .ok_or(SolveError::PowerLength { found: power_k2.len(), expected: l_max + 1 })?;
+                Diagonal::ByDegree(power_k2.iter().map(|power| epsilon / power).collect())
+            }
+        })
+    }
+}
+
+/// C_l of a table, or what is wrong in it.
+fn power_of(text: &str) -> Result<Vec<f64>, String> {
+    let mut power_k2 = Vec::new();
+    for (number, line) in text.lines().enumerate() {
+        let fields: Vec<&str> =
+            line.split([',', ' ', '\t']).map(str::trim).filter(|field| !field.is_empty()).collect();
+        let is_head = number == 0 && fields.first().is_some_and(|field| field.parse::<f64>().is_err());
+        if fields.is_empty() || is_head || line.starts_with('#') {
+            continue;
+        }
+        let values = (fields.first().and_then(|l| l.parse::<usize>().ok()), fields.get(1));
+        let power = values.1.and_then(|power| power.parse::<f64>().ok());
+        match (values.0, power) {
+            (Some(l), Some(power)) if l == power_k2.len() && power > 0.0 && power.is_finite() => {
+                power_k2.push(power);
+            }
+            _ => return Err(format!("line {}: {}", number + 1, line.chars().take(60).collect::<String>())),
+        }
+    }
+    if power_k2.is_empty() { Err("no degrees".to_owned()) } else { Ok(power_k2) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn r_grows_as_its_exponent_says_or_as_power_falls() {
+        let of = |regulariser: Regulariser| regulariser.diagonal(0.5, 4.0, 2);
+        assert_eq!(of(Regulariser::default()), Ok(Diagonal::Uniform(2.0)));
+        assert_eq!(of(Regulariser::Power(2.0)), Ok(Diagonal::ByDegree(vec![2.0, 8.0, 18.0])));
+        let power_k2 = vec![1.0, 0.25, 0.125, 9.0];
+        assert_eq!(of(Regulariser::Wiener(power_k2)), Ok(Diagonal::ByDegree(vec![0.5, 2.0, 4.0])));
+        let short = SolveError::PowerLength { found: 2, expected: 3 };
+        assert_eq!(of(Regulariser::Wiener(vec![1.0; 2])), Err(short));
+    }
+
+    #[test]
+    fn tables_hold_every_degree_or_say_where_they_do_not() {
+        assert_eq!(power_of("l,power_k2\n0,3e9\n1, 2.5\n\n2\t1\n"), Ok(vec![3e9, 2.5, 1.0]));
+        assert_eq!(power_of("# from elsewhere\n0 1\n"), Ok(vec![1.0]));
+        for (text, found) in [
+            ("", "no degrees"),
+            ("0,1\n2,1", "line 2: 2,1"),
+            ("0,1\n1,0", "line 2: 1,0"),
+            ("0,1\n1,-1", "line 2: 1,-1"),
+            ("0,inf", "line 1: 0,inf"),
+            ("0,1\n1", "line 2: 1"),
+            ("0,1\none,1", "line 2: one,1"),
+        ] {
+            assert_eq!(power_of(text), Err(found.to_owned()), "{text}");
+        }
+        let gone = Regulariser::read(Path::new("no such table")).unwrap_err().to_string();
+        assert!(gone.contains("no such table"), "{gone}");
+    }
+}

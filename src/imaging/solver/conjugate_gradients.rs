@@ -1,0 +1,283 @@
+//! Conjugate gradients for `(BtN^-1B + R) x = b`.
+
+use super::vectors::{dot, subtract};
+use super::watch::SolveTask;
+use crate::imaging::NormalSums;
+use crate::imaging::regulariser::Diagonal;
+
+/// When to stop.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StoppingRule {
+    /// Greatest residual, relative to the right-hand side, in the preconditioner's norm.
+    pub residual_max: f64,
+    /// Iteration limit.
+    pub iterations_max: usize,
+}
+
+/// How an iteration ended.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, bincode::Encode, bincode::Decode)]
+pub struct Convergence {
+    /// Products with BtN^-1B.
+    pub iterations: usize,
+    /// `sqrt(r.Mr / b.Mb)`, M the preconditioner, r the residual, b the right-hand side.
+    pub residual: f64,
+    /// Whether the residual was reached; if not, the iteration limit was, or the run was interrupted.
+    pub converged: bool,
+}
+
+/// A symmetric system.
+pub(in crate::imaging) struct System<'a> {
+    pub(in crate::imaging) sums: &'a dyn NormalSums,
+    pub(in crate::imaging) regularisation: Diagonal,
+    /// Multiplies a vector by the preconditioner, in place.
+    pub(in crate::imaging) precondition: &'a dyn Fn(&mut [f64]),
+}
+
+/// One right-hand side on its way.
+struct Iteration {
+    x: Vec<f64>,
+    residual: Vec<f64>,
+    direction: Vec<f64>,
+    /// The residual's square in the preconditioner's norm.
+    energy: f64,
+    /// The right-hand side's.
+    whole: f64,
+    products: usize,
+    /// Rounding errors dominate: no further gain is possible.
+    is_stuck: bool,
+}
+
+impl Iteration {
+    /// From the first guess `x`, whose product is known unless it is zero.
+    fn new(b: &[f64], x: Vec<f64>, product: Option<&[f64]>, precondition: &dyn Fn(&mut [f64])) -> Self {
+        let preconditioned = |v: &[f64]| {
+            let mut z = v.to_vec();
+            precondition(&mut z);
+            z
+        };
+        let whole = dot(b, &preconditioned(b));
+        let mut residual = b.to_vec();
+        if let Some(product) = product {
+            subtract(&mut residual, 1.0, product);
+        }
+        let direction = preconditioned(&residual);
+        let energy = dot(&residual, &direction);
+        let products = usize::from(product.is_some());
+        Self { x, residual, direction, energy, whole, products, is_stuck: false }
+    }
+
+    /// The residual, relative to the right-hand side; 0 if that is zero.
+    fn relative(&self) -> f64 {
+        if self.whole <= 0.0 { 0.0 } else { (self.energy.max(0.0) / self.whole).sqrt() }
+    }
+
+    fn wants(&self, rule: StoppingRule) -> bool {
+        !self.is_stuck && self.relative() > rule.residual_max && self.products < rule.iterations_max
+    }
+
+    /// Takes the step along the direction, of which this is the product, and turns to the next.
+    fn step(&mut self, product: &[f64], precondition: &dyn Fn(&mut [f64])) {
+        self.products += 1;
+        let curvature = dot(&self.direction, product);
+        if curvature.is_nan() || curvature <= 0.0 {
+            self.is_stuck = true;
+            return;
+        }
+        let step = self.energy / curvature;
+        self.x.iter_mut().zip(&self.direction).for_each(|(x, d)| *x += step * d);
+        subtract(&mut self.residual, step, product);
+        let mut z = self.residual.clone();
+        precondition(&mut z);
+        let next = dot(&self.residual, &z);
+        let turn = next / self.energy;
+        self.energy = next;
+        self.direction.iter_mut().zip(&z).for_each(|(d, z)| *d = z + turn * *d);
+    }
+
+    fn convergence(&self, rule: StoppingRule) -> Convergence {
+        let residual = self.relative();
+        Convergence { iterations: self.products, residual, converged: residual <= rule.residual_max }
+    }
+}
+
+impl System<'_> {
+    /// The products of several vectors with the system's matrix.
+    fn apply(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
+        let mut products = self.sums.apply_all(x);
+        products.iter_mut().zip(x).for_each(|(product, x)| self.regularisation.add_product(x, product));
+        products
+    }
+
+    /// Solves for each right-hand side `b` in place, from the first guess `x`; the best so far is left whenever it ends. Each solution has
+    /// the bits that it has alone: only products are made together.
+    pub(in crate::imaging) fn solve(
+        &self,
+        b: &[&[f64]],
+        x: &mut [Vec<f64>],
+        rule: StoppingRule,
+        task: &SolveTask<'_>,
+    ) -> Vec<Convergence> {
+        let is_guess = |x: &Vec<f64>| x.iter().any(|x| *x != 0.0);
+        let guesses: Vec<&[f64]> = x.iter().filter(|x| is_guess(x)).map(Vec::as_slice).collect();
+        let mut products = if guesses.is_empty() { Vec::new() } else { self.apply(&guesses) }.into_iter();
+        let mut iterations: Vec<Iteration> = b
+            .iter()
+            .zip(x.iter_mut())
+            .map(|(b, x)| {
+                let product = is_guess(x).then(|| products.next()).flatten();
+                Iteration::new(b, std::mem::take(x), product.as_deref(), self.precondition)
+            })
+            .collect();
+        loop {
+            let wants: Vec<bool> = iterations.iter().map(|iteration| iteration.wants(rule)).collect();
+            let products = iterations.iter().map(|iteration| iteration.products).max().unwrap_or(0);
+            let residual = iterations.iter().map(Iteration::relative).fold(0.0, f64::max);
+            let goes_on = task.report_each(&wants, products, residual);
+            let mut open: Vec<&mut Iteration> = iterations
+                .iter_mut()
+                .zip(goes_on)
+                .filter_map(|(one, goes_on)| goes_on.then_some(one))
+                .collect();
+            if open.is_empty() {
+                break;
+            }
+            let directions: Vec<&[f64]> = open.iter().map(|one| one.direction.as_slice()).collect();
+            let products = self.apply(&directions);
+            for (iteration, product) in open.iter_mut().zip(&products) {
+                iteration.step(product, self.precondition);
+            }
+        }
+        let convergence = iterations.iter().map(|iteration| iteration.convergence(rule)).collect();
+        x.iter_mut().zip(iterations).for_each(|(x, iteration)| *x = iteration.x);
+        convergence
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+
+    use super::*;
+    use crate::imaging::solver::SolveWatch;
+    use crate::imaging::{Accuracy, SumCounts};
+    use crate::ranks::on_threads;
+
+    const ORDER: usize = 40;
+
+    /// A symmetric matrix with eigenvalues from 1 to 40, which keeps how many vectors each product had.
+    #[derive(Default)]
+    struct Known {
+        products: Mutex<Vec<usize>>,
+    }
+
+    impl NormalSums for Known {
+        fn unknowns(&self) -> usize {
+            ORDER
+        }
+
+        /// With v a unit vector, `(1 - 2 v v') D (1 - 2 v v')`.
+        fn apply(&self, x: &[f64], y: &mut [f64]) {
+            let mirrored = |x: &[f64]| {
+                let twice = 2.0 * x.iter().sum::<f64>() / ORDER as f64;
+                x.iter().map(|x| x - twice).collect::<Vec<f64>>()
+            };
+            let scaled: Vec<f64> = mirrored(x).iter().enumerate().map(|(k, x)| (k + 1) as f64 * x).collect();
+            y.copy_from_slice(&mirrored(&scaled));
+        }
+
+        fn apply_all(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
+            self.products.lock().unwrap().push(x.len());
+            let product = |x: &&[f64]| {
+                let mut y = vec![0.0; ORDER];
+                self.apply(x, &mut y);
+                y
+            };
+            x.iter().map(product).collect()
+        }
+
+        fn right_hand_side(&self) -> &[f64] {
+            &[]
+        }
+
+        fn noise_right_hand_side(&self) -> &[f64] {
+            &[]
+        }
+
+        fn counts(&self) -> SumCounts {
+            SumCounts::default()
+        }
+
+        fn accuracy(&self) -> Accuracy {
+            Accuracy { relative: 0.0, absolute: 0.0 }
+        }
+    }
+
+    fn solve(
+        known: &Known,
+        b: &[&[f64]],
+        x: &mut [Vec<f64>],
+        rule: StoppingRule,
+        watch: &SolveWatch,
+    ) -> Vec<Convergence> {
+        let system = System { sums: known, regularisation: Diagonal::Uniform(0.5), precondition: &|_| () };
+        system.solve(b, x, rule, &watch.named("test").start("columns", rule.residual_max))
+    }
+
+    const RULE: StoppingRule = StoppingRule { residual_max: 1e-6, iterations_max: 100 };
+
+    #[test]
+    fn columns_of_all_kinds_have_the_bits_of_each_alone() {
+        let wave = |f: f64| (0..ORDER).map(|k| (f * k as f64).sin()).collect::<Vec<f64>>();
+        let known = Known::default();
+        let zeros = vec![0.0; ORDER];
+        let watch = SolveWatch::default();
+        let mut solved = [zeros.clone()];
+        solve(&known, &[&wave(0.3)], &mut solved, RULE, &watch);
+        let [solved] = solved;
+        // Nothing to solve; one that is solved already; one with a first guess of another; a plain one; and not a number.
+        let columns = [
+            (zeros.clone(), zeros.clone()),
+            (wave(0.3), solved.clone()),
+            (wave(0.7), solved),
+            (wave(1.1), zeros.clone()),
+            (vec![f64::NAN; ORDER], zeros),
+        ];
+        let bits = |x: &[f64]| x.iter().map(|x| x.to_bits()).collect::<Vec<u64>>();
+        let b: Vec<&[f64]> = columns.iter().map(|(b, _)| b.as_slice()).collect();
+        let mut together: Vec<Vec<f64>> = columns.iter().map(|(_, x)| x.clone()).collect();
+        let found = solve(&known, &b, &mut together, RULE, &watch);
+        for (k, (b, x)) in columns.iter().enumerate() {
+            let mut alone = [x.clone()];
+            let convergence = solve(&known, &[b], &mut alone, RULE, &watch)[0];
+            assert_eq!(bits(&together[k]), bits(&alone[0]), "{k}");
+            assert_eq!(format!("{:?}", found[k]), format!("{convergence:?}"), "{k}");
+        }
+        let products: Vec<usize> = found.iter().map(|one| one.iterations).collect();
+        assert!(products[0] == 0 && products[1] == 1 && products[2] > 5 && products[3] > 5, "{products:?}");
+        let converged: Vec<bool> = found.iter().map(|one| one.converged).collect();
+        assert_eq!(converged, [true, true, true, true, false]);
+        // The matrix is that of the right-hand side.
+        let mut again = vec![0.0; ORDER];
+        known.apply(&together[3], &mut again);
+        for (k, (y, x)) in again.iter().zip(&together[3]).enumerate() {
+            assert!((y + 0.5 * x - columns[3].0[k]).abs() < 1e-5, "{k}");
+        }
+    }
+
+    /// Processors that round in other ways find an end at other products.
+    #[test]
+    fn ranks_end_a_column_together() {
+        let wave = |f: f64| (0..ORDER).map(|k| (f * k as f64).sin()).collect::<Vec<f64>>();
+        let b = [wave(0.7), wave(1.1)];
+        let found = on_threads(3, |ranks| {
+            let known = Known::default();
+            let watch = SolveWatch::default().among(ranks);
+            let residual_max = [1e-3, 1e-6, 1e-9][ranks.share().rank];
+            let mut x = [vec![0.0; ORDER], vec![0.0; ORDER]];
+            let b: Vec<&[f64]> = b.iter().map(Vec::as_slice).collect();
+            solve(&known, &b, &mut x, StoppingRule { residual_max, ..RULE }, &watch);
+            (known.products.into_inner().unwrap(), x)
+        });
+        assert!(found[0].0.len() > 3 && found.iter().all(|one| *one == found[0]), "{:?}", found[0].0);
+    }
+}

@@ -1,0 +1,144 @@
+//! The largest eigenvalue by Lanczos iteration.
+
+use rand_distr::{Distribution, StandardNormal};
+
+use super::vectors::{dot, norm, subtract};
+use crate::imaging::NormalSums;
+use crate::units::{StreamKind, random_stream};
+
+/// Iteration limit; 20 to 40 are usual.
+const ITERATIONS_MAX: usize = 200;
+
+/// The largest eigenvalue, and how it was found.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct LargestEigenvalue {
+    /// W_max, K^-2.
+    pub value: f64,
+    /// Products with the matrix.
+    pub iterations: usize,
+    /// Relative change in the last iteration.
+    pub change: f64,
+}
+
+/// Relative change at which W_max is as exact as sums in f64 allow.
+pub const W_MAX_EXACT: f64 = 1e-10;
+
+/// W_max of `BtN^-1B`.
+///
+/// Lanczos from a fixed random vector with full reorthogonalisation; the Ritz value rises towards W_max,
+/// and the iteration ends when it has twice risen by less than `tolerance` of itself. The error is then of the
+/// same order: it falls by a constant factor per iteration. `report` receives the number of products and the last
+/// change; it ends the iteration early by returning `false`.
+#[must_use]
+pub fn largest_eigenvalue(
+    sums: &dyn NormalSums,
+    tolerance: f64,
+    report: &mut dyn FnMut(usize, f64) -> bool,
+) -> LargestEigenvalue {
+    let start = random_vector(sums.unknowns());
+    largest_eigenvalue_from(start, sums, tolerance, &mut |wants, step, change| report(step, change) && wants)
+}
+
+/// A vector whose direction nothing prefers.
+pub(in crate::imaging) fn random_vector(order: usize) -> Vec<f64> {
+    let mut stream = random_stream(0, StreamKind::Probe, [order as u64, 0]);
+    (0..order).map(|_| StandardNormal.sample(&mut stream)).collect()
+}
+
+/// As [`largest_eigenvalue`], from a vector that should have parts of all vectors with large eigenvalues. `report` also receives whether
+/// there is more to find, and decides.
+pub(in crate::imaging) fn largest_eigenvalue_from(
+    start: Vec<f64>,
+    sums: &dyn NormalSums,
+    tolerance: f64,
+    report: &mut dyn FnMut(bool, usize, f64) -> bool,
+) -> LargestEigenvalue {
+    let order = sums.unknowns();
+    let mut krylov = Krylov::new(start);
+    let mut found = LargestEigenvalue { value: 0.0, iterations: 0, change: f64::INFINITY };
+    let (mut calm, mut wants) = (0, order > 0);
+    while wants {
+        let is_open = krylov.step(sums);
+        let value = largest_of_tridiagonal(&krylov.alphas, &krylov.betas);
+        found.iterations += 1;
+        found.change = ((value - found.value) / value).abs();
+        found.value = value;
+        calm = if found.change < tolerance { calm + 1 } else { 0 };
+        // In an invariant subspace the Ritz value is exact.
+        wants = is_open && calm < 2 && found.iterations < ITERATIONS_MAX.min(order);
+        wants = report(wants, found.iterations, found.change);
+    }
+    found
+}
+
+/// An orthonormal basis of the space of `v, A v, A^2 v, ..`, in which A is tridiagonal.
+pub(in crate::imaging) struct Krylov {
+    pub(in crate::imaging) basis: Vec<Vec<f64>>,
+    pub(in crate::imaging) alphas: Vec<f64>,
+    pub(in crate::imaging) betas: Vec<f64>,
+}
+
+impl Krylov {
+    pub(in crate::imaging) fn new(start: Vec<f64>) -> Self {
+        Self { basis: vec![normalised(start)], alphas: Vec::new(), betas: Vec::new() }
+    }
+
+    /// One product with A; whether the space can grow further.
+    pub(in crate::imaging) fn step(&mut self, sums: &dyn NormalSums) -> bool {
+        let Some(last) = self.basis.last() else { return false };
+        let mut next = vec![0.0; last.len()];
+        sums.apply(last, &mut next);
+        self.alphas.push(dot(last, &next));
+        // Twice: the second pass removes what rounding left of the first.
+        for _ in 0..2 {
+            for vector in &self.basis {
+                let part = dot(vector, &next);
+                subtract(&mut next, part, vector);
+            }
+        }
+        let beta = norm(&next);
+        let largest = self.alphas.iter().fold(0.0_f64, |a, b| a.max(b.abs()));
+        if beta.is_nan() || beta <= f64::EPSILON * largest {
+            return false;
+        }
+        self.betas.push(beta);
+        self.basis.push(normalised(next));
+        true
+    }
+}
+
+pub(in crate::imaging) fn normalised(mut vector: Vec<f64>) -> Vec<f64> {
+    let norm = norm(&vector);
+    vector.iter_mut().for_each(|x| *x /= norm);
+    vector
+}
+
+/// Largest eigenvalue of a symmetric tridiagonal matrix by bisection on Sturm counts.
+fn largest_of_tridiagonal(diagonal: &[f64], beside: &[f64]) -> f64 {
+    let radius = |k: usize| {
+        let left = if k > 0 { beside[k - 1].abs() } else { 0.0 };
+        let right = if k + 1 < diagonal.len() { beside[k].abs() } else { 0.0 };
+        left + right
+    };
+    // Gershgorin's circles hold all eigenvalues.
+    let mut high = (0..diagonal.len()).map(|k| diagonal[k] + radius(k)).fold(f64::MIN, f64::max);
+    let mut low = diagonal.iter().copied().fold(f64::MIN, f64::max);
+    let is_above_all = |x: f64| {
+        let mut pivot = diagonal[0] - x;
+        for k in 1..diagonal.len() {
+            if pivot >= 0.0 {
+                return false;
+            }
+            pivot = diagonal[k] - x - beside[k - 1] * beside[k - 1] / pivot;
+        }
+        pivot < 0.0
+    };
+    for _ in 0..200 {
+        let middle = 0.5 * (low + high);
+        if middle <= low || middle >= high {
+            break;
+        }
+        if is_above_all(middle) { high = middle } else { low = middle }
+    }
+    high
+}

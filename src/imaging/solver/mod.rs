@@ -1,0 +1,24 @@
+//! What map methods share to solve their equations: conjugate gradients, eigenvalues, traces of covariances, progress.
+
+mod conjugate_gradients;
+mod diagnostics;
+mod error;
+mod fit;
+mod lanczos;
+mod probing;
+mod traces;
+mod vectors;
+mod watch;
+
+pub(super) use conjugate_gradients::System;
+pub use conjugate_gradients::{Convergence, StoppingRule};
+pub use diagnostics::{Spectrum, spectrum};
+pub use error::SolveError;
+pub use fit::Fit;
+pub(super) use fit::Fitted;
+pub use lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
+pub(super) use lanczos::{largest_eigenvalue_from, normalised, random_vector};
+pub use probing::{effective_beam, noise_variance, regularisation};
+pub use traces::{Estimate, HELD_MAX, Traces, UnsupportedEpsilon, probed_traces, traces};
+pub(super) use vectors::{add, dot, subtract};
+pub use watch::{NamedWatch, SolveWatch, Solving, SolvingPart};

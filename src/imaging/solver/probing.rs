@@ -1,0 +1,148 @@
+//! Properties of covariances without their matrices: functions of BtN^-1B from the Krylov spaces of random probes.
+//!
+//! From a vector v, k Lanczos steps give a tridiagonal T with `v.f(A)v = |v|^2 e1.f(T)e1` for all polynomials f up
+//! to degree 2 k - 1, and `f(A)v ~ |v| Q f(T) e1` (Golub & Meurant 2010).
+
+use faer::{Mat, Side};
+use rand_distr::{Distribution, StandardNormal};
+
+use super::error::SolveError;
+use super::lanczos::{Krylov, W_MAX_EXACT, largest_eigenvalue};
+use super::vectors::norm;
+use super::watch::{NamedWatch, SolveTask};
+use crate::imaging::NormalSums;
+use crate::imaging::circle::{HarmonicSums, coefficients, unknowns};
+use crate::sky::harmonics::Transform;
+use crate::units::{StreamKind, random_stream};
+
+/// Most steps from one probe; fewer if the function converges.
+const STEPS_MAX: usize = 120;
+/// Steps between tests of convergence.
+const STEPS_BETWEEN: usize = 5;
+/// Relative change that counts as converged: a hundredth of the spread of a few random probes.
+const CONVERGED: f64 = 1e-4;
+
+/// Variance of the thermal noise of every pixel of an `nside` map, K^2, from `probes` noise maps.
+///
+/// Each is `(A + eps)^-1 A^(1/2) g`, g unit normal, which has the covariance `W / (W + eps)^2` exactly. A pixel's
+/// variance is uncertain by `sqrt(2 / probes)` of itself.
+///
+/// # Errors
+/// An nside or degree for which there is no transform.
+pub fn noise_variance(
+    sums: &HarmonicSums,
+    regularisation: f64,
+    nside: usize,
+    probes: usize,
+    watch: NamedWatch<'_>,
+) -> Result<Vec<f64>, SolveError> {
+    let eps = regularisation;
+    let transform = Transform::new(nside, sums.setup().l_max)?;
+    let mut variance = vec![0.0; crate::sky::healpix::pixel_count(nside)];
+    for probe in 0..probes {
+        let task = watch.start(&format!("noise map {} of {probes}", probe + 1), CONVERGED);
+        let mut stream = random_stream(1, StreamKind::Probe, [sums.unknowns() as u64, probe as u64]);
+        let start: Vec<f64> = (0..sums.unknowns()).map(|_| StandardNormal.sample(&mut stream)).collect();
+        let length = norm(&start);
+        let noise = |w: f64| w.max(0.0).sqrt() / (w + eps);
+        let space = converged_space(sums, start, &task, &|w| noise(w).powi(2));
+        let map = transform.synthesis(&coefficients(&space.function(length, noise), sums.setup().l_max))?;
+        variance.iter_mut().zip(map).for_each(|(sum, x)| *sum += x * x / probes as f64);
+    }
+    Ok(variance)
+}
+
+/// The effective beam at one pixel of an `nside` map: the map of a sky that is 1 K in that pixel alone, up to the map's
+/// degree; `B_eff = (A + eps)^-1 A`.
+///
+/// # Errors
+/// An nside or degree for which there is no transform; a pixel that the map does not have.
+pub fn effective_beam(
+    sums: &HarmonicSums,
+    regularisation: f64,
+    nside: usize,
+    pixel: usize,
+    watch: NamedWatch<'_>,
+) -> Result<Vec<f64>, SolveError> {
+    let l_max = sums.setup().l_max;
+    let transform = Transform::new(nside, l_max)?;
+    let mut map = vec![0.0; crate::sky::healpix::pixel_count(nside)];
+    let pixels = map.len();
+    *map.get_mut(pixel).ok_or(SolveError::NoPixel { pixel, pixels })? = 1.0;
+    let start = unknowns(&transform.adjoint(&map)?);
+    let length = norm(&start);
+    let task = watch.start(&format!("beam at pixel {pixel}"), CONVERGED);
+    let beam = |w: f64| w / (w + regularisation);
+    let space = converged_space(sums, start, &task, &beam);
+    Ok(transform.synthesis(&coefficients(&space.function(length, beam), l_max))?)
+}
+
+/// R = epsilon W_max I of some sums.
+#[must_use]
+pub fn regularisation(sums: &dyn NormalSums, epsilon: f64) -> f64 {
+    epsilon * largest_eigenvalue(sums, W_MAX_EXACT, &mut |_, _| true).value
+}
+
+/// A Krylov space and its tridiagonal matrix's eigenvalues and first components.
+struct Space {
+    krylov: Krylov,
+    eigenvalues: Vec<f64>,
+    vectors: Mat<f64>,
+}
+
+/// A Krylov space large enough for `e1.f(T)e1` to have converged.
+fn converged_space(
+    sums: &dyn NormalSums,
+    start: Vec<f64>,
+    task: &SolveTask<'_>,
+    f: &dyn Fn(f64) -> f64,
+) -> Space {
+    let mut krylov = Krylov::new(start);
+    let mut last = f64::NAN;
+    for step in 1..=STEPS_MAX.min(sums.unknowns()) {
+        let is_open = krylov.step(sums);
+        if !is_open || step % STEPS_BETWEEN == 0 {
+            let value = Space::decompose(&krylov).map_or(f64::NAN, |(eigenvalues, vectors)| {
+                eigenvalues.iter().enumerate().map(|(k, w)| f(*w) * vectors[(0, k)].powi(2)).sum::<f64>()
+            });
+            let change = ((value - last) / value).abs();
+            last = value;
+            if !is_open || change < CONVERGED || !task.report(step, change) {
+                break;
+            }
+        }
+    }
+    let (eigenvalues, vectors) = Space::decompose(&krylov).unwrap_or_else(|| (Vec::new(), Mat::new()));
+    Space { krylov, eigenvalues, vectors }
+}
+
+impl Space {
+    /// Eigenvalues and eigenvectors of the tridiagonal matrix.
+    fn decompose(krylov: &Krylov) -> Option<(Vec<f64>, Mat<f64>)> {
+        let (alphas, betas) = (&krylov.alphas, &krylov.betas);
+        let size = alphas.len();
+        // The decomposition's thresholds are absolute: the matrix has to be of order one.
+        let scale = alphas.iter().fold(f64::MIN_POSITIVE, |a, b| a.max(b.abs()));
+        let matrix = Mat::from_fn(size, size, |i, j| match i.abs_diff(j) {
+            0 => alphas[i] / scale,
+            1 => betas[i.min(j)] / scale,
+            _ => 0.0,
+        });
+        let decomposed = matrix.self_adjoint_eigen(Side::Lower).ok()?;
+        let eigenvalues = decomposed.S().column_vector().iter().map(|w| w * scale).collect();
+        Some((eigenvalues, decomposed.U().to_owned()))
+    }
+
+    /// `f(A)v` for the vector of that length that it started from.
+    fn function(&self, length: f64, f: impl Fn(f64) -> f64) -> Vec<f64> {
+        let mut result = vec![0.0; self.krylov.basis.first().map_or(0, Vec::len)];
+        for (row, vector) in self.krylov.basis.iter().enumerate().take(self.eigenvalues.len()) {
+            let terms = self.eigenvalues.iter().enumerate();
+            let factor: f64 =
+                terms.map(|(k, w)| f(*w) * self.vectors[(0, k)] * self.vectors[(row, k)]).sum::<f64>()
+                    * length;
+            result.iter_mut().zip(vector).for_each(|(sum, x)| *sum += factor * x);
+        }
+        result
+    }
+}
