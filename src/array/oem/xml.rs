@@ -48,7 +48,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Reading, Fault> {
                             return Err(Fault::new(line, "another oem", "one satellite a file"));
                         }
                     }
-                    _ if messages == 0 && depth > 1 => {
+                    _ if depth == 1 && name != "ndm" => {
                         return Err(Fault::new(line, format!("<{name}>"), "<oem>, alone or in <ndm>"));
                     }
                     "metadata" => {
