@@ -270,7 +270,9 @@ impl TableOrbit {
 
     /// First and last time, s since the mission's epoch, between which positions are known without a gap.
     pub(in crate::array) fn span_s(&self) -> [f64; 2] {
-        self.span_s.map(|t_s| t_s - self.epoch_s)
+        // The epoch is rounded to half a microsecond.
+        let since = |t_s: f64| if (t_s - self.epoch_s).abs() < SEAM_S { 0.0 } else { t_s - self.epoch_s };
+        self.span_s.map(since)
     }
 
     /// Position and velocity; beyond what is known they are not numbers.
