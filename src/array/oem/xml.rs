@@ -27,81 +27,97 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Reading, Fault> {
     let text = String::from_utf8_lossy(bytes);
     let mut reader = Reader::from_str(&text);
     let mut lines = LineCount { bytes: text.as_bytes(), place: 0, line: 1 };
-    let mut collector = Collector::default();
-    let mut state = State::default();
-    let (mut messages, mut depth) = (0, 0_usize);
-    // The elements around: what a value is of.
-    let (mut around, mut value) = (Around::Nothing, String::new());
+    let mut elements = Elements::default();
     loop {
         let event = reader.read_event();
         let line = lines.at(reader.buffer_position());
-        let event = event.map_err(|error| Fault::new(line, error.to_string(), "XML"))?;
-        match event {
-            Event::Start(element) => {
-                depth += 1;
-                value.clear();
-                let name = name_of(&element);
-                match name.as_str() {
-                    "oem" => {
-                        messages += 1;
-                        if messages > 1 {
-                            return Err(Fault::new(line, "another oem", "one satellite a file"));
-                        }
-                    }
-                    _ if depth == 1 && name != "ndm" => {
-                        return Err(Fault::new(line, format!("<{name}>"), "<oem>, alone or in <ndm>"));
-                    }
-                    "metadata" => {
-                        collector.end_segment(line)?;
-                        collector.begin_metadata();
-                        around = Around::Metadata;
-                    }
-                    "stateVector" => (around, state) = (Around::State, State::default()),
-                    "covarianceMatrix" => {
-                        collector.covariances += 1;
-                        around = Around::Nothing;
-                    }
-                    _ if around == Around::State => require_unit(&element, &name, line)?,
-                    _ => {}
-                }
-            }
-            Event::Text(text) => {
-                if value.len() + text.len() <= VALUE_BYTES_MAX {
-                    value.push_str(&text);
-                }
-            }
-            Event::End(element) => {
-                depth = depth.saturating_sub(1);
-                let name = element.local_name().as_ref().to_owned();
-                match (around, name.as_str()) {
-                    (_, "metadata") => {
-                        collector.end_metadata(line)?;
-                        around = Around::Nothing;
-                    }
-                    (_, "stateVector") => {
-                        state.add_to(&mut collector, line)?;
-                        around = Around::Nothing;
-                    }
-                    (Around::Metadata, _) => collector.set(&name, value.trim(), line),
-                    (Around::State, _) => state.set(&name, value.trim(), line)?,
-                    (Around::Nothing, _) => {}
-                }
-                value.clear();
-            }
+        match event.map_err(|error| Fault::new(line, error.to_string(), "XML"))? {
+            Event::Start(element) => elements.start(&element, line)?,
+            Event::Text(text) => elements.text(&text),
+            Event::End(element) => elements.end(element.local_name().as_ref(), line)?,
             Event::Eof => break,
             _ => {}
         }
     }
-    let line = lines.line;
-    if depth > 0 {
-        return Err(Fault::new(line, "the end", "the ends of all elements"));
+    match elements.depth {
+        0 => elements.collector.finish(lines.line),
+        _ => Err(Fault::new(lines.line, "the end", "the ends of all elements")),
     }
-    collector.finish(line)
+}
+
+/// Elements as they come.
+#[derive(Default)]
+struct Elements {
+    collector: Collector,
+    messages: usize,
+    depth: usize,
+    around: Around,
+    state: State,
+    /// Text of the latest element.
+    value: String,
+}
+
+impl Elements {
+    fn start(&mut self, element: &BytesStart<'_>, line: usize) -> Result<(), Fault> {
+        self.depth += 1;
+        self.value.clear();
+        match element.local_name().as_ref() {
+            "oem" => {
+                self.messages += 1;
+                if self.messages > 1 {
+                    return Err(Fault::new(line, "another oem", "one satellite a file"));
+                }
+            }
+            name if self.depth == 1 && name != "ndm" => {
+                return Err(Fault::new(line, format!("<{}>", short(name)), "<oem>, alone or in <ndm>"));
+            }
+            "metadata" => {
+                self.collector.end_segment(line)?;
+                self.collector.begin_metadata();
+                self.around = Around::Metadata;
+            }
+            "stateVector" => (self.around, self.state) = (Around::State, State::default()),
+            "covarianceMatrix" => {
+                self.collector.covariances += 1;
+                self.around = Around::Nothing;
+            }
+            name if self.around == Around::State => require_unit(element, name, line)?,
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn text(&mut self, text: &str) {
+        if self.value.len() + text.len() <= VALUE_BYTES_MAX {
+            self.value.push_str(text);
+        }
+    }
+
+    fn end(&mut self, name: &str, line: usize) -> Result<(), Fault> {
+        self.depth = self.depth.saturating_sub(1);
+        let value = self.value.trim();
+        match (self.around, name) {
+            (_, "metadata") => {
+                self.collector.end_metadata(line)?;
+                self.around = Around::Nothing;
+            }
+            (_, "stateVector") => {
+                self.state.add_to(&mut self.collector, line)?;
+                self.around = Around::Nothing;
+            }
+            (Around::Metadata, _) => self.collector.set(name, value, line),
+            (Around::State, _) => self.state.set(name, value, line)?,
+            (Around::Nothing, _) => {}
+        }
+        self.value.clear();
+        Ok(())
+    }
 }
 
 /// What is around a value.
-#[derive(Clone, Copy, PartialEq)]
+#[derive(Clone, Copy, Default, PartialEq)]
 enum Around {
+    #[default]
     Nothing,
     Metadata,
     State,
@@ -146,10 +162,6 @@ fn require_unit(element: &BytesStart<'_>, name: &str, line: usize) -> Result<(),
         }
     }
     Ok(())
-}
-
-fn name_of(element: &BytesStart<'_>) -> String {
-    element.local_name().as_ref().to_owned()
 }
 
 /// Lines of growing places.
