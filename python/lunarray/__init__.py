@@ -20,8 +20,7 @@ from ._chain import Ground, Replay, Run, State, replay, run
 from ._downlink import Downlink, open
 from ._map import Map, read_map
 from ._native import VERSION as __version__
-from ._native import ConfigurationError
-from ._native import LunarrayError as Error
+from ._native import ConfigurationError, Error
 from ._native import inspect as _inspect
 from ._predict import predict
 

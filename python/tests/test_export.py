@@ -1,6 +1,8 @@
 """Exports, read by other people's software."""
 
 import csv
+import os
+import shutil
 import subprocess
 import sys
 
@@ -98,6 +100,73 @@ def test_a_sky_predicted_from_the_exported_baselines_is_what_was_exported(exact,
         # The simulation evaluates fringes to 1e-6; a pixel at the Moon's limb may be seen in one and not in the other.
         limb = jansky * np.abs(pixels).max() * healpy.nside2pixarea(8)
         assert abs(data.data_array[k, 0, 0] - expected) < 1e-4 * scale + 0.01 * limb, k
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_uvh5_has_the_weights(small, tmp_path):
+    """nsample_array times integration_time is in proportion to the inverse variance, as the format defines both."""
+    from pyuvdata import UVData
+
+    downlink = lunarray.open(small.downlink)
+    downlink.write_uvh5(tmp_path / "v.uvh5", 0)
+    data = UVData.from_file(tmp_path / "v.uvh5", run_check=False)
+    rows = downlink.visibilities(0)
+    rows = rows[rows["flag"] == 0]
+    rows = rows[np.argsort(rows["time_s"], kind="stable")]
+    ratio = data.nsample_array[:, 0, 0] * data.integration_time / rows["weight"]
+    # Single precision, twice.
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
+    assert data.nsample_array.max() == 1.0 and data.nsample_array.min() < 0.999
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("kind", ["uvh5", "parquet"])
+def test_files_of_others_are_not_replaced(small, tmp_path, kind):
+    downlink = lunarray.open(shutil.copy(small.downlink, tmp_path / "in.ccsds"))
+    before = (tmp_path / "in.ccsds").read_bytes()
+    precious = tmp_path / "precious"
+    precious.write_text("precious")
+    (tmp_path / "link").symlink_to(precious)
+    (tmp_path / "dangling").symlink_to(tmp_path / "elsewhere")
+    os.link(tmp_path / "in.ccsds", tmp_path / "hard")
+    os.mkfifo(tmp_path / "pipe")
+
+    def write(name):
+        return getattr(downlink, f"write_{kind}")(tmp_path / name, 0)
+
+    for name, text in [
+        ("link", "link is a link, to "),
+        ("dangling", "dangling is a link, to "),
+        ("precious", "precious is there and is no "),
+        ("in.ccsds", "is the downlink that is exported"),
+        ("hard", "is the downlink that is exported"),
+        ("pipe", "pipe is no file"),
+        (".", "is no file"),
+        ("nowhere/v", "nowhere is none"),
+    ]:
+        with pytest.raises(lunarray.Error, match=text):
+            write(name)
+    assert precious.read_text() == "precious" and not (tmp_path / "elsewhere").exists()
+    assert (tmp_path / "in.ccsds").read_bytes() == before
+    # One of its kind is replaced, by a whole one, and nothing else is left.
+    count = write("v")
+    (tmp_path / "v").write_bytes((tmp_path / "v").read_bytes()[:100])
+    assert write("v") == count and (tmp_path / "v").stat().st_size > 10_000
+    assert {path.name for path in tmp_path.iterdir()} == {"in.ccsds", "precious", "link", "dangling", "hard", "pipe", "v"}
+
+
+@pytest.mark.parametrize(
+    ("package", "extra", "write"),
+    [("h5py", "uvh5", "write_uvh5"), ("pyuvdata", "uvh5", "write_uvh5"), ("pyarrow", "parquet", "write_parquet")],
+)
+def test_a_missing_package_names_the_extra(small, tmp_path, monkeypatch, package, extra, write):
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    # What Python makes of a package that is not installed.
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=rf"pip install 'lunarray\[{extra}\]' brings {package}"):
+        getattr(lunarray.open(small.downlink), write)(tmp_path / "v", 0)
+    assert not (tmp_path / "v").exists()
 
 
 def export(*words):

@@ -2,7 +2,6 @@
 //!
 //! A thread of its own writes; the run never waits for it. Maps wait for it in a queue, and those that find it full are counted.
 
-use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -16,6 +15,7 @@ use serde::Serialize;
 use super::output::{CommandError, json_text, print_notes};
 use crate::calibration::solver::InstrumentEvent;
 use crate::downlink::ReceptionCounters;
+use crate::files::growing_file;
 use crate::frames::VisibilityReason;
 use crate::ground::SavingReport;
 use crate::pipeline::{Config, Watched};
@@ -52,7 +52,7 @@ impl EventsArgs {
         let out: Box<dyn Write + Send> = match self.take_stdout() {
             true => Box::new(std::io::stdout()),
             false => {
-                let file = File::create(path);
+                let file = growing_file(path);
                 Box::new(file.map_err(|error| format!("cannot write events to {}: {error}", path.display()))?)
             }
         };

@@ -8,6 +8,7 @@ use clap::Args;
 use super::arguments::input_path;
 use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::downlink::Kind;
+use crate::files::ProtectedInputs;
 use crate::ground::archive::{CoverageSurvey, GapReport, Gaps, RestartReport};
 use crate::products::draw_coverage;
 
@@ -38,6 +39,7 @@ pub(super) struct GapsArgs {
 }
 
 pub(super) fn execute(args: &GapsArgs) -> CommandResult {
+    let _inputs = ProtectedInputs::of([&args.path]);
     let survey = CoverageSurvey::of(&args.path)?;
     print_notes(survey.notes());
     let gaps = survey.gaps();

@@ -10,6 +10,8 @@ mod check;
 mod compare;
 mod corrupt;
 mod cutout;
+#[cfg(all(test, feature = "serve"))]
+mod documented;
 mod events;
 mod explain;
 mod export;

@@ -27,6 +27,7 @@ use crate::downlink::transport::socket::{
     HeldAnswers, ListenNote, SocketError, SocketSource, Stations, TcpUrl, Until,
 };
 use crate::downlink::{FileSource, Pace, Paced, Steps};
+use crate::files::ProtectedInputs;
 use crate::frames::Instrument;
 use crate::ground::{Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
 use crate::pipeline::{
@@ -180,6 +181,8 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     }
     let source = ConfigSource { file: args.map.clone(), overrides, seed: None };
     let config = args.with_known_settings(source, job)?.load_ground()?;
+    let named = args.files.iter().chain(&args.map).chain(&args.stations).cloned();
+    let _inputs = ProtectedInputs::of(named.chain(config.input_files()));
     use_threads(&config.runtime)?;
     print_notes(config.positions_note());
     if let Some(size) = args.groups {

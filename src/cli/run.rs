@@ -64,6 +64,7 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     if job.is_first() {
         print_config_notes(&config);
     }
+    let _inputs = args.pipeline.protect(&config);
     let plan = Plan::new(config)?;
     if job.is_first() {
         print_notes(plan.array.notes());

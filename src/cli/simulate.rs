@@ -73,6 +73,7 @@ fn rate(text: &str) -> Result<f64, String> {
 pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let config = args.pipeline.load()?;
     print_config_notes(&config);
+    let _inputs = args.pipeline.protect(&config);
     let plan = Plan::new(config)?;
     print_notes(plan.array.notes());
     print_notes(sky_notes(&plan)?);

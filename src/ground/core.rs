@@ -75,6 +75,7 @@ impl Ground {
     /// archive they are held for the next session, as far as the hold buffer has room. Without one they are added for
     /// `linger` yet, and the rest counts as not received. Checkpoint and final sums follow as ever.
     #[must_use]
+    #[doc(hidden)]
     pub fn cancelled_by(mut self, cancel: &Cancel, linger: Duration) -> Self {
         self.accumulator = self.accumulator.cancelled_by(cancel);
         Self { cancel: cancel.clone(), linger, ..self }
@@ -82,12 +83,14 @@ impl Ground {
 
     /// As one rank's of several: it receives everything, and holds its part of the sums.
     #[must_use]
+    #[doc(hidden)]
     pub fn among(self, ranks: &Ranks) -> Self {
         Self { accumulator: self.accumulator.among(ranks), ..self }
     }
 
     /// Sums noise of further realisations as well, one a seed: for final maps of the harmonic engine, without an archive.
     #[must_use]
+    #[doc(hidden)]
     pub fn with_noises(self, seeds: &[u64]) -> Self {
         Self { accumulator: self.accumulator.with_noises(seeds), ..self }
     }
@@ -95,12 +98,14 @@ impl Ground {
     /// Tells senders that wait for it, through `answers`, what its checkpoints hold. To be of use, it needs an archive, and has to take
     /// the stream of the source that shares `answers`, from its beginning.
     #[must_use]
+    #[doc(hidden)]
     pub fn answering(self, answers: &HeldAnswers) -> Self {
         Self { promises: self.promises.answering(answers), ..self }
     }
 
     /// Tells `observer` of each pass whose gains it has found, on its own thread.
     #[must_use]
+    #[doc(hidden)]
     pub fn observed_by(mut self, observer: PassObserver) -> Self {
         if let Some(gate) = &mut self.gate {
             gate.observed_by(observer);
@@ -110,12 +115,14 @@ impl Ground {
 
     /// Those that hold parts of the sums.
     #[must_use]
+    #[doc(hidden)]
     pub fn ranks(&self) -> &Ranks {
         self.accumulator.ranks()
     }
 
     /// The instrument, once it is known.
     #[must_use]
+    #[doc(hidden)]
     pub fn instrument(&self) -> Option<&Instrument> {
         self.collector.instrument()
     }

@@ -22,6 +22,7 @@ mod schedule;
 mod sizes;
 mod spool;
 mod store;
+mod thinning;
 mod troubles;
 
 pub use config::{
@@ -36,3 +37,4 @@ pub use schedule::{Integration, Schedule};
 pub use sizes::VISIBILITY_BYTES;
 pub use spool::{SpoolError, SpoolReader, SpoolWriter};
 pub use store::{PacedLink, Store};
+pub use thinning::{WindowThinning, largest_gap};

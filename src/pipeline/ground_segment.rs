@@ -12,7 +12,7 @@ use crate::imaging::anywhere::RefineRule;
 use crate::imaging::{Regulariser, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
 use crate::products::{ChannelSummary, MapWatch, ProductsError, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link, Sink};
-use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::fits::{ReadOptions, read_prior};
 
 /// Name of the stage that keeps the state.
 pub(super) const GROUND: &str = "ground";
@@ -41,6 +41,7 @@ impl Config {
     ///
     /// # Errors
     /// Prior maps and tables of power that cannot be read.
+    #[doc(hidden)]
     pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
         let map = &self.map;
         Ok(SolverSetup {
@@ -140,7 +141,7 @@ fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {
     let map = &config.map;
     let options = ReadOptions { frame_if_missing: map.prior_frame, ..ReadOptions::default() };
     let read = |path: &std::path::PathBuf| {
-        let prior = read_whole_map(path, &options)?.to_ecliptic();
+        let prior = read_prior(path, &options)?.to_ecliptic();
         let smooth = prior.smoothed(map.prior_fwhm_deg.to_radians())?;
         Ok(smooth.resized(map.nside)?.into_values())
     };

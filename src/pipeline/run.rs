@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
+use std::{fs, io};
 
 use super::config::Config;
 use super::error::PipelineError;
@@ -139,7 +140,7 @@ pub fn run_among(
             expected: "neither: simulate first, then replay --mpi",
         });
     }
-    let _lock = ranks.is_first().then(|| lock_folder(out)).transpose()?;
+    let _lock = ranks.is_first().then(|| lock_products(&plan.config, out)).transpose()?;
     let file = out.join(downlink_file(plan.config.downlink.format));
     let recorder = if ranks.is_first() {
         write_settings(&plan.config, out)?;
@@ -256,7 +257,7 @@ pub(super) fn replay_knowing<S: GroundSource + 'static>(
 ) -> Result<RunSummary, PipelineError> {
     let ranks = ground.ranks().clone();
     config.require_shareable(ranks.share().count)?;
-    let _lock = ranks.is_first().then(|| lock_folder(out)).transpose()?;
+    let _lock = ranks.is_first().then(|| lock_products(config, out)).transpose()?;
     let ended = ground_alone(truth, source, config, ground, out, cancel, watch)?;
     conclude(RunScope::Ground, &ranks, config, out, ended)
 }
@@ -292,6 +293,7 @@ impl Config {
     ///
     /// # Errors
     /// [`PipelineError::NotShareable`].
+    #[doc(hidden)]
     pub fn require_shareable(&self, ranks: usize) -> Result<(), PipelineError> {
         let found = match self {
             _ if ranks < 2 => None,
@@ -356,13 +358,39 @@ pub(super) fn write_settings(config: &Config, out: &Path) -> Result<(), Pipeline
         "# All settings of this run, by lunarray {version}: `lunarray run {SETTINGS}` repeats it. Paths of files are as they were \
          given.\n\n{settings}"
     );
+    // A run of the settings that it left may leave them.
+    let has_its_length =
+        fs::metadata(&path).is_ok_and(|found| found.is_file() && found.len() == text.len() as u64);
+    if has_its_length && fs::read(&path).is_ok_and(|known| known == text.as_bytes()) {
+        return Ok(());
+    }
     Ok(write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?)
+}
+
+/// As [`lock_folder`], for maps: no file that the configuration names may be in the place of one.
+pub(super) fn lock_products(config: &Config, out: &Path) -> Result<FolderLock, PipelineError> {
+    for input in config.input_files() {
+        if is_place_of_product(&input, out) {
+            let reason = "the configuration names it as an input, and the run would replace it; expected another output folder";
+            let source = io::Error::new(io::ErrorKind::InvalidInput, reason);
+            return Err(ProductsError::Write { path: input, source }.into());
+        }
+    }
+    lock_folder(out)
 }
 
 /// Creates and locks the folder before anything is computed, so that an error shows at once.
 pub(super) fn lock_folder(out: &Path) -> Result<FolderLock, PipelineError> {
     let locked = FolderLock::acquire(out, ".lock", true);
     locked.map_err(|source| ProductsError::Write { path: out.to_owned(), source }.into())
+}
+
+/// Whether a file lies in one of the folders of channels in `out`.
+fn is_place_of_product(input: &Path, out: &Path) -> bool {
+    let (Ok(input), Ok(out)) = (fs::canonicalize(input), fs::canonicalize(out)) else { return false };
+    let Some(folder) = input.parent() else { return false };
+    folder.parent() == Some(out.as_path())
+        && folder.file_name().is_some_and(|name| name.to_string_lossy().ends_with("MHz"))
 }
 
 /// How the time after cancellation is divided.

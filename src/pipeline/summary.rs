@@ -122,6 +122,7 @@ impl RunSummary {
 
     /// Whether maps are missing because the time after cancellation did not suffice.
     #[must_use]
+    #[doc(hidden)]
     pub fn lacks_maps(&self) -> bool {
         let is_skipped = |solve: &StageReport| solve.items_out < solve.items_in;
         self.cancelled && (!self.report.cut.is_empty() || self.report.stage(SOLVE).is_some_and(is_skipped))

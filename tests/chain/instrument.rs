@@ -167,7 +167,8 @@ fn tilted_dipoles_see_one_source_by_their_projections() {
     let options = lunarray::sky::fits::WriteOptions::default();
     lunarray::sky::fits::write_map(Path::new(&path), &map, &options).unwrap();
     let n_hat = lunarray::sky::healpix::pixel_directions(nside)[pixel];
-    let file = format!("sky.file={path}");
+    // Sky by sky, as the map says no frequency.
+    let file = format!("sky.file=[{path:?}, {path:?}]");
     let set = [
         &file,
         "spacecraft.thermal_noise=false",

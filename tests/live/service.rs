@@ -112,7 +112,7 @@ fn dashboard_and_alerts_name_metrics_that_exist() {
         assert!(collector.contains(&format!("\"{name}\"")));
         known.insert(format!("lunarray_{name}_{unit}").trim_end_matches('_').to_owned());
     }
-    for path in ["docs/deploy/grafana.json", "docs/deploy/alerts.yml", "docs/serve.md"] {
+    for path in ["docs/deploy/grafana.json", "docs/deploy/alerts.yml", "docs/live.md"] {
         let named = metrics_in(&ours(path));
         assert!(named.len() > 5, "{path}: {named:?}");
         let unknown: Vec<&String> = named.difference(&known).collect();

@@ -9,6 +9,7 @@
 #![allow(clippy::unwrap_used, clippy::panic)] // A test fails by panicking.
 
 mod book;
+mod public;
 mod rules;
 mod source;
 
@@ -18,7 +19,7 @@ use std::path::Path;
 use source::{File, ModulePath, parse};
 
 /// Folders (and files) directly below `src/`, each after all that it may use.
-const ORDER: [&str; 22] = [
+const ORDER: [&str; 23] = [
     "units",
     "numerics",
     "files",
@@ -36,6 +37,7 @@ const ORDER: [&str; 22] = [
     "ground",
     "products",
     "pipeline",
+    "prelude",
     "figures",
     "serve",
     "bench",

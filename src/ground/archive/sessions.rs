@@ -28,6 +28,7 @@ impl Ground {
     ///
     /// # Errors
     /// Likewise; a folder that ranks do not share.
+    #[doc(hidden)]
     pub fn open_among(
         folder: &Path,
         config: &GroundConfig,
@@ -78,6 +79,7 @@ impl Ground {
     ///
     /// # Errors
     /// A folder without a usable checkpoint, or in use.
+    #[doc(hidden)]
     pub fn settings_in(folder: &Path) -> Result<Vec<(String, String)>, GroundError> {
         if checkpoints(folder)?.is_empty() {
             return Err(GroundError::without_checkpoint(folder));
@@ -90,6 +92,7 @@ impl Ground {
     ///
     /// # Errors
     /// A folder without a usable checkpoint.
+    #[doc(hidden)]
     pub fn settings_for_ranks(folder: &Path) -> Result<Vec<(String, String)>, GroundError> {
         for path in checkpoints(folder)?.iter().rev() {
             match settings_at(path) {
@@ -104,6 +107,7 @@ impl Ground {
     ///
     /// # Errors
     /// As [`Ground::open`]; a folder without a checkpoint.
+    #[doc(hidden)]
     pub fn sums_in(folder: &Path, config: &GroundConfig) -> Result<Vec<Snapshot>, GroundError> {
         if checkpoints(folder)?.is_empty() {
             return Err(GroundError::without_checkpoint(folder));
@@ -118,11 +122,13 @@ impl Ground {
 
     /// Packets of visibilities in the archive.
     #[must_use]
+    #[doc(hidden)]
     pub fn packets(&self) -> usize {
         self.archive.as_ref().map_or(0, |archive| archive.journal.packets())
     }
 
     /// Checkpoints that could not be used, in words.
+    #[doc(hidden)]
     pub fn notes(&self) -> impl Iterator<Item = &str> {
         self.archive.iter().flat_map(Archive::notes)
     }

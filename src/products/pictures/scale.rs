@@ -75,6 +75,7 @@ impl ColourScale {
 
     /// A diverging scale, symmetric about zero, up to the 99 % quantile of `|values|`.
     #[must_use]
+    #[doc(hidden)]
     pub fn symmetric(values: &[f64]) -> Self {
         let sizes = values.iter().copied().filter(|v| is_seen(*v)).map(f64::abs).collect();
         let (_, reach) = percentiles(sizes, 0.0, 99.0).unwrap_or(ANY_SCALE);
@@ -98,12 +99,14 @@ impl ColourScale {
 
     /// Lower limit.
     #[must_use]
+    #[doc(hidden)]
     pub fn low(&self) -> f64 {
         self.low
     }
 
     /// Upper limit.
     #[must_use]
+    #[doc(hidden)]
     pub fn high(&self) -> f64 {
         self.high
     }
