@@ -57,7 +57,7 @@ class Array:
         return [(i, j) for i in range(1, self.satellites + 1) for j in range(i + 1, self.satellites + 1)]
 
     def positions(self, t: ArrayLike) -> NDArray[np.float64]:
-        """Positions at a time or times, s: shape ``t.shape + (satellites, 3)``, m; NaN where unknown."""
+        """Positions at a time or times, s: shape ``t.shape + (satellites, 3)``, m. A time at which they are not known is an error."""
         times = seconds(t, self.epoch_tai_s)
         return self._native.positions(times.ravel()).reshape(*times.shape, self.satellites, 3)
 
@@ -69,12 +69,11 @@ class Array:
 
     def geometry(self, t: float, frequency_hz: float | str = 10e6) -> dict[str, Any]:
         """Everything at a time, s, as ``lunarray geometry --json`` prints it: positions, baselines r_i - r_j by pair and their
-        lengths, m; and for an array of a pipeline whether it observes (the Moon hides the Earth), the direction of the Earth, and
-        the integration time of each pair at a frequency, s."""
+        lengths, m; and for an array of a pipeline whether it observes (the Moon hides the Earth), the direction of the Earth and of
+        the Sun (None where the mission's Earth is an idealised one, without dates), and the integration time of each pair at a
+        frequency, s."""
         time_s = float(self._time(t))
         places = self.positions(time_s)
-        if not np.isfinite(places).all():
-            raise _native.Error(f"t = {time_s} s: expected a time at which positions are known")
         first, second = (np.array(part) - 1 for part in zip(*self.pairs))
         baselines = places[first] - places[second]
         found = {
@@ -85,8 +84,9 @@ class Array:
             "lengths_m": np.linalg.norm(baselines, axis=1),
         }
         if isinstance(self._native, _native.NativeArray):
-            observing, earth = self._native.earth(time_s)
+            observing, earth, sun = self._native.earth(time_s)
             found["observing"], found["earth_hat"] = observing, np.array(earth)
+            found["sun_hat"] = None if sun is None else np.array(sun)
             found["dt_s"] = np.array(
                 [self._native.integration_s(time_s, i - 1, j - 1, hertz(frequency_hz)) for i, j in self.pairs]
             )

@@ -56,8 +56,8 @@ class Downlink:
         ``time_s`` is the middle of an integration, s since the epoch, ``tai`` and ``utc`` the same as ``datetime64``, ``dt_s`` its
         length; ``i`` and ``j`` the satellites, from 1; ``uvw_m`` the baseline r_i - r_j and ``r_i_m``, ``r_j_m`` the positions, m in
         Moon-centred ecliptic axes, NaN where the file has none; ``value_k_sr`` the visibility and ``value_jy`` the same times
-        2 k nu^2 / c^2; ``weight`` the inverse variance of the real part, (K sr)^-2; ``flag`` is 0 for a good one. UTC is TAI less
-        37 s, as since 2017.
+        2 k nu^2 / c^2; ``weight`` the inverse variance of the real part, (K sr)^-2; ``flag`` is 0 for a good one. ``utc`` has
+        leap seconds; during one it is the next midnight, as ``datetime64`` has no second 60.
         """
         # The native function counts in 16 bits, and Python would say no more than that another number does not fit.
         number, count = operator.index(channel), len(self.channels_hz)

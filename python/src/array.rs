@@ -99,22 +99,30 @@ impl NativeArray {
         py: Python<'py>,
         times_s: PyReadonlyArray1<'py, f64>,
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        times_s.as_array().iter().try_for_each(|&t_s| self.require_known(t_s))?;
         places(py, &times_s, self.array.satellites(), |t_s, n| Some(self.array.position_m(n, t_s)))
     }
 
-    /// Whether the Moon hides the Earth, and the direction of the Earth.
-    fn earth(&self, t_s: f64) -> PyResult<(bool, Vec3)> {
-        require_time(t_s)?;
-        Ok((self.array.observing(t_s), self.array.earth_hat(t_s)))
+    /// Whether the Moon hides the Earth, and the directions of the Earth and, where orbits have dates, of the Sun.
+    fn earth(&self, t_s: f64) -> PyResult<(bool, Vec3, Option<Vec3>)> {
+        self.require_known(t_s)?;
+        Ok((self.array.observing(t_s), self.array.earth_hat(t_s), self.array.sun_hat(t_s)))
     }
 
     /// Integration time of a pair (satellites from 0) at a frequency, s.
     fn integration_s(&self, t_s: f64, i: usize, j: usize, frequency_hz: f64) -> PyResult<f64> {
-        require_time(t_s)?;
+        self.require_known(t_s)?;
         require_frequency(frequency_hz)?;
         require_pairs(&[(i, j)], self.array.satellites())?;
         let [i, j] = [i, j].map(|n| self.array.state(n, t_s));
         Ok(integration_time_s(self.config.spacecraft.rule(), frequency_hz, i.velocity_m_s, j.velocity_m_s))
+    }
+}
+
+impl NativeArray {
+    fn require_known(&self, t_s: f64) -> PyResult<()> {
+        require_time(t_s)?;
+        self.array.require_known(t_s).map_err(exception)
     }
 }
 
@@ -123,6 +131,8 @@ impl NativeArray {
 pub(crate) struct NativeEphemeris {
     ephemeris: Ephemeris,
     satellites: usize,
+    /// First and last time.
+    known_s: [f64; 2],
 }
 
 #[pymethods]
@@ -175,7 +185,7 @@ impl NativeEphemeris {
         require_flown(&segment.positions_m, satellites, &times_s.to_vec(), moon_radius_m)?;
         let mut ephemeris = Ephemeris::default();
         ephemeris.insert(segment);
-        Ok(Self { ephemeris, satellites })
+        Ok(Self { ephemeris, satellites, known_s: [times_s[0], times_s[nodes - 1]] })
     }
 
     #[getter]
@@ -188,6 +198,12 @@ impl NativeEphemeris {
         py: Python<'py>,
         times_s: PyReadonlyArray1<'py, f64>,
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let [from_s, until_s] = self.known_s;
+        if let Some(t_s) = times_s.as_array().iter().find(|t_s| !(from_s..=until_s).contains(*t_s)) {
+            return Err(refused(format!(
+                "t = {t_s} s: expected a time at which positions are known, {from_s} s to {until_s} s"
+            )));
+        }
         places(py, &times_s, self.satellites, |t_s, n| self.ephemeris.position_at(t_s, n))
     }
 }

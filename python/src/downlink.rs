@@ -9,6 +9,7 @@ use lunarray::products::{VisibilityRow, VisibilityTable, jansky_per_k_sr};
 use lunarray::response::harmonic::GeometryLimits;
 use lunarray::runtime::Cancel;
 use lunarray::units::ChannelId;
+use lunarray::units::time_scales::tai_less_utc_s;
 use lunarray::units::vector::{Vec3, sub};
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1};
 use pyo3::prelude::*;
@@ -20,9 +21,6 @@ use crate::wait::{wait, wait_to_read};
 
 /// Nanoseconds from 1958-01-01, where TAI is counted from, to 1970-01-01, where numpy's `datetime64` is.
 const FROM_1958_NS: i128 = 4383 * 86_400 * 1_000_000_000;
-
-/// TAI - UTC since 2017-01-01, ns (IERS Bulletin C).
-const LEAP_NS: i64 = 37_000_000_000;
 
 /// What is in a downlink file, as `lunarray inspect --json` prints it.
 #[pyfunction]
@@ -136,7 +134,9 @@ fn put(bytes: &mut Vec<u8>, row: &VisibilityRow, epoch_ns: i128, frequency_hz: f
     let jansky_per_k_sr = jansky_per_k_sr(frequency_hz);
     bytes.extend((row.middle_half_us as f64 * 0.5e-6).to_ne_bytes());
     bytes.extend(tai_ns.to_ne_bytes());
-    bytes.extend(tai_ns.saturating_sub(LEAP_NS).to_ne_bytes());
+    // `datetime64` has no second 60: a leap second is that of the next midnight.
+    let behind_ns = tai_less_utc_s(tai_ns.div_euclid(1_000_000_000)) * 1_000_000_000;
+    bytes.extend(tai_ns.saturating_sub(behind_ns).to_ne_bytes());
     bytes.extend((f64::from(row.duration_us) * 1e-6).to_ne_bytes());
     bytes.extend([row.pair.i + 1, row.pair.j + 1, row.flags.0, 0]);
     bytes.extend(row.weight.to_ne_bytes());

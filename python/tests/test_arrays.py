@@ -65,7 +65,7 @@ def test_given_positions_are_an_array():
     np.testing.assert_allclose(ours, theirs, rtol=1e-4)
     geometry = array.geometry(333.3)
     assert geometry["baselines_m"].shape == (28, 3) and "observing" not in geometry
-    with pytest.raises(lunarray.Error, match="expected times at which positions are known"):
+    with pytest.raises(lunarray.Error, match="t = 1000000 s: expected a time at which positions are known, 0 s to 2340 s"):
         lunarray.predict(sky(8), 3e6, [1e6], array=array)
 
 

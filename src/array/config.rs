@@ -7,8 +7,8 @@ use thiserror::Error;
 
 use super::kepler::KeplerElements;
 use super::propagate::PropagateConfig;
-use crate::units::calendar::epoch_s;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
+use crate::units::time_scales::{Tai, TimeScale, utc_text};
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES, keys};
 
 /// Sense of the precession of the ascending node.
@@ -52,7 +52,8 @@ keys! {
         /// Greatest distance of each daughter from daughter 1 across the track, in units of that along it: their planes are
         /// inclined to each other by that much.
         expert cross_track_ratio: f64 = 0.0;
-        /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch, degrees.
+        /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch, degrees: of the idealised Earth on a circle in the
+        /// ecliptic, which missions without `oem` have.
         expert earth_longitude_deg: f64 = 0.0;
         /// Arcs by which daughter 2 and those after it trail daughter 1 at their greatest, m, in ascending order; empty for
         /// those that `breathing` describes.
@@ -61,10 +62,11 @@ keys! {
         /// eccentricity = 0.01, inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.0
         /// }` at the epoch, on ecliptic axes; if they turn, `node_rate_deg_per_day` and `periapsis_rate_deg_per_day`.
         everyday kepler: Vec<KeplerElements> = Vec::new();
-        /// Orbits from CCSDS OEM files (KVN), one a satellite, in place of the circle and its formation; empty for the circle.
+        /// Orbits from CCSDS OEM files (KVN or XML, also compressed by gzip), one a satellite, in place of the circle and its
+        /// formation; empty for the circle. Their dates give the mission's epoch, and where the Earth is.
         everyday oem: Vec<PathBuf> = Vec::new();
         /// Epoch of the mission in the files' time system, such as 2030-01-31T12:00:00; empty for the latest of their first
-        /// epochs.
+        /// useable times.
         #[only_with("array.oem")]
         expert oem_epoch: String = String::new();
         /// Orbits by numerical integration in the Moon's field (GRGM900C), from the formation at the epoch, whose followers go
@@ -124,6 +126,19 @@ pub enum ArrayError {
         /// What was found there, and what was expected.
         what: String,
     },
+    /// A time at which positions are not known.
+    #[error(
+        "t = {t_s} s: expected a time at which positions are known, {:.3} s to {:.3} s after the mission's epoch{}", known_s[0],
+        known_s[1], epoch_said(*epoch_tai_s)
+    )]
+    NotKnown {
+        /// The time, s after the mission's epoch.
+        t_s: f64,
+        /// First and last that are known, s.
+        known_s: [f64; 2],
+        /// The epoch, if the orbits have dates: TAI seconds since 1958.
+        epoch_tai_s: Option<f64>,
+    },
     /// A propagated satellite that does not stay in orbit.
     #[error(
         "array.propagate: satellite {satellite} is {:.1} km from the Moon's centre after {day:.2} days; expected orbits above \
@@ -178,6 +193,11 @@ pub enum ArrayError {
     },
 }
 
+fn epoch_said(epoch_tai_s: Option<f64>) -> String {
+    let said = |tai_s| format!(", which is {} UTC", utc_text(tai_s));
+    epoch_tai_s.map(said).unwrap_or_default()
+}
+
 /// Greatest radius or altitude that is accepted, m: the Moon's sphere of influence has 6.6e7 m.
 const ORBIT_M_MAX: f64 = 1e8;
 
@@ -196,9 +216,20 @@ impl ArrayConfig {
         !self.has_own_orbits() && self.eccentricity == 0.0 && self.cross_track_ratio == 0.0
     }
 
-    /// Epoch of the mission in the seconds of OEM files, if it is given.
-    pub(super) fn oem_epoch_s(&self) -> Option<f64> {
-        epoch_s(&self.oem_epoch)
+    /// What the dates of files give, and other keys do not.
+    fn check_dates(&self, checks: &mut Checks) {
+        let epoch = &self.oem_epoch;
+        // A second 60 is for the files' time system to judge.
+        let is_date = |scale| Tai::read(epoch, scale).is_some();
+        let good = epoch.is_empty() || is_date(TimeScale::Tai) || is_date(TimeScale::Utc);
+        let expected = "an epoch such as 2030-01-31T12:00:00, or nothing";
+        checks.require("oem_epoch", format_args!("{epoch:?}"), good, expected);
+        let idle = epoch.is_empty() || !self.oem.is_empty();
+        let expected = "nothing without array.oem: it is a date of its files";
+        checks.require("oem_epoch", format_args!("{epoch:?}"), idle, expected);
+        let idle = self.oem.is_empty() || self.earth_longitude_deg == 0.0;
+        let expected = "nothing with array.oem: the dates of the files say where the Earth is";
+        checks.number("earth_longitude_deg", self.earth_longitude_deg, idle, expected);
     }
 
     /// Everything that is wrong with the configuration; empty if it is good.
@@ -287,14 +318,7 @@ impl ArrayConfig {
             one,
             "none where array.propagate.days is given",
         );
-        let epoch = &self.oem_epoch;
-        let good = epoch.is_empty() || epoch_s(epoch).is_some();
-        checks.require(
-            "oem_epoch",
-            format_args!("{epoch:?}"),
-            good,
-            "an epoch such as 2030-01-31T12:00:00, or nothing",
-        );
+        self.check_dates(&mut checks);
         for (key, value) in [
             ("orbital_phase_deg", self.orbital_phase_deg),
             ("node_longitude_deg", self.node_longitude_deg),

@@ -5,7 +5,7 @@ use std::fmt::Write;
 use super::oem::{Stretch, to_equatorial};
 use super::orbit::Array;
 use super::state::SatelliteState;
-use crate::units::calendar::{TAI_1970_S, epoch_s, epoch_text};
+use crate::units::time_scales::{Tai, TimeScale};
 use crate::units::{Checks, InvalidValue};
 
 /// States of a stretch, at least: as many as its interpolation takes.
@@ -14,39 +14,25 @@ const STATES_MIN: f64 = 4.0;
 /// How orbits are written as OEM files.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OemExport {
-    epoch_s: f64,
+    epoch: Tai,
     until_s: f64,
     step_s: f64,
 }
 
-/// TDB less TAI, s, but for milliseconds.
-const TDB_LESS_TAI_S: f64 = 32.184;
-
-/// TAI, s from 1958-01-01T00:00:00, of a date such as 2030-01-31T12:00:00 on that scale; `None` of other text.
-#[must_use]
-pub fn tai_s_of(date: &str) -> Option<f64> {
-    // Z is the mark of UTC, which is whole seconds off.
-    let from_1970_s = Some(date).filter(|date| !date.ends_with('Z')).and_then(epoch_s)?;
-    Some(from_1970_s + TAI_1970_S)
-}
+/// Years of dates that are written, TAI since 1970, s: 1972 to 2200. UTC begins with 1972.
+const DATES_1958_S: [f64; 2] = [4.42e8, 7.64e9];
 
 impl OemExport {
-    /// The epoch (TDB) that is `tai_s` from 1958-01-01T00:00:00 TAI.
-    #[must_use]
-    pub fn epoch_of(tai_s: f64) -> String {
-        epoch_text(tai_s - TAI_1970_S + TDB_LESS_TAI_S)
-    }
-
-    /// Files whose first epoch is `epoch` (TDB), such as 2030-01-31T12:00:00, that end `until_s` later, with states at most `step_s` apart.
+    /// Files of a mission whose epoch is `epoch_tai_s` (TAI since 1958-01-01), that end `until_s` later, with states at most `step_s`
+    /// apart.
     ///
     /// # Errors
     /// The first of them that is not accepted.
-    pub fn new(epoch: &str, until_s: f64, step_s: f64) -> Result<Self, InvalidValue> {
+    pub fn new(epoch_tai_s: f64, until_s: f64, step_s: f64) -> Result<Self, InvalidValue> {
         let mut checks = Checks::of("");
-        let epoch_s = epoch_s(epoch);
-        let expected = "an epoch such as 2030-01-31T12:00:00, of the years 1900 to 2200";
-        let good = epoch_s.is_some_and(|s| (-2.3e9..7.3e9).contains(&s));
-        checks.require("--epoch", format_args!("{epoch:?}"), good, expected);
+        let [from_s, to_s] = DATES_1958_S;
+        let expected = "TAI since 1958, s, of the years 1972 to 2200";
+        checks.number("epoch", epoch_tai_s, (from_s..to_s).contains(&epoch_tai_s), expected);
         checks.number(
             "--duration",
             until_s,
@@ -56,20 +42,32 @@ impl OemExport {
         checks.number("--step", step_s, (1.0..=600.0).contains(&step_s), "1 s to 600 s");
         match checks.finish().into_iter().next() {
             Some(problem) => Err(problem),
-            None => Ok(Self { epoch_s: epoch_s.unwrap_or_default(), until_s, step_s }),
+            None => Ok(Self { epoch: Tai::from_1958_s(epoch_tai_s), until_s, step_s }),
         }
+    }
+
+    /// A date of the mission, UTC.
+    fn date(&self, time_s: f64) -> String {
+        self.epoch.plus_s(time_s).text(TimeScale::Utc, 9)
     }
 
     /// The file of one satellite (from 0), and the number of its states.
     ///
     /// Positions to a micrometre and velocities to a nanometre a second, on the axes of EME2000, in stretches between which the velocity
     /// jumps: where a formation turns round, or station keeping acts. Orbits of tables are written at their own states, as long as
-    /// they last. Read again, positions are the same to 1 mm: an epoch is a number of seconds since 1970, which rounds to 0.2 us.
+    /// they last. Dates are UTC to a nanosecond; a comment says so where the Earth of the mission is idealised.
     #[must_use]
     pub fn text(&self, array: &Array, satellite: usize) -> (String, usize) {
         let stretches = array.stretches(satellite).unwrap_or_else(|| self.sampled(array, satellite));
-        let epoch = epoch_text(self.epoch_s);
-        let mut text = format!("CCSDS_OEM_VERS = 2.0\nCREATION_DATE = {epoch}\nORIGINATOR = LUNARRAY\n\n");
+        let epoch = self.date(0.0);
+        let idealised = match array.epoch_tai_s() {
+            Some(_) => "",
+            None => {
+                "COMMENT Idealised mission: its windows are those of an Earth on a circle in the ecliptic, whatever the dates.\n"
+            }
+        };
+        let mut text =
+            format!("CCSDS_OEM_VERS = 2.0\n{idealised}CREATION_DATE = {epoch}\nORIGINATOR = LUNARRAY\n\n");
         let mut count = 0;
         for stretch in stretches {
             let (Some(first_s), Some(last_s)) = (stretch.times_s().first(), stretch.times_s().last()) else {
@@ -79,17 +77,17 @@ impl OemExport {
             let _ = write!(
                 text,
                 "META_START\nOBJECT_NAME = SATELLITE {}\nOBJECT_ID = {}-001{}\nCENTER_NAME = MOON\nREF_FRAME = EME2000\n\
-                 TIME_SYSTEM = TDB\nSTART_TIME = {}\nSTOP_TIME = {}\nINTERPOLATION = HERMITE\nINTERPOLATION_DEGREE = 7\nMETA_STOP\n",
+                 TIME_SYSTEM = UTC\nSTART_TIME = {}\nSTOP_TIME = {}\nINTERPOLATION = HERMITE\nINTERPOLATION_DEGREE = 7\nMETA_STOP\n",
                 satellite + 1,
                 &epoch[..4],
                 letters(satellite),
-                epoch_text(self.epoch_s + first_s),
-                epoch_text(self.epoch_s + last_s),
+                self.date(*first_s),
+                self.date(*last_s),
             );
             for (time_s, state) in stretch.states() {
                 let [x, y, z] = to_equatorial(state.position_m).map(|m| m / 1e3);
                 let [vx, vy, vz] = to_equatorial(state.velocity_m_s).map(|m_s| m_s / 1e3);
-                let time = epoch_text(self.epoch_s + time_s);
+                let time = self.date(time_s);
                 let _ = writeln!(text, "{time} {x:.9} {y:.9} {z:.9} {vx:.12} {vy:.12} {vz:.12}");
                 count += 1;
             }
@@ -141,6 +139,9 @@ mod tests {
     use crate::units::constants::DAY_S;
     use crate::units::vector::{norm, sub};
 
+    /// 2030-12-31T00:00:00 TAI, s since 1958: 26,662 days.
+    const EPOCH_TAI_S: f64 = 26_662.0 * DAY_S;
+
     #[test]
     fn what_is_written_is_read_again_to_a_millimetre() {
         let formation = ArrayConfig { satellites: 3, arcs_m: vec![2e3, 9e3], ..ArrayConfig::default() };
@@ -149,7 +150,15 @@ mod tests {
         let propagated = ArrayConfig { propagate, ..shaped.clone() };
         for config in [formation, shaped, propagated] {
             let array = Array::new(&config).unwrap();
-            let export = OemExport::new("2030-12-31T00:00:00", 10.0 * DAY_S, 120.0).unwrap();
+            // Half a minute before midnight UTC, 37 s behind TAI.
+            assert!(
+                OemExport::new(EPOCH_TAI_S, DAY_S, 120.0)
+                    .unwrap()
+                    .text(&array, 0)
+                    .0
+                    .contains("TIME_SYSTEM = UTC\nSTART_TIME = 2030-12-30T23:59:23.000000000\n")
+            );
+            let export = OemExport::new(EPOCH_TAI_S, 10.0 * DAY_S, 120.0).unwrap();
             let folder = tempfile::tempdir().unwrap();
             let oem: Vec<_> = (0..3).map(|n| folder.path().join(format!("sat{n}.oem"))).collect();
             for (n, path) in oem.iter().enumerate() {
@@ -161,6 +170,7 @@ mod tests {
             let again = Array::new(&read).unwrap();
             let span = again.known_s().unwrap();
             assert!(span[0] == 0.0 && span[1] >= 10.0 * DAY_S && span[1] < 10.01 * DAY_S, "{span:?}");
+            assert_eq!((array.epoch_tai_s(), again.epoch_tai_s()), (None, Some(EPOCH_TAI_S)));
             for k in 0..2_000 {
                 // Through a turnaround after seven days, and through station keeping.
                 let t_s = 431.7 * f64::from(k);
@@ -175,14 +185,14 @@ mod tests {
 
     #[test]
     fn what_cannot_be_written_is_told() {
-        for (epoch, until_s, step_s, told) in [
-            ("tomorrow", 1e5, 60.0, "--epoch"),
-            ("9030-01-01T00:00:00", 1e5, 60.0, "--epoch"),
-            ("2030-01-01T00:00:00", 0.0, 60.0, "--duration"),
-            ("2030-01-01T00:00:00", f64::NAN, 60.0, "--duration"),
-            ("2030-01-01T00:00:00", 1e5, 6e3, "--step"),
+        for (epoch_tai_s, until_s, step_s, told) in [
+            (0.0, 1e5, 60.0, "epoch"),
+            (f64::NAN, 1e5, 60.0, "epoch"),
+            (EPOCH_TAI_S, 0.0, 60.0, "--duration"),
+            (EPOCH_TAI_S, f64::NAN, 60.0, "--duration"),
+            (EPOCH_TAI_S, 1e5, 6e3, "--step"),
         ] {
-            assert!(OemExport::new(epoch, until_s, step_s).unwrap_err().to_string().contains(told));
+            assert!(OemExport::new(epoch_tai_s, until_s, step_s).unwrap_err().to_string().contains(told));
         }
         assert_eq!([0, 25, 26, 63].map(letters), ["A", "Z", "AA", "BL"]);
     }

@@ -6,6 +6,7 @@
 //! pole.
 
 mod baseline;
+mod bodies;
 mod config;
 mod ephemeris;
 mod export;
@@ -23,6 +24,8 @@ mod windows;
 
 #[doc(hidden)]
 pub use baseline::scaled_baseline;
+#[doc(hidden)]
+pub use bodies::{EarthModel, earth_is_hidden_by_date};
 pub use config::{ArrayConfig, ArrayError};
 #[doc(hidden)]
 pub use config::{BreathingConfig, NodeMotion, Spacing};
@@ -30,7 +33,7 @@ pub use ephemeris::Ephemeris;
 #[doc(hidden)]
 pub use ephemeris::{Insertion, segments_for};
 #[doc(hidden)]
-pub use export::{OemExport, tai_s_of};
+pub use export::OemExport;
 #[doc(hidden)]
 pub use formation::{Formation, Progression};
 pub use integration::{IntegrationRule, integration_time_s};

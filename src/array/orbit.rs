@@ -1,14 +1,17 @@
 //! Orbital motion of the daughters, direction of the Earth, and occultation by the Moon.
 
 use std::f64::consts::TAU;
+use std::sync::Arc;
 
+use super::bodies::{DatedEarth, Earth};
 use super::config::{ArrayConfig, ArrayError, NodeMotion};
 use super::formation::Formation;
 use super::kepler::{KeplerOrbit, eccentric_anomaly};
 use super::oem::{self, Stretch, TableOrbit};
 use super::propagate;
 use super::state::SatelliteState;
-use crate::units::constants::{DAY_S, SIDEREAL_MONTH_S};
+use crate::units::constants::DAY_S;
+use crate::units::time_scales::Tai;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
 
 /// Nearest that two satellites may be at the epoch, m.
@@ -120,7 +123,11 @@ pub struct Array {
     phase_rad: f64,
     node_rad: f64,
     node_rate_rad_s: f64,
-    earth_rad: f64,
+    earth: Earth,
+    /// Epoch of orbits that have dates.
+    epoch: Option<Tai>,
+    /// What files of orbits hold and is not used.
+    notes: Vec<String>,
 }
 
 impl Array {
@@ -135,12 +142,19 @@ impl Array {
         let rate = TAU / config.precession_period_s;
         let kepler: Vec<KeplerOrbit> = config.kepler.iter().map(KeplerOrbit::new).collect();
         require_apart(&kepler)?;
+        let (mut epoch, mut notes) = (None, Vec::new());
         let own: Vec<OwnOrbit> = if config.propagate.is_on() {
             propagate::orbits(config)?.into_iter().map(OwnOrbit::Table).collect()
+        } else if config.oem.is_empty() {
+            kepler.into_iter().map(OwnOrbit::Kepler).collect()
         } else {
-            let tables = oem::read(&config.oem, config.oem_epoch_s(), config.moon_radius_m)?;
-            let tables = tables.into_iter().map(OwnOrbit::Table);
-            kepler.into_iter().map(OwnOrbit::Kepler).chain(tables).collect()
+            let found = oem::read(&config.oem, &config.oem_epoch, config.moon_radius_m)?;
+            (epoch, notes) = (Some(found.epoch), found.notes);
+            found.orbits.into_iter().map(OwnOrbit::Table).collect()
+        };
+        let earth = match (epoch, known_s(&own)) {
+            (Some(epoch), Some(known_s)) => Earth::Dated(Arc::new(DatedEarth::new(epoch, known_s))),
+            _ => Earth::Circle(config.earth_longitude_deg.to_radians()),
         };
         Ok(Self {
             formation: if own.is_empty() { Some(Formation::new(config)?) } else { None },
@@ -156,18 +170,43 @@ impl Array {
                 NodeMotion::Regress => -rate,
                 NodeMotion::Advance => rate,
             },
-            earth_rad: config.earth_longitude_deg.to_radians(),
+            earth,
+            epoch,
+            notes,
         })
     }
 
-    /// First and last mission time, s, for which positions are known; `None` if that is always.
+    /// First and last mission time, s, between which positions are known without a gap; `None` if that is always. Positions at other
+    /// times are not numbers.
     #[must_use]
     pub fn known_s(&self) -> Option<[f64; 2]> {
-        let spans = self.own.iter().filter_map(|orbit| match orbit {
-            OwnOrbit::Table(orbit) => Some(orbit.span_s()),
-            OwnOrbit::Kepler(_) => None,
-        });
-        spans.reduce(|[from, to], [start, end]| [from.max(start), to.min(end)])
+        known_s(&self.own)
+    }
+
+    /// Requires that positions are known at a time, s.
+    ///
+    /// # Errors
+    /// [`ArrayError::NotKnown`] beyond [`Self::known_s`].
+    pub fn require_known(&self, t_s: f64) -> Result<(), ArrayError> {
+        match self.known_s() {
+            // Dates of files are to a microsecond.
+            Some([from_s, until_s]) if !(from_s - 1e-6..=until_s + 1e-6).contains(&t_s) => {
+                Err(ArrayError::NotKnown { t_s, known_s: [from_s, until_s], epoch_tai_s: self.epoch_tai_s() })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Epoch of a mission whose orbits have dates: TAI seconds since 1958-01-01; `None` if the configuration is to say.
+    #[must_use]
+    pub fn epoch_tai_s(&self) -> Option<f64> {
+        self.epoch.map(Tai::from_1958)
+    }
+
+    /// What files of orbits hold and is not used.
+    #[must_use]
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// Memory of the states of orbits that are given by tables (files, or what was propagated), bytes. Clones share it.
@@ -362,11 +401,20 @@ impl Array {
         self.state(n, t_s).position_m
     }
 
-    /// Direction of the Earth from the Moon.
+    /// Direction of the Earth from the Moon's centre: by the date where orbits have dates (to 0.004 degrees from 2020 to 2040), else of
+    /// an idealised Earth on a circle in the ecliptic.
     #[must_use]
     pub fn earth_hat(&self, t_s: f64) -> Vec3 {
-        let (sin, cos) = (self.earth_rad + TAU * t_s / SIDEREAL_MONTH_S).sin_cos();
-        [cos, sin, 0.0]
+        self.earth.hat(t_s)
+    }
+
+    /// Direction of the Sun from the Moon's centre (to 0.002 degrees from 2020 to 2040); `None` without dates.
+    #[must_use]
+    pub fn sun_hat(&self, t_s: f64) -> Option<Vec3> {
+        match &self.earth {
+            Earth::Circle(_) => None,
+            Earth::Dated(earth) => Some(earth.sun_hat(t_s)),
+        }
     }
 
     /// Whether the Earth is hidden from daughter 1, so that the array observes.
@@ -400,6 +448,15 @@ impl Array {
         let limb_from_nadir = (self.moon_radius_m / distance_m).min(1.0).asin();
         from_zenith - (std::f64::consts::PI - limb_from_nadir)
     }
+}
+
+/// From when to when all of some orbits are known, s; `None` if that is always.
+fn known_s(orbits: &[OwnOrbit]) -> Option<[f64; 2]> {
+    let spans = orbits.iter().filter_map(|orbit| match orbit {
+        OwnOrbit::Table(orbit) => Some(orbit.span_s()),
+        OwnOrbit::Kepler(_) => None,
+    });
+    spans.reduce(|[from, to], [start, end]| [from.max(start), to.min(end)])
 }
 
 /// Requires that no two satellites are at one place at the epoch.

@@ -7,13 +7,13 @@ use clap::Args;
 use clap::builder::{PathBufValueParser, TypedValueParser};
 
 use super::output::print_notes;
-use crate::array::tai_s_of;
 use crate::files::ProtectedInputs;
 use crate::ground::GroundError;
 use crate::pipeline::{Config, ConfigError, ConfigSource, GroupSize, MemoryLimit};
 use crate::sky::Frame;
 use crate::sky::fits::ReadOptions;
 use crate::units::Dimension;
+use crate::units::time_scales::{Tai, TimeScale};
 
 /// A pipeline file, and settings that replace some of its own.
 #[derive(Debug, Args)]
@@ -257,12 +257,15 @@ impl TimeOfMission {
     }
 }
 
-/// A time such as `7d`, or a date such as `2027-01-08T12:00:00`.
+/// A time such as `7d`, or a date such as `2027-01-08T12:00:00` (TAI) or `2027-01-08T12:00:00Z` (UTC).
 pub(super) fn time_of_mission(text: &str) -> Result<TimeOfMission, String> {
-    match tai_s_of(text) {
-        Some(tai_s) => Ok(TimeOfMission::Tai(tai_s)),
+    let scale = if text.ends_with('Z') { TimeScale::Utc } else { TimeScale::Tai };
+    match Tai::read(text, scale) {
+        Some(time) => Ok(TimeOfMission::Tai(time.from_1958())),
         None => time_s(text).map(TimeOfMission::Since).map_err(|expected| {
-            format!("{expected}; or a date, TAI as inspect shows it, such as 2027-01-08T12:00:00")
+            format!(
+                "{expected}; or a date, TAI such as 2027-01-08T12:00:37, or UTC such as 2027-01-08T12:00:00Z"
+            )
         }),
     }
 }
@@ -297,7 +300,9 @@ mod tests {
         assert_eq!(since("1.5h"), Ok(5400.0));
         assert_eq!(since("2027-01-08T12:00:00"), Ok(7.5 * 86_400.0));
         assert_eq!(since("2026-12-31T23:59:59.5"), Ok(-0.5));
-        for text in ["2027-01-08T12:00:00Z", "2027-02-30T00:00:00", "2027-01-08", "soon"] {
+        // UTC is 37 s behind (IERS Bulletin C 52 and later).
+        assert_eq!(since("2027-01-08T12:00:00Z"), Ok(7.5 * 86_400.0 + 37.0));
+        for text in ["2027-02-30T00:00:00Z", "2027-02-30T00:00:00", "2027-01-08", "soon"] {
             assert!(since(text).unwrap_err().contains("or a date, TAI"), "{text}");
         }
     }

@@ -7,7 +7,9 @@ use super::arguments::{PipelineArgs, group_size};
 use super::output::{
     CommandResult, Completion, print_config_notes, print_json_line, print_notes, print_text,
 };
+use crate::array::EarthModel;
 use crate::pipeline::{ConfigError, Cost, GroupSize, Plan, RunGroups, Segment, sky_notes};
+use crate::units::time_scales::utc_text;
 
 /// Check a pipeline and estimate its cost, without running it.
 ///
@@ -37,6 +39,10 @@ pub(super) struct CheckArgs {
 struct Checked<'a> {
     #[serde(flatten)]
     cost: &'a Cost,
+    /// Epoch of the mission, UTC.
+    epoch_utc: &'a str,
+    /// Which Earth hides the array.
+    earth: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     groups: Option<&'a RunGroups>,
     /// What was understood of each map and catalogue.
@@ -49,6 +55,7 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let config = args.pipeline.load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
+    print_notes(plan.array.notes());
     print_notes(plan.thinning_notes());
     let problems = plan.file_problems();
     if !problems.is_empty() {
@@ -63,11 +70,14 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let limit = args.pipeline.memory_limit();
     let groups = args.groups.map(|size| plan.run_groups(size, limit)).transpose();
     let found = groups.as_ref().ok().and_then(Option::as_ref);
+    let epoch_utc = &utc_text(plan.instrument.epoch_tai_s);
+    let earth = EarthModel::of(&plan.config.array).to_string();
     if args.json {
-        print_json_line(&Checked { cost: &cost, groups: found, files: &files })?;
+        print_json_line(&Checked { cost: &cost, epoch_utc, earth, groups: found, files: &files })?;
     } else {
         let files: String = files.iter().map(|line| format!("{line}\n")).collect();
-        print_text(&format!("{}: no problems\n{files}\n{cost}", source.origin()))?;
+        let mission = format!("epoch {epoch_utc} UTC; the Earth is {earth}");
+        print_text(&format!("{}: no problems\n{mission}\n{files}\n{cost}", source.origin()))?;
         if let Some(groups) = found {
             print_text(&format!("{groups}\nMemory above is that of all channels at once."))?;
         }

@@ -6,7 +6,7 @@ use std::time::SystemTime;
 use clap::{Args, Subcommand, ValueEnum};
 
 use super::arguments::{ArrayArgs, MapFileArgs, frame, input_path, is_standard, output_path, time_s};
-use super::log::utc_text;
+use super::log::system_utc_text;
 use super::output::{
     CommandError, CommandResult, Completion, of_stdout, print_config_notes, print_json_line, print_notes,
     print_text,
@@ -20,6 +20,7 @@ use crate::sky::Frame;
 use crate::sky::fits::{Card, read_map_file, read_whole_map, write_alm};
 use crate::sky::harmonics::AnalysisOptions;
 use crate::units::ChannelId;
+use crate::units::time_scales::{Tai, TimeScale, utc_text};
 
 /// Export visibilities, spectra, harmonic coefficients or tiles for other software.
 ///
@@ -117,8 +118,8 @@ struct HipsArgs {
 
 /// Orbits of an array as CCSDS OEM files, DIR/sat1.oem, sat2.oem, .., which `array.oem` and other software read.
 ///
-/// Positions in km and velocities in km/s on the axes of EME2000, centre MOON, times TDB, Hermite's interpolation of degree 7. Read again, positions are
-/// the same to 1 mm. Orbits of tables (`array.oem`, `array.propagate`) are written at their own states, as long as they last.
+/// Positions in km and velocities in km/s on the axes of EME2000, centre MOON, dates UTC, Hermite's interpolation of degree 7. Read again,
+/// positions are the same to 1 mm. Orbits of tables (`array.oem`, `array.propagate`) are written at their own states, as long as they last.
 ///
 /// Example: lunarray export orbits --set array.propagate.days=475 --out oem
 #[derive(Debug, Args)]
@@ -131,8 +132,7 @@ struct OrbitArgs {
     /// Most time between states, with an optional unit s, h or d.
     #[arg(long, value_name = "TIME", value_parser = time_s, default_value = "120s")]
     step: f64,
-    /// First epoch, TDB, such as 2030-01-31T12:00:00; that of the mission if not given: array.oem_epoch with array.oem, else
-    /// spacecraft.epoch_tai_s.
+    /// First epoch, UTC, such as 2030-01-31T12:00:00; spacecraft.epoch_tai_s if not given. Orbits of array.oem have their own dates.
     #[arg(long)]
     epoch: Option<String>,
     /// Folder for the files.
@@ -305,20 +305,28 @@ fn orbits(args: &OrbitArgs) -> CommandResult {
     let config = args.array.source().load()?;
     print_config_notes(&config);
     let until_s = args.duration.unwrap_or(config.spacecraft.duration_s);
-    let epoch = match (&args.epoch, &config.array) {
-        (Some(epoch), _) => epoch.clone(),
-        (None, array) if array.oem.is_empty() => OemExport::epoch_of(config.spacecraft.epoch_tai_s),
-        (None, array) if array.oem_epoch.is_empty() => {
-            return Err(
-                "--epoch: not given; expected the epoch of the files' orbits, here or as array.oem_epoch"
-                    .into(),
-            );
-        }
-        (None, array) => array.oem_epoch.clone(),
-    };
     let _inputs = ProtectedInputs::of(config.input_files());
-    let export = OemExport::new(&epoch, until_s, args.step)?;
     let array = Array::new(&config.array)?;
+    print_notes(array.notes());
+    let epoch_tai_s = match (&args.epoch, array.epoch_tai_s()) {
+        (None, _) => config.epoch_tai_s(&array),
+        (Some(_), Some(tai_s)) => {
+            let own = utc_text(tai_s);
+            return Err(format!(
+                "--epoch: the orbits have dates of their own, from {own} UTC on; expected none"
+            )
+            .into());
+        }
+        (Some(date), None) => match Tai::read(date, TimeScale::Utc) {
+            Some(time) => time.from_1958(),
+            None => {
+                return Err(
+                    format!("--epoch {date}: expected a date, UTC, such as 2030-01-31T12:00:00").into()
+                );
+            }
+        },
+    };
+    let export = OemExport::new(epoch_tai_s, until_s, args.step)?;
     let mut states = 0;
     for satellite in 0..array.satellites() {
         let (text, count) = export.text(&array, satellite);
@@ -337,7 +345,7 @@ fn orbits(args: &OrbitArgs) -> CommandResult {
 /// When a file was written, UTC to the minute: an export of the same file is the same at any time.
 fn written_at(path: &Path) -> String {
     let modified = std::fs::metadata(path).and_then(|found| found.modified());
-    let text = utc_text(modified.unwrap_or(SystemTime::UNIX_EPOCH));
+    let text = system_utc_text(modified.unwrap_or(SystemTime::UNIX_EPOCH));
     format!("{}Z", text.get(..16).unwrap_or(&text))
 }
 

@@ -41,7 +41,7 @@ pub(super) struct FigureArgs {
     /// Pair of rows and waterfall, such as 1-2; the one closest to 2 b_p if not given.
     #[arg(long)]
     pair: Option<Pair>,
-    /// Time of rows and waterfall since the mission epoch, a number with an optional unit s, h or d, or a date (TAI); the middle of the
+    /// Time of rows and waterfall since the mission epoch, a number with an optional unit s, h or d, or a date (TAI, or UTC with a Z); the middle of the
     /// first window if not given.
     #[arg(long, value_name = "TIME", value_parser = time_of_mission)]
     at: Option<TimeOfMission>,
@@ -55,7 +55,7 @@ pub(super) fn execute(args: &FigureArgs) -> CommandResult {
     let plan = Plan::new(source.load()?)?;
     let _inputs = ProtectedInputs::of(args.pipeline.iter().cloned().chain(plan.config.input_files()));
     use_threads(&plan.config.runtime)?;
-    let at_s = args.at.map(|time| time.since_s(plan.config.spacecraft.epoch_tai_s));
+    let at_s = args.at.map(|time| time.since_s(plan.instrument.epoch_tai_s));
     let request = FigureRequest { name: args.name.clone(), pair: args.pair, at_s };
     let made = make_figure(&request, &plan, &args.out)?;
     if args.json {

@@ -103,14 +103,14 @@ pub(super) fn note(event: &str, fields: &Value, message: impl Display) {
 /// Writes a line as JSON.
 pub(super) fn log_json(level: Level, event: &str, fields: &Value, message: Option<&str>) {
     let message = message.map(|message| message.trim().to_owned());
-    let time = format!("{}Z", utc_text(SystemTime::now()));
+    let time = format!("{}Z", system_utc_text(SystemTime::now()));
     if let Ok(text) = json_text(&LogLine { time, level, event, message, fields }) {
         print_line(text);
     }
 }
 
 /// A time as a date, UTC to the millisecond; that of 1970 for times before, as of a clock that was never set.
-pub(super) fn utc_text(time: SystemTime) -> String {
+pub(super) fn system_utc_text(time: SystemTime) -> String {
     let unix_s = time.duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64());
     tai_text(unix_s + TAI_1970_S)
 }

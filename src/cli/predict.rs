@@ -34,8 +34,8 @@ pub(super) struct PredictArgs {
     /// Frequency, Hz, or with a unit, such as 3MHz.
     #[arg(long, requires = "at", value_parser = frequency_hz)]
     freq_hz: Option<f64>,
-    /// Time since the mission epoch, a number with an optional unit s, h or d, such as 7d; or a date, TAI as inspect shows it, such as
-    /// 2027-01-08T12:00:00.
+    /// Time since the mission epoch, a number with an optional unit s, h or d, such as 7d; or a date: TAI such as
+    /// 2027-01-08T12:00:00, or UTC such as 2027-01-08T12:00:00Z.
     #[arg(long, value_name = "TIME", requires_all = ["freq_hz", "pair"], value_parser = time_of_mission)]
     at: Option<TimeOfMission>,
     /// Pair of satellites, such as 1-2.
@@ -95,7 +95,7 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
         ))
     };
     if let (Some(time), Some(pair), Some(freq_hz)) = (args.at, args.pair, args.freq_hz) {
-        let t_s = time.since_s(config.spacecraft.epoch_tai_s);
+        let t_s = time.since_s(config.epoch_tai_s(&array));
         answer(VisibilityQuery { t_s, pair, freq_hz })?;
         return Ok(Completion::Done);
     }
@@ -135,6 +135,7 @@ fn check(array: &Array, query: VisibilityQuery) -> Result<(), String> {
     if !(-1e9..=1e9).contains(&t_s) {
         return Err(format!("t_s = {}: expected seconds, -1e9 to 1e9", echo(t_s)));
     }
+    array.require_known(t_s).map_err(|error| error.to_string())?;
     if usize::from(pair.j) >= array.satellites() {
         return Err(format!("pair {pair}: the array has {} satellites", array.satellites()));
     }

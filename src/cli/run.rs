@@ -67,6 +67,7 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     let _inputs = args.pipeline.protect(&config);
     let plan = Plan::new(config)?;
     if job.is_first() {
+        print_notes(plan.array.notes());
         print_notes(sky_notes(&plan)?);
     }
     use_threads(&plan.config.runtime)?;

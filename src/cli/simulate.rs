@@ -75,6 +75,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     print_config_notes(&config);
     let _inputs = args.pipeline.protect(&config);
     let plan = Plan::new(config)?;
+    print_notes(plan.array.notes());
     print_notes(sky_notes(&plan)?);
     use_threads(&plan.config.runtime)?;
     if let (Some(size), Some(out)) = (args.groups, &args.out) {

@@ -13,7 +13,7 @@ use super::pulse::{Pulse, whole_run};
 use super::shelf::Shelf;
 use super::status::{LedgerStatus, ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, stages_of};
 use super::subject::Subject;
-use crate::array::Array;
+use crate::array::EarthModel;
 use crate::downlink::transport::packet_archive::{ArchiveReport, PacketArchive};
 use crate::ground::{GroundOutcome, HitsMap, PassLine, PowerWaterfall, SavingReport, UvwDensity};
 use crate::imaging::Solving;
@@ -78,7 +78,7 @@ pub(super) struct Console {
     /// Folder of the state, if there is one.
     pub(super) state: Option<PathBuf>,
     /// Says where the Earth is.
-    model: Option<Array>,
+    earth: EarthModel,
     /// Folders on whose disks there has to be room, by what they hold.
     pub(super) folders: Vec<(&'static str, PathBuf)>,
     pub(super) started: Instant,
@@ -94,13 +94,13 @@ pub(super) struct Console {
 
 impl Console {
     pub(super) fn new(subject: Subject) -> Self {
-        let Subject { name, segment, config, state, model, folders } = subject;
+        let Subject { name, segment, config, state, earth, folders } = subject;
         Self {
             name,
             segment,
             config: config.into(),
             state,
-            model,
+            earth,
             folders,
             started: Instant::now(),
             shelf: Arc::default(),
@@ -183,7 +183,7 @@ impl Console {
     /// Where everything is; `None` before there are data with positions.
     pub(super) fn geometry(&self) -> Option<Geometry> {
         let now = self.ground()?.lookout.array()?;
-        Some(Geometry::of(&now, self.model.as_ref()))
+        Some(Geometry::of(&now, self.earth))
     }
 
     /// Baselines of a channel; `None` if it has none.

@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use serde::Serialize;
 
-use crate::array::{Array, SatelliteState, hidden_by_moon};
+use crate::array::{EarthModel, SatelliteState, hidden_by_moon};
 use crate::ground::ArrayNow;
 use crate::units::constants::MOON_GM_M3_S2;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub, unit};
@@ -43,15 +43,15 @@ pub(super) struct Geometry {
 }
 
 impl Geometry {
-    /// Of an array, with the Earth as `model` has it.
-    pub(super) fn of(now: &ArrayNow, model: Option<&Array>) -> Self {
+    /// Of an array, with the Earth as a model has it.
+    pub(super) fn of(now: &ArrayNow, earth: EarthModel) -> Self {
         let ArrayNow { epoch_tai_s, time_s, moon_radius_m, positions_m, motion, known_s, track_m } = now;
         let is_hidden =
             |position_m: Vec3, earth_hat: Vec3| hidden_by_moon(position_m, earth_hat, *moon_radius_m);
-        let earth_hat = model.map(|array| array.earth_hat(*time_s));
+        let earth_hat = earth.hat(*epoch_tai_s, *time_s);
         let is_plausible =
             |earth_hat: &Vec3| positions_m.first().is_some_and(|first| is_hidden(*first, *earth_hat));
-        let earth_hat = earth_hat.filter(is_plausible);
+        let earth_hat = Some(earth_hat).filter(is_plausible);
         let satellite = |&position_m: &Vec3| SatelliteNow {
             position_m,
             earth_is_hidden: earth_hat.map(|earth_hat| is_hidden(position_m, earth_hat)),
@@ -94,7 +94,7 @@ fn orbit_m(motion: &SatelliteState) -> Vec<Vec3> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::array::{ArrayConfig, KeplerElements};
+    use crate::array::{Array, ArrayConfig, KeplerElements};
 
     #[test]
     fn the_orbit_is_that_on_which_a_satellite_goes_round() {

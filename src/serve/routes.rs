@@ -30,6 +30,7 @@ use crate::downlink::transport::socket::Listening;
 use crate::ground::archive::CoverageSurvey;
 use crate::sky::{Frame, Rotation};
 use crate::units::ChannelId;
+use crate::units::time_scales::leap_seconds;
 
 /// The page may load what this server has, and nothing else from anywhere.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; \
@@ -158,6 +159,8 @@ async fn page_constants() -> Response {
         palettes: [(&'static str, String); 4],
         /// Row k is the frame's axis k on ecliptic axes.
         frames: [(&'static str, Rotation); 3],
+        /// From when on (TAI since 1970-01-01, s) UTC is how many seconds behind.
+        leap_seconds: Vec<[i64; 2]>,
     }
     let colours = |gradient: colorous::Gradient, place: fn(f64) -> f64| {
         let colour = |k| gradient.eval_continuous(place(f64::from(k) / f64::from(PALETTE_STEPS - 1)));
@@ -178,6 +181,7 @@ async fn page_constants() -> Response {
             ("ecliptic", frame(Frame::Ecliptic)),
             ("equatorial", frame(Frame::Equatorial)),
         ],
+        leap_seconds: leap_seconds().collect(),
     })
 }
 

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::array::{Array, ArrayConfig};
+use crate::array::EarthModel;
 use crate::pipeline::Config;
 
 /// What the server tells about.
@@ -17,7 +17,7 @@ pub struct Subject {
     /// Folder of the state, if there is one.
     pub state: Option<PathBuf>,
     /// Says where the Earth is.
-    pub model: Option<Array>,
+    pub earth: EarthModel,
     /// Folders on whose disks there has to be room, by what they hold.
     pub folders: Vec<(&'static str, PathBuf)>,
 }
@@ -28,9 +28,7 @@ impl Subject {
     pub fn new(config: &Config, segment: &'static str, state: Option<&Path>) -> Self {
         // A configuration that was read can be written.
         let text = serde_json::to_vec(config).unwrap_or_default();
-        // Nothing but the Earth is asked of it; the orbits come down.
-        let earth_longitude_deg = config.array.earth_longitude_deg;
-        let model = Array::new(&ArrayConfig { earth_longitude_deg, ..ArrayConfig::default() }).ok();
+        let earth = EarthModel::of(&config.array);
         let (name, state) = (config.name.clone(), state.map(Path::to_owned));
         Self {
             name,
@@ -38,7 +36,7 @@ impl Subject {
             config: text,
             folders: state.iter().map(|path| ("state", path.clone())).collect(),
             state,
-            model,
+            earth,
         }
     }
 

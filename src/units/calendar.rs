@@ -1,4 +1,4 @@
-//! Dates of scales without leap seconds (TAI, TDB, system time), by the calendar of `chrono`.
+//! Dates of the calendar, by `chrono`; which scale they are of is for [`super::time_scales`].
 
 use chrono::{DateTime, NaiveDate};
 
@@ -15,42 +15,66 @@ pub fn tai_text(tai_s: f64) -> String {
     written(DateTime::from_timestamp_millis(ms), "%Y-%m-%dT%H:%M:%S%.3f")
 }
 
-/// The date and time of day, to the microsecond, of seconds from 1970-01-01T00:00:00.
-#[must_use]
-pub fn epoch_text(from_1970_s: f64) -> String {
-    let whole = from_1970_s.floor();
-    let micros = ((from_1970_s - whole) * 1e6).round() as i64;
-    let all = (whole as i64).saturating_mul(1_000_000).saturating_add(micros);
-    written(DateTime::from_timestamp_micros(all), "%Y-%m-%dT%H:%M:%S%.6f")
+/// A date and time of day of the calendar, whatever its scale.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct CalendarTime {
+    /// Days from 1970-01-01.
+    pub(super) day: i64,
+    /// Whole seconds of the day, 0 to 86,400: the last one is a leap second's.
+    pub(super) second: i64,
+    /// The rest of the second, 0 to less than 1.
+    pub(super) part_s: f64,
+}
+
+impl CalendarTime {
+    /// Reads `YYYY-MM-DDThh:mm:ss[.d]` or `YYYY-DDDThh:mm:ss[.d]`, with or without a Z; only 23:59 has a second 60.
+    pub(super) fn read(text: &str) -> Option<Self> {
+        fn digits(text: &str, count: usize) -> Option<u32> {
+            (text.len() == count && text.bytes().all(|b| b.is_ascii_digit())).then(|| text.parse().ok())?
+        }
+        let (date, clock) = text.strip_suffix('Z').unwrap_or(text).split_once('T')?;
+        let parts: Vec<&str> = date.split('-').collect();
+        let year = digits(parts.first()?, 4)?.cast_signed();
+        let date = match parts[1..] {
+            [month, day] => NaiveDate::from_ymd_opt(year, digits(month, 2)?, digits(day, 2)?)?,
+            [day] => NaiveDate::from_yo_opt(year, digits(day, 3)?)?,
+            _ => return None,
+        };
+        let clock: Vec<&str> = clock.split(':').collect();
+        let [hour, minute, second] = clock[..] else { return None };
+        let (hour, minute) = (digits(hour, 2)?, digits(minute, 2)?);
+        let (whole, decimals) = second.split_once('.').unwrap_or((second, "0"));
+        let whole = digits(whole, 2)?;
+        let part_s: f64 = match decimals.bytes().all(|b| b.is_ascii_digit()) {
+            true => format!("0.{decimals}").parse().ok()?,
+            false => return None,
+        };
+        // Twenty nines and more round to 1.
+        let part_s = part_s.min(1.0 - f64::EPSILON / 2.0);
+        let leaps = (hour, minute, whole) == (23, 59, 60);
+        let good = hour < 24 && minute < 60 && (whole < 60 || leaps);
+        good.then(|| Self {
+            day: date.signed_duration_since(NaiveDate::default()).num_days(),
+            second: i64::from(hour * 3600 + minute * 60 + whole),
+            part_s,
+        })
+    }
+
+    /// The date and time of day with so many decimals of a second; the rest is cut off.
+    pub(super) fn text(self, decimals: usize) -> String {
+        let Self { day, second, part_s } = self;
+        let date = DateTime::from_timestamp(day.saturating_mul(DAY_S), 0);
+        let Some(date) = date else { return "beyond the calendar".to_owned() };
+        let (minutes, seconds) = if second < DAY_S { (second / 60, second % 60) } else { (24 * 60 - 1, 60) };
+        let unit = 10f64.powi(decimals as i32);
+        let fraction = (part_s * unit).round().min(unit - 1.0);
+        let fraction = if decimals == 0 { String::new() } else { format!(".{fraction:0decimals$.0}") };
+        format!("{}T{:02}:{:02}:{seconds:02}{fraction}", date.format("%Y-%m-%d"), minutes / 60, minutes % 60)
+    }
 }
 
 fn written(time: Option<DateTime<chrono::Utc>>, pattern: &str) -> String {
     time.map_or_else(|| "beyond the calendar".to_owned(), |time| time.format(pattern).to_string())
-}
-
-/// Seconds from 1970-01-01T00:00:00 of an epoch `YYYY-MM-DDThh:mm:ss[.d]` or `YYYY-DDDThh:mm:ss[.d]`; a second may be a leap second's.
-#[must_use]
-pub fn epoch_s(epoch: &str) -> Option<f64> {
-    fn digits(text: &str, count: usize) -> Option<u32> {
-        (text.len() == count && text.bytes().all(|b| b.is_ascii_digit())).then(|| text.parse().ok())?
-    }
-    let (date, clock) = epoch.trim_end_matches('Z').split_once('T')?;
-    let parts: Vec<&str> = date.split('-').collect();
-    let year = digits(parts.first()?, 4)?.cast_signed();
-    let date = match parts[1..] {
-        [month, day] => NaiveDate::from_ymd_opt(year, digits(month, 2)?, digits(day, 2)?)?,
-        [day] => NaiveDate::from_yo_opt(year, digits(day, 3)?)?,
-        _ => return None,
-    };
-    let clock: Vec<&str> = clock.split(':').collect();
-    let [hour, minute, second] = clock[..] else { return None };
-    let (hour, minute) = (digits(hour, 2)?, digits(minute, 2)?);
-    let (whole, _) = second.split_once('.').unwrap_or((second, ""));
-    digits(whole, 2)?;
-    let second: f64 = second.parse().ok()?;
-    let days = date.signed_duration_since(NaiveDate::default()).num_days();
-    let good = hour < 24 && minute < 60 && second < 61.0;
-    good.then(|| (days * DAY_S) as f64 + f64::from(hour * 3600 + minute * 60) + second)
 }
 
 #[cfg(test)]
@@ -72,32 +96,28 @@ mod tests {
     }
 
     #[test]
-    fn epochs_are_seconds_of_the_calendar() {
+    fn dates_are_days_and_seconds_of_the_calendar() {
         // `date -u -d ... +%s`.
-        for (epoch, expected) in [
+        for (date, expected) in [
             ("1970-01-01T00:00:00", 0.0),
+            ("1969-12-31T23:59:59", -1.0),
+            ("1968-12-31T00:00:00", -31_622_400.0),
+            ("1901-01-01T00:00:00", -2_177_452_800.0),
             ("2000-01-01T12:00:00", 946_728_000.0),
             ("2024-02-29T23:59:59.5", 1_709_251_199.5),
             ("2024-060T23:59:59.5", 1_709_251_199.5),
             ("2030-12-31T00:00:00Z", 1_924_905_600.0),
             ("2030-365T00:00:00", 1_924_905_600.0),
+            // A second 60 has a number of its own: that of the next midnight.
+            ("2016-12-31T23:59:60.5", 1_483_228_800.5),
         ] {
-            assert_eq!(epoch_s(epoch), Some(expected), "{epoch}");
+            let CalendarTime { day, second, part_s } = CalendarTime::read(date).unwrap();
+            assert_eq!((day * DAY_S + second) as f64 + part_s, expected, "{date}");
         }
-        for (expected, seconds) in [
-            ("1970-01-01T00:00:00.000000", 0.0),
-            ("1969-12-31T23:59:59.000000", -1.0),
-            // `date -u -d 1968-12-31 +%s`, and so on.
-            ("1968-12-31T00:00:00.000000", -31_622_400.0),
-            ("1960-12-31T12:00:00.000000", -284_040_000.0),
-            ("1901-01-01T00:00:00.000000", -2_177_452_800.0),
-            ("2000-01-01T12:00:00.000000", 946_728_000.0),
-            ("2024-02-29T23:59:59.500000", 1_709_251_199.5),
-            ("2024-03-01T00:00:00.000000", 1_709_251_199.999_999_8),
-            ("2030-12-31T00:00:00.000000", 1_924_905_600.0),
-        ] {
-            assert_eq!(epoch_text(seconds), expected);
+        for date in ["1960-12-31T12:00:00.000", "2024-02-29T23:59:59.500", "2016-12-31T23:59:60.250"] {
+            assert_eq!(CalendarTime::read(date).unwrap().text(3), date);
         }
+        assert_eq!(CalendarTime::read("2024-03-01T00:00:09.999").unwrap().text(0), "2024-03-01T00:00:09");
         for bad in [
             "",
             "2030-02-29T00:00:00",
@@ -106,11 +126,13 @@ mod tests {
             "2030-01-01",
             "2030-01-01T24:00:00",
             "2030-01-01T00:00:NaN",
+            "2030-01-01T00:00:00.1e3",
+            "2030-01-01T12:00:60",
             "30-01-01T00:00:00",
             "2030-01-01T0:00:00",
             "2030-1-1T00:00:00",
         ] {
-            assert_eq!(epoch_s(bad), None, "{bad}");
+            assert_eq!(CalendarTime::read(bad), None, "{bad}");
         }
     }
 }

@@ -447,3 +447,79 @@ fn propagated_orbits_are_flown_and_exported() {
     let said = fail(&["check", &place.pipeline, "--set", "spacecraft.duration_s=1e6"]);
     assert!(said.contains("spacecraft.duration_s = ") && said.contains("array.propagate.days"), "{said}");
 }
+
+/// Orbits of files with dates: the epoch, the Earth and the windows are those of the dates, and nothing is known beyond them.
+#[test]
+fn dates_of_orbits_give_epoch_earth_and_windows() {
+    let kepler = TRIPLE.find("kepler").unwrap()..TRIPLE.find("[spacecraft]").unwrap();
+    let mut pipeline = TRIPLE.replace("every_nth_window = 100", "duration_s = 21000.0");
+    pipeline.replace_range(kepler, "arcs_m = [600.0, 1500.0]\n");
+    let place = Workplace::new(&pipeline);
+    let folder = place.path("orbits");
+    // 2024-03-01T00:00:00 UTC, 24,166 days and 37 s after 1958-01-01T00:00:00 TAI.
+    let export = ["export", "orbits", "--pipeline", &place.pipeline, "--out", &folder, "--set"];
+    succeed(&[&export[..], &["spacecraft.epoch_tai_s=2_087_942_437.0", "--duration", "6h"]].concat());
+    let written = std::fs::read_to_string(format!("{folder}/sat1.oem")).unwrap();
+    assert!(
+        written.contains("TIME_SYSTEM = UTC\nSTART_TIME = 2024-03-01T00:00:00.000000000\n"),
+        "{}",
+        &written[..400]
+    );
+    let files = format!("array.oem=[\"{folder}/sat1.oem\", \"{folder}/sat2.oem\", \"{folder}/sat3.oem\"]");
+    let sets = ["--pipeline", &place.pipeline, "--set", "array.arcs_m=[]", "--set", &files];
+    let at = |time: &'static str| [&["geometry", "--at", time][..], &sets].concat();
+    let geometry = json(&at("2024-03-01T00:00:37"));
+    assert_eq!(
+        (geometry["t_s"].as_f64(), geometry["utc"].as_str()),
+        (Some(0.0), Some("2024-03-01T00:00:00.000"))
+    );
+    assert_eq!(json(&at("2024-03-01T01:00:00Z"))["t_s"].as_f64(), Some(3600.0));
+    let degrees = |hat: &serde_json::Value| {
+        let [x, y, z] = [0, 1, 2].map(|k| hat[k].as_f64().unwrap());
+        [y.atan2(x).to_degrees().rem_euclid(360.0), z.asin().to_degrees()]
+    };
+    // As astropy 8.0.2 has them with DE421 (`src/array/bodies`).
+    for (key, expected) in [("earth_hat", [40.1461, 2.1637]), ("sun_hat", [340.6916, 0.0065])] {
+        let found = degrees(&geometry[key]);
+        assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 0.01), "{key}: {found:?}");
+    }
+    for time in ["7h", "-1", "2027-01-01T00:00:00"] {
+        let said = fail(&at(time));
+        assert!(
+            said.contains("expected a time at which positions are known, 0.000 s to 21600.000 s"),
+            "{said}"
+        );
+    }
+    let sky = place.path("sky.fits");
+    succeed(&["sky", &place.pipeline, "--no-picture", "--freq-hz", "3MHz", "--nside", "4", "--out", &sky]);
+    let predict = ["predict", "--sky", &sky, "--pair", "1-2", "--freq-hz", "3MHz", "--at"];
+    assert!(fail(&[&predict[..], &["7h"], &sets].concat()).contains("positions are known"));
+    let export =
+        [&["export", "orbits", "--out", &folder, "--epoch", "2030-01-01T00:00:00"][..], &sets].concat();
+    assert!(fail(&export).contains("dates of their own, from 2024-03-01T00:00:00.000 UTC"));
+    for set in ["spacecraft.epoch_tai_s=0", "array.earth_longitude_deg=10"] {
+        assert!(fail(&[&at("0")[..], &["--set", set]].concat()).contains("with array.oem"));
+    }
+    // What comes down says the same.
+    let (dated, circle) = (place.path("dated.ccsds"), place.path("circle.ccsds"));
+    succeed(&["simulate", &place.pipeline, "--out", &dated, "--set", "array.arcs_m=[]", "--set", &files]);
+    succeed(&["simulate", &place.pipeline, "--out", &circle, "--set", "array.earth_longitude_deg=180"]);
+    let contents = json(&["inspect", &dated]);
+    assert_eq!(contents["instrument"]["epoch_utc"], "2024-03-01T00:00:00.000");
+    assert!(
+        contents["span"]["start_utc"].as_str().unwrap().starts_with("2024-03-01T0"),
+        "{}",
+        contents["span"]
+    );
+    let hidden = |contents: &serde_json::Value| {
+        ["earth_hidden_by_date", "segments"].map(|key| contents["ephemeris"][key].as_u64().unwrap())
+    };
+    let [by_date, segments] = hidden(&contents);
+    assert!(segments > 1 && by_date == segments, "{by_date} {segments}");
+    // The Earth of 1 January 2027 is at longitude 24 degrees, the idealised one at 180.
+    assert!(hidden(&json(&["inspect", &circle]))[0] == 0);
+    assert!(
+        succeed(&["check", &place.pipeline])
+            .contains("epoch 2026-12-31T23:59:23.000 UTC; the Earth is idealised")
+    );
+}

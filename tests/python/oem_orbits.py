@@ -83,7 +83,7 @@ for satellite in range(3):
                 ("OBJECT_ID", f"2030-001{'ABC'[satellite]}"),
                 ("CENTER_NAME", "MOON"),
                 ("REF_FRAME", "EME2000"),
-                ("TIME_SYSTEM", "TDB"),
+                ("TIME_SYSTEM", "TAI"),
                 ("START_TIME", when[0]),
                 ("STOP_TIME", when[-1]),
                 ("INTERPOLATION", "HERMITE"),

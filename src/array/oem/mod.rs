@@ -1,7 +1,10 @@
 //! Orbits from CCSDS Orbit Ephemeris Messages.
 
-mod file;
+mod checks;
+mod kvn;
+mod message;
 mod orbit;
+mod xml;
 
-pub(super) use file::to_equatorial;
+pub(super) use message::to_equatorial;
 pub(super) use orbit::{Stretch, TableOrbit, read};

@@ -1,20 +1,29 @@
 //! Orbits given by tables of positions and velocities.
 
-use std::path::Path;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::file::{DEGREE_MAX, Fault, OemFile, OemSegment, TableMethod, parse};
+use flate2::read::MultiGzDecoder;
+use rayon::prelude::*;
+
+use super::checks::check;
+use super::message::{DEGREE_MAX, Fault, OemMessage, OemSegment, Reading, TableMethod};
+use super::{kvn, xml};
 use crate::array::config::ArrayError;
 use crate::array::state::SatelliteState;
 use crate::units::constants::MOON_GM_M3_S2;
+use crate::units::time_scales::Tai;
 use crate::units::vector::{Vec3, cross, dot, norm, scale, sub};
 
 /// An orbit from a file. Cheap to clone.
 #[derive(Clone, Debug, PartialEq)]
 pub(in crate::array) struct TableOrbit {
-    file: Arc<OemFile>,
-    /// Epoch of the mission in the file's seconds.
+    message: Arc<OemMessage>,
+    /// Epoch of the mission in the message's seconds.
     epoch_s: f64,
+    /// Between which of them positions are known without a gap.
+    span_s: [f64; 2],
 }
 
 /// States of one orbit, at rising times, without a jump.
@@ -44,49 +53,63 @@ impl Stretch {
     }
 }
 
-/// Largest file that is read, bytes: ten years of states each minute.
+/// Largest file that is read, and largest content of a compressed one, bytes: ten years of states each minute.
 const FILE_BYTES_MAX: u64 = 1 << 30;
 
 /// Nearest that two satellites may be at any state of the first, m.
 const APART_M: f64 = 1.0;
 
+/// How far beyond its states an orbit goes on, s: ticks of time tags. Farther out nothing is known, and states are not numbers.
+const BEYOND_S: f64 = 1.0;
+
+/// Greatest gap between segments that is none, s: rounded epochs.
+const SEAM_S: f64 = 1e-6;
+
+/// The orbits of all satellites.
+#[derive(Clone, Debug)]
+pub(in crate::array) struct OemOrbits {
+    pub(in crate::array) orbits: Vec<TableOrbit>,
+    /// Epoch of the mission.
+    pub(in crate::array) epoch: Tai,
+    /// What the files hold and is not used.
+    pub(in crate::array) notes: Vec<String>,
+}
+
 fn error(path: &Path, what: String) -> ArrayError {
     ArrayError::Oem { path: path.to_owned(), what }
 }
 
-/// Reads the files of all satellites. The mission starts at `epoch_s` of their time system, or with the last to start.
+/// Reads the files of all satellites. The mission begins at `epoch`, a date in their time system, or with the last to begin.
 pub(in crate::array) fn read(
-    paths: &[std::path::PathBuf],
-    epoch_s: Option<f64>,
+    paths: &[PathBuf],
+    epoch: &str,
     moon_radius_m: f64,
-) -> Result<Vec<TableOrbit>, ArrayError> {
-    let mut files: Vec<OemFile> = Vec::new();
-    for path in paths {
-        let size = std::fs::metadata(path).map_err(|source| error(path, source.to_string()))?.len();
-        if size > FILE_BYTES_MAX {
-            return Err(error(path, format!("{size} bytes; expected at most {FILE_BYTES_MAX}")));
+) -> Result<OemOrbits, ArrayError> {
+    let readings: Result<Vec<Reading>, ArrayError> =
+        paths.par_iter().map(|path| read_file(path, moon_radius_m)).collect();
+    let readings = readings?;
+    let epoch = epoch_of(paths, &readings, epoch)?;
+    let mut orbits = Vec::with_capacity(readings.len());
+    let mut notes = Vec::new();
+    for (path, reading) in paths.iter().zip(readings) {
+        if reading.covariances > 0 {
+            notes.push(format!("{}: {} covariances are not used", path.display(), reading.covariances));
         }
-        let text = std::fs::read_to_string(path).map_err(|source| error(path, source.to_string()))?;
-        let of_line = |Fault { line, found, expected }: Fault| {
-            error(path, format!("line {line}: found {found}; expected {expected}"))
+        let Reading { message, scale, .. } = reading;
+        let text = |s: f64| format!("{} {scale}", message.zero.plus_s(s).text(scale, 3));
+        let epoch_s = epoch.since_s(message.zero);
+        let Some(span_s) = message.span_s(epoch_s) else {
+            let spans: Vec<String> =
+                message.segments.iter().take(4).map(|s| s.useable_s.map(text).join(" to ")).collect();
+            let found = format!(
+                "nothing at the mission's epoch, {}; expected states then, and they go from {}",
+                text(epoch_s),
+                spans.join(", ")
+            );
+            return Err(error(path, found));
         };
-        let file = parse(&text).map_err(of_line)?;
-        check(&file, moon_radius_m).map_err(of_line)?;
-        if let Some(first) = files.first()
-            && first.time_system != file.time_system
-        {
-            let expected = &first.time_system;
-            return Err(error(
-                path,
-                format!("TIME_SYSTEM = {}; expected {expected} as in the first file", file.time_system),
-            ));
-        }
-        files.push(file);
+        orbits.push(TableOrbit { epoch_s, span_s, message: Arc::new(message) });
     }
-    let latest_s = files.iter().map(|file| file.span_s()[0]).fold(f64::NEG_INFINITY, f64::max);
-    let epoch_s = epoch_s.unwrap_or(latest_s);
-    let orbits: Vec<TableOrbit> =
-        files.into_iter().map(|file| TableOrbit { file: Arc::new(file), epoch_s }).collect();
     for (second, path) in paths.iter().enumerate() {
         for first in 0..second {
             if let Some(t_s) = meeting_s(&orbits[first], &orbits[second]) {
@@ -101,54 +124,75 @@ pub(in crate::array) fn read(
             }
         }
     }
-    Ok(orbits)
+    Ok(OemOrbits { orbits, epoch, notes })
 }
 
-/// Requires orbits above the surface that the Moon holds, and segments that follow each other.
-fn check(file: &OemFile, moon_radius_m: f64) -> Result<(), Fault> {
-    for segment in &file.segments {
-        for (k, (position_m, velocity_m_s)) in
-            segment.position_m.iter().zip(&segment.velocity_m_s).enumerate()
+/// The mission's epoch, to the digits that time codes have.
+fn epoch_of(paths: &[PathBuf], readings: &[Reading], epoch: &str) -> Result<Tai, ArrayError> {
+    let begins = |reading: &Reading| {
+        let first = reading.message.segments.first();
+        reading.message.zero.plus_s(first.map_or(0.0, |segment| segment.useable_s[0]))
+    };
+    let latest = readings.iter().map(begins).reduce(|a, b| if b > a { b } else { a });
+    let (Some(latest), Some(first)) = (latest, readings.first()) else { return Ok(Tai::from_1958_s(0.0)) };
+    let given = if epoch.is_empty() {
+        latest
+    } else {
+        if let Some((path, reading)) =
+            paths.iter().zip(readings).find(|(_, reading)| reading.scale != first.scale)
         {
-            let (radius_m, speed_m_s) = (norm(*position_m), norm(*velocity_m_s));
-            if radius_m <= moon_radius_m || radius_m > 1e9 {
-                let found = format!("{:.3} km from the Moon's centre", radius_m / 1e3);
-                return Err(Fault {
-                    line: segment.line + k,
-                    found,
-                    expected: "above the Moon's surface, within 1e6 km",
-                });
-            }
-            if 0.5 * speed_m_s * speed_m_s >= MOON_GM_M3_S2 / radius_m {
-                let found =
-                    format!("{:.3} km/s at {:.1} km from the Moon's centre", speed_m_s / 1e3, radius_m / 1e3);
-                let expected =
-                    "less than the velocity of escape: other orbits are not closed (parabolic, hyperbolic)";
-                return Err(Fault { line: segment.line + k, found, expected });
-            }
+            return Err(error(
+                path,
+                format!(
+                    "TIME_SYSTEM = {}; expected {} as in the first file, where array.oem_epoch is a date in it",
+                    reading.scale, first.scale
+                ),
+            ));
         }
+        Tai::read(epoch, first.scale).ok_or_else(|| {
+            error(
+                &paths[0],
+                format!("array.oem_epoch = {epoch:?}; expected a date on {}, as in the file", first.scale),
+            )
+        })?
+    };
+    Ok(Tai::from_1958_s(given.from_1958()))
+}
+
+fn read_file(path: &Path, moon_radius_m: f64) -> Result<Reading, ArrayError> {
+    let of_io = |source: std::io::Error| error(path, source.to_string());
+    let size = std::fs::metadata(path).map_err(of_io)?.len();
+    let too_large = |size: u64| error(path, format!("{size} bytes; expected at most {FILE_BYTES_MAX}"));
+    if size > FILE_BYTES_MAX {
+        return Err(too_large(size));
     }
-    for (before, after) in file.segments.iter().zip(file.segments.iter().skip(1)) {
-        let (Some(end_s), Some(start_s)) = (before.time_s.last(), after.time_s.first()) else { continue };
-        let gap_s = start_s - end_s;
-        if gap_s != 0.0 {
-            let found = format!(
-                "a segment that begins {:.3} s {} the one before ends",
-                gap_s.abs(),
-                if gap_s > 0.0 { "after" } else { "before" }
-            );
-            let expected =
-                "segments without gaps and overlaps: each begins with the last epoch of the one before";
-            return Err(Fault { line: after.line, found, expected });
+    let mut bytes = std::fs::read(path).map_err(of_io)?;
+    if bytes.starts_with(&[0x1f, 0x8b]) {
+        let mut content = Vec::new();
+        // A sum at the end says whether it is whole.
+        let unpacked = MultiGzDecoder::new(&*bytes).take(FILE_BYTES_MAX + 1).read_to_end(&mut content);
+        unpacked.map_err(|source| error(path, format!("gzip: {source}")))?;
+        if content.len() as u64 > FILE_BYTES_MAX {
+            return Err(too_large(content.len() as u64));
         }
+        bytes = content;
     }
-    Ok(())
+    if bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) {
+        return Err(error(path, "UTF-16; expected ASCII or UTF-8".into()));
+    }
+    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
+    let is_xml = text.trim_ascii_start().starts_with(b"<");
+    let reading = if is_xml { xml::parse(text) } else { kvn::parse(text) };
+    let reading = reading.and_then(|reading| check(&reading, moon_radius_m).map(|()| reading));
+    reading.map_err(|Fault { line, found, expected }| {
+        error(path, format!("line {line}: found {found}; expected {expected}"))
+    })
 }
 
 /// A time, s since the epoch, at which two orbits meet, among the states of both.
 fn meeting_s(first: &TableOrbit, second: &TableOrbit) -> Option<f64> {
     let times = |orbit: &TableOrbit| -> Vec<f64> {
-        orbit.file.segments.iter().flat_map(|s| &s.time_s).map(|t_s| t_s - orbit.epoch_s).collect()
+        orbit.message.segments.iter().flat_map(|s| &s.time_s).map(|t_s| t_s - orbit.epoch_s).collect()
     };
     let ([from, to], [start, end]) = (first.span_s(), second.span_s());
     let common = |t_s: &f64| (from.max(start)..=to.min(end)).contains(t_s);
@@ -159,11 +203,18 @@ fn meeting_s(first: &TableOrbit, second: &TableOrbit) -> Option<f64> {
         .find(|&t_s| norm(sub(first.state(t_s).position_m, second.state(t_s).position_m)) < APART_M)
 }
 
-impl OemFile {
-    fn span_s(&self) -> [f64; 2] {
-        let first = self.segments.first().and_then(|segment| segment.time_s.first());
-        let last = self.segments.last().and_then(|segment| segment.time_s.last());
-        [first.copied().unwrap_or(0.0), last.copied().unwrap_or(0.0)]
+impl OemMessage {
+    /// From when to when there is no gap about a time, s; `None` if nothing is known then.
+    fn span_s(&self, at_s: f64) -> Option<[f64; 2]> {
+        let mut spans: Vec<[f64; 2]> = Vec::new();
+        for OemSegment { useable_s, .. } in &self.segments {
+            match spans.last_mut() {
+                Some(last) if useable_s[0] - last[1] <= SEAM_S => last[1] = last[1].max(useable_s[1]),
+                _ => spans.push(*useable_s),
+            }
+        }
+        // The epoch is rounded to half a microsecond.
+        spans.into_iter().find(|[from_s, until_s]| (from_s - SEAM_S..=until_s + SEAM_S).contains(&at_s))
     }
 }
 
@@ -174,48 +225,72 @@ impl TableOrbit {
         let segment = |Stretch { time_s, position_m, velocity_m_s }| OemSegment {
             method: TableMethod::Hermite,
             degree: 7,
-            line: 0,
+            useable_s: [time_s.first(), time_s.last()].map(|s| s.copied().unwrap_or_default()),
             time_s,
             position_m,
             velocity_m_s,
         };
-        let segments = stretches.into_iter().map(segment).collect();
-        Self { file: Arc::new(OemFile { time_system: "TDB".into(), segments }), epoch_s: 0.0 }
+        let segments: Vec<OemSegment> = stretches.into_iter().map(segment).collect();
+        let message = OemMessage { zero: Tai::from_1958_s(0.0), segments };
+        let span_s = message.span_s(0.0).unwrap_or_default();
+        Self { message: Arc::new(message), epoch_s: 0.0, span_s }
     }
 
-    /// The states of the table, at times since the mission's epoch.
+    /// The states of the table that are to be used, at times since the mission's epoch; where useable times lie between states, also
+    /// those then.
     pub(in crate::array) fn stretches(&self) -> Vec<Stretch> {
-        let stretch = |segment: &OemSegment| Stretch {
-            time_s: segment.time_s.iter().map(|t_s| t_s - self.epoch_s).collect(),
-            position_m: segment.position_m.clone(),
-            velocity_m_s: segment.velocity_m_s.clone(),
+        let stretch = |segment: &OemSegment| {
+            let [from_s, until_s] = segment.useable_s;
+            let first = segment.time_s.partition_point(|t_s| *t_s < from_s);
+            let end = segment.time_s.partition_point(|t_s| *t_s <= until_s);
+            // An end between two states gets one of its own.
+            let own = |t_s: f64, k: usize| {
+                segment.time_s.get(k).is_none_or(|known_s| *known_s != t_s).then_some(t_s)
+            };
+            let mut out = Stretch::default();
+            let mut add = |t_s: f64| out.push(t_s - self.epoch_s, segment.state(t_s));
+            own(from_s, first).into_iter().for_each(&mut add);
+            segment.time_s[first..end].iter().copied().for_each(&mut add);
+            own(until_s, end.saturating_sub(1)).into_iter().for_each(&mut add);
+            out
         };
-        self.file.segments.iter().map(stretch).collect()
+        self.message.segments.iter().filter(|segment| self.is_within(segment)).map(stretch).collect()
+    }
+
+    /// Whether a segment is of the time about the epoch without a gap.
+    fn is_within(&self, segment: &OemSegment) -> bool {
+        self.span_s[0] <= segment.useable_s[0] && segment.useable_s[1] <= self.span_s[1]
     }
 
     /// Memory of the states, bytes; clones share it.
     pub(in crate::array) fn table_bytes(&self) -> u64 {
-        let states: usize = self.file.segments.iter().map(|segment| segment.time_s.len()).sum();
+        let states: usize = self.message.segments.iter().map(|segment| segment.time_s.len()).sum();
         (states * (size_of::<f64>() + 2 * size_of::<Vec3>())) as u64
     }
 
-    /// First and last time, s since the mission's epoch.
+    /// First and last time, s since the mission's epoch, between which positions are known without a gap.
     pub(in crate::array) fn span_s(&self) -> [f64; 2] {
-        self.file.span_s().map(|t_s| t_s - self.epoch_s)
+        // The epoch is rounded to half a microsecond.
+        let since = |t_s: f64| if (t_s - self.epoch_s).abs() < SEAM_S { 0.0 } else { t_s - self.epoch_s };
+        self.span_s.map(since)
     }
 
-    /// Position and velocity; beyond the file the nearest polynomial goes on.
+    /// Position and velocity; beyond what is known they are not numbers.
     pub(in crate::array) fn state(&self, t_s: f64) -> SatelliteState {
         let at_s = t_s + self.epoch_s;
-        let segments = &self.file.segments;
-        let after =
-            segments.partition_point(|segment| segment.time_s.first().is_some_and(|first| *first <= at_s));
+        let [from_s, until_s] = self.span_s;
+        if !(from_s - BEYOND_S..=until_s + BEYOND_S).contains(&at_s) {
+            return SatelliteState { position_m: [f64::NAN; 3], velocity_m_s: [f64::NAN; 3] };
+        }
+        let inside_s = at_s.clamp(from_s, until_s);
+        let segments = &self.message.segments;
+        let after = segments.partition_point(|segment| segment.useable_s[0] <= inside_s);
         segments[after.saturating_sub(1)].state(at_s)
     }
 
     /// Greatest distance from the Moon's centre among the states, m.
     pub(in crate::array) fn farthest_m(&self) -> f64 {
-        let positions = self.file.segments.iter().flat_map(|segment| &segment.position_m);
+        let positions = self.message.segments.iter().flat_map(|segment| &segment.position_m);
         positions.map(|position_m| norm(*position_m)).fold(0.0, f64::max)
     }
 
@@ -244,38 +319,48 @@ impl TableOrbit {
 }
 
 impl OemSegment {
-    /// Newton's polynomial through the states about a time, and its derivative.
+    /// Position and velocity by the file's own interpolation.
     fn state(&self, at_s: f64) -> SatelliteState {
-        let (repeats, points) = (self.repeats(), self.points());
-        let after = self.time_s.partition_point(|t_s| *t_s <= at_s);
-        let first = after.saturating_sub(points.div_ceil(2)).min(self.time_s.len() - points);
-        // Times from the middle, so that differences keep their digits.
-        let zero_s = self.time_s[first];
-        let count = points * repeats;
-        let mut times = [0.0; 2 * DEGREE_MAX + 2];
-        let mut divided = [[0.0; 3]; 2 * DEGREE_MAX + 2];
-        for k in 0..count {
-            times[k] = self.time_s[first + k / repeats] - zero_s;
-            divided[k] = self.position_m[first + k / repeats];
-        }
-        for order in 1..count {
-            for k in (order..count).rev() {
-                let step = times[k] - times[k - order];
-                divided[k] = if step == 0.0 {
-                    self.velocity_m_s[first + k / repeats]
-                } else {
-                    scale(1.0 / step, sub(divided[k], divided[k - 1]))
-                };
-            }
-        }
-        let tau = at_s - zero_s;
-        let (mut position_m, mut velocity_m_s) = (divided[count - 1], [0.0; 3]);
-        for k in (0..count - 1).rev() {
-            for axis in 0..3 {
-                velocity_m_s[axis] = velocity_m_s[axis] * (tau - times[k]) + position_m[axis];
-                position_m[axis] = position_m[axis] * (tau - times[k]) + divided[k][axis];
-            }
-        }
-        SatelliteState { position_m, velocity_m_s }
+        interpolated(self, self.method, self.points(), at_s)
     }
+}
+
+/// Newton's polynomial through some of a segment's states about a time, and its derivative.
+pub(super) fn interpolated(
+    segment: &OemSegment,
+    method: TableMethod,
+    points: usize,
+    at_s: f64,
+) -> SatelliteState {
+    let repeats = if method == TableMethod::Hermite { 2 } else { 1 };
+    let after = segment.time_s.partition_point(|t_s| *t_s <= at_s);
+    let first = after.saturating_sub(points.div_ceil(2)).min(segment.time_s.len() - points);
+    // Times from the middle, so that differences keep their digits.
+    let zero_s = segment.time_s[first];
+    let count = points * repeats;
+    let mut times = [0.0; 2 * DEGREE_MAX + 2];
+    let mut divided = [[0.0; 3]; 2 * DEGREE_MAX + 2];
+    for k in 0..count {
+        times[k] = segment.time_s[first + k / repeats] - zero_s;
+        divided[k] = segment.position_m[first + k / repeats];
+    }
+    for order in 1..count {
+        for k in (order..count).rev() {
+            let step = times[k] - times[k - order];
+            divided[k] = if step == 0.0 {
+                segment.velocity_m_s[first + k / repeats]
+            } else {
+                scale(1.0 / step, sub(divided[k], divided[k - 1]))
+            };
+        }
+    }
+    let tau = at_s - zero_s;
+    let (mut position_m, mut velocity_m_s) = (divided[count - 1], [0.0; 3]);
+    for k in (0..count - 1).rev() {
+        for axis in 0..3 {
+            velocity_m_s[axis] = velocity_m_s[axis] * (tau - times[k]) + position_m[axis];
+            position_m[axis] = position_m[axis] * (tau - times[k]) + divided[k][axis];
+        }
+    }
+    SatelliteState { position_m, velocity_m_s }
 }

@@ -36,7 +36,7 @@ impl Plan {
         let spacecraft = &config.spacecraft;
         let instrument = Instrument {
             name: config.name.clone(),
-            epoch_tai_s: spacecraft.epoch_tai_s,
+            epoch_tai_s: config.epoch_tai_s(&array),
             moon_radius_m: array.moon_radius_m(),
             // At most MAX_SATELLITES, as the array has checked.
             satellites: array.satellites() as u8,

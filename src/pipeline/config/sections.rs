@@ -16,6 +16,7 @@ use crate::products::ProductsConfig;
 use crate::response::model::ModelChoice;
 use crate::runtime::RuntimeConfig;
 use crate::sky::SkyConfig;
+use crate::units::time_scales::utc_text;
 use crate::units::{Checks, InvalidValue, keys};
 
 keys! {
@@ -84,6 +85,7 @@ impl Config {
                         found.push(|| problem);
                     }
                     found.extend(self.unknown_positions(&array));
+                    found.extend(self.misdated(&array));
                 }
                 Ok(_) => {}
                 Err(problem) => found.push(|| problem),
@@ -116,18 +118,47 @@ impl Config {
         Self { instrument, navigation: NavigationConfig::default(), ..self.clone() }
     }
 
+    /// Epoch of the mission, TAI seconds since 1958-01-01: that of the orbits, where they have dates.
+    #[must_use]
+    pub fn epoch_tai_s(&self, array: &Array) -> f64 {
+        array.epoch_tai_s().unwrap_or(self.spacecraft.epoch_tai_s)
+    }
+
+    /// Requires that no other epoch is given than that of orbits with dates, and that time codes hold it.
+    fn misdated(&self, array: &Array) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("spacecraft");
+        if let Some(dated_s) = array.epoch_tai_s() {
+            let given_s = self.spacecraft.epoch_tai_s;
+            let usual_s = SpacecraftConfig::default().epoch_tai_s;
+            let expected = format!("nothing with array.oem: by the dates of the files it is {dated_s}");
+            checks.number("epoch_tai_s", given_s, given_s == usual_s || given_s == dated_s, expected);
+            let date = utc_text(dated_s);
+            let inside = (0.0..=3.0e9).contains(&dated_s);
+            let expected = "an epoch from 1958 to 2053, which is what the packets' time code holds";
+            checks.require(
+                "epoch_tai_s",
+                format_args!("(by the files of array.oem) {date} UTC"),
+                inside,
+                expected,
+            );
+        }
+        checks.finish()
+    }
+
     /// Requires that positions are known for the whole mission.
     fn unknown_positions(&self, array: &Array) -> Vec<InvalidValue> {
         let Some([from_s, until_s]) = array.known_s() else { return Vec::new() };
         let mut checks = Checks::of("spacecraft");
         let duration_s = self.spacecraft.duration_s;
-        let good = from_s <= 0.0 && until_s >= duration_s;
+        // Dates of files are to a microsecond.
+        let good = from_s <= 1e-6 && until_s + 1e-6 >= duration_s;
         let source = match self.array.propagate.is_on() {
             true => "what array.propagate.days gives",
             false => "what the files of array.oem hold",
         };
-        let expected =
-            format!("at most {source}: from {from_s:.3} s to {until_s:.3} s after the mission's epoch");
+        let expected = format!(
+            "at most {source} without a gap: from {from_s:.3} s to {until_s:.3} s after the mission's epoch"
+        );
         checks.number("duration_s", duration_s, good, expected);
         checks.finish()
     }

@@ -2,7 +2,7 @@
 import { Sky, isSeen, rmsNear } from "/sky.js";
 import { Passes } from "/passes.js";
 import { drawOrbit, drawPowers, drawUvw, tellOrbit } from "/array.js";
-import { $, copyText, css, make, nice, number, short, stored, ticks } from "/tools.js";
+import { $, copyText, css, learnLeaps, make, nice, number, short, stored, ticks } from "/tools.js";
 
 const HELD_BYTES = 96e6, SAMPLE = 65536;
 const BLINK_MS = 700, PLAY_MS = 450;
@@ -549,6 +549,7 @@ function controls() {
 async function begin() {
   document.documentElement.dataset.theme = stored("theme") ?? (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark");
   const constants = await (await fetch("/page.json")).json();
+  learnLeaps(constants.leap_seconds);
   sky = new Sky($("gl"), $("over"), constants);
   for (const id of ["scale", "palette"]) { const value = stored(id); if (value && [...$(id).options].some((o) => o.value === value)) $(id).value = value; }
   for (const id of ["projection", "frame"]) { const value = stored(id); if (value && [...$(id).options].some((o) => o.value === value)) $(id).value = sky.view[id] = value; }

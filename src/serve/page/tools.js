@@ -48,10 +48,13 @@ export async function copyText(text) {
   return done;
 }
 
-// A mission's epoch counts TAI seconds since 1958; UTC is 37 s behind since 2017, and no further leap second is announced.
-const TO_1970_S = 4383 * 86400, TAI_AHEAD_S = 37;
+// A mission's epoch counts TAI seconds since 1958; UTC is whole seconds behind. Rows of when (TAI since 1970, s) and by how many.
+const TO_1970_S = 4383 * 86400;
+let leaps = [];
+export const learnLeaps = (rows) => { leaps = rows; };
 /** Date and time, UTC, of a mission time. */
 export const utc = (epochTaiS, timeS) => {
-  const date = new Date((epochTaiS + timeS - TO_1970_S - TAI_AHEAD_S) * 1000);
+  const tai = epochTaiS + timeS - TO_1970_S;
+  const date = new Date((tai - leaps.reduce((behind, [from, s]) => (from <= tai ? s : behind), 10)) * 1000);
   return Number.isNaN(date.getTime()) ? "–" : date.toISOString().slice(0, 16).replace("T", " ");
 };

@@ -17,9 +17,9 @@ pub struct TimeSpan {
     pub start_tai: String,
     /// End as a date, TAI.
     pub end_tai: String,
-    /// Start as a date, UTC (37 leap seconds, as since 2017).
+    /// Start as a date, UTC.
     pub start_utc: String,
-    /// End as a date, UTC (37 leap seconds, as since 2017).
+    /// End as a date, UTC.
     pub end_utc: String,
 }
 
@@ -32,6 +32,8 @@ pub struct InstrumentSummary {
     pub epoch_tai_s: f64,
     /// Mission epoch as a date, TAI.
     pub epoch_tai: String,
+    /// Mission epoch as a date, UTC.
+    pub epoch_utc: String,
     /// Number of daughters.
     pub satellites: u8,
     /// Radius of the Moon, m.
@@ -113,6 +115,8 @@ pub struct EphemerisSummary {
     pub covered: Listing<[f64; 2]>,
     /// Segments that say other positions than one that begins at the same time, which the ground keeps.
     pub contradictory: u64,
+    /// Segments at whose ends the Moon hides the Earth, where that is by the dates: all, unless the mission's Earth is idealised.
+    pub earth_hidden_by_date: u64,
     /// Greatest error of positions between nodes, m, as the nodes themselves tell; `None` without segments.
     pub interpolation_error_m_max: Option<f64>,
 }

@@ -9,7 +9,7 @@ use super::contents::{
     ChannelContents, Contents, DamagedEntry, EphemerisSummary, FaultEntry, GapEntry, GarbageEntry,
     HousekeepingSummary, InstrumentSummary, KindSummary, PairSummary, TimeSpan, VisibilityCounts,
 };
-use crate::array::interpolation_error_m;
+use crate::array::{earth_is_hidden_by_date, interpolation_error_m};
 use crate::downlink::error::{DownlinkError, io_error};
 use crate::downlink::receive::{Decoder, Event, EventReader, LISTED_MAX, Listing, ReceptionCounters};
 use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
@@ -17,10 +17,8 @@ use crate::frames::{
     AntennaResponse, EphemerisSegment, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
 };
 use crate::units::calendar::tai_text;
+use crate::units::time_scales::utc_text;
 use crate::units::{ChannelId, IntervalSet, MissionTime, Pair, TICKS_PER_SECOND};
-
-/// TAI - UTC since 2017-01-01 (IERS Bulletin C).
-const LEAP_S: f64 = 37.0;
 
 /// Rows of the table by pair and channel: all 28 pairs in every channel of the band. Rows beyond them count in the
 /// sums alone.
@@ -122,6 +120,7 @@ struct Inspector {
     total: Tally,
     segments: u64,
     nodes: u64,
+    in_shadow: u64,
     interpolation_error_m: Option<f64>,
     /// By start: a checksum of a segment's positions. As many as intervals are kept apart.
     told: BTreeMap<MissionTime, u64>,
@@ -203,6 +202,9 @@ impl Inspector {
             .flatten()
             .reduce(f64::max);
         self.covered.add(segment.start, segment.end());
+        if let Some(Instrument { epoch_tai_s, moon_radius_m, .. }) = &self.instrument {
+            self.in_shadow += u64::from(earth_is_hidden_by_date(segment, *epoch_tai_s, *moon_radius_m));
+        }
     }
 
     fn see_block(&mut self, block: &VisibilityBlock) {
@@ -266,6 +268,7 @@ impl Inspector {
             baselines: self.rows.iter().map(pair).collect(),
             ephemeris: EphemerisSummary {
                 contradictory: self.contradictory,
+                earth_hidden_by_date: self.in_shadow,
                 interpolation_error_m_max: self.interpolation_error_m,
                 ..self.covered.summary(self.segments, self.nodes)
             },
@@ -309,6 +312,7 @@ fn instrument_summary(instrument: &Instrument) -> InstrumentSummary {
         name: instrument.name.clone(),
         epoch_tai_s: instrument.epoch_tai_s,
         epoch_tai: tai_text(instrument.epoch_tai_s),
+        epoch_utc: utc_text(instrument.epoch_tai_s),
         satellites: instrument.satellites,
         moon_radius_m: instrument.moon_radius_m,
         response: match instrument.response {
@@ -333,8 +337,8 @@ fn span_of([start, end]: [MissionTime; 2], epoch_tai_s: f64) -> TimeSpan {
         end_s,
         start_tai: tai(start_s),
         end_tai: tai(end_s),
-        start_utc: tai(start_s - LEAP_S),
-        end_utc: tai(end_s - LEAP_S),
+        start_utc: utc_text(epoch_tai_s + start_s),
+        end_utc: utc_text(epoch_tai_s + end_s),
     }
 }
 

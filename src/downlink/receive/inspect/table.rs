@@ -48,7 +48,11 @@ impl Contents {
                     i.satellites,
                     i.response
                 )?;
-                writeln!(f, "              epoch {} TAI, Moon {} m", i.epoch_tai, i.moon_radius_m)?;
+                writeln!(
+                    f,
+                    "              epoch {} TAI, {} UTC, Moon {} m",
+                    i.epoch_tai, i.epoch_utc, i.moon_radius_m
+                )?;
                 writeln!(f, "              seed {}, configuration {}", i.seed, i.configuration_hash)?;
                 if let Some(spectrometer) = &i.spectrometer {
                     writeln!(
@@ -83,6 +87,14 @@ impl Contents {
             count => {
                 writeln!(f, "              {count} segments contradict others that begin at the same time")?
             }
+        }
+        if segments > 0 {
+            let hidden = ephemeris.earth_hidden_by_date;
+            write!(
+                f,
+                "              the Moon hides the Earth of these dates in {hidden} of {segments} segments"
+            )?;
+            writeln!(f, "{}", if hidden < segments { ": the mission's Earth is idealised" } else { "" })?;
         }
         match ephemeris.interpolation_error_m_max {
             Some(error_m) => writeln!(f, "              positions between nodes to {}", length(error_m)),
