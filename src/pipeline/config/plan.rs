@@ -66,7 +66,7 @@ impl Plan {
 
     /// The channel for which a sky is read.
     #[must_use]
-    pub(super) fn sky_channel(&self, channel: usize) -> SkyChannel {
+    pub(in crate::pipeline) fn sky_channel(&self, channel: usize) -> SkyChannel {
         let Config { sky, spacecraft, .. } = &self.config;
         let channels = spacecraft.channels_hz.len();
         SkyChannel {

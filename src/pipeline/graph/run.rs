@@ -382,7 +382,7 @@ pub(in crate::pipeline) fn write_settings(config: &Config, out: &Path) -> Result
 }
 
 /// As [`lock_folder`], for maps: no file that the configuration names may be in the place of one.
-pub(super) fn lock_products(config: &Config, out: &Path) -> Result<FolderLock, PipelineError> {
+pub(in crate::pipeline) fn lock_products(config: &Config, out: &Path) -> Result<FolderLock, PipelineError> {
     for input in config.input_files() {
         if is_place_of_product(&input, out) {
             let reason = "the configuration names it as an input, and the run would replace it; expected another output folder";
