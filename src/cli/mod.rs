@@ -31,6 +31,7 @@ mod recalibrate;
 mod replay;
 mod retract;
 mod run;
+mod sample;
 #[cfg(not(feature = "serve"))]
 #[path = "not_serving.rs"]
 mod serving;
@@ -96,6 +97,7 @@ enum Command {
     Merge(merge::MergeArgs),
     Recalibrate(recalibrate::RecalibrateArgs),
     Retract(retract::RetractArgs),
+    Sample(sample::SampleArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
     Figure(figure::FigureArgs),
@@ -163,6 +165,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Merge(args) => merge::execute(&args),
         Command::Recalibrate(args) => recalibrate::execute(&args),
         Command::Retract(args) => retract::execute(&args),
+        Command::Sample(args) => sample::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
         Command::Figure(args) => figure::execute(&args),

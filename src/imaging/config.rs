@@ -9,6 +9,7 @@ use crate::frames::Instrument;
 use crate::imaging::antennas::AntennasConfig;
 use crate::imaging::anywhere::RowBelief;
 use crate::imaging::circle::L_MAX;
+use crate::imaging::pixel::POWER_NSIDE_MAX;
 use crate::imaging::{AccumulationError, PixelEngine};
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
@@ -60,6 +61,21 @@ pub enum MatrixKind {
     Remade,
 }
 
+/// What R is.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[non_exhaustive]
+pub enum RegulariserChoice {
+    /// `R_l = 1 / C_l` with the sky's angular power C_l as the data have it.
+    Data,
+    /// `R = epsilon W_max I`, the paper's.
+    Identity,
+    /// `R_l = epsilon W_max (l + 1)^exponent`.
+    Degree(f64),
+    /// `R_l = epsilon / C_l` of tables of l and C_l (K^2), one a channel.
+    File(Vec<PathBuf>),
+}
+
 /// Configuration of map making.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -85,12 +101,15 @@ pub struct MapConfig {
     pub baseline_bp_max: f64,
     /// Regularisation epsilon: R = epsilon W_max I.
     pub epsilon: PerChannel<f64>,
-    /// How R grows with the degree: `R_l = epsilon W_max (l + 1)^exponent`. Harmonic engine; 0 for the identity.
-    #[serde(skip_serializing_if = "is_zero")]
-    pub regularisation_exponent: f64,
-    /// Tables of l and C_l (K^2), one a channel: `R_l = epsilon / C_l`. Harmonic engine; empty for none.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub regularisation_files: Vec<PathBuf>,
+    /// What R is; [`MapConfig::regulariser`] if it is not set.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub regulariser: Option<RegulariserChoice>,
+    /// Replaced by `regulariser`: named, so that it is refused with the key that takes its place.
+    #[serde(skip_serializing)]
+    pub regularisation_exponent: Option<f64>,
+    /// Likewise.
+    #[serde(skip_serializing)]
+    pub regularisation_files: Option<Vec<PathBuf>>,
     /// Ecliptic longitudes and latitudes, degrees, at which the effective beam of a final map is solved for.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub beams_deg: Vec<[f64; 2]>,
@@ -175,8 +194,9 @@ impl Default for MapConfig {
             l_max: 0,
             baseline_bp_max: 2.0,
             epsilon: PerChannel::All(1e-4),
-            regularisation_exponent: 0.0,
-            regularisation_files: Vec::new(),
+            regulariser: None,
+            regularisation_exponent: None,
+            regularisation_files: None,
             beams_deg: Vec::new(),
             prior_k: PerChannel::All(0.0),
             prior_files: Vec::new(),
@@ -197,11 +217,6 @@ impl Default for MapConfig {
 }
 
 /// So that what is not set changes no hash of a configuration.
-fn is_zero(value: &f64) -> bool {
-    *value == 0.0
-}
-
-/// Likewise.
 #[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
 fn is_off(value: &bool) -> bool {
     !*value
@@ -213,10 +228,21 @@ fn is_usual(matrix: &MatrixKind) -> bool {
 }
 
 impl MapConfig {
-    /// Whether R is `epsilon W_max` times the identity.
+    /// What R is: from the data, unless something else is set or visibilities are held one by one, whose R is the identity.
     #[must_use]
-    pub fn is_plain(&self) -> bool {
-        is_zero(&self.regularisation_exponent) && self.regularisation_files.is_empty()
+    pub fn regulariser(&self) -> RegulariserChoice {
+        let usual =
+            if self.holds_visibilities() { RegulariserChoice::Identity } else { RegulariserChoice::Data };
+        self.regulariser.clone().unwrap_or(usual)
+    }
+
+    /// Tables of the sky's angular power that are to be read, one a channel.
+    #[must_use]
+    pub fn power_files(&self) -> &[PathBuf] {
+        match &self.regulariser {
+            Some(RegulariserChoice::File(files)) => files,
+            _ => &[],
+        }
     }
 
     /// Whether rows of B are made again for each product over pixels.
@@ -319,14 +345,46 @@ impl MapConfig {
 
     /// Checks R, and that nothing is asked for that holds for multiples of the identity alone.
     fn check_regularisation(&self, checks: &mut Checks) {
-        let (exponent, files) = (self.regularisation_exponent, self.regularisation_files.len());
-        checks.number("regularisation_exponent", exponent, (-10.0..=10.0).contains(&exponent), "-10 to 10");
-        let one = files == 0 || exponent == 0.0;
+        for (key, is_set, instead) in [
+            ("regularisation_exponent", self.regularisation_exponent.is_some(), "{ degree = 2.0 }"),
+            ("regularisation_files", self.regularisation_files.is_some(), "{ file = [\"cl.csv\"] }"),
+        ] {
+            let expected = format!("no such key: map.regulariser = {instead} has taken its place");
+            checks.require(key, "(set)", !is_set, expected);
+        }
+        let regulariser = self.regulariser();
+        if let RegulariserChoice::Degree(exponent) = regulariser {
+            checks.number("regulariser.degree", exponent, (-10.0..=10.0).contains(&exponent), "-10 to 10");
+        }
+        if let RegulariserChoice::File(files) = &regulariser {
+            checks.require("regulariser.file", "[]", !files.is_empty(), "at least one table");
+        }
+        let is_identity = regulariser == RegulariserChoice::Identity;
+        let by_degree = !is_identity && regulariser != RegulariserChoice::Data;
+        let found = match &regulariser {
+            RegulariserChoice::Data => "data",
+            RegulariserChoice::Identity => "identity",
+            RegulariserChoice::Degree(_) => "degree",
+            RegulariserChoice::File(_) => "file",
+        };
         checks.require(
-            "regularisation_files",
-            format!("({files} files)"),
-            one,
-            "none with map.regularisation_exponent",
+            "regulariser",
+            found,
+            is_identity || !self.holds_visibilities(),
+            "\"identity\", or no such key, with map.refine or map.matrix = \"remade\"",
+        );
+        checks.require(
+            "regulariser",
+            found,
+            !by_degree || self.engine == EngineKind::Harmonic,
+            "\"data\" or \"identity\" without map.engine = \"harmonic\"",
+        );
+        let is_small = self.engine == EngineKind::Harmonic || self.nside <= POWER_NSIDE_MAX;
+        checks.require(
+            "regulariser",
+            found,
+            regulariser != RegulariserChoice::Data || is_small,
+            "\"identity\" with the pixel engine beyond nside 32; or map.engine = \"harmonic\"",
         );
         let beams = self.beams_deg.len();
         let few = beams <= BEAMS_MAX && (beams == 0 || !self.holds_visibilities());
@@ -341,12 +399,9 @@ impl MapConfig {
             let found = format!("[{longitude_deg}, {latitude_deg}]");
             checks.require("beams_deg", found, good, "ecliptic longitude and latitude, degrees");
         }
-        if !self.is_plain() {
-            let expected = "0 with this R: traces are those of R = epsilon W_max I";
+        if !is_identity {
+            let expected = "0 unless map.regulariser = \"identity\": traces are those of R = epsilon W_max I";
             checks.require("trace_probes", self.trace_probes, self.trace_probes == 0, expected);
-            let refined = self.refine.is_on();
-            let expected = "no map.regularisation_exponent and no map.regularisation_files with it";
-            checks.require("refine.passes_max", self.refine.passes_max, !refined, expected);
         }
     }
 
@@ -373,8 +428,6 @@ impl MapConfig {
                 "harmonic",
                 vec![
                     ("l_max", self.l_max != usual.l_max),
-                    ("regularisation_exponent", self.regularisation_exponent != 0.0),
-                    ("regularisation_files", !self.regularisation_files.is_empty()),
                     ("limits", self.limits != usual.limits),
                     ("refine", self.refine != refine),
                 ],
@@ -411,6 +464,7 @@ impl MapConfig {
             channels: mapped,
             channels_max: _,
             epsilon: _,
+            regulariser: _,
             regularisation_exponent: _,
             regularisation_files: _,
             beams_deg: _,
@@ -520,7 +574,7 @@ impl MapConfig {
     /// Settings by channel that do not match an instrument of `channels` channels.
     #[must_use]
     pub fn misfits(&self, channels: usize) -> Vec<InvalidValue> {
-        let (files, tables) = (self.prior_files.len(), self.regularisation_files.len());
+        let (files, tables) = (self.prior_files.len(), self.power_files().len());
         let mut checks = Checks::of("map");
         let expected =
             format!("at least the {channels} channels of the instrument, each of which needs memory");
@@ -533,7 +587,7 @@ impl MapConfig {
             ("epsilon", self.epsilon.fits(channels), self.epsilon.values().len()),
             ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),
             ("prior_files", files == 0 || files == channels, files),
-            ("regularisation_files", [0, channels].contains(&tables), tables),
+            ("regulariser.file", [0, channels].contains(&tables), tables),
         ] {
             let expected = format!("one value, or one for each of the {channels} channels");
             checks.require(key, format!("({found} values)"), fits, expected);

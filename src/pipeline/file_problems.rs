@@ -38,9 +38,7 @@ impl Plan {
             let checked = of_channels.filter_map(|(path, &hz)| check_frequency(path, hz).err());
             checked.filter(is_other).for_each(|problem| found.push(|| problem));
         }
-        for problem in
-            self.config.map.regularisation_files.iter().filter_map(|path| Regulariser::read(path).err())
-        {
+        for problem in self.config.map.power_files().iter().filter_map(|path| Regulariser::read(path).err()) {
             found.push(|| problem);
         }
         if let Some(Err(problem)) = sky.added.as_ref().map(AddedSky::check) {

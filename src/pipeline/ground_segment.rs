@@ -9,7 +9,9 @@ use super::live_gains::GainsWriter;
 use crate::ground::{Ground, GroundConfig, GroundOutcome};
 use crate::imaging::MapConfig;
 use crate::imaging::anywhere::RefineRule;
-use crate::imaging::{Regulariser, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
+use crate::imaging::{
+    Regulariser, RegulariserChoice, Solution, SolveWatch, Solver, SolverSetup, StoppingRule,
+};
 use crate::products::{ChannelSummary, MapWatch, ProductsError, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link, Sink};
 use crate::sky::fits::{ReadOptions, read_whole_map};
@@ -55,6 +57,7 @@ impl Config {
             belief: map.belief(),
             passes: None,
             trace_probes: map.trace_probes,
+            samples: 0,
             watch,
         })
     }
@@ -128,12 +131,16 @@ impl Sink for Bystander {
     }
 }
 
-/// How R depends on the degree, by channel.
+/// What R is, by channel.
 fn regularisers(map: &MapConfig) -> Result<Vec<Regulariser>, PipelineError> {
-    if map.regularisation_files.is_empty() {
-        return Ok(vec![Regulariser::Power(map.regularisation_exponent)]);
-    }
-    map.regularisation_files.iter().map(|path| Ok(Regulariser::read(path)?)).collect()
+    Ok(match map.regulariser() {
+        RegulariserChoice::Data => vec![Regulariser::Data],
+        RegulariserChoice::Degree(exponent) => vec![Regulariser::Power(exponent)],
+        RegulariserChoice::File(files) => {
+            files.iter().map(|path| Ok(Regulariser::read(path)?)).collect::<Result<_, PipelineError>>()?
+        }
+        _ => vec![Regulariser::default()],
+    })
 }
 
 fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {

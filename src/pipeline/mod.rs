@@ -60,7 +60,7 @@ pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
 pub use sampling::sample_stages;
 pub use simulation_groups::{MERGE, simulate_in_groups};
 pub use space_segment::{INTEGRATE, sky_notes};
-pub use state::solve_state;
+pub use state::{sample_state, solve_state};
 pub use study::{CaseSummary, StudyStep, StudySummary, StudyWatcher, run_study};
 pub use study_file::{Study, StudyCase, StudyError};
 pub use summary::{RunScope, RunSummary};

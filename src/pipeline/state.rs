@@ -131,13 +131,40 @@ pub fn solve_state(
     let each: Vec<_> = if epsilons.is_empty() { vec![config.map.epsilon.clone()] } else { given.collect() };
     for epsilon in each {
         // Solving takes the sums: they are read again for the next.
-        let sums = Ground::sums_in(folder, &config.ground(WAIT_BYTES))?;
-        let mut solver = Solver::new(SolverSetup { epsilon, ..config.solver(watch.clone())? });
-        for snapshot in sums {
-            let mut out = Outlet::collect();
-            solver.step(snapshot, &mut out)?;
-            out.into_vec().into_iter().for_each(&mut *found);
-        }
+        let setup = SolverSetup { epsilon, ..config.solver(watch.clone())? };
+        solve_sums(folder, config, setup, found)?;
+    }
+    Ok(())
+}
+
+/// Maps of the sums in a state with `count` others that are as likely, draws from the posterior of R from the data. The state stays as
+/// it is.
+///
+/// # Errors
+/// As [`solve_state`].
+pub fn sample_state(
+    folder: &Path,
+    config: &Config,
+    count: usize,
+    watch: &SolveWatch,
+    found: &mut dyn FnMut(Solution),
+) -> Result<(), PipelineError> {
+    let setup = SolverSetup { samples: count, ..config.solver(watch.clone())? };
+    solve_sums(folder, config, setup, found)
+}
+
+fn solve_sums(
+    folder: &Path,
+    config: &Config,
+    setup: SolverSetup,
+    found: &mut dyn FnMut(Solution),
+) -> Result<(), PipelineError> {
+    let sums = Ground::sums_in(folder, &config.ground(WAIT_BYTES))?;
+    let mut solver = Solver::new(setup);
+    for snapshot in sums {
+        let mut out = Outlet::collect();
+        solver.step(snapshot, &mut out)?;
+        out.into_vec().into_iter().for_each(&mut *found);
     }
     Ok(())
 }

@@ -1,0 +1,134 @@
+//! Rounds of solution and power, until neither changes.
+
+use super::blocks::{Block, Factors};
+use super::draws::{Covariance, Drawn};
+use super::knots::FREE;
+use super::{BlockData, PowerFit, SkyPower};
+use crate::imaging::NormalSums;
+use crate::imaging::regulariser::Diagonal;
+use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System};
+
+/// Most rounds, and the change of ln C_l at a knot at which they end: a tenth in C_l changes a map by far less than its error.
+const ROUNDS_MAX: usize = 4;
+const SETTLED: f64 = 0.1;
+/// Rounds that draw for the traces: later ones change R by little.
+const DRAWN: usize = 2;
+/// The draw for the traces; samples have others.
+const TRACES: u64 = 1 << 32;
+/// By how much traces may differ from those of the blocks.
+const RATIO_MAX: f64 = 30.0;
+
+/// Equations whose R is sought.
+pub(in crate::imaging) struct Sought<'a> {
+    pub(in crate::imaging) sums: &'a dyn NormalSums,
+    /// Blocks near the normal matrix, with which it is preconditioned.
+    pub(in crate::imaging) blocks: &'a [Block<'a>],
+    /// Degree of each unknown.
+    pub(in crate::imaging) degrees: &'a [usize],
+    pub(in crate::imaging) right: &'a [f64],
+}
+
+/// What was found.
+pub(in crate::imaging) struct FoundPower {
+    /// R by degree.
+    pub(in crate::imaging) regularisation: Vec<f64>,
+    /// The last solution: of an R near this one.
+    pub(in crate::imaging) solution: Vec<f64>,
+    pub(in crate::imaging) power: SkyPower,
+    /// Traces of `(A + R)^-1` over those of the blocks, by degree.
+    pub(in crate::imaging) ratio: Vec<f64>,
+}
+
+impl Sought<'_> {
+    fn l_max(&self) -> usize {
+        self.degrees.iter().copied().max().unwrap_or(0)
+    }
+
+    /// Of blocks that are the normal matrix.
+    ///
+    /// # Errors
+    /// Numbers that are not finite.
+    pub(in crate::imaging) fn found_in_blocks(&self) -> Result<FoundPower, SolveError> {
+        let l_max = self.l_max();
+        let tilt = vec![0.0; l_max + 1];
+        let data = BlockData { blocks: self.blocks, right: self.right, tilt: &tilt };
+        let fit = PowerFit::begin(self.blocks, l_max, self.right)?.maximised(data)?;
+        let regularisation = fit.regularisation();
+        let factors = Factors::new(self.blocks, &regularisation);
+        let mut solution = self.right.to_vec();
+        factors.solve(&mut solution);
+        let power = fit.estimate(data, &factors.traces(l_max))?;
+        Ok(FoundPower { regularisation, solution, power, ratio: vec![1.0; l_max + 1] })
+    }
+
+    /// In rounds, from the solution `start`.
+    ///
+    /// # Errors
+    /// Likewise.
+    pub(in crate::imaging) fn found(
+        &self,
+        start: Option<&[f64]>,
+        rule: StoppingRule,
+        watch: NamedWatch<'_>,
+    ) -> Result<FoundPower, SolveError> {
+        let l_max = self.l_max();
+        let mut fit = PowerFit::begin(self.blocks, l_max, self.right)?;
+        let mut x = [match start {
+            Some(start) if start.len() == self.right.len() => start.to_vec(),
+            _ => vec![0.0; self.right.len()],
+        }];
+        let mut ratio = vec![1.0; l_max + 1];
+        for round in 1..=ROUNDS_MAX {
+            let r = fit.regularisation();
+            let factors = Factors::new(self.blocks, &r);
+            let regularisation = Diagonal::ByDegree(r.clone());
+            if round <= DRAWN {
+                let task = watch.start(&format!("draw for the sky's power, round {round}"), 1e-3);
+                let covariance =
+                    Covariance { sums: self.sums, regularisation: &regularisation, factors: &factors };
+                let drawn = covariance.draw(&[TRACES], &task);
+                ratio = self.ratio(&drawn, &factors.traces(l_max));
+            }
+            let system = System { sums: self.sums, regularisation, precondition: &|v| factors.solve(v) };
+            {
+                let task = watch.start(&format!("map and the sky's power, round {round}"), rule.residual_max);
+                system.solve(&[self.right], &mut x, rule, &task);
+            }
+            let traces = factors.traces(l_max);
+            let tilt: Vec<f64> = (0..=l_max).map(|l| 0.5 * r[l] * (ratio[l] - 1.0) * traces[l]).collect();
+            let right = fit.data_of(self.blocks, &x[0], self.degrees);
+            let data = BlockData { blocks: self.blocks, right: &right, tilt: &tilt };
+            let next = fit.maximised(data)?;
+            let change = next.change(&fit);
+            fit = next;
+            let task = watch.start("the sky's power", SETTLED);
+            if !task.report_wanting(change > SETTLED && round < ROUNDS_MAX, round, change) {
+                let factors = Factors::new(self.blocks, &fit.regularisation());
+                let mut traces = factors.traces(l_max);
+                traces.iter_mut().zip(&ratio).for_each(|(trace, ratio)| *trace *= ratio);
+                let power = fit.estimate(data, &traces)?;
+                let [solution] = x;
+                return Ok(FoundPower { regularisation: fit.regularisation(), solution, power, ratio });
+            }
+        }
+        Err(SolveError::NoPower)
+    }
+
+    /// Traces of the true covariance over those of the blocks, means over neighbouring degrees: a draw has few numbers of each.
+    fn ratio(&self, drawn: &[Drawn], traces: &[f64]) -> Vec<f64> {
+        let mut more = vec![0.0; traces.len()];
+        for Drawn { whole, of_blocks } in drawn {
+            for ((l, d), of_blocks) in self.degrees.iter().zip(whole).zip(of_blocks) {
+                more[*l] += (d * d - of_blocks * of_blocks) / drawn.len() as f64;
+            }
+        }
+        let of_degree = |l: usize| {
+            let l = l.max(FREE);
+            let width = (l / 4).max(2);
+            let near = l.saturating_sub(width).max(FREE)..(l + width + 1).min(traces.len());
+            let sums = near.fold([0.0, 0.0], |[a, b], l| [a + more[l], b + traces[l]]);
+            if sums[1] > 0.0 { (1.0 + sums[0] / sums[1]).clamp(RATIO_MAX.recip(), RATIO_MAX) } else { 1.0 }
+        };
+        (0..traces.len()).map(of_degree).collect()
+    }
+}
