@@ -136,8 +136,9 @@ impl ChannelSummary {
         let decided: f64 = power.decided.iter().sum();
         let all = power.decided.len().pow(2);
         format!(
-            "as smooth as the data say (map.regulariser = \"data\"): they decide {decided:.0} of {all} harmonics; errors of \
-             pixels are in sigma.fits"
+            "as smooth as the data say (map.regulariser = \"data\"): they decide {decided:.0} of {all} harmonics, and \
+             scatter {:.2} times their noise; errors of pixels are in sigma.fits",
+            power.noise_factor
         )
     }
 }

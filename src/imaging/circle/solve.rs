@@ -3,17 +3,17 @@
 use super::sigma::pixel_sigma_k;
 use super::sums::degrees;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
-use crate::imaging::NormalSums;
 use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
 use crate::imaging::power::{Covariance, Drawn, Factors, FoundPower, Sought, Uncertainty};
 use crate::imaging::regulariser::{Diagonal, Regulariser};
 use crate::imaging::solver::Fitted;
 use crate::imaging::solver::NamedWatch;
 use crate::imaging::solver::SolveError;
-use crate::imaging::solver::add;
 use crate::imaging::solver::traces;
 use crate::imaging::solver::{Convergence, StoppingRule, System};
 use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from, normalised, random_vector};
+use crate::imaging::solver::{add, dot};
+use crate::imaging::{NormalSums, SumCounts};
 use crate::sky::harmonics::{AnalysisOptions, analysis, synthesis};
 use crate::sky::healpix::{nside_of, pixel_area_sr};
 
@@ -167,8 +167,15 @@ pub(super) fn power_of_data(
     let order_blocks = sums.order_blocks();
     let degrees: Vec<usize> = degrees(sums.setup().l_max).collect();
     let (blocks, right) = (order_blocks.blocks(), sums.right_hand_side());
-    let sought = Sought { sums, blocks: &blocks, degrees: &degrees, right };
-    Ok(Regulariser::Wiener(sought.found(None, rule, watch)?.power.power_k2))
+    let SumCounts { visibilities, power, .. } = sums.counts();
+    let numbers = 2.0 * visibilities as f64;
+    let sought = Sought { sums, blocks: &blocks, degrees: &degrees, right, power, numbers };
+    Ok(Regulariser::Wiener(sought.found(None, rule, watch)?.power.over_noise_k2()))
+}
+
+/// By how much a prior lessens `V'N^-1V`: `p.(2 b - A p)`, with `right` what it leaves of b.
+fn predicted_power(sums: &HarmonicSums, prior: &[f64], right: &[f64]) -> f64 {
+    dot(prior, sums.right_hand_side()) + dot(prior, right)
 }
 
 /// As [`solve_regularised`], with R from the data.
@@ -189,9 +196,18 @@ fn solve_with_power(
     }
     let order_blocks = sums.order_blocks();
     let (blocks, degrees) = (order_blocks.blocks(), degrees(l_max).collect::<Vec<usize>>());
-    let sought = Sought { sums, blocks: &blocks, degrees: &degrees, right: &right };
-    let FoundPower { regularisation, solution, power, ratio } =
-        sought.found(start.map(|[map, _]| map.as_slice()), rule, watch)?;
+    let SumCounts { visibilities, power, .. } = sums.counts();
+    let sought = Sought {
+        sums,
+        blocks: &blocks,
+        degrees: &degrees,
+        right: &right,
+        power: power - prior.as_ref().map_or(0.0, |prior| predicted_power(sums, prior, &right)),
+        numbers: 2.0 * visibilities as f64,
+    };
+    let found = sought.found(start.map(|[map, _]| map.as_slice()), rule, watch)?;
+    let factor = found.noise_factor();
+    let FoundPower { regularisation, solution, power, ratio } = found;
     let factors = Factors::new(&blocks, &regularisation);
     let regularisation = Diagonal::ByDegree(regularisation);
     let precondition = |v: &mut [f64]| factors.solve(v);
@@ -220,13 +236,16 @@ fn solve_with_power(
     for which in numbers.chunks(NOISES_TOGETHER) {
         let task = watch.start(&format!("samples from {}", which[0] + 1), rule.residual_max);
         for Drawn { whole: mut sample, .. } in covariance.draw(which, &task) {
+            sample.iter_mut().for_each(|value| *value *= factor);
             add(&mut sample, &whole);
             samples_k.push(map(&sample)?);
         }
     }
+    let mut sigma_k = pixel_sigma_k(&blocks, &factors, &ratio, nside);
+    sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= factor);
     let uncertainty = Uncertainty {
-        sigma_k: pixel_sigma_k(&blocks, &factors, &ratio, nside),
-        mean_sigma_k: (of_mean[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt(),
+        sigma_k,
+        mean_sigma_k: factor * (of_mean[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt(),
         power,
         samples_k,
     };

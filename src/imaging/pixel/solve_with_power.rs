@@ -8,8 +8,8 @@ use faer::{Accum, Mat, Par};
 use super::solve::{Diagnostics, PixelSolution, PointBeam, check_request, seen_point, subtract_prediction};
 use crate::imaging::circle::{coefficients, degrees, unknowns};
 use crate::imaging::power::{Block, Factors, FoundPower, Sought, Uncertainty};
-use crate::imaging::solver::{NamedWatch, SolveError, add};
-use crate::imaging::{NormalSums, PixelSums};
+use crate::imaging::solver::{NamedWatch, SolveError, add, dot};
+use crate::imaging::{NormalSums, PixelSums, SumCounts};
 use crate::sky::harmonics::Transform;
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::{StreamKind, random_stream};
@@ -37,11 +37,14 @@ pub fn solve_pixels_with_power(
     check_request(sums, 1.0)?;
     let (nside, pixels) = (sums.nside, sums.unknowns());
     let mut right = sums.right.clone();
+    let mut predicted = 0.0;
     if let Some(prior_k) = prior_k {
         if prior_k.len() != pixels {
             return Err(SolveError::PriorLength { found: prior_k.len(), expected: pixels });
         }
         subtract_prediction(sums, prior_k, &mut right);
+        // p.(2 b - A p), of which `right` is b - A p.
+        predicted = dot(prior_k, &sums.right) + dot(prior_k, &right);
     }
     let l_max = (DEGREES_PER_NSIDE * nside as f64) as usize;
     let transform = Transform::new(nside, l_max)?;
@@ -63,8 +66,13 @@ pub fn solve_pixels_with_power(
     let places = vec![(0..degrees.len()).collect()];
     let blocks = [Block { matrix: Cow::Owned(matrix), degrees: degrees.clone(), places }];
     let right = from_pixels(&right)?;
-    let sought = Sought { sums, blocks: &blocks, degrees: &degrees, right: &right };
-    let FoundPower { regularisation, solution, power, .. } = sought.found_in_blocks()?;
+    let SumCounts { visibilities, power, .. } = sums.counts();
+    let numbers = 2.0 * visibilities as f64;
+    let sought =
+        Sought { sums, blocks: &blocks, degrees: &degrees, right: &right, power: power - predicted, numbers };
+    let found = sought.found_in_blocks()?;
+    let factor = found.noise_factor();
+    let FoundPower { regularisation, solution, power, .. } = found;
     let factors = Factors::new(&blocks, &regularisation);
     let solved = |map: &[f64]| -> Result<Vec<f64>, SolveError> {
         let mut x = from_pixels(map)?;
@@ -87,6 +95,7 @@ pub fn solve_pixels_with_power(
         let mut stream = random_stream(3, StreamKind::Probe, [degrees.len() as u64, which as u64]);
         let mut draw: Vec<f64> = degrees.iter().map(|_| StandardNormal.sample(&mut stream)).collect();
         factors.solve_upper(&mut draw);
+        draw.iter_mut().for_each(|value| *value *= factor);
         let mut sample = to_pixels(&draw)?;
         add(&mut sample, &map_k);
         Ok(sample)
@@ -95,9 +104,9 @@ pub fn solve_pixels_with_power(
         sigma_k: factors
             .quadratic_forms(0, harmonics.transpose().to_owned())
             .into_iter()
-            .map(f64::sqrt)
+            .map(|variance| factor * variance.sqrt())
             .collect(),
-        mean_sigma_k: (monopole[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt(),
+        mean_sigma_k: factor * (monopole[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt(),
         power,
         samples_k: (0..samples).map(sample).collect::<Result<_, SolveError>>()?,
     };

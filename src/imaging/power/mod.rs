@@ -11,6 +11,9 @@
 //! approximation that preconditions it) all of it costs little. With the true A a round solves for x, and the blocks stand for A with
 //! the data that would make x their solution, and with the true traces where a draw tells them: both have the same gradient at theta, so
 //! that where rounds end is the maximum for the true A.
+//!
+//! A map ends at some degree and the sky does not. What the map leaves of the data is known (`|V - B x|^2` from sums): where it exceeds the
+//! noise, by a factor s^2, it counts as noise, and all of this is done for data divided by s.
 
 mod blocks;
 mod draws;
@@ -50,6 +53,9 @@ pub struct SkyPower {
     pub sigma_ln: Vec<f64>,
     /// Number of coefficients that the data decide, of 2 l + 1.
     pub decided: Vec<f64>,
+    /// Scatter of what the map leaves of the data in units of their noise, at least 1: above it is sky beyond the map's degrees, or errors of
+    /// the instrument. It counts as noise.
+    pub noise_factor: f64,
 }
 
 impl SkyPower {
@@ -58,6 +64,19 @@ impl SkyPower {
     pub fn interval_k2(&self, l: usize) -> Option<[f64; 2]> {
         let (power, sigma) = (self.power_k2.get(l)?, self.sigma_ln.get(l)?);
         Some([power * (-sigma).exp(), power * sigma.exp()])
+    }
+
+    /// One over R by degree: the power less what the data scatter more than their noise.
+    #[must_use]
+    pub fn over_noise_k2(&self) -> Vec<f64> {
+        self.power_k2.iter().map(|power| power / self.noise_factor.powi(2)).collect()
+    }
+
+    /// As found for data that were divided by `factor`.
+    fn of_data_divided_by(mut self, factor: f64) -> Self {
+        self.power_k2.iter_mut().for_each(|power| *power *= factor * factor);
+        self.noise_factor = factor;
+        self
     }
 
     /// A table: a line a degree from l = 2.
@@ -245,6 +264,7 @@ impl PowerFit {
             power_k2: self.power.clone(),
             sigma_ln: (0..self.power.len()).map(sigma).collect(),
             decided: decided.collect(),
+            noise_factor: 1.0,
         })
     }
 }

@@ -6,7 +6,7 @@ use super::knots::FREE;
 use super::{BlockData, PowerFit, SkyPower};
 use crate::imaging::NormalSums;
 use crate::imaging::regulariser::Diagonal;
-use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System};
+use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System, dot};
 
 /// Most rounds, and the change of ln C_l at a knot at which they end: a tenth in C_l changes a map by far less than its error.
 const ROUNDS_MAX: usize = 4;
@@ -17,6 +17,8 @@ const DRAWN: usize = 2;
 const TRACES: u64 = 1 << 32;
 /// By how much traces may differ from those of the blocks.
 const RATIO_MAX: f64 = 30.0;
+/// Change of the logarithm of the noise's factor at which it is found.
+const FACTOR_SETTLED: f64 = 0.03;
 
 /// Equations whose R is sought.
 pub(in crate::imaging) struct Sought<'a> {
@@ -26,6 +28,10 @@ pub(in crate::imaging) struct Sought<'a> {
     /// Degree of each unknown.
     pub(in crate::imaging) degrees: &'a [usize],
     pub(in crate::imaging) right: &'a [f64],
+    /// `V'N^-1V` of the data that these are the right-hand side of.
+    pub(in crate::imaging) power: f64,
+    /// Real numbers in them.
+    pub(in crate::imaging) numbers: f64,
 }
 
 /// What was found.
@@ -37,6 +43,13 @@ pub(in crate::imaging) struct FoundPower {
     pub(in crate::imaging) power: SkyPower,
     /// Traces of `(A + R)^-1` over those of the blocks, by degree.
     pub(in crate::imaging) ratio: Vec<f64>,
+}
+
+impl FoundPower {
+    /// By which the standard deviations of `(A + R)^-1` are multiplied.
+    pub(in crate::imaging) fn noise_factor(&self) -> f64 {
+        self.power.noise_factor
+    }
 }
 
 impl Sought<'_> {
@@ -51,14 +64,37 @@ impl Sought<'_> {
     pub(in crate::imaging) fn found_in_blocks(&self) -> Result<FoundPower, SolveError> {
         let l_max = self.l_max();
         let tilt = vec![0.0; l_max + 1];
-        let data = BlockData { blocks: self.blocks, right: self.right, tilt: &tilt };
-        let fit = PowerFit::begin(self.blocks, l_max, self.right)?.maximised(data)?;
-        let regularisation = fit.regularisation();
-        let factors = Factors::new(self.blocks, &regularisation);
-        let mut solution = self.right.to_vec();
-        factors.solve(&mut solution);
-        let power = fit.estimate(data, &factors.traces(l_max))?;
-        Ok(FoundPower { regularisation, solution, power, ratio: vec![1.0; l_max + 1] })
+        let mut fit = PowerFit::begin(self.blocks, l_max, self.right)?;
+        let mut factor = 1.0;
+        for round in 1.. {
+            let right = self.right_over(factor);
+            let data = BlockData { blocks: self.blocks, right: &right, tilt: &tilt };
+            fit = fit.maximised(data)?;
+            let regularisation = fit.regularisation();
+            let factors = Factors::new(self.blocks, &regularisation);
+            let mut solution = self.right.to_vec();
+            factors.solve(&mut solution);
+            let next = self.noise_factor(&solution, &regularisation);
+            if round >= ROUNDS_MAX || (next / factor).ln().abs() < FACTOR_SETTLED {
+                let power = fit.estimate(data, &factors.traces(l_max))?.of_data_divided_by(factor);
+                return Ok(FoundPower { regularisation, solution, power, ratio: vec![1.0; l_max + 1] });
+            }
+            factor = next;
+        }
+        Err(SolveError::NoPower)
+    }
+
+    fn right_over(&self, factor: f64) -> Vec<f64> {
+        self.right.iter().map(|b| b / factor).collect()
+    }
+
+    /// Scatter of what a solution leaves of the data, in units of their noise; 1 if it is less.
+    fn noise_factor(&self, x: &[f64], r: &[f64]) -> f64 {
+        // |V - B x|^2 = V'N^-1V - 2 x.b + x.A x, and A x = b - R x.
+        let regularised: f64 = x.iter().zip(self.degrees).map(|(x, l)| r[*l] * x * x).sum();
+        let left = self.power - dot(x, self.right) - regularised;
+        // As many numbers as the solution decides are no noise of it, but they are few.
+        (left / self.numbers).max(1.0).sqrt()
     }
 
     /// In rounds, from the solution `start`.
@@ -78,6 +114,7 @@ impl Sought<'_> {
             _ => vec![0.0; self.right.len()],
         }];
         let mut ratio = vec![1.0; l_max + 1];
+        let mut factor = 1.0;
         for round in 1..=ROUNDS_MAX {
             let r = fit.regularisation();
             let factors = Factors::new(self.blocks, &r);
@@ -96,17 +133,21 @@ impl Sought<'_> {
             }
             let traces = factors.traces(l_max);
             let tilt: Vec<f64> = (0..=l_max).map(|l| 0.5 * r[l] * (ratio[l] - 1.0) * traces[l]).collect();
-            let right = fit.data_of(self.blocks, &x[0], self.degrees);
+            let before = factor;
+            factor = self.noise_factor(&x[0], &r);
+            let mut right = fit.data_of(self.blocks, &x[0], self.degrees);
+            right.iter_mut().for_each(|b| *b /= factor);
             let data = BlockData { blocks: self.blocks, right: &right, tilt: &tilt };
             let next = fit.maximised(data)?;
-            let change = next.change(&fit);
+            // That of the noise is one of the power, too.
+            let change = next.change(&fit).max((factor / before).ln().abs());
             fit = next;
             let task = watch.start("the sky's power", SETTLED);
             if !task.report_wanting(change > SETTLED && round < ROUNDS_MAX, round, change) {
                 let factors = Factors::new(self.blocks, &fit.regularisation());
                 let mut traces = factors.traces(l_max);
                 traces.iter_mut().zip(&ratio).for_each(|(trace, ratio)| *trace *= ratio);
-                let power = fit.estimate(data, &traces)?;
+                let power = fit.estimate(data, &traces)?.of_data_divided_by(factor);
                 let [solution] = x;
                 return Ok(FoundPower { regularisation: fit.regularisation(), solution, power, ratio });
             }

@@ -203,7 +203,7 @@ impl Stage for Solver {
                 if !pixels.is_empty() {
                     let w_max = solved.diagnostics.w_max.unwrap_or(0.0) / pixel_area_sr(nside);
                     // One over the power that was found.
-                    let found = solved.uncertainty.as_ref().map(|errors| errors.power.power_k2.clone());
+                    let found = solved.uncertainty.as_ref().map(|errors| errors.power.over_noise_k2());
                     let epsilon = if found.is_some() { 1.0 } else { epsilon };
                     let regulariser = found.map_or(regulariser, Regulariser::Wiener);
                     let request = HarmonicRequest { epsilon, ..request };
