@@ -28,6 +28,9 @@ pub const REMADE_NSIDE_MAX: usize = 256;
 /// Greatest nside of maps from the harmonic engine: pixels ten times finer than its greatest degree.
 pub const HARMONIC_ENGINE_NSIDE_MAX: usize = 1024;
 
+/// epsilon of an R that has one, if it is not set.
+const EPSILON: f64 = 1e-4;
+
 /// Default number of degrees of a harmonic map per nside: as many as pixels represent to 1e-6.
 const DEGREES_PER_NSIDE: f64 = 2.5;
 
@@ -99,8 +102,9 @@ pub struct MapConfig {
     pub l_max: usize,
     /// Longest baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
     pub baseline_bp_max: f64,
-    /// Regularisation epsilon: R = epsilon W_max I.
-    pub epsilon: PerChannel<f64>,
+    /// Regularisation epsilon: R = epsilon W_max I, unless `regulariser` says otherwise; [`MapConfig::epsilon`] if it is not set.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub epsilon: Option<PerChannel<f64>>,
     /// What R is; [`MapConfig::regulariser`] if it is not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub regulariser: Option<RegulariserChoice>,
@@ -193,7 +197,7 @@ impl Default for MapConfig {
             matrix: MatrixKind::Held,
             l_max: 0,
             baseline_bp_max: 2.0,
-            epsilon: PerChannel::All(1e-4),
+            epsilon: None,
             regulariser: None,
             regularisation_exponent: None,
             regularisation_files: None,
@@ -228,12 +232,19 @@ fn is_usual(matrix: &MatrixKind) -> bool {
 }
 
 impl MapConfig {
-    /// What R is: from the data, unless something else is set or visibilities are held one by one, whose R is the identity.
+    /// What R is: from the data, unless something else is set. An epsilon alone asks for the identity, and so do visibilities that are held
+    /// one by one.
     #[must_use]
     pub fn regulariser(&self) -> RegulariserChoice {
-        let usual =
-            if self.holds_visibilities() { RegulariserChoice::Identity } else { RegulariserChoice::Data };
+        let is_identity = self.holds_visibilities() || self.epsilon.is_some();
+        let usual = if is_identity { RegulariserChoice::Identity } else { RegulariserChoice::Data };
         self.regulariser.clone().unwrap_or(usual)
+    }
+
+    /// epsilon of an R that has one.
+    #[must_use]
+    pub fn epsilon(&self) -> PerChannel<f64> {
+        self.epsilon.clone().unwrap_or(PerChannel::All(EPSILON))
     }
 
     /// Tables of the sky's angular power that are to be read, one a channel.
@@ -274,7 +285,7 @@ impl MapConfig {
         checks.require("channels_max", channels, (1..=4096).contains(&channels), "1 to 4096");
         let longest = self.baseline_bp_max;
         checks.number("baseline_bp_max", longest, longest > 0.0, "a positive number, in units of b_p");
-        checks.numbers("epsilon", self.epsilon.values(), |e| e > 0.0 && e <= 1.0, "above 0 and at most 1");
+        checks.numbers("epsilon", self.epsilon().values(), |e| e > 0.0 && e <= 1.0, "above 0 and at most 1");
         checks.numbers("prior_k", self.prior_k.values(), |k| k >= 0.0, "K, not negative");
         let fwhm = self.prior_fwhm_deg;
         checks.number("prior_fwhm_deg", fwhm, (0.0..=180.0).contains(&fwhm), "0 to 180");
@@ -379,6 +390,8 @@ impl MapConfig {
             !by_degree || self.engine == EngineKind::Harmonic,
             "\"data\" or \"identity\" without map.engine = \"harmonic\"",
         );
+        let has_effect = self.epsilon.is_none() || regulariser != RegulariserChoice::Data;
+        checks.require("epsilon", "(set)", has_effect, "no such key with map.regulariser = \"data\"");
         let is_small = self.engine == EngineKind::Harmonic || self.nside <= POWER_NSIDE_MAX;
         checks.require(
             "regulariser",
@@ -574,6 +587,7 @@ impl MapConfig {
     /// Settings by channel that do not match an instrument of `channels` channels.
     #[must_use]
     pub fn misfits(&self, channels: usize) -> Vec<InvalidValue> {
+        let epsilon = self.epsilon();
         let (files, tables) = (self.prior_files.len(), self.power_files().len());
         let mut checks = Checks::of("map");
         let expected =
@@ -584,7 +598,7 @@ impl MapConfig {
             checks.require(format!("channels[{place}]"), channel, usize::from(channel) < channels, expected);
         }
         for (key, fits, found) in [
-            ("epsilon", self.epsilon.fits(channels), self.epsilon.values().len()),
+            ("epsilon", epsilon.fits(channels), epsilon.values().len()),
             ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),
             ("prior_files", files == 0 || files == channels, files),
             ("regulariser.file", [0, channels].contains(&tables), tables),

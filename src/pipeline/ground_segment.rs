@@ -46,7 +46,7 @@ impl Config {
     pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
         let map = &self.map;
         Ok(SolverSetup {
-            epsilon: map.epsilon.clone(),
+            epsilon: map.epsilon(),
             regularisers: regularisers(map)?,
             beams_deg: map.beams_deg.clone(),
             moon_reflection: map.moon_reflection,

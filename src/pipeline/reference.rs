@@ -87,7 +87,7 @@ mod tests {
             assert!(found.iter().any(|described| described.key == *key), "{key}");
         }
         let of = |key: &str| found.iter().find(|described| described.key == key).unwrap();
-        assert_eq!(of("map.epsilon").default.as_deref(), Some("1e-4"));
+        assert_eq!(of("map.residual_max").default.as_deref(), Some("1e-4"));
         assert!(of("sky.frequency").about.ends_with("T(nu) = T(FREQ) (nu / FREQ)^index"));
         assert_eq!(of("sky").about, "the simulated sky");
         // Not there by default.

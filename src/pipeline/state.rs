@@ -6,7 +6,7 @@ use super::config::Config;
 use super::config_source::ConfigSource;
 use super::error::PipelineError;
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
-use crate::imaging::REFINED;
+use crate::imaging::{REFINED, Regulariser, RegulariserChoice};
 use crate::imaging::{Solution, SolveWatch, Solver, SolverSetup};
 use crate::runtime::{Outlet, Stage};
 use crate::units::PerChannel;
@@ -114,7 +114,8 @@ fn toml_of(value: &str) -> Option<String> {
     Some(format!("{text:?}"))
 }
 
-/// Maps of the sums in a state, without new data: of every channel, with each of these epsilons, or those of the
+/// Maps of the sums in a state, without new data: of every channel, with each of these epsilons (`R = epsilon W_max I`, unless the
+/// configuration has another R with an epsilon), or those of the
 /// configuration if there are none. The state stays as it is. `found` gets each map as soon as it is made, with its epsilon;
 /// `watch` follows, and ends it early.
 ///
@@ -128,10 +129,14 @@ pub fn solve_state(
     found: &mut dyn FnMut(Solution),
 ) -> Result<(), PipelineError> {
     let given = epsilons.iter().map(|&epsilon| PerChannel::All(epsilon));
-    let each: Vec<_> = if epsilons.is_empty() { vec![config.map.epsilon.clone()] } else { given.collect() };
+    let each: Vec<_> = if epsilons.is_empty() { vec![config.map.epsilon()] } else { given.collect() };
     for epsilon in each {
         // Solving takes the sums: they are read again for the next.
-        let setup = SolverSetup { epsilon, ..config.solver(watch.clone())? };
+        let mut setup = SolverSetup { epsilon, ..config.solver(watch.clone())? };
+        if !epsilons.is_empty() && config.map.regulariser() == RegulariserChoice::Data {
+            // Who names an epsilon asks for the R that has one.
+            setup.regularisers = vec![Regulariser::default()];
+        }
         solve_sums(folder, config, setup, found)?;
     }
     Ok(())

@@ -25,12 +25,7 @@ fn summaries(place: &Workplace) -> Vec<String> {
         assert!(done.status.success(), "{args:?}: {}", String::from_utf8_lossy(&done.stderr));
         found.push(format!("{out}/summary.json"));
     };
-    let whole = [
-        "products.smooth_fwhm_deg=20",
-        "map.snapshot_every_s=1e7",
-        "map.trace_probes=2",
-        "map.regulariser=identity",
-    ];
+    let whole = ["products.smooth_fwhm_deg=20", "map.snapshot_every_s=1e7", "map.trace_probes=2"];
     let refined = ["map.engine=\"harmonic\"", "map.refine.passes_max=1"];
     for (name, settings) in [("whole", &whole[..]), ("refined", &refined[..])] {
         let set: Vec<&str> = settings.iter().flat_map(|set| ["--set", set]).collect();

@@ -17,7 +17,7 @@ use super::common::workplace::{SMALL, Workplace, fail, json, succeed};
 const STUDY: &str = r#"
 name = "both"
 pipeline = "pipeline.toml"
-set = ["map.trace_probes=4", "map.regulariser=identity"]
+set = ["map.trace_probes=4"]
 [[axis]]
 cases = [
     { label = "b < b_p", set = ["map.baseline_bp_max=1.0"] },
@@ -51,16 +51,7 @@ fn a_study_gives_the_maps_of_separate_runs() {
     for (number, [limit, epsilon, folder]) in CASES.into_iter().enumerate() {
         let alone = place.path(&format!("alone-{number}"));
         let sets = [format!("map.baseline_bp_max={limit}"), format!("map.epsilon={epsilon}")];
-        let more = [
-            "--set",
-            &sets[0],
-            "--set",
-            &sets[1],
-            "--set",
-            "map.trace_probes=4",
-            "--set",
-            "map.regulariser=identity",
-        ];
+        let more = ["--set", &sets[0], "--set", &sets[1], "--set", "map.trace_probes=4"];
         let run = json(&[&["run", &place.pipeline, "--out", &alone], &more[..]].concat());
         assert_eq!(cases[number]["folder"].as_str(), Some(folder));
         let folder = format!("{out}/{folder}");
@@ -231,7 +222,7 @@ fn realisations_scatter_by_the_noise_that_the_matrix_tells() {
     let study = r#"
 name = "many"
 pipeline = "pipeline.toml"
-set = ["map.trace_probes=1", "map.regulariser=identity", "products.pictures=false", "spacecraft.channels_hz=[3e6]", "map.snapshot_every_s=0"]
+set = ["map.trace_probes=1", "products.pictures=false", "spacecraft.channels_hz=[3e6]", "map.snapshot_every_s=0"]
 realisations = 60
 covariance_at_deg = [[45.0, 85.0], [315.0, -85.0]]
 "#;
