@@ -249,17 +249,7 @@ fn solve_with_power(
         power,
         samples_k,
     };
-    let diagnostics = Diagnostics {
-        epsilon: None,
-        w_max: None,
-        w_max_iterations: 0,
-        l_max: Some(l_max),
-        convergence: convergence.first().copied(),
-        noise_convergence: convergence.get(1).copied(),
-        traces: None,
-        traces_refused: None,
-        fit: None,
-    };
+    let diagnostics = Diagnostics::of_power(l_max, &convergence);
     Ok(HarmonicSolution {
         map_k: map(&whole)?,
         noise_k: map(&noise)?,

@@ -44,6 +44,21 @@ pub struct Diagnostics {
 }
 
 impl Diagnostics {
+    /// Of a map up to `l_max` with R from the data.
+    pub(in crate::imaging) fn of_power(l_max: usize, convergence: &[Convergence]) -> Self {
+        Self {
+            epsilon: None,
+            w_max: None,
+            w_max_iterations: 0,
+            l_max: Some(l_max),
+            convergence: convergence.first().copied(),
+            noise_convergence: convergence.get(1).copied(),
+            traces: None,
+            traces_refused: None,
+            fit: None,
+        }
+    }
+
     /// With the traces of pixels, whose unknowns have the area `per_area_sr` that those of the sums are without.
     pub(in crate::imaging) fn with_traces(
         mut self,

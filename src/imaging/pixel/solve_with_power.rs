@@ -92,11 +92,7 @@ pub fn solve_pixels_with_power(
     monopole[0] = 1.0;
     factors.solve(&mut monopole);
     let sample = |which: usize| {
-        let mut stream = random_stream(3, StreamKind::Probe, [degrees.len() as u64, which as u64]);
-        let mut draw: Vec<f64> = degrees.iter().map(|_| StandardNormal.sample(&mut stream)).collect();
-        factors.solve_upper(&mut draw);
-        draw.iter_mut().for_each(|value| *value *= factor);
-        let mut sample = to_pixels(&draw)?;
+        let mut sample = to_pixels(&draw(&factors, degrees.len(), factor, which))?;
         add(&mut sample, &map_k);
         Ok(sample)
     };
@@ -110,19 +106,18 @@ pub fn solve_pixels_with_power(
         power,
         samples_k: (0..samples).map(sample).collect::<Result<_, SolveError>>()?,
     };
-    let diagnostics = Diagnostics {
-        epsilon: None,
-        w_max: None,
-        w_max_iterations: 0,
-        l_max: Some(l_max),
-        convergence: None,
-        noise_convergence: None,
-        traces: None,
-        traces_refused: None,
-        fit: None,
-    };
+    let diagnostics = Diagnostics::of_power(l_max, &[]);
     let noise_k = solved(&sums.noise)?;
     Ok((PixelSolution { map_k, noise_k, beams, diagnostics }, uncertainty))
+}
+
+/// A draw from the posterior, its mean taken off.
+fn draw(factors: &Factors<'_>, count: usize, factor: f64, which: usize) -> Vec<f64> {
+    let mut stream = random_stream(3, StreamKind::Probe, [count as u64, which as u64]);
+    let mut draw: Vec<f64> =
+        (0..count).map(|_| StandardNormal.sample(&mut stream)).map(|w: f64| factor * w).collect();
+    factors.solve_upper(&mut draw);
+    draw
 }
 
 /// The harmonics at the pixels, a column each.

@@ -14,7 +14,7 @@ use crate::imaging::{NormalSums, regulariser::Diagonal};
 use crate::units::{StreamKind, random_stream};
 
 /// Change of a draw from step to step, relative, at which it is done: far below what a draw scatters by.
-const SETTLED: f64 = 1e-3;
+pub(super) const DRAW_SETTLED: f64 = 1e-3;
 /// Most steps.
 const STEPS_MAX: usize = 100;
 
@@ -77,7 +77,7 @@ impl Path {
         self.coefficients = coefficients;
         let beta = dot(&next, &next).sqrt();
         let is_closed = beta.is_nan() || beta <= 1e-12 * self.alphas[0].abs();
-        self.is_open = !is_closed && self.change > SETTLED && self.alphas.len() < STEPS_MAX;
+        self.is_open = !is_closed && self.change > DRAW_SETTLED && self.alphas.len() < STEPS_MAX;
         if self.is_open {
             self.betas.push(beta);
             self.basis.push(normalised(next));

@@ -1,7 +1,7 @@
 //! Rounds of solution and power, until neither changes.
 
 use super::blocks::{Block, Factors};
-use super::draws::{Covariance, Drawn};
+use super::draws::{Covariance, DRAW_SETTLED, Drawn};
 use super::knots::FREE;
 use super::{BlockData, PowerFit, SkyPower};
 use crate::imaging::NormalSums;
@@ -9,12 +9,12 @@ use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System, dot};
 
 /// Most rounds, and the change of ln C_l at a knot at which they end: a tenth in C_l changes a map by far less than its error.
-const ROUNDS_MAX: usize = 4;
+const ROUNDS_MAX: usize = 6;
 const SETTLED: f64 = 0.1;
-/// Rounds that draw for the traces: later ones change R by little.
-const DRAWN: usize = 2;
-/// The draw for the traces; samples have others.
-const TRACES: u64 = 1 << 32;
+/// The draws for the traces, always the same; samples have others. One is enough where the blocks are near: it tells what traces differ by.
+const TRACES: [u64; 4] = [1 << 32, (1 << 32) + 1, (1 << 32) + 2, (1 << 32) + 3];
+/// How far the logarithm of a trace may be from that of the blocks for one draw to be enough.
+const NEAR: f64 = 0.2;
 /// By how much traces may differ from those of the blocks.
 const RATIO_MAX: f64 = 30.0;
 /// Change of the logarithm of the noise's factor at which it is found.
@@ -119,13 +119,7 @@ impl Sought<'_> {
             let r = fit.regularisation();
             let factors = Factors::new(self.blocks, &r);
             let regularisation = Diagonal::ByDegree(r.clone());
-            if round <= DRAWN {
-                let task = watch.start(&format!("draw for the sky's power, round {round}"), 1e-3);
-                let covariance =
-                    Covariance { sums: self.sums, regularisation: &regularisation, factors: &factors };
-                let drawn = covariance.draw(&[TRACES], &task);
-                ratio = self.ratio(&drawn, &factors.traces(l_max));
-            }
+            ratio = self.drawn_ratio(&regularisation, &factors, &ratio, watch);
             let system = System { sums: self.sums, regularisation, precondition: &|v| factors.solve(v) };
             {
                 let task = watch.start(&format!("map and the sky's power, round {round}"), rule.residual_max);
@@ -153,6 +147,21 @@ impl Sought<'_> {
             }
         }
         Err(SolveError::NoPower)
+    }
+
+    /// The ratio of traces by draws: few where the last ones said that the blocks are near.
+    fn drawn_ratio(
+        &self,
+        regularisation: &Diagonal,
+        factors: &Factors<'_>,
+        last: &[f64],
+        watch: NamedWatch<'_>,
+    ) -> Vec<f64> {
+        let is_near = last.iter().all(|ratio| ratio.ln().abs() < NEAR);
+        let which = if is_near { &TRACES[..1] } else { &TRACES };
+        let task = watch.start("draws for the sky's power", DRAW_SETTLED);
+        let drawn = Covariance { sums: self.sums, regularisation, factors }.draw(which, &task);
+        self.ratio(&drawn, &factors.traces(self.l_max()))
     }
 
     /// Traces of the true covariance over those of the blocks, means over neighbouring degrees: a draw has few numbers of each.

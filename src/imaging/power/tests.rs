@@ -281,7 +281,7 @@ fn rounds_with_products_find_what_the_matrix_itself_gives() {
     for l in FREE..=L_MAX {
         let off = (found.power.power_k2[l] / expected.power.power_k2[l]).ln();
         println!("{l}: {off:.3} of sigma {:.3}", expected.power.sigma_ln[l]);
-        // Rounds end within a tenth; traces are of one draw of 81 numbers, so that they are known to some 15 %.
+        // Rounds end within a tenth; traces are of four draws of 81 numbers, and these blocks are off by a factor of three.
         assert!(
             off.abs() < 0.15 + 0.3 * expected.power.sigma_ln[l],
             "{l}: {off} {:?}",
