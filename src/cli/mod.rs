@@ -37,6 +37,7 @@ mod recalibrate;
 mod replay;
 mod retract;
 mod run;
+mod sample;
 #[cfg(not(feature = "serve"))]
 #[path = "not_serving.rs"]
 mod serving;
@@ -108,6 +109,7 @@ enum Command {
     Rebuild(rebuild::RebuildArgs),
     Recalibrate(recalibrate::RecalibrateArgs),
     Retract(retract::RetractArgs),
+    Sample(sample::SampleArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
     Figure(figure::FigureArgs),
@@ -238,6 +240,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Rebuild(args) => rebuild::execute(&args),
         Command::Recalibrate(args) => recalibrate::execute(&args),
         Command::Retract(args) => retract::execute(&args),
+        Command::Sample(args) => sample::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
         Command::Figure(args) => figure::execute(&args),

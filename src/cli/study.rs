@@ -151,11 +151,14 @@ fn table(summary: &StudySummary) -> String {
             let [n, s] = [traces.map(|t| t.sigma_n_k2.value), traces.map(|t| t.sigma_s.value)]
                 .map(|value| value.map_or_else(|| "-".to_owned(), |value| format!("{value:.3e}")));
             lines.push(format!(
-                "{:<widest$}  {:>10.3}  {:>12}  {:>9.1e}  {:>10.3e}  {n:>10}  {s:>10}",
+                "{:<widest$}  {:>10.3}  {:>12}  {:>9}  {:>10.3e}  {n:>10}  {s:>10}",
                 case.figures.label,
                 channel.frequency_hz / 1e6,
                 channel.visibilities,
-                channel.diagnostics.epsilon,
+                channel
+                    .diagnostics
+                    .epsilon
+                    .map_or_else(|| "-".to_owned(), |epsilon| format!("{epsilon:.1e}")),
                 channel.noise_rms_k
             ));
         }

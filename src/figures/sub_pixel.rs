@@ -167,7 +167,7 @@ pub(super) fn make(plan: &Plan, folder: &Path) -> Result<FigureParts, FigureErro
 }
 
 fn epsilon(plan: &Plan) -> f64 {
-    plan.config.map.epsilon.get(0).unwrap_or(1e-4)
+    plan.config.map.epsilon().get(0).unwrap_or(1e-4)
 }
 
 /// Both methods at one resolution.

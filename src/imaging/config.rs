@@ -9,6 +9,7 @@ use crate::frames::Instrument;
 use crate::imaging::antennas::AntennasConfig;
 use crate::imaging::anywhere::RowBelief;
 use crate::imaging::circle::L_MAX;
+use crate::imaging::pixel::POWER_NSIDE_MAX;
 use crate::imaging::{AccumulationError, PixelEngine};
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
@@ -26,6 +27,9 @@ pub const REMADE_NSIDE_MAX: usize = 256;
 
 /// Greatest nside of maps from the harmonic engine: pixels ten times finer than its greatest degree.
 pub const HARMONIC_ENGINE_NSIDE_MAX: usize = 1024;
+
+/// epsilon of an R that has one, if it is not set.
+const EPSILON: f64 = 1e-4;
 
 /// Default number of degrees of a harmonic map per nside: as many as pixels represent to 1e-6.
 const DEGREES_PER_NSIDE: f64 = 2.5;
@@ -60,6 +64,21 @@ pub enum MatrixKind {
     Remade,
 }
 
+/// What R is.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[non_exhaustive]
+pub enum RegulariserChoice {
+    /// `R_l = 1 / C_l` with the sky's angular power C_l as the data have it.
+    Data,
+    /// `R = epsilon W_max I`, the paper's.
+    Identity,
+    /// `R_l = epsilon W_max (l + 1)^exponent`.
+    Degree(f64),
+    /// `R_l = epsilon / C_l` of tables of l and C_l (K^2), one a channel.
+    File(Vec<PathBuf>),
+}
+
 keys! {
     /// Configuration of map making.
     pub struct MapConfig {
@@ -86,16 +105,15 @@ keys! {
         expert l_max: usize = 0;
         /// Longest baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
         everyday baseline_bp_max: f64 = 2.0;
-        /// Regularisation epsilon, R = epsilon W_max I; one value, or one a channel.
-        everyday epsilon: PerChannel<f64> = PerChannel::All(1e-4);
-        /// Growth of R with the degree, R_l = epsilon W_max (l + 1)^exponent; 0 for the identity.
-        #[only_with(r#"map.engine = "harmonic""#)]
-        #[serde(skip_serializing_if = "is_zero")]
-        expert regularisation_exponent: f64 = 0.0;
-        /// Tables of l and C_l (K^2), one a channel: R_l = epsilon / C_l.
-        #[only_with(r#"map.engine = "harmonic""#)]
-        #[serde(skip_serializing_if = "Vec::is_empty")]
-        expert regularisation_files: Vec<PathBuf> = Vec::new();
+        /// Regularisation epsilon; one value, or one a channel. Alone it asks for R = epsilon W_max I, the paper's; "degree" and
+        /// "file" take 1e-4 without it.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        everyday epsilon: Option<PerChannel<f64>> = None;
+        /// Regulariser R: "data", 1 / C_l of the sky as the data have it, the default without epsilon, map.refine and matrix =
+        /// "remade"; "identity", epsilon W_max I, the paper's; with the engine "harmonic" also { degree = 2.0 }, epsilon W_max
+        /// (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l of tables of l and C_l (K^2), one a channel.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        everyday regulariser: Option<RegulariserChoice> = None;
         /// Ecliptic longitude and latitude of points at which the effective beam is solved for, such as `[[0.0, 90.0]]`,
         /// degrees.
         #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -176,11 +194,6 @@ impl RefineConfig {
 }
 
 /// So that what is not set changes no hash of a configuration.
-fn is_zero(value: &f64) -> bool {
-    *value == 0.0
-}
-
-/// Likewise.
 #[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
 fn is_off(value: &bool) -> bool {
     !*value
@@ -192,11 +205,28 @@ fn is_usual(matrix: &MatrixKind) -> bool {
 }
 
 impl MapConfig {
-    /// Whether R is `epsilon W_max` times the identity.
+    /// What R is: from the data, unless something else is set. An epsilon alone asks for the identity, and so do visibilities that are held
+    /// one by one.
     #[must_use]
-    #[doc(hidden)]
-    pub fn is_plain(&self) -> bool {
-        is_zero(&self.regularisation_exponent) && self.regularisation_files.is_empty()
+    pub fn regulariser(&self) -> RegulariserChoice {
+        let is_identity = self.holds_visibilities() || self.epsilon.is_some();
+        let usual = if is_identity { RegulariserChoice::Identity } else { RegulariserChoice::Data };
+        self.regulariser.clone().unwrap_or(usual)
+    }
+
+    /// epsilon of an R that has one.
+    #[must_use]
+    pub fn epsilon(&self) -> PerChannel<f64> {
+        self.epsilon.clone().unwrap_or(PerChannel::All(EPSILON))
+    }
+
+    /// Tables of the sky's angular power that are to be read, one a channel.
+    #[must_use]
+    pub fn power_files(&self) -> &[PathBuf] {
+        match &self.regulariser {
+            Some(RegulariserChoice::File(files)) => files,
+            _ => &[],
+        }
     }
 
     /// Whether rows of B are made again for each product over pixels.
@@ -232,7 +262,7 @@ impl MapConfig {
         let longest = self.baseline_bp_max;
         let expected = "above 0 and at most 1e12, in units of b_p";
         checks.number("baseline_bp_max", longest, longest > 0.0 && longest <= 1e12, expected);
-        checks.numbers("epsilon", self.epsilon.values(), |e| e > 0.0 && e <= 1.0, "above 0 and at most 1");
+        checks.numbers("epsilon", self.epsilon().values(), |e| e > 0.0 && e <= 1.0, "above 0 and at most 1");
         let is_temperature = |k| (0.0..=TEMPERATURE_K_MAX).contains(&k);
         checks.numbers("prior_k", self.prior_k.values(), is_temperature, "0 to 1e16 K");
         let fwhm = self.prior_fwhm_deg;
@@ -298,14 +328,41 @@ impl MapConfig {
 
     /// Checks R, and that nothing is asked for that holds for multiples of the identity alone.
     fn check_regularisation(&self, checks: &mut Checks) {
-        let (exponent, files) = (self.regularisation_exponent, self.regularisation_files.len());
-        checks.number("regularisation_exponent", exponent, (-10.0..=10.0).contains(&exponent), "-10 to 10");
-        let one = files == 0 || exponent == 0.0;
+        let regulariser = self.regulariser();
+        if let RegulariserChoice::Degree(exponent) = regulariser {
+            checks.number("regulariser.degree", exponent, (-10.0..=10.0).contains(&exponent), "-10 to 10");
+        }
+        if let RegulariserChoice::File(files) = &regulariser {
+            checks.require("regulariser.file", "[]", !files.is_empty(), "at least one table");
+        }
+        let is_identity = regulariser == RegulariserChoice::Identity;
+        let by_degree = !is_identity && regulariser != RegulariserChoice::Data;
+        let found = match &regulariser {
+            RegulariserChoice::Data => "data",
+            RegulariserChoice::Identity => "identity",
+            RegulariserChoice::Degree(_) => "degree",
+            RegulariserChoice::File(_) => "file",
+        };
         checks.require(
-            "regularisation_files",
-            format!("({files} files)"),
-            one,
-            "none with map.regularisation_exponent",
+            "regulariser",
+            found,
+            is_identity || !self.holds_visibilities(),
+            "\"identity\", or no such key, with map.refine or map.matrix = \"remade\"",
+        );
+        checks.require(
+            "regulariser",
+            found,
+            !by_degree || self.engine == EngineKind::Harmonic,
+            "\"data\" or \"identity\" without map.engine = \"harmonic\"",
+        );
+        let has_effect = self.epsilon.is_none() || regulariser != RegulariserChoice::Data;
+        checks.require("epsilon", "(set)", has_effect, "no such key with map.regulariser = \"data\"");
+        let is_small = self.engine == EngineKind::Harmonic || self.nside <= POWER_NSIDE_MAX;
+        checks.require(
+            "regulariser",
+            found,
+            regulariser != RegulariserChoice::Data || is_small,
+            "\"identity\" with the pixel engine beyond nside 32; or map.engine = \"harmonic\"",
         );
         let beams = self.beams_deg.len();
         let few = beams <= BEAMS_MAX && (beams == 0 || !self.holds_visibilities());
@@ -320,12 +377,9 @@ impl MapConfig {
             let found = format!("[{longitude_deg}, {latitude_deg}]");
             checks.require("beams_deg", found, good, "ecliptic longitude and latitude, degrees");
         }
-        if !self.is_plain() {
-            let expected = "0 with this R: traces are those of R = epsilon W_max I";
+        if !is_identity {
+            let expected = "0 unless map.regulariser = \"identity\": traces are those of R = epsilon W_max I";
             checks.require("trace_probes", self.trace_probes, self.trace_probes == 0, expected);
-            let refined = self.refine.is_on();
-            let expected = "no map.regularisation_exponent and no map.regularisation_files with it";
-            checks.require("refine.passes_max", self.refine.passes_max, !refined, expected);
         }
     }
 
@@ -353,6 +407,7 @@ impl MapConfig {
             channels: mapped,
             channels_max: _,
             epsilon: _,
+            regulariser: _,
             regularisation_exponent: _,
             regularisation_files: _,
             beams_deg: _,
@@ -468,7 +523,8 @@ impl MapConfig {
     #[must_use]
     #[doc(hidden)]
     pub fn misfits(&self, channels: usize) -> Vec<InvalidValue> {
-        let (files, tables) = (self.prior_files.len(), self.regularisation_files.len());
+        let epsilon = self.epsilon();
+        let (files, tables) = (self.prior_files.len(), self.power_files().len());
         let mut checks = Checks::of("map");
         let expected =
             format!("at least the {channels} channels of the instrument, each of which needs memory");
@@ -478,10 +534,10 @@ impl MapConfig {
             checks.require(format!("channels[{place}]"), channel, usize::from(channel) < channels, expected);
         }
         for (key, fits, found) in [
-            ("epsilon", self.epsilon.fits(channels), self.epsilon.values().len()),
+            ("epsilon", epsilon.fits(channels), epsilon.values().len()),
             ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),
             ("prior_files", files == 0 || files == channels, files),
-            ("regularisation_files", [0, channels].contains(&tables), tables),
+            ("regulariser.file", [0, channels].contains(&tables), tables),
         ] {
             let expected = format!("one value, or one for each of the {channels} channels");
             checks.require(key, format!("({found} values)"), fits, expected);

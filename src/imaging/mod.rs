@@ -1,6 +1,6 @@
 //! Maps from visibilities: normal equations, summed as data arrive, and their regularised solution
-//! `T = (BtN^-1B + R)^-1 BtN^-1 (V - B T_p) + T_p` with `R = epsilon W_max I`, W_max the largest eigenvalue of `BtN^-1B`
-//! (the paper, Sect. 4), or another [`Regulariser`].
+//! `T = (BtN^-1B + R)^-1 BtN^-1 (V - B T_p) + T_p` with `R_l = 1 / C_l`, C_l the sky's angular power as the data have it ([`SkyPower`]);
+//! or `R = epsilon W_max I`, W_max the largest eigenvalue of `BtN^-1B` (the paper, Sect. 4), or another [`Regulariser`].
 //!
 //! A folder holds one map method, its sums and their solution: `pixel` forms the matrix itself (or makes its rows again for each product);
 //! [`circle`] holds what makes the matrix act on spherical harmonics, for satellites on one circular orbit; [`anywhere`] refines
@@ -18,6 +18,7 @@ pub(crate) mod cost;
 mod error;
 mod exact;
 mod pixel;
+mod power;
 pub(crate) mod rates;
 mod regulariser;
 mod solver;
@@ -30,7 +31,7 @@ pub use circle::{
 };
 pub use config::MapConfig;
 #[doc(hidden)]
-pub use config::{ChannelGroup, EngineKind, MatrixKind, REFINED, RefineConfig};
+pub use config::{ChannelGroup, EngineKind, MatrixKind, REFINED, RefineConfig, RegulariserChoice};
 pub use error::AccumulationError;
 pub use exact::ExactEngine;
 #[doc(hidden)]
@@ -38,9 +39,11 @@ pub use exact::automatic_weight_max;
 #[doc(hidden)]
 pub use pixel::{
     Cholesky, ColumnBlock, NotPositive, PixelExtras, PointBeam, RemadeSums, RemadeVisibilities,
-    SymmetricTiles, TILE, solve_pixels_with, solve_remade,
+    SymmetricTiles, TILE, solve_pixels_with, solve_pixels_with_power, solve_remade,
 };
 pub use pixel::{Diagnostics, PixelEngine, PixelSetup, PixelSolution, PixelSums, solve_pixels};
+#[doc(hidden)]
+pub use power::{SkyPower, Uncertainty};
 #[doc(hidden)]
 pub use regulariser::Regulariser;
 pub use solver::SolveError;

@@ -1,4 +1,5 @@
-//! R, diagonal over degrees: `epsilon W_max` times the identity, or growing with l; or what a known angular power asks for.
+//! R, diagonal over degrees: one over the sky's angular power as the data have it, `epsilon W_max` times the identity, or growing with l; or
+//! what a known angular power asks for.
 
 use std::path::Path;
 
@@ -12,6 +13,8 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 /// How R depends on the degree.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Regulariser {
+    /// `R_l = 1 / C_l` with the C_l that the data make most likely ([`crate::imaging::SkyPower`]).
+    Data,
     /// `R_l = epsilon W_max (l + 1)^exponent`; the identity with an exponent of 0.
     Power(f64),
     /// `R_l = epsilon / C_l` for a sky (without the prior) of the angular power C_l, K^2, from l = 0: with epsilon = 1 the map that is
@@ -78,6 +81,8 @@ impl Regulariser {
     ) -> Result<Diagonal, SolveError> {
         let level = epsilon * w_max;
         Ok(match self {
+            // Found while the map is solved for.
+            Self::Data => return Err(SolveError::NoPower),
             Self::Power(0.0) => Diagonal::Uniform(level),
             Self::Power(exponent) => {
                 Diagonal::ByDegree((0..=l_max).map(|l| level * ((l + 1) as f64).powf(*exponent)).collect())

@@ -1,6 +1,6 @@
 //! The effective beam of a map, from what it keeps of each degree, and noise in janskys a beam.
 
-use std::f64::consts::{FRAC_PI_2, LN_2, TAU};
+use std::f64::consts::{FRAC_PI_2, TAU};
 
 use serde::Serialize;
 
@@ -22,7 +22,8 @@ pub struct EffectiveBeam {
     /// FWHM of the effective beam `sum_l (2 l + 1) w_l P_l(cos theta) / 4 pi`, degrees; absent without a peak. A map that keeps all
     /// degrees up to l_max has 4.430 / (l_max + 1) rad.
     pub fwhm_deg: Option<f64>,
-    /// Solid angle of a Gaussian beam of that width, `2 pi sigma^2`, sr.
+    /// Solid angle of that beam, `4 pi / sum (2 l + 1) w_l` with w_l relative to that of the monopole, sr: what a source's peak in K is
+    /// multiplied by for its flux density.
     pub area_sr: Option<f64>,
     /// RMS of the noise-only map, K, as compared.
     pub noise_rms_k: f64,
@@ -39,7 +40,7 @@ impl EffectiveBeam {
         let w: Vec<f64> =
             share.enumerate().map(|(l, w)| w * smoothing.get(l).copied().unwrap_or(1.0)).collect();
         let fwhm_rad = fwhm_rad(&w);
-        let area_sr = fwhm_rad.map(|fwhm_rad| TAU * fwhm_rad.powi(2) / (8.0 * LN_2));
+        let area_sr = area_sr(&w);
         let noise_rms_k = (noise.iter().map(|x| x * x).sum::<f64>() / noise.len().max(1) as f64).sqrt();
         Self {
             w,
@@ -55,6 +56,15 @@ impl EffectiveBeam {
 fn flux_jy(temperature_k: f64, frequency_hz: f64, area_sr: f64) -> f64 {
     let per_m = frequency_hz / SPEED_OF_LIGHT_M_S;
     2.0 * BOLTZMANN_J_K * temperature_k * per_m * per_m * area_sr / JANSKY
+}
+
+/// Solid angle of the beam `sum_l (2 l + 1) w_l P_l / 4 pi` over its value at 0, sr; degrees without a value count nothing. `None`
+/// without a peak, or without a monopole.
+fn area_sr(w: &[f64]) -> Option<f64> {
+    let known = |w: &f64| if w.is_finite() { *w } else { 0.0 };
+    let peak: f64 = (0..).zip(w).map(|(l, w)| f64::from(2 * l + 1) * known(w)).sum();
+    let area_sr = 2.0 * TAU * known(w.first()?) / peak;
+    (peak > 0.0 && area_sr > 0.0).then_some(area_sr)
 }
 
 /// Full width at half maximum of `sum_l (2 l + 1) w_l P_l(cos theta)`, rad; degrees without a value count nothing. `None` if it has no
@@ -99,6 +109,21 @@ mod tests {
         // By hand: 1e4 K at 10 MHz are 3.0724e4 Jy/sr, and a beam of 1 degree FWHM 1.1331 (pi/180)^2 sr.
         let area_sr = 1.1331 * 1_f64.to_radians().powi(2);
         assert!((flux_jy(1e4, 1e7, area_sr) / 10.605 - 1.0).abs() < 1e-4);
+    }
+
+    #[test]
+    fn the_area_is_that_of_the_beam_itself() {
+        // All degrees up to l_max alike: sum (2 l + 1) = (l_max + 1)^2, so 4 pi / 161^2 = 4.848e-4 sr; a Gaussian of its width has 8.58e-4.
+        let sharp = area_sr(&[0.7; 161]).unwrap();
+        assert!((sharp / 4.848e-4 - 1.0).abs() < 1e-4, "{sharp}");
+        // A Gaussian that ends far beyond its width: 2 pi sigma^2, up to sigma^2.
+        let fwhm_rad = 2.0_f64.to_radians();
+        let smooth = area_sr(&gaussian_beam(fwhm_rad, 600)).unwrap();
+        let expected = TAU * fwhm_rad.powi(2) / (8.0 * std::f64::consts::LN_2);
+        assert!((smooth / expected - 1.0).abs() < fwhm_rad.powi(2), "{smooth} {expected}");
+        for hopeless in [vec![], vec![f64::NAN; 10], vec![0.0; 10], vec![-1.0; 10]] {
+            assert_eq!(area_sr(&hopeless), None, "{hopeless:?}");
+        }
     }
 
     #[test]

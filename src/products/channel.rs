@@ -236,6 +236,8 @@ impl ChannelFolder {
             span_s: solution.span_s,
             visibilities: solution.visibilities,
             mean_k: solution.map_k.iter().sum::<f64>() / pixels,
+            mean_sigma_k: solution.uncertainty.as_ref().map(|errors| errors.mean_sigma_k),
+            sky_power: solution.uncertainty.as_ref().map(|errors| errors.power.clone()),
             noise_rms_k: (solution.noise_k.iter().map(|x| x * x).sum::<f64>() / pixels).sqrt(),
             diagnostics: solution.diagnostics,
             refinement: solution.refinement.clone(),
@@ -296,6 +298,13 @@ impl ChannelFolder {
         self.write_map(&format!("noise{ending}.fits"), noise, processing, origin)?;
         if let Some(input) = self.input(processing).map(|input| input.map.clone()) {
             self.write_map(&format!("input{ending}.fits"), &input, processing, origin)?;
+        }
+        if let Some(errors) = &origin.solution.uncertainty {
+            let sigma = SkyMap::new(Frame::Ecliptic, errors.sigma_k.clone())?;
+            self.write_map("sigma.fits", &sigma, None, origin)?;
+            let path = self.file("sky-power.csv");
+            write_atomically(&path, errors.power.csv().as_bytes())
+                .map_err(|source| ProductsError::Write { path, source })?;
         }
         if let Some(refinement) = &origin.solution.refinement {
             let path = self.file("residuals.csv");

@@ -140,7 +140,7 @@ fn point(channel: &ChannelFigures) -> Option<EpsilonPoint> {
     let score_error =
         score.map(|score| n * residual_error / (left * left) + 2.0 * score.abs() * measured_error / left);
     Some(EpsilonPoint {
-        epsilon: channel.diagnostics.epsilon,
+        epsilon: channel.diagnostics.epsilon?,
         residual: residual.value,
         residual_error,
         solution_k2: fit.solution_k2,

@@ -6,7 +6,7 @@ use super::config::PostProcessing;
 use crate::frames::{AntennaResponse, Instrument};
 use crate::imaging::Solution;
 use crate::imaging::anywhere::Refinement;
-use crate::imaging::{EngineKind, MapConfig};
+use crate::imaging::{EngineKind, MapConfig, RegulariserChoice};
 use crate::sky::fits::Card;
 use crate::units::calendar::tai_text;
 
@@ -44,12 +44,11 @@ impl Provenance {
             Card::text("DATE-BEG", &tai_text(epoch_tai_s + solution.span_s[0]), "first data"),
             Card::text("DATE-END", &tai_text(epoch_tai_s + solution.span_s[1]), "last data"),
             Card::real("EPOCHTAI", *epoch_tai_s, "[s] mission epoch, TAI since 1958-01-01"),
-            Card::real("EPSILON", solution.diagnostics.epsilon, "regularisation, of W_max"),
-            Card::real("WMAX", solution.diagnostics.w_max, "[K-2] greatest eigenvalue of BtN^-1B"),
             Card::text("SEED", &format!("{seed:016x}"), "seed of the space segment, hexadecimal"),
             Card::text("HASHSPAC", &format!("{configuration_hash:016x}"), "configuration, space segment"),
             Card::text("HASHGRND", &format!("{:016x}", self.ground_hash), "configuration, ground segment"),
         ];
+        cards.extend(self.regulariser_cards(solution));
         cards.extend(self.method_cards(solution, frequency_hz));
         if let Some(PostProcessing { split, fwhm_deg }) = processing {
             let split = i64::try_from(split).unwrap_or(i64::MAX);
@@ -89,17 +88,34 @@ impl Provenance {
         cards.push(Card::real("BASEMAX", limit_m, "[m] longest baseline used"));
         cards.push(Card::real("BPMAX", limit, "the same in units of b_p = wavelength / pixel"));
         let channel = usize::from(solution.channel.0);
-        if map.regularisation_exponent != 0.0 {
-            cards.push(Card::real(
-                "REXPON",
-                map.regularisation_exponent,
-                "R_l = EPSILON WMAX (l + 1)^REXPON",
-            ));
+        cards.push(Card::text("PRIOR", &self.prior(channel), "prior map"));
+        cards
+    }
+
+    /// What R is.
+    fn regulariser_cards(&self, solution: &Solution) -> Vec<Card> {
+        let mut cards = Vec::new();
+        if let Some(epsilon) = solution.diagnostics.epsilon {
+            cards.push(Card::real("EPSILON", epsilon, "regularisation, of W_max"));
         }
-        if let Some(path) = map.regularisation_files.get(channel) {
-            cards.push(Card::text("RPOWER", &file_name(path), "R_l = EPSILON / C_l of this table"));
+        if let Some(w_max) = solution.diagnostics.w_max {
+            cards.push(Card::real("WMAX", w_max, "[K-2] greatest eigenvalue of BtN^-1B"));
         }
-        cards.push(Card::text("PRIOR", &self.prior(usize::from(solution.channel.0)), "prior map"));
+        let channel = usize::from(solution.channel.0);
+        match self.map.regulariser() {
+            RegulariserChoice::Data => {
+                cards.push(Card::text("REGULAR", "data", "R_l = 1 / C_l of the sky from the data"));
+            }
+            RegulariserChoice::Degree(exponent) => {
+                cards.push(Card::real("REXPON", exponent, "R_l = EPSILON WMAX (l + 1)^REXPON"));
+            }
+            RegulariserChoice::File(files) => {
+                if let Some(path) = files.get(channel) {
+                    cards.push(Card::text("RPOWER", &file_name(path), "R_l = EPSILON / C_l of this table"));
+                }
+            }
+            _ => {}
+        }
         cards
     }
 
@@ -134,14 +150,15 @@ impl Provenance {
     pub(super) fn caption(&self, solution: &Solution) -> String {
         let map = &self.map;
         let prior = self.prior(usize::from(solution.channel.0));
-        let shape = match (map.regularisation_exponent, map.regularisation_files.is_empty()) {
-            (_, false) => " / C_{l}".to_owned(),
-            (0.0, true) => String::new(),
-            (exponent, true) => format!(" (l + 1)^{exponent}"),
+        let epsilon = solution.diagnostics.epsilon.unwrap_or(1.0);
+        let regulariser = match map.regulariser() {
+            RegulariserChoice::Data => "R from the data".to_owned(),
+            RegulariserChoice::Degree(exponent) => format!("epsilon {epsilon:e} (l + 1)^{exponent}"),
+            RegulariserChoice::File(_) => format!("epsilon {epsilon:e} / C_{{l}}"),
+            _ => format!("epsilon {epsilon:e}"),
         };
         format!(
-            "epsilon {:e}{shape}, b < {} b_p, prior: {prior}, thermal noise {}",
-            solution.diagnostics.epsilon,
+            "{regulariser}, b < {} b_p, prior: {prior}, thermal noise {}",
             map.baseline_bp_max,
             noise(&solution.instrument)
         )

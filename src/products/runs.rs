@@ -87,9 +87,11 @@ impl PowerKept {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DiagnosticFigures {
     /// epsilon of R = epsilon W_max I.
-    pub epsilon: f64,
-    /// W_max, K^-2.
-    pub w_max: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub epsilon: Option<f64>,
+    /// W_max, K^-2; both absent where R is from the data.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub w_max: Option<f64>,
     /// Traces, if they were asked for.
     pub traces: Option<TraceFigures>,
     /// What the map leaves of the data, likewise.
@@ -237,7 +239,7 @@ pub fn crossings(groups: &[Vec<&RunFigures>]) -> Vec<Crossing> {
                     let channel = run.channels.get(k)?;
                     let traces = channel.diagnostics.traces.as_ref()?;
                     let (n, s) = (traces.sigma_n_k2.value, traces.sigma_s.value);
-                    Some([channel.diagnostics.epsilon, n, s, channel.input_mean_k()?])
+                    Some([channel.diagnostics.epsilon?, n, s, channel.input_mean_k()?])
                 })
                 .collect();
             points.sort_by(|a, b| a[0].total_cmp(&b[0]));
@@ -297,8 +299,8 @@ pub fn runs_csv(runs: &[&RunFigures]) -> String {
             channel.visibilities.to_string(),
         ];
         let numbers = [
-            Some(*epsilon),
-            Some(*w_max),
+            *epsilon,
+            *w_max,
             Some(channel.mean_k),
             channel.input_mean_k(),
             Some(channel.noise_rms_k),
@@ -435,7 +437,7 @@ fn trace_plot(channels: &[(String, &ChannelFigures)]) -> Option<Plot> {
             .filter_map(|(_, channel)| {
                 let traces = channel.diagnostics.traces.as_ref()?;
                 let square = channel.input_mean_k()?.powi(2);
-                Some((channel.diagnostics.epsilon, traces.sigma_n_k2.value, square * traces.sigma_s.value))
+                Some((channel.diagnostics.epsilon?, traces.sigma_n_k2.value, square * traces.sigma_s.value))
             })
             .collect();
         points.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -480,7 +482,12 @@ mod tests {
             mean_k: 9.5,
             noise_rms_k: 0.5,
             thermal_noise: true,
-            diagnostics: DiagnosticFigures { epsilon, w_max: 2.0, traces: Some(traces), fit: None },
+            diagnostics: DiagnosticFigures {
+                epsilon: Some(epsilon),
+                w_max: Some(2.0),
+                traces: Some(traces),
+                fit: None,
+            },
             rho: Some(vec![Some(1.0), None]),
             rho_noise_subtracted: None,
             snr: None,

@@ -9,7 +9,7 @@ use super::config::PostProcessing;
 use super::latitudes::LatitudeError;
 use super::point_beams::{BeamWidths, PointBeamSummary};
 use crate::imaging::anywhere::Refinement;
-use crate::imaging::{Convergence, Diagnostics};
+use crate::imaging::{Convergence, Diagnostics, SkyPower};
 
 /// One snapshot.
 #[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
@@ -58,6 +58,12 @@ pub struct ChannelSummary {
     pub visibilities: u64,
     /// Mean of the final map, K.
     pub mean_k: f64,
+    /// Standard deviation of the mean, K, by the posterior; absent unless R is from the data.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mean_sigma_k: Option<f64>,
+    /// Angular power of the sky that R is the inverse of, with its uncertainty; absent unless R is from the data.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sky_power: Option<SkyPower>,
     /// RMS of the noise-only companion map, K.
     pub noise_rms_k: f64,
     /// Regularisation and solver diagnostics of the final solution.
@@ -108,21 +114,51 @@ impl ChannelSummary {
     }
 }
 
+/// A temperature with its standard deviation, if that is known.
+fn with_error(value_k: f64, sigma_k: Option<f64>) -> String {
+    match sigma_k {
+        Some(sigma_k) => format!("({value_k:.4e} +- {sigma_k:.1e}) K"),
+        None => format!("{value_k:.3e} K"),
+    }
+}
+
+impl ChannelSummary {
+    /// What R the map was made with, in words.
+    fn told_regulariser(&self) -> String {
+        let Some(power) = &self.sky_power else {
+            return match self.diagnostics.epsilon {
+                Some(epsilon) => {
+                    format!("regularised with epsilon {epsilon:e}: errors of pixels are not known")
+                }
+                None => String::new(),
+            };
+        };
+        let decided: f64 = power.decided.iter().sum();
+        let all = power.decided.len().pow(2);
+        format!(
+            "as smooth as the data say (map.regulariser = \"data\"): they decide {decided:.0} of {all} harmonics, and \
+             scatter {:.2} times their noise; errors of pixels are in sigma.fits",
+            power.noise_factor
+        )
+    }
+}
+
 impl fmt::Display for ChannelSummary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "{:>8.3} MHz  nside {}  {} visibilities  mean {:.3e} K  noise {:.2e} K rms",
+            "{:>8.3} MHz  nside {}  {} visibilities  mean {}  noise {:.2e} K rms",
             self.frequency_hz / 1e6,
             self.nside,
             self.visibilities,
-            self.mean_k,
+            with_error(self.mean_k, self.mean_sigma_k),
             self.noise_rms_k
         )?;
+        write!(f, "\n             {}", self.told_regulariser())?;
         if self.is_noise() {
             write!(
                 f,
-                "\n             mostly noise, {:.1} times the mean: more data, a larger map.epsilon or a smaller map.nside lowers it",
+                "\n             mostly noise, {:.1} times the mean: more data or a smaller map.nside lowers it",
                 self.noise_rms_k / self.mean_k.abs()
             )?;
         }

@@ -73,8 +73,8 @@ fn said(args: &[&str]) -> String {
 
 #[test]
 fn an_installed_program_explains_itself() {
-    let epsilon = said(&["explain", "map.epsilon"]);
-    assert!(epsilon.starts_with("map.epsilon = 1e-4\n") && epsilon.contains("regularisation"), "{epsilon}");
+    let epsilon = said(&["explain", "map.residual_max"]);
+    assert!(epsilon.starts_with("map.residual_max = 1e-4\n") && epsilon.contains("residual"), "{epsilon}");
     // A section with its keys; a part of a name; all sections.
     assert!(said(&["explain", "map.refine"]).contains("map.refine.passes_max = 0"));
     assert!(said(&["explain", "gains_file"]).contains("calibration.gains_file (none)"));

@@ -76,7 +76,11 @@ fn what_takes_time_and_memory_by_the_million_is_in_the_estimate() {
     };
     let number = |cost: &serde_json::Value, key: &str| cost[key].as_f64().unwrap();
     let with_probes = |probes: &str| {
-        let cost = check(&["map.engine=harmonic", &format!("map.trace_probes={probes}")]);
+        let cost = check(&[
+            "map.engine=harmonic",
+            "map.regulariser=identity",
+            &format!("map.trace_probes={probes}"),
+        ]);
         number(&cost, "predicted_s")
     };
     let [none, one, two] = ["0", "1000000", "2000000"].map(with_probes);

@@ -146,10 +146,11 @@ fn fit_and_regulariser_of_harmonics_are_those_of_dense_rows() {
     let blocks = noisy(3e6, 300.0, 900, 2e4);
     let sums = harmonic_sums(&blocks, L_MAX, 300.0);
     let rule = StoppingRule { residual_max: 1e-7, iterations_max: 500 };
-    let request = |epsilon: f64, probes: usize| HarmonicRequest { epsilon, nside: 8, rule, probes };
+    let request =
+        |epsilon: f64, probes: usize| HarmonicRequest { epsilon, nside: 8, rule, samples: 0, probes };
     let watch = SolveWatch::default();
     let plain = solve_harmonics(&sums, request(1e-3, 0), None, None, watch.named("test")).unwrap();
-    let level = 1e-3 * plain.diagnostics.w_max / pixel_area_sr(8);
+    let level = 1e-3 * plain.diagnostics.w_max.unwrap() / pixel_area_sr(8);
     let r_of_degree: Vec<f64> = (0..=L_MAX).map(|l| level * ((l + 1) as f64).powf(2.5)).collect();
     let power_k2: Vec<f64> = r_of_degree.iter().map(|r| 1e-3 / r).collect();
     let mut asked = asked_of(&blocks);
@@ -195,7 +196,7 @@ fn beams_of_points_are_columns_of_the_effective_beam() {
     // Harmonics: conjugate gradients against the Krylov space of a point.
     let sums = harmonic_sums(&blocks, 12, 1_500.0);
     let rule = StoppingRule { residual_max: 1e-7, iterations_max: 500 };
-    let request = HarmonicRequest { epsilon, nside: 8, rule, probes: 0 };
+    let request = HarmonicRequest { epsilon, nside: 8, rule, samples: 0, probes: 0 };
     let w_max = largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| true).value;
     let with = (&Regulariser::default(), w_max);
     let found = harmonic_beams(&sums, request, with, &[300], watch.named("test")).unwrap();

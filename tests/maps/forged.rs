@@ -154,6 +154,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             belief: RowBelief::default(),
             passes: None,
             trace_probes: 0,
+            samples: 0,
             watch: SolveWatch::default(),
         };
         let mut maps = Outlet::collect();

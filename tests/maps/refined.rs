@@ -120,7 +120,7 @@ fn sums(l_max: usize, blocks: &[PlacedVisibilities]) -> RefinedSums {
 
 fn request(nside: usize) -> HarmonicRequest {
     let rule = StoppingRule { residual_max: 1e-6, iterations_max: 300 };
-    HarmonicRequest { epsilon: EPSILON, nside, rule, probes: 0 }
+    HarmonicRequest { epsilon: EPSILON, nside, rule, samples: 0, probes: 0 }
 }
 
 /// From the beginning, and telling nobody.
@@ -172,7 +172,7 @@ fn refined_maps_are_the_dense_solution_of_other_code() {
         let altitude_m = 20e3;
         let at = geometry(altitude_m, cross, 130.0, 9, &BASELINES_M);
         let nothing = vec![Complex64::ZERO; at.len()];
-        let w_max = refined(&sums(L_MAX, &blocks(&at, &nothing, 50)), NSIDE, 1).0.diagnostics.w_max;
+        let w_max = refined(&sums(L_MAX, &blocks(&at, &nothing, 50)), NSIDE, 1).0.diagnostics.w_max.unwrap();
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         write(&path("positions"), at.iter().flat_map(|at| [at.r_i_m, at.r_j_m]).flatten());

@@ -204,8 +204,8 @@ pub fn solve_refined(
         add(&mut whole, &prior);
     }
     let diagnostics = Diagnostics {
-        epsilon: request.epsilon,
-        w_max: w_max * area_sr,
+        epsilon: Some(request.epsilon),
+        w_max: Some(w_max * area_sr),
         w_max_iterations: iterations,
         l_max: Some(l_max),
         convergence: Some(map.convergence()),
@@ -227,6 +227,7 @@ pub fn solve_refined(
         noise_k: synthesised(&noise.x)?,
         unknowns: [map.x, noise.x],
         diagnostics,
+        uncertainty: None,
     };
     Ok((solution, refinement))
 }

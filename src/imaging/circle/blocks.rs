@@ -1,5 +1,7 @@
 //! The blocks of BtN^-1B that keep the order m, for preconditioning.
 
+use std::borrow::Cow;
+
 use faer::linalg::solvers::{Llt, Solve};
 use faer::{Accum, Mat, MatMut, MatRef, Par, Side};
 use rayon::prelude::*;
@@ -10,6 +12,7 @@ use super::grid::{Grids, NODES};
 use super::stored::TorusPart;
 use super::tori::Tori;
 use crate::imaging::exact::fixed_point::parts::sum_of_parts;
+use crate::imaging::power::Block;
 use crate::ranks::Ranks;
 use crate::response::harmonic::degrees;
 use crate::response::harmonic::filter::FilteredPatterns;
@@ -80,6 +83,27 @@ impl OrderBlocks {
         }
     }
 
+    /// The blocks with the places of their unknowns, in the order of m and parity.
+    pub(in crate::imaging) fn blocks(&self) -> Vec<Block<'_>> {
+        let mut first = 0;
+        let mut all = Vec::new();
+        for (m, blocks) in self.blocks.iter().enumerate() {
+            let parts = parts_of(m);
+            for (parity, block) in blocks.iter().enumerate().filter(|(_, block)| block.nrows() > 0) {
+                let place = |part: usize| {
+                    (0..block.nrows()).map(|k| first + (2 * k + parity) * parts + part).collect()
+                };
+                all.push(Block {
+                    matrix: Cow::Borrowed(block),
+                    degrees: (0..block.nrows()).map(|k| m + parity + 2 * k).collect(),
+                    places: (0..parts).map(place).collect(),
+                });
+            }
+            first += parts * (self.l_max + 1 - m);
+        }
+        all
+    }
+
     /// Factors of the blocks plus `regularisation` I; a block without a factor leaves its unknowns unchanged.
     #[must_use]
     pub fn factors(&self, regularisation: f64) -> OrderFactors {
@@ -119,6 +143,12 @@ impl OrderFactors {
             }
         }
     }
+}
+
+/// The order m of each of [`OrderBlocks::blocks`].
+pub(super) fn orders_of(l_max: usize) -> Vec<usize> {
+    let of_order = |m: usize| (0..2).filter(move |parity| size(l_max, m, *parity) > 0).map(move |_| m);
+    (0..=l_max).flat_map(of_order).collect()
 }
 
 /// Numbers of a coefficient of order m.

@@ -30,6 +30,7 @@ mod operator;
 mod parts;
 mod quanta;
 mod setup;
+mod sigma;
 mod solve;
 mod spread;
 mod stored;
@@ -46,7 +47,7 @@ pub use beams::harmonic_beams;
 pub use blocks::{OrderBlocks, OrderFactors};
 pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
-pub use noise_maps::{NOISES_TOGETHER, solve_noises};
+pub use noise_maps::solve_noises;
 pub use noises::NoiseSums;
 pub use parts::SumPart;
 pub use setup::{
@@ -54,7 +55,7 @@ pub use setup::{
     shared_size,
 };
 pub(super) use setup::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
-pub use solve::{HarmonicRequest, HarmonicSolution, solve_harmonics, solve_regularised};
+pub use solve::{HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, solve_harmonics, solve_regularised};
 pub(super) use solve::{W_MAX_TOLERANCE, lifted, prior_unknowns};
 pub use sums::{HarmonicSums, coefficients, degrees, unknowns, unknowns_of_gradient};
 

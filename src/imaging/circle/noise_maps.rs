@@ -1,6 +1,6 @@
 //! Maps of noise of many realisations, which share everything but their right-hand sides.
 
-use super::solve::{HarmonicRequest, W_MAX_TOLERANCE, lifted};
+use super::solve::{HarmonicRequest, NOISES_TOGETHER, W_MAX_TOLERANCE, lifted, power_of_data};
 use super::{HarmonicSums, coefficients};
 use crate::imaging::NormalSums;
 use crate::imaging::pixel::check_request;
@@ -10,9 +10,6 @@ use crate::imaging::solver::SolveError;
 use crate::imaging::solver::System;
 use crate::imaging::solver::largest_eigenvalue_from;
 use crate::sky::harmonics::synthesis;
-
-/// Realisations that are solved together: a thread has a workspace for each.
-pub const NOISES_TOGETHER: usize = 4;
 
 /// The noise-only maps, K, of the further realisations that the sums hold ([`HarmonicSums::further_noises`]): each as
 /// [`crate::imaging::solve_regularised`] makes it of sums with that realisation as their companion.
@@ -25,7 +22,14 @@ pub fn solve_noises(
     regulariser: &Regulariser,
     watch: NamedWatch<'_>,
 ) -> Result<Vec<Vec<f64>>, SolveError> {
-    check_request(sums, request.epsilon)?;
+    let known = *regulariser != Regulariser::Data;
+    let regulariser = match regulariser {
+        Regulariser::Data => &power_of_data(sums, request.rule, watch)?,
+        given => given,
+    };
+    // One over a power is what it is.
+    let epsilon = if known { request.epsilon } else { 1.0 };
+    check_request(sums, epsilon)?;
     let blocks = sums.order_blocks();
     let w_max = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
@@ -36,7 +40,7 @@ pub fn solve_noises(
         .value
     };
     let l_max = sums.setup().l_max;
-    let regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
+    let regularisation = regulariser.diagonal(epsilon, w_max, l_max)?;
     let factors = blocks.factors_with(&|l| regularisation.at(l));
     drop(blocks);
     let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };

@@ -1,21 +1,27 @@
 //! The regularised solution over harmonic coefficients.
 
+use super::sigma::pixel_sigma_k;
+use super::sums::degrees;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
-use crate::imaging::NormalSums;
 use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
-use crate::imaging::regulariser::Regulariser;
+use crate::imaging::power::{Covariance, Drawn, Factors, FoundPower, Sought, Uncertainty};
+use crate::imaging::regulariser::{Diagonal, Regulariser};
 use crate::imaging::solver::Fitted;
 use crate::imaging::solver::NamedWatch;
 use crate::imaging::solver::SolveError;
-use crate::imaging::solver::add;
 use crate::imaging::solver::traces;
 use crate::imaging::solver::{Convergence, StoppingRule, System};
 use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from, normalised, random_vector};
+use crate::imaging::solver::{add, dot};
+use crate::imaging::{NormalSums, SumCounts};
 use crate::sky::harmonics::{AnalysisOptions, analysis, synthesis};
 use crate::sky::healpix::{nside_of, pixel_area_sr};
 
 /// Change of W_max from product to product, relative, at which it is found: it only scales R, and no map knows epsilon to a percent.
 pub(in crate::imaging) const W_MAX_TOLERANCE: f64 = 1e-3;
+
+/// Realisations or samples that are solved for together: a thread has a workspace for each.
+pub const NOISES_TOGETHER: usize = 4;
 
 /// Products with the blocks before the iteration for W_max.
 const LIFTS: usize = 6;
@@ -29,6 +35,8 @@ pub struct HarmonicRequest {
     pub nside: usize,
     /// When to stop.
     pub rule: StoppingRule,
+    /// Maps as likely as the map itself to be drawn beside it; with R from the data.
+    pub samples: usize,
     /// Random probes for the traces of the covariances where the matrix is too large to be held; 0 for no traces. Traces are those of
     /// an R that is a multiple of the identity.
     pub probes: usize,
@@ -45,6 +53,8 @@ pub struct HarmonicSolution {
     pub unknowns: [Vec<f64>; 2],
     /// How they were found.
     pub diagnostics: Diagnostics,
+    /// Errors of the map; with R from the data.
+    pub uncertainty: Option<Uncertainty>,
 }
 
 /// Solves by conjugate gradients, preconditioned by the blocks of BtN^-1B that keep m.
@@ -77,6 +87,9 @@ pub fn solve_regularised(
     start: Option<&[Vec<f64>; 2]>,
     watch: NamedWatch<'_>,
 ) -> Result<HarmonicSolution, SolveError> {
+    if *regulariser == Regulariser::Data {
+        return solve_with_power(sums, request, prior_k, start, watch);
+    }
     check_request(sums, request.epsilon)?;
     let l_max = sums.setup().l_max;
     let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
@@ -106,8 +119,8 @@ pub fn solve_regularised(
         add(&mut whole, &prior);
     }
     let mut diagnostics = Diagnostics {
-        epsilon: request.epsilon,
-        w_max: w_max * area_sr,
+        epsilon: Some(request.epsilon),
+        w_max: Some(w_max * area_sr),
         w_max_iterations: iterations,
         l_max: Some(l_max),
         convergence: convergence.first().copied(),
@@ -132,7 +145,118 @@ pub fn solve_regularised(
         let found = traces(sums, request.epsilon, w_max, request.probes, watch);
         diagnostics = diagnostics.with_traces(found, area_sr);
     }
-    Ok(HarmonicSolution { map_k: map(&whole)?, noise_k: map(&solved[1])?, unknowns: solved, diagnostics })
+    Ok(HarmonicSolution {
+        map_k: map(&whole)?,
+        noise_k: map(&solved[1])?,
+        unknowns: solved,
+        diagnostics,
+        uncertainty: None,
+    })
+}
+
+/// The R of the data, by degree: for what is solved for beside their map.
+///
+/// # Errors
+/// No data, or numbers that are not finite.
+pub(super) fn power_of_data(
+    sums: &HarmonicSums,
+    rule: StoppingRule,
+    watch: NamedWatch<'_>,
+) -> Result<Regulariser, SolveError> {
+    check_request(sums, 1.0)?;
+    let order_blocks = sums.order_blocks();
+    let degrees: Vec<usize> = degrees(sums.setup().l_max).collect();
+    let (blocks, right) = (order_blocks.blocks(), sums.right_hand_side());
+    let SumCounts { visibilities, power, .. } = sums.counts();
+    let numbers = 2.0 * visibilities as f64;
+    let sought = Sought { sums, blocks: &blocks, degrees: &degrees, right, power, numbers };
+    Ok(Regulariser::Wiener(sought.found(None, rule, watch)?.power.over_noise_k2()))
+}
+
+/// By how much a prior lessens `V'N^-1V`: `p.(2 b - A p)`, with `right` what it leaves of b.
+fn predicted_power(sums: &HarmonicSums, prior: &[f64], right: &[f64]) -> f64 {
+    dot(prior, sums.right_hand_side()) + dot(prior, right)
+}
+
+/// As [`solve_regularised`], with R from the data.
+fn solve_with_power(
+    sums: &HarmonicSums,
+    request: HarmonicRequest,
+    prior_k: Option<&[f64]>,
+    start: Option<&[Vec<f64>; 2]>,
+    watch: NamedWatch<'_>,
+) -> Result<HarmonicSolution, SolveError> {
+    check_request(sums, 1.0)?;
+    let HarmonicRequest { nside, rule, samples, .. } = request;
+    let l_max = sums.setup().l_max;
+    let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
+    let mut right = sums.right_hand_side().to_vec();
+    if let Some(prior) = &prior {
+        subtract_prediction(sums, prior, &mut right);
+    }
+    let order_blocks = sums.order_blocks();
+    let (blocks, degrees) = (order_blocks.blocks(), degrees(l_max).collect::<Vec<usize>>());
+    let SumCounts { visibilities, power, .. } = sums.counts();
+    let sought = Sought {
+        sums,
+        blocks: &blocks,
+        degrees: &degrees,
+        right: &right,
+        power: power - prior.as_ref().map_or(0.0, |prior| predicted_power(sums, prior, &right)),
+        numbers: 2.0 * visibilities as f64,
+    };
+    let found = sought.found(start.map(|[map, _]| map.as_slice()), rule, watch)?;
+    let factor = found.noise_factor();
+    let FoundPower { regularisation, solution, power, ratio } = found;
+    let factors = Factors::new(&blocks, &regularisation);
+    let regularisation = Diagonal::ByDegree(regularisation);
+    let precondition = |v: &mut [f64]| factors.solve(v);
+    let system = System { sums, regularisation: regularisation.clone(), precondition: &precondition };
+    // The third column is that of the covariance for the monopole.
+    let mut monopole = vec![0.0; right.len()];
+    monopole[0] = 1.0;
+    let noise = match start {
+        Some([_, noise]) if noise.len() == right.len() => noise.clone(),
+        _ => vec![0.0; right.len()],
+    };
+    let mut columns = [solution, noise, vec![0.0; right.len()]];
+    let convergence = {
+        let task = watch.start("map, noise map and error of the mean", rule.residual_max);
+        system.solve(&[&right, sums.noise_right_hand_side(), &monopole], &mut columns, rule, &task)
+    };
+    let [solved, noise, of_mean] = columns;
+    let mut whole = solved.clone();
+    if let Some(prior) = prior {
+        add(&mut whole, &prior);
+    }
+    let map = |x: &[f64]| synthesis(&coefficients(x, l_max), nside).map_err(SolveError::from);
+    let mut samples_k = Vec::new();
+    let covariance = Covariance { sums, regularisation: &regularisation, factors: &factors };
+    let numbers: Vec<u64> = (0..samples as u64).collect();
+    for which in numbers.chunks(NOISES_TOGETHER) {
+        let task = watch.start(&format!("samples from {}", which[0] + 1), rule.residual_max);
+        for Drawn { whole: mut sample, .. } in covariance.draw(which, &task) {
+            sample.iter_mut().for_each(|value| *value *= factor);
+            add(&mut sample, &whole);
+            samples_k.push(map(&sample)?);
+        }
+    }
+    let mut sigma_k = pixel_sigma_k(&blocks, &factors, &ratio, nside);
+    sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= factor);
+    let uncertainty = Uncertainty {
+        sigma_k,
+        mean_sigma_k: factor * (of_mean[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt(),
+        power,
+        samples_k,
+    };
+    let diagnostics = Diagnostics::of_power(l_max, &convergence);
+    Ok(HarmonicSolution {
+        map_k: map(&whole)?,
+        noise_k: map(&noise)?,
+        unknowns: [solved, noise],
+        diagnostics,
+        uncertainty: Some(uncertainty),
+    })
 }
 
 /// A random vector times the blocks of BtN^-1B that keep m, several times over: a beginning near the vectors with the largest

@@ -12,6 +12,7 @@ mod exact;
 mod remade;
 mod solve;
 mod solve_remade;
+mod solve_with_power;
 mod sums;
 mod tiles;
 
@@ -21,6 +22,7 @@ pub use remade::{RemadeSums, RemadeVisibilities};
 pub use solve::{Diagnostics, PixelExtras, PixelSolution, PointBeam, solve_pixels, solve_pixels_with};
 pub(super) use solve::{check_request, subtract_prediction};
 pub use solve_remade::solve_remade;
+pub use solve_with_power::{POWER_NSIDE_MAX, solve_pixels_with_power};
 pub use sums::PixelSums;
 pub use tiles::{ColumnBlock, SymmetricTiles, TILE};
 

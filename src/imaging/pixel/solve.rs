@@ -15,11 +15,13 @@ use crate::imaging::{NormalSums, PixelSums};
 /// Diagnostics of a solution. Eigenvalues and traces are those of pixels, also for a map of harmonics.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct Diagnostics {
-    /// epsilon of `R = epsilon W_max I`.
-    pub epsilon: f64,
-    /// W_max, the largest eigenvalue of `BtN^-1B`, K^-2.
-    pub w_max: f64,
-    /// Lanczos iterations for it.
+    /// epsilon of `R = epsilon W_max I`; absent where R is from the data.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub epsilon: Option<f64>,
+    /// W_max, the largest eigenvalue of `BtN^-1B`, K^-2; absent where R is from the data, which need none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub w_max: Option<f64>,
+    /// Lanczos iterations for it; 0 without.
     pub w_max_iterations: usize,
     /// Greatest degree of a map of harmonics; absent for one of pixels.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -42,6 +44,21 @@ pub struct Diagnostics {
 }
 
 impl Diagnostics {
+    /// Of a map up to `l_max` with R from the data.
+    pub(in crate::imaging) fn of_power(l_max: usize, convergence: &[Convergence]) -> Self {
+        Self {
+            epsilon: None,
+            w_max: None,
+            w_max_iterations: 0,
+            l_max: Some(l_max),
+            convergence: convergence.first().copied(),
+            noise_convergence: convergence.get(1).copied(),
+            traces: None,
+            traces_refused: None,
+            fit: None,
+        }
+    }
+
     /// With the traces of pixels, whose unknowns have the area `per_area_sr` that those of the sums are without.
     pub(in crate::imaging) fn with_traces(
         mut self,
@@ -220,8 +237,8 @@ pub fn solve_pixels_with(
         Fitted { counts, accuracy, w_max, right, whole, product, solved }.fit(1.0)
     });
     let diagnostics = Diagnostics {
-        epsilon,
-        w_max,
+        epsilon: Some(epsilon),
+        w_max: Some(w_max),
         w_max_iterations: iterations,
         l_max: None,
         convergence: None,
@@ -238,7 +255,7 @@ pub fn solve_pixels_with(
 }
 
 /// `BtN^-1B` times a sky that is 1 K in one pixel.
-fn seen_point(sums: &PixelSums, pixel: usize) -> Result<PointBeam, SolveError> {
+pub(super) fn seen_point(sums: &PixelSums, pixel: usize) -> Result<PointBeam, SolveError> {
     let pixels = sums.unknowns();
     let mut point = vec![0.0; pixels];
     *point.get_mut(pixel).ok_or(SolveError::NoPixel { pixel, pixels })? = 1.0;

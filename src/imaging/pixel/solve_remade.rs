@@ -68,8 +68,8 @@ pub fn solve_remade(
         add(&mut map_k, prior_k);
     }
     let diagnostics = Diagnostics {
-        epsilon,
-        w_max,
+        epsilon: Some(epsilon),
+        w_max: Some(w_max),
         w_max_iterations: iterations,
         l_max: None,
         convergence: convergence.first().copied(),

@@ -39,7 +39,7 @@ pub enum SolveError {
         expected: usize,
     },
     /// A table of angular power that cannot be used.
-    #[error("map.regularisation_files: {}: {found}; expected a table of l and C_l in K^2, from l = 0 on, all above 0", path.display())]
+    #[error("map.regulariser.file: {}: {found}; expected a table of l and C_l in K^2, from l = 0 on, all above 0", path.display())]
     Power {
         /// Its path.
         path: std::path::PathBuf,
@@ -47,13 +47,19 @@ pub enum SolveError {
         found: String,
     },
     /// A table of angular power that ends too early.
-    #[error("map.regularisation_files: {found} degrees; expected {expected}, up to the greatest of the map")]
+    #[error("map.regulariser.file: {found} degrees; expected {expected}, up to the greatest of the map")]
     PowerLength {
         /// Degrees in it.
         found: usize,
         /// Degrees of the map.
         expected: usize,
     },
+    /// No power of the sky makes the matrix positive definite.
+    #[error(
+        "no angular power of the sky fits the data: the normal matrix has no Cholesky factor with any; expected finite numbers in it. \
+         map.regulariser = \"identity\" takes R = epsilon W_max I instead"
+    )]
+    NoPower,
     /// A pixel that is not on the map.
     #[error("there is no pixel {pixel} on a map of {pixels}")]
     NoPixel {

@@ -21,4 +21,5 @@ pub(super) use lanczos::{largest_eigenvalue_from, normalised, random_vector};
 pub use probing::{effective_beam, noise_variance, regularisation};
 pub use traces::{Estimate, HELD_MAX, Traces, UnsupportedEpsilon, probed_traces, traces};
 pub(super) use vectors::{add, dot, subtract};
+pub(super) use watch::SolveTask;
 pub use watch::{NamedWatch, SolveWatch, Solving, SolvingPart};

@@ -11,8 +11,8 @@ use crate::imaging::anywhere::{RefineRule, RefineSteps, Refinement, solve_refine
 use crate::imaging::circle::harmonic_beams;
 use crate::imaging::circle::{HarmonicRequest, solve_regularised};
 use crate::imaging::pixel::solve_remade;
-use crate::imaging::pixel::{PixelExtras, PointBeam, solve_pixels_with};
-use crate::imaging::{Diagnostics, Regulariser, SolveError, SolveWatch, StoppingRule};
+use crate::imaging::pixel::{PixelExtras, PointBeam, solve_pixels_with, solve_pixels_with_power};
+use crate::imaging::{Diagnostics, Regulariser, SolveError, SolveWatch, StoppingRule, Uncertainty};
 use crate::imaging::{NormalSums, Snapshot, SnapshotSums, SumCounts};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::sky::healpix::{pixel_area_sr, pixel_count, pixel_of};
@@ -45,6 +45,8 @@ pub struct Solution {
     pub diagnostics: Diagnostics,
     /// How it was refined, and the residuals that remain; only with `map.refine`.
     pub refinement: Option<Refinement>,
+    /// Errors of the map, and the sky's power that R is from; only with R from the data.
+    pub uncertainty: Option<Uncertainty>,
 }
 
 /// Numbers in which ranks agree before they solve.
@@ -55,8 +57,8 @@ const QUESTIONS: usize = 7;
 pub struct SolverSetup {
     /// epsilon of R = epsilon W_max I.
     pub epsilon: PerChannel<f64>,
-    /// How R depends on the degree, by channel: harmonic maps only. The last holds for the channels beyond; the identity if there
-    /// is none.
+    /// What R is, by channel. The last holds for the channels beyond; the identity if there is none. Pixels have R from the data or the
+    /// identity.
     pub regularisers: Vec<Regulariser>,
     /// Ecliptic longitudes and latitudes, degrees, at which a final map's effective beam is solved for.
     pub beams_deg: Vec<[f64; 2]>,
@@ -77,6 +79,8 @@ pub struct SolverSetup {
     pub passes: Option<PathBuf>,
     /// Random probes for the traces of a final map, where its matrix is too large to be held; 0 for no traces.
     pub trace_probes: usize,
+    /// Maps as likely as a final map that are drawn beside it, with R from the data.
+    pub samples: usize,
     /// Receives progress, and may interrupt.
     pub watch: SolveWatch,
 }
@@ -154,9 +158,21 @@ impl Stage for Solver {
         if !watch.goes_on() {
             return Ok(());
         }
-        let (mut refinement, mut beams) = (None, Vec::new());
+        let (mut refinement, mut beams, mut uncertainty) = (None, Vec::new(), None);
+        let samples = if is_final { self.setup.samples } else { 0 };
+        let regulariser = self.setup.regulariser(index);
         let pixels: Vec<usize> = if is_final { self.setup.beam_pixels(nside) } else { Vec::new() };
         let (map_k, noise_k, diagnostics) = match sums {
+            SnapshotSums::Pixel(sums) if regulariser == Regulariser::Data => {
+                let solved = match solve_pixels_with_power(&sums, prior.as_deref(), samples, &pixels, watch) {
+                    Err(SolveError::Interrupted) => return Ok(()),
+                    Err(SolveError::NoPower) if !is_final => return Ok(()),
+                    solved => solved?,
+                };
+                let (solved, errors) = solved;
+                (beams, uncertainty) = (solved.beams, Some(errors));
+                (solved.map_k, solved.noise_k, solved.diagnostics)
+            }
             SnapshotSums::Pixel(sums) => {
                 let extras = PixelExtras { probes, beams: &pixels };
                 let solved = match solve_pixels_with(sums, epsilon, prior.as_deref(), extras, watch) {
@@ -170,22 +186,30 @@ impl Stage for Solver {
                 (solved.map_k, solved.noise_k, solved.diagnostics)
             }
             SnapshotSums::Harmonic(sums) => {
-                let regulariser = self.setup.regulariser(index);
-                let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes };
+                let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, samples, probes };
                 let start = self.last.remove(&channel);
                 let (prior, start) = (prior.as_deref(), start.as_ref());
                 let solved = solve_regularised(&sums, request, &regulariser, prior, start, watch);
                 if let Some(reason) = sums.failure() {
                     return Err(SolveError::Sums(reason.to_owned()));
                 }
-                let solved = solved?;
+                let solved = match solved {
+                    Err(SolveError::NoPower) if !is_final => return Ok(()),
+                    solved => solved?,
+                };
                 if !watch.goes_on() && !is_final {
                     return Ok(());
                 }
                 if !pixels.is_empty() {
-                    let with = (&regulariser, solved.diagnostics.w_max / pixel_area_sr(nside));
-                    beams = harmonic_beams(&sums, request, with, &pixels, watch)?;
+                    let w_max = solved.diagnostics.w_max.unwrap_or(0.0) / pixel_area_sr(nside);
+                    // One over the power that was found.
+                    let found = solved.uncertainty.as_ref().map(|errors| errors.power.over_noise_k2());
+                    let epsilon = if found.is_some() { 1.0 } else { epsilon };
+                    let regulariser = found.map_or(regulariser, Regulariser::Wiener);
+                    let request = HarmonicRequest { epsilon, ..request };
+                    beams = harmonic_beams(&sums, request, (&regulariser, w_max), &pixels, watch)?;
                 }
+                uncertainty = solved.uncertainty;
                 if !is_final {
                     self.last.insert(channel, solved.unknowns);
                 }
@@ -210,7 +234,8 @@ impl Stage for Solver {
                 (solved.map_k, solved.noise_k, solved.diagnostics)
             }
             SnapshotSums::Refined(archive) => {
-                let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, probes: 0 };
+                let request =
+                    HarmonicRequest { epsilon, nside, rule: self.setup.rule, samples: 0, probes: 0 };
                 let sums = archive.into_sums(&self.setup.belief)?;
                 let rule = self.setup.refine;
                 let of = [which.as_slice(), &data, &[epsilon.to_bits().cast_signed()]].concat();
@@ -250,6 +275,7 @@ impl Stage for Solver {
             beams,
             diagnostics,
             refinement,
+            uncertainty: uncertainty.map(|errors| errors.reduced(1.0 + self.setup.moon_reflection)),
         });
         Ok(())
     }

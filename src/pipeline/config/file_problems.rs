@@ -41,9 +41,7 @@ impl Plan {
             let checked = of_channels.filter_map(|(path, &hz)| check_frequency(path, hz).err());
             checked.filter(is_other).for_each(|problem| found.push(|| problem));
         }
-        for problem in
-            self.config.map.regularisation_files.iter().filter_map(|path| Regulariser::read(path).err())
-        {
+        for problem in self.config.map.power_files().iter().filter_map(|path| Regulariser::read(path).err()) {
             found.push(|| problem);
         }
         if let Some(problem) = self.sky_l_max_problem() {
@@ -104,7 +102,7 @@ impl Config {
     pub fn input_files(&self) -> Vec<PathBuf> {
         let skies = self.sky.file.iter().flat_map(|files| files.values().iter().cloned());
         let catalogue = self.sky.added.iter().filter_map(|added| added.catalogue.clone());
-        let maps = self.map.prior_files.iter().chain(&self.map.regularisation_files);
+        let maps = self.map.prior_files.iter().chain(self.map.power_files());
         let others = maps.chain(&self.calibrate.model_files).chain(&self.calibration.gains_file).cloned();
         skies.chain(catalogue).chain(others).chain(self.array.oem.iter().map(PathBuf::from)).collect()
     }

@@ -12,7 +12,9 @@ use super::sections::Config;
 use crate::units::{Dimension, shortened};
 
 /// Old names of keys, and the new ones; those of values that change their unit say so.
-const RENAMED_KEYS: [(&str, &str); 16] = [
+const RENAMED_KEYS: [(&str, &str); 18] = [
+    ("map.regularisation_exponent", "map.regulariser, as { degree = 2.0 }"),
+    ("map.regularisation_files", "map.regulariser, as { file = [\"cl.csv\"] }"),
     ("instrument.along_m", "navigation.along_m"),
     ("instrument.across_m", "navigation.across_m"),
     ("instrument.radial_m", "navigation.radial_m"),

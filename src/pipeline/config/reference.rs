@@ -204,7 +204,7 @@ mod tests {
     fn descriptions_have_default_meaning_and_condition() {
         let found = key_descriptions();
         let of = |key: &str| found.iter().find(|described| described.key == key).unwrap();
-        assert_eq!(of("map.epsilon").default.as_deref(), Some("1e-4"));
+        assert_eq!(of("map.residual_max").default.as_deref(), Some("1e-4"));
         assert!(of("map.epsilon").everyday && !of("map.l_max").everyday && of("map").everyday);
         assert_eq!(of("map.l_max").only_with, ["map.engine = \"harmonic\""]);
         // The condition of the key, and of its section.

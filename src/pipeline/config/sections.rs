@@ -10,7 +10,7 @@ use crate::calibration::solver::SolverConfig;
 use crate::calibration::{CalibrationConfig, CalibrationHook, VanVleck};
 use crate::daughters::{DaughtersConfig, InstrumentConfig, NavigationConfig, Tones};
 use crate::downlink::DownlinkConfig;
-use crate::imaging::{EngineKind, MapConfig};
+use crate::imaging::{EngineKind, MapConfig, RegulariserChoice};
 use crate::mother::{Antenna, Fidelity, MoonMirror, SpacecraftConfig};
 use crate::products::ProductsConfig;
 use crate::response::model::ModelChoice;
@@ -306,7 +306,9 @@ impl Config {
         let (mut calibration, mut map) = (self.calibration.clone(), self.map.clone());
         calibration.gains_file = calibration.gains_file.as_deref().map(contents);
         map.prior_files = map.prior_files.iter().map(|path| contents(path)).collect();
-        map.regularisation_files = map.regularisation_files.iter().map(|path| contents(path)).collect();
+        if let Some(RegulariserChoice::File(files)) = &mut map.regulariser {
+            files.iter_mut().for_each(|path| *path = contents(path));
+        }
         if calibration.hook != CalibrationHook::Solve {
             return hash(&(calibration, map));
         }

@@ -7,7 +7,9 @@ use super::live_gains::GainsWriter;
 use crate::ground::{Ground, GroundConfig, GroundOutcome};
 use crate::imaging::MapConfig;
 use crate::imaging::anywhere::RefineRule;
-use crate::imaging::{Regulariser, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
+use crate::imaging::{
+    Regulariser, RegulariserChoice, Solution, SolveWatch, Solver, SolverSetup, StoppingRule,
+};
 use crate::pipeline::config::{Config, PipelineError};
 use crate::products::{ChannelSummary, MapWatch, ProductsError, ProductsWatch, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link, Sink};
@@ -44,7 +46,7 @@ impl Config {
     pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
         let map = &self.map;
         Ok(SolverSetup {
-            epsilon: map.epsilon.clone(),
+            epsilon: map.epsilon(),
             regularisers: regularisers(map)?,
             beams_deg: map.beams_deg.clone(),
             moon_reflection: map.moon_reflection,
@@ -55,6 +57,7 @@ impl Config {
             belief: map.belief(),
             passes: None,
             trace_probes: map.trace_probes,
+            samples: 0,
             watch,
         })
     }
@@ -131,12 +134,16 @@ impl Sink for Bystander {
     }
 }
 
-/// How R depends on the degree, by channel.
+/// What R is, by channel.
 fn regularisers(map: &MapConfig) -> Result<Vec<Regulariser>, PipelineError> {
-    if map.regularisation_files.is_empty() {
-        return Ok(vec![Regulariser::Power(map.regularisation_exponent)]);
-    }
-    map.regularisation_files.iter().map(|path| Ok(Regulariser::read(path)?)).collect()
+    Ok(match map.regulariser() {
+        RegulariserChoice::Data => vec![Regulariser::Data],
+        RegulariserChoice::Degree(exponent) => vec![Regulariser::Power(exponent)],
+        RegulariserChoice::File(files) => {
+            files.iter().map(|path| Ok(Regulariser::read(path)?)).collect::<Result<_, PipelineError>>()?
+        }
+        _ => vec![Regulariser::default()],
+    })
 }
 
 fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {

@@ -128,7 +128,7 @@ impl Sink for Realiser {
         let setup = &self.setup;
         let index = usize::from(channel.0);
         let epsilon = setup.epsilon.get(index).ok_or(SolveError::NoEpsilon(channel))?;
-        let request = HarmonicRequest { epsilon, nside, rule: setup.rule, probes: 0 };
+        let request = HarmonicRequest { epsilon, nside, rule: setup.rule, samples: 0, probes: 0 };
         let frequency_hz = instrument.channels.get(index).map_or(0.0, |channel| channel.frequency_hz);
         let name = format!("{:.3} MHz", frequency_hz / 1e6);
         let maps = match solve_noises(&sums, request, &setup.regulariser(index), setup.watch.named(&name)) {

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
-use crate::imaging::REFINED;
+use crate::imaging::{REFINED, Regulariser, RegulariserChoice};
 use crate::imaging::{Solution, SolveWatch, Solver, SolverSetup};
 use crate::pipeline::config::{Config, ConfigSource, PipelineError};
 use crate::runtime::{Outlet, Stage};
@@ -114,7 +114,8 @@ fn toml_of(value: &str) -> Option<String> {
     Some(format!("{text:?}"))
 }
 
-/// Maps of the sums in a state, without new data: of every channel, with each of these epsilons, or those of the
+/// Maps of the sums in a state, without new data: of every channel, with each of these epsilons (`R = epsilon W_max I`, unless the
+/// configuration has another R with an epsilon), or those of the
 /// configuration if there are none. The state stays as it is. `found` gets each map as soon as it is made, with its epsilon;
 /// `watch` follows, and ends it early.
 ///
@@ -128,16 +129,47 @@ pub fn solve_state(
     found: &mut dyn FnMut(Solution),
 ) -> Result<(), PipelineError> {
     let given = epsilons.iter().map(|&epsilon| PerChannel::All(epsilon));
-    let each: Vec<_> = if epsilons.is_empty() { vec![config.map.epsilon.clone()] } else { given.collect() };
+    let each: Vec<_> = if epsilons.is_empty() { vec![config.map.epsilon()] } else { given.collect() };
     for epsilon in each {
         // Solving takes the sums: they are read again for the next.
-        let sums = Ground::sums_in(folder, &config.ground(WAIT_BYTES))?;
-        let mut solver = Solver::new(SolverSetup { epsilon, ..config.solver(watch.clone())? });
-        for snapshot in sums {
-            let mut out = Outlet::collect();
-            solver.step(snapshot, &mut out)?;
-            out.into_vec().into_iter().for_each(&mut *found);
+        let mut setup = SolverSetup { epsilon, ..config.solver(watch.clone())? };
+        if !epsilons.is_empty() && config.map.regulariser() == RegulariserChoice::Data {
+            // Who names an epsilon asks for the R that has one.
+            setup.regularisers = vec![Regulariser::default()];
         }
+        solve_sums(folder, config, setup, found)?;
+    }
+    Ok(())
+}
+
+/// Maps of the sums in a state with `count` others that are as likely, draws from the posterior of R from the data. The state stays as
+/// it is.
+///
+/// # Errors
+/// As [`solve_state`].
+pub fn sample_state(
+    folder: &Path,
+    config: &Config,
+    count: usize,
+    watch: &SolveWatch,
+    found: &mut dyn FnMut(Solution),
+) -> Result<(), PipelineError> {
+    let setup = SolverSetup { samples: count, ..config.solver(watch.clone())? };
+    solve_sums(folder, config, setup, found)
+}
+
+fn solve_sums(
+    folder: &Path,
+    config: &Config,
+    setup: SolverSetup,
+    found: &mut dyn FnMut(Solution),
+) -> Result<(), PipelineError> {
+    let sums = Ground::sums_in(folder, &config.ground(WAIT_BYTES))?;
+    let mut solver = Solver::new(setup);
+    for snapshot in sums {
+        let mut out = Outlet::collect();
+        solver.step(snapshot, &mut out)?;
+        out.into_vec().into_iter().for_each(&mut *found);
     }
     Ok(())
 }

@@ -296,7 +296,7 @@ fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary,
         let mut figures = RunFigures::read(&out.join(case.folder()))?;
         figures.label = case.label();
         let mut config = case.plan.config.clone();
-        config.map.epsilon = crate::imaging::MapConfig::default().epsilon;
+        config.map.epsilon = None;
         let key = serde_json::to_vec(&(config, case.calibrated)).unwrap_or_default();
         match groups.iter_mut().find(|(found, _)| *found == key) {
             Some((_, members)) => members.push(cases.len()),

@@ -1,0 +1,86 @@
+//! The standard deviation of every pixel of a harmonic map.
+//!
+//! The blocks that keep m couple no orders, so that a variance depends on the latitude alone. By degree it is scaled as draws say that the
+//! covariance of the true matrix is.
+
+use faer::Mat;
+use rayon::prelude::*;
+
+use super::blocks::orders_of;
+use crate::imaging::power::{Block, Factors};
+use crate::sky::healpix::pixel_directions;
+
+/// Standard deviations, K, of the pixels of a map, HEALPix RING; `ratio` is that of traces, by degree.
+pub(super) fn pixel_sigma_k(
+    blocks: &[Block<'_>],
+    factors: &Factors<'_>,
+    ratio: &[f64],
+    nside: usize,
+) -> Vec<f64> {
+    let z: Vec<f64> = pixel_directions(nside).iter().map(|direction| direction[2]).collect();
+    let rings: Vec<&[f64]> = z.chunk_by(|a, b| a == b).collect();
+    let orders = orders_of(ratio.len().saturating_sub(1));
+    let of_block = |(index, block): (usize, &Block<'_>)| -> Vec<f64> {
+        let m = orders[index];
+        let mut values = Mat::zeros(block.degrees.len(), rings.len());
+        let l_max = block.degrees.last().copied().unwrap_or(m);
+        for (column, ring) in rings.iter().enumerate() {
+            let lambda = legendre(m, l_max, ring[0]);
+            for (row, l) in block.degrees.iter().enumerate() {
+                values[(row, column)] = ratio[*l].sqrt() * lambda[l - m];
+            }
+        }
+        let mut variances = factors.quadratic_forms(index, values);
+        // sqrt(2) Y_lm of cosine and sine: their squares add up to 2.
+        variances.iter_mut().for_each(|variance| *variance *= block.places.len() as f64);
+        variances
+    };
+    let parts: Vec<Vec<f64>> = blocks.par_iter().enumerate().map(of_block).collect();
+    let mut variances = vec![0.0; rings.len()];
+    for part in parts {
+        variances.iter_mut().zip(part).for_each(|(sum, variance)| *sum += variance);
+    }
+    let of_ring = |(ring, variance): (&&[f64], &f64)| std::iter::repeat_n(variance.sqrt(), ring.len());
+    rings.iter().zip(&variances).flat_map(of_ring).collect()
+}
+
+/// `Y_lm(theta, 0)` for l = m ..= l_max at `z = cos theta`.
+fn legendre(m: usize, l_max: usize, z: f64) -> Vec<f64> {
+    let sin = (1.0 - z * z).max(0.0).sqrt();
+    let mut first = (4.0 * std::f64::consts::PI).sqrt().recip();
+    for k in 1..=m {
+        first *= sin * ((2 * k + 1) as f64 / (2 * k) as f64).sqrt();
+    }
+    let factor = |l: usize| {
+        let (l, m) = (l as f64, m as f64);
+        ((4.0 * l * l - 1.0) / (l * l - m * m)).sqrt()
+    };
+    let mut values = vec![first];
+    let mut before = 0.0;
+    for l in m + 1..=l_max {
+        let last = values[l - m - 1];
+        let down = if l > m + 1 { before / factor(l - 1) } else { 0.0 };
+        values.push(factor(l) * (z * last - down));
+        before = last;
+    }
+    values
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn legendre_functions_are_those_of_tables() {
+        // sqrt(3 / 4 pi) z, sqrt(5 / 16 pi) (3 z^2 - 1), sqrt(3 / 8 pi) sin, sqrt(15 / 8 pi) sin z, sqrt(15 / 32 pi) sin^2: magnitudes.
+        let (z, pi) = (0.3_f64, std::f64::consts::PI);
+        let sin = (1.0 - z * z).sqrt();
+        let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-14, "{a} {b}");
+        let zonal = legendre(0, 2, z);
+        close(zonal[1], (3.0 / (4.0 * pi)).sqrt() * z);
+        close(zonal[2], (5.0 / (16.0 * pi)).sqrt() * (3.0 * z * z - 1.0));
+        close(legendre(1, 2, z)[0], (3.0 / (8.0 * pi)).sqrt() * sin);
+        close(legendre(1, 2, z)[1], (15.0 / (8.0 * pi)).sqrt() * sin * z);
+        close(legendre(2, 2, z)[0], (15.0 / (32.0 * pi)).sqrt() * sin * sin);
+    }
+}

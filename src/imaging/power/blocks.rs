@@ -1,0 +1,228 @@
+//! A normal matrix as independent blocks: exact, or an approximation of a larger one that it preconditions.
+
+use std::borrow::Cow;
+
+use faer::linalg::solvers::{DenseSolveCore, Llt, Solve};
+use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
+use faer::{Mat, Par, Side};
+use rayon::prelude::*;
+
+use super::knots::Knots;
+
+/// Unknowns that are coupled with one another and with no others.
+#[derive(Clone, Debug)]
+pub(in crate::imaging) struct Block<'a> {
+    /// The block of BtN^-1B.
+    pub(in crate::imaging) matrix: Cow<'a, Mat<f64>>,
+    /// The degree of each row.
+    pub(in crate::imaging) degrees: Vec<usize>,
+    /// Where the unknowns of the rows are among all: a list for each set of unknowns that the matrix couples alike.
+    pub(in crate::imaging) places: Vec<Vec<usize>>,
+}
+
+/// The evidence of data for a power, and its derivatives.
+pub(super) struct Evidence {
+    /// `1/2 b.(A + R)^-1 b + 1/2 ln det R - 1/2 ln det(A + R)`.
+    pub(super) value: f64,
+    /// With respect to ln C_l, by degree.
+    pub(super) gradient: Vec<f64>,
+    /// Fisher's information on the parameters.
+    pub(super) fisher: Mat<f64>,
+}
+
+/// Cholesky factors of the blocks plus R, where there are any.
+pub(in crate::imaging) struct Factors<'a> {
+    blocks: &'a [Block<'a>],
+    factors: Vec<Option<Llt<f64>>>,
+}
+
+impl Block<'_> {
+    fn order(&self) -> usize {
+        self.degrees.len()
+    }
+
+    fn factor(&self, r: &[f64]) -> Option<Llt<f64>> {
+        let mut matrix = Mat::clone(&self.matrix);
+        for (k, l) in self.degrees.iter().enumerate() {
+            matrix[(k, k)] += r[*l];
+        }
+        matrix.llt(Side::Lower).ok()
+    }
+
+    fn gather(&self, unknowns: &[f64]) -> Mat<f64> {
+        Mat::from_fn(self.order(), self.places.len(), |k, part| unknowns[self.places[part][k]])
+    }
+
+    /// Value alone of the block's evidence.
+    fn value(&self, factor: &Llt<f64>, r: &[f64], right: &Mat<f64>, solved: &Mat<f64>) -> f64 {
+        let half_logarithms: f64 =
+            self.degrees.iter().enumerate().map(|(k, l)| 0.5 * r[*l].ln() - factor.L()[(k, k)].ln()).sum();
+        let mut product = 0.0;
+        for part in 0..right.ncols() {
+            for k in 0..right.nrows() {
+                product += right[(k, part)] * solved[(k, part)];
+            }
+        }
+        0.5 * product + self.places.len() as f64 * half_logarithms
+    }
+}
+
+fn regularisation(power: &[f64]) -> Vec<f64> {
+    power.iter().map(|power| power.recip()).collect()
+}
+
+/// The evidence alone; `None` where a block is not positive definite.
+pub(super) fn value(blocks: &[Block<'_>], power: &[f64], right: &[f64]) -> Option<f64> {
+    let r = regularisation(power);
+    let of = |block: &Block<'_>| {
+        let factor = block.factor(&r)?;
+        let right = block.gather(right);
+        let solved = factor.solve(&right);
+        Some(block.value(&factor, &r, &right, &solved))
+    };
+    let values: Vec<Option<f64>> = blocks.par_iter().map(of).collect();
+    values.into_iter().sum::<Option<f64>>().filter(|value| value.is_finite())
+}
+
+/// Of one block: value, gradient and information.
+type Part = (f64, Vec<f64>, Mat<f64>);
+
+/// The evidence with its derivatives.
+pub(super) fn evidence(
+    blocks: &[Block<'_>],
+    knots: &Knots,
+    power: &[f64],
+    right: &[f64],
+) -> Option<Evidence> {
+    let r = regularisation(power);
+    let parts: Vec<Option<Part>> = blocks.par_iter().map(|block| part(block, knots, &r, right)).collect();
+    let mut sum = Evidence {
+        value: 0.0,
+        gradient: vec![0.0; power.len()],
+        fisher: Mat::zeros(knots.count(), knots.count()),
+    };
+    for (block, part) in blocks.iter().zip(parts) {
+        let (value, gradient, fisher) = part?;
+        sum.value += value;
+        block.degrees.iter().zip(gradient).for_each(|(l, term)| sum.gradient[*l] += term);
+        sum.fisher += fisher;
+    }
+    sum.value.is_finite().then_some(sum)
+}
+
+fn part(block: &Block<'_>, knots: &Knots, r: &[f64], right: &[f64]) -> Option<Part> {
+    let factor = block.factor(r)?;
+    let right = block.gather(right);
+    let solved = factor.solve(&right);
+    let value = block.value(&factor, r, &right, &solved);
+    let inverse = factor.inverse();
+    let (order, copies) = (block.order(), block.places.len() as f64);
+    let r_at: Vec<f64> = block.degrees.iter().map(|l| r[*l]).collect();
+    let gradient: Vec<f64> = (0..order)
+        .map(|k| {
+            let square: f64 = (0..solved.ncols()).map(|part| solved[(k, part)].powi(2)).sum();
+            0.5 * (r_at[k] * square - copies * (1.0 - r_at[k] * inverse[(k, k)]))
+        })
+        .collect();
+    // G = 1 - R^(1/2) (A + R)^-1 R^(1/2); information on ln C_l and ln C_l': half the sum of its squares.
+    let weights: Vec<[(usize, f64); 2]> = block.degrees.iter().map(|l| knots.weights(*l)).collect();
+    let roots: Vec<f64> = r_at.iter().map(|r| r.sqrt()).collect();
+    let mut half = Mat::<f64>::zeros(order, knots.count());
+    for j in 0..order {
+        for (knot, share) in weights[j].into_iter().filter(|(_, share)| *share != 0.0) {
+            for i in 0..order {
+                let g = f64::from(u8::from(i == j)) - roots[i] * inverse[(i, j)] * roots[j];
+                half[(i, knot)] += 0.5 * copies * g * g * share;
+            }
+        }
+    }
+    let mut fisher = Mat::<f64>::zeros(knots.count(), knots.count());
+    for (i, weights) in weights.iter().enumerate() {
+        for (knot, share) in weights.iter().filter(|(_, share)| *share != 0.0) {
+            for other in 0..knots.count() {
+                fisher[(*knot, other)] += share * half[(i, other)];
+            }
+        }
+    }
+    Some((value, gradient, fisher))
+}
+
+impl<'a> Factors<'a> {
+    /// Of the blocks plus R by degree; a block without a factor leaves its unknowns unchanged.
+    pub(in crate::imaging) fn new(blocks: &'a [Block<'a>], r: &[f64]) -> Self {
+        Self { blocks, factors: blocks.par_iter().map(|block| block.factor(r)).collect() }
+    }
+
+    fn change(&self, unknowns: &mut [f64], with: &dyn Fn(&Llt<f64>, &mut Mat<f64>)) {
+        for (block, factor) in self.blocks.iter().zip(&self.factors) {
+            let Some(factor) = factor else { continue };
+            let mut values = block.gather(unknowns);
+            with(factor, &mut values);
+            for (part, places) in block.places.iter().enumerate() {
+                places.iter().enumerate().for_each(|(k, place)| unknowns[*place] = values[(k, part)]);
+            }
+        }
+    }
+
+    /// Solves for a vector of unknowns, in place.
+    pub(in crate::imaging) fn solve(&self, unknowns: &mut [f64]) {
+        self.change(unknowns, &|factor, values| factor.solve_in_place(values));
+    }
+
+    /// Solves with the lower factors alone, `L^-1 x`.
+    pub(in crate::imaging) fn solve_lower(&self, unknowns: &mut [f64]) {
+        self.change(unknowns, &|factor, values| {
+            solve_lower_triangular_in_place(factor.L(), values.as_mut(), Par::Seq);
+        });
+    }
+
+    /// Solves with the upper factors alone, `L^-t x`: of unit normal numbers a draw from the inverse of the blocks plus R.
+    pub(in crate::imaging) fn solve_upper(&self, unknowns: &mut [f64]) {
+        self.change(unknowns, &|factor, values| {
+            solve_upper_triangular_in_place(factor.L().transpose(), values.as_mut(), Par::Seq);
+        });
+    }
+
+    /// The trace of the inverse, by degree.
+    pub(in crate::imaging) fn traces(&self, l_max: usize) -> Vec<f64> {
+        let diagonal = |factor: &Option<Llt<f64>>| {
+            factor.as_ref().map(|factor| {
+                let inverse = factor.inverse();
+                (0..inverse.nrows()).map(|k| inverse[(k, k)]).collect::<Vec<f64>>()
+            })
+        };
+        let diagonals: Vec<Option<Vec<f64>>> = self.factors.par_iter().map(diagonal).collect();
+        let mut traces = vec![0.0; l_max + 1];
+        for (block, diagonal) in self.blocks.iter().zip(diagonals) {
+            for (l, term) in block.degrees.iter().zip(diagonal.unwrap_or_default()) {
+                traces[*l] += block.places.len() as f64 * term;
+            }
+        }
+        traces
+    }
+
+    /// `v.(A + R)^-1 v` in one block for each column of `v`; zeros without a factor.
+    pub(in crate::imaging) fn quadratic_forms(&self, block: usize, mut v: Mat<f64>) -> Vec<f64> {
+        let Some(Some(factor)) = self.factors.get(block) else { return vec![0.0; v.ncols()] };
+        solve_lower_triangular_in_place(factor.L(), v.as_mut(), Par::Seq);
+        (0..v.ncols()).map(|column| (0..v.nrows()).map(|k| v[(k, column)].powi(2)).sum()).collect()
+    }
+}
+
+/// Blocks times a vector of unknowns.
+pub(super) fn multiply(blocks: &[Block<'_>], unknowns: &[f64]) -> Vec<f64> {
+    let mut products = vec![0.0; unknowns.len()];
+    for block in blocks {
+        let product = &*block.matrix * block.gather(unknowns);
+        for (part, places) in block.places.iter().enumerate() {
+            places.iter().enumerate().for_each(|(k, place)| products[*place] = product[(k, part)]);
+        }
+    }
+    products
+}
+
+/// The greatest element of the diagonals.
+pub(super) fn greatest(blocks: &[Block<'_>]) -> f64 {
+    let of = |block: &Block<'_>| (0..block.order()).map(|k| block.matrix[(k, k)]).fold(0.0, f64::max);
+    blocks.iter().map(of).fold(0.0, f64::max)
+}

@@ -1,0 +1,270 @@
+//! The sky's angular power from the data: the C_l that make the data most likely, whose inverse is R (empirical Bayes).
+//!
+//! With `b = A x + n`, n of covariance A, and a Gaussian sky of power C_l(theta), `R_l = 1 / C_l`,
+//!
+//! ```text
+//! ln p(b | theta) = 1/2 b.(A + R)^-1 b + 1/2 ln det R - 1/2 ln det(A + R) + const,
+//! its gradient in ln C_l:  1/2 (R_l |x_l|^2 - gamma_l),   gamma_l = (2 l + 1) - R_l Tr_l (A + R)^-1
+//! ```
+//!
+//! x the solution, gamma_l the number of coefficients that the data decide (MacKay 1992). Where A is known as blocks (exactly, or as an
+//! approximation that preconditions it) all of it costs little. With the true A a round solves for x, and the blocks stand for A with
+//! the data that would make x their solution, and with the true traces where a draw tells them: both have the same gradient at theta, so
+//! that where rounds end is the maximum for the true A.
+//!
+//! A map ends at some degree and the sky does not. What the map leaves of the data is known (`|V - B x|^2` from sums): where it exceeds the
+//! noise, by a factor s^2, it counts as noise, and all of this is done for data divided by s.
+
+mod blocks;
+mod draws;
+mod knots;
+mod rounds;
+#[cfg(test)]
+mod tests;
+
+use faer::linalg::solvers::DenseSolveCore;
+use faer::{Mat, Side};
+use serde::Serialize;
+
+pub(super) use blocks::{Block, Factors};
+pub(super) use draws::{Covariance, Drawn};
+pub(super) use rounds::{FoundPower, Sought};
+
+use self::blocks::{evidence, greatest, multiply, value};
+use self::knots::{FREE, Knots};
+use crate::imaging::solver::SolveError;
+
+/// Decades of amplitude that are searched, in units of the least variance of noise.
+const DECADES: std::ops::RangeInclusive<i32> = -3..=13;
+/// Most steps of Newton's iteration, and the gain in evidence that is none.
+const STEPS_MAX: usize = 20;
+const GAIN_MIN: f64 = 1e-4;
+/// Greatest change of ln C_l in one step.
+const STEP_MAX: f64 = 2.0;
+/// Halvings of a step that gains nothing.
+const HALVINGS: usize = 8;
+
+/// The angular power of the sky (less its prior map) as the data have it, with its uncertainty: R = 1 / C_l of a map.
+#[derive(Clone, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
+pub struct SkyPower {
+    /// C_l of the ensemble, K^2, from l = 0: a smooth curve. Those of l = 0 and 1 are no estimates, but so large that mean and dipole are free.
+    pub power_k2: Vec<f64>,
+    /// Standard deviation of ln C_l, from the curvature of the evidence; 0 for l = 0 and 1.
+    pub sigma_ln: Vec<f64>,
+    /// Number of coefficients that the data decide, of 2 l + 1.
+    pub decided: Vec<f64>,
+    /// Scatter of what the map leaves of the data in units of their noise, at least 1: above it is sky beyond the map's degrees, or errors of
+    /// the instrument. It counts as noise.
+    pub noise_factor: f64,
+}
+
+impl SkyPower {
+    /// The interval that holds C_l with 68 % probability, K^2.
+    #[must_use]
+    pub fn interval_k2(&self, l: usize) -> Option<[f64; 2]> {
+        let (power, sigma) = (self.power_k2.get(l)?, self.sigma_ln.get(l)?);
+        Some([power * (-sigma).exp(), power * sigma.exp()])
+    }
+
+    /// One over R by degree: the power less what the data scatter more than their noise.
+    #[must_use]
+    pub fn over_noise_k2(&self) -> Vec<f64> {
+        self.power_k2.iter().map(|power| power / self.noise_factor.powi(2)).collect()
+    }
+
+    /// As found for data that were divided by `factor`.
+    fn of_data_divided_by(mut self, factor: f64) -> Self {
+        self.power_k2.iter_mut().for_each(|power| *power *= factor * factor);
+        self.noise_factor = factor;
+        self
+    }
+
+    /// A table: a line a degree from l = 2.
+    #[must_use]
+    pub fn csv(&self) -> String {
+        let mut table = String::from(
+            "# Angular power of the sky from the data, with the interval that holds it with 68 % probability; decided: how many of the 2 l + 1\n\
+             # coefficients the data decide. R = 1 / C_l.\n\
+             l,power_k2,low_k2,high_k2,decided\n",
+        );
+        for l in FREE..self.power_k2.len() {
+            let [low, high] = self.interval_k2(l).unwrap_or_default();
+            let decided = self.decided.get(l).copied().unwrap_or_default();
+            table.push_str(&format!("{l},{:e},{low:e},{high:e},{decided:.3}\n", self.power_k2[l]));
+        }
+        table
+    }
+}
+
+/// What is known of a map's errors, with R from the data.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Uncertainty {
+    /// Standard deviation of every pixel, K: of noise and of what the data leave open, up to the map's degrees.
+    pub sigma_k: Vec<f64>,
+    /// Standard deviation of the mean, K.
+    pub mean_sigma_k: f64,
+    /// The sky's power that R is the inverse of.
+    pub power: SkyPower,
+    /// Maps as likely as the map itself (draws from the posterior), K, if any were asked for.
+    pub samples_k: Vec<Vec<f64>>,
+}
+
+impl Uncertainty {
+    /// Of a map that is divided by `factor`.
+    #[must_use]
+    pub(super) fn reduced(mut self, factor: f64) -> Self {
+        let samples = self.samples_k.iter_mut().flatten();
+        self.sigma_k.iter_mut().chain(samples).for_each(|value| *value /= factor);
+        self.mean_sigma_k /= factor;
+        self.power.power_k2.iter_mut().for_each(|power| *power /= factor * factor);
+        self
+    }
+}
+
+/// A power on its way to the most likely one.
+#[derive(Clone, Debug)]
+pub(super) struct PowerFit {
+    knots: Knots,
+    theta: Vec<f64>,
+    /// C_l, K^2.
+    power: Vec<f64>,
+}
+
+/// What a fit takes the data to be.
+#[derive(Clone, Copy)]
+pub(super) struct BlockData<'a> {
+    /// The normal matrix.
+    pub(super) blocks: &'a [Block<'a>],
+    /// Right-hand side.
+    pub(super) right: &'a [f64],
+    /// By how much the gradient in ln C_l is more than that of the blocks.
+    pub(super) tilt: &'a [f64],
+}
+
+impl PowerFit {
+    fn new(knots: Knots, theta: Vec<f64>) -> Self {
+        let power = knots.log_power(&theta).into_iter().map(f64::exp).collect();
+        Self { knots, theta, power }
+    }
+
+    /// `C_l` proportional to `(l + 1)^-2` with the most likely amplitude.
+    ///
+    /// # Errors
+    /// A matrix that no R makes positive definite: of numbers that are not finite.
+    pub(super) fn begin(blocks: &[Block<'_>], l_max: usize, right: &[f64]) -> Result<Self, SolveError> {
+        let unit = greatest(blocks).recip();
+        let of = |decade: i32| {
+            let knots = Knots::new(l_max, (unit * 10.0_f64.powi(decade)).ln());
+            let fit = Self::new(knots.clone(), knots.plain());
+            Some((value(blocks, &fit.power, right)?, fit))
+        };
+        let best = DECADES.filter_map(of).max_by(|(a, _), (b, _)| a.total_cmp(b));
+        best.map(|(_, fit)| fit).ok_or(SolveError::NoPower)
+    }
+
+    /// R by degree, K^-2.
+    pub(super) fn regularisation(&self) -> Vec<f64> {
+        self.power.iter().map(|power| power.recip()).collect()
+    }
+
+    /// The data of which `solution` is the solution with this R if the blocks are the normal matrix.
+    pub(super) fn data_of(&self, blocks: &[Block<'_>], solution: &[f64], degrees: &[usize]) -> Vec<f64> {
+        let mut data = multiply(blocks, solution);
+        for ((data, x), l) in data.iter_mut().zip(solution).zip(degrees) {
+            *data += x / self.power[*l];
+        }
+        data
+    }
+
+    /// Evidence and hyperprior at some parameters.
+    fn objective(&self, theta: &[f64], data: BlockData<'_>) -> Option<f64> {
+        let log_power = self.knots.log_power(theta);
+        let power: Vec<f64> = log_power.iter().map(|ln| ln.exp()).collect();
+        let tilted: f64 = data.tilt.iter().zip(&log_power).skip(FREE).map(|(t, ln)| t * ln).sum();
+        Some(value(data.blocks, &power, data.right)? + tilted + self.knots.hyperprior(theta).value)
+    }
+
+    /// Gradient and information of the objective.
+    fn derivatives(&self, data: BlockData<'_>) -> Option<(Vec<f64>, Mat<f64>)> {
+        let found = evidence(data.blocks, &self.knots, &self.power, data.right)?;
+        let prior = self.knots.hyperprior(&self.theta);
+        let mut gradient = prior.gradient;
+        for (l, of_degree) in found.gradient.iter().enumerate().skip(FREE) {
+            let of_degree = of_degree + data.tilt.get(l).copied().unwrap_or(0.0);
+            for (knot, share) in self.knots.weights(l) {
+                gradient[knot] += share * of_degree;
+            }
+        }
+        Some((gradient, found.fisher + prior.precision))
+    }
+
+    /// The most likely power.
+    ///
+    /// # Errors
+    /// As [`PowerFit::begin`].
+    pub(super) fn maximised(&self, data: BlockData<'_>) -> Result<Self, SolveError> {
+        let mut fit = self.clone();
+        let mut best = fit.objective(&fit.theta, data).ok_or(SolveError::NoPower)?;
+        for _ in 0..STEPS_MAX {
+            let (gradient, information) = fit.derivatives(data).ok_or(SolveError::NoPower)?;
+            let Ok(factor) = information.llt(Side::Lower) else { break };
+            let covariance = factor.inverse();
+            let mut step: Vec<f64> = (0..gradient.len())
+                .map(|k| gradient.iter().enumerate().map(|(j, g)| covariance[(k, j)] * g).sum())
+                .collect();
+            let longest = step.iter().fold(0.0_f64, |most, step| most.max(step.abs()));
+            if longest > STEP_MAX {
+                step.iter_mut().for_each(|step| *step *= STEP_MAX / longest);
+            }
+            let tried = (0..HALVINGS).find_map(|halving| {
+                let share = 0.5_f64.powi(halving as i32);
+                let theta: Vec<f64> = fit.theta.iter().zip(&step).map(|(t, s)| t + share * s).collect();
+                let found = fit.objective(&theta, data).filter(|found| *found > best)?;
+                Some((found, theta))
+            });
+            let Some((found, theta)) = tried else { break };
+            let gain = found - best;
+            (best, fit) = (found, Self::new(fit.knots, theta));
+            if gain < GAIN_MIN {
+                break;
+            }
+        }
+        Ok(fit)
+    }
+
+    /// Greatest change of ln C_l at a knot.
+    pub(super) fn change(&self, from: &Self) -> f64 {
+        self.theta.iter().zip(&from.theta).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+    }
+
+    /// The estimate with its uncertainty; `traces` are those of `(A + R)^-1` by degree.
+    ///
+    /// # Errors
+    /// As [`PowerFit::begin`].
+    pub(super) fn estimate(&self, data: BlockData<'_>, traces: &[f64]) -> Result<SkyPower, SolveError> {
+        let (_, information) = self.derivatives(data).ok_or(SolveError::NoPower)?;
+        let covariance = information.llt(Side::Lower).map_err(|_| SolveError::NoPower)?.inverse();
+        let sigma = |l: usize| {
+            let weights = self.knots.weights(l);
+            let term = |(k, a): (usize, f64)| weights.iter().map(move |(j, b)| (k, *j, a * b));
+            let variance: f64 = weights
+                .iter()
+                .flat_map(|one| term(*one))
+                .map(|(k, j, share)| share * covariance[(k, j)])
+                .sum();
+            variance.max(0.0).sqrt()
+        };
+        let mut count = vec![0.0; self.power.len()];
+        for block in data.blocks {
+            block.degrees.iter().for_each(|l| count[*l] += block.places.len() as f64);
+        }
+        let decided =
+            (count.iter().zip(traces)).zip(&self.power).map(|((n, trace), c)| (n - trace / c).max(0.0));
+        Ok(SkyPower {
+            power_k2: self.power.clone(),
+            sigma_ln: (0..self.power.len()).map(sigma).collect(),
+            decided: decided.collect(),
+            noise_factor: 1.0,
+        })
+    }
+}
