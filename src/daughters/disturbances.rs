@@ -17,6 +17,7 @@ use crate::units::{StreamKind, random_stream};
 impl Tones {
     /// Whether any is added.
     #[must_use]
+    #[doc(hidden)]
     pub fn are_on(&self) -> bool {
         self.interference_k_sr > 0.0 || self.calibration_k_sr > 0.0
     }

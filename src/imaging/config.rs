@@ -208,6 +208,7 @@ impl MapConfig {
     /// What R is: from the data, unless something else is set. An epsilon alone asks for the identity, and so do visibilities that are held
     /// one by one.
     #[must_use]
+    #[doc(hidden)]
     pub fn regulariser(&self) -> RegulariserChoice {
         let is_identity = self.holds_visibilities() || self.epsilon.is_some();
         let usual = if is_identity { RegulariserChoice::Identity } else { RegulariserChoice::Data };
@@ -216,12 +217,14 @@ impl MapConfig {
 
     /// epsilon of an R that has one.
     #[must_use]
+    #[doc(hidden)]
     pub fn epsilon(&self) -> PerChannel<f64> {
         self.epsilon.clone().unwrap_or(PerChannel::All(EPSILON))
     }
 
     /// Tables of the sky's angular power that are to be read, one a channel.
     #[must_use]
+    #[doc(hidden)]
     pub fn power_files(&self) -> &[PathBuf] {
         match &self.regulariser {
             Some(RegulariserChoice::File(files)) => files,
@@ -408,8 +411,6 @@ impl MapConfig {
             channels_max: _,
             epsilon: _,
             regulariser: _,
-            regularisation_exponent: _,
-            regularisation_files: _,
             beams_deg: _,
             prior_k: _,
             prior_files: _,

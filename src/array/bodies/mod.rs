@@ -62,6 +62,7 @@ impl fmt::Display for EarthModel {
 /// Whether the Moon hides the Earth, as it is by the dates, from satellite 1 at both ends of an ephemeris segment: to a degree, the
 /// Earth's own radius. That of observing windows is, unless the mission's Earth is an idealised one.
 #[must_use]
+#[doc(hidden)]
 pub fn earth_is_hidden_by_date(segment: &EphemerisSegment, epoch_tai_s: f64, moon_radius_m: f64) -> bool {
     let last = segment.positions_m.len().saturating_sub(usize::from(segment.satellites));
     [(segment.start, 0), (segment.end(), last)].into_iter().all(|(time, place)| {

@@ -175,6 +175,7 @@ impl CoverageSurvey {
     }
 
     /// Checkpoints that could not be used, in words.
+    #[doc(hidden)]
     pub fn notes(&self) -> impl Iterator<Item = &str> {
         self.notes.iter().map(String::as_str)
     }

@@ -96,6 +96,7 @@ impl SolverSetup {
 
     /// R of a channel.
     #[must_use]
+    #[doc(hidden)]
     pub fn regulariser(&self, channel: usize) -> Regulariser {
         self.regularisers.get(channel).or(self.regularisers.last()).cloned().unwrap_or_default()
     }
