@@ -6,7 +6,7 @@ use toml::{Table, Value};
 use super::key_list::{FlatKey, flat_keys};
 use super::problems::Problems;
 use super::sections::Config;
-use crate::units::shortened;
+use crate::units::{Level, shortened};
 
 /// Most characters of a value that are shown.
 const SHOWN_MAX: usize = 60;
@@ -33,7 +33,7 @@ impl Config {
         let is_asked = |key: &&FlatKey| {
             sections.is_empty() || sections.contains(&key.path.split('.').next().unwrap_or(""))
         };
-        for key in keys.iter().filter(is_asked) {
+        for key in keys.iter().filter(|key| key.key.level != Level::Section).filter(is_asked) {
             let Some(value) = value_of(&set, &key.path).filter(|value| Some(*value) != key.default.as_ref())
             else {
                 continue;
